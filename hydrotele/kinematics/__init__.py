@@ -1,0 +1,1 @@
+"""Closed forms used on both sides of the wall: arm kinematics and cylinder linkages."""

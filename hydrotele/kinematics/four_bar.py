@@ -1,0 +1,204 @@
+"""A cylinder that turns a bucket through rocker and coupler: output angle to length and back."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.kinematics.triangle import (
+    LoopOpen,
+    Point,
+    Scalar,
+    closing,
+    cross,
+    library,
+    minus,
+    third_pin,
+)
+
+
+class FourBarPose(NamedTuple):
+    """Where the bars of a four-bar are.
+
+    Attributes:
+        rocker_angle: direction from rocker pivot to rod pin in the ground link's frame [rad].
+        coupler_angle: direction from the output link's pin to the rod pin in the ground link's
+            frame [rad].
+        length: pin-to-pin length of the cylinder [m].
+    """
+
+    rocker_angle: Scalar
+    coupler_angle: Scalar
+    length: Scalar
+
+
+@dataclass(frozen=True)
+class FourBar:
+    """A cylinder that turns the output link (bucket) through a rocker and a coupler.
+
+    The rod pin R joins cylinder, rocker and coupler. Every point is (x, z) [m]: x along the link, z
+    up. Output angle theta = 0 where the output frame is parallel to the ground link's frame (Zhu
+    1994 Fig. 6.36, Table 6.5).
+
+    Attributes:
+        output_pivot: O, about which the output link turns, in the ground link's frame.
+        rocker_pivot: P, in the ground link's frame.
+        cylinder_base: B, in the ground link's frame.
+        rocker: length P to R [m], > 0.
+        coupler: length Q to R [m], > 0.
+        output_arm: Q as seen from O in the output link's frame.
+        assembly: +1 if R lies to the left of the way from P to Q, -1 if to the right [-].
+        working_angle: any output angle inside the working range [rad]; chooses the branches of
+            `angle`.
+    """
+
+    output_pivot: tuple[float, float]
+    rocker_pivot: tuple[float, float]
+    cylinder_base: tuple[float, float]
+    rocker: float
+    coupler: float
+    output_arm: tuple[float, float]
+    assembly: int = 1
+    working_angle: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse bars without length and an assembly that is no sign."""
+        if self.rocker <= 0 or self.coupler <= 0 or math.hypot(*self.output_arm) <= 0:
+            raise ValueError("four-bar rocker, coupler and output arm must have a positive length")
+        if self.assembly not in (1, -1):
+            raise ValueError(f"four-bar assembly must be +1 or -1, got {self.assembly}")
+
+    def pins(self, theta: Scalar) -> tuple[Point, Point]:
+        """Pin Q of the output link and rod pin R, by intersecting the circles about P and Q.
+
+        Args:
+            theta: output angle, any shape [rad].
+
+        Returns:
+            Q and R, each (x, z) in the ground link's frame [m], every coordinate with the shape of
+            theta.
+
+        Raises:
+            LoopOpen: rocker and coupler cannot meet at an angle asked.
+
+        >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
+        >>> q, r = bucket.pins(-1.0)
+        >>> [round(v, 4) for v in (*q, *r)]
+        [1.9865, 0.3574, 1.5992, 0.641]
+        """
+        m = library(theta)
+        cosine, sine = m.cos(theta), m.sin(theta)
+        (ox, oz), (ax, az) = self.output_pivot, self.output_arm
+        q = (ox + ax * cosine - az * sine, oz + ax * sine + az * cosine)
+        return q, third_pin(self.rocker_pivot, q, self.rocker, self.coupler, self.assembly)
+
+    def pose(self, theta: Scalar) -> FourBarPose:
+        """Rocker angle, coupler angle and cylinder length.
+
+        Args:
+            theta: output angle, any shape [rad].
+
+        Returns:
+            rocker_angle [rad], coupler_angle [rad], length [m], each with the shape of theta.
+
+        Raises:
+            LoopOpen: rocker and coupler cannot meet at an angle asked.
+
+        >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
+        >>> [round(v, 4) for v in bucket.pose(-1.0)]
+        [1.3895, 2.5095, 1.7555]
+        """
+        m = library(theta)
+        q, r = self.pins(theta)
+        rocker, coupler = minus(r, self.rocker_pivot), minus(r, q)
+        rod = minus(r, self.cylinder_base)
+        return FourBarPose(
+            m.atan2(rocker[1], rocker[0]),
+            m.atan2(coupler[1], coupler[0]),
+            m.sqrt(rod[0] ** 2 + rod[1] ** 2),
+        )
+
+    def length(self, theta: Scalar) -> Scalar:
+        """Pin-to-pin length c = |R - B|.
+
+        Args:
+            theta: output angle, any shape [rad].
+
+        Returns:
+            Pin-to-pin length, shape of theta [m].
+
+        Raises:
+            LoopOpen: rocker and coupler cannot meet at an angle asked.
+
+        >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
+        >>> round(bucket.length(-1.0), 4)
+        1.7555
+        """
+        return self.pose(theta).length
+
+    def rate(self, theta: Scalar) -> Scalar:
+        """Signed moment arm dc/dtheta = ratio ((R - P) x (R - B)) / c.
+
+        ratio = d(rocker angle)/dtheta = ((Q - O) x (R - Q)) / ((R - P) x (R - Q)), since the
+        coupler keeps its length.
+
+        Args:
+            theta: output angle, any shape [rad].
+
+        Returns:
+            Moment arm, shape of theta [m/rad]; infinite where rocker and coupler are in line (a
+            dead point).
+
+        Raises:
+            LoopOpen: rocker and coupler cannot meet at an angle asked.
+
+        >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
+        >>> round(bucket.rate(-1.0), 4)
+        -0.4015
+        """
+        q, r = self.pins(theta)
+        arm, coupler = minus(q, self.output_pivot), minus(r, q)
+        rocker, rod = minus(r, self.rocker_pivot), minus(r, self.cylinder_base)
+        ratio = cross(arm, coupler) / cross(rocker, coupler)
+        return ratio * cross(rocker, rod) / library(theta).sqrt(rod[0] ** 2 + rod[1] ** 2)
+
+    def angle(self, length: Scalar) -> Scalar:
+        """Output angle: the triangle B-P-R gives R, then the triangle O-R-Q gives Q.
+
+        Of the two solutions of each, the one of the working angle is taken.
+
+        Args:
+            length: pin-to-pin length, any shape [m].
+
+        Returns:
+            Output angle, shape of length [rad], within pi of the working angle.
+
+        Raises:
+            LoopOpen: a length is out of reach of the rocker, or the rocker then out of reach of the
+                output arm, or rocker and coupler would have passed their dead point.
+
+        >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
+        >>> round(bucket.angle(bucket.length(-1.0)), 9)
+        -1.0
+        """
+        m = library(length)
+        rod_side, arm_side = self._sides
+        ground = math.dist(self.rocker_pivot, self.cylinder_base)
+        closing(length, abs(ground - self.rocker), ground + self.rocker, "cylinder length")
+        r = third_pin(self.rocker_pivot, self.cylinder_base, self.rocker, length, rod_side)
+        q = third_pin(self.output_pivot, r, math.hypot(*self.output_arm), self.coupler, arm_side)
+        turned = cross(minus(q, self.rocker_pivot), minus(r, self.rocker_pivot)) * self.assembly
+        if np.any(turned < -1e-12):
+            raise LoopOpen(f"cylinder length {length} m: rocker and coupler pass their dead point")
+        arm = minus(q, self.output_pivot)
+        theta = m.atan2(arm[1], arm[0]) - math.atan2(self.output_arm[1], self.output_arm[0])
+        return theta - math.tau * m.floor((theta - self.working_angle) / math.tau + 0.5)
+
+    @cached_property
+    def _sides(self) -> tuple[int, int]:
+        q, r = self.pins(float(self.working_angle))
+        rod = cross(minus(self.cylinder_base, self.rocker_pivot), minus(r, self.rocker_pivot))
+        arm = cross(minus(r, self.output_pivot), minus(q, self.output_pivot))
+        return (1 if rod > 0 else -1), (1 if arm > 0 else -1)

@@ -1,0 +1,304 @@
+"""A machine as data: links, joints, drives, valves, sensors and home position, all SI and frozen.
+
+The numbers stand in `models/<machine>/machine.yaml`, the tree and the shapes in its MJCF. A link's
+position and inertia may stand in either of them, never in both.
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hydrotele.datafile import Facts, suggest
+
+Vector = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+
+
+class Joint(Facts):
+    """One degree of freedom: `range` [rad] or [m], `damping` [N m s/rad] or [N s/m]."""
+
+    name: Name
+    type: Literal["hinge", "slide"] = "hinge"
+    axis: Vector = (0.0, 0.0, 1.0)
+    range: tuple[float, float] | None = None
+    damping: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if abs(np.linalg.norm(self.axis) - 1.0) > 1e-6:
+            raise ValueError(f"axis {self.axis} must have unit length")
+        if self.range and self.range[0] >= self.range[1]:
+            raise ValueError(f"range {self.range} must be [low, high] with low < high")
+        return self
+
+
+class Link(Facts):
+    """A rigid body in its parent's frame: position [m], mass [kg], inertia about com [kg m^2]."""
+
+    parent: Name = "world"
+    position: Vector = (0.0, 0.0, 0.0)
+    joint: Joint | None = None
+    mass: Positive
+    com: Vector = (0.0, 0.0, 0.0)
+    inertia: tuple[Positive, Positive, Positive]
+
+    @model_validator(mode="after")
+    def _check(self):
+        a, b, c = sorted(self.inertia)
+        if a + b < c * (1 - 1e-9):
+            raise ValueError(
+                f"inertia {self.inertia} is impossible for a rigid body: the largest moment exceeds"
+                " the sum of the other two"
+            )
+        return self
+
+
+class Pin(Facts):
+    """A point [m] fixed to a link (or to the world)."""
+
+    link: Name
+    position: Vector
+
+
+class Friction(Facts):
+    """Friction numbers of `hydraulics.friction`: [N] or [N m], velocities [m/s] or [rad/s]."""
+
+    coulomb: NonNegative = 0.0
+    stribeck_extra: NonNegative = 0.0
+    stribeck_velocity: Positive = 0.02
+    viscous: NonNegative = 0.0
+    smoothing_velocity: Positive = 0.005
+
+
+class Bar(Facts):
+    """Tube or rod of a cylinder: com is its distance [m] from its own pin."""
+
+    mass: Positive
+    com: float
+    inertia: tuple[Positive, Positive, Positive]
+
+
+class Cylinder(Facts):
+    """A hydraulic cylinder between two pins; x = pin-to-pin length - closed_length, 0 .. stroke."""
+
+    base_pin: Pin
+    rod_pin: Pin
+    closed_length: Positive
+    stroke: Positive
+    area_head: Positive
+    area_rod: Positive
+    dead_volume: Positive
+    leakage: NonNegative
+    friction: Friction = Friction()
+    tube: Bar
+    rod: Bar
+
+
+class Motor(Facts):
+    """A hydraulic motor on a joint: displacement [m^3/rad], constant chamber volumes [m^3]."""
+
+    displacement: Positive
+    dead_volume: Positive
+    leakage: NonNegative
+    friction: Friction = Friction()
+
+
+class ForceDrive(Facts):
+    """A plain force or torque drive: gain [N or N m per unit of command]."""
+
+    gain: float
+    command_unit: Literal["1", "V", "N", "A"] = "1"
+    command_limit: Positive = 1.0
+    friction: Friction = Friction()
+    offset: float = 0.0
+
+
+class Valve(Facts):
+    """A spool valve: rated_flow [m^3/s] at rated_pressure_drop [Pa], bandwidth [rad/s]."""
+
+    rated_flow: Positive
+    rated_pressure_drop: Positive = 7.0e6
+    deadband: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    bandwidth: Positive
+    damping: Positive = 0.9
+    port_relief: Positive = 32.0e6
+    smoothing: Positive = 5.0e4
+    port_relief_gain: NonNegative = 1.0e-9
+    makeup_gain: NonNegative = 5.0e-9
+
+
+class FourBar(Facts):
+    """Names of the links between cylinder and joint of a four-bar linkage."""
+
+    rocker: Name
+    coupler: Name
+
+
+class Axis(Facts):
+    """One driven joint with exactly one of cylinder, motor or force."""
+
+    joint: Name
+    cylinder: Cylinder | None = None
+    motor: Motor | None = None
+    force: ForceDrive | None = None
+    valve: Valve | None = None
+    four_bar: FourBar | None = None
+
+    @model_validator(mode="after")
+    def _check(self):
+        drives = [d for d in ("cylinder", "motor", "force") if getattr(self, d) is not None]
+        if len(drives) != 1:
+            raise ValueError(f"needs exactly one of cylinder, motor, force; has {drives or 'none'}")
+        if (self.force is None) == (self.valve is None):
+            raise ValueError("a cylinder or motor needs a valve; a plain force drive has none")
+        if self.four_bar and not self.cylinder:
+            raise ValueError("a four_bar linkage is moved by a cylinder")
+        return self
+
+    @property
+    def hydraulic(self) -> bool:
+        """Whether the axis has a valve and chambers."""
+        return self.valve is not None
+
+    @property
+    def drive(self) -> Cylinder | Motor | ForceDrive:
+        """The cylinder, the motor or the force drive."""
+        drive = self.cylinder or self.motor or self.force
+        assert drive is not None
+        return drive
+
+
+class Closure(Facts):
+    """A pin that closes a loop: the two points coincide."""
+
+    a: Pin
+    b: Pin
+
+
+class Supply(Facts):
+    """Pump and tank shared by all valves; pressures [Pa], flow [m^3/s], bulk modulus [Pa]."""
+
+    relief_pressure: Positive
+    tank_pressure: NonNegative
+    pump_flow: Positive
+    bulk_modulus: Positive
+
+
+class Sensor(Facts):
+    """Uniform error +-accuracy, then 2^bits equal steps of the span; `None` = no such defect."""
+
+    accuracy: NonNegative = 0.0
+    bits: Annotated[int, Field(ge=1, le=32)] | None = None
+    span: Positive | None = None
+
+
+class SensorSet(Facts):
+    """Sensors of a machine by kind of channel, sampled at `rate` [Hz]."""
+
+    rate: Positive = 50.0
+    angle: Sensor = Sensor()
+    position: Sensor = Sensor()
+    length: Sensor = Sensor()
+    pressure: Sensor = Sensor()
+    force: Sensor = Sensor()
+
+
+class Arm(Facts):
+    """Names of the joints of a swing-boom-stick(-tool) arm and the point it moves."""
+
+    swing: Name
+    boom: Name
+    stick: Name
+    tool: Name | None = None
+    tip: Pin
+
+
+class Machine(Facts):
+    """Everything the simulator, the controller and the learning code know of a machine."""
+
+    name: Name
+    description: str = ""
+    source: str = ""
+    mjcf: str | None = None
+    folder: str = ""
+    tool: Name = "none"
+    tools: tuple[str, ...] = ("none",)
+    gravity: Vector = (0.0, 0.0, -9.81)
+    links: dict[Name, Link]
+    axes: dict[Name, Axis]
+    closures: dict[Name, Closure] = {}
+    supply: Supply | None = None
+    sensors: dict[Name, SensorSet] = {}
+    home: dict[Name, float] = {}
+    arm: Arm | None = None
+    log_columns: dict[str, str] = {}
+    removed_bodies: tuple[str, ...] = ()
+
+    @property
+    def joints(self) -> dict[str, Joint]:
+        """Joints of the links by name, in tree order."""
+        return {link.joint.name: link.joint for link in self.links.values() if link.joint}
+
+    @property
+    def hydraulic_axes(self) -> dict[str, Axis]:
+        """Axes with a valve."""
+        return {name: axis for name, axis in self.axes.items() if axis.hydraulic}
+
+    def link_of(self, joint: str) -> str:
+        """Name of the link that a joint moves."""
+        return next(n for n, li in self.links.items() if li.joint and li.joint.name == joint)
+
+    def position_kind(self, axis: str) -> str:
+        """`angle` for a hinge axis, `position` for a slide."""
+        return "angle" if self.joints[self.axes[axis].joint].type == "hinge" else "position"
+
+    @model_validator(mode="after")
+    def _check(self):
+        known = {"world", *self.links}
+        for name, link in self.links.items():
+            _expect(link.parent, known - {name}, f"links.{name}.parent")
+        _refuse_cycles(self.links)
+        joints = self.joints
+        for name, axis in self.axes.items():
+            _expect(axis.joint, joints, f"axes.{name}.joint")
+            if axis.cylinder:
+                _expect(axis.cylinder.base_pin.link, known, f"axes.{name}.cylinder.base_pin.link")
+                _expect(axis.cylinder.rod_pin.link, known, f"axes.{name}.cylinder.rod_pin.link")
+            if axis.four_bar:
+                _expect(axis.four_bar.rocker, known, f"axes.{name}.four_bar.rocker")
+                _expect(axis.four_bar.coupler, known, f"axes.{name}.four_bar.coupler")
+        for name, closure in self.closures.items():
+            for end in (closure.a, closure.b):
+                _expect(end.link, known, f"closures.{name}")
+        for joint in self.home:
+            _expect(joint, joints, "home")
+        if self.arm:
+            for part in ("swing", "boom", "stick", "tool"):
+                joint = getattr(self.arm, part)
+                if joint is not None:
+                    _expect(joint, joints, f"arm.{part}")
+            _expect(self.arm.tip.link, known, "arm.tip.link")
+        if self.hydraulic_axes and self.supply is None:
+            raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
+        if len(self.hydraulic_axes) > 8:
+            raise ValueError("at most 8 valves can share one supply")
+        return self
+
+
+def _expect(name: str, valid, where: str) -> None:
+    if name not in valid:
+        raise ValueError(f"{where}: {name!r} is not known; {suggest(name, valid)}")
+
+
+def _refuse_cycles(links: dict[str, Link]) -> None:
+    for start in links:
+        seen, link = {start}, links[start].parent
+        while link != "world":
+            if link in seen:
+                raise ValueError(f"links.{start}: its parents form a cycle ({', '.join(seen)})")
+            seen.add(link)
+            link = links[link].parent

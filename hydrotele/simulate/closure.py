@@ -1,0 +1,194 @@
+"""Closed loops: which joints follow, where they stand, how fast they move, what loads they carry.
+
+Loops are closed on the MuJoCo model itself, so that any tree with `connect` constraints works.
+"""
+
+import mujoco
+import numpy as np
+
+from hydrotele.errors import InputError
+from hydrotele.machine import Machine
+
+_STEP = 0.2  # largest move of an independent joint between two Newton solutions [rad] or [m]
+_CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
+
+
+def following_joints(machine: Machine) -> tuple[str, ...]:
+    """Names of the joints that the closures determine: tubes, rods and undriven links in a loop."""
+    driven = {axis.joint for axis in machine.axes.values()}
+    names: list[str] = []
+    for name, axis in machine.axes.items():
+        if axis.cylinder:
+            names += [f"{name}_tube", f"{name}_rod"]
+    for closure in machine.closures.values():
+        for link in _loop(machine, closure.a.link, closure.b.link):
+            joint = machine.links[link].joint
+            if joint and joint.name not in driven and joint.name not in names:
+                names.append(joint.name)
+    return tuple(names)
+
+
+def _loop(machine: Machine, a: str, b: str) -> list[str]:
+    chains = []
+    for link in (a, b):
+        chain = []
+        while link != "world":
+            chain.append(link)
+            link = machine.links[link].parent
+        chains.append(chain)
+    return [x for x in chains[0] + chains[1] if not (x in chains[0] and x in chains[1])]
+
+
+def closure_error(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+    """Openings of all `connect` pins and their Jacobian, in the current configuration.
+
+    Args:
+        model: the model; its connects are defined by sites.
+        data: the data; kinematics are updated here.
+
+    Returns:
+        (errors (3 neq,) [m], Jacobian (3 neq, nv)).
+    """
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    errors = np.zeros(3 * model.neq)
+    jacobian = np.zeros((3 * model.neq, model.nv))
+    ja, jb = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    for k in range(model.neq):
+        a, b = model.eq_obj1id[k], model.eq_obj2id[k]
+        errors[3 * k : 3 * k + 3] = data.site_xpos[a] - data.site_xpos[b]
+        mujoco.mj_jacSite(model, data, ja, None, a)
+        mujoco.mj_jacSite(model, data, jb, None, b)
+        jacobian[3 * k : 3 * k + 3] = ja - jb
+    return errors, jacobian
+
+
+def pin_opening(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """Largest distance between the two halves of a pin, with `site_xpos` as it stands [m]."""
+    if model.neq == 0:
+        return 0.0
+    gap = data.site_xpos[model.eq_obj1id] - data.site_xpos[model.eq_obj2id]
+    return float(np.sqrt((gap * gap).sum(axis=1).max()))
+
+
+def close_loops(
+    machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, target: dict[str, float]
+) -> None:
+    """Put the independent joints at their target and close every loop.
+
+    Starts from the machine's home position and moves to the target in small steps, so that each
+    linkage stays on its home branch.
+
+    Args:
+        machine: the machine.
+        model: its model.
+        data: written: `qpos`.
+        target: joint name -> angle [rad] or position [m]; others stay at home.
+
+    Raises:
+        InputError: a loop cannot be closed there (outside the reach of a linkage).
+    """
+    following = following_joints(machine)
+    names = [n for n in machine.joints if n not in following]
+    places = [model.joint(n).qposadr[0] for n in names]
+    home = np.array([machine.home.get(n, 0.0) for n in names])
+    goal = np.array([target.get(n, h) for n, h in zip(names, home, strict=True)])
+    data.qpos[:] = model.qpos0
+    for name in following:
+        data.qpos[model.joint(name).qposadr[0]] = machine.home.get(name, 0.0)
+    parts = 1 + int(np.max(np.abs(goal - home), initial=0.0) / _STEP)
+    for part in range(parts + 1):
+        data.qpos[places] = home + (goal - home) * part / parts
+        if part == 0:
+            _aim_cylinders(machine, model, data)
+        if not _newton(model, data, following):
+            where = ", ".join(f"{n} {v:.3f}" for n, v in zip(names, data.qpos[places], strict=True))
+            raise InputError(f"machine {machine.name}", f"its linkages do not close at {where}")
+
+
+def _aim_cylinders(machine, model, data) -> None:
+    for _ in range(2):
+        for name, axis in machine.axes.items():
+            if not axis.cylinder:
+                continue
+            mujoco.mj_kinematics(model, data)
+            tube, rod_pin = model.body(f"{name}_tube").id, model.site(f"{name}_pin_b").id
+            way = data.site_xpos[rod_pin] - data.xpos[tube]
+            parent = data.xmat[model.body_parentid[tube]].reshape(3, 3)
+            local = parent.T @ way
+            angle = np.arctan2(local[2], local[0])
+            data.qpos[model.joint(f"{name}_tube").qposadr[0]] = angle
+            reach = np.linalg.norm(way) - axis.cylinder.closed_length
+            data.qpos[model.joint(f"{name}_rod").qposadr[0]] = reach
+
+
+def _newton(model, data, following) -> bool:
+    dofs = [model.joint(n).dofadr[0] for n in following]
+    places = [model.joint(n).qposadr[0] for n in following]
+    if not dofs:
+        return True
+    for _ in range(30):
+        error, jacobian = closure_error(model, data)
+        if np.abs(error).max() < _CLOSED:
+            return True
+        step = np.linalg.lstsq(jacobian[:, dofs], -error, rcond=1e-10)[0]
+        data.qpos[places] += step * min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
+    return bool(np.abs(error).max() < 1e3 * _CLOSED)
+
+
+def independent_dofs(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
+    """Places in `qvel` of the joints that the closures leave free, ascending."""
+    dependent = [model.joint(n).dofadr[0] for n in following_joints(machine)]
+    return np.setdiff1d(np.arange(model.nv), dependent)
+
+
+def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Velocities of all joints per unit velocity of each independent one.
+
+    Args:
+        machine: the machine.
+        model: its model.
+        data: a configuration with closed loops.
+
+    Returns:
+        N, (nv, n), with `qvel = N @ qvel[independent_dofs]`.
+    """
+    independent = independent_dofs(machine, model)
+    dependent = np.setdiff1d(np.arange(model.nv), independent)
+    basis = np.zeros((model.nv, len(independent)))
+    basis[independent, np.arange(len(independent))] = 1.0
+    if len(dependent):
+        _, jacobian = closure_error(model, data)
+        basis[dependent] = -np.linalg.lstsq(
+            jacobian[:, dependent], jacobian[:, independent], rcond=1e-10
+        )[0]
+    return basis
+
+
+def holding_forces(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Actuator forces that hold the machine still where it stands, without contact.
+
+    Virtual work: `N^T (qfrc_bias - passive) = N^T M_act^T F`, solved in the least-squares sense.
+
+    Args:
+        machine: the machine.
+        model: its model.
+        data: a configuration with closed loops; velocity is taken as zero.
+
+    Returns:
+        (nu,) forces [N] or torques [N m].
+
+    Source: Khoshzaban 1992, section 4.3 (forces of the minor links projected on the joints).
+    """
+    scratch = mujoco.MjData(model)
+    scratch.qpos[:] = data.qpos
+    mujoco.mj_fwdPosition(model, scratch)
+    mujoco.mj_fwdVelocity(model, scratch)
+    moment = np.zeros((model.nu, model.nv))
+    mujoco.mju_sparse2dense(
+        moment, scratch.actuator_moment, scratch.moment_rownnz, scratch.moment_rowadr,
+        scratch.moment_colind,
+    )  # fmt: skip
+    basis = motion_basis(machine, model, scratch)
+    load = basis.T @ (scratch.qfrc_bias - scratch.qfrc_passive)
+    return np.linalg.lstsq(basis.T @ moment.T, load, rcond=1e-10)[0]

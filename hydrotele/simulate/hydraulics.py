@@ -1,0 +1,159 @@
+"""Laws of valve, orifice, chamber, supply and friction, in SI, as small compiled functions.
+
+They are written once here and used by the native callbacks, the tests and the identification.
+Equations: Merritt, *Hydraulic Control Systems* (1967); the set is fixed as the nominal model of
+`models/cat215/README.md`.
+"""
+
+import math
+
+from numba import njit
+
+law = njit(cache=True, error_model="numpy")
+
+
+@law
+def valve_opening(spool, deadband):
+    """Opening of a valve with overlap: 0 inside the dead band, then linear up to 1.
+
+    Args:
+        spool: spool position s, scalar [1], not clamped.
+        deadband: half width of the overlap, scalar [1], 0 <= deadband < 1.
+
+    Returns:
+        Opening o, scalar [1]: `sgn(s) (|s| - db) / (1 - db)` outside the dead band, else 0.
+
+    Source: nominal model, "Spool".
+
+    >>> valve_opening(1.0, 0.04)
+    1.0
+    >>> valve_opening(-0.03, 0.04)
+    0.0
+    """
+    beyond = abs(spool) - deadband
+    if beyond <= 0.0:
+        return 0.0
+    return math.copysign(beyond / (1.0 - deadband), spool)
+
+
+@law
+def orifice(pressure_drop, flow_gain, smoothing):
+    """Turbulent orifice flow, made smooth through zero pressure drop, and its slope.
+
+    `q = k dp / (dp^2 + d^2)^(1/4)`, which is `k sgn(dp) sqrt(|dp|)` away from zero.
+
+    Args:
+        pressure_drop: dp, scalar [Pa].
+        flow_gain: k = Q_rated |o| / sqrt(dp_rated), scalar [m^3/(s sqrt(Pa))].
+        smoothing: d, scalar [Pa], > 0.
+
+    Returns:
+        (flow q [m^3/s] with the sign of the pressure drop, slope dq/d(dp) [m^3/(s Pa)] > 0).
+
+    Source: nominal model, "Orifice".
+
+    >>> flow, slope = orifice(7.0e6, 6.0e-3 / 7.0e6**0.5, 5.0e4)
+    >>> round(flow, 7)
+    0.0059999
+    >>> orifice(0.0, 1.0, 4.0)
+    (0.0, 0.5)
+    """
+    square = pressure_drop * pressure_drop + smoothing * smoothing
+    scaled = flow_gain / math.sqrt(math.sqrt(square))
+    return scaled * pressure_drop, scaled * (1.0 - 0.5 * pressure_drop * pressure_drop / square)
+
+
+@law
+def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
+    """Flow into a chamber through port relief (outward) and make-up valve (inward), and its slope.
+
+    `r = -k_r max(0, p - p_port) + k_m max(0, p_t - p)`.
+
+    Args:
+        pressure: chamber pressure p, scalar [Pa].
+        port_relief: p_port, scalar [Pa].
+        relief_gain: k_r, scalar [m^3/(s Pa)].
+        tank_pressure: p_t, scalar [Pa].
+        makeup_gain: k_m, scalar [m^3/(s Pa)].
+
+    Returns:
+        (flow into the chamber [m^3/s], d flow / d p [m^3/(s Pa)] <= 0).
+
+    Source: nominal model, "Chambers".
+
+    >>> port_flow(33.0e6, 32.0e6, 1.0e-9, 0.3e6, 5.0e-9)
+    (-0.001, -1e-09)
+    """
+    if pressure > port_relief:
+        return -relief_gain * (pressure - port_relief), -relief_gain
+    if pressure < tank_pressure:
+        return makeup_gain * (tank_pressure - pressure), -makeup_gain
+    return 0.0, 0.0
+
+
+@law
+def friction(velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity):
+    """Coulomb, Stribeck and viscous friction that opposes a velocity.
+
+    `F_f = (F_c + F_s exp(-(v/v_s)^2)) tanh(v/v_0) + b v`.
+
+    Args:
+        velocity: v, scalar [m/s] or [rad/s].
+        coulomb: F_c, scalar [N] or [N m].
+        stribeck: F_s, extra friction at rest, scalar [N] or [N m].
+        stribeck_velocity: v_s, scalar [m/s] or [rad/s], > 0.
+        viscous: b, scalar [N s/m] or [N m s/rad].
+        coulomb_velocity: v_0, smoothing of the sign function, scalar [m/s] or [rad/s], > 0.
+
+    Returns:
+        Friction force, scalar [N] or [N m], with the sign of the velocity.
+
+    Source: nominal model, "Piston force" and "Swing motor".
+
+    >>> round(friction(1.0, 3000.0, 1500.0, 0.02, 6000.0, 0.005), 6)
+    9000.0
+    """
+    dry = coulomb
+    if stribeck != 0.0:
+        dry += stribeck * math.exp(-((velocity / stribeck_velocity) ** 2))
+    return dry * math.tanh(velocity / coulomb_velocity) + viscous * velocity
+
+
+@law
+def spool_step(spool, spool_rate, command, bandwidth, damping, dt):
+    """One step of the spool `s'' = w^2 (u - s) - 2 z w s'` with the command held.
+
+    The exact exponential is cut after its fourth power of `w dt`: the error is below
+    `(w dt)^5 / 120` of the command per step (2.6e-9 for 8 Hz and 1 ms). For `w dt > 0.5` the step
+    is divided.
+
+    Args:
+        spool: s, scalar [1].
+        spool_rate: s', scalar [1/s].
+        command: u, scalar [1].
+        bandwidth: w, natural frequency, scalar [rad/s].
+        damping: z, scalar [1].
+        dt: step, scalar [s].
+
+    Returns:
+        (s, s') at the end of the step.
+
+    Source: nominal model, "Spool".
+
+    >>> s, rate = spool_step(0.0, 0.0, 1.0, 50.0, 0.9, 1.0e-3)
+    >>> round(s, 6)
+    0.001213
+    """
+    parts = 1 + int(bandwidth * dt / 0.5)
+    h = dt / parts
+    w2 = bandwidth * bandwidth
+    c = 2.0 * damping * bandwidth
+    e, v = spool - command, spool_rate
+    for _ in range(parts):
+        e1, v1 = v, -w2 * e - c * v
+        e2, v2 = v1, -w2 * e1 - c * v1
+        e3, v3 = v2, -w2 * e2 - c * v2
+        v4 = -w2 * e3 - c * v3
+        e += h * (e1 + h * (e2 / 2 + h * (e3 / 6 + h * v3 / 24)))
+        v += h * (v1 + h * (v2 / 2 + h * (v3 / 6 + h * v4 / 24)))
+    return e + command, v

@@ -1,0 +1,118 @@
+"""Byte offsets of mjModel and mjData fields, for native code that is handed their addresses.
+
+Offsets follow from MuJoCo's own description of its structs (`mujoco.introspect`) and the C layout
+rules, and are checked against addresses and values that the bindings expose.
+"""
+
+import ctypes
+import functools
+
+import mujoco
+import numpy as np
+from mujoco.introspect import ast_nodes, structs
+
+_PRIMITIVES = {
+    "int": 4, "float": 4, "double": 8, "mjtNum": 8, "char": 1, "unsigned char": 1, "mjtByte": 1,
+    "mjtBool": 1, "bool": 1, "_Bool": 1, "size_t": 8, "uintptr_t": 8, "uint64_t": 8, "int64_t": 8,
+    "mjtSize": 8, "unsigned int": 4,
+}  # fmt: skip
+
+
+def _size_and_alignment(node) -> tuple[int, int]:
+    if isinstance(node, ast_nodes.PointerType):
+        return 8, 8
+    if isinstance(node, ast_nodes.ArrayType):
+        size, alignment = _size_and_alignment(node.inner_type)
+        return size * int(np.prod(node.extents)), alignment
+    name = getattr(node, "name", "")
+    if name in _PRIMITIVES:
+        return _PRIMITIVES[name], _PRIMITIVES[name]
+    for candidate in (name, name.removesuffix("_")):
+        if candidate in structs.STRUCTS:
+            fields = structs.STRUCTS[candidate].fields
+            return _struct_layout(fields)[1:]
+    if isinstance(node, ast_nodes.AnonymousStructDecl):
+        return _struct_layout(node.fields)[1:]
+    if name.startswith("mjt"):  # an enum
+        return 4, 4
+    raise RuntimeError(f"unknown C type {node!r} in MuJoCo {mujoco.__version__}")
+
+
+def _struct_layout(fields) -> tuple[dict[str, int], int, int]:
+    offsets: dict[str, int] = {}
+    position, alignment = 0, 1
+    for field in fields:
+        size, align = _size_and_alignment(field.type)
+        position = -(-position // align) * align
+        offsets[field.name] = position
+        position += size
+        alignment = max(alignment, align)
+    return offsets, -(-position // alignment) * alignment, alignment
+
+
+@functools.cache
+def field_offsets(struct: str) -> dict[str, int]:
+    """Offset of every field of a MuJoCo struct.
+
+    Args:
+        struct: "mjModel" or "mjData".
+
+    Returns:
+        Field name -> offset [byte].
+
+    Raises:
+        RuntimeError: the struct holds a type that is not known here.
+
+    Source: `mujoco.introspect.structs` and the C layout rules.
+    """
+    return _struct_layout(structs.STRUCTS[struct].fields)[0]
+
+
+def _read(address: int, dtype) -> float:
+    kind = {np.float64: ctypes.c_double, np.int64: ctypes.c_int64}[dtype]
+    return kind.from_address(address).value
+
+
+@functools.cache
+def option_offset(name: str) -> int:
+    """Offset of a field of `mjModel.opt` from the start of mjModel [byte]."""
+    option = _struct_layout(structs.STRUCTS["mjOption"].fields)[0]
+    return field_offsets("mjModel")["opt"] + option[name]
+
+
+_PROBE = """<mujoco><option timestep="0.0123"/><worldbody><body><joint name="j" type="slide"/>
+<geom size="0.1"/></body></worldbody><actuator>
+<general joint="j" dyntype="integrator" user="1 2 3"/></actuator></mujoco>"""
+
+
+@functools.cache
+def verify_layout() -> None:
+    """Compare the computed offsets with what the bindings show of a small model.
+
+    Raises:
+        RuntimeError: a field is not where it was computed to be; native hydraulics cannot run with
+            this MuJoCo.
+    """
+    model = mujoco.MjModel.from_xml_string(_PROBE)
+    data = mujoco.MjData(model)
+    data.time = 0.456
+    in_model, in_data = field_offsets("mjModel"), field_offsets("mjData")
+    wrong = [
+        name
+        for name in ("actuator_user", "actuator_actadr", "actuator_biastype", "actuator_dyntype")
+        if _read(model._address + in_model[name], np.int64) != getattr(model, name).ctypes.data
+    ]
+    wrong += [
+        name
+        for name in ("ctrl", "act", "act_dot", "actuator_velocity", "actuator_length")
+        if _read(data._address + in_data[name], np.int64) != getattr(data, name).ctypes.data
+    ]
+    if _read(model._address + option_offset("timestep"), np.float64) != 0.0123:
+        wrong.append("opt.timestep")
+    if _read(data._address + in_data["time"], np.float64) != 0.456:
+        wrong.append("time")
+    if wrong:
+        raise RuntimeError(
+            f"MuJoCo {mujoco.__version__} keeps {', '.join(wrong)} elsewhere than its own"
+            " description says; install a version in the range of pyproject.toml"
+        )

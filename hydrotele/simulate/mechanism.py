@@ -1,0 +1,185 @@
+"""From a Machine to MuJoCo: the MJCF of a run, assembled with `dm_control.mjcf`.
+
+The machine's MJCF gives the tree and the shapes, the Machine gives every number. Each cylinder
+becomes a tube (hinged to its base pin), a rod (sliding in the tube; the slide's position is the
+piston displacement x) and a `connect` constraint at the rod pin.
+"""
+
+from pathlib import Path
+
+from dm_control import mjcf
+
+from hydrotele.errors import InputError
+from hydrotele.machine import Axis, Cylinder, Link, Machine, Pin
+from hydrotele.simulate.circuit import ACTIVATIONS, SLOTS
+from hydrotele.simulate.parameters import actuator_numbers
+
+# Default softness opens the pins of a 10 t machine by decimetres. A time constant of two steps is
+# the stiffest that MuJoCo takes, and makes the softness vanish with the step.
+_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2)
+_CONTACT_SOLREF = (0.02, 1.0)
+
+
+def assemble(machine: Machine, timestep: float = 1.0e-3, ground: bool = True) -> mjcf.RootElement:
+    """Build the MJCF of a machine, with scene, closures, actuators and home keyframe.
+
+    Args:
+        machine: the machine, with one tool.
+        timestep: physics step [s].
+        ground: whether there is a ground to touch.
+
+    Returns:
+        The MJCF document. `mjcf_text` writes it out.
+
+    Raises:
+        InputError: the machine's MJCF cannot be read or lacks a body's parent.
+    """
+    root = _read_mjcf(machine)
+    root.model = machine.name
+    _set_options(root, machine, timestep)
+    for name in machine.removed_bodies:
+        if body := root.find("body", name):
+            body.remove()
+    for name, link in machine.links.items():
+        _write_link(root, name, link)
+    for name, axis in machine.axes.items():
+        if axis.cylinder:
+            _write_cylinder(root, name, axis.cylinder, timestep)
+    for name, closure in machine.closures.items():
+        _connect(root, name, closure.a, closure.b, timestep)
+    _write_actuators(root, machine)
+    _write_scene(root, ground)
+    return root
+
+
+def mjcf_text(root: mjcf.RootElement) -> str:
+    """The MJCF document as text that MuJoCo and any other tool reads."""
+    return root.to_xml_string(precision=17, filename_with_hash=False)
+
+
+def _read_mjcf(machine: Machine) -> mjcf.RootElement:
+    if not machine.mjcf:
+        return mjcf.RootElement(model=machine.name)
+    path = Path(machine.folder, machine.mjcf)
+    try:
+        return mjcf.from_path(str(path))
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise InputError(path, f"is not an MJCF that dm_control reads: {error}") from None
+    except Exception as error:  # lxml's syntax errors have no common public base
+        raise InputError(path, f"cannot be parsed: {error}") from None
+
+
+def _set_options(root, machine: Machine, timestep: float) -> None:
+    root.compiler.angle = "radian"
+    root.compiler.autolimits = True
+    del root.compiler.boundmass, root.compiler.boundinertia  # a forgotten inertia is an error
+    root.option.timestep = timestep
+    root.option.gravity = machine.gravity
+    root.option.integrator = "Euler"
+    root.option.jacobian = "dense"
+    root.option.solver = "Newton"
+    root.option.iterations = 20
+    root.option.tolerance = 0.0
+    root.option.cone = "pyramidal"
+    root.size.nuser_actuator = SLOTS
+    root.option.flag.island = "disable"  # one machine is one island: looking for it costs 10 %
+
+
+def _body(root, name: str):
+    return root.worldbody if name == "world" else root.find("body", name)
+
+
+def _write_link(root, name: str, link: Link) -> None:
+    body = root.find("body", name)
+    if body is None:
+        parent = _body(root, link.parent)
+        if parent is None:
+            raise InputError(f"links.{name}", f"its parent {link.parent!r} has no body in the MJCF")
+        body = parent.add("body", name=name)
+    body.pos = link.position
+    _set_inertial(body, link.mass, link.com, link.inertia)
+    if link.joint is None:
+        return
+    joint = root.find("joint", link.joint.name)
+    if joint is None:
+        joint = body.add("joint", name=link.joint.name)
+    joint.type, joint.axis, joint.damping = link.joint.type, link.joint.axis, link.joint.damping
+    if link.joint.range:
+        joint.range = link.joint.range
+
+
+def _set_inertial(body, mass, com, inertia) -> None:
+    if body.inertial is not None:
+        body.inertial.remove()
+    body.add("inertial", mass=mass, pos=com, diaginertia=inertia)
+
+
+def _write_cylinder(root, name: str, cylinder: Cylinder, timestep: float) -> None:
+    tube = root.find("body", f"{name}_tube")
+    if tube is None:
+        base = _body(root, cylinder.base_pin.link)
+        tube = base.add("body", name=f"{name}_tube")
+        tube.add("joint", name=f"{name}_tube", type="hinge", axis=(0, -1, 0))
+    tube.pos = cylinder.base_pin.position
+    _set_inertial(tube, cylinder.tube.mass, (cylinder.tube.com, 0, 0), cylinder.tube.inertia)
+    rod = root.find("body", f"{name}_rod")
+    if rod is None:
+        rod = tube.add("body", name=f"{name}_rod")
+        rod.add("joint", name=f"{name}_rod", type="slide", axis=(1, 0, 0))
+    rod.pos = (cylinder.closed_length, 0.0, 0.0)
+    _set_inertial(rod, cylinder.rod.mass, (-cylinder.rod.com, 0, 0), cylinder.rod.inertia)
+    rod_end = Pin(link=f"{name}_rod", position=(0.0, 0.0, 0.0))
+    _connect(root, f"{name}_pin", rod_end, cylinder.rod_pin, timestep)
+
+
+def _connect(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
+    for end, pin in (("a", a), ("b", b)):
+        _body(root, pin.link).add(
+            "site", name=f"{name}_{end}", pos=pin.position, size=(0.03,), group=4
+        )
+    root.equality.add(
+        "connect", name=name, site1=f"{name}_a", site2=f"{name}_b",
+        solref=(2.0 * timestep, 1.0), solimp=_IMPEDANCE,
+    )  # fmt: skip
+
+
+def _write_actuators(root, machine: Machine) -> None:
+    for name, numbers in actuator_numbers(machine).items():
+        axis: Axis = machine.axes[name]
+        actuator = root.actuator.add(
+            "general", name=name, user=numbers, biastype="user",
+            joint=f"{name}_rod" if axis.cylinder else axis.joint,
+        )  # fmt: skip
+        if axis.hydraulic:
+            actuator.dyntype, actuator.actdim = "user", ACTIVATIONS
+            actuator.gainprm = (0.0,)
+            actuator.ctrlrange = (-1.0, 1.0)
+        elif axis.force:
+            actuator.gainprm = (axis.force.gain,)
+            actuator.ctrlrange = (-axis.force.command_limit, axis.force.command_limit)
+
+
+def _write_scene(root, ground: bool) -> None:
+    root.visual.headlight.ambient = (0.35, 0.35, 0.35)
+    root.visual.headlight.diffuse = (0.45, 0.45, 0.45)
+    getattr(root.visual, "global").offwidth = 1920
+    getattr(root.visual, "global").offheight = 1080
+    root.asset.add(
+        "texture", name="sky", type="skybox", builtin="gradient", rgb1=(0.62, 0.75, 0.88),
+        rgb2=(0.92, 0.94, 0.96), width=256, height=256,
+    )  # fmt: skip
+    root.asset.add(
+        "texture", name="ground", type="2d", builtin="checker", rgb1=(0.52, 0.47, 0.40),
+        rgb2=(0.56, 0.51, 0.44), width=256, height=256,
+    )  # fmt: skip
+    root.asset.add("material", name="ground", texture="ground", texrepeat=(40, 40), reflectance=0)
+    root.worldbody.add(
+        "light", name="sun", pos=(4, 8, 14), dir=(-0.25, -0.5, -1), directional=True,
+        castshadow=True, diffuse=(0.6, 0.6, 0.55),
+    )  # fmt: skip
+    touch = {"contype": 1, "conaffinity": 2} if ground else {"contype": 0, "conaffinity": 0}
+    root.worldbody.add(
+        "geom", name="ground", type="plane", size=(40, 40, 1), material="ground",
+        friction=(0.8, 0.02, 0.001), solref=_CONTACT_SOLREF, **touch,
+    )  # fmt: skip
+

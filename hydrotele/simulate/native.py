@@ -1,0 +1,143 @@
+"""Hydraulics inside MuJoCo at native speed: the actuator callbacks.
+
+Every hydraulic actuator has four activations and carries its numbers in `actuator_user`
+(`circuit.Slot`). The last one advances all of them, because they share the supply (MuJoCo clears an
+actuator's rates just before it calls back for it); the force is that of the pressures at the end of the step, as `actearly` does, or explicit stepping would add
+negative damping. The callbacks touch nothing but the mjModel and mjData that they are given, so
+they are thread-safe, and a model can be randomised through `actuator_user`. Actuators without the
+marker are left alone.
+"""
+
+import functools
+
+import mujoco
+import numpy as np
+from numba import carray, cfunc, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from hydrotele.simulate.circuit import SCRATCH, SLOTS, Slot, actuator_friction, step_circuit
+from hydrotele.simulate.layout import field_offsets, option_offset, verify_layout
+from hydrotele.simulate.parameters import MARKER
+
+
+
+_FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
+_AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
+_SIGNATURE = types.float64(types.int64, types.int64, types.intc)
+
+
+@intrinsic
+def _pointer(typingctx, address):
+    """Reinterpret an int64 address as void*."""
+
+    def codegen(context, builder, signature, args):
+        return builder.inttoptr(args[0], cgutils.voidptr_t)
+
+    return types.voidptr(types.int64), codegen
+
+
+@intrinsic
+def _stack(typingctx, size):
+    """Work space on the stack of the calling function, zero cost and private to the thread."""
+
+    def codegen(context, builder, signature, args):
+        space = cgutils.alloca_once(builder, cgutils.voidptr_t, size=SCRATCH)
+        return builder.bitcast(space, cgutils.voidptr_t)
+
+    return types.voidptr(types.int64), codegen
+
+
+@functools.cache
+def _compile_callbacks():
+    """Compile (or load from the cache) the dynamics and bias callbacks for this MuJoCo."""
+    verify_layout()
+    model_at, data_at = field_offsets("mjModel"), field_offsets("mjData")
+    m_user, m_actadr = model_at["actuator_user"], model_at["actuator_actadr"]
+    m_nuser, m_timestep = model_at["nuser_actuator"], option_offset("timestep")
+    m_nu = model_at["nu"]
+    d_ctrl, d_act, d_act_dot = data_at["ctrl"], data_at["act"], data_at["act_dot"]
+    d_length, d_velocity = data_at["actuator_length"], data_at["actuator_velocity"]
+
+    @cfunc(_SIGNATURE, cache=False, error_model="numpy")
+    def advance(m, d, i):
+        if carray(_pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
+            return 0.0
+        nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
+        at_user = carray(_pointer(m + m_user), (1,), np.int64)[0]
+        user = carray(_pointer(at_user), (nu * SLOTS,), np.float64)
+        if user[i * SLOTS] != MARKER:
+            return 0.0
+        first, count = int(user[i * SLOTS + _FIRST]), int(user[i * SLOTS + _COUNT])
+        if i != first + count - 1:
+            return 0.0
+        at_actadr = carray(_pointer(m + m_actadr), (1,), np.int64)[0]
+        start = 8 * carray(_pointer(at_actadr), (nu,), np.int32)[first]
+        at_act = carray(_pointer(d + d_act), (1,), np.int64)[0]
+        at_act_dot = carray(_pointer(d + d_act_dot), (1,), np.int64)[0]
+        at_ctrl = carray(_pointer(d + d_ctrl), (1,), np.int64)[0]
+        at_length = carray(_pointer(d + d_length), (1,), np.int64)[0]
+        at_velocity = carray(_pointer(d + d_velocity), (1,), np.int64)[0]
+        step_circuit(
+            user,
+            first,
+            count,
+            carray(_pointer(at_act + start), (4 * count,), np.float64),
+            carray(_pointer(at_ctrl), (nu,), np.float64),
+            carray(_pointer(at_length), (nu,), np.float64),
+            carray(_pointer(at_velocity), (nu,), np.float64),
+            carray(_pointer(m + m_timestep), (1,), np.float64)[0],
+            carray(_pointer(at_act_dot + start), (4 * count,), np.float64),
+            carray(_stack(0), (SCRATCH,), np.float64),
+        )
+        return 0.0
+
+    @cfunc(_SIGNATURE, cache=False, error_model="numpy")
+    def force(m, d, i):
+        if carray(_pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
+            return 0.0
+        nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
+        at_user = carray(_pointer(m + m_user), (1,), np.int64)[0]
+        user = carray(_pointer(at_user), (nu * SLOTS,), np.float64)
+        u = i * SLOTS
+        if user[u] != MARKER:
+            return 0.0
+        at_velocity = carray(_pointer(d + d_velocity), (1,), np.int64)[0]
+        resisting = actuator_friction(user, u, carray(_pointer(at_velocity), (nu,), np.float64)[i])
+        if user[u + _KIND] > 2.0:  # Kind.FORCE: MuJoCo's own gain gives the drive force
+            return -resisting
+        at_actadr = carray(_pointer(m + m_actadr), (1,), np.int64)[0]
+        start = 8 * carray(_pointer(at_actadr), (nu,), np.int32)[i]
+        at_act = carray(_pointer(d + d_act), (1,), np.int64)[0]
+        at_act_dot = carray(_pointer(d + d_act_dot), (1,), np.int64)[0]
+        act = carray(_pointer(at_act + start), (4,), np.float64)
+        rate = carray(_pointer(at_act_dot + start), (4,), np.float64)
+        dt = carray(_pointer(m + m_timestep), (1,), np.float64)[0]
+        return (
+            user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
+            - user[u + _AREA_ROD] * (act[3] + dt * rate[3])
+            - resisting
+        )
+
+    return advance, force
+
+
+def install_hydraulics() -> None:
+    """Install the actuator callbacks in this process; calling it again does nothing.
+
+    Raises:
+        RuntimeError: another package has installed actuator callbacks, or MuJoCo's structs are not
+            laid out as expected.
+    """
+    advance, force = _compile_callbacks()
+    ours = (advance.ctypes, force.ctypes)
+    present = (mujoco.get_mjcb_act_dyn(), mujoco.get_mjcb_act_bias())
+    if present == ours:
+        return
+    if any(callback is not None for callback in present):
+        raise RuntimeError(
+            "another package has installed mjcb_act_dyn or mjcb_act_bias in this process;"
+            " run hydrotele in a process of its own"
+        )
+    mujoco.set_mjcb_act_dyn(ours[0])
+    mujoco.set_mjcb_act_bias(ours[1])

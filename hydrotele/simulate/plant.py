@@ -1,0 +1,136 @@
+"""The plant: a Machine compiled to MuJoCo with its hydraulics, and its states as the field names them."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from hydrotele.machine import Machine
+from hydrotele.simulate.circuit import ACTIVATIONS
+from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
+from hydrotele.simulate.mechanism import assemble, mjcf_text
+from hydrotele.simulate.native import install_hydraulics
+from hydrotele.simulate.parameters import actuator_order
+
+REST_PRESSURE = 2.0e6  # Pa, in the chamber that carries no load when a machine stands
+
+
+@dataclasses.dataclass(frozen=True)
+class Plant:
+    """A compiled machine.
+
+    Attributes:
+        machine: the machine.
+        model: its MuJoCo model; steps with `mj_step`, `mujoco.rollout` and `mujoco.batch`.
+        mjcf: the MJCF text that was compiled.
+        axes: axis names in actuator order.
+        qpos: (nu,) place of each axis' joint in `qpos`.
+        dof: (nu,) place of each axis' joint in `qvel`.
+        rod_qpos: (nu,) place of the piston displacement in `qpos`, -1 without cylinder.
+        hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i + 3.
+    """
+
+    machine: Machine
+    model: mujoco.MjModel
+    mjcf: str
+    axes: tuple[str, ...]
+    qpos: np.ndarray
+    dof: np.ndarray
+    rod_qpos: np.ndarray
+    hydraulic: int
+
+
+def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True) -> Plant:
+    """Compile a machine.
+
+    Args:
+        machine: the machine.
+        timestep: physics step [s].
+        ground: whether there is a ground to touch.
+
+    Returns:
+        The plant; the native hydraulics are installed in this process.
+
+    Raises:
+        InputError: the MJCF cannot be assembled.
+        RuntimeError: the native hydraulics cannot run with this MuJoCo.
+    """
+    install_hydraulics()
+    text = mjcf_text(assemble(machine, timestep, ground))
+    model = mujoco.MjModel.from_xml_string(text)
+    axes = tuple(actuator_order(machine))
+    joints = [model.joint(machine.axes[name].joint) for name in axes]
+    rods = [
+        model.joint(f"{n}_rod").qposadr[0] if machine.axes[n].cylinder else -1 for n in axes
+    ]
+    return Plant(
+        machine=machine,
+        model=model,
+        mjcf=text,
+        axes=axes,
+        qpos=np.array([j.qposadr[0] for j in joints], dtype=int),
+        dof=np.array([j.dofadr[0] for j in joints], dtype=int),
+        rod_qpos=np.array(rods, dtype=int),
+        hydraulic=len(machine.hydraulic_axes),
+    )
+
+
+def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoco.MjData:
+    """The machine standing still: loops closed, valves closed, chambers holding the load.
+
+    Args:
+        plant: the plant.
+        joints: joint name -> angle [rad] or position [m]; others at home.
+
+    Returns:
+        A new MjData. The unloaded chamber of each axis is at REST_PRESSURE, the other one carries
+        the static load.
+
+    Raises:
+        InputError: the linkages do not close there.
+    """
+    data = mujoco.MjData(plant.model)
+    close_loops(plant.machine, plant.model, data, dict(joints or {}))
+    forces = holding_forces(plant.machine, plant.model, data)
+    for i, name in enumerate(plant.axes[: plant.hydraulic]):
+        drive = plant.machine.axes[name].drive
+        head = getattr(drive, "area_head", None) or drive.displacement
+        rod = getattr(drive, "area_rod", None) or drive.displacement
+        p_head, p_rod = (forces[i] + rod * REST_PRESSURE) / head, REST_PRESSURE
+        if p_head < REST_PRESSURE:
+            p_head, p_rod = REST_PRESSURE, (head * REST_PRESSURE - forces[i]) / rod
+        data.act[ACTIVATIONS * i + 2 : ACTIVATIONS * i + 4] = p_head, p_rod
+    for i in range(plant.hydraulic, len(plant.axes)):
+        data.ctrl[i] = forces[i] / plant.machine.axes[plant.axes[i]].drive.gain
+    return data
+
+
+def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
+    """A complete state in the form of a log's `initial_state`.
+
+    Args:
+        plant: the plant.
+        state: `order` (axis names) and, in that order, `angle` [rad] or [m], `velocity`, `spool`,
+            `spool_rate`, `pressure_head`, `pressure_rod`; any but `order` and `angle` may lack and is
+            then that of rest. `joints` (name -> value) may give undriven joints.
+
+    Returns:
+        A new MjData.
+
+    Raises:
+        InputError: the linkages do not close there.
+    """
+    order = list(state["order"])
+    joints = {plant.machine.axes[n].joint: v for n, v in zip(order, state["angle"], strict=True)}
+    data = rest_state(plant, {**joints, **state.get("joints", {})})
+    if "velocity" in state:
+        data.qvel[[plant.dof[plant.axes.index(n)] for n in order]] = state["velocity"]
+        basis = motion_basis(plant.machine, plant.model, data)
+        data.qvel[:] = basis @ data.qvel[independent_dofs(plant.machine, plant.model)]
+    for column, key in enumerate(("spool", "spool_rate", "pressure_head", "pressure_rod")):
+        for name, value in zip(order, state.get(key, ()), strict=False):
+            i = plant.axes.index(name)
+            if i < plant.hydraulic:
+                data.act[ACTIVATIONS * i + column] = value
+    return data
