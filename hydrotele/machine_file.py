@@ -76,7 +76,8 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
             data[section] = entries
     data |= {"tool": tool, "tools": sorted(tools), "folder": str(path.parent.resolve())}
     others = [fragment for name, fragment in tools.items() if name != tool and fragment]
-    data["removed_bodies"] = _bodies_of(others)
+    kept = _bodies_of([data])
+    data["removed_bodies"] = [name for name in _bodies_of(others) if name not in kept]
     _complete_links(data, path)
     _resolve_drives(data, path)
     return parse(Machine, data, str(path), lines)
