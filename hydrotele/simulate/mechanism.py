@@ -79,7 +79,7 @@ def _set_options(root, machine: Machine, timestep: float) -> None:
     root.option.jacobian = "dense"
     root.option.solver = "Newton"
     root.option.iterations = 20
-    root.option.tolerance = 0.0
+    root.option.tolerance = 1.0e-8
     root.option.cone = "pyramidal"
     root.size.nuser_actuator = SLOTS
     root.option.flag.island = "disable"  # one machine is one island: looking for it costs 10 %

@@ -23,7 +23,7 @@ class Plant:
     Attributes:
         machine: the machine.
         model: its MuJoCo model; steps with `mj_step`, `mujoco.rollout` and `mujoco.batch`.
-        mjcf: the MJCF text that was compiled.
+        mjcf: the full MJCF text, with the looks that `model` leaves out.
         axes: axis names in actuator order.
         qpos: (nu,) place of each axis' joint in `qpos`.
         dof: (nu,) place of each axis' joint in `qvel`.
@@ -58,7 +58,7 @@ def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True)
     """
     install_hydraulics()
     text = mjcf_text(assemble(machine, timestep, ground))
-    model = mujoco.MjModel.from_xml_string(text)
+    model = _compile_without_looks(text)
     axes = tuple(actuator_order(machine))
     joints = [model.joint(machine.axes[name].joint) for name in axes]
     rods = [
@@ -74,6 +74,15 @@ def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True)
         rod_qpos=np.array(rods, dtype=int),
         hydraulic=len(machine.hydraulic_axes),
     )
+
+
+def _compile_without_looks(text: str) -> mujoco.MjModel:
+    """Compile without what only a picture needs: placing it in every step doubles the cost."""
+    spec = mujoco.MjSpec.from_string(text)
+    seen = [geom for geom in spec.geoms if geom.contype == 0 and geom.conaffinity == 0]
+    for part in (*seen, *spec.cameras, *spec.lights):
+        spec.delete(part)
+    return spec.compile()
 
 
 def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoco.MjData:
