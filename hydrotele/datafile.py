@@ -7,6 +7,7 @@ converted to SI here, at the boundary, and nowhere else.
 import difflib
 import math
 import re
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +22,7 @@ UNIT_SUFFIXES = {
     "_deg": math.pi / 180.0,
     "_mm": 1.0e-3,
     "_in2": 0.0254**2,
+    "_cm2": 1.0e-4,
     "_psi": PSI,
     "_bar": 1.0e5,
     "_hz": 2.0 * math.pi,
@@ -36,14 +38,30 @@ def to_si(value: Any, factor: float) -> Any:
         return [to_si(item, factor) for item in value]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
-    return value * factor
+    try:
+        return value * factor
+    except OverflowError:  # an integer beyond any float
+        return math.inf
 
 
-def suggest(name: str, valid) -> str:
+def split_unit(key: str) -> tuple[str, float | None]:
+    """Stem of a key and the factor of its unit suffix to SI, `None` without one.
+
+    >>> split_unit("accuracy_mm")
+    ('accuracy', 0.001)
+    """
+    for suffix, factor in UNIT_SUFFIXES.items():
+        if key.endswith(suffix):
+            return key.removesuffix(suffix), factor
+    return key, None
+
+
+def suggest(name: object, valid) -> str:
     """A sentence with the closest valid name, if there is one, and all valid names."""
-    close = difflib.get_close_matches(str(name), list(valid), n=1)
+    names = sorted(map(str, valid))
+    close = difflib.get_close_matches(str(name), names, n=1)
     hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"{hint}valid: {', '.join(sorted(valid)) or '(none)'}"
+    return f"{hint}valid: {', '.join(names) or '(none)'}"
 
 
 class Facts(pydantic.BaseModel):
@@ -59,13 +77,11 @@ class Facts(pydantic.BaseModel):
         fields = cls.model_fields
         result: dict[str, Any] = {}
         for key, value in data.items():
-            key = str(key)
-            suffix = next((s for s in UNIT_SUFFIXES if key.endswith(s)), "")
-            stem = key.removesuffix(suffix)
+            name, factor = split_unit(str(key))
             if key in fields:
                 name = key
-            elif suffix and stem in fields:
-                name, value = stem, to_si(value, UNIT_SUFFIXES[suffix])
+            elif factor is not None and name in fields:
+                value = to_si(value, factor)
             else:
                 raise ValueError(f"unknown key {key!r}; {suggest(key, fields)}")
             if name in result:
@@ -77,12 +93,18 @@ class Facts(pydantic.BaseModel):
 class _Loader(yaml.SafeLoader):
     """SafeLoader that reads 28.0e6 as a number, as YAML 1.2 does, and refuses repeated keys."""
 
+    def __init__(self, stream):
+        super().__init__(stream)
+        self.deep_construct = True  # refuses an alias inside its own anchor
+
     def construct_mapping(self, node, deep=False):
         seen = set()
-        for key_node, _ in node.value:
+        for key_node, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, Hashable):
+                continue  # SafeLoader itself refuses it, with the line
             if key in seen:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"the key {key!r} stands twice", key_node.start_mark
@@ -98,17 +120,27 @@ _Loader.add_implicit_resolver(
 )
 
 
-def _key_lines(node, path=(), lines=None) -> dict[tuple, int]:
-    lines = {} if lines is None else lines
-    lines[path] = node.start_mark.line + 1
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            _key_lines(value, (*path, key.value), lines)
-            lines[(*path, key.value)] = key.start_mark.line + 1
-    elif isinstance(node, yaml.SequenceNode):
-        for index, value in enumerate(node.value):
-            _key_lines(value, (*path, index), lines)
+def _key_lines(root) -> dict[tuple, int]:
+    """Line of every key; what an alias repeats has the line of the key that holds the alias."""
+    lines, opened, waiting = {(): root.start_mark.line + 1}, set(), [(root, ())]
+    while waiting:
+        node, path = waiting.pop()
+        if node in opened:
+            continue
+        opened.add(node)
+        children = []
+        if isinstance(node, yaml.MappingNode):
+            children = [(str(key.value), key, value) for key, value in node.value]
+        elif isinstance(node, yaml.SequenceNode):
+            children = [(index, value, value) for index, value in enumerate(node.value)]
+        for name, marked, child in children:
+            lines[(*path, name)] = marked.start_mark.line + 1
+            waiting.append((child, (*path, name)))
     return lines
+
+
+# What PyYAML's constructors raise at an explicit tag that does not suit its scalar.
+_BAD_SCALARS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
 
 def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
@@ -130,10 +162,12 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
         data = yaml.load(text, Loader=_Loader)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(str(path), f"cannot be read: {error}") from None
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError, *_BAD_SCALARS) as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or str(error)
+        nested = isinstance(error, RecursionError)
+        untold = "it is nested too deeply" if nested else "a value does not suit its !!tag"
+        problem = getattr(error, "problem", None) or str(error if error.args[1:] else untold)
         raise InputError(f"{path}{line}", f"is not valid YAML: {problem}") from None
     if not isinstance(data, dict) or node is None:
         raise InputError(str(path), "must be a mapping of keys to values")

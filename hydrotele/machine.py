@@ -4,7 +4,6 @@ The numbers stand in `models/<machine>/machine.yaml`, the tree and the shapes in
 position and inertia may stand in either of them, never in both.
 """
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -108,7 +107,7 @@ class Motor(Facts):
 
 
 class ForceDrive(Facts):
-    """A plain force or torque drive: gain [N or N m per unit of command]."""
+    """A plain force or torque drive: `gain command = load + friction + offset` [N] or [N m]."""
 
     gain: float
     command_unit: Literal["1", "V", "N", "A"] = "1"
@@ -258,6 +257,7 @@ class Machine(Facts):
 
     @model_validator(mode="after")
     def _check(self):
+        _refuse_names(self.links)
         known = {"world", *self.links}
         for name, link in self.links.items():
             _expect(link.parent, known - {name}, f"links.{name}.parent")
@@ -292,6 +292,17 @@ class Machine(Facts):
 def _expect(name: str, valid, where: str) -> None:
     if name not in valid:
         raise ValueError(f"{where}: {name!r} is not known; {suggest(name, valid)}")
+
+
+def _refuse_names(links: dict[str, Link]) -> None:
+    if "world" in links:
+        raise ValueError("links.world: this name is that of the fixed frame; choose another one")
+    owner: dict[str, str] = {}
+    for name, link in links.items():
+        if link.joint and (first := owner.setdefault(link.joint.name, name)) != name:
+            raise ValueError(
+                f"links.{name}.joint: {link.joint.name!r} is already the joint of link {first!r}"
+            )
 
 
 def _refuse_cycles(links: dict[str, Link]) -> None:

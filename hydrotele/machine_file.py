@@ -1,4 +1,4 @@
-"""Machine files: `load_machine` reads machine.yaml and its MJCF tree, `save_machine` writes one back.
+"""Machine files: `load_machine` reads machine.yaml and its MJCF tree, `save_machine` writes one.
 
 A user's machine is a folder with `machine.yaml` (and usually an MJCF beside it); nothing in the
 package has to change for it. What the YAML does not say of a link is taken from the MJCF body of
@@ -6,12 +6,13 @@ the same name; saying the same number twice is refused.
 """
 
 import math
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import yaml
 
-from hydrotele.datafile import PSI, parse, read_yaml, suggest
+from hydrotele.datafile import PSI, parse, read_yaml, split_unit, suggest, to_si
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.resources import models_folder
@@ -63,23 +64,18 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
     path = machine_path(name_or_path)
     data, lines = read_yaml(path)
     tools = data.pop("tools", None) or {"none": {}}
+    _check_tools(tools, path, lines)
     tool = tool or data.get("tool") or "none"
-    if not isinstance(tools, dict) or tool not in tools:
-        raise InputError(f"{path}: tools", f"no tool {tool!r}; {suggest(tool, tools)}")
-    for section, entries in (tools[tool] or {}).items():
-        if isinstance(entries, dict) and isinstance(data.get(section), dict):
-            if section in ("links", "axes", "closures") and (twice := entries.keys() & data[section]):
-                raise InputError(f"{path}: tools.{tool}.{section}", f"{sorted(twice)} stand twice")
-            data[section] = {**data[section], **entries}
-            lines = _move_lines(lines, ("tools", tool, section), (section,))
-        else:
-            data[section] = entries
+    if not isinstance(tool, str) or tool not in tools:
+        raise InputError(_place(path, lines, "tools"), f"no tool {tool!r}; {suggest(tool, tools)}")
+    lines = _merge_tool(data, tool, tools[tool] or {}, path, lines)
     data |= {"tool": tool, "tools": sorted(tools), "folder": str(path.parent.resolve())}
     others = [fragment for name, fragment in tools.items() if name != tool and fragment]
     kept = _bodies_of([data])
-    data["removed_bodies"] = [name for name in _bodies_of(others) if name not in kept]
-    _complete_links(data, path)
-    _resolve_drives(data, path)
+    if not data.get("resolved"):
+        data["removed_bodies"] = [name for name in _bodies_of(others) if name not in kept]
+    _complete_links(data, path, lines)
+    _resolve_drives(data, path, lines)
     return parse(Machine, data, str(path), lines)
 
 
@@ -100,126 +96,157 @@ def save_machine(machine: Machine, path: str | Path) -> None:
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 
-def _move_lines(lines, old, new):
-    moved = {new + p[len(old) :]: n for p, n in lines.items() if p[: len(old)] == old}
-    return {**lines, **moved}
+def _place(path: Path, lines, *keys: str) -> str:
+    """File, line and key path, for messages."""
+    line = next((lines[keys[:k]] for k in range(len(keys), 0, -1) if keys[:k] in lines), 0)
+    return f"{path}{f':{line}' if line else ''}: {'.'.join(keys)}"
+
+
+def _check_tools(tools, path: Path, lines) -> None:
+    if not isinstance(tools, dict) or not all(isinstance(name, str) for name in tools):
+        raise InputError(_place(path, lines, "tools"), "must map names of tools to what they add")
+    for name, fragment in tools.items():
+        if not isinstance(fragment, (dict, type(None))):
+            message = "must map sections (links, axes, home, ...) to what the tool adds"
+            raise InputError(_place(path, lines, "tools", name), message)
+
+
+def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dict:
+    """Add a tool's sections to the machine's; returns the lines of the result."""
+    for section, entries in fragment.items():
+        old, new = ("tools", tool, str(section)), (str(section),)
+        lines = lines | {new + p[len(old) :]: n for p, n in lines.items() if p[: len(old)] == old}
+        if isinstance(entries, dict) and isinstance(data.get(section), dict):
+            if section in ("links", "axes", "closures"):
+                for twice in entries.keys() & data[section]:
+                    message = "is already there without the tool; give it another name"
+                    raise InputError(_place(path, lines, *old, str(twice)), message)
+            entries = {**data[section], **entries}
+        data[section] = entries
+    return lines
+
+
+def _entries(data: dict, section: str) -> dict:
+    """A section's named entries; empty where the section is none, which validation will refuse."""
+    entries = data.get(section)
+    if not isinstance(entries, dict):
+        return {}
+    return {name: facts for name, facts in entries.items() if isinstance(name, str)}
 
 
 def _bodies_of(fragments) -> tuple[str, ...]:
     names = []
     for fragment in fragments:
-        names += list(fragment.get("links") or {})
-        for axis, facts in (fragment.get("axes") or {}).items():
+        names += _entries(fragment, "links")
+        for axis, facts in _entries(fragment, "axes").items():
             if isinstance(facts, dict) and "cylinder" in facts:
                 names += [f"{axis}_tube", f"{axis}_rod"]
-    return tuple(names)
+    return tuple(dict.fromkeys(names))
 
 
-def _complete_links(data: dict, path: Path) -> None:
+def _complete_links(data: dict, path: Path, lines) -> None:
     """Fill in what the MJCF says of each link; refuse what stands in both."""
     if data.pop("resolved", False):
         return
-    if not data.get("mjcf") or not isinstance(data.get("links"), dict):
+    if not data.get("mjcf"):
         return
     mjcf = path.parent / str(data["mjcf"])
     try:
-        root = ElementTree.parse(mjcf).getroot()
-    except (OSError, ElementTree.ParseError) as error:
-        raise InputError(f"{path}: mjcf", f"{mjcf} cannot be read: {error}") from None
-    compiler = root.find("compiler")
-    degrees = compiler is None or compiler.get("angle", "degree") == "degree"
-    bodies = _mjcf_bodies(root.find("worldbody"), "world", degrees)
-    for name, link in data["links"].items():
-        if not isinstance(link, dict) or name not in bodies:
+        spec = mujoco.MjSpec.from_file(str(mjcf))
+    except (OSError, ValueError) as error:
+        message = f"{mjcf} cannot be read: {error}"
+        raise InputError(_place(path, lines, "mjcf"), message) from None
+    for name, link in _entries(data, "links").items():
+        body = spec.body(name)
+        if body is None or name == "world" or not isinstance(link, dict):
             continue
-        known = bodies[name]
-        joint, known_joint = link.get("joint"), known.get("joint")
-        twice = link.keys() & known.keys() - {"joint"}
-        if isinstance(joint, dict) and known_joint:
-            twice |= joint.keys() & known_joint.keys()
-            known = {**known, "joint": {**known_joint, **joint}}
-            link = {key: value for key, value in link.items() if key != "joint"}
-        if twice:
-            raise InputError(
-                f"{path}: links.{name}",
-                f"{', '.join(sorted(twice))} also stands in {mjcf.name}; keep it in one place",
-            )
-        data["links"][name] = {**known, **link}
+        where = _place(path, lines, "links", name)
+        known = _facts_of_body(body, spec.compiler.degree, f"{where}: body {name!r} of {mjcf.name}")
+        data["links"][name] = _join(link, known, where, mjcf.name)
 
 
-def _mjcf_bodies(element, parent: str, degrees: bool) -> dict[str, dict]:
-    bodies: dict[str, dict] = {}
-    if element is None:
-        return bodies
-    for body in element.findall("body"):
-        name = body.get("name", "")
-        facts: dict = {"parent": parent}
-        if body.get("pos"):
-            facts["position"] = _numbers(body.get("pos"))
-        inertial = body.find("inertial")
-        if inertial is not None:
-            facts["mass"] = float(inertial.get("mass", "nan"))
-            facts["com"] = _numbers(inertial.get("pos", "0 0 0"))
-            facts["inertia"] = _numbers(inertial.get("diaginertia", ""))
-        joint = body.find("joint")
-        if joint is not None:
-            kind = joint.get("type", "hinge")
-            facts["joint"] = {"name": joint.get("name", name), "type": kind}
-            facts["joint"]["axis"] = _numbers(joint.get("axis", "0 0 1"))
-            if joint.get("range"):
-                factor = math.pi / 180.0 if degrees and kind == "hinge" else 1.0
-                facts["joint"]["range"] = [factor * v for v in _numbers(joint.get("range"))]
-            if joint.get("damping"):
-                facts["joint"]["damping"] = float(joint.get("damping", "0"))
-        bodies[name] = facts
-        bodies |= _mjcf_bodies(body, name, degrees)
-    return bodies
+def _join(link: dict, known: dict, where: str, mjcf: str) -> dict:
+    """What YAML and MJCF say of one link; a number may stand in one of them only."""
+    joint, known_joint = link.get("joint"), known.get("joint")
+    twice = {key for key in link if split_unit(str(key))[0] in known} - {"joint"}
+    if isinstance(joint, dict) and known_joint:
+        twice |= {f"joint.{key}" for key in joint if split_unit(str(key))[0] in known_joint}
+        known = known | {"joint": known_joint | joint}
+        link = {key: value for key, value in link.items() if key != "joint"}
+    if twice:
+        message = f"{', '.join(sorted(twice))} also stands in {mjcf}; keep it in one place"
+        raise InputError(where, message)
+    return known | link
 
 
-def _numbers(text: str | None) -> list[float]:
-    return [float(part) for part in (text or "").split()]
+def _facts_of_body(body, degrees: bool, where: str) -> dict:
+    """Parent, position, inertia and joint of an MJCF body, with its default classes applied."""
+    facts: dict = {"parent": body.parent.name}
+    if np.any(body.pos):
+        facts["position"] = body.pos.tolist()
+    if body.explicitinertial:
+        if np.all(np.isfinite(body.fullinertia)) or abs(body.iquat[0]) < 1.0 - 1e-12:
+            raise InputError(where, "give its inertial as diaginertia in the axes of the body")
+        facts |= {"mass": body.mass, "com": body.ipos.tolist(), "inertia": body.inertia.tolist()}
+    if not body.joints:
+        return facts
+    if len(body.joints) > 1 or not body.joints[0].name:
+        raise InputError(where, f"needs one joint with a name, has {len(body.joints)} joints")
+    joint = body.joints[0]
+    kind = mujoco.mjtJoint(joint.type).name.removeprefix("mjJNT_").lower()
+    facts["joint"] = {"name": joint.name, "type": kind, "axis": joint.axis.tolist()}
+    if np.any(joint.range):
+        factor = math.pi / 180.0 if degrees and kind == "hinge" else 1.0
+        facts["joint"]["range"] = (factor * joint.range).tolist()
+    if damping := float(np.ravel(joint.damping)[0]):
+        facts["joint"]["damping"] = damping
+    return facts
 
 
-def _resolve_drives(data: dict, path: Path) -> None:
+def _resolve_drives(data: dict, path: Path, lines) -> None:
     """Turn polar pins into points and motor torque per psi into displacement."""
-    axes = data.get("axes")
-    if not isinstance(axes, dict):
-        return
-    for name, axis in axes.items():
+    for name, axis in _entries(data, "axes").items():
         if not isinstance(axis, dict):
             continue
+        cylinder, motor = axis.get("cylinder"), axis.get("motor")
         for part in ("base_pin", "rod_pin"):
-            cylinder = axis.get("cylinder")
             if isinstance(cylinder, dict) and isinstance(cylinder.get(part), dict):
-                where = f"{path}: axes.{name}.cylinder.{part}"
+                where = _place(path, lines, "axes", name, "cylinder", part)
                 cylinder[part] = _resolve_pin(cylinder[part], data, where)
-        motor = axis.get("motor")
         if isinstance(motor, dict) and "torque_per_psi" in motor:
-            try:
-                torque = float(motor.pop("torque_per_psi")) * float(motor.pop("gear_ratio", 1.0))
-            except (TypeError, ValueError):
-                raise InputError(f"{path}: axes.{name}.motor", "must hold numbers") from None
-            motor["displacement"] = torque / PSI
+            motor = dict(motor)
+            where = _place(path, lines, "axes", name, "motor", "torque_per_psi")
+            torque = _number(motor.pop("torque_per_psi"), where)
+            ratio = _number(motor.pop("gear_ratio", 1.0), where)
+            axis["motor"] = motor | {"displacement": torque * ratio / PSI}
 
 
 def _resolve_pin(pin: dict, data: dict, where: str) -> dict:
+    """The point at `distance` and `angle` from the joint of link `from`, in the x-z plane."""
     if "distance" not in pin:
         return pin
     pin = dict(pin)
-    try:
-        origin = [0.0, 0.0, 0.0]
-        if "from" in pin:
-            child = pin.pop("from")
-            links = data.get("links") or {}
-            if child not in links:
-                raise InputError(where, f"from: {child!r} is no link; {suggest(child, links)}")
-            origin = [float(v) for v in links[child].get("position", origin)]
-        distance = float(pin.pop("distance"))
-        angle = math.radians(float(pin.pop("angle_deg", 0.0)))
-    except (TypeError, ValueError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(where, "distance, angle_deg and the link's position are numbers") from None
-    x, y, z = origin
+    origin = [0.0, 0.0, 0.0]
+    if "from" in pin:
+        child, links = pin.pop("from"), _entries(data, "links")
+        if child not in list(links):
+            raise InputError(where, f"from: {child!r} is no link; {suggest(child, links)}")
+        link = links[child] if isinstance(links[child], dict) else {}
+        origin = link.get("position") or to_si(link.get("position_mm"), 1.0e-3) or origin
+        if not isinstance(origin, list) or len(origin) != 3:
+            raise InputError(where, f"links.{child}.position must be three numbers")
+    x, y, z = (_number(value, f"{where}: links.position") for value in origin)
+    distance = _number(pin.pop("distance"), f"{where}.distance")
+    angle = math.radians(_number(pin.pop("angle_deg", 0.0), f"{where}.angle_deg"))
     pin["position"] = [x + distance * math.cos(angle), y, z + distance * math.sin(angle)]
     return pin
+
+
+def _number(value, where: str) -> float:
+    try:
+        number = float("nan" if isinstance(value, (str, bool)) else value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(where, f"must be a finite number, not {value!r}")
+    return number

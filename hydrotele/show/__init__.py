@@ -1,0 +1,1 @@
+"""Pictures, recordings and plots of what has been run. Computes nothing new."""

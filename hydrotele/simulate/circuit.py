@@ -51,6 +51,7 @@ class Slot(enum.IntEnum):
     STRIBECK_VELOCITY = 24
     VISCOUS = 25
     COULOMB_VELOCITY = 26
+    OFFSET = 27
 
 
 SLOTS = 32
@@ -76,7 +77,7 @@ _FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the flow balance of 1e-
 (
     _AH, _AR, _VH, _VR, _STROKE, _LEAK, _W, _Z, _DB, _K, _D, _PORT, _KR, _KM, _BETA, _TANK,
     _RELIEF, _PUMP, _FC, _FS, _VS, _B, _V0,
-) = (int(slot) for slot in list(Slot)[4:])  # fmt: skip
+) = (int(slot) for slot in list(Slot)[4:27])  # fmt: skip
 
 
 @compiled
@@ -84,7 +85,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow):
     """Largest pressure up to the relief setting at which the valves draw no more than the pump.
 
     Solves `sum_i k_i g(p_s - p_i) = Q_pump` over the valves whose load check is open, by Newton's
-    method in `sqrt(p_s - min p_i)` inside a bracket.
+    method in `sqrt(p_s - min p_i)` inside a bracket, which is halved where Newton does not converge.
 
     Args:
         ports: (>= 4 count,) per axis `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa] and two unused places.
@@ -103,7 +104,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow):
     >>> round(supply_pressure(one_valve, 1, 5.0e4, 28.0e6, 5.0e-3) / 1e6, 3)
     11.25
     """
-    low, high, p = relief, relief, relief
+    low, high, p, last = relief, relief, relief, math.inf
     for i in range(count):
         if ports[4 * i] > 0.0:
             low = min(low, ports[4 * i + 1])
@@ -127,10 +128,11 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow):
             return p
         root = math.sqrt(p - floor) if p > floor else 0.0
         guess = -1.0
-        if slope > 0.0 and root > 0.0:
+        if slope > 0.0 and root > 0.0 and abs(excess) < 0.5 * last:  # else Newton may cycle
             root -= excess / (2.0 * slope * root)
             if root > 0.0:
                 guess = floor + root * root
+        last = abs(excess)
         p = guess if low < guess < high else 0.5 * (low + high)
     return p
 
@@ -143,7 +145,7 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
         user: (nu * SLOTS,) actuator numbers.
         act: (4 count,) activations; pressures [Pa].
         spool: (4 count,) array whose every fourth entry is the spool position to use [1].
-        ports: (>= 4 count,) written: `k_i`, `p_i`.
+        ports: (>= 4 count,) written: `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa].
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ahead: time to look ahead with `rate`, scalar [s].
@@ -264,12 +266,12 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
         user: (nu * SLOTS,) actuator numbers.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators, <= MAX_AXES.
-        act: (4 count,) activations at the start of the step.
+        act: (4 count,) spool [1], spool rate [1/s] and pressures [Pa] at the start of the step.
         command: (nu,) valve commands, clipped here to [-1, 1] [1].
         length: (nu,) piston displacements x [m] (joint angle for a motor).
         velocity: (nu,) piston velocities [m/s] or [rad/s].
         dt: step, scalar [s].
-        act_dot: (4 count,) written: mean rate of every activation over the step.
+        act_dot: (4 count,) written: mean rates over the step, in the unit of `act` per [s].
         scratch: (SCRATCH,) work space.
 
     Returns:
@@ -342,7 +344,7 @@ def axis_state(user, i, supply, act, x, v):
         user: (nu * SLOTS,) actuator numbers.
         i: index of the actuator.
         supply: supply pressure, scalar [Pa].
-        act: (4,) spool, spool rate, p_head, p_rod.
+        act: (4,) spool [1], spool rate [1/s], p_head, p_rod [Pa].
         x: piston displacement, scalar [m].
         v: piston velocity, scalar [m/s] or [rad/s].
 

@@ -3,6 +3,8 @@
 Loops are closed on the MuJoCo model itself, so that any tree with `connect` constraints works.
 """
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 
@@ -11,6 +13,7 @@ from hydrotele.machine import Machine
 
 _STEP = 0.2  # largest move of an independent joint between two Newton solutions [rad] or [m]
 _CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
+_FOLLOWED = 1.0e-9  # the same where only looks depend on it
 
 
 def following_joints(machine: Machine) -> tuple[str, ...]:
@@ -106,6 +109,50 @@ def close_loops(
             raise InputError(f"machine {machine.name}", f"its linkages do not close at {where}")
 
 
+def follow_loops(
+    machine: Machine,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    joints: Mapping[str, np.ndarray],
+) -> np.ndarray:
+    """Poses of the whole machine along a motion of its independent joints.
+
+    The first row is closed by `close_loops`; each next one by Newton's method from the row before,
+    so that every linkage stays on its branch.
+
+    Args:
+        machine: the machine.
+        model: its model.
+        data: written: `qpos`, that of the last row.
+        joints: independent joint name -> (n,) angles [rad] or positions [m]; others stay at home.
+
+    Returns:
+        qpos, (n, nq), with the pins closed to 1e-9 m.
+
+    Raises:
+        InputError: a joint is not an independent one, or a loop cannot be closed in some row.
+    """
+    following = following_joints(machine)
+    free = [name for name in machine.joints if name not in following]
+    if strange := [name for name in joints if name not in free]:
+        raise InputError(f"joint {strange[0]}", f"cannot be set; the free ones are {free}")
+    values = np.stack([np.asarray(v, float) for v in joints.values()], 1) if joints else None
+    if values is None or not len(values):
+        close_loops(machine, model, data, {})
+        return np.tile(data.qpos, (0 if joints else 1, 1))
+    places = [model.joint(n).qposadr[0] for n in joints]
+    poses = np.empty((len(values), model.nq))
+    for row, target in enumerate(values):
+        data.qpos[places] = target
+        if row == 0 or not _newton(model, data, following, _FOLLOWED):
+            try:
+                close_loops(machine, model, data, dict(zip(joints, target, strict=True)))
+            except InputError as error:
+                raise InputError(f"{error.where}, row {row}", error.message) from None
+        poses[row] = data.qpos
+    return poses
+
+
 def _aim_cylinders(machine, model, data) -> None:
     for _ in range(2):
         for name, axis in machine.axes.items():
@@ -122,18 +169,18 @@ def _aim_cylinders(machine, model, data) -> None:
             data.qpos[model.joint(f"{name}_rod").qposadr[0]] = reach
 
 
-def _newton(model, data, following) -> bool:
+def _newton(model, data, following, closed: float = _CLOSED) -> bool:
     dofs = [model.joint(n).dofadr[0] for n in following]
     places = [model.joint(n).qposadr[0] for n in following]
     if not dofs:
         return True
     for _ in range(30):
         error, jacobian = closure_error(model, data)
-        if np.abs(error).max() < _CLOSED:
+        if np.abs(error).max() < closed:
             return True
         step = np.linalg.lstsq(jacobian[:, dofs], -error, rcond=1e-10)[0]
         data.qpos[places] += step * min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
-    return bool(np.abs(error).max() < 1e3 * _CLOSED)
+    return bool(np.abs(error).max() < 1e3 * closed)
 
 
 def independent_dofs(machine: Machine, model: mujoco.MjModel) -> np.ndarray:

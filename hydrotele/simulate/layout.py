@@ -82,7 +82,7 @@ def option_offset(name: str) -> int:
 
 _PROBE = """<mujoco><option timestep="0.0123"/><worldbody><body><joint name="j" type="slide"/>
 <geom size="0.1"/></body></worldbody><actuator>
-<general joint="j" dyntype="integrator" user="1 2 3"/></actuator></mujoco>"""
+<general joint="j" dyntype="integrator" user="1 2 3"/><motor joint="j"/></actuator></mujoco>"""
 
 
 @functools.cache
@@ -101,6 +101,11 @@ def verify_layout() -> None:
         name
         for name in ("actuator_user", "actuator_actadr", "actuator_biastype", "actuator_dyntype")
         if _read(model._address + in_model[name], np.int64) != getattr(model, name).ctypes.data
+    ]
+    wrong += [
+        name
+        for name in ("nu", "nuser_actuator")
+        if _read(model._address + in_model[name], np.int64) != getattr(model, name)
     ]
     wrong += [
         name

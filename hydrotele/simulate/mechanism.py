@@ -47,6 +47,9 @@ def assemble(machine: Machine, timestep: float = 1.0e-3, ground: bool = True) ->
             _write_cylinder(root, name, axis.cylinder, timestep)
     for name, closure in machine.closures.items():
         _connect(root, name, closure.a, closure.b, timestep)
+    if machine.arm:
+        tip = machine.arm.tip
+        _body(root, tip.link).add("site", name="tip", pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
     _write_scene(root, ground)
     return root

@@ -26,6 +26,7 @@ from hydrotele.simulate.parameters import MARKER
 
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
 _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
+_OFFSET = int(Slot.OFFSET)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
 
 
@@ -107,7 +108,7 @@ def _compile_callbacks():
         at_velocity = carray(_pointer(d + d_velocity), (1,), np.int64)[0]
         resisting = actuator_friction(user, u, carray(_pointer(at_velocity), (nu,), np.float64)[i])
         if user[u + _KIND] > 2.0:  # Kind.FORCE: MuJoCo's own gain gives the drive force
-            return -resisting
+            return -resisting - user[u + _OFFSET]
         at_actadr = carray(_pointer(m + m_actadr), (1,), np.int64)[0]
         start = 8 * carray(_pointer(at_actadr), (nu,), np.int32)[i]
         at_act = carray(_pointer(d + d_act), (1,), np.int64)[0]

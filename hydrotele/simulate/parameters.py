@@ -11,7 +11,7 @@ MARKER = 215325.0  # CAT 215, CAT 325: no other model writes this into actuator_
 
 
 def actuator_order(machine: Machine) -> list[str]:
-    """Axis names in actuator order: the valve-controlled ones first, since they share the supply."""
+    """Axis names in actuator order: the valve-controlled ones first, as they share the supply."""
     return [*machine.hydraulic_axes, *(n for n, a in machine.axes.items() if not a.hydraulic)]
 
 
@@ -36,6 +36,7 @@ def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
             _write_hydraulics(numbers, axis, machine.supply)
         else:
             numbers[Slot.KIND] = Kind.FORCE
+            numbers[Slot.OFFSET] = axis.force.offset if axis.force else 0.0
         table[name] = numbers
     return table
 

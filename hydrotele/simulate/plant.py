@@ -1,4 +1,4 @@
-"""The plant: a Machine compiled to MuJoCo with its hydraulics, and its states as the field names them."""
+"""The plant: a Machine compiled to MuJoCo with its hydraulics, and its complete states."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
+from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.simulate.circuit import ACTIVATIONS
 from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
@@ -28,7 +29,7 @@ class Plant:
         qpos: (nu,) place of each axis' joint in `qpos`.
         dof: (nu,) place of each axis' joint in `qvel`.
         rod_qpos: (nu,) place of the piston displacement in `qpos`, -1 without cylinder.
-        hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i + 3.
+        hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i to 4 i + 3.
     """
 
     machine: Machine
@@ -58,12 +59,13 @@ def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True)
     """
     install_hydraulics()
     text = mjcf_text(assemble(machine, timestep, ground))
-    model = _compile_without_looks(text)
+    try:
+        model = _compile_without_looks(text)
+    except ValueError as error:
+        raise InputError(f"machine {machine.name}", f"does not compile: {error}") from None
     axes = tuple(actuator_order(machine))
     joints = [model.joint(machine.axes[name].joint) for name in axes]
-    rods = [
-        model.joint(f"{n}_rod").qposadr[0] if machine.axes[n].cylinder else -1 for n in axes
-    ]
+    rods = [model.joint(f"{n}_rod").qposadr[0] if machine.axes[n].cylinder else -1 for n in axes]
     return Plant(
         machine=machine,
         model=model,
@@ -111,7 +113,8 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
             p_head, p_rod = REST_PRESSURE, (head * REST_PRESSURE - forces[i]) / rod
         data.act[ACTIVATIONS * i + 2 : ACTIVATIONS * i + 4] = p_head, p_rod
     for i in range(plant.hydraulic, len(plant.axes)):
-        data.ctrl[i] = forces[i] / plant.machine.axes[plant.axes[i]].drive.gain
+        drive = plant.machine.axes[plant.axes[i]].force
+        data.ctrl[i] = (forces[i] + drive.offset) / drive.gain
     return data
 
 
@@ -121,8 +124,8 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
     Args:
         plant: the plant.
         state: `order` (axis names) and, in that order, `angle` [rad] or [m], `velocity`, `spool`,
-            `spool_rate`, `pressure_head`, `pressure_rod`; any but `order` and `angle` may lack and is
-            then that of rest. `joints` (name -> value) may give undriven joints.
+            `spool_rate`, `pressure_head`, `pressure_rod`; any but `order` and `angle` may lack and
+            is then that of rest. `joints` (name -> value) may give undriven joints.
 
     Returns:
         A new MjData.

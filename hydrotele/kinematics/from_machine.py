@@ -1,0 +1,173 @@
+"""Closed-form geometry of a Machine: its arm, and the linkage between each drive and its joint."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hydrotele.errors import InputError
+from hydrotele.kinematics.arm import ArmGeometry
+from hydrotele.kinematics.linkage import FourBar, TwoBar, two_bar_from_points
+from hydrotele.machine import Axis, Machine
+
+
+@dataclass(frozen=True)
+class Direct:
+    """A drive that acts on its joint itself: the drive coordinate is the joint coordinate."""
+
+    def length(self, theta: Any) -> Any:
+        """Drive coordinate, [rad] or [m], same shape as theta."""
+        return theta
+
+    def rate(self, theta: Any) -> Any:
+        """d(drive)/d(joint) = 1, same shape as theta."""
+        return 0.0 * theta + 1.0
+
+    def angle(self, length: Any) -> Any:
+        """Joint coordinate, [rad] or [m], same shape as length."""
+        return length
+
+
+@dataclass(frozen=True)
+class Slider:
+    """A cylinder on a prismatic joint: length = sqrt((x + along)^2 + across^2).
+
+    Attributes:
+        along: distance of the pins along the joint axis at joint position 0 [m].
+        across: their distance across the axis [m].
+    """
+
+    along: float
+    across: float
+
+    def length(self, theta: Any) -> Any:
+        """Pin-to-pin length [m] at joint position theta [m], any shape."""
+        return np.hypot(theta + self.along, self.across)
+
+    def rate(self, theta: Any) -> Any:
+        """d(length)/d(position) [-], any shape."""
+        return (theta + self.along) / self.length(theta)
+
+    def angle(self, length: Any) -> Any:
+        """Joint position [m] at a pin-to-pin length [m], on the extended side, any shape."""
+        return np.sqrt(length**2 - self.across**2) - self.along
+
+
+DriveLinkage = TwoBar | FourBar | Slider | Direct
+
+
+def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
+    """Linkage between an axis' drive and its joint.
+
+    Args:
+        machine: the machine.
+        name: axis name.
+
+    Returns:
+        Two-bar, four-bar or slider with `length`, `rate`, `angle` of the pin-to-pin length; `Direct`
+        for motors and force drives.
+
+    Raises:
+        InputError: the pins of the cylinder are not on the two links that the joint connects.
+    """
+    axis = machine.axes[name]
+    if axis.cylinder is None:
+        return Direct()
+    if axis.four_bar:
+        return _four_bar(machine, axis)
+    upper = machine.link_of(axis.joint)
+    link = machine.links[upper]
+    pins = {axis.cylinder.base_pin.link: axis.cylinder.base_pin.position}
+    pins[axis.cylinder.rod_pin.link] = axis.cylinder.rod_pin.position
+    if set(pins) != {upper, link.parent} or link.joint is None:
+        raise InputError(
+            f"machine {machine.name}: axes.{name}.cylinder",
+            f"pins must be on {link.parent} and {upper}, or give a four_bar",
+        )
+    base = np.subtract(pins[link.parent], link.position)
+    rod = np.array(pins[upper])
+    axis_way = np.array(link.joint.axis)
+    if link.joint.type == "slide":
+        way = rod - base
+        along = float(way @ axis_way)
+        return Slider(along, float(np.linalg.norm(way - along * axis_way)))
+    first = np.array([1.0, 0.0, 0.0]) if abs(axis_way[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
+    first -= axis_way * (first @ axis_way)
+    first /= np.linalg.norm(first)
+    second = np.cross(axis_way, first)
+    return two_bar_from_points(
+        (float(base @ first), float(base @ second)),
+        (float(rod @ first), float(rod @ second)),
+        machine.home.get(axis.joint, 0.0),
+    )
+
+
+def _four_bar(machine: Machine, axis: Axis) -> FourBar:
+    assert axis.four_bar and axis.cylinder
+    output = machine.link_of(axis.joint)
+    rocker, coupler = machine.links[axis.four_bar.rocker], machine.links[axis.four_bar.coupler]
+    arm = next(
+        end.position
+        for closure in machine.closures.values()
+        for end, other in ((closure.a, closure.b), (closure.b, closure.a))
+        if end.link == output and other.link == axis.four_bar.coupler
+    )
+    arm_of_coupler = next(
+        end.position
+        for closure in machine.closures.values()
+        for end in (closure.a, closure.b)
+        if end.link == axis.four_bar.coupler
+    )
+    return FourBar(
+        output_pivot=_plane(machine.links[output].position),
+        rocker_pivot=_plane(rocker.position),
+        cylinder_base=_plane(axis.cylinder.base_pin.position),
+        rocker=math.hypot(*_plane(coupler.position)),
+        coupler=math.hypot(*_plane(arm_of_coupler)),
+        output_arm=_plane(arm),
+        working_angle=machine.home.get(axis.joint, 0.0),
+    )
+
+
+def _plane(point) -> tuple[float, float]:
+    return point[0], point[2]
+
+
+def closed_length(machine: Machine, name: str) -> float:
+    """Pin-to-pin length at zero piston displacement [m]; 0 for motors and force drives."""
+    cylinder = machine.axes[name].cylinder
+    return cylinder.closed_length if cylinder else 0.0
+
+
+def arm_geometry(machine: Machine) -> ArmGeometry:
+    """Dimensions of the machine's arm, heights counted from the ground.
+
+    Args:
+        machine: a machine with an `arm`.
+
+    Returns:
+        The geometry of `kinematics.arm`.
+
+    Raises:
+        InputError: the machine has no arm.
+    """
+    arm = machine.arm
+    if arm is None:
+        raise InputError(f"machine {machine.name}", "has no arm: give arm.swing, boom, stick, tip")
+    swing, boom, stick = (machine.links[machine.link_of(j)] for j in (arm.swing, arm.boom, arm.stick))
+    if arm.tool:
+        tool_pin = machine.links[machine.link_of(arm.tool)].position
+        offset = _plane(arm.tip.position)
+    else:
+        tool_pin, offset = arm.tip.position, (0.0, 0.0)
+    base = np.add(swing.position, boom.position)
+    return ArmGeometry(
+        base_radius=float(base[0]),
+        lateral_offset=float(base[1] + stick.position[1] + tool_pin[1]),
+        boom_pin_height=float(base[2]),
+        boom_length=math.hypot(*_plane(stick.position)),
+        stick_length=math.hypot(*_plane(tool_pin)),
+        tool_offset=offset,
+        tool_joint=arm.tool is not None,
+    )

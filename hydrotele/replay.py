@@ -1,0 +1,183 @@
+"""Open-loop replay: a log's commands drive the model from the log's initial state; how far is it off?"""
+
+import dataclasses
+import json
+import time as clock
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hydrotele.errors import InputError
+from hydrotele.log import Log
+from hydrotele.machine import Machine
+from hydrotele.signals import usual_unit
+from hydrotele.simulate.plant import Plant, build_plant, initial_state
+from hydrotele.simulate.readout import Record, true_channels
+from hydrotele.simulate.sensors import noise_rms, sensor_set
+
+PREDICTED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
+
+
+@dataclasses.dataclass(frozen=True)
+class ChannelDifference:
+    """How far a simulated channel is from the measured one.
+
+    Attributes:
+        rms: RMS difference [unit].
+        max: largest difference [unit].
+        unit: SI unit.
+        range: full scale of the sensor, or else the span of the measured values [unit].
+        noise_rms: standard deviation of one reading of the log's sensors [unit], 0 if ideal.
+    """
+
+    rms: float
+    max: float
+    unit: str
+    range: float
+    noise_rms: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """Result of a replay: the simulated log, the differences, and how fast it went."""
+
+    measured: Log
+    simulated: Log
+    channels: dict[str, ChannelDifference]
+    realtime_factor: float
+
+
+def replay_log(
+    log: Log,
+    machine: Machine,
+    timestep: float = 1.0e-3,
+    progress: Callable[[float, float], None] | None = None,
+) -> Replay:
+    """Drive a machine with a log's commands.
+
+    Starts from the log's `initial_state` metadata if it has one, else from its first row: measured
+    positions, measured pressures, zero velocity, closed spools. There is a ground to touch only if
+    the log's metadata says `ground: yes`, as logs of scenarios with a ground do.
+
+    Args:
+        log: the log; needs the command and the position of every axis.
+        machine: the machine.
+        timestep: largest physics step [s]; a whole number of steps fits between two rows.
+        progress: called now and then with (simulated seconds, total seconds).
+
+    Returns:
+        The replay.
+
+    Raises:
+        InputError: a command or position column is missing, or the start cannot be assembled.
+    """
+    period = float(np.median(np.diff(log.time)))
+    steps = max(1, round(period / timestep + 0.499999))
+    plant = build_plant(machine, period / steps, ground=log.metadata.get("ground") == "yes")
+    missing = [c for c in _needed(plant) if c not in log]
+    if missing:
+        raise InputError(
+            log.source,
+            f"a replay of {machine.name} needs {', '.join(missing)}; the log has"
+            f" {', '.join(sorted(log.columns))}",
+        )
+    data = initial_state(plant, _start(plant, log))
+    commands = np.column_stack([log[f"command.{a}"] for a in plant.axes])
+    begin = clock.perf_counter()
+    record = _drive(plant, data, log.time, commands, steps, progress)
+    factor = (log.time[-1] - log.time[0]) / max(clock.perf_counter() - begin, 1e-9)
+    values, units = true_channels(plant, record)
+    simulated = Log(
+        time=log.time, columns=values, units=units, source=f"replay of {log.source}",
+        metadata={"machine": machine.name, "tool": machine.tool, "run": f"replay {log.name}"},
+    )  # fmt: skip
+    return Replay(log, simulated, _differences(log, simulated, machine), factor)
+
+
+def _needed(plant: Plant) -> list[str]:
+    positions = [f"{plant.machine.position_kind(a)}.{a}" for a in plant.axes]
+    return [f"command.{a}" for a in plant.axes] + positions
+
+
+def _start(plant: Plant, log: Log) -> dict[str, Any]:
+    if "initial_state" in log.metadata:
+        return _stated_start(plant, log)
+    axes = list(plant.axes)
+    state: dict[str, Any] = {
+        "order": axes,
+        "angle": [float(log[f"{plant.machine.position_kind(a)}.{a}"][0]) for a in axes],
+    }
+    valves = axes[: plant.hydraulic]
+    names = [f"pressure_{side}.{a}" for side in ("head", "rod") for a in valves]
+    if valves and all(n in log for n in names):
+        state["pressure_head"] = [float(log[f"pressure_head.{a}"][0]) for a in valves]
+        state["pressure_rod"] = [float(log[f"pressure_rod.{a}"][0]) for a in valves]
+    return state
+
+
+def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
+    try:
+        state = json.loads(log.metadata["initial_state"])
+        order = list(state["order"])
+        if sorted(order) != sorted(plant.axes) or len(state["angle"]) != len(order):
+            raise ValueError(f"its order {order} is not that of the axes {list(plant.axes)}")
+        for key, values in state.items():
+            if key not in ("order", "joints"):
+                np.asarray(values, dtype=float)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{log.source}: metadata initial_state", f"is not usable: {error}") from None
+    return state
+
+
+def _drive(plant: Plant, data, times, commands, steps, progress) -> Record:
+    model, rows = plant.model, len(times)
+    qpos, qvel = np.empty((rows, model.nq)), np.empty((rows, model.nv))
+    qacc, act = np.empty((rows, model.nv)), np.empty((rows, model.na))
+    tips = np.zeros((rows, 3 if plant.machine.arm else 0))
+    tip = model.site("tip").id if plant.machine.arm else -1
+    for row in range(rows):
+        data.ctrl[:] = commands[row]
+        mujoco.mj_forward(model, data)
+        qpos[row], qvel[row], qacc[row], act[row] = data.qpos, data.qvel, data.qacc, data.act
+        if tip >= 0:
+            tips[row] = data.site_xpos[tip]
+        if progress and row % 100 == 0:
+            progress(times[row] - times[0], times[-1] - times[0])
+        mujoco.mj_step(model, data, nstep=steps)
+    if progress:
+        progress(times[-1] - times[0], times[-1] - times[0])
+    return Record(times, qpos, qvel, qacc, act, commands, np.zeros((rows, 3)), tips)
+
+
+def _differences(log: Log, simulated: Log, machine: Machine) -> dict[str, ChannelDifference]:
+    name = log.metadata.get("sensors", "")
+    sensors = sensor_set(machine, name) if name in machine.sensors else None
+    table = {}
+    for channel in log.columns:
+        kind = channel.partition(".")[0]
+        if kind not in PREDICTED or channel not in simulated:
+            continue
+        error = simulated[channel] - log[channel]
+        span = _span(machine, channel) or float(np.ptp(log[channel]))
+        table[channel] = ChannelDifference(
+            rms=float(np.sqrt(np.mean(error**2))),
+            max=float(np.abs(error).max()),
+            unit=log.units.get(channel) or usual_unit(channel),
+            range=span,
+            noise_rms=noise_rms(machine, sensors, channel),
+        )
+    return table
+
+
+def _span(machine: Machine, channel: str) -> float | None:
+    """Full scale: the main relief pressure for pressures, the stroke for lengths."""
+    kind, _, axis = channel.partition(".")
+    if kind.startswith("pressure") and machine.supply:
+        return machine.supply.relief_pressure
+    if kind == "length" and axis in machine.axes and machine.axes[axis].cylinder:
+        return machine.axes[axis].cylinder.stroke  # type: ignore[union-attr]
+    return None
+
+

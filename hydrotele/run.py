@@ -1,0 +1,350 @@
+"""The one loop: a scenario runs, and two logs come out, `measured` and `truth`."""
+
+import dataclasses
+import json
+import subprocess
+import time as clock
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+import hydrotele
+from hydrotele.effects import apply_effect
+from hydrotele.errors import InputError
+from hydrotele.log import Log
+from hydrotele.machine import Machine
+from hydrotele.machine_file import load_machine
+from hydrotele.operate.plan import Plan, make_plan
+from hydrotele.operate.resolved_motion import pose_to_joints
+from hydrotele.operate.servo import drive_references, servo_numbers, servo_step
+from hydrotele.scenario import Scenario
+from hydrotele.simulate.audit import audit, full_state
+from hydrotele.simulate.circuit import ACTIVATIONS, circuit_scratch
+from hydrotele.simulate.closure import pin_opening
+from hydrotele.simulate.plant import Plant, build_plant, rest_state
+from hydrotele.simulate.readout import Record, ground_force, read_feedback, true_channels
+from hydrotele.simulate.sensors import channel_sensor, measure, sensor_errors, sensor_set
+
+AUDIT_SECONDS = 5.0
+Progress = Callable[[float, float], None]
+
+
+class SimulationFailed(RuntimeError):
+    """The simulation left the finite numbers; the message holds the last states."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Everything a run yields.
+
+    Attributes:
+        scenario: what was asked.
+        machine: the machine that was simulated, with its planted effects.
+        mjcf: its complete MJCF.
+        plan: what was asked of every axis.
+        measured: what the sensors say.
+        truth: what was true, with `initial_state` in its metadata.
+        summary: versions, speed, pins, balances, tracking.
+    """
+
+    scenario: Scenario
+    machine: Machine
+    mjcf: str
+    plan: Plan
+    measured: Log
+    truth: Log
+    summary: dict[str, Any]
+
+
+def scenario_machine(scenario: Scenario) -> Machine:
+    """The machine of a scenario, with its planted effects.
+
+    Raises:
+        InputError: unknown machine, tool, effect or location.
+    """
+    path = Path(scenario.folder, scenario.machine)
+    found = path if scenario.folder and (path.is_dir() or path.is_file()) else scenario.machine
+    machine = load_machine(found, scenario.tool)
+    for planted in scenario.effects:
+        machine = apply_effect(machine, planted.name, planted.location, planted.parameters)
+    return machine
+
+
+def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
+    """Simulate a scenario.
+
+    Args:
+        scenario: the scenario.
+        progress: called now and then with (simulated seconds, total seconds).
+
+    Returns:
+        The run.
+
+    Raises:
+        InputError: the scenario asks for what the machine has not.
+        SimulationFailed: states became infinite or not a number.
+    """
+    machine = scenario_machine(scenario)
+    plant = build_plant(machine, scenario.timestep, scenario.ground)
+    data, start = _start(plant, scenario)
+    ticks = round(scenario.duration * scenario.control_rate)
+    times = np.arange(ticks) / scenario.control_rate
+    plan = make_plan(machine, plant.axes, scenario.pilot, start, times)
+    begin = full_state(plant.model, data)
+    wall = clock.perf_counter()
+    record, commands, pins = _loop(plant, scenario, plan, data, progress)
+    wall = clock.perf_counter() - wall
+    values, units = true_channels(plant, record)
+    truth = _log(scenario, machine, record.time, values, units, "ideal")
+    truth.metadata["initial_state"] = json.dumps(_initial_state(plant, record))
+    sensors = sensor_set(machine, scenario.sensors)
+    seen = {c: v for c, v in values.items() if not c.startswith(("truth.", "command."))}
+    readings = measure(machine, sensors, scenario.seed, seen, _row_errors(plant, scenario))
+    readings = {c: values[c] for c in values if c.startswith("command.")} | readings
+    measured = _log(
+        scenario, machine, record.time, readings, {c: units[c] for c in readings}, scenario.sensors
+    )
+    summary = _summary(plant, scenario, plan, record, pins, wall, data)
+    steps = round(1.0 / (scenario.control_rate * scenario.timestep))
+    window = np.repeat(commands[: round(AUDIT_SECONDS * scenario.control_rate)], steps, axis=0)
+    summary["balance"] = audit(plant, begin, window)
+    return Run(scenario, machine, plant.mjcf, plan, measured, truth, summary)
+
+
+def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, float]]:
+    machine = plant.machine
+    joints = {name: machine.home.get(name, 0.0) for name in machine.joints}
+    for name, value in scenario.start.joints.items():
+        if name not in joints:
+            raise InputError(
+                "start.joints", f"{name!r} is no joint of the machine; valid: {', '.join(joints)}"
+            )
+        joints[name] = value
+    if scenario.start.pose:
+        here = {a: joints[machine.axes[a].joint] for a in plant.axes}
+        there = pose_to_joints(machine, scenario.start.pose, here)
+        joints |= {machine.axes[a].joint: value for a, value in there.items()}
+    for name, joint in machine.joints.items():
+        if joint.range and not joint.range[0] <= joints[name] <= joint.range[1]:
+            low, high = joint.range
+            raise InputError(
+                "start", f"{name} {joints[name]:.4g} is outside its range {low:.4g} .. {high:.4g}"
+            )
+    return rest_state(plant, joints), joints
+
+
+def _feedback_errors(plant: Plant, scenario: Scenario) -> dict[str, np.ndarray]:
+    """Errors of the fed-back channels at every control tick; the log shows every so many of them."""
+    sensors = sensor_set(plant.machine, scenario.sensors)
+    count = round(scenario.duration * scenario.control_rate)
+    names = [f"{plant.machine.position_kind(a)}.{a}" for a in plant.axes]
+    for axis in plant.axes[: plant.hydraulic]:
+        names += [f"pressure_head.{axis}", f"pressure_rod.{axis}"]
+    if plant.hydraulic:
+        names.append("pressure_supply")
+    return {
+        name: sensor_errors(
+            channel_sensor(plant.machine, sensors, name), scenario.seed, name, count
+        )
+        for name in names
+    }
+
+
+def _row_errors(plant: Plant, scenario: Scenario) -> dict[str, np.ndarray]:
+    every = round(scenario.control_rate / scenario.log_rate)
+    rows = round(scenario.duration * scenario.log_rate)
+    return {k: v[::every][:rows] for k, v in _feedback_errors(plant, scenario).items()}
+
+
+def _converter_steps(plant: Plant, scenario: Scenario, names: list[str]) -> np.ndarray:
+    sensors = sensor_set(plant.machine, scenario.sensors)
+    steps = []
+    for name in names:
+        sensor = channel_sensor(plant.machine, sensors, name)
+        exact = not (sensor.bits and sensor.span)
+        steps.append(0.0 if exact else sensor.span / 2.0**sensor.bits)  # type: ignore[operator]
+    return np.array(steps)
+
+
+def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress | None):
+    """Step through the run; returns the record, all commands (n, nu) and the largest opening."""
+    model, dt = plant.model, 1.0 / scenario.control_rate
+    steps = round(dt / scenario.timestep)
+    every = round(scenario.control_rate / scenario.log_rate)
+    rows = round(scenario.duration * scenario.log_rate)
+    ticks, count = len(plan.time), plant.hydraulic
+    numbers = servo_numbers(plant.machine, plant.axes, scenario.servo, dt)
+    drives = drive_references(plant.machine, plan, scenario.servo)
+    errors = _feedback_errors(plant, scenario)
+    feedback = np.column_stack(list(errors.values()))
+    grain = _converter_steps(plant, scenario, list(errors))
+    user, scratch = model.actuator_user.ravel(), circuit_scratch()
+    k = len(plant.axes)
+    joint, last, load = np.empty(k), np.empty(k), np.zeros(k)
+    head, rod = np.zeros(k), np.zeros(k)
+    command, commands = np.zeros(k), np.empty((ticks, k))
+    recorder = _Recorder(plant, rows)
+    qpos, act, ctrl = data.qpos, data.act, data.ctrl
+    worst = 0.0
+    for tick in range(ticks):
+        if tick % every == 0 and tick // every < rows:
+            recorder.take(tick // every, tick * dt, data)
+            if progress and tick % (every * 50) == 0:
+                progress(tick * dt, scenario.duration)
+        supply = read_feedback(
+            qpos, plant.qpos, act, user, count, feedback[tick], grain, joint, head, rod, scratch
+        )
+        if tick == 0:
+            last[:] = joint
+            load[:] = numbers[:, 1] * head - numbers[:, 2] * rod
+        command[:] = plan.command[tick]
+        servo_step(
+            numbers, plan.closed, drives.velocity[tick], drives.arm[tick],
+            drives.volume_head[tick], drives.volume_rod[tick], plan.reference[tick], joint, last,
+            head, rod, supply, dt, load, command,
+        )  # fmt: skip
+        ctrl[:] = command
+        commands[tick] = command
+        mujoco.mj_step(model, data, nstep=steps)
+        worst = max(worst, pin_opening(model, data))
+    recorder.command[:] = commands[: rows * every].reshape(rows, every, k).mean(axis=1)
+    if progress:
+        progress(scenario.duration, scenario.duration)
+    return recorder.record(), commands, worst
+
+
+class _Recorder:
+    """Arrays that a run fills, one row per log sample."""
+
+    def __init__(self, plant: Plant, rows: int) -> None:
+        model = plant.model
+        self.model = model
+        self.tip_site = model.site("tip").id if plant.machine.arm else -1
+        self.time = np.zeros(rows)
+        self.qpos, self.qvel = np.zeros((rows, model.nq)), np.zeros((rows, model.nv))
+        self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
+        self.command, self.contact = np.zeros((rows, model.nu)), np.zeros((rows, 3))
+        self.tip = np.zeros((rows, 3 if self.tip_site >= 0 else 0))
+
+    def take(self, row: int, time: float, data: mujoco.MjData) -> None:
+        mujoco.mj_forward(self.model, data)
+        self.time[row] = time
+        self.qpos[row], self.qvel[row], self.qacc[row] = data.qpos, data.qvel, data.qacc
+        self.act[row] = data.act
+        if self.tip_site >= 0:
+            self.tip[row] = data.site_xpos[self.tip_site]
+        if data.ncon:
+            self.contact[row] = ground_force(self.model, data)
+        if not np.isfinite(self.qacc[row]).all() or data.warning.number.any():
+            raise SimulationFailed(self._story(row))
+
+    def _story(self, row: int) -> str:
+        lines = [f"the simulation became unstable at {self.time[row]:.3f} s; the last states:"]
+        for r in range(max(0, row - 3), row + 1):
+            lines.append(f"  t={self.time[r]:.3f} qpos={np.array2string(self.qpos[r], precision=4)}")
+            lines.append(f"    pressures and spools={np.array2string(self.act[r], precision=4)}")
+        return "\n".join(lines)
+
+    def record(self) -> Record:
+        return Record(
+            self.time, self.qpos, self.qvel, self.qacc, self.act, self.command, self.contact,
+            self.tip,
+        )  # fmt: skip
+
+
+def _log(scenario, machine, time, values, units, sensors: str) -> Log:
+    metadata = {
+        "machine": machine.name,
+        "tool": machine.tool,
+        "sample_rate_hz": f"{scenario.log_rate:g}",
+        "sensors": sensors,
+        "run": scenario.name,
+        "seed": str(scenario.seed),
+        "ground": "yes" if scenario.ground else "no",
+        "hydrotele": hydrotele.__version__,
+        "command": "held" if scenario.control_rate == scenario.log_rate else "mean over the row",
+    }
+    return Log(time=time, columns=values, units=units, metadata=metadata, source=scenario.name)
+
+
+def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
+    act = record.act[0, : ACTIVATIONS * plant.hydraulic].reshape(plant.hydraulic, ACTIVATIONS)
+    keys = ("spool", "spool_rate", "pressure_head", "pressure_rod")
+    driven = {axis.joint for axis in plant.machine.axes.values()}
+    free = [n for n in plant.machine.joints if n not in driven]
+    return {
+        "order": list(plant.axes),
+        "angle": record.qpos[0, plant.qpos].tolist(),
+        "velocity": record.qvel[0, plant.dof].tolist(),
+        **{key: act[:, column].tolist() for column, key in enumerate(keys)},
+        "joints": {n: float(record.qpos[0, plant.model.joint(n).qposadr[0]]) for n in free},
+    }
+
+
+def _summary(plant, scenario, plan: Plan, record: Record, pins, wall, data) -> dict[str, Any]:
+    summary: dict[str, Any] = {
+        "scenario": scenario.name,
+        "machine": plant.machine.name,
+        "tool": plant.machine.tool,
+        "seed": scenario.seed,
+        "simulated_seconds": scenario.duration,
+        "wall_seconds": round(wall, 4),
+        "realtime_factor": round(scenario.duration / wall, 1),
+        "physics_steps": round(scenario.duration / scenario.timestep),
+        "largest_pin_opening_mm": pins * 1e3,
+        "warnings": int(data.warning.number.sum()),
+        "notes": list(plan.notes),
+        "largest_contact_force_N": float(np.linalg.norm(record.contact, axis=1).max()),
+        "tracking": _tracking(plant, plan, record),
+        "versions": _versions(),
+        "git_commit": _git_commit(),
+    }
+    return summary
+
+
+def _tracking(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
+    """Largest and RMS deviation of every followed axis, and of the tip from its desired pose."""
+    rows = np.searchsorted(plan.time, record.time - 1e-9)
+    result: dict[str, Any] = {}
+    for i, name in enumerate(plan.axes):
+        if plan.closed[i]:
+            error = record.qpos[:, plant.qpos[i]] - plan.reference[rows, i]
+            result[name] = {"rms": float(np.sqrt(np.mean(error**2))), "max": float(abs(error).max())}
+    if plan.pose is not None and record.tip.shape[1]:
+        desired = plan.pose[rows]
+        r = np.hypot(record.tip[:, 0], record.tip[:, 1]) - desired[:, 0]
+        arm = plant.machine.arm
+        joints = [j for j in (arm.boom, arm.stick, arm.tool) if j] if arm else []
+        places = [plant.model.joint(j).qposadr[0] for j in joints]
+        attitude = record.qpos[:, places].sum(axis=1) - desired[:, 3]
+        for key, error in (("r", r), ("z", record.tip[:, 2] - desired[:, 2]), ("attitude", attitude)):
+            result[f"tip_{key}"] = {
+                "rms": float(np.sqrt(np.mean(error**2))), "max": float(abs(error).max()),
+            }  # fmt: skip
+    return result
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import version
+
+    names = ("mujoco", "dm-control", "numpy", "scipy", "numba", "pyarrow", "rerun-sdk")
+    return {"hydrotele": hydrotele.__version__, **{n: version(n) for n in names}}
+
+
+def _git_commit() -> str | None:
+    """Commit of the checkout that this package runs from, with `+` if it has changes."""
+    folder = Path(hydrotele.__file__).parent.parent
+    if not (folder / ".git").exists():
+        return None
+    ask = ["git", "-C", str(folder)]
+    try:
+        head = subprocess.run([*ask, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
+        dirty = subprocess.run(
+            [*ask, "status", "--porcelain", "-uno"], capture_output=True, text=True, timeout=5
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return head.stdout.strip() + ("+" if dirty.stdout.strip() else "") or None

@@ -1,0 +1,274 @@
+"""A scenario: machine, start, pilot, controller, sensors and clocks of one run; frozen, validated.
+
+Scenarios are YAML files; `scenarios/` holds the shipped ones. Keys may carry units as suffixes, as
+in machine files.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import Field, model_validator
+
+from hydrotele.datafile import Facts, parse, read_yaml, suggest
+from hydrotele.errors import InputError
+from hydrotele.machine import Name, NonNegative, Positive
+from hydrotele.resources import scenarios_folder
+
+
+class Pose(Facts):
+    """Where the arm's tip is: r, z [m] from the swing axis and the ground, theta, attitude [rad]."""
+
+    r: Positive
+    z: float
+    theta: float = 0.0
+    attitude: float | None = None
+
+
+class Start(Facts):
+    """Where a run starts: joint positions [rad] or [m], or a pose of the tip; else home."""
+
+    joints: dict[Name, float] = {}
+    pose: Pose | None = None
+
+
+class ConstantPilot(Facts):
+    """Open loop: the same drive commands all the time."""
+
+    kind: Literal["constant"]
+    commands: dict[Name, float] = {}
+
+
+class TablePilot(Facts):
+    """A table over time, given here by column or in a CSV file with the same column names.
+
+    `of: command` drives the valves open loop, `of: joint` gives joint references [rad] or [m].
+    """
+
+    kind: Literal["table"]
+    of: Literal["command", "joint"] = "command"
+    time: list[NonNegative] = []
+    columns: dict[Name, list[float]] = {}
+    file: str | None = None
+    interpolate: Literal["hold", "linear"] = "hold"
+
+    @model_validator(mode="after")
+    def _check(self):
+        if bool(self.file) == bool(self.columns):
+            raise ValueError("give either columns (with time) or file")
+        for name, values in self.columns.items():
+            if len(values) != len(self.time):
+                raise ValueError(
+                    f"columns.{name} has {len(values)} values, time has {len(self.time)}"
+                )
+        if self.columns and (self.time[0] != 0.0 or any(_falls(self.time))):
+            raise ValueError("time must start at 0 and rise")
+        return self
+
+
+def _falls(values) -> list[bool]:
+    return [b <= a for a, b in zip(values, values[1:], strict=False)]
+
+
+class Harmonics(Facts):
+    """Fourier reference of one joint: mean + sum_k sin_k sin(k w t) + cos_k cos(k w t)."""
+
+    mean: float = 0.0
+    sin: list[float] = []
+    cos: list[float] = []
+
+
+class FourierPilot(Facts):
+    """Fourier references with a common period [s], faded in from the start over `fade` [s]."""
+
+    kind: Literal["fourier"]
+    period: Positive
+    fade: NonNegative = 2.0
+    axes: dict[Name, Harmonics]
+
+
+class Move(Facts):
+    """A straight move of the tip: signed distances of r, z [m], theta, attitude [rad]."""
+
+    r: float = 0.0
+    z: float = 0.0
+    theta: float = 0.0
+    attitude: float = 0.0
+    speed: Positive = 0.5
+    pause: NonNegative = 0.5
+
+
+class LinesPilot(Facts):
+    """Straight lines by resolved motion in cylindrical coordinates.
+
+    `mode: rate` integrates rate commands as a joystick under rate control gives them, `position`
+    commands the pose itself. Speed [m/s] is that of the tip (or [rad/s] where only angles change),
+    reached with `acceleration`.
+    """
+
+    kind: Literal["lines"]
+    mode: Literal["rate", "position"] = "rate"
+    settle: NonNegative = 1.0
+    acceleration: Positive = 1.0
+    moves: Annotated[list[Move], Field(min_length=1)]
+
+
+class Waypoint(Facts):
+    """A joint target or a pose, reached `duration` [s] after the one before, then held `pause`."""
+
+    duration: Positive
+    pause: NonNegative = 0.0
+    joints: dict[Name, float] = {}
+    pose: Pose | None = None
+
+
+class WaypointsPilot(Facts):
+    """A list of waypoints, joined by quintic polynomials, in joint space or along the pose."""
+
+    kind: Literal["waypoints"]
+    settle: NonNegative = 0.5
+    points: Annotated[list[Waypoint], Field(min_length=1)]
+
+
+Pilot = Annotated[
+    ConstantPilot | TablePilot | FourierPilot | LinesPilot | WaypointsPilot,
+    Field(discriminator="kind"),
+]
+
+
+class Servo(Facts):
+    """Joint servo.
+
+    position_gain [1/s], velocity_gain (force drives only) [N s/m] or [N m s/rad], feedforward and
+    deadband_compensation as fractions, lead [s] that makes up for the spool's lag, pressure_feedback
+    [1/s] (damping) with load_time [s] of the slow mean force.
+    """
+
+    position_gain: NonNegative = 5.0
+    velocity_gain: NonNegative = 0.0
+    feedforward: Annotated[float, Field(ge=0, le=1.5)] = 1.0
+    lead: Annotated[float, Field(ge=0, le=0.3)] = 0.04
+    deadband_compensation: Annotated[float, Field(ge=0, le=1)] = 1.0
+    load_time: Positive = 0.2
+    pressure_feedback: NonNegative = 10.0
+
+
+class PlantedEffect(Facts):
+    """An effect that the simulated machine has and its model lacks; see `hydrotele list effects`."""
+
+    name: str
+    location: str = ""
+    parameters: dict[str, float] = {}
+
+
+class Scenario(Facts):
+    """One run, complete: same scenario, same bits."""
+
+    name: Name
+    description: str = ""
+    machine: str = "cat215"
+    tool: Name | None = None
+    seed: Annotated[int, Field(ge=0)] = 0
+    duration: Annotated[float, Field(gt=0, le=36000)]
+    timestep: Annotated[float, Field(ge=1e-5, le=5e-3)] = 1.0e-3
+    control_rate: Positive = 200.0
+    log_rate: Positive = 50.0
+    sensors: str = "ideal"
+    ground: bool = True
+    start: Start = Start()
+    pilot: Pilot
+    servo: Servo = Servo()
+    effects: tuple[PlantedEffect, ...] = ()
+    folder: str = ""
+
+    @model_validator(mode="after")
+    def _check(self):
+        steps = 1.0 / (self.control_rate * self.timestep)
+        if steps < 0.999 or abs(steps - round(steps)) > 1e-6:
+            raise ValueError(
+                f"control_rate {self.control_rate:g} Hz needs a whole number of physics steps of"
+                f" {self.timestep:g} s per control period, not {steps:g}"
+            )
+        ticks = self.control_rate / self.log_rate
+        if ticks < 0.999 or abs(ticks - round(ticks)) > 1e-6:
+            raise ValueError(
+                f"log_rate {self.log_rate:g} Hz must divide control_rate {self.control_rate:g} Hz"
+            )
+        if self.duration * self.log_rate < 10:
+            raise ValueError("duration is too short: a log needs at least 10 rows")
+        if self.duration * self.control_rate > 2e7:
+            raise ValueError("duration is too long: more than 2e7 control periods")
+        return self
+
+
+def shipped_scenarios() -> list[str]:
+    """Names of the scenarios that come with the package."""
+    return sorted(path.stem for path in scenarios_folder().glob("*.yaml"))
+
+
+def scenario_path(name_or_path: str | Path) -> Path:
+    """File of a shipped scenario (by name) or of a user's.
+
+    Raises:
+        InputError: there is no such scenario; lists those that are shipped.
+    """
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    shipped = scenarios_folder() / f"{name_or_path}.yaml"
+    if path.name == str(name_or_path) and shipped.is_file():
+        return shipped
+    raise InputError(
+        f"scenario {str(name_or_path)!r}",
+        f"is neither a file nor a shipped scenario; {suggest(path.stem, shipped_scenarios())}",
+    )
+
+
+def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = None) -> Scenario:
+    """Read a scenario.
+
+    Args:
+        name_or_path: name of a shipped scenario or a YAML file.
+        overrides: dotted key path -> YAML text, as of `--set servo.position_gain=2`.
+
+    Returns:
+        The validated scenario.
+
+    Raises:
+        InputError: names file, line, key path and what is allowed.
+    """
+    path = scenario_path(name_or_path)
+    data, lines = read_yaml(path)
+    for key, text in (overrides or {}).items():
+        _override(data, key, text)
+    data["folder"] = str(path.parent.resolve())
+    return parse(Scenario, data, str(path), lines)
+
+
+def save_scenario(scenario: Scenario, path: str | Path) -> None:
+    """Write a scenario as YAML, complete with every default, readable by `load_scenario`."""
+    data = scenario.model_dump(mode="json")
+    data.pop("folder")
+    Path(path).write_text(yaml.safe_dump(data, sort_keys=False))
+
+
+def _override(data: dict[str, Any], key: str, text: str) -> None:
+    where: Any = data
+    parts = key.split(".")
+    for part in parts[:-1]:
+        if isinstance(where, list) and part.isdigit() and int(part) < len(where):
+            where = where[int(part)]
+        elif isinstance(where, dict):
+            where = where.setdefault(part, {})
+        else:
+            raise InputError(f"--set {key}", f"there is nothing below {part!r} to set")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(f"--set {key}", f"{text!r} is not a YAML value") from None
+    if isinstance(where, list) and parts[-1].isdigit() and int(parts[-1]) < len(where):
+        where[int(parts[-1])] = value
+    elif isinstance(where, dict):
+        where[parts[-1]] = value
+    else:
+        raise InputError(f"--set {key}", "there is nothing there to set")

@@ -1,0 +1,117 @@
+"""From a log to the place of every body: what the 3D view shows."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from hydrotele.log import Log
+from hydrotele.machine import Machine
+from hydrotele.simulate.closure import follow_loops, following_joints
+from hydrotele.simulate.mechanism import assemble
+
+
+class Poses(NamedTuple):
+    """World poses of the bodies over time.
+
+    Attributes:
+        bodies: names of the nbody bodies, the world first.
+        position: (n, nbody, 3) [m].
+        quaternion: (n, nbody, 4), w x y z.
+    """
+
+    bodies: tuple[str, ...]
+    position: np.ndarray
+    quaternion: np.ndarray
+
+
+def model_with_looks(machine: Machine) -> mujoco.MjModel:
+    """Compile a machine with all that a picture needs; a plant leaves that out for speed.
+
+    Raises:
+        InputError: the MJCF cannot be assembled.
+    """
+    root = assemble(machine)
+    return mujoco.MjModel.from_xml_string(root.to_xml_string(precision=17), root.get_assets())
+
+
+def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
+    """Motion of the independent joints that a log knows of.
+
+    Sensors come first; truth fills in what they do not measure, such as a hanging grapple.
+
+    Args:
+        machine: the machine.
+        log: its log.
+
+    Returns:
+        Joint name -> (n,) angle [rad] or position [m].
+    """
+    following = following_joints(machine)
+    axis_of = {axis.joint: name for name, axis in machine.axes.items()}
+    found = {}
+    for joint in machine.joints:
+        if joint in following:
+            continue
+        names = [n for n in (axis_of.get(joint), joint) if n]
+        candidates = [
+            f"{truth}{kind}.{name}"
+            for truth in ("", "truth.")
+            for name in names
+            for kind in ("angle", "position")
+        ]
+        if column := next((c for c in candidates if c in log), None):
+            found[joint] = log[column]
+    return found
+
+
+def body_poses(
+    machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray]
+) -> Poses:
+    """Place every body, with tubes, rods, rockers and couplers where the pins put them.
+
+    Args:
+        machine: the machine.
+        model: its model, as `model_with_looks` gives it.
+        joints: joint name -> (n,) angles [rad] or positions [m]; others stay at home.
+
+    Returns:
+        The poses, n rows; one row where no joint is given.
+
+    Raises:
+        InputError: a linkage cannot be closed in some row.
+    """
+    data = mujoco.MjData(model)
+    rows = follow_loops(machine, model, data, joints)
+    position = np.empty((len(rows), model.nbody, 3))
+    quaternion = np.empty((len(rows), model.nbody, 4))
+    for row, qpos in enumerate(rows):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        position[row], quaternion[row] = data.xpos, data.xquat
+    return Poses(body_names(model), position, quaternion)
+
+
+def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of the bodies, the world first."""
+    return tuple(model.body(i).name or f"body_{i}" for i in range(model.nbody))
+
+
+def points_on_body(
+    poses: Poses, body: str, point: tuple[float, float, float] | np.ndarray
+) -> np.ndarray:
+    """Path of a point fixed to a body.
+
+    Args:
+        poses: n poses.
+        body: name of the body.
+        point: (3,) in the body's frame [m].
+
+    Returns:
+        (n, 3) in the world [m].
+    """
+    index = poses.bodies.index(body)
+    w, axis = poses.quaternion[:, index, :1], poses.quaternion[:, index, 1:]
+    turned = 2.0 * np.cross(axis, point)
+    return poses.position[:, index] + point + w * turned + np.cross(axis, turned)

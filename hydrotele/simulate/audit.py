@@ -1,0 +1,116 @@
+"""Books of a run: does the oil that went in come out or compress, does the work become energy.
+
+The first seconds are run again at full rate with the same commands (`mujoco.rollout`, bit for bit
+the same states) and integrated by the trapezoidal rule.
+"""
+
+import copy
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from hydrotele.simulate.circuit import ACTIVATIONS
+from hydrotele.simulate.hydraulics import port_flow
+from hydrotele.simulate.plant import Plant
+from hydrotele.simulate.readout import drive_motion, state_flows
+
+_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+
+def full_state(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """The full physics state as `mujoco.rollout` takes it, (nstate,)."""
+    state = np.empty(mujoco.mj_stateSize(model, _FULL))
+    mujoco.mj_getState(model, data, state, _FULL)
+    return state
+
+
+def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, float | None]:
+    """Balances over a stretch of a run.
+
+    Args:
+        plant: the plant.
+        start: (nstate,) full physics state at the beginning.
+        controls: (nstep, nu) commands of every physics step.
+
+    Returns:
+        `seconds`; `flow_balance`: largest |in - out - compressed| of a chamber over the volume that
+        went through it; `energy_balance`: |work of the drives - damping - change of mechanical
+        energy| over the work of all drives (None if the machine touched something or hit a limit);
+        `pin_opening` [m].
+    """
+    model = plant.model
+    data = mujoco.MjData(model)
+    states, _ = rollout.rollout(
+        model, data, start[None, :], controls[None, :, :], persistent_pool=False
+    )
+    states = np.concatenate([start[None, :], states[0]])
+    at = np.cumsum([1, model.nq, model.nv, model.na])
+    qpos, qvel, act = states[:, 1 : at[1]], states[:, at[1] : at[2]], states[:, at[2] : at[3]]
+    dt = model.opt.timestep
+    work, flow = _hydraulic_balance(plant, qpos, qvel, act, controls, dt)
+    return {
+        "seconds": len(controls) * dt,
+        "flow_balance": flow,
+        "energy_balance": _energy_balance(plant, qpos, qvel, work, dt),
+    }
+
+
+def _hydraulic_balance(plant, qpos, qvel, act, controls, dt):
+    """Work of the drives (n,) [J] and the largest relative volume error."""
+    user, count = plant.model.actuator_user, plant.hydraulic
+    x, v = drive_motion(plant, qpos, qvel)
+    if not count:
+        return np.zeros(len(x)), None
+    table = state_flows(user.ravel(), count, np.ascontiguousarray(act), x, v)
+    worst = 0.0
+    power = np.zeros(len(x))
+    for i in range(count):
+        power += table[:, 3 + 3 * i] * v[:, i]
+        worst = max(worst, *_volume_errors(plant, i, table, act, x, v, dt))
+    return np.concatenate([[0.0], np.cumsum(0.5 * dt * (power[1:] + power[:-1]))]), worst
+
+
+def _volume_errors(plant, i, table, act, x, v, dt):
+    axis = plant.machine.axes[plant.axes[i]]
+    valve, supply = axis.valve, plant.machine.supply
+    drive = axis.drive
+    head = axis.cylinder.area_head if axis.cylinder else drive.displacement
+    rod = axis.cylinder.area_rod if axis.cylinder else drive.displacement
+    left = axis.cylinder.stroke - x[:, i] if axis.cylinder else 0.0
+    p_head, p_rod = act[:, ACTIVATIONS * i + 2], act[:, ACTIVATIONS * i + 3]
+    leak = drive.leakage * (p_head - p_rod)
+    sides = (
+        (p_head, table[:, 1 + 3 * i] - leak, head, head * v[:, i], drive.dead_volume + head * x[:, i]),
+        (p_rod, table[:, 2 + 3 * i] + leak, rod, -rod * v[:, i], drive.dead_volume + rod * left),
+    )
+    for pressure, inflow, _, swept, volume in sides:
+        if axis.motor:
+            volume = np.full_like(pressure, drive.dead_volume)
+        port = np.array([
+            port_flow(p, valve.port_relief, valve.port_relief_gain, supply.tank_pressure,
+                      valve.makeup_gain)[0] for p in pressure
+        ])  # fmt: skip
+        net = inflow + port - swept
+        entered = np.sum(0.5 * dt * (net[1:] + net[:-1]))
+        middle = 0.5 * (volume[1:] + volume[:-1])
+        compressed = np.sum(middle * np.diff(pressure)) / supply.bulk_modulus
+        through = np.sum(np.abs(inflow) + np.abs(port) + np.abs(swept)) * dt
+        yield abs(entered - compressed) / max(through, 1e-12)
+
+
+def _energy_balance(plant, qpos, qvel, work, dt):
+    model = copy.copy(plant.model)
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    data = mujoco.MjData(model)
+    energy, lost = np.empty(2), 0.0
+    for row in (0, len(qpos) - 1):
+        data.qpos[:], data.qvel[:] = qpos[row], qvel[row]
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        if data.ncon or data.nefc > 3 * model.neq:
+            return None
+        energy[min(row, 1)] = data.energy.sum()
+    lost = np.sum(model.dof_damping * np.sum(qvel[1:] ** 2, axis=0)) * dt
+    done = np.sum(np.abs(np.diff(work)))
+    return float(abs(work[-1] - lost - (energy[1] - energy[0])) / done) if done > 1.0 else None

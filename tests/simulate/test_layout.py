@@ -1,0 +1,74 @@
+"""Field offsets are MuJoCo's own, and a wrong one is found before native code reads through it."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from hydrotele.simulate import layout
+
+
+@pytest.fixture
+def fresh():
+    """Run the checks anew, before and after the test."""
+    caches = (layout.field_offsets, layout.option_offset, layout.verify_layout)
+    for cached in caches:
+        cached.cache_clear()
+    yield
+    for cached in caches:
+        cached.cache_clear()
+
+
+def test_layout_is_that_of_the_installed_mujoco(fresh):
+    layout.verify_layout()
+
+
+@pytest.mark.parametrize("field", ["actuator_user", "actuator_actadr", "nuser_actuator", "nu"])
+def test_model_fields_lie_where_the_bindings_show_them(field):
+    model = mujoco.MjModel.from_xml_string(layout._PROBE)
+    address = model._address + layout.field_offsets("mjModel")[field]
+    value = layout._read(address, np.int64)
+    shown = getattr(model, field)
+    assert value == (shown if np.isscalar(shown) else shown.ctypes.data)
+
+
+@pytest.mark.parametrize(
+    ("struct", "field"),
+    [
+        ("mjModel", "actuator_user"),
+        ("mjModel", "actuator_actadr"),
+        ("mjModel", "nu"),
+        ("mjModel", "nuser_actuator"),
+        ("mjData", "ctrl"),
+        ("mjData", "act"),
+        ("mjData", "act_dot"),
+        ("mjData", "actuator_length"),
+        ("mjData", "actuator_velocity"),
+    ],
+)
+def test_a_moved_field_is_detected(fresh, monkeypatch, struct, field):
+    true = layout.field_offsets
+
+    def forged(name):
+        offsets = dict(true(name))
+        if name == struct:
+            offsets[field] += 8
+        return offsets
+
+    monkeypatch.setattr(layout, "field_offsets", forged)
+    with pytest.raises(RuntimeError, match=rf"keeps .*{field}.* elsewhere"):
+        layout.verify_layout()
+
+
+def test_a_moved_option_is_detected(fresh, monkeypatch):
+    true = layout.option_offset("timestep")
+    monkeypatch.setattr(layout, "option_offset", lambda name: true + 8)
+    with pytest.raises(RuntimeError, match="opt.timestep"):
+        layout.verify_layout()
+
+
+def test_an_unknown_type_is_refused():
+    class Strange:
+        name = "quaternion_of_the_future"
+
+    with pytest.raises(RuntimeError, match="unknown C type"):
+        layout._size_and_alignment(Strange())
