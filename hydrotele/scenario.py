@@ -144,13 +144,13 @@ class Servo(Facts):
     [1/s] (damping) with load_time [s] of the slow mean force.
     """
 
-    position_gain: NonNegative = 5.0
+    position_gain: NonNegative = 4.0
     velocity_gain: NonNegative = 0.0
     feedforward: Annotated[float, Field(ge=0, le=1.5)] = 1.0
-    lead: Annotated[float, Field(ge=0, le=0.3)] = 0.04
+    lead: Annotated[float, Field(ge=0, le=0.3)] = 0.05
     deadband_compensation: Annotated[float, Field(ge=0, le=1)] = 1.0
     load_time: Positive = 0.2
-    pressure_feedback: NonNegative = 10.0
+    pressure_feedback: NonNegative = 6.0
 
 
 class PlantedEffect(Facts):

@@ -17,7 +17,7 @@ _TABS: Mapping[str, tuple[str, ...]] = {
     "Mechanics": ("length", "position", "force", "torque", "contact_force", "tip"),
     "Rates": ("velocity", "acceleration", "piston_velocity", "spool_rate", "reference"),
 }
-_COMPARED = ("angle", "position", "length", "pressure_head", "pressure_rod")
+_COMPARED = ("angle", "position", "pressure_head", "pressure_rod", "length")
 _FIXED_RANGES = {"command": (-1.05, 1.05)}
 _SKY = (206, 217, 228)
 _GRID = (120, 125, 130, 90)
@@ -129,7 +129,7 @@ def _tabs(plots: Sequence[Plot], differences: Sequence[Plot], minus: str):
         if views := [by_kind[kind] for kind in kinds if kind in by_kind]:
             tabs.append(_column(title, views, minus))
     if differences:
-        tabs.append(_column("Differences", [gap_of[k] for k in kinds], minus))
+        tabs.append(_column("Differences", list(differences), minus))
     return tabs
 
 
@@ -143,7 +143,8 @@ def _column(
     views, heights = [], []
     for plot, share in zip(plots, shares or [1.0] * len(plots), strict=True):
         legend = len(plot.labels) > 1 and not named.issuperset(plot.labels)
-        named.update(plot.labels if legend else ())
+        if legend:
+            named.update(plot.labels, (label.split()[-1] for label in plot.labels))
         views.append(_view(plot, minus if plot.is_difference else "", legend))
         heights.append(share * (_FIRST_SHARE if legend else 1.0))
     return rrb.Vertical(*views, name=title, row_shares=heights)

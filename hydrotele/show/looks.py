@@ -73,8 +73,8 @@ def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return model.mat_rgba[material]
 
 
-def frame(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
-    """Return centre (3,) [m] and radius [m] of a ball around all that is seen; planes do not count.
+def bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+    """Return lowest and highest corner (3,) [m] of a box around all that is seen, without planes.
 
     Args:
         model: the model.
@@ -82,10 +82,13 @@ def frame(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float
     """
     seen = (model.geom_type != _Geom.mjGEOM_PLANE) & (model.geom_group < _HIDDEN_GROUP)
     if not seen.any():
-        return np.array(model.stat.center), float(model.stat.extent)
+        return model.stat.center - model.stat.extent, model.stat.center + model.stat.extent
     places, reach = data.geom_xpos[seen], model.geom_rbound[seen, None]
     low, high = (places - reach).min(axis=0), (places + reach).max(axis=0)
-    return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    height = ground_height(model)
+    if height is not None:
+        low[2] = max(low[2], height)
+    return low, high
 
 
 def ground_height(model: mujoco.MjModel) -> float | None:

@@ -17,7 +17,7 @@ from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.show.channels import colours, common_channels, difference, grouped, shown
 from hydrotele.show.layout import Plot, Scene, blueprint
-from hydrotele.show.looks import frame
+from hydrotele.show.looks import bounds
 from hydrotele.show.output import replacing
 from hydrotele.show.pose import Poses, body_poses, logged_joints, model_with_looks, points_on_body
 from hydrotele.show.scene import log_ground, log_machine, log_tip
@@ -29,7 +29,7 @@ TIMELINE = "time"
 _ENTRY = re.compile(r"[a-z][a-z0-9_]*")
 _RESERVED = ("about", "difference", "ground")
 _PALENESS = 0.65  # part of white in the lines of logs after the first
-_EYE_DISTANCE = 1.3  # in radii of what is to be seen
+_EYE_DISTANCE = 1.5  # in radii of what is to be seen
 _LONGEST_ID = 180  # characters that rerun takes as an application id
 
 
@@ -147,10 +147,9 @@ def _eye(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.
     """
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
-    centre, radius = frame(model, data)
+    low, high = bounds(model, data)
     camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "overview")
-    way = data.cam_xpos[camera] - centre if camera >= 0 else np.array([1.6, 1.4, 0.8])
-    low, high = centre - 0.6 * radius, centre + 0.6 * radius
+    way = data.cam_xpos[camera] - 0.5 * (low + high) if camera >= 0 else np.array([1.6, 1.4, 0.8])
     if tip is not None:
         low, high = np.minimum(low, tip.min(axis=0)), np.maximum(high, tip.max(axis=0))
     target = 0.5 * (low + high)
@@ -170,7 +169,8 @@ def _log_channels(stream, entries) -> list[Plot]:
             trace = shown(log, channel)
             path = entity(name, channel)
             label = f"{name} {trace.name}" if len(entries) > 1 else trace.name
-            style = _line_style(palette[trace.channel.axis], f"{label} [{trace.unit}]", rank)
+            width = 1.0 if rank else 3.0 if len(entries) > 1 else 1.6
+            style = _line_style(palette[trace.channel.axis], f"{label} [{trace.unit}]", rank, width)
             stream.log(path, style, static=True)
             stream.send_columns(path, [clock], rr.Scalars.columns(scalars=trace.values))
             if channel in members:
@@ -208,12 +208,12 @@ def _plots(drawn: Mapping[str, list], is_difference: bool = False) -> list[Plot]
     return plots
 
 
-def _line_style(colour: tuple[int, int, int], name: str, rank: int) -> "rr.SeriesLines":
-    """The first log is drawn strong, others thin and pale upon it."""
+def _line_style(colour: tuple[int, int, int], name: str, rank: int, width: float = 1.2):
+    """The first log is drawn wide and strong, others thin and pale upon it."""
     import rerun as rr
 
     paler = [round(c + (_PALENESS if rank else 0.0) * (255 - c)) for c in colour]
-    return rr.SeriesLines(colors=paler, names=name, widths=1.0 if rank else 2.0)
+    return rr.SeriesLines(colors=paler, names=name, widths=width)
 
 
 def _about(entries: Mapping[str, tuple[Machine, Log]]) -> "rr.TextDocument":

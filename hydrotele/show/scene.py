@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 _GHOST_COLOUR = np.array([40.0, 130.0, 255.0])
 _GHOST_TINT = 0.7  # part of the ghost's own colour in what is seen
 _GHOST_OPACITY = 0.35
+_GHOST_INSET = 0.01  # m that it is smaller: where both machines agree, the solid one hides it
 _GROUND_COLOURS = np.array([[134, 122, 104], [144, 131, 112]], dtype=np.uint8)
 _GROUND_HALF_SIZE = 20.0  # m
 _TIP_COLOUR, _GHOST_TIP_COLOUR = (215, 40, 30), (40, 110, 230)
@@ -54,12 +55,13 @@ def mesh_entity(look: Look, ghost: bool = False) -> "rr.Mesh3D":
     """A look as a rerun mesh; a ghost is tinted and transparent."""
     import rerun as rr
 
-    colours, opacity = look.colours, look.opacity
+    colours, opacity, vertices = look.colours, look.opacity, look.mesh.vertices
     if ghost:
+        vertices = vertices - _GHOST_INSET * look.mesh.normals
         colours = (1.0 - _GHOST_TINT) * colours + _GHOST_TINT * _GHOST_COLOUR
         opacity *= _GHOST_OPACITY
     return rr.Mesh3D(
-        vertex_positions=look.mesh.vertices.astype(np.float32),
+        vertex_positions=vertices.astype(np.float32),
         vertex_normals=look.mesh.normals.astype(np.float32),
         triangle_indices=look.mesh.triangles.astype(np.uint32),
         vertex_colors=np.asarray(colours, dtype=np.uint8),
@@ -98,10 +100,10 @@ def log_tip(
     thin = rr.LineStrips3D([tip.astype(np.float32)], colors=[pale], radii=[0.005])
     stream.log(f"{root}/way", thin, static=True)
     pieces = np.stack([np.concatenate([tip[:1], tip[:-1]]), tip], axis=1)
-    style = rr.LineStrips3D.from_fields(colors=[colour], radii=[0.02])
+    style = rr.LineStrips3D.from_fields(colors=[colour], radii=[0.012 if ghost else 0.02])
     stream.log(f"{root}/trail", style, static=True)
     stream.send_columns(f"{root}/trail", [clock], rr.LineStrips3D.columns(strips=pieces))
-    style = rr.Points3D.from_fields(colors=[colour], radii=[0.07])
+    style = rr.Points3D.from_fields(colors=[colour], radii=[0.06 if ghost else 0.07])
     stream.log(f"{root}/now", style, static=True)
     stream.send_columns(f"{root}/now", [clock], rr.Points3D.columns(positions=tip))
 

@@ -85,7 +85,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow):
     """Largest pressure up to the relief setting at which the valves draw no more than the pump.
 
     Solves `sum_i k_i g(p_s - p_i) = Q_pump` over the valves whose load check is open, by Newton's
-    method in `sqrt(p_s - min p_i)` inside a bracket, which is halved where Newton does not converge.
+    method in `sqrt(p_s - min p_i)` inside a bracket, which is halved where Newton fails.
 
     Args:
         ports: (>= 4 count,) per axis `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa] and two unused places.

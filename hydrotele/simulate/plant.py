@@ -29,7 +29,7 @@ class Plant:
         qpos: (nu,) place of each axis' joint in `qpos`.
         dof: (nu,) place of each axis' joint in `qvel`.
         rod_qpos: (nu,) place of the piston displacement in `qpos`, -1 without cylinder.
-        hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i to 4 i + 3.
+        hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i+3.
     """
 
     machine: Machine

@@ -1,4 +1,4 @@
-"""The circuit's step against an independent integration, oil balances and closed-form steady states."""
+"""The circuit step against an independent integration, oil balances and steady states by hand."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,9 @@ def reference(user, act, command, x, v, end, stiff_tolerance=1e-10):
         def excess(p):
             return np.sum(k * abs(o) * g(np.maximum(0, p - fed))) - PUMP
 
-        p_s = RELIEF if excess(RELIEF) <= 0 else brentq(excess, fed[o != 0].min(), RELIEF, xtol=1e-6)
+        p_s = (
+            RELIEF if excess(RELIEF) <= 0 else brentq(excess, fed[o != 0].min(), RELIEF, xtol=1e-6)
+        )
         q_in = k * abs(o) * g(np.maximum(0, p_s - fed))
         q_out = k * abs(o) * g(np.where(o > 0, p_b, p_a) - TANK)
         q_a, q_b = np.where(o > 0, q_in, -q_out), np.where(o > 0, -q_out, q_in)

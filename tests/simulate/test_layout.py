@@ -32,27 +32,24 @@ def test_model_fields_lie_where_the_bindings_show_them(field):
 
 
 @pytest.mark.parametrize(
-    ("struct", "field"),
+    ("struct", "field", "shift"),
     [
-        ("mjModel", "actuator_user"),
-        ("mjModel", "actuator_actadr"),
-        ("mjModel", "nu"),
-        ("mjModel", "nuser_actuator"),
-        ("mjData", "ctrl"),
-        ("mjData", "act"),
-        ("mjData", "act_dot"),
-        ("mjData", "actuator_length"),
-        ("mjData", "actuator_velocity"),
+        ("mjModel", "actuator_user", 8),
+        ("mjModel", "actuator_actadr", 8),
+        ("mjModel", "nu", -8),
+        ("mjModel", "nuser_actuator", 8),
+        ("mjData", "ctrl", 8),
+        ("mjData", "act", 8),
+        ("mjData", "act_dot", 8),
+        ("mjData", "actuator_length", 8),
+        ("mjData", "actuator_velocity", 8),
     ],
 )
-def test_a_moved_field_is_detected(fresh, monkeypatch, struct, field):
+def test_a_moved_field_is_detected(fresh, monkeypatch, struct, field, shift):
     true = layout.field_offsets
 
     def forged(name):
-        offsets = dict(true(name))
-        if name == struct:
-            offsets[field] += 8
-        return offsets
+        return {k: v + shift * (name == struct and k == field) for k, v in true(name).items()}
 
     monkeypatch.setattr(layout, "field_offsets", forged)
     with pytest.raises(RuntimeError, match=rf"keeps .*{field}.* elsewhere"):

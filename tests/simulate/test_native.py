@@ -1,0 +1,201 @@
+"""The callbacks inside MuJoCo: the same numbers as the pure functions, on every way of stepping."""
+
+import subprocess
+import sys
+import threading
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco import rollout
+from mujoco.batch import Batch
+
+from hydrotele.simulate.circuit import (
+    ACTIVATIONS,
+    SLOTS,
+    Slot,
+    actuator_friction,
+    circuit_scratch,
+    step_circuit,
+)
+from hydrotele.simulate.native import install_hydraulics
+from hydrotele.simulate.plant import rest_state
+
+HOLD = 20  # steps of one command
+
+
+def commands(plant, runs, holds, seed=0):
+    """Random commands (runs, holds, nu)."""
+    return np.random.default_rng(seed).uniform(-1, 1, (runs, holds, plant.model.nu))
+
+
+@pytest.mark.parametrize("tool", ["none", "bucket", "grapple"])
+def test_step_is_the_pure_circuit_bit_for_bit(plant_of, tool):
+    plant = plant_of(tool)
+    model, data = plant.model, rest_state(plant)
+    user, scratch = model.actuator_user.ravel(), circuit_scratch()
+    rate, dt = np.zeros(model.na), model.opt.timestep
+    for hold in commands(plant, 1, 25)[0]:
+        data.ctrl[:] = hold
+        for _ in range(HOLD):
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            act, velocity = data.act.copy(), data.actuator_velocity.copy()
+            step_circuit(
+                user, 0, plant.hydraulic, act, data.ctrl, data.actuator_length, velocity, dt, rate,
+                scratch,
+            )  # fmt: skip
+            mujoco.mj_step(model, data)
+            assert np.array_equal(data.act, act + dt * rate)
+            ends = (act + dt * rate).reshape(-1, ACTIVATIONS)
+            force = [
+                user[i * SLOTS + Slot.AREA_HEAD] * ends[i, 2]
+                - user[i * SLOTS + Slot.AREA_ROD] * ends[i, 3]
+                - actuator_friction(user, i * SLOTS, velocity[i])
+                for i in range(plant.hydraulic)
+            ]
+            assert np.array_equal(data.actuator_force, force)
+    assert np.abs(data.act).reshape(-1, 4)[:, 0].max() > 0.1, "the spools have moved"
+
+
+def stepped(plant, controls):
+    finals = []
+    for run in controls:
+        data = rest_state(plant)
+        for hold in run:
+            data.ctrl[:] = hold
+            mujoco.mj_step(plant.model, data, nstep=HOLD)
+        finals.append(np.concatenate([[data.time], data.qpos, data.qvel, data.act]))
+    return np.array(finals)
+
+
+def rolled_out(plant, controls, threads):
+    start = rest_state(plant)
+    spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    state = np.zeros(mujoco.mj_stateSize(plant.model, spec))
+    mujoco.mj_getState(plant.model, start, state, spec)
+    states, _ = rollout.rollout(
+        plant.model,
+        [mujoco.MjData(plant.model) for _ in range(threads)],
+        np.tile(state, (len(controls), 1)),
+        np.repeat(controls, HOLD, axis=1),
+    )
+    return states[:, -1, : 1 + plant.model.nq + plant.model.nv + plant.model.na]
+
+
+def batched(plant, controls, threads):
+    start = rest_state(plant)
+    batch = Batch(plant.model, len(controls), nthread=threads)
+    batch.qpos[:], batch.act[:] = start.qpos, start.act
+    for k in range(controls.shape[1]):
+        batch.ctrl[:] = controls[:, k]
+        batch.step(nstep=HOLD)
+    return np.concatenate([batch.time[:, None], batch.qpos, batch.qvel, batch.act], axis=1)
+
+
+@pytest.mark.parametrize("tool", ["none", "bucket"])
+def test_every_way_of_stepping_gives_the_same_bits(plant_of, tool):
+    plant = plant_of(tool, ground=True)
+    controls = commands(plant, 64, 10)
+    truth = stepped(plant, controls)
+    assert np.ptp(truth[:, 1], axis=0) > 1e-3, "the runs differ from one another"
+    for threads in (1, 2):
+        assert np.array_equal(rolled_out(plant, controls, threads), truth)
+        assert np.array_equal(batched(plant, controls, threads), truth)
+
+
+def test_threads_with_different_machines_do_not_disturb_each_other(plant_of):
+    plants = [plant_of("none"), plant_of("bucket"), plant_of("none"), plant_of("bucket")]
+    controls = [commands(plant, 1, 60, seed) for seed, plant in enumerate(plants)]
+    alone = [stepped(plant, c) for plant, c in zip(plants, controls, strict=True)]
+    together, barrier = [None] * len(plants), threading.Barrier(len(plants))
+
+    def work(i):
+        barrier.wait()
+        together[i] = stepped(plants[i], controls[i])
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(len(plants))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for i, result in enumerate(together):
+        assert np.array_equal(result, alone[i])
+
+
+def test_parameters_are_read_from_the_model_at_every_step(plant_of):
+    plant = plant_of("none")
+    model, results = plant.model.__copy__(), []
+    for relief in (28.0e6, 5.0e6):
+        model.actuator_user[:, Slot.RELIEF_PRESSURE] = relief
+        data = rest_state(plant)
+        data.ctrl[:] = 0, 1, 0
+        mujoco.mj_step(model, data, nstep=500)
+        results.append(data.qvel[plant.dof[1]])
+    assert results[0] > 0.1 > results[1], "5 MPa do not lift the boom"
+
+
+def test_installing_again_changes_nothing():
+    install_hydraulics()
+    before = mujoco.get_mjcb_act_dyn(), mujoco.get_mjcb_act_bias()
+    install_hydraulics()
+    assert (mujoco.get_mjcb_act_dyn(), mujoco.get_mjcb_act_bias()) == before
+    assert None not in before
+
+
+FOREIGN = """
+import mujoco, numpy as np
+XML = '''<mujoco><size nuser_actuator="{nuser}"/><worldbody><body><joint name="a"/>
+<geom size="0.1" pos="0.3 0 0"/><body pos="0.6 0 0"><joint name="b" axis="0 1 0"/>
+<geom size="0.1" pos="0.3 0 0"/></body></body></worldbody><actuator>
+<muscle joint="a" lengthrange="0 1"/>
+<general joint="b" dyntype="filter" dynprm="0.1" gainprm="3" biastype="affine" biasprm="1 -2 -1"/>
+<general joint="a" dyntype="user" actdim="4" biastype="user" gainprm="2" user="1 2 3"/>
+<general joint="b" dyntype="integrator" biastype="none"/></actuator></mujoco>'''
+
+def run(nuser):
+    model = mujoco.MjModel.from_xml_string(XML.replace('{nuser}', str(nuser)))
+    data = mujoco.MjData(model)
+    data.act[:] = 0.1 * np.arange(model.na)
+    for k in range(500):
+        data.ctrl[:] = np.sin(0.05 * k + np.arange(model.nu))
+        mujoco.mj_step(model, data)
+    return np.concatenate([data.qpos, data.qvel, data.act, data.actuator_force])
+
+before = [run(n) for n in (3, 5, 32)]
+from hydrotele.simulate.native import install_hydraulics
+install_hydraulics()
+after = [run(n) for n in (3, 5, 32)]
+assert np.abs(before).max() > 0.5
+assert all(np.array_equal(a, b) for a, b in zip(before, after)), (before, after)
+print("identical")
+"""
+
+TAKEN = """
+import mujoco
+mujoco.set_mjcb_act_{which}(lambda m, d, i: 0.0)
+from hydrotele.simulate.native import install_hydraulics
+try:
+    install_hydraulics()
+except RuntimeError as error:
+    print("refused:", error)
+"""
+
+
+def in_a_process_of_its_own(text):
+    result = subprocess.run(
+        [sys.executable, "-c", text], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_models_of_others_are_left_alone():
+    assert "identical" in in_a_process_of_its_own(FOREIGN)
+
+
+@pytest.mark.parametrize("which", ["dyn", "bias"])
+def test_callbacks_of_others_are_not_replaced(which):
+    said = in_a_process_of_its_own(TAKEN.replace("{which}", which))
+    assert said.startswith("refused: another package has installed")
+    assert "process of its own" in said, "says what to do"
