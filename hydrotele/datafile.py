@@ -123,8 +123,7 @@ _Loader.add_implicit_resolver(
 def _key_lines(root) -> dict[tuple, int]:
     """Line of every key; what an alias repeats has the line of the key that holds the alias."""
     lines, opened, waiting = {(): root.start_mark.line + 1}, set(), [(root, ())]
-    while waiting:
-        node, path = waiting.pop()
+    for node, path in waiting:  # grows on the way
         if node in opened:
             continue
         opened.add(node)

@@ -185,7 +185,10 @@ def _facts_of_body(body, degrees: bool, where: str) -> dict:
     if np.any(body.pos):
         facts["position"] = body.pos.tolist()
     if body.explicitinertial:
-        if np.all(np.isfinite(body.fullinertia)) or abs(body.iquat[0]) < 1.0 - 1e-12:
+        turned = (
+            np.any(body.iquat[1:]) or body.ialt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT
+        )
+        if turned or np.all(np.isfinite(body.fullinertia)):
             raise InputError(where, "give its inertial as diaginertia in the axes of the body")
         facts |= {"mass": body.mass, "com": body.ipos.tolist(), "inertia": body.inertia.tolist()}
     if not body.joints:

@@ -6,7 +6,7 @@ import subprocess
 import time as clock
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -42,8 +42,7 @@ class Run:
 
     Attributes:
         scenario: what was asked.
-        machine: the machine that was simulated, with its planted effects.
-        mjcf: its complete MJCF.
+        plant: what was simulated; its machine has the planted effects.
         plan: what was asked of every axis.
         measured: what the sensors say.
         truth: what was true, with `initial_state` in its metadata.
@@ -51,8 +50,7 @@ class Run:
     """
 
     scenario: Scenario
-    machine: Machine
-    mjcf: str
+    plant: Plant
     plan: Plan
     measured: Log
     truth: Log
@@ -73,6 +71,28 @@ def scenario_machine(scenario: Scenario) -> Machine:
     return machine
 
 
+class Prepared(NamedTuple):
+    """A scenario before its first step."""
+
+    plant: Plant
+    data: mujoco.MjData
+    plan: Plan
+
+
+def prepare(scenario: Scenario) -> Prepared:
+    """Compile the machine of a scenario, put it at its start and plan the run.
+
+    Raises:
+        InputError: the scenario asks for what the machine has not.
+    """
+    machine = scenario_machine(scenario)
+    sensor_set(machine, scenario.sensors)
+    plant = build_plant(machine, scenario.timestep, scenario.ground)
+    data, start = _start(plant, scenario)
+    times = np.arange(round(scenario.duration * scenario.control_rate)) / scenario.control_rate
+    return Prepared(plant, data, make_plan(machine, plant.axes, scenario.pilot, start, times))
+
+
 def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
     """Simulate a scenario.
 
@@ -87,16 +107,10 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
         InputError: the scenario asks for what the machine has not.
         SimulationFailed: states became infinite or not a number.
     """
-    machine = scenario_machine(scenario)
-    plant = build_plant(machine, scenario.timestep, scenario.ground)
-    data, start = _start(plant, scenario)
-    ticks = round(scenario.duration * scenario.control_rate)
-    times = np.arange(ticks) / scenario.control_rate
-    plan = make_plan(machine, plant.axes, scenario.pilot, start, times)
+    plant, data, plan = prepare(scenario)
+    machine = plant.machine
     begin = full_state(plant.model, data)
-    wall = clock.perf_counter()
-    record, commands, pins = _loop(plant, scenario, plan, data, progress)
-    wall = clock.perf_counter() - wall
+    record, commands, pins, wall = _loop(plant, scenario, plan, data, progress)
     values, units = true_channels(plant, record)
     truth = _log(scenario, machine, record.time, values, units, "ideal")
     truth.metadata["initial_state"] = json.dumps(_initial_state(plant, record))
@@ -111,7 +125,7 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
     window = np.repeat(commands[: round(AUDIT_SECONDS * scenario.control_rate)], steps, axis=0)
     summary["balance"] = audit(plant, begin, window)
-    return Run(scenario, machine, plant.mjcf, plan, measured, truth, summary)
+    return Run(scenario, plant, plan, measured, truth, summary)
 
 
 def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, float]]:
@@ -170,7 +184,10 @@ def _converter_steps(plant: Plant, scenario: Scenario, names: list[str]) -> np.n
 
 
 def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress | None):
-    """Step through the run; returns the record, all commands (n, nu) and the largest opening."""
+    """Step through the run; returns the record, all commands (n, nu), the largest opening [m] and
+
+    the wall time [s] from the second control tick on (the first one loads compiled code).
+    """
     model, dt = plant.model, 1.0 / scenario.control_rate
     steps = round(dt / scenario.timestep)
     every = round(scenario.control_rate / scenario.log_rate)
@@ -188,7 +205,7 @@ def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress
     command, commands = np.zeros(k), np.empty((ticks, k))
     recorder = _Recorder(plant, rows)
     qpos, act, ctrl = data.qpos, data.act, data.ctrl
-    worst = 0.0
+    worst, begin = 0.0, 0.0
     for tick in range(ticks):
         if tick % every == 0 and tick // every < rows:
             recorder.take(tick // every, tick * dt, data)
@@ -208,12 +225,13 @@ def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress
         )  # fmt: skip
         ctrl[:] = command
         commands[tick] = command
+        begin = begin if tick else clock.perf_counter()
         mujoco.mj_step(model, data, nstep=steps)
         worst = max(worst, pin_opening(model, data))
     recorder.command[:] = commands[: rows * every].reshape(rows, every, k).mean(axis=1)
     if progress:
         progress(scenario.duration, scenario.duration)
-    return recorder.record(), commands, worst
+    return recorder.record(), commands, worst, clock.perf_counter() - begin
 
 
 class _Recorder:

@@ -66,9 +66,7 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
     return found
 
 
-def body_poses(
-    machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray]
-) -> Poses:
+def body_poses(machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray]) -> Poses:
     """Place every body, with tubes, rods, rockers and couplers where the pins put them.
 
     Args:

@@ -1,24 +1,27 @@
 """A picture of a recording as the rerun viewer shows it, without a screen.
 
-The viewer of the wheel draws off-screen (`rerun --headless`) through Vulkan; without a graphics card
-Mesa's lavapipe draws on the processor. It is driven over its local port.
+The viewer of the wheel draws off-screen (`rerun --headless`) through Vulkan; without a graphics
+card Mesa's lavapipe draws on the processor. It is driven over its local port.
 """
 
+import contextlib
 import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydrotele.errors import InputError
 from hydrotele.show.output import replacing
 from hydrotele.show.recording import TIMELINE
-from hydrotele.show.viewer import Viewer, free_port, running
+from hydrotele.show.viewer import Viewer, free_port, recording_file, running
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient, ViewerState
 
 _POLL = 0.1  # s
-_SETTLING = 3  # pictures that are drawn before one counts: layout and plots take a few frames
+_SETTLING = 3  # pictures that are drawn at least: layout and data take a few frames
+_NO_DRIVER = ("render context", "graphics adapter")  # what the viewer says then
 _DRIVER = (
     "needs Vulkan to draw: install a graphics driver or, without a graphics card, Mesa's"
     " (Debian: apt-get install mesa-vulkan-drivers)"
@@ -30,7 +33,7 @@ def take_screenshot(
     png: str | os.PathLike,
     size: tuple[int, int] = (1600, 1000),
     at: float | None = None,
-    timeout: float = 60.0,
+    timeout: float = 90.0,
 ) -> None:
     """Save what the viewer shows of a recording.
 
@@ -45,43 +48,43 @@ def take_screenshot(
         InputError: the recording cannot be read, there is no Vulkan driver (says what to install),
             or time is up. Nothing is written and no process is left then.
     """
-    rrd = Path(rrd)
-    if not rrd.is_file():
-        raise InputError(rrd, "is not a file: give the path of an .rrd recording")
-    deadline, port = time.monotonic() + timeout, free_port()
-    arguments = ["--headless", "--bind", "127.0.0.1", "--port", str(port)]
-    arguments += ["--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}", str(rrd)]
-    with replacing(png, ".png") as part, running(arguments, clean=True) as viewer:
-        client = _connected(viewer, port, rrd, deadline)
-        state = _loaded(viewer, client, rrd, deadline)
+    deadline = time.monotonic() + timeout
+    with replacing(png, ".png") as part, _viewing(rrd, size, deadline) as (client, state):
         _hide_top_panel(client)
         client.set_time(TIMELINE, duration=_moment(state, at, rrd), play_state="paused")
-        for _ in range(_SETTLING):
-            content = client.take_screenshot()
-            time.sleep(_POLL)
-        part.write_bytes(content)
+        part.write_bytes(_settled_picture(client, deadline))
 
 
-def view_reports(rrd: str | os.PathLike, timeout: float = 60.0) -> list[str]:
-    """Return the warnings and errors that the viewer's views report for a recording.
+def view_reports(rrd: str | os.PathLike, timeout: float = 90.0) -> list[str]:
+    """Return the warnings and errors that the viewer has for a recording; none is good.
 
     Raises:
         InputError: as `take_screenshot`.
     """
-    rrd, deadline, port = Path(rrd), time.monotonic() + timeout, free_port()
-    arguments = ["--headless", "--bind", "127.0.0.1", "--port", str(port), str(rrd)]
+    deadline = time.monotonic() + timeout
+    with _viewing(rrd, (1600, 1000), deadline) as (client, _):
+        _settled_picture(client, deadline)
+        views = client.get_state().views
+        shown = [f"{v.name}: {r.severity}: {r.summary}" for v in views for r in v.reports]
+        entries = [e for e in client.get_logs() if e.level in ("WARN", "ERROR")]
+        return shown + [e.message for e in entries if "rasterizer" not in e.message]
+
+
+@contextlib.contextmanager
+def _viewing(
+    rrd: str | os.PathLike, size: tuple[int, int], deadline: float
+) -> Iterator[tuple["ViewerClient", "ViewerState"]]:
+    """A viewer that has loaded the recording."""
+    rrd, port = recording_file(rrd), free_port()
+    arguments = ["--headless", "--bind", "127.0.0.1", "--port", str(port)]
+    arguments += ["--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}", str(rrd)]
     with running(arguments, clean=True) as viewer:
         client = _connected(viewer, port, rrd, deadline)
-        _loaded(viewer, client, rrd, deadline)
-        client.take_screenshot()
-        state = client.get_state()
-        reports = [(view.name, report) for view in state.views for report in view.reports]
-        logged = [
-            f"{entry.target}: {entry.message}"
-            for entry in client.get_logs()
-            if entry.level != "INFO" and "rasterizer" not in entry.message
-        ]
-        return [f"{name}: {r.severity}: {r.summary}" for name, r in reports] + logged
+        try:
+            yield client, _loaded(viewer, client, rrd, deadline)
+        except (RuntimeError, ConnectionError) as error:
+            _check(viewer, rrd, deadline)
+            raise InputError(rrd, f"the viewer does not answer: {error}") from error
 
 
 def _connected(viewer: Viewer, port: int, rrd: Path, deadline: float) -> "ViewerClient":
@@ -93,21 +96,18 @@ def _connected(viewer: Viewer, port: int, rrd: Path, deadline: float) -> "Viewer
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.get_state()
             return client
-        except (RuntimeError, ConnectionError, OSError):
+        except (RuntimeError, ConnectionError):
             time.sleep(_POLL)
 
 
-def _loaded(
-    viewer: Viewer, client: "ViewerClient", rrd: Path, deadline: float
-) -> "ViewerState":
+def _loaded(viewer: Viewer, client: "ViewerClient", rrd: Path, deadline: float) -> "ViewerState":
     while True:
         _check(viewer, rrd, deadline)
         state = client.get_state()
         if not state.loading and state.recordings and state.recordings[0].timelines:
             return state
-        failed = [e.message for e in client.get_logs() if e.level == "ERROR"]
-        if failed:
-            raise InputError(rrd, f"the viewer cannot show it: {failed[0]}")
+        if failed := [entry.message for entry in client.get_logs() if entry.level == "ERROR"]:
+            raise InputError(rrd, f"the viewer cannot show it: {' '.join(failed[0].split())}")
         time.sleep(_POLL)
 
 
@@ -115,7 +115,7 @@ def _check(viewer: Viewer, rrd: Path, deadline: float) -> None:
     """Explain a viewer that has ended, or one that takes too long."""
     if viewer.process.poll() is not None:
         said = viewer.said()
-        if "adapter" in said or "wgpu" in said.lower() or "vulkan" in said.lower():
+        if any(sign in said for sign in _NO_DRIVER):
             raise InputError("rerun viewer", _DRIVER)
         last = " ".join(said.split()[-40:])
         raise InputError(rrd, f"the viewer ended with {viewer.process.returncode}: {last}")
@@ -123,7 +123,18 @@ def _check(viewer: Viewer, rrd: Path, deadline: float) -> None:
         raise InputError(rrd, "the viewer does not show it in time: raise the timeout")
 
 
-def _moment(state: "ViewerState", at: float | None, rrd: Path) -> float:
+def _settled_picture(client: "ViewerClient", deadline: float) -> bytes:
+    """The first picture that is like the one before: all data have arrived then."""
+    previous, count = b"", 0
+    while True:
+        picture, count = client.take_screenshot(), count + 1
+        if count >= _SETTLING and (picture == previous or time.monotonic() > deadline):
+            return picture
+        previous = picture
+        time.sleep(_POLL)
+
+
+def _moment(state: "ViewerState", at: float | None, rrd: str | os.PathLike) -> float:
     lines = {line.name: line for line in state.recordings[0].timelines}
     if TIMELINE not in lines:
         raise InputError(rrd, f"has no timeline {TIMELINE!r}; it has {', '.join(lines)}")

@@ -50,6 +50,18 @@ def rerun_program() -> Path:
     return program
 
 
+def recording_file(path: str | os.PathLike) -> Path:
+    """Absolute path of a recording that is there.
+
+    Raises:
+        InputError: it is not.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(path, "is not a file: give the path of an .rrd recording")
+    return path.resolve()
+
+
 def free_port() -> int:
     """Return a TCP port of this machine that nobody listens to."""
     with socket.socket() as listener:

@@ -5,14 +5,19 @@ becomes a tube (hinged to its base pin), a rod (sliding in the tube; the slide's
 piston displacement x) and a `connect` constraint at the rod pin.
 """
 
+import warnings
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-
-from dm_control import mjcf
 
 from hydrotele.errors import InputError
 from hydrotele.machine import Axis, Cylinder, Link, Machine, Pin
 from hydrotele.simulate.circuit import ACTIVATIONS, SLOTS
+from hydrotele.simulate.looks import name_geoms, without_looks
 from hydrotele.simulate.parameters import actuator_numbers
+
+with warnings.catch_warnings():  # glfw warns when there is no screen, which nobody needs here
+    warnings.simplefilter("ignore")
+    from dm_control import mjcf
 
 # Default softness opens the pins of a 10 t machine by decimetres. A time constant of two steps is
 # the stiffest that MuJoCo takes, and makes the softness vanish with the step.
@@ -20,13 +25,16 @@ _IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2)
 _CONTACT_SOLREF = (0.02, 1.0)
 
 
-def assemble(machine: Machine, timestep: float = 1.0e-3, ground: bool = True) -> mjcf.RootElement:
-    """Build the MJCF of a machine, with scene, closures, actuators and home keyframe.
+def assemble(
+    machine: Machine, timestep: float = 1.0e-3, ground: bool = True, looks: bool = True
+) -> mjcf.RootElement:
+    """Build the MJCF of a machine, with scene, closures and actuators.
 
     Args:
         machine: the machine, with one tool.
         timestep: physics step [s].
         ground: whether there is a ground to touch.
+        looks: whether to keep what only a picture needs.
 
     Returns:
         The MJCF document. `mjcf_text` writes it out.
@@ -34,7 +42,7 @@ def assemble(machine: Machine, timestep: float = 1.0e-3, ground: bool = True) ->
     Raises:
         InputError: the machine's MJCF cannot be read or lacks a body's parent.
     """
-    root = _read_mjcf(machine)
+    root = _read_mjcf(machine, looks)
     root.model = machine.name
     _set_options(root, machine, timestep)
     for name in machine.removed_bodies:
@@ -51,7 +59,7 @@ def assemble(machine: Machine, timestep: float = 1.0e-3, ground: bool = True) ->
         tip = machine.arm.tip
         _body(root, tip.link).add("site", name="tip", pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
-    _write_scene(root, ground)
+    _write_scene(root, ground, looks)
     return root
 
 
@@ -60,16 +68,21 @@ def mjcf_text(root: mjcf.RootElement) -> str:
     return root.to_xml_string(precision=17, filename_with_hash=False)
 
 
-def _read_mjcf(machine: Machine) -> mjcf.RootElement:
+def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
     if not machine.mjcf:
         return mjcf.RootElement(model=machine.name)
     path = Path(machine.folder, machine.mjcf)
     try:
-        return mjcf.from_path(str(path))
+        tree = ElementTree.parse(path).getroot()
+        name_geoms(tree)
+        if not looks:
+            without_looks(tree)
+        text = ElementTree.tostring(tree, encoding="unicode")
+        return mjcf.from_xml_string(text, model_dir=str(path.parent))
+    except ElementTree.ParseError as error:
+        raise InputError(path, f"is not XML: {error}") from None
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise InputError(path, f"is not an MJCF that dm_control reads: {error}") from None
-    except Exception as error:  # lxml's syntax errors have no common public base
-        raise InputError(path, f"cannot be parsed: {error}") from None
 
 
 def _set_options(root, machine: Machine, timestep: float) -> None:
@@ -162,11 +175,19 @@ def _write_actuators(root, machine: Machine) -> None:
             actuator.ctrlrange = (-axis.force.command_limit, axis.force.command_limit)
 
 
-def _write_scene(root, ground: bool) -> None:
+def _write_scene(root, ground: bool, looks: bool) -> None:
+    touch = {"contype": 1, "conaffinity": 2} if ground else {"contype": 0, "conaffinity": 0}
+    if ground or looks:
+        root.worldbody.add(
+            "geom", name="ground", type="plane", size=(40, 40, 1), friction=(0.8, 0.02, 0.001),
+            solref=_CONTACT_SOLREF, **touch,
+        )  # fmt: skip
+    if not looks:
+        return
     root.visual.headlight.ambient = (0.35, 0.35, 0.35)
     root.visual.headlight.diffuse = (0.45, 0.45, 0.45)
     getattr(root.visual, "global").offwidth = 1920
-    getattr(root.visual, "global").offheight = 1080
+    getattr(root.visual, "global").offheight = 1200
     root.asset.add(
         "texture", name="sky", type="skybox", builtin="gradient", rgb1=(0.62, 0.75, 0.88),
         rgb2=(0.92, 0.94, 0.96), width=256, height=256,
@@ -176,13 +197,8 @@ def _write_scene(root, ground: bool) -> None:
         rgb2=(0.56, 0.51, 0.44), width=256, height=256,
     )  # fmt: skip
     root.asset.add("material", name="ground", texture="ground", texrepeat=(40, 40), reflectance=0)
+    root.find("geom", "ground").material = "ground"
     root.worldbody.add(
         "light", name="sun", pos=(4, 8, 14), dir=(-0.25, -0.5, -1), directional=True,
         castshadow=True, diffuse=(0.6, 0.6, 0.55),
     )  # fmt: skip
-    touch = {"contype": 1, "conaffinity": 2} if ground else {"contype": 0, "conaffinity": 0}
-    root.worldbody.add(
-        "geom", name="ground", type="plane", size=(40, 40, 1), material="ground",
-        friction=(0.8, 0.02, 0.001), solref=_CONTACT_SOLREF, **touch,
-    )  # fmt: skip
-

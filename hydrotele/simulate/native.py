@@ -62,7 +62,7 @@ def _compile_callbacks():
     d_ctrl, d_act, d_act_dot = data_at["ctrl"], data_at["act"], data_at["act_dot"]
     d_length, d_velocity = data_at["actuator_length"], data_at["actuator_velocity"]
 
-    @cfunc(_SIGNATURE, cache=False, error_model="numpy")
+    @cfunc(_SIGNATURE, cache=True, error_model="numpy")
     def advance(m, d, i):
         if carray(_pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
@@ -95,7 +95,7 @@ def _compile_callbacks():
         )
         return 0.0
 
-    @cfunc(_SIGNATURE, cache=False, error_model="numpy")
+    @cfunc(_SIGNATURE, cache=True, error_model="numpy")
     def force(m, d, i):
         if carray(_pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0

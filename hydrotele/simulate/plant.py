@@ -1,6 +1,7 @@
 """The plant: a Machine compiled to MuJoCo with its hydraulics, and its complete states."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 
 import mujoco
@@ -24,7 +25,7 @@ class Plant:
     Attributes:
         machine: the machine.
         model: its MuJoCo model; steps with `mj_step`, `mujoco.rollout` and `mujoco.batch`.
-        mjcf: the full MJCF text, with the looks that `model` leaves out.
+        ground: whether there is a ground to touch.
         axes: axis names in actuator order.
         qpos: (nu,) place of each axis' joint in `qpos`.
         dof: (nu,) place of each axis' joint in `qvel`.
@@ -34,12 +35,22 @@ class Plant:
 
     machine: Machine
     model: mujoco.MjModel
-    mjcf: str
+    ground: bool
     axes: tuple[str, ...]
     qpos: np.ndarray
     dof: np.ndarray
     rod_qpos: np.ndarray
     hydraulic: int
+
+    @functools.cached_property
+    def mjcf(self) -> str:
+        """The complete MJCF as text, with looks and the `home` keyframe, made when asked for."""
+        root = assemble(self.machine, self.model.opt.timestep, self.ground)
+        home = rest_state(self)
+        key = root.keyframe.add("key", name="home", qpos=home.qpos)
+        if self.model.na:
+            key.act = home.act
+        return mjcf_text(root)
 
 
 def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True) -> Plant:
@@ -58,9 +69,9 @@ def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True)
         RuntimeError: the native hydraulics cannot run with this MuJoCo.
     """
     install_hydraulics()
-    text = mjcf_text(assemble(machine, timestep, ground))
+    text = mjcf_text(assemble(machine, timestep, ground, looks=False))
     try:
-        model = _compile_without_looks(text)
+        model = mujoco.MjModel.from_xml_string(text)
     except ValueError as error:
         raise InputError(f"machine {machine.name}", f"does not compile: {error}") from None
     axes = tuple(actuator_order(machine))
@@ -69,22 +80,13 @@ def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True)
     return Plant(
         machine=machine,
         model=model,
-        mjcf=text,
+        ground=ground,
         axes=axes,
         qpos=np.array([j.qposadr[0] for j in joints], dtype=int),
         dof=np.array([j.dofadr[0] for j in joints], dtype=int),
         rod_qpos=np.array(rods, dtype=int),
         hydraulic=len(machine.hydraulic_axes),
     )
-
-
-def _compile_without_looks(text: str) -> mujoco.MjModel:
-    """Compile without what only a picture needs: placing it in every step doubles the cost."""
-    spec = mujoco.MjSpec.from_string(text)
-    seen = [geom for geom in spec.geoms if geom.contype == 0 and geom.conaffinity == 0]
-    for part in (*seen, *spec.cameras, *spec.lights):
-        spec.delete(part)
-    return spec.compile()
 
 
 def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoco.MjData:

@@ -1,0 +1,183 @@
+"""`hydrotele bench`: what a step, a scenario, a batch and a start cost, as ratios from one process."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from hydrotele.commands.console import notes, out, print_json, table
+from hydrotele.errors import InputError
+from hydrotele.machine_file import load_machine
+from hydrotele.output import write_text
+from hydrotele.run import run_scenario
+from hydrotele.scenario import load_scenario
+from hydrotele.simulate.plant import Plant, build_plant, rest_state
+
+STEPS = 1000
+SIMULATIONS = 256
+COMMAND = (0.2, 0.1, -0.1)
+
+
+def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json: bool) -> None:
+    """Measure, print, and save or compare.
+
+    Args:
+        save: file for the figures, or None.
+        compare: file with earlier figures, or None.
+        quick: fewer repetitions.
+        as_json: print JSON only.
+
+    Raises:
+        InputError: the file to compare with cannot be read.
+    """
+    earlier = _read(compare) if compare else None
+    figures = measure(5 if quick else 25)
+    if save:
+        write_text(save, json.dumps(figures, indent=2) + "\n")
+    if as_json:
+        print_json(figures)
+        return
+    _print(figures, earlier)
+
+
+def measure(repeats: int) -> dict:
+    """All figures; times are the best of `repeats`, taken in turns so that ratios hold.
+
+    Args:
+        repeats: number of turns.
+
+    Returns:
+        mechanism_us, hydraulics_us, ratio, scenario_realtime_factor, batch_steps_per_s by thread
+        count, batch_scaling, help_s, run_s.
+    """
+    notes.print("mechanism with and without hydraulics ...", style="dim")
+    plant = build_plant(load_machine("cat215", "none"))
+    bare, full = best_of(repeats, [_bare_stepper(plant), _full_stepper(plant)])
+    notes.print("whole scenario ...", style="dim")
+    factor = max(_scenario_factor() for _ in range(1 + repeats // 5))
+    notes.print("batches ...", style="dim")
+    one, two = best_of(max(3, repeats // 3), [_batch_stepper(plant, n) for n in (1, 2)])
+    notes.print("start-up ...", style="dim")
+    steps = SIMULATIONS * STEPS / 5
+    return {
+        "mechanism_us": round(bare / STEPS * 1e6, 3),
+        "hydraulics_us": round(full / STEPS * 1e6, 3),
+        "ratio": round(full / bare, 4),
+        "scenario_realtime_factor": round(factor, 1),
+        "batch_steps_per_s": {"1": round(steps / one), "2": round(steps / two)},
+        "batch_scaling": round(one / two, 3),
+        "help_s": round(min(_start("--help") for _ in range(3)), 3),
+        "run_s": round(
+            min(_start("run", "excitation", "--set", "duration=1.0", "--no-review") for _ in range(2)), 3
+        ),
+    }  # fmt: skip
+
+
+def best_of(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:
+    """Shortest time of each job [s], the jobs taken in turns."""
+    best = [float("inf")] * len(jobs)
+    for _ in range(repeats):
+        best = [min(b, job()) for b, job in zip(best, jobs, strict=True)]
+    return best
+
+
+def _full_stepper(plant: Plant) -> Callable[[], float]:
+    start = rest_state(plant)
+    start.ctrl[:] = COMMAND
+    return _stepper(plant.model, start)
+
+
+def _bare_stepper(plant: Plant) -> Callable[[], float]:
+    """The same mechanism with its actuators switched off, coasting without gravity."""
+    model = build_plant(plant.machine).model
+    model.actuator_dyntype[:] = mujoco.mjtDyn.mjDYN_NONE
+    model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_NONE
+    model.opt.gravity[:] = 0.0
+    start = rest_state(plant)
+    start.qvel[plant.dof[0]] = 0.1
+    return _stepper(model, start)
+
+
+def _stepper(model: mujoco.MjModel, start: mujoco.MjData) -> Callable[[], float]:
+    data = mujoco.MjData(model)
+
+    def job() -> float:
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = start.qpos, start.qvel, start.ctrl
+        data.act[:] = start.act
+        begin = time.perf_counter()
+        mujoco.mj_step(model, data, nstep=STEPS)
+        return time.perf_counter() - begin
+
+    return job
+
+
+def _batch_stepper(plant: Plant, threads: int) -> Callable[[], float]:
+    start = rest_state(plant)
+    batch = Batch(plant.model, SIMULATIONS, nthread=threads)
+    commands = np.random.default_rng(0).uniform(-0.3, 0.3, (SIMULATIONS, plant.model.nu))
+
+    def job() -> float:
+        batch.qpos[:], batch.qvel[:], batch.act[:] = start.qpos, start.qvel, start.act
+        batch.ctrl[:] = commands
+        begin = time.perf_counter()
+        batch.step(nstep=STEPS // 5)
+        return time.perf_counter() - begin
+
+    return job
+
+
+def _scenario_factor() -> float:
+    """Real-time factor of the excitation scenario with control, sensors and log, all included."""
+    scenario = load_scenario("excitation")
+    begin = time.perf_counter()
+    run_scenario(scenario)
+    return scenario.duration / (time.perf_counter() - begin)
+
+
+def _start(*arguments: str) -> float:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "hydrotele.cli", *arguments]
+        if arguments[0] == "run":
+            command += ["--out", f"{folder}/run"]
+        begin = time.perf_counter()
+        subprocess.run(command, check=True, capture_output=True)
+        return time.perf_counter() - begin
+
+
+def _read(path: Path) -> dict:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"is no saved benchmark: {error}") from None
+
+
+def _flat(figures: dict) -> dict[str, float]:
+    flat = {}
+    for key, value in figures.items():
+        if isinstance(value, dict):
+            flat |= {f"{key}.{k}": v for k, v in value.items()}
+        else:
+            flat[key] = value
+    return flat
+
+
+def _print(figures: dict, earlier: dict | None) -> None:
+    columns = ["figure", "now", *(["earlier", "now / earlier"] if earlier else [])]
+    rows = table("hydrotele bench", *columns)
+    before = _flat(earlier) if earlier else {}
+    for key, value in _flat(figures).items():
+        cells = [key, f"{value:,}"]
+        if earlier:
+            old = before.get(key)
+            cells += [f"{old:,}", f"{value / old:.3f}"] if old else ["-", "-"]
+        rows.add_row(*cells)
+    out.print(rows)

@@ -1,0 +1,191 @@
+"""Command line: one thin function per command. Heavy imports stay inside the functions."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hydrotele.errors import InputError
+
+app = typer.Typer(
+    name="hydrotele",
+    help="Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+MachineName = Annotated[
+    str | None,
+    typer.Option("--machine", "-m", help="Shipped machine, or a folder with machine.yaml."),
+]
+ToolName = Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")]
+
+
+def _overrides(items: list[str]) -> dict[str, str]:
+    pairs = {}
+    for item in items:
+        key, sign, value = item.partition("=")
+        if not sign or not key:
+            raise InputError(f"--set {item}", "must be key=value, for example servo.lead=0.04")
+        pairs[key] = value
+    return pairs
+
+
+@app.command(
+    epilog="Examples:  hydrotele run zhu_up   |   hydrotele run my.yaml --out runs/a --set seed=7"
+)
+def run(
+    scenario: Annotated[str, typer.Argument(help="Shipped scenario, or a YAML file.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write; default runs/SCENARIO.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Override key=value; may be repeated.")
+    ] = None,
+    review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
+    json: Json = False,
+) -> None:
+    """Simulate a scenario; write both logs, the rerun recording, the summary and the MJCF."""
+    from hydrotele.commands.running import run_to_folder
+
+    run_to_folder(scenario, out, _overrides(set_ or []), review, json)
+
+
+@app.command(
+    epilog="Example:  hydrotele replay measured/fit_1.parquet --machine cat215 --out overlay"
+)
+def replay(
+    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv) or run folders.")],
+    machine: MachineName = None,
+    tool: ToolName = None,
+    timestep: Annotated[float, typer.Option(help="Physics step [s].")] = 1.0e-3,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the overlay plot and recording.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Drive the model with logged commands from the logged initial state; print the differences."""
+    from hydrotele.commands.replaying import replay_logs
+
+    replay_logs(logs, machine, tool, timestep, out, json)
+
+
+@app.command(
+    epilog="Examples:  hydrotele review runs/zhu_up   |   hydrotele review a.parquet b.parquet"
+)
+def review(
+    log: Annotated[Path, typer.Argument(help="Run folder or log file.")],
+    log2: Annotated[Path | None, typer.Argument(help="Second one, on the same clock.")] = None,
+    machine: MachineName = None,
+    tool: ToolName = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Recording to write.")] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve the web viewer.")] = False,
+    port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
+    screenshot: Annotated[
+        Path | None, typer.Option("--screenshot", help="Write a PNG of the viewer, headless.")
+    ] = None,
+) -> None:
+    """Look at a run: the machine moving in 3D, joints, pressures, flows and forces, in rerun."""
+    from hydrotele.commands.reviewing import review_logs
+
+    review_logs(log, log2, machine, tool, out, serve, port, screenshot)
+
+
+@app.command("list", epilog="Example:  hydrotele list scenarios --json")
+def list_(
+    what: Annotated[
+        str, typer.Argument(help="machines, scenarios, effects, or nothing for all.")
+    ] = "all",
+    json: Json = False,
+) -> None:
+    """List what is shipped: machines with their tools, scenarios, effects."""
+    from hydrotele.commands.catalogue import list_things
+
+    list_things(what, json)
+
+
+@app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
+def validate(
+    files: Annotated[list[Path], typer.Argument(help="Machines, scenarios or logs.")],
+    json: Json = False,
+) -> None:
+    """Check a machine, a scenario or a log; say what is wrong and where."""
+    from hydrotele.commands.catalogue import validate_files
+
+    validate_files(files, json)
+
+
+@app.command(epilog="Example:  hydrotele export cat215 --tool bucket --out scene.xml")
+def export(
+    machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
+    tool: ToolName = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="MJCF file; default stdout.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", help="Write a PNG of the machine instead.")
+    ] = None,
+    camera: Annotated[str, typer.Option(help="Camera of the picture.")] = "overview",
+) -> None:
+    """Write the complete MJCF of a machine, or a picture of it."""
+    from hydrotele.commands.catalogue import export_machine
+
+    export_machine(machine, tool, out, picture, camera)
+
+
+@app.command(epilog="Example:  hydrotele bench --save base.json; hydrotele bench --compare base.json")
+def bench(
+    save: Annotated[Path | None, typer.Option("--save", help="Write the figures.")] = None,
+    compare: Annotated[Path | None, typer.Option("--compare", help="Compare with these.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions.")] = False,
+    json: Json = False,
+) -> None:
+    """Measure speed: mechanism, hydraulics, a whole scenario, batches, start-up."""
+    from hydrotele.bench import run_benchmarks
+
+    run_benchmarks(save, compare, quick, json)
+
+
+@app.command(epilog="Example:  hydrotele demo --out demo")
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("demo"),
+) -> None:
+    """Run an excavator, replay its log, draw the pictures: a tour of what is there."""
+    from hydrotele.commands.demo import run_demo
+
+    run_demo(out)
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+) -> None:
+    if version:
+        import hydrotele
+
+        typer.echo(hydrotele.__version__)
+        raise typer.Exit
+
+
+def main() -> None:
+    """Entry point: errors of the user exit with 2, failed simulations with 3, interrupts with 130."""
+    try:
+        app()
+    except InputError as error:
+        typer.secho("error ", fg="red", bold=True, err=True, nl=False)
+        typer.echo(str(error), err=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        typer.echo("interrupted", err=True)
+        sys.exit(130)
+    except RuntimeError as error:
+        if type(error).__name__ != "SimulationFailed":
+            raise
+        typer.echo(f"simulation failed: {error}", err=True)
+        sys.exit(3)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What the commands of `hydrotele` do; `cli.py` only declares them."""

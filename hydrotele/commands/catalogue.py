@@ -1,0 +1,162 @@
+"""`hydrotele list`, `validate` and `export`: what there is, and whether a file is right."""
+
+from pathlib import Path
+
+from hydrotele.commands.console import notes, out, print_json, table
+from hydrotele.datafile import read_yaml, suggest
+from hydrotele.errors import InputError
+from hydrotele.machine_file import load_machine, machine_path, shipped_machines
+
+_KINDS = ("machines", "scenarios", "effects")
+
+
+def list_things(what: str, as_json: bool) -> None:
+    """List machines, scenarios, effects, or all of them.
+
+    Raises:
+        InputError: there is no such list.
+    """
+    if what not in (*_KINDS, "all"):
+        raise InputError(f"list {what}", suggest(what, [*_KINDS, "all"]))
+    wanted = _KINDS if what == "all" else (what,)
+    tables = {"machines": _machines, "scenarios": _scenarios, "effects": _effects}
+    data = {kind: tables[kind]() for kind in wanted}
+    if as_json:
+        print_json(data if what == "all" else data[what])
+        return
+    for kind, rows in data.items():
+        columns = [key for key in rows[0] if key != "parameters"] if rows else ["name"]
+        shown = table(kind, *columns)
+        for column in shown.columns:
+            column.justify = "left"
+        for row in rows:
+            cells = (row[c] for c in columns)
+            shown.add_row(*(", ".join(c) if isinstance(c, list) else str(c) for c in cells))
+        out.print(shown)
+
+
+def _machines() -> list[dict]:
+    rows = []
+    for name in shipped_machines():
+        data, _ = read_yaml(machine_path(name))
+        tools = list(data.get("tools") or ["none"])
+        axes = list(data.get("axes") or {})
+        rows.append(
+            {"name": name, "axes": axes, "tools": tools, "description": data.get("description", "")}
+        )
+    return rows
+
+
+def _scenarios() -> list[dict]:
+    from hydrotele.scenario import scenario_path, shipped_scenarios
+
+    rows = []
+    for name in shipped_scenarios():
+        data, _ = read_yaml(scenario_path(name))
+        keys = ("machine", "tool", "duration", "description")
+        rows.append({"name": name, **{k: data.get(k, "") for k in keys}})
+    return rows
+
+
+def _effects() -> list[dict]:
+    from hydrotele.effects import EFFECTS
+
+    machine = load_machine("cat215", "bucket")
+    return [
+        {
+            "name": effect.name,
+            "what": effect.sentence,
+            "locations": list(effect.locations(machine)),
+            "parameters": {
+                n: {"unit": p.unit, "low": p.low, "high": p.high}
+                for n, p in effect.parameters.items()
+            },
+        }
+        for effect in EFFECTS.values()
+    ]
+
+
+def validate_files(paths: list[Path], as_json: bool) -> None:
+    """Check machines (with all their tools), scenarios and logs.
+
+    Raises:
+        InputError: the first thing that is wrong.
+    """
+    checked = []
+    for path in paths:
+        kind, said = _validate(path)
+        checked.append({"file": str(path), "kind": kind, "valid": True, "contents": said})
+        if not as_json:
+            out.print(f"[green]valid[/] {kind} {path}: {said}")
+    if as_json:
+        print_json(checked)
+
+
+def _validate(path: Path) -> tuple[str, str]:
+    if path.suffix in (".parquet", ".csv"):
+        from hydrotele.log import load_log
+
+        log = load_log(path)
+        return "log", f"{len(log)} rows at {log.rate:g} Hz, {len(log.columns)} columns"
+    if path.is_dir() and (path / "summary.json").is_file():
+        return _validate(path / "measured.parquet")
+    from hydrotele.scenario import load_scenario, shipped_scenarios
+
+    name = str(path)
+    if path.is_dir() or name in shipped_machines():
+        return "machine", _check_machine(path)
+    if name in shipped_scenarios() or (path.is_file() and "pilot" in read_yaml(path)[0]):
+        return "scenario", _check_scenario(load_scenario(path))
+    if path.is_file():
+        return "machine", _check_machine(path)
+    names = [*shipped_machines(), *shipped_scenarios()]
+    raise InputError(path, f"is no file, machine or scenario; {suggest(name, names)}")
+
+
+def _check_machine(path: Path) -> str:
+    from hydrotele.kinematics.from_machine import axis_linkage
+    from hydrotele.simulate.plant import build_plant, rest_state
+
+    first = load_machine(path)
+    for tool in first.tools:
+        machine = load_machine(path, tool)
+        plant = build_plant(machine)
+        rest_state(plant)
+        for axis in machine.axes:
+            axis_linkage(machine, axis)
+    tools = "" if first.tools == ("none",) else f", tools {', '.join(first.tools)}"
+    return f"axes {', '.join(first.axes)}{tools}; all assemble and stand at rest at home"
+
+
+def _check_scenario(scenario) -> str:
+    from hydrotele.run import prepare
+
+    plan = prepare(scenario).plan
+    notes_ = f"; {'; '.join(plan.notes)}" if plan.notes else ""
+    return f"{scenario.duration:g} s of {scenario.machine}, {scenario.pilot.kind} pilot{notes_}"
+
+
+def export_machine(
+    name: str, tool: str | None, target: Path | None, picture: Path | None, camera: str
+) -> None:
+    """Write a machine's complete MJCF (default: to stdout), or a picture of it at home.
+
+    Raises:
+        InputError: the machine is not usable, or pictures cannot be rendered here.
+    """
+    machine = load_machine(name, tool)
+    if picture:
+        from hydrotele.show.picture import render_picture
+
+        render_picture(machine, picture, camera=camera)
+        notes.print(f"written to {picture}")
+        return
+    from hydrotele.output import write_text
+    from hydrotele.simulate.plant import build_plant
+
+    text = build_plant(machine).mjcf
+    if target:
+        write_text(target, text)
+        notes.print(f"written to {target}")
+    else:
+        print(text)

@@ -1,0 +1,66 @@
+"""Printing for people and for scripts."""
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+Progress = Callable[[float, float], None]
+
+out = Console(highlight=False)
+notes = Console(stderr=True, highlight=False)
+
+
+def print_json(data: Any) -> None:
+    """Print data as JSON; numbers that are not finite become null."""
+    print(json.dumps(plain(data), indent=2))
+
+
+def plain(data: Any) -> Any:
+    """Data with Python numbers only, NaN and infinity as None."""
+    if isinstance(data, dict):
+        return {str(key): plain(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple, np.ndarray)):
+        return [plain(value) for value in data]
+    if isinstance(data, (float, np.floating)):
+        return float(data) if np.isfinite(data) else None
+    if isinstance(data, np.integer):
+        return int(data)
+    return data
+
+
+def table(title: str, *columns: str) -> Table:
+    """A table whose columns after the first are right-aligned."""
+    made = Table(title=title, title_justify="left", header_style="bold")
+    for place, column in enumerate(columns):
+        made.add_column(column, justify="left" if place == 0 else "right")
+    return made
+
+
+@contextlib.contextmanager
+def progress_bar(label: str, quiet: bool = False) -> Iterator[Progress | None]:
+    """A bar with simulated time and real-time factor on stderr; None where nobody watches."""
+    if quiet or not notes.is_terminal:
+        yield None
+        return
+    import time
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    text = TextColumn("{task.completed:6.1f} / {task.total:.1f} s  {task.fields[factor]}")
+    bar = Progress(
+        TextColumn(label), BarColumn(), text, TimeRemainingColumn(), console=notes, transient=True
+    )
+    with bar:
+        task = bar.add_task(label, total=1.0, factor="")
+        begin = time.perf_counter()
+
+        def update(done: float, total: float) -> None:
+            factor = done / max(time.perf_counter() - begin, 1e-6)
+            bar.update(task, completed=done, total=total, factor=f"{factor:.0f} x real time")
+
+        yield update

@@ -1,0 +1,62 @@
+"""Logs and their machines, as a user names them: run folders, log files, shipped machines."""
+
+from pathlib import Path
+
+from hydrotele.errors import InputError
+from hydrotele.log import Log, load_log
+from hydrotele.machine import Machine
+from hydrotele.machine_file import MACHINE_FILE, load_machine, machine_path
+
+
+def log_path(path: Path, which: str = "measured") -> Path:
+    """The log file that a path means: itself, or the one of that kind in a run folder.
+
+    Raises:
+        InputError: neither is there.
+    """
+    if path.is_dir():
+        inside = path / f"{which}.parquet"
+        if inside.is_file():
+            return inside
+        raise InputError(path, f"holds no {which}.parquet; give a log file or a run folder")
+    return path
+
+
+def open_log(
+    path: Path, machine: str | None = None, tool: str | None = None, which: str = "measured"
+) -> tuple[Machine, Log]:
+    """A log with its machine.
+
+    The machine is the one named, else the `machine.yaml` beside the log, else the shipped one that
+    the log's metadata names.
+
+    Args:
+        path: log file or run folder.
+        machine: name or folder of a machine, None to find it.
+        tool: its tool, None for the log's.
+        which: `measured` or `truth`, for run folders.
+
+    Returns:
+        (machine, log).
+
+    Raises:
+        InputError: the log is not usable, or no machine is known.
+    """
+    file = log_path(path, which)
+    beside = file.parent / MACHINE_FILE
+    chosen = machine or (str(beside) if beside.is_file() else None)
+    log = load_log(file, aliases=_aliases(chosen)) if chosen else load_log(file)
+    if chosen is None:
+        chosen = log.metadata.get("machine")
+        if not chosen:
+            raise InputError(file, "its metadata names no machine: give --machine")
+    if tool is None and not beside.is_file():
+        tool = log.metadata.get("tool")
+    return load_machine(chosen, tool), log
+
+
+def _aliases(machine: str) -> dict[str, str]:
+    from hydrotele.datafile import read_yaml
+
+    columns = read_yaml(machine_path(machine))[0].get("log_columns")
+    return dict(columns) if isinstance(columns, dict) else {}

@@ -1,0 +1,60 @@
+"""`hydrotele review`: a recording of one or two logs, opened, served or photographed."""
+
+import tempfile
+from pathlib import Path
+
+from hydrotele.commands.console import notes, out
+from hydrotele.commands.opening import open_log
+
+
+def review_logs(
+    first: Path, second: Path | None, machine: str | None, tool: str | None, target: Path | None,
+    serve: bool, port: int, screenshot: Path | None,
+) -> None:  # fmt: skip
+    """Make a recording and show it.
+
+    Args:
+        first: run folder or log file.
+        second: another one on the same clock, or None.
+        machine: machine of both logs, None to find them.
+        tool: its tool.
+        target: recording to write; default is review.rrd in the run folder or a temporary file.
+        serve: serve the web viewer until interrupted.
+        port: of the web viewer.
+        screenshot: PNG to write, headless.
+
+    Raises:
+        InputError: a log, machine or viewer is not usable.
+    """
+    recording = _recording(first, second, machine, tool, target)
+    if screenshot:
+        from hydrotele.show.screenshot import take_screenshot
+
+        notes.print("taking a screenshot ...", style="dim")
+        take_screenshot(recording, screenshot)
+        out.print(f"written to [bold]{screenshot}[/]")
+    elif serve:
+        from hydrotele.show.serve import serve_recording
+
+        serve_recording(recording, port)
+    elif target is None:
+        from hydrotele.show.serve import open_viewer
+
+        open_viewer(recording)
+
+
+def _recording(first, second, machine, tool, target) -> Path:
+    from hydrotele.show.recording import write_recording
+
+    made = first / "review.rrd"
+    if second is None and target is None and made.is_file():
+        return made
+    which = "truth" if second is None and (first / "truth.parquet").is_file() else "measured"
+    entries = {which: open_log(first, machine, tool, which)}
+    if second is not None:
+        other = open_log(second, machine, tool, "measured")
+        entries = {"first": entries[which], "second": other}
+    path = target or Path(tempfile.mkdtemp(prefix="hydrotele_"), "review.rrd")
+    write_recording(path, entries)
+    out.print(f"recording: [bold]{path}[/]")
+    return path

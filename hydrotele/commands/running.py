@@ -1,0 +1,79 @@
+"""`hydrotele run`: a scenario into a folder."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from hydrotele.commands.console import notes, out, plain, print_json, progress_bar, table
+from hydrotele.log import save_log
+from hydrotele.machine_file import save_machine
+from hydrotele.output import check_target, whole_folder
+from hydrotele.run import Run, run_scenario
+from hydrotele.scenario import load_scenario, save_scenario
+
+
+def run_to_folder(
+    name: str, target: Path | None, overrides: dict[str, str], review: bool, as_json: bool
+) -> Path:
+    """Run a scenario and write everything into a folder, whole or not at all.
+
+    Args:
+        name: scenario name or file.
+        target: folder, default `runs/<scenario>`.
+        overrides: key path -> YAML text.
+        review: whether to write the rerun recording.
+        as_json: print the summary as JSON instead of a table.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: scenario, machine or target are not usable.
+        SimulationFailed: the simulation left the finite numbers.
+    """
+    scenario = load_scenario(name, overrides)
+    target = target or Path("runs", scenario.name)
+    check_target(target)
+    with progress_bar(f"run {scenario.name}", quiet=as_json) as progress:
+        result = run_scenario(scenario, progress)
+    with whole_folder(target) as folder:
+        write_run(result, folder, review)
+    if as_json:
+        print_json({**result.summary, "folder": str(target)})
+    else:
+        _print_summary(result.summary)
+        out.print(f"written to [bold]{target}[/]")
+    return target
+
+
+def write_run(result: Run, folder: Path, review: bool = True) -> None:
+    """Write logs, summary, scenario, machine, MJCF and recording of a run into a folder."""
+    save_log(result.measured, folder / "measured.parquet")
+    save_log(result.truth, folder / "truth.parquet")
+    save_scenario(result.scenario, folder / "scenario.yaml")
+    (folder / "machine.xml").write_text(result.plant.mjcf)
+    save_machine(result.plant.machine, folder / "machine.yaml")
+    if review:
+        from hydrotele.show.recording import write_recording
+
+        notes.print("writing review.rrd ...", style="dim")
+        write_recording(folder / "review.rrd", {"truth": (result.plant.machine, result.truth)})
+    (folder / "summary.json").write_text(json.dumps(plain(result.summary), indent=2) + "\n")
+
+
+def _print_summary(summary: dict[str, Any]) -> None:
+    rows = table(f"{summary['scenario']} ({summary['machine']}, tool {summary['tool']})", "", "")
+    rows.show_header = False
+    rows.add_row("simulated", f"{summary['simulated_seconds']:g} s")
+    rows.add_row("real-time factor", f"{summary['realtime_factor']:.0f}")
+    rows.add_row("largest pin opening", f"{summary['largest_pin_opening_mm']:.4f} mm")
+    rows.add_row("largest contact force", f"{summary['largest_contact_force_N'] / 1e3:.1f} kN")
+    for key, label in (("flow_balance", "flow balance"), ("energy_balance", "energy balance")):
+        value = summary["balance"][key]
+        rows.add_row(label, "-" if value is None else f"{value:.1e}")
+    for name, error in summary["tracking"].items():
+        unit, factor = ("mm", 1e3) if name in ("tip_r", "tip_z") else ("deg", 57.29577951308232)
+        rows.add_row(f"tracking {name}", f"rms {error['rms'] * factor:.2f}, max {error['max'] * factor:.2f} {unit}")
+    out.print(rows)
+    for note in summary["notes"]:
+        out.print(f"[yellow]note[/] {note}")

@@ -1,0 +1,34 @@
+"""Child process of `picture`: draws one frame with the OpenGL that MUJOCO_GL names.
+
+Usage: `python offscreen.py FOLDER`, with `model.mjb` and `task.npz` there; writes `pixels.npy`.
+"""
+
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+
+def main(folder: Path) -> None:
+    """Draw the task of a folder."""
+    model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
+    task = np.load(folder / "task.npz")
+    width, height = (int(n) for n in task["size"])
+    data = mujoco.MjData(model)
+    data.qpos[:] = task["qpos"]
+    mujoco.mj_fwdPosition(model, data)
+    camera = mujoco.MjvCamera()
+    if "fixed" in task:
+        camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, int(task["fixed"])
+    else:
+        camera.lookat[:] = task["lookat"]
+        camera.distance, camera.azimuth = float(task["distance"]), float(task["azimuth"])
+        camera.elevation = float(task["elevation"])
+    with mujoco.Renderer(model, height, width, max_geom=max(10000, 2 * model.ngeom)) as renderer:
+        renderer.update_scene(data, camera)
+        np.save(folder / "pixels.npy", renderer.render())
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

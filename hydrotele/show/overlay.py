@@ -1,0 +1,189 @@
+"""Plots on paper: a log at a glance, and measured against simulated with the difference below."""
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hydrotele.errors import InputError
+from hydrotele.log import Log
+from hydrotele.show.channels import (
+    TITLES,
+    Trace,
+    colours,
+    common_channels,
+    difference,
+    grouped,
+    padded_range,
+    shown,
+)
+from hydrotele.show.output import replacing
+from hydrotele.signals import parse_channel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COMPARED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
+_DPI = 100
+_CELL, _PANEL = (560, 270), (820, 220)  # pixel
+_HEADER, _FOOTER, _LEFT, _RIGHT = 84, 56, 72, 28  # pixel
+_STYLE = {
+    "font.size": 9.5,
+    "axes.titlesize": 10.5,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.edgecolor": "0.5",
+    "grid.color": "0.88",
+    "grid.linewidth": 0.7,
+}
+_FIRST, _OTHER, _GAP = "#1f4e79", "#f08a00", "#a32a22"
+
+
+def plot_overlay(
+    first: Log,
+    other: Log,
+    path: str | os.PathLike,
+    names: tuple[str, str] = ("measured", "simulated"),
+    kinds: Sequence[str] = COMPARED,
+    size: tuple[int, int] | None = None,
+    title: str = "",
+) -> None:
+    """Draw two logs over each other, one cell per channel, with `first - other` below.
+
+    Args:
+        first: the log whose clock counts.
+        other: the one to compare with; interpolated linearly.
+        path: the PNG to write, all or nothing.
+        names: what the legend calls them.
+        kinds: kinds of channels to draw, where both logs have them.
+        size: width and height [pixel]; default grows with the number of channels.
+        title: heading; default is made of the logs' names.
+
+    Raises:
+        InputError: they have no such channel in common or share no time, or the file cannot be
+            written.
+    """
+    groups = grouped(common_channels(first, other))
+    rows = [groups[kind] for kind in kinds if kind in groups]
+    if not rows:
+        raise InputError(other.source, f"has no {', '.join(kinds)} in common with {first.source}")
+    axes_shown = [parse_channel(name).axis for some in rows for name in some]
+    columns = [axis for axis in dict.fromkeys(axes_shown) if axis] or [""]
+    default = len(columns) * _CELL[0], len(rows) * _CELL[1] + _HEADER + _FOOTER
+    runs = " and ".join(dict.fromkeys(log.name for log in (first, other)))
+    with _drawing(path, size or default) as figure:
+        grid = _grid(figure, len(rows), len(columns))
+        for row, channels in enumerate(rows):
+            for name in channels:
+                axis = parse_channel(name).axis
+                place = grid[row, columns.index(axis)] if axis else grid[row, :]
+                _draw_pair(figure, place, first, other, name)
+        keys = [*zip(names, (_FIRST, _OTHER), strict=True), (" - ".join(names), _GAP)]
+        _heading(figure, title or f"{' and '.join(names)}: {runs}", keys)
+
+
+def plot_log(
+    log: Log, path: str | os.PathLike, size: tuple[int, int] | None = None, title: str = ""
+) -> None:
+    """Draw all channels of a log, one panel per kind, one colour per axis.
+
+    Args:
+        log: the log.
+        path: the PNG to write, all or nothing.
+        size: width and height [pixel]; default grows with the number of panels.
+        title: heading; default is the log's name.
+
+    Raises:
+        InputError: the log has no channel, or the file cannot be written.
+    """
+    groups = grouped(log.columns)
+    if not groups:
+        raise InputError(log.source, "has no channel to draw")
+    columns = 2 if len(groups) > 4 else 1
+    rows = -(-len(groups) // columns)
+    default = columns * _PANEL[0], rows * _PANEL[1] + _HEADER + _FOOTER
+    palette = {axis: tuple(0.85 * c / 255 for c in rgb) for axis, rgb in colours([log]).items()}
+    with _drawing(path, size or default) as figure:
+        grid = _grid(figure, rows, columns)
+        for place, (kind, names) in enumerate(groups.items()):
+            axes = figure.add_subplot(grid[place % rows, place // rows])
+            traces = [shown(log, name) for name in names]
+            for trace in traces:
+                axes.plot(log.time, trace.values, color=palette[trace.channel.axis], lw=1.0)
+            _finish(axes, log.time, traces, TITLES.get(kind, kind))
+            axes.set_xlabel("time [s]" if place % rows == rows - 1 else "")
+        _heading(figure, title or log.name, [(axis, c) for axis, c in palette.items() if axis])
+
+
+def _draw_pair(figure: "Figure", place, first: Log, other: Log, name: str) -> None:
+    """Both logs above, their difference below."""
+    cell = place.subgridspec(2, 1, height_ratios=(3, 1.1), hspace=0.12)
+    upper = figure.add_subplot(cell[0])
+    lower = figure.add_subplot(cell[1], sharex=upper)
+    ours, theirs = shown(first, name), shown(other, name)
+    upper.plot(first.time, ours.values, color=_FIRST, lw=1.9)
+    upper.plot(other.time, theirs.values, color=_OTHER, lw=0.9)
+    what = TITLES.get(ours.channel.kind, ours.channel.kind)
+    heading = f"{ours.channel.axis} {what}" if ours.channel.axis else what
+    _finish(upper, first.time, [ours, theirs], heading)
+    upper.tick_params(labelbottom=False)
+    time, gap = difference(first, other, name)
+    lower.plot(time, gap.values, color=_GAP, lw=0.8)
+    _finish(lower, first.time, [gap], "")
+    rms = float(np.sqrt(np.mean(gap.values**2)))
+    upper.set_title(f"rms difference {rms:.3g} {gap.unit}", loc="right", fontsize=8.5, color=_GAP)
+    lower.set_xlabel("time [s]")
+
+
+def _finish(axes: "Axes", time: np.ndarray, traces: Sequence[Trace], title: str) -> None:
+    """Title, limits and units of one plot."""
+    units = dict.fromkeys("" if trace.unit == "1" else trace.unit for trace in traces)
+    axes.set_title(title)
+    axes.set_ylabel(", ".join(units))
+    axes.yaxis.set_label_coords(-0.105, 0.5)
+    axes.set_xlim(time[0], time[-1])
+    axes.set_ylim(padded_range([trace.values for trace in traces], traces[0].unit))
+    axes.locator_params(axis="y", nbins=5 if title else 3)
+
+
+@contextlib.contextmanager
+def _drawing(path: str | os.PathLike, size: tuple[int, int]) -> Iterator["Figure"]:
+    """Give a figure of a size [pixel]; it becomes the PNG at the end."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    # No pyplot: neither a window nor a global state is wanted.
+    with replacing(path, ".png") as part, matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(size[0] / _DPI, size[1] / _DPI), dpi=_DPI, facecolor="white")
+        FigureCanvasAgg(figure)
+        yield figure
+        figure.savefig(part, dpi=_DPI)
+
+
+def _grid(figure: "Figure", rows: int, columns: int):
+    width, height = figure.get_size_inches() * _DPI
+    return figure.add_gridspec(
+        rows, columns, left=_LEFT / width, right=1.0 - _RIGHT / width, bottom=_FOOTER / height,
+        top=1.0 - _HEADER / height, wspace=0.2, hspace=0.42,
+    )  # fmt: skip
+
+
+def _heading(figure: "Figure", title: str, keys: Sequence[tuple[str, object]]) -> None:
+    """Title and one legend for all plots."""
+    from matplotlib.lines import Line2D
+
+    width, height = figure.get_size_inches() * _DPI
+    figure.text(
+        _LEFT / width, 1.0 - 22 / height, title, fontsize=14, fontweight="bold", va="center"
+    )
+    figure.legend(
+        handles=[Line2D([], [], color=colour, lw=2.4, label=name) for name, colour in keys],
+        loc="center right", bbox_to_anchor=(1.0 - _RIGHT / width, 1.0 - 22 / height),
+        ncols=len(keys), frameon=False, borderaxespad=0.0,
+    )  # fmt: skip

@@ -1,0 +1,114 @@
+"""A picture of a machine, drawn by MuJoCo without a screen.
+
+A child process draws it, because the OpenGL of a process can be chosen only once, and a faulty
+driver may take the process with it.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from hydrotele.errors import InputError
+from hydrotele.machine import Machine
+from hydrotele.show.looks import bounds
+from hydrotele.show.output import replacing
+from hydrotele.show.pose import model_with_looks
+from hydrotele.simulate.closure import close_loops
+
+_BACKENDS = ("egl", "osmesa")
+_PACKAGES = "libegl1 and libgl1-mesa-dri, or libosmesa6"
+_OVERVIEW, _FREE = "overview", "free"
+_FIELD_OF_VIEW = 45.0  # degree, that of MuJoCo's free camera
+_TIMEOUT = 120.0  # s
+
+
+def render_picture(
+    machine: Machine,
+    path: str | os.PathLike,
+    joints: Mapping[str, float] | None = None,
+    camera: str = _OVERVIEW,
+    size: tuple[int, int] = (1600, 1000),
+) -> None:
+    """Draw a machine into a PNG file.
+
+    Args:
+        machine: the machine.
+        path: the picture to write, all or nothing.
+        joints: joint name -> angle [rad] or position [m]; others at home.
+        camera: a camera of the machine, or `free` for one that shows all of it; `overview` is
+            that too where the machine has no camera of this name.
+        size: width and height [pixel].
+
+    Raises:
+        InputError: the linkages do not close there, there is no such camera, OpenGL cannot draw
+            without a screen (says what to install), or the file cannot be written.
+    """
+    model = model_with_looks(machine)
+    data = mujoco.MjData(model)
+    close_loops(machine, model, data, dict(joints or {}))
+    mujoco.mj_fwdPosition(model, data)
+    cameras = [model.camera(i).name for i in range(model.ncam)]
+    if camera == _OVERVIEW and _OVERVIEW not in cameras:
+        camera = _FREE
+    if camera not in (*cameras, _FREE):
+        raise InputError(f"camera {camera!r}", f"choose one of {', '.join((*cameras, _FREE))}")
+    view = _free_view(model, data, size) if camera == _FREE else {"fixed": cameras.index(camera)}
+    model.vis.global_.offwidth, model.vis.global_.offheight = size
+    model.vis.quality.offsamples = 8
+    model.vis.quality.shadowsize = 8192
+    with replacing(path, ".png") as part:
+        save_png(part, _draw(model, data.qpos, view, size))
+
+
+def save_png(path: Path, pixels: np.ndarray) -> None:
+    """Write pixels (height, width, 3) uint8 as PNG."""
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path, format="PNG")
+
+
+def _free_view(model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int]) -> dict:
+    """A camera from ahead, aside and above that shows all of the machine."""
+    low, high = bounds(model, data)
+    radius = 0.5 * float(np.linalg.norm(high - low))
+    narrow = np.radians(0.5 * _FIELD_OF_VIEW) * min(1.0, size[0] / size[1])
+    distance = 0.65 * radius / np.sin(narrow)
+    return {
+        "lookat": 0.5 * (low + high), "distance": distance, "azimuth": 222.0, "elevation": -16.0,
+    }  # fmt: skip
+
+
+def _draw(model: mujoco.MjModel, qpos: np.ndarray, view: dict, size: tuple[int, int]) -> np.ndarray:
+    """Pixels (height, width, 3) uint8, with the first OpenGL that works."""
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    backends = dict.fromkeys((*((wanted,) if wanted in _BACKENDS else ()), *_BACKENDS))
+    reasons = []
+    with tempfile.TemporaryDirectory(prefix="hydrotele_") as folder:
+        task, result = Path(folder, "task.npz"), Path(folder, "pixels.npy")
+        mujoco.mj_saveModel(model, str(Path(folder, "model.mjb")))
+        np.savez(task, qpos=qpos, size=size, **view)
+        for backend in backends:
+            environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+            worker = [sys.executable, str(Path(__file__).with_name("offscreen.py")), folder]
+            try:
+                done = subprocess.run(
+                    worker, env=environment, capture_output=True, text=True, timeout=_TIMEOUT
+                )
+            except subprocess.TimeoutExpired:
+                reasons.append(f"{backend}: no picture within {_TIMEOUT:.0f} s")
+                continue
+            if done.returncode == 0 and result.is_file():
+                return np.load(result)
+            said = done.stderr.strip().splitlines() or [f"ended with {done.returncode}"]
+            reasons.append(f"{backend}: {said[-1]}")
+    raise InputError(
+        "picture",
+        "OpenGL cannot draw without a screen; install its software drivers"
+        f" (Debian: {_PACKAGES}). {'; '.join(reasons)}",
+    )

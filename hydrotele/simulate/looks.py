@@ -1,0 +1,74 @@
+"""MJCF text with or without what only a picture needs.
+
+Hundreds of geoms that touch nothing double the cost of a step and make assembling slow, so physics
+leaves them out; masses do not come from geoms here.
+"""
+
+import xml.etree.ElementTree as ElementTree
+
+Element = ElementTree.Element
+
+
+def without_looks(root: Element) -> None:
+    """Remove geoms that touch nothing, meshes and materials, cameras and lights, in place.
+
+    Args:
+        root: the `mujoco` element of an MJCF file.
+    """
+    world = root.find("worldbody")
+    if world is None:
+        return
+    touching = _touching_by_class(root)
+    _prune(world, "main", touching)
+    kept = {geom.get("mesh") for geom in world.iter("geom")}
+    for asset in root.findall("asset"):
+        for element in list(asset):
+            if element.tag != "mesh" or element.get("name") not in kept:
+                asset.remove(element)
+    for geom in (*world.iter("geom"), *root.iter("geom")):
+        geom.attrib.pop("material", None)
+
+
+def name_geoms(root: Element) -> None:
+    """Give every unnamed geom a name made of its body's, in place.
+
+    `dm_control` searches the whole document for each unnamed element that it writes.
+    """
+    for body in root.iter("body"):
+        for number, geom in enumerate(body.findall("geom")):
+            if not geom.get("name"):
+                geom.set("name", f"{body.get('name', 'body')}_look{number}")
+
+
+def _touching_by_class(root: Element) -> dict[str, bool]:
+    """Class name -> whether its geoms can touch something by default."""
+    table: dict[str, bool] = {}
+
+    def walk(element: Element, name: str, contype: int, conaffinity: int) -> None:
+        geom = element.find("geom")
+        if geom is not None:
+            contype = int(geom.get("contype", contype))
+            conaffinity = int(geom.get("conaffinity", conaffinity))
+        table[name] = bool(contype or conaffinity)
+        for child in element.findall("default"):
+            walk(child, child.get("class", "main"), contype, conaffinity)
+
+    for top in root.findall("default"):
+        walk(top, top.get("class", "main"), 1, 1)
+    table.setdefault("main", True)
+    return table
+
+
+def _prune(body: Element, inherited: str, touching: dict[str, bool]) -> None:
+    childclass = body.get("childclass", inherited)
+    for element in list(body):
+        if element.tag == "geom":
+            default = touching.get(element.get("class", childclass), True)
+            stated = [element.get(key) for key in ("contype", "conaffinity")]
+            own = any(value not in (None, "0") for value in stated)
+            if not (own or (default and stated != ["0", "0"])):
+                body.remove(element)
+        elif element.tag in ("camera", "light"):
+            body.remove(element)
+        elif element.tag in ("body", "frame"):
+            _prune(element, childclass, touching)

@@ -1,0 +1,38 @@
+"""A small version of tools/random_commands.py (10^7 steps in full)."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "tools" / "random_commands.py"
+
+
+def run(*arguments):
+    return subprocess.run(
+        [sys.executable, str(SCRIPT), *arguments],
+        capture_output=True, text=True, cwd=ROOT, timeout=300, check=False,
+    )  # fmt: skip
+
+
+def test_random_commands_make_no_nan_and_no_warning():
+    result = run("--steps", "2e5", "--simulations", "32", "--reset", "1000")
+    assert result.returncode == 0, result.stdout + result.stderr
+    lines = result.stdout.splitlines()
+    assert {line.split(":")[0] for line in lines[:-1]} == {
+        "none", "bucket", "grapple", "grapple_log",
+    }  # fmt: skip
+    for line in lines[:-1]:
+        assert "NaN 0, warnings none" in line
+        gap = float(line.split("largest pin opening ")[1].split(" mm")[0])
+        assert 0 < gap < 0.1, "pins open by less than 0.1 mm"
+    assert int(lines[-1].split()[2]) >= 200_000
+
+
+@pytest.mark.parametrize("timestep", ["0.05"])
+def test_a_step_that_cannot_work_is_noticed(timestep):
+    # 20 steps per period of the boom, and the stick's 20 Hz not resolved at all
+    result = run("--tools", "none", "--steps", "2e4", "--simulations", "8", "--timestep", timestep)
+    assert result.returncode == 1, result.stdout
