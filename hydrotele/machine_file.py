@@ -72,7 +72,9 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
     data |= {"tool": tool, "tools": sorted(tools), "folder": str(path.parent.resolve())}
     others = [fragment for name, fragment in tools.items() if name != tool and fragment]
     kept = _bodies_of([data])
-    if not data.get("resolved"):
+    if data.get("resolved") and not (path.parent / str(data.get("mjcf"))).exists():
+        data["folder"] = str(models_folder().resolve())
+    elif not data.get("resolved"):
         data["removed_bodies"] = [name for name in _bodies_of(others) if name not in kept]
     _complete_links(data, path, lines)
     _resolve_drives(data, path, lines)
@@ -84,7 +86,8 @@ def save_machine(machine: Machine, path: str | Path) -> None:
 
     Args:
         machine: the machine.
-        path: file to write; its MJCF, if any, is referred to by absolute path.
+        path: file to write. A shipped MJCF is referred to by its place among the shipped models, so
+            that the file works with any installation; a user's by absolute path.
     """
     data = machine.model_dump(mode="json", exclude_defaults=True)
     tool = data.pop("tool", "none")
@@ -92,7 +95,10 @@ def save_machine(machine: Machine, path: str | Path) -> None:
         data.pop(key, None)
     data |= {"tool": tool, "tools": {tool: {}}, "resolved": True}
     if machine.mjcf:
-        data["mjcf"] = str(Path(machine.folder, machine.mjcf).resolve())
+        mjcf = Path(machine.folder, machine.mjcf).resolve()
+        shipped = models_folder().resolve()
+        inside = mjcf.is_relative_to(shipped)
+        data["mjcf"] = str(mjcf.relative_to(shipped) if inside else mjcf)
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 

@@ -80,7 +80,9 @@ def _write(folder: Path, name: str, machine, result: Replay) -> None:
     from hydrotele.show.recording import write_recording
 
     save_log(result.simulated, folder / f"{name}_simulated.parquet")
-    plot_overlay(result.measured, result.simulated, folder / f"{name}.png")
+    run = result.measured.metadata.get("run", name)
+    title = f"{machine.name}, {run}: measured and replayed"
+    plot_overlay(result.measured, result.simulated, folder / f"{name}.png", title=title)
     entries = {
         "measured": (machine, result.measured.without_truth()),
         "simulated": (machine, result.simulated.without_truth()),

@@ -117,8 +117,8 @@ def follow_loops(
 ) -> np.ndarray:
     """Poses of the whole machine along a motion of its independent joints.
 
-    The first row is closed by `close_loops`; each next one by Newton's method from the row before,
-    so that every linkage stays on its branch.
+    The first row is closed by `close_loops`, and so is each one after a jump; the others by Newton's
+    method from the row before. So every linkage stays on its branch.
 
     Args:
         machine: the machine.
@@ -143,8 +143,9 @@ def follow_loops(
     places = [model.joint(n).qposadr[0] for n in joints]
     poses = np.empty((len(values), model.nq))
     for row, target in enumerate(values):
+        near = row > 0 and np.abs(target - values[row - 1]).max() <= _STEP
         data.qpos[places] = target
-        if row == 0 or not _newton(model, data, following, _FOLLOWED):
+        if not (near and _newton(model, data, following, _FOLLOWED)):
             try:
                 close_loops(machine, model, data, dict(zip(joints, target, strict=True)))
             except InputError as error:

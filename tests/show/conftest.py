@@ -11,7 +11,7 @@ _ROWS = 50
 
 @pytest.fixture(scope="session")
 def machine():
-    """The machine with the most linkages: bucket, rocker and coupler close a second kind of loop."""
+    """The machine with the most linkages: bucket, rocker and coupler close a loop of four bars."""
     return load_machine("cat215", tool="bucket")
 
 
