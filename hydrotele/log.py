@@ -14,7 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele import signals
-from hydrotele.csv_import import Table, check_values, checked, lacks, lost_samples, read_csv
+from hydrotele.csv_import import (
+    Table,
+    check_values,
+    checked,
+    lacks,
+    lost_samples,
+    read_csv,
+)
 from hydrotele.errors import InputError
 
 

@@ -14,7 +14,8 @@ from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.signals import usual_unit
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
-from hydrotele.simulate.readout import Record, true_channels
+from hydrotele.simulate.readout import true_channels
+from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
 from hydrotele.simulate.sensors import noise_rms, sensor_set
 
 PREDICTED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
@@ -132,23 +133,18 @@ def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
 
 
 def _drive(plant: Plant, data, times, commands, steps, progress) -> Record:
-    model, rows = plant.model, len(times)
-    qpos, qvel = np.empty((rows, model.nq)), np.empty((rows, model.nv))
-    qacc, act = np.empty((rows, model.nv)), np.empty((rows, model.na))
-    tips = np.zeros((rows, 3 if plant.machine.arm else 0))
-    tip = model.site("tip").id if plant.machine.arm else -1
-    for row in range(rows):
-        data.ctrl[:] = commands[row]
-        mujoco.mj_forward(model, data)
-        qpos[row], qvel[row], qacc[row], act[row] = data.qpos, data.qvel, data.qacc, data.act
-        if tip >= 0:
-            tips[row] = data.site_xpos[tip]
+    recorder = Recorder(plant, len(times))
+    recorder.command[:] = commands
+    begin_leapfrog(plant.model, data)
+    for row, time in enumerate(times):
+        recorder.take(row, time, data)
         if progress and row % 100 == 0:
-            progress(times[row] - times[0], times[-1] - times[0])
-        mujoco.mj_step(model, data, nstep=steps)
+            progress(time - times[0], times[-1] - times[0])
+        data.ctrl[:] = commands[row]
+        mujoco.mj_step(plant.model, data, nstep=steps)
     if progress:
         progress(times[-1] - times[0], times[-1] - times[0])
-    return Record(times, qpos, qvel, qacc, act, commands, np.zeros((rows, 3)), tips)
+    return recorder.record()
 
 
 def _differences(log: Log, simulated: Log, machine: Machine) -> dict[str, ChannelDifference]:

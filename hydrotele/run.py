@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 import hydrotele
+from hydrotele.datafile import suggest
 from hydrotele.effects import apply_effect
 from hydrotele.errors import InputError
 from hydrotele.log import Log
@@ -20,20 +21,22 @@ from hydrotele.machine_file import load_machine
 from hydrotele.operate.plan import Plan, make_plan
 from hydrotele.operate.resolved_motion import pose_to_joints
 from hydrotele.operate.servo import drive_references, servo_numbers, servo_step
-from hydrotele.scenario import Scenario
+from hydrotele.scenario import Scenario, own_machine
 from hydrotele.simulate.audit import audit, full_state
 from hydrotele.simulate.circuit import ACTIVATIONS, circuit_scratch
 from hydrotele.simulate.closure import pin_opening
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
-from hydrotele.simulate.readout import Record, ground_force, read_feedback, true_channels
-from hydrotele.simulate.sensors import channel_sensor, measure, sensor_errors, sensor_set
+from hydrotele.simulate.readout import read_feedback, true_channels
+from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
+from hydrotele.simulate.sensors import (
+    channel_sensor,
+    measure,
+    sensor_errors,
+    sensor_set,
+)
 
 AUDIT_SECONDS = 5.0
 Progress = Callable[[float, float], None]
-
-
-class SimulationFailed(RuntimeError):
-    """The simulation left the finite numbers; the message holds the last states."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,9 +66,7 @@ def scenario_machine(scenario: Scenario) -> Machine:
     Raises:
         InputError: unknown machine, tool, effect or location.
     """
-    path = Path(scenario.folder, scenario.machine)
-    found = path if scenario.folder and (path.is_dir() or path.is_file()) else scenario.machine
-    machine = load_machine(found, scenario.tool)
+    machine = load_machine(own_machine(scenario) or scenario.machine, scenario.tool)
     for planted in scenario.effects:
         machine = apply_effect(machine, planted.name, planted.location, planted.parameters)
     return machine
@@ -89,7 +90,7 @@ def prepare(scenario: Scenario) -> Prepared:
     sensor_set(machine, scenario.sensors)
     plant = build_plant(machine, scenario.timestep, scenario.ground)
     data, start = _start(plant, scenario)
-    times = np.arange(round(scenario.duration * scenario.control_rate)) / scenario.control_rate
+    times = np.arange(scenario.ticks) / scenario.control_rate
     return Prepared(plant, data, make_plan(machine, plant.axes, scenario.pilot, start, times))
 
 
@@ -109,6 +110,7 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
     """
     plant, data, plan = prepare(scenario)
     machine = plant.machine
+    begin_leapfrog(plant.model, data)
     begin = full_state(plant.model, data)
     record, commands, pins, wall = _loop(plant, scenario, plan, data, progress)
     values, units = true_channels(plant, record)
@@ -134,12 +136,12 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
     for name, value in scenario.start.joints.items():
         if name not in joints:
             raise InputError(
-                "start.joints", f"{name!r} is no joint of the machine; valid: {', '.join(joints)}"
+                "start.joints", f"{name!r} is no joint of the machine; {suggest(name, joints)}"
             )
         joints[name] = value
     if scenario.start.pose:
         here = {a: joints[machine.axes[a].joint] for a in plant.axes}
-        there = pose_to_joints(machine, scenario.start.pose, here)
+        there = pose_to_joints(machine, scenario.start.pose, here, "start.pose")
         joints |= {machine.axes[a].joint: value for a, value in there.items()}
     for name, joint in machine.joints.items():
         if joint.range and not joint.range[0] <= joints[name] <= joint.range[1]:
@@ -153,7 +155,6 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
 def _feedback_errors(plant: Plant, scenario: Scenario) -> dict[str, np.ndarray]:
     """Errors of the fed-back channels at every control tick; the log shows every so many of them."""
     sensors = sensor_set(plant.machine, scenario.sensors)
-    count = round(scenario.duration * scenario.control_rate)
     names = [f"{plant.machine.position_kind(a)}.{a}" for a in plant.axes]
     for axis in plant.axes[: plant.hydraulic]:
         names += [f"pressure_head.{axis}", f"pressure_rod.{axis}"]
@@ -161,7 +162,7 @@ def _feedback_errors(plant: Plant, scenario: Scenario) -> dict[str, np.ndarray]:
         names.append("pressure_supply")
     return {
         name: sensor_errors(
-            channel_sensor(plant.machine, sensors, name), scenario.seed, name, count
+            channel_sensor(plant.machine, sensors, name), scenario.seed, name, scenario.ticks
         )
         for name in names
     }
@@ -169,8 +170,7 @@ def _feedback_errors(plant: Plant, scenario: Scenario) -> dict[str, np.ndarray]:
 
 def _row_errors(plant: Plant, scenario: Scenario) -> dict[str, np.ndarray]:
     every = round(scenario.control_rate / scenario.log_rate)
-    rows = round(scenario.duration * scenario.log_rate)
-    return {k: v[::every][:rows] for k, v in _feedback_errors(plant, scenario).items()}
+    return {k: v[::every][: scenario.rows] for k, v in _feedback_errors(plant, scenario).items()}
 
 
 def _converter_steps(plant: Plant, scenario: Scenario, names: list[str]) -> np.ndarray:
@@ -191,8 +191,7 @@ def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress
     model, dt = plant.model, 1.0 / scenario.control_rate
     steps = round(dt / scenario.timestep)
     every = round(scenario.control_rate / scenario.log_rate)
-    rows = round(scenario.duration * scenario.log_rate)
-    ticks, count = len(plan.time), plant.hydraulic
+    ticks, rows, count = scenario.ticks, scenario.rows, plant.hydraulic
     numbers = servo_numbers(plant.machine, plant.axes, scenario.servo, dt)
     drives = drive_references(plant.machine, plan, scenario.servo)
     errors = _feedback_errors(plant, scenario)
@@ -203,8 +202,8 @@ def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress
     joint, last, load = np.empty(k), np.empty(k), np.zeros(k)
     head, rod = np.zeros(k), np.zeros(k)
     command, commands = np.zeros(k), np.empty((ticks, k))
-    recorder = _Recorder(plant, rows)
-    qpos, act, ctrl = data.qpos, data.act, data.ctrl
+    recorder = Recorder(plant, rows)
+    qpos, qvel, act, ctrl = data.qpos, data.qvel, data.act, data.ctrl
     worst, begin = 0.0, 0.0
     for tick in range(ticks):
         if tick % every == 0 and tick // every < rows:
@@ -212,8 +211,9 @@ def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress
             if progress and tick % (every * 50) == 0:
                 progress(tick * dt, scenario.duration)
         supply = read_feedback(
-            qpos, plant.qpos, act, user, count, feedback[tick], grain, joint, head, rod, scratch
-        )
+            qpos - scenario.timestep * qvel, plant.qpos, act, user, count, feedback[tick], grain,
+            joint, head, rod, scratch,
+        )  # fmt: skip
         if tick == 0:
             last[:] = joint
             load[:] = numbers[:, 1] * head - numbers[:, 2] * rod
@@ -232,45 +232,6 @@ def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress
     if progress:
         progress(scenario.duration, scenario.duration)
     return recorder.record(), commands, worst, clock.perf_counter() - begin
-
-
-class _Recorder:
-    """Arrays that a run fills, one row per log sample."""
-
-    def __init__(self, plant: Plant, rows: int) -> None:
-        model = plant.model
-        self.model = model
-        self.tip_site = model.site("tip").id if plant.machine.arm else -1
-        self.time = np.zeros(rows)
-        self.qpos, self.qvel = np.zeros((rows, model.nq)), np.zeros((rows, model.nv))
-        self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
-        self.command, self.contact = np.zeros((rows, model.nu)), np.zeros((rows, 3))
-        self.tip = np.zeros((rows, 3 if self.tip_site >= 0 else 0))
-
-    def take(self, row: int, time: float, data: mujoco.MjData) -> None:
-        mujoco.mj_forward(self.model, data)
-        self.time[row] = time
-        self.qpos[row], self.qvel[row], self.qacc[row] = data.qpos, data.qvel, data.qacc
-        self.act[row] = data.act
-        if self.tip_site >= 0:
-            self.tip[row] = data.site_xpos[self.tip_site]
-        if data.ncon:
-            self.contact[row] = ground_force(self.model, data)
-        if not np.isfinite(self.qacc[row]).all() or data.warning.number.any():
-            raise SimulationFailed(self._story(row))
-
-    def _story(self, row: int) -> str:
-        lines = [f"the simulation became unstable at {self.time[row]:.3f} s; the last states:"]
-        for r in range(max(0, row - 3), row + 1):
-            lines.append(f"  t={self.time[r]:.3f} qpos={np.array2string(self.qpos[r], precision=4)}")
-            lines.append(f"    pressures and spools={np.array2string(self.act[r], precision=4)}")
-        return "\n".join(lines)
-
-    def record(self) -> Record:
-        return Record(
-            self.time, self.qpos, self.qvel, self.qacc, self.act, self.command, self.contact,
-            self.tip,
-        )  # fmt: skip
 
 
 def _log(scenario, machine, time, values, units, sensors: str) -> Log:

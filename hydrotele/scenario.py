@@ -12,8 +12,10 @@ from pydantic import Field, model_validator
 
 from hydrotele.datafile import Facts, parse, read_yaml, suggest
 from hydrotele.errors import InputError
+from hydrotele.log import load_log
 from hydrotele.machine import Name, NonNegative, Positive
 from hydrotele.resources import scenarios_folder
+from hydrotele.signals import parse_channel
 
 
 class Pose(Facts):
@@ -40,9 +42,10 @@ class ConstantPilot(Facts):
 
 
 class TablePilot(Facts):
-    """A table over time, given here by column or in a CSV file with the same column names.
+    """A table over time, given here by column or in a log file (`file`, CSV or Parquet).
 
-    `of: command` drives the valves open loop, `of: joint` gives joint references [rad] or [m].
+    `of: command` drives the valves open loop, `of: joint` gives joint references [rad] or [m]. Of a
+    file, `command.<axis>` or `reference.<axis>` (else `angle.<axis>`, `position.<axis>`) is taken.
     """
 
     kind: Literal["table"]
@@ -61,7 +64,7 @@ class TablePilot(Facts):
                 raise ValueError(
                     f"columns.{name} has {len(values)} values, time has {len(self.time)}"
                 )
-        if self.columns and (self.time[0] != 0.0 or any(_falls(self.time))):
+        if self.columns and (not self.time or self.time[0] != 0.0 or any(_falls(self.time))):
             raise ValueError("time must start at 0 and rise")
         return self
 
@@ -194,11 +197,21 @@ class Scenario(Facts):
             raise ValueError(
                 f"log_rate {self.log_rate:g} Hz must divide control_rate {self.control_rate:g} Hz"
             )
-        if self.duration * self.log_rate < 10:
-            raise ValueError("duration is too short: a log needs at least 10 rows")
         if self.duration * self.control_rate > 2e7:
             raise ValueError("duration is too long: more than 2e7 control periods")
+        if self.rows < 10:
+            raise ValueError("duration is too short: a log needs at least 10 rows")
         return self
+
+    @property
+    def ticks(self) -> int:
+        """Number of control periods."""
+        return round(self.duration * self.control_rate)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of the logs, all complete."""
+        return self.ticks // round(self.control_rate / self.log_rate)
 
 
 def shipped_scenarios() -> list[str]:
@@ -241,13 +254,54 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
     data, lines = read_yaml(path)
     for key, text in (overrides or {}).items():
         _override(data, key, text)
+    if "folder" in data:
+        raise InputError(_at(path, lines, "folder"), "is the scenario file's own; remove the key")
     data["folder"] = str(path.parent.resolve())
-    return parse(Scenario, data, str(path), lines)
+    kind = data["pilot"].get("kind") if isinstance(data.get("pilot"), dict) else None
+    if isinstance(kind, str):  # pydantic names the pilot's kind in its key paths
+        lines |= {("pilot", kind, *k[1:]): n for k, n in lines.items() if k[:1] == ("pilot",)}
+    scenario = parse(Scenario, data, str(path), lines)
+    return _with_table(scenario, _at(path, lines, "pilot", "file"))
+
+
+def _at(path: Path, lines: dict[tuple, int], *keys: str) -> str:
+    return f"{path}:{lines[keys]}: {'.'.join(keys)}" if keys in lines else f"{path}: {'.'.join(keys)}"
+
+
+def _with_table(scenario: Scenario, where: str) -> Scenario:
+    """The scenario with the file of its table pilot read in, so that it is complete by itself."""
+    pilot = scenario.pilot
+    if not isinstance(pilot, TablePilot) or pilot.file is None:
+        return scenario
+    try:
+        log = load_log(Path(scenario.folder, pilot.file), minimum_rows=2, maximum_dropped=1.0)
+    except InputError as error:
+        raise InputError(where, str(error)) from None
+    kinds = ("command",) if pilot.of == "command" else ("position", "angle", "reference")
+    found = {c.axis: c.name for k in kinds for c in map(parse_channel, log.columns)
+             if c.kind == k and not c.truth}  # fmt: skip
+    if not found:
+        wanted = " or ".join(f"{kind}.<axis>" for kind in reversed(kinds))
+        raise InputError(where, f"{log.source} has no {wanted}; it has {', '.join(log.columns)}")
+    table = pilot.model_copy(update={
+        "time": (log.time - log.time[0]).tolist(), "file": None,
+        "columns": {axis: log[channel].tolist() for axis, channel in found.items()},
+    })  # fmt: skip
+    return scenario.model_copy(update={"pilot": table})
+
+
+def own_machine(scenario: Scenario) -> Path | None:
+    """The machine file or folder that lies beside the scenario, None for a shipped machine."""
+    path = Path(scenario.folder, scenario.machine)
+    beside = scenario.folder and (path.is_file() or (path / "machine.yaml").is_file())
+    return path if beside else None
 
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
     """Write a scenario as YAML, complete with every default, readable by `load_scenario`."""
     data = scenario.model_dump(mode="json")
+    beside = own_machine(scenario)
+    data["machine"] = str(beside) if beside else scenario.machine
     data.pop("folder")
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False))
 

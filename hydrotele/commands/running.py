@@ -4,7 +4,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-from hydrotele.commands.console import notes, out, plain, print_json, progress_bar, table
+from hydrotele.commands.console import (
+    notes,
+    out,
+    plain,
+    print_json,
+    progress_bar,
+    table,
+)
 from hydrotele.log import save_log
 from hydrotele.machine_file import save_machine
 from hydrotele.output import check_target, whole_folder

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
 from hydrotele.kinematics.arm import forward
 from hydrotele.kinematics.from_machine import arm_geometry
@@ -23,6 +24,9 @@ from hydrotele.scenario import (
     Waypoint,
     WaypointsPilot,
 )
+
+_FARTHEST = 1.0e6  # rad or m, of a joint without a range
+_ROUNDING = 1.0e-3  # of a command, as `signals` allows real loggers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,8 +70,44 @@ def make_plan(
         The plan.
 
     Raises:
-        InputError: the pilot names an unknown axis or joint, or starts out of reach.
+        InputError: the pilot names an unknown axis, starts out of reach, or asks for more than a
+            joint's range or a drive's largest command.
     """
+    plan = _plan(machine, axes, pilot, start, time)
+    for column, name in enumerate(axes):
+        if plan.closed[column]:
+            _check_reference(machine, name, plan.time, plan.reference[:, column])
+        else:
+            _check_command(machine, name, plan.command[:, column])
+    return plan
+
+
+def _check_reference(machine: Machine, name: str, time, reference) -> None:
+    low, high = machine.joints[machine.axes[name].joint].range or (-_FARTHEST, _FARTHEST)
+    outside = np.flatnonzero(~((low - 1e-9 <= reference) & (reference <= high + 1e-9)))
+    if len(outside):
+        row = outside[0]
+        raise InputError(
+            "pilot",
+            f"asks {name} for {reference[row]:.4g} at {time[row]:.4g} s, its joint allows"
+            f" {low:.4g} .. {high:.4g}",
+        )
+
+
+def _check_command(machine: Machine, name: str, command) -> None:
+    force = machine.axes[name].force
+    limit, unit = (force.command_limit, force.command_unit) if force else (1.0, "1")
+    if len(outside := np.flatnonzero(~(np.abs(command) <= limit + _ROUNDING))):
+        raise InputError(
+            "pilot",
+            f"commands {name} with {command[outside[0]]:g}, its drive takes -{limit:g} .. {limit:g}"
+            f" [{unit}]",
+        )
+
+
+def _plan(
+    machine: Machine, axes: tuple[str, ...], pilot: Pilot, start: dict[str, float], time: np.ndarray
+) -> Plan:
     n, k = len(time), len(axes)
     home = np.array([start.get(machine.axes[a].joint, 0.0) for a in axes])
     plan = Plan(
@@ -76,7 +116,7 @@ def make_plan(
     match pilot:
         case ConstantPilot():
             for name, value in pilot.commands.items():
-                plan.command[:, _column(axes, name)] = value
+                plan.command[:, _column(axes, name, "pilot.commands")] = value
             return plan
         case TablePilot():
             return _table(plan, pilot)
@@ -88,9 +128,9 @@ def make_plan(
             return _waypoints(plan, machine, pilot)
 
 
-def _column(axes: tuple[str, ...], name: str) -> int:
+def _column(axes: tuple[str, ...], name: str, where: str) -> int:
     if name not in axes:
-        raise InputError("pilot", f"{name!r} is no axis of the machine; valid: {', '.join(axes)}")
+        raise InputError(where, f"{name!r} is no axis of the machine; {suggest(name, axes)}")
     return axes.index(name)
 
 
@@ -98,7 +138,7 @@ def _table(plan: Plan, pilot: TablePilot) -> Plan:
     times = np.array(pilot.time)
     closed = plan.closed.copy()
     for name, values in pilot.columns.items():
-        column = _column(plan.axes, name)
+        column = _column(plan.axes, name, "pilot.columns")
         if pilot.interpolate == "linear":
             wanted = np.interp(plan.time, times, values)
         else:
@@ -119,7 +159,7 @@ def _fourier(plan: Plan, pilot: FourierPilot) -> Plan:
     s, ds = quintic(plan.time, pilot.fade)
     omega = 2.0 * math.pi / pilot.period
     for name, harmonics in pilot.axes.items():
-        column = _column(plan.axes, name)
+        column = _column(plan.axes, name, "pilot.axes")
         wave = np.full_like(plan.time, harmonics.mean)
         slope = np.zeros_like(plan.time)
         for order, (a, b) in enumerate(_pairs(harmonics.sin, harmonics.cos), start=1):
@@ -219,10 +259,10 @@ def _move_duration(move: Move, acceleration: float) -> float:
 def _waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
     begin = pilot.settle
     here = dict(zip(plan.axes, plan.reference[0], strict=True))
-    for point in pilot.points:
+    for number, point in enumerate(pilot.points):
         inside = (plan.time >= begin) & (plan.time <= begin + point.duration)
         s, ds = quintic(plan.time[inside] - begin, point.duration)
-        target = _waypoint_joints(machine, plan.axes, here, point)
+        target = _waypoint_joints(machine, plan.axes, here, point, f"pilot.points.{number}")
         if point.pose:
             path, speeds = _pose_path(machine, plan.axes, here, target, s, ds)
         else:
@@ -237,12 +277,12 @@ def _waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
     return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool))
 
 
-def _waypoint_joints(machine, axes, here: dict, point: Waypoint) -> dict[str, float]:
+def _waypoint_joints(machine, axes, here: dict, point: Waypoint, where: str) -> dict[str, float]:
     target = dict(here)
     if point.pose:
-        target |= pose_to_joints(machine, point.pose, here)
+        target |= pose_to_joints(machine, point.pose, here, f"{where}.pose")
     for name, value in point.joints.items():
-        target[axes[_column(axes, name)]] = value
+        target[axes[_column(axes, name, f"{where}.joints")]] = value
     return target
 
 

@@ -11,7 +11,13 @@ import math
 import numpy as np
 
 from hydrotele.errors import InputError
-from hydrotele.kinematics.arm import ArmGeometry, Unreachable, forward, inverse, jacobian
+from hydrotele.kinematics.arm import (
+    ArmGeometry,
+    Unreachable,
+    forward,
+    inverse,
+    jacobian,
+)
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.machine import Machine
 from hydrotele.scenario import Pose
@@ -126,13 +132,16 @@ def _arm_facts(machine: Machine):
     return arm_geometry(machine), axes, ranges
 
 
-def pose_to_joints(machine: Machine, pose: Pose, here: dict[str, float]) -> dict[str, float]:
+def pose_to_joints(
+    machine: Machine, pose: Pose, here: dict[str, float], where: str = "pose"
+) -> dict[str, float]:
     """Axis positions that bring the tip to a pose.
 
     Args:
         machine: the machine.
         pose: the pose; without `attitude` the tool keeps that of `here`.
         here: axis -> present position [rad].
+        where: key path of the pose, for messages.
 
     Returns:
         Axis -> position [rad].
@@ -147,11 +156,11 @@ def pose_to_joints(machine: Machine, pose: Pose, here: dict[str, float]) -> dict
     try:
         joints = inverse(geometry, (pose.r, pose.theta, pose.z, attitude)[: len(axes)])
     except Unreachable as error:
-        raise InputError("pose", str(error)) from None
+        raise InputError(where, str(error)) from None
     for name, q, (low, high) in zip(axes, joints, ranges, strict=True):
         if not low <= q <= high:
             raise InputError(
-                "pose",
+                where,
                 f"needs {name} at {math.degrees(q):.1f} deg, which its joint allows only from"
                 f" {math.degrees(low):.1f} to {math.degrees(high):.1f} deg",
             )

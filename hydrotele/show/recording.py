@@ -19,7 +19,13 @@ from hydrotele.show.channels import colours, common_channels, difference, groupe
 from hydrotele.show.layout import Plot, Scene, blueprint
 from hydrotele.show.looks import bounds
 from hydrotele.show.output import replacing
-from hydrotele.show.pose import Poses, body_poses, logged_joints, model_with_looks, points_on_body
+from hydrotele.show.pose import (
+    Poses,
+    body_poses,
+    logged_joints,
+    model_with_looks,
+    points_on_body,
+)
 from hydrotele.show.scene import log_ground, log_machine, log_tip
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ card Mesa's lavapipe draws on the processor. It is driven over its local port.
 
 import contextlib
 import os
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from rerun.experimental import ViewerClient, ViewerState
 
 _POLL = 0.1  # s
+_LAST_WORDS = 3.0  # s that a dying viewer takes to say why
 _SETTLING = 3  # pictures that are drawn at least: layout and data take a few frames
 _NO_DRIVER = ("render context", "graphics adapter")  # what the viewer says then
 _DRIVER = (
@@ -83,6 +85,8 @@ def _viewing(
         try:
             yield client, _loaded(viewer, client, rrd, deadline)
         except (RuntimeError, ConnectionError) as error:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                viewer.process.wait(_LAST_WORDS)
             _check(viewer, rrd, deadline)
             raise InputError(rrd, f"the viewer does not answer: {error}") from error
 

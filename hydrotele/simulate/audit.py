@@ -46,6 +46,8 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
     at = np.cumsum([1, model.nq, model.nv, model.na])
     qpos, qvel, act = states[:, 1 : at[1]], states[:, at[1] : at[2]], states[:, at[2] : at[3]]
     dt = model.opt.timestep
+    qpos = qpos[1:] - dt * qvel[1:]  # states at equal times, see record.py
+    qvel, act = 0.5 * (qvel[1:] + qvel[:-1]), act[1:]
     work, flow = _hydraulic_balance(plant, qpos, qvel, act, controls, dt)
     return {
         "seconds": len(controls) * dt,

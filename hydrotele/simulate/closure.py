@@ -117,8 +117,8 @@ def follow_loops(
 ) -> np.ndarray:
     """Poses of the whole machine along a motion of its independent joints.
 
-    The first row is closed by `close_loops`, and so is each one after a jump; the others by Newton's
-    method from the row before. So every linkage stays on its branch.
+    The first row is closed by `close_loops`, and so is each one after a jump; the others by
+    Newton's method from the row before. So every linkage stays on its branch.
 
     Args:
         machine: the machine.

@@ -10,7 +10,12 @@ import numpy as np
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.simulate.circuit import ACTIVATIONS
-from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
+from hydrotele.simulate.closure import (
+    close_loops,
+    holding_forces,
+    independent_dofs,
+    motion_basis,
+)
 from hydrotele.simulate.mechanism import assemble, mjcf_text
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.simulate.parameters import actuator_order

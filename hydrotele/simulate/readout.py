@@ -1,8 +1,5 @@
 """What a run shows: true channels from recorded states."""
 
-import dataclasses
-
-import mujoco
 import numpy as np
 from numba import njit
 
@@ -16,6 +13,7 @@ from hydrotele.simulate.circuit import (
 )
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.plant import Plant
+from hydrotele.simulate.record import Record
 
 _D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 
@@ -106,43 +104,6 @@ def state_flows(user, count, act, x, v):
             )
             out[row, 1 + 3 * i], out[row, 2 + 3 * i], out[row, 3 + 3 * i] = q_head, q_rod, force
     return out
-
-
-@dataclasses.dataclass(frozen=True)
-class Record:
-    """States of a run at the log's rows.
-
-    Attributes:
-        time: (n,) [s].
-        qpos: (n, nq).
-        qvel: (n, nv).
-        qacc: (n, nv).
-        act: (n, na).
-        command: (n, nu) mean command over the row's interval.
-        contact: (n, 3) sum of the ground's forces on the machine, world frame [N].
-        tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
-    """
-
-    time: np.ndarray
-    qpos: np.ndarray
-    qvel: np.ndarray
-    qacc: np.ndarray
-    act: np.ndarray
-    command: np.ndarray
-    contact: np.ndarray
-    tip: np.ndarray
-
-
-def ground_force(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Sum of all contact forces on the machine, (3,) [N] in the world frame."""
-    total, wrench = np.zeros(3), np.zeros(6)
-    for k in range(data.ncon):
-        contact = data.contact[k]
-        mujoco.mj_contactForce(model, data, k, wrench)
-        force = contact.frame.reshape(3, 3).T @ wrench[:3]
-        on_second = model.geom_bodyid[contact.geom[0]] == 0
-        total += force if on_second else -force
-    return total
 
 
 def true_channels(plant: Plant, record: Record) -> tuple[dict[str, np.ndarray], dict[str, str]]:

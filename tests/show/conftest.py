@@ -16,6 +16,15 @@ def machine():
 
 
 @pytest.fixture(scope="session")
+def stuck(machine):
+    """The same with a coupler so short that the bucket cannot be turned beyond some 0.3 rad."""
+    closure = machine.closures["bucket_coupler_pin"]
+    shorter = closure.a.model_copy(update={"position": (0.35, 0.0, 0.0)})
+    closure = closure.model_copy(update={"a": shorter})
+    return machine.model_copy(update={"closures": {"bucket_coupler_pin": closure}})
+
+
+@pytest.fixture(scope="session")
 def log():
     """50 rows at 50 Hz."""
     return make_log(0.02 * np.arange(_ROWS))

@@ -50,9 +50,16 @@ def test_without_joints_the_machine_is_at_home(machine, model):
     assert poses.position.shape == (1, model.nbody, 3)
 
 
-def test_an_impossible_pose_names_its_row(machine, model):
-    with pytest.raises(InputError, match="row 1"):
-        body_poses(machine, model, {"bucket": np.array([-1.2, 2.5])})
+def test_an_impossible_pose_names_its_row(stuck):
+    with pytest.raises(InputError, match="row 1: .*do not close.*bucket"):
+        body_poses(stuck, model_with_looks(stuck), {"bucket": np.array([-1.2, 1.0])})
+
+
+def test_a_jump_does_not_change_the_branch(machine, model):
+    data = mujoco.MjData(model)
+    jump = follow_loops(machine, model, data, {"bucket": np.array([-2.3, 0.2, -2.3])})
+    slow = follow_loops(machine, model, data, {"bucket": np.linspace(-2.3, 0.2, 100)})
+    assert jump[[0, 1, 2]] == pytest.approx(slow[[0, -1, 0]], abs=1e-7)  # as above
 
 
 def test_a_following_joint_cannot_be_set(machine, model):
