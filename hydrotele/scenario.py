@@ -97,7 +97,7 @@ class Move(Facts):
     z: float = 0.0
     theta: float = 0.0
     attitude: float = 0.0
-    speed: Positive = 0.5
+    speed: Annotated[float, Field(ge=1e-4, le=100)] = 0.5
     pause: NonNegative = 0.5
 
 
@@ -112,7 +112,7 @@ class LinesPilot(Facts):
     kind: Literal["lines"]
     mode: Literal["rate", "position"] = "rate"
     settle: NonNegative = 1.0
-    acceleration: Positive = 1.0
+    acceleration: Annotated[float, Field(ge=1e-3, le=1000)] = 1.0
     moves: Annotated[list[Move], Field(min_length=1)]
 
 

@@ -223,9 +223,18 @@ def _lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
             column = plan.axes.index(name)
             plan.reference[row, column] = value
             plan.rate[row, column] = speeds[name]
-    notes = (f"resolved motion was stopped at a limit for {blocked} ticks",) if blocked else ()
+    notes = _cut_short(plan.time, lines_duration(pilot))
+    if blocked:
+        seconds = blocked * (plan.time[1] - plan.time[0])
+        notes += (f"resolved motion stood at the edge of the workspace for {seconds:.3g} s",)
     closed = np.ones(len(plan.axes), bool)
     return dataclasses.replace(plan, closed=closed, pose=pose, notes=notes)
+
+
+def _cut_short(time: np.ndarray, needed: float) -> tuple[str, ...]:
+    """A note where a pilot is not through when the run ends."""
+    missing = needed - (2 * time[-1] - time[-2])
+    return (f"the run ends {missing:.3g} s before its pilot",) if missing > 1e-6 else ()
 
 
 def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
@@ -262,9 +271,12 @@ def _waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
     for number, point in enumerate(pilot.points):
         inside = (plan.time >= begin) & (plan.time <= begin + point.duration)
         s, ds = quintic(plan.time[inside] - begin, point.duration)
-        target = _waypoint_joints(machine, plan.axes, here, point, f"pilot.points.{number}")
+        where = f"pilot.points.{number}"
+        target = _waypoint_joints(machine, plan.axes, here, point, where)
+        for name, value in target.items():
+            _check_reference(machine, name, np.array([begin]), np.array([value]))
         if point.pose:
-            path, speeds = _pose_path(machine, plan.axes, here, target, s, ds)
+            path, speeds = _pose_path(machine, plan.axes, here, target, s, ds, where)
         else:
             span = np.array([target[a] - here[a] for a in plan.axes])
             path = np.array([here[a] for a in plan.axes]) + s[:, None] * span
@@ -274,7 +286,8 @@ def _waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
         plan.reference[plan.time > begin] = [target[a] for a in plan.axes]
         begin += point.pause
         here = target
-    return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool))
+    notes = _cut_short(plan.time, begin)
+    return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool), notes=notes)
 
 
 def _waypoint_joints(machine, axes, here: dict, point: Waypoint, where: str) -> dict[str, float]:
@@ -286,7 +299,7 @@ def _waypoint_joints(machine, axes, here: dict, point: Waypoint, where: str) -> 
     return target
 
 
-def _pose_path(machine, axes, here, target, s, ds) -> tuple[np.ndarray, np.ndarray]:
+def _pose_path(machine, axes, here, target, s, ds, where: str) -> tuple[np.ndarray, np.ndarray]:
     geometry, order = arm_geometry(machine), arm_axes(machine)
     first = np.array(forward(geometry, [here[a] for a in order]))
     last = np.array(forward(geometry, [target[a] for a in order]))
@@ -301,6 +314,11 @@ def _pose_path(machine, axes, here, target, s, ds) -> tuple[np.ndarray, np.ndarr
         motion, joints, velocity = motion.position_step(
             first + part * (last - first), rate * (last - first)
         )
+        if motion.blocked:
+            raise InputError(
+                f"{where}.pose", f"its straight way leaves the workspace after {100 * part:.0f} %;"
+                " go there by another waypoint, or give joints",
+            )  # fmt: skip
         for name, value in joints.items():
             path[row, axes.index(name)] = value
             speeds[row, axes.index(name)] = velocity[name]

@@ -2,7 +2,7 @@
 
 Inverse kinematics gives the joint references and the inverse Jacobian their rates, so that no error
 is integrated. A step that would leave the reach or a joint's range is not made: the reference stays
-and `blocked` says so.
+and `blocked` says so, until the command comes back to where it stands.
 """
 
 import dataclasses
@@ -21,6 +21,8 @@ from hydrotele.kinematics.arm import (
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.machine import Machine
 from hydrotele.scenario import Pose
+
+_NEAR = 0.02  # m or rad, about one control period of motion: a blocked reference must not jump
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,11 +81,11 @@ class ResolvedMotion:
         """
         size = len(self.axes)
         joints = self._solve(tuple(wanted))
-        if joints is None:
+        speeds = None if joints is None else self._speeds(joints, np.array(rate)[:size])
+        if joints is None or speeds is None:
             still = dict.fromkeys(self.axes, 0.0)
             held = dataclasses.replace(self, blocked=True)
             return held, dict(zip(self.axes, self.joints, strict=True)), still
-        speeds = np.linalg.solve(np.array(jacobian(self.geometry, joints)), np.array(rate)[:size])
         attitude = wanted[3] if size == 4 else sum(joints[1:])
         pose = (wanted[0], wanted[1], wanted[2], attitude)
         state = dataclasses.replace(self, joints=joints, pose=pose, blocked=False)
@@ -93,7 +95,17 @@ class ResolvedMotion:
             dict(zip(self.axes, speeds.tolist(), strict=True)),
         )
 
+    def _speeds(self, joints, rate) -> np.ndarray | None:
+        try:
+            return np.linalg.solve(np.array(jacobian(self.geometry, joints)), rate)
+        except np.linalg.LinAlgError:  # a straight arm
+            return None
+
     def _solve(self, wanted) -> tuple[float, ...] | None:
+        size = len(self.axes)
+        way = np.subtract(wanted[:size], self.pose[:size])
+        if self.blocked and np.abs(way).max() > _NEAR:
+            return None
         try:
             joints = inverse(self.geometry, wanted[: len(self.axes)])
         except Unreachable:
