@@ -90,7 +90,7 @@ class Facts(pydantic.BaseModel):
         return result
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # libyaml: ten times as fast
     """SafeLoader that reads 28.0e6 as a number, as YAML 1.2 does, and refuses repeated keys."""
 
     def __init__(self, stream):
@@ -157,8 +157,9 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
-        node = yaml.compose(text, Loader=_Loader)
-        data = yaml.load(text, Loader=_Loader)
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        data = loader.construct_document(node) if node else None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(str(path), f"cannot be read: {error}") from None
     except (yaml.YAMLError, RecursionError, *_BAD_SCALARS) as error:

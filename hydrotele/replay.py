@@ -1,7 +1,8 @@
-"""Open-loop replay: a log's commands drive the model from the log's initial state; how far is it off?"""
+"""Open-loop replay: a log's commands drive the model from its initial state; how far is it off?"""
 
 import dataclasses
 import json
+import math
 import time as clock
 from collections.abc import Callable
 from typing import Any
@@ -72,10 +73,16 @@ def replay_log(
         The replay.
 
     Raises:
-        InputError: a command or position column is missing, or the start cannot be assembled.
+        InputError: a command or position column is missing, samples are missing, or the start
+            cannot be assembled.
+        SimulationFailed: states became infinite or not a number.
     """
-    period = float(np.median(np.diff(log.time)))
-    steps = max(1, round(period / timestep + 0.499999))
+    if not 1e-6 <= timestep < math.inf:
+        raise InputError("timestep", f"must be at least 1e-6 s, not {timestep:g}")
+    if len(log.gaps):
+        raise InputError(f"{log.source}, row {log.gaps[0]}", "samples are missing: cut the log there")
+    period = float(log.time[-1] - log.time[0]) / (len(log) - 1)
+    steps = max(1, math.ceil(period / timestep - 1e-6))
     plant = build_plant(machine, period / steps, ground=log.metadata.get("ground") == "yes")
     missing = [c for c in _needed(plant) if c not in log]
     if missing:
@@ -122,14 +129,28 @@ def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
     try:
         state = json.loads(log.metadata["initial_state"])
         order = list(state["order"])
-        if sorted(order) != sorted(plant.axes) or len(state["angle"]) != len(order):
+        if sorted(order) != sorted(plant.axes):
             raise ValueError(f"its order {order} is not that of the axes {list(plant.axes)}")
-        for key, values in state.items():
-            if key not in ("order", "joints"):
-                np.asarray(values, dtype=float)
+        start: dict[str, Any] = {"order": order, "angle": _vector(state, "angle", len(order))}
+        for key in ("velocity", "spool", "spool_rate", "pressure_head", "pressure_rod"):
+            if key in state:
+                size = len(order) if key == "velocity" else plant.hydraulic
+                start[key] = _vector(state, key, size, len(order))
+        joints = dict(state.get("joints", {}))
+        start["joints"] = {name: float(_vector(joints, name)) for name in joints}
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{log.source}: metadata initial_state", f"is not usable: {error}") from None
-    return state
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        where = f"{log.source}: metadata initial_state"
+        raise InputError(where, f"is not usable: {reason}") from None
+    return start
+
+
+def _vector(state: dict, key: str, *sizes: int) -> np.ndarray:
+    """Finite numbers of a state, of one of these sizes; a scalar where no size is given."""
+    values = np.asarray(state[key], dtype=float)
+    if values.shape not in ([(size,) for size in sizes] or [()]) or not np.isfinite(values).all():
+        raise ValueError(f"{key} must be {sizes[0] if sizes else 1} finite numbers")
+    return values
 
 
 def _drive(plant: Plant, data, times, commands, steps, progress) -> Record:

@@ -265,7 +265,8 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
 
 
 def _at(path: Path, lines: dict[tuple, int], *keys: str) -> str:
-    return f"{path}:{lines[keys]}: {'.'.join(keys)}" if keys in lines else f"{path}: {'.'.join(keys)}"
+    line = f":{lines[keys]}" if keys in lines else ""
+    return f"{path}{line}: {'.'.join(keys)}"
 
 
 def _with_table(scenario: Scenario, where: str) -> Scenario:

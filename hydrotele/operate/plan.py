@@ -13,6 +13,7 @@ from hydrotele.errors import InputError
 from hydrotele.kinematics.arm import forward
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.machine import Machine
+from hydrotele.operate.limits import check_command, check_reference, cut_short
 from hydrotele.operate.resolved_motion import ResolvedMotion, arm_axes, pose_to_joints
 from hydrotele.scenario import (
     ConstantPilot,
@@ -24,9 +25,6 @@ from hydrotele.scenario import (
     Waypoint,
     WaypointsPilot,
 )
-
-_FARTHEST = 1.0e6  # rad or m, of a joint without a range
-_ROUNDING = 1.0e-3  # of a command, as `signals` allows real loggers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,33 +74,10 @@ def make_plan(
     plan = _plan(machine, axes, pilot, start, time)
     for column, name in enumerate(axes):
         if plan.closed[column]:
-            _check_reference(machine, name, plan.time, plan.reference[:, column])
+            check_reference(machine, name, plan.time, plan.reference[:, column])
         else:
-            _check_command(machine, name, plan.command[:, column])
+            check_command(machine, name, plan.command[:, column])
     return plan
-
-
-def _check_reference(machine: Machine, name: str, time, reference) -> None:
-    low, high = machine.joints[machine.axes[name].joint].range or (-_FARTHEST, _FARTHEST)
-    outside = np.flatnonzero(~((low - 1e-9 <= reference) & (reference <= high + 1e-9)))
-    if len(outside):
-        row = outside[0]
-        raise InputError(
-            "pilot",
-            f"asks {name} for {reference[row]:.4g} at {time[row]:.4g} s, its joint allows"
-            f" {low:.4g} .. {high:.4g}",
-        )
-
-
-def _check_command(machine: Machine, name: str, command) -> None:
-    force = machine.axes[name].force
-    limit, unit = (force.command_limit, force.command_unit) if force else (1.0, "1")
-    if len(outside := np.flatnonzero(~(np.abs(command) <= limit + _ROUNDING))):
-        raise InputError(
-            "pilot",
-            f"commands {name} with {command[outside[0]]:g}, its drive takes -{limit:g} .. {limit:g}"
-            f" [{unit}]",
-        )
 
 
 def _plan(
@@ -223,18 +198,12 @@ def _lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
             column = plan.axes.index(name)
             plan.reference[row, column] = value
             plan.rate[row, column] = speeds[name]
-    notes = _cut_short(plan.time, lines_duration(pilot))
+    notes = cut_short(plan.time, lines_duration(pilot))
     if blocked:
         seconds = blocked * (plan.time[1] - plan.time[0])
         notes += (f"resolved motion stood at the edge of the workspace for {seconds:.3g} s",)
     closed = np.ones(len(plan.axes), bool)
     return dataclasses.replace(plan, closed=closed, pose=pose, notes=notes)
-
-
-def _cut_short(time: np.ndarray, needed: float) -> tuple[str, ...]:
-    """A note where a pilot is not through when the run ends."""
-    missing = needed - (2 * time[-1] - time[-2])
-    return (f"the run ends {missing:.3g} s before its pilot",) if missing > 1e-6 else ()
 
 
 def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
@@ -274,7 +243,7 @@ def _waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
         where = f"pilot.points.{number}"
         target = _waypoint_joints(machine, plan.axes, here, point, where)
         for name, value in target.items():
-            _check_reference(machine, name, np.array([begin]), np.array([value]))
+            check_reference(machine, name, np.array([begin]), np.array([value]))
         if point.pose:
             path, speeds = _pose_path(machine, plan.axes, here, target, s, ds, where)
         else:
@@ -286,7 +255,7 @@ def _waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
         plan.reference[plan.time > begin] = [target[a] for a in plan.axes]
         begin += point.pause
         here = target
-    notes = _cut_short(plan.time, begin)
+    notes = cut_short(plan.time, begin)
     return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool), notes=notes)
 
 

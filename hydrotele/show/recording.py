@@ -35,7 +35,7 @@ TIMELINE = "time"
 _ENTRY = re.compile(r"[a-z][a-z0-9_]*")
 _RESERVED = ("about", "difference", "ground")
 _PALENESS = 0.65  # part of white in the lines of logs after the first
-_EYE_DISTANCE = 1.25  # in radii of what is to be seen
+_EYE_DISTANCE = 1.4  # in radii of what is to be seen
 _LONGEST_ID = 180  # characters that rerun takes as an application id
 
 
