@@ -14,7 +14,7 @@ from mujoco.batch import Batch
 from hydrotele.commands.console import notes, out, print_json, table
 from hydrotele.errors import InputError
 from hydrotele.machine_file import load_machine
-from hydrotele.output import write_text
+from hydrotele.output import replacing
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
@@ -39,7 +39,8 @@ def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json
     earlier = _read(compare) if compare else None
     figures = measure(5 if quick else 25)
     if save:
-        write_text(save, json.dumps(figures, indent=2) + "\n")
+        with replacing(save, ".json") as part:
+            part.write_text(json.dumps(figures, indent=2) + "\n")
     if as_json:
         print_json(figures)
         return

@@ -5,7 +5,6 @@ are known, in SI, finite and of one length, and its time rises.
 """
 
 import os
-import secrets
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,15 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele import signals
-from hydrotele.csv_import import (
-    Table,
-    check_values,
-    checked,
-    lacks,
-    lost_samples,
-    read_csv,
-)
+from hydrotele.csv_import import read_csv
 from hydrotele.errors import InputError
+from hydrotele.log_checks import Table, check_values, checked, lacks, lost_samples
+from hydrotele.output import replacing
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +119,9 @@ def load_log(
 
     Args:
         path: the file.
-        aliases: the file's own column name -> channel name; names that the file lacks are ignored.
+        aliases: the file's own column name -> channel name, with a minus before it where the sign is
+            the other way round; names that the file lacks are ignored, and so
+            are all of them for logs that hydrotele wrote.
         required: channels that must be there, after renaming.
         minimum_rows: fewer rows are refused.
         maximum_dropped: fraction of the samples [1] that may be missing or come off time by more
@@ -136,8 +132,9 @@ def load_log(
     """
     path = Path(path)
     table = _read(path)
-    names = [(aliases or {}).get(name, name) for name in table.names]
-    table = table._replace(names=names)
+    if aliases and "hydrotele" not in table.metadata:
+        table = _renamed(table, aliases)
+    names = table.names
     rows, needed = len(table.values[0]) if names else 0, max(minimum_rows, 2)
     if rows < needed:
         raise InputError(path, f"the run is too short: {rows} rows, {needed} are needed")
@@ -147,6 +144,15 @@ def load_log(
     time = columns.pop("time")
     del units["time"]
     return Log(time, columns, units, table.metadata, str(path))
+
+
+def _renamed(table: Table, aliases: Mapping[str, str]) -> Table:
+    names = [aliases.get(name, name) for name in table.names]
+    signs = [-1.0 if name.startswith("-") else 1.0 for name in names]
+    return table._replace(
+        names=[name.removeprefix("-") for name in names],
+        values=[sign * values for sign, values in zip(signs, table.values, strict=True)],
+    )
 
 
 def load_logs(
@@ -168,7 +174,8 @@ def load_logs(
     path = Path(path)
     files = [path]
     if path.is_dir():
-        files = sorted(p for p in path.iterdir() if p.suffix.lower() in (".parquet", ".csv"))
+        seen = [p for p in path.iterdir() if not p.name.startswith(".")]
+        files = sorted(p for p in seen if p.suffix.lower() in (".parquet", ".csv"))
     if not files:
         raise InputError(path, "the folder holds no log: put .parquet or .csv files there")
     for stem, count in Counter(file.stem for file in files).items():
@@ -194,23 +201,14 @@ def save_log(log: Log, path: str | os.PathLike) -> None:
             .parquet, or the folder cannot be written. Nothing is written then.
     """
     path = Path(path)
-    if path.suffix.lower() != ".parquet":
-        raise InputError(path, "a log is written as Parquet: give it a name that ends in .parquet")
     names, values = ["time", *log.columns], [log.time, *log.columns.values()]
     table = Table(str(path), names, values, ["s", *log.units.values()], log.metadata)
     check_values(table, maximum_dropped=np.inf)
     content = _parquet_bytes(table)
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        with open(part, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except OSError as error:
-        raise InputError(path, f"cannot be written: {error.strerror}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing(path, ".parquet") as part, open(part, "xb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _parquet_bytes(table: Table) -> memoryview:

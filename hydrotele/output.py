@@ -1,7 +1,8 @@
-"""Folders that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 import contextlib
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -70,11 +71,30 @@ def _alive(part: Path) -> bool:
     return pid != os.getpid()
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a file so that it appears whole or not at all."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike, suffix: str) -> Iterator[Path]:
+    """Give a path beside `path` to write to; it takes the place of `path` at the end.
+
+    Args:
+        path: the file to write.
+        suffix: the ending that its name must have, with the dot; "" for any.
+
+    Yields:
+        The path to write to. A killed process leaves at most a hidden file of another name.
+
+    Raises:
+        InputError: the name ends otherwise, or the folder cannot be written. Nothing is left then.
+    """
+    path = Path(path)
+    if suffix and path.suffix.lower() != suffix:
+        raise InputError(path, f"give it a name that ends in {suffix}")
+    if not path.parent.is_dir():
+        raise InputError(path, f"cannot be written: {path.parent} is not a folder")
+    part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
     try:
-        part.write_text(text)
+        yield part
         os.replace(part, path)
+    except OSError as error:
+        raise InputError(path, f"cannot be written: {error.strerror or error}") from error
     finally:
         part.unlink(missing_ok=True)

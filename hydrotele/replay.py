@@ -80,7 +80,8 @@ def replay_log(
     if not 1e-6 <= timestep < math.inf:
         raise InputError("timestep", f"must be at least 1e-6 s, not {timestep:g}")
     if len(log.gaps):
-        raise InputError(f"{log.source}, row {log.gaps[0]}", "samples are missing: cut the log there")
+        where = f"{log.source}, row {log.gaps[0]}"
+        raise InputError(where, "samples are missing: cut the log there")
     period = float(log.time[-1] - log.time[0]) / (len(log) - 1)
     steps = max(1, math.ceil(period / timestep - 1e-6))
     plant = build_plant(machine, period / steps, ground=log.metadata.get("ground") == "yes")

@@ -254,7 +254,7 @@ def test_a_kill_in_the_middle_leaves_no_file_of_that_name(tmp_path):
     done = subprocess.run([sys.executable, "-c", code, str(path), *paths], capture_output=True)
     assert done.returncode == -signal.SIGKILL, done.stderr.decode()
     assert not path.exists()
-    assert [name for name in os.listdir(tmp_path) if not name.endswith(".part")] == []
+    assert [name for name in os.listdir(tmp_path) if not name.startswith(".")] == []
     with pytest.raises(InputError, match="holds no log"):
         load_logs(tmp_path)
 

@@ -151,12 +151,13 @@ def export_machine(
         render_picture(machine, picture, camera=camera)
         notes.print(f"written to {picture}")
         return
-    from hydrotele.output import write_text
+    from hydrotele.output import replacing
     from hydrotele.simulate.plant import build_plant
 
     text = build_plant(machine).mjcf
     if target:
-        write_text(target, text)
+        with replacing(target, ".xml") as part:
+            part.write_text(text)
         notes.print(f"written to {target}")
     else:
         print(text)

@@ -19,7 +19,7 @@ from hydrotele.show.channels import (
     padded_range,
     shown,
 )
-from hydrotele.show.output import replacing
+from hydrotele.output import replacing
 from hydrotele.signals import parse_channel
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ import numpy as np
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.show.looks import bounds
-from hydrotele.show.output import replacing
+from hydrotele.output import replacing
 from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.closure import close_loops
 

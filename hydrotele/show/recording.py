@@ -18,7 +18,7 @@ from hydrotele.machine import Machine
 from hydrotele.show.channels import colours, common_channels, difference, grouped, shown
 from hydrotele.show.layout import Plot, Scene, blueprint
 from hydrotele.show.looks import bounds
-from hydrotele.show.output import replacing
+from hydrotele.output import replacing
 from hydrotele.show.pose import (
     Poses,
     body_poses,

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydrotele.errors import InputError
-from hydrotele.show.output import replacing
+from hydrotele.output import replacing
 from hydrotele.show.recording import TIMELINE
 from hydrotele.show.viewer import Viewer, free_port, recording_file, running
 
