@@ -143,6 +143,7 @@ def _write_cylinder(root, name: str, cylinder: Cylinder, timestep: float) -> Non
         rod = tube.add("body", name=f"{name}_rod")
         rod.add("joint", name=f"{name}_rod", type="slide", axis=(1, 0, 0))
     rod.pos = (cylinder.closed_length, 0.0, 0.0)
+    root.find("joint", f"{name}_rod").range = (0.0, cylinder.stroke)
     _set_inertial(rod, cylinder.rod.mass, (-cylinder.rod.com, 0, 0), cylinder.rod.inertia)
     rod_end = Pin(link=f"{name}_rod", position=(0.0, 0.0, 0.0))
     _connect(root, f"{name}_pin", rod_end, cylinder.rod_pin, timestep)

@@ -233,6 +233,25 @@ def test_port_relief_limits_the_pressure_of_a_pushed_piston(user, speed):
     assert states[-1, 2] > limit - 2 * lost
 
 
+@pytest.mark.parametrize("dt", [1e-3, 2.5e-4])
+def test_oil_locked_in_is_compressed_by_the_logarithm_of_its_volume(user, dt):
+    boom = user[SLOTS : 2 * SLOTS].copy()
+    boom[Slot.LEAKAGE] = 0.0
+    x, v, end = 0.2, -0.05, 0.08
+    states = run(boom, [0, 0, 2e6, 20e6], np.zeros(1), [x], [v], dt, round(end / dt), count=1)
+    head, rod = boom[Slot.AREA_HEAD], boom[Slot.AREA_ROD]
+    v_head = boom[Slot.VOLUME_HEAD] + head * np.array([x, x + v * end])
+    v_rod = boom[Slot.VOLUME_ROD] + rod * (boom[Slot.STROKE] - np.array([x, x + v * end]))
+    # beta ln(V_0 / V); trapezium rule: T h^2 / 12 of the rate's second derivative 2 beta (A v / V)^3
+    error = end * dt**2 / 12 * 2 * BETA * (head * abs(v) / v_head.min()) ** 3
+    assert states[-1, 2] - 2e6 == pytest.approx(
+        BETA * np.log(v_head[0] / v_head[1]), abs=error + 1e-4
+    )
+    assert states[-1, 3] - 20e6 == pytest.approx(
+        BETA * np.log(v_rod[0] / v_rod[1]), abs=error + 1e-4
+    )
+
+
 def test_leakage_equalises_a_standing_motor(user):
     numbers = swing(user)
     states = run(numbers, [0, 0, 8e6, 2e6], np.zeros(1), [0], [0], 1e-3, 1000, count=1)

@@ -145,16 +145,21 @@ def test_installing_again_changes_nothing():
 
 FOREIGN = """
 import mujoco, numpy as np
+# the numbers of a cylinder, all but the marker: only the marker keeps the callbacks off
+USER = (1, 1, 2, 1, 0.02, 0.01, 4e-3, 4e-3, 1, 2e-12, 50, 0.9, 0.04, 2e-6, 5e4, 32e6, 1e-9, 5e-9,
+        9e8, 3e5, 28e6, 5e-3, 3000, 1500, 0.02, 6000, 0.005)
 XML = '''<mujoco><size nuser_actuator="{nuser}"/><worldbody><body><joint name="a"/>
 <geom size="0.1" pos="0.3 0 0"/><body pos="0.6 0 0"><joint name="b" axis="0 1 0"/>
 <geom size="0.1" pos="0.3 0 0"/></body></body></worldbody><actuator>
 <muscle joint="a" lengthrange="0 1"/>
 <general joint="b" dyntype="filter" dynprm="0.1" gainprm="3" biastype="affine" biasprm="1 -2 -1"/>
-<general joint="a" dyntype="user" actdim="4" biastype="user" gainprm="2" user="1 2 3"/>
+<general joint="a" dyntype="user" actdim="4" biastype="user" gainprm="2" user="{user}"/>
 <general joint="b" dyntype="integrator" biastype="none"/></actuator></mujoco>'''
 
 def run(nuser):
-    model = mujoco.MjModel.from_xml_string(XML.replace('{nuser}', str(nuser)))
+    user = ' '.join(map(str, USER[:nuser]))
+    text = XML.replace('{nuser}', str(nuser)).replace('{user}', user)
+    model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     data.act[:] = 0.1 * np.arange(model.na)
     for k in range(500):
