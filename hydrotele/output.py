@@ -1,6 +1,7 @@
 """Files and folders that appear whole or not at all."""
 
 import contextlib
+import glob
 import os
 import secrets
 import shutil
@@ -23,18 +24,22 @@ def whole_folder(target: str | Path) -> Iterator[Path]:
         same name removes.
 
     Raises:
-        InputError: the target is a file, or a folder that was not written by a run.
+        InputError: the target is a file, a folder that was not written by a run, or cannot be
+            written.
     """
-    target = Path(target)
-    check_target(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    for stale in target.parent.glob(f".{target.name}.*.part"):
-        if not _alive(stale):
-            shutil.rmtree(stale, ignore_errors=True)
-    prefix = f".{target.name}.{os.getpid()}."
-    part = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=target.parent))
-    part.chmod(0o755)
+    asked, target = target, Path(target).resolve()
+    check_target(asked)
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        for stale in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
+            if not _alive(stale):
+                shutil.rmtree(stale, ignore_errors=True)
+        prefix = f".{target.name}.{os.getpid()}."
+        part = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=target.parent))
+    except OSError as error:
+        raise InputError(asked, f"cannot be made: {error.strerror}") from None
+    try:
+        part.chmod(0o755)
         yield part
         old = None
         if target.exists():
@@ -43,20 +48,30 @@ def whole_folder(target: str | Path) -> Iterator[Path]:
         part.rename(target)
         if old:
             shutil.rmtree(old, ignore_errors=True)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(part, ignore_errors=True)
+        if isinstance(error, OSError):
+            reason = error.strerror or str(error)
+            raise InputError(asked, f"cannot be written, nothing is left of it: {reason}") from error
         raise
 
 
-def check_target(target: Path) -> None:
-    """Refuse to replace what is not ours.
+def check_target(target: str | Path) -> None:
+    """Refuse to replace what is not ours, or to write where one cannot.
 
     Raises:
-        InputError: the target is a file, or a folder with something in it but no summary.json.
+        InputError: the target is a file, or a folder with something in it but no summary.json, or
+            lies where no folder can be made.
     """
-    if not target.exists() or (target / "summary.json").is_file():
+    place = Path(target).resolve()
+    if not place.exists():
+        above = next(p for p in place.parents if p.exists())
+        if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+            raise InputError(target, f"cannot be made: {above} is no folder that can be written to")
         return
-    if target.is_file() or next(target.iterdir(), None) is not None:
+    if (place / "summary.json").is_file():
+        return
+    if not place.is_dir() or next(place.iterdir(), None) is not None:
         raise InputError(target, "exists and was not written by a run; choose another --out")
 
 

@@ -225,9 +225,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
 
     Source: nominal model, "Chambers".
     """
-    q_head, q_rod, slope_head, slope_rod = chamber_flows(
-        user, u, opening, p_supply, p_head, p_rod
-    )
+    q_head, q_rod, slope_head, slope_rod = chamber_flows(user, u, opening, p_supply, p_head, p_rod)
     leak = user[u + _LEAK] * (p_head - p_rod)
     port, relief_gain = user[u + _PORT], user[u + _KR]
     tank, makeup_gain = user[u + _TANK], user[u + _KM]

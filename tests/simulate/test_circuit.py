@@ -242,7 +242,7 @@ def test_oil_locked_in_is_compressed_by_the_logarithm_of_its_volume(user, dt):
     head, rod = boom[Slot.AREA_HEAD], boom[Slot.AREA_ROD]
     v_head = boom[Slot.VOLUME_HEAD] + head * np.array([x, x + v * end])
     v_rod = boom[Slot.VOLUME_ROD] + rod * (boom[Slot.STROKE] - np.array([x, x + v * end]))
-    # beta ln(V_0 / V); trapezium rule: T h^2 / 12 of the rate's second derivative 2 beta (A v / V)^3
+    # beta ln(V_0 / V); trapezium rule: T h^2 / 12 of the second derivative 2 beta (A v / V)^3
     error = end * dt**2 / 12 * 2 * BETA * (head * abs(v) / v_head.min()) ** 3
     assert states[-1, 2] - 2e6 == pytest.approx(
         BETA * np.log(v_head[0] / v_head[1]), abs=error + 1e-4

@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -20,7 +20,6 @@ from hydrotele.simulate.hydraulics import (
     valve_opening,
 )
 
-unhurried = settings(deadline=None)  # the first call compiles
 PLACES = {"user", "u", "i", "first", "count", "scratch"}  # memory and indices carry no unit
 PORT = (32.0e6, 1.0e-9, 0.3e6, 5.0e-9)
 
@@ -68,7 +67,6 @@ def test_doctests_run():
     assert examples >= len(laws(hydraulics)), "every law of hydraulics.py shows an example"
 
 
-@unhurried
 @given(st.floats(-3, 3), st.floats(0, 0.9))
 def test_valve_opening_has_a_dead_band_and_unit_slope_to_one(spool, deadband):
     o = valve_opening(spool, deadband)
@@ -87,7 +85,6 @@ def test_valve_is_fully_open_at_full_command():
     assert valve_opening(math.nextafter(0.04, 1), 0.04) < 1e-15, "continuous at the dead band"
 
 
-@unhurried
 @given(st.floats(-30e6, 30e6), st.floats(1e-8, 1e-5), st.floats(1e3, 1e6))
 def test_orifice_slope_is_the_derivative(drop, gain, smoothing):
     flow, slope = orifice(drop, gain, smoothing)
@@ -99,7 +96,6 @@ def test_orifice_slope_is_the_derivative(drop, gain, smoothing):
     assert orifice(-drop, gain, smoothing)[0] == -flow
 
 
-@unhurried
 @given(st.floats(1e5, 30e6), st.floats(1e-8, 1e-5))
 def test_orifice_is_the_square_root_law_far_from_zero(drop, gain):
     smoothing = 5.0e4
@@ -114,7 +110,6 @@ def test_orifice_passes_the_rated_flow_at_the_rated_drop():
     assert flow == pytest.approx(6.0e-3, rel=1.3e-5)  # (d / dp)^2 / 4 = 1.28e-5
 
 
-@unhurried
 @given(st.floats(-5e6, 40e6))
 def test_port_flow_drives_the_pressure_back_into_the_band(pressure):
     flow, slope = port_flow(pressure, *PORT)
@@ -132,7 +127,6 @@ def test_port_flow_is_continuous_where_the_valves_open():
     assert port_flow(0.3e6, *PORT)[0] == 0.0
 
 
-@unhurried
 @given(st.floats(-2, 2))
 def test_friction_is_odd_and_dissipates(velocity):
     numbers = (3000.0, 1500.0, 0.02, 6000.0, 0.005)
@@ -159,7 +153,6 @@ def test_friction_without_stribeck_is_coulomb_and_viscous():
     assert friction(0.3, 4000.0, 0.0, 0.05, 2000.0, 0.005) == 4600.0
 
 
-@unhurried
 @given(
     st.floats(-1, 1), st.floats(-50, 50), st.floats(-1, 1), st.floats(5, 300), st.floats(0.3, 1),
     st.floats(0.01, 3),

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hydrotele.simulate.circuit import SLOTS, Slot, axis_state, open_ports, supply_pressure
 
-unhurried = settings(deadline=None)  # the first call compiles
 RELIEF, SMOOTHING = 28.0e6, 5.0e4
 GAINS = st.one_of(st.just(0.0), st.floats(1e-9, 1e-5))  # [m^3/(s sqrt(Pa))], rated 2.3e-6
 LOADS = st.floats(-1e6, 36e6)  # [Pa], from cavitation to above the port relief
@@ -31,7 +30,6 @@ def demand(valves, pressure):
     return total
 
 
-@unhurried
 @given(VALVES, PUMPS)
 def test_demand_is_the_pump_flow_or_the_relief_holds(valves, pump_flow):
     pressure = solve(valves, pump_flow)
@@ -45,7 +43,6 @@ def test_demand_is_the_pump_flow_or_the_relief_holds(valves, pump_flow):
         assert demand(valves, pressure) == pytest.approx(pump_flow, rel=1e-9, abs=rounding)
 
 
-@unhurried
 @given(VALVES, PUMPS, st.floats(1.0, 3.0), st.integers(0, 7))
 def test_pressure_falls_with_opening_and_rises_with_pump_flow(valves, pump_flow, more, which):
     pressure = solve(valves, pump_flow)
@@ -59,7 +56,6 @@ def test_pressure_falls_with_opening_and_rises_with_pump_flow(valves, pump_flow,
     assert solve(wider, pump_flow) >= pressure - slack
 
 
-@unhurried
 @given(st.lists(st.tuples(GAINS, st.floats(RELIEF, 36e6)), min_size=1, max_size=8), PUMPS)
 def test_relief_pressure_with_all_load_checks_closed(valves, pump_flow):
     assert solve(valves, pump_flow) == RELIEF

@@ -1,0 +1,267 @@
+"""Rooms import downwards only, files stay short, heavy libraries stay where they are used."""
+
+import ast
+import graphlib
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = "hydrotele"
+
+# Bottom first. A room is a file or folder directly under hydrotele; it sees every floor below its
+# own. Rooms of one floor see each other, in one direction only, unless the floor is in WALLED.
+FLOORS = (
+    ("errors", "signals", "resources", "datafile"),
+    ("machine", "machine_file", "effects", "scenario", "csv_import", "log_checks", "log"),
+    ("kinematics",),
+    ("simulate", "operate"),
+    ("run", "replay"),
+    ("calibrate", "identify", "gap"),
+    ("show",),
+    ("envs", "bench", "sweep", "commands"),
+    ("cli",),
+)
+WALLED = {"simulate", "operate", "calibrate", "identify", "gap"}
+_FACTS = {*FLOORS[0], *FLOORS[1], "kinematics"}
+# Rooms that see less than all the floors below.
+ONLY = {
+    "errors": set(),
+    "signals": set(),
+    "kinematics": {"errors"},
+    "calibrate": _FACTS,
+    "identify": _FACTS,
+    "gap": _FACTS,
+}
+
+HEAVY = {"rerun": {"show", "envs"}, "matplotlib": {"show", "envs"}, "gymnasium": {"show", "envs"}}
+MAX_LINES = 400
+UNFINISHED = re.compile(r"\b(?:TODO|FIXME|XXX|HACK)\b")
+MACHINE_PATH = re.compile(r"(?<![\w.:/~$}-])/(?:work|home|root|Users|mnt|srv|tmp)/\w")
+
+
+class Import(NamedTuple):
+    """One imported module, seen in one line of a file."""
+
+    module: str
+    line: int
+    at_top: bool
+
+
+def floor_of(room: str) -> int | None:
+    return next((level for level, rooms in enumerate(FLOORS) if room in rooms), None)
+
+
+def may_import(room: str, other: str) -> bool:
+    """Whether one placed room may import another placed room."""
+    if room == other:
+        return True
+    if room in ONLY:
+        return other in ONLY[room]
+    here, there = FLOORS[floor_of(room)], FLOORS[floor_of(other)]
+    if here == there:
+        return room not in WALLED
+    return FLOORS.index(there) < FLOORS.index(here)
+
+
+def modules_of(root: Path) -> dict[str, Path]:
+    """Every module of the package under `root`, by its dotted name."""
+    modules = {}
+    for path in sorted((root / PACKAGE).rglob("*.py")):
+        parts = path.relative_to(root).with_suffix("").parts
+        modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return modules
+
+
+def room_of(module: str) -> str:
+    """`hydrotele.simulate.plant` is in the room `simulate`; the package itself has no room."""
+    return (module.split(".") + [""])[1]
+
+
+def imports_of(tree: ast.Module, module: str, is_package: bool) -> Iterator[Import]:
+    """Every import statement of a file, with relative names made absolute."""
+    inside = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            inside.update(id(child) for child in ast.walk(node))
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            inside.update(id(child) for statement in node.body for child in ast.walk(statement))
+    for node in ast.walk(tree):
+        at_top = id(node) not in inside
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield Import(alias.name, node.lineno, at_top)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parts = module.split(".") + ([""] if is_package else [])
+                base = ".".join(parts[: -node.level] + ([base] if base else []))
+            for alias in node.names:
+                yield Import(f"{base}.{alias.name}", alias.lineno, at_top)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            if node.args and isinstance(node.args[0], ast.Constant):
+                yield Import(str(node.args[0].value), node.lineno, at_top)
+
+
+def known_module(name: str, modules: Iterable[str]) -> str | None:
+    """The module that an imported name is or lies in."""
+    while name and name not in modules:
+        name = name.rpartition(".")[0]
+    return name or None
+
+
+def import_problems(root: Path) -> list[str]:
+    """What is wrong with the imports of the package under `root`, one sentence each."""
+    modules = modules_of(root)
+    problems = [
+        f"{PACKAGE}.{room} has no floor; place it in FLOORS of tests/test_architecture.py"
+        for room in sorted({room_of(module) for module in modules} - {""})
+        if floor_of(room) is None
+    ]
+    graph: dict[str, set[str]] = {module: set() for module in modules}
+    for module, path in modules.items():
+        room, where = room_of(module), path.relative_to(root).as_posix()
+        tree = ast.parse(path.read_text(encoding="utf-8"), filename=where)
+        for name, line, at_top in imports_of(tree, module, path.name == "__init__.py"):
+            library = name.partition(".")[0]
+            if at_top and library in HEAVY and room not in HEAVY[library]:
+                problems.append(f"{where}:{line} imports {library} at the top of the file")
+            if library != PACKAGE:
+                continue
+            target = known_module(name, modules)
+            if target is None or target == PACKAGE != name:
+                problems.append(f"{where}:{line} imports {name}, which there is not")
+                continue
+            if target != module:
+                graph[module].add(target)
+            other = room_of(target)
+            if room == "":
+                problems.append(f"{where}:{line} imports {target}; the package imports no room")
+            elif None not in (floor_of(room), floor_of(other)) and not may_import(room, other):
+                problems.append(f"{where}:{line} {room} may not import {target}")
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        problems.append("import cycle: " + " <- ".join(error.args[1]))
+    return list(dict.fromkeys(problems))
+
+
+def test_no_room_reaches_up_or_sideways():
+    assert import_problems(ROOT) == []
+
+
+def test_every_room_has_one_floor():
+    rooms = [room for floor in FLOORS for room in floor]
+    assert len(rooms) == len(set(rooms))
+    assert WALLED | set(ONLY) <= set(rooms)
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "problem"),
+    [
+        ("kinematics/arm.py", "from hydrotele.simulate import plant", "may not import"),
+        ("kinematics/arm.py", "from hydrotele import machine", "may not import"),
+        ("kinematics/arm.py", "from ..machine import Machine", "may not import"),
+        ("kinematics/__init__.py", "from ..machine import Machine", "may not import"),
+        ("machine.py", "def late():\n    import hydrotele.run", "may not import"),
+        ("operate/joystick.py", "from hydrotele.simulate.plant import Plant", "may not import"),
+        ("simulate/plant.py", "import hydrotele.operate", "may not import"),
+        ("gap/proof.py", "from hydrotele.simulate import plant", "may not import"),
+        ("gap/proof.py", "from hydrotele.identify import fit", "may not import"),
+        ("gap/proof.py", "from hydrotele import run", "may not import"),
+        ("signals.py", "from hydrotele.errors import InputError", "may not import"),
+        ("run.py", "import importlib\nimportlib.import_module('hydrotele.cli')", "may not import"),
+        ("__init__.py", "from hydrotele.machine import Machine", "imports no room"),
+        ("run.py", "from hydrotele.missing import thing", "which there is not"),
+        ("plumbing.py", "import math", "has no floor"),
+        ("machine.py", "from hydrotele.log import Log", "import cycle"),
+        ("simulate/plant.py", "from hydrotele.simulate import native", "import cycle"),
+        ("run.py", "import rerun as rr", "at the top"),
+        (
+            "run.py",
+            "try:\n    from matplotlib import pyplot\nexcept ImportError:\n    pass",
+            "at the top",
+        ),
+        ("simulate/plant.py", "class A:\n    import gymnasium", "at the top"),
+    ],
+)
+def test_checker_finds_a_forged_violation(tmp_path, path, text, problem):
+    forge(tmp_path)
+    assert import_problems(tmp_path) == []
+    target = tmp_path / PACKAGE / path
+    target.parent.mkdir(exist_ok=True)
+    target.write_text(text + "\n", encoding="utf-8")
+    assert any(problem in found for found in import_problems(tmp_path))
+
+
+def forge(root: Path) -> None:
+    """Write a small package that keeps every rule."""
+    files = {
+        "__init__.py": "import importlib.metadata",
+        "errors.py": "",
+        "signals.py": "import math",
+        "machine.py": "from hydrotele.errors import InputError",
+        "log.py": "from hydrotele import machine, signals",
+        "kinematics/__init__.py": "",
+        "kinematics/arm.py": "from hydrotele.errors import InputError",
+        "simulate/__init__.py": "",
+        "simulate/plant.py": "from hydrotele.kinematics.arm import reach",
+        "simulate/native.py": "from .plant import Plant",
+        "operate/__init__.py": "from hydrotele.log import Log",
+        "identify/fit.py": "from hydrotele.kinematics import arm",
+        "run.py": "from . import operate\nfrom .simulate.native import install",
+        "show/__init__.py": "import rerun\nfrom hydrotele.simulate import plant",
+        "cli.py": "def show():\n    import rerun\n    from hydrotele import run, show",
+    }
+    for name, text in files.items():
+        path = root / PACKAGE / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n", encoding="utf-8")
+
+
+def texts(*patterns: str) -> Iterator[tuple[str, list[str]]]:
+    """Name and lines of every text file that a pattern finds under the repository root."""
+    for pattern in patterns:
+        for path in sorted(ROOT.glob(pattern)):
+            if not path.is_file() or "__pycache__" in path.parts:
+                continue
+            try:
+                yield path.relative_to(ROOT).as_posix(), path.read_text("utf-8").splitlines()
+            except UnicodeDecodeError:
+                continue  # a picture
+
+
+def test_files_are_short():
+    lengths = {name: len(lines) for name, lines in texts(f"{PACKAGE}/**/*.py")}
+    assert lengths
+    assert {name: n for name, n in lengths.items() if n > MAX_LINES} == {}
+
+
+def test_nothing_is_left_unfinished():
+    found = [
+        f"{name}:{number}"
+        for name, lines in texts(f"{PACKAGE}/**/*", "models/**/*", "scenarios/**/*")
+        for number, line in enumerate(lines, 1)
+        if UNFINISHED.search(line)
+    ]
+    assert found == []
+
+
+def test_no_file_names_a_path_of_one_machine():
+    patterns = [f"{folder}/**/*" for folder in (PACKAGE, "models", "scenarios", "tests", "tools")]
+    found = [
+        f"{name}:{number}: {line.strip()}"
+        for name, lines in texts(*patterns, "docs/**/*", ".ci/*", "*.md", "*.toml", "*.txt")
+        for number, line in enumerate(lines, 1)
+        if MACHINE_PATH.search(line)
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize("folder", ["work", "home", "root", "Users", "tmp"])
+def test_machine_paths_are_recognised(folder):
+    assert MACHINE_PATH.search(f'open("/{folder}/someone/log.parquet")')
+    assert not MACHINE_PATH.search(f"https://example.org/{folder}/page")

@@ -1,0 +1,135 @@
+"""What is built is complete: code, machines and scenarios in the wheel, everything in the sdist."""
+
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parent.parent
+
+pytest.importorskip("hatchling", reason="the test extra is not installed")
+
+
+def run(*command: str | Path, **options) -> str:
+    """Run a command and return its output; the output is also the message when it fails."""
+    done = subprocess.run(
+        [str(part) for part in command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        **options,
+    )
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+def pip(*arguments: str | Path) -> None:
+    run(sys.executable, "-m", "pip", "--no-input", *arguments, cwd=ROOT)
+
+
+def shipped(folder: str) -> set[str]:
+    """Files under a folder of the repository, as paths relative to the repository root."""
+    return {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    pip("wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, ".")
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def test_wheel_has_the_package_machines_and_scenarios_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+    data = {f"hydrotele/{name}" for name in shipped("models") | shipped("scenarios")}
+    assert "hydrotele/models/cat215/machine.yaml" in data
+    assert names == shipped("hydrotele") | data
+
+
+def test_every_machine_folder_has_its_numbers():
+    folders = {path.name for path in (ROOT / "models").iterdir() if path.is_dir()}
+    assert folders
+    assert {path.parent.name for path in (ROOT / "models").glob("*/machine.yaml")} == folders
+
+
+def test_installed_wheel_finds_its_machines_from_any_folder(wheel, tmp_path):
+    site = tmp_path / "site"
+    pip("install", "--quiet", "--no-deps", "--no-index", "--target", site, wheel)
+    script = (
+        "from hydrotele import resources\n"
+        "print(resources.__file__)\n"
+        "print(*sorted(p.name for p in resources.models_folder().glob('*/machine.yaml')))\n"
+        "print(resources.models_folder())\n"
+    )
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    lines = run(sys.executable, "-c", script, cwd=elsewhere, env=environment).splitlines()
+    assert lines == [
+        str(site / "hydrotele" / "resources.py"),
+        " ".join(["machine.yaml"] * len(list((ROOT / "models").glob("*/machine.yaml")))),
+        str(site / "hydrotele" / "models"),
+    ]
+    assert (site / "bin" / "hydrotele").is_file()
+
+
+def test_sdist_is_complete_and_builds_the_same_wheel(wheel, tmp_path):
+    run(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", tmp_path, cwd=ROOT)
+    (built,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(built) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (unpacked,) = (path for path in tmp_path.iterdir() if path.is_dir())
+    for folder in ("hydrotele", "models", "scenarios", "tests", "tools", ".ci"):
+        missing = {name for name in shipped(folder) if not (unpacked / name).is_file()}
+        assert missing == set()
+    for name in ("LICENSE", "README.md", "CHANGELOG.md", "pyproject.toml", "constraints.txt"):
+        assert (unpacked / name).is_file()
+    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", cwd=unpacked)
+    (again,) = (unpacked / "dist").glob("*.whl")
+    with zipfile.ZipFile(wheel) as first, zipfile.ZipFile(again) as second:
+        assert set(first.namelist()) == set(second.namelist())
+
+
+def locked() -> tuple[dict[str, str], dict[str, str]]:
+    """Versions in constraints.txt by name, for running and for testing."""
+    parts = (ROOT / "constraints.txt").read_text(encoding="utf-8").split("\n# test\n")
+    core, test = (
+        {canonicalize_name(name): v for name, v in re.findall(r"^([\w.-]+)==(\S+)", part, re.M)}
+        for part in parts
+    )
+    return core, test
+
+
+def test_lock_holds_every_declared_dependency():
+    # tools/setup installs the lock without resolving, so a gap in it would be a gap in .venv.
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    core, test = locked()
+    declared = [(text, core) for text in project["dependencies"]]
+    extras = project["optional-dependencies"]
+    declared += [(text, core | test) for texts in extras.values() for text in texts]
+    stale = []
+    for text, versions in declared:
+        requirement = Requirement(text)
+        version = versions.get(canonicalize_name(requirement.name))
+        if version is None or not requirement.specifier.contains(version):
+            stale.append(f"{text}: {version} in constraints.txt; run tools/setup --lock")
+    assert stale == []
+
+
+def test_lock_names_no_index():
+    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    assert not re.search(r"://|^-|@", text, re.M)
