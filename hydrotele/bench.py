@@ -1,4 +1,4 @@
-"""`hydrotele bench`: what a step, a scenario, a batch and a start cost, as ratios from one process."""
+"""`hydrotele bench`: what a step, a scenario, a batch and a start cost, all from one process."""
 
 import json
 import subprocess
@@ -22,6 +22,7 @@ from hydrotele.simulate.plant import Plant, build_plant, rest_state
 STEPS = 1000
 SIMULATIONS = 256
 COMMAND = (0.2, 0.1, -0.1)
+_SHORT_RUN = ("run", "excitation", "--set", "duration=1.0", "--no-review")
 
 
 def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json: bool) -> None:
@@ -74,10 +75,8 @@ def measure(repeats: int) -> dict:
         "batch_steps_per_s": {"1": round(steps / one), "2": round(steps / two)},
         "batch_scaling": round(one / two, 3),
         "help_s": round(min(_start("--help") for _ in range(3)), 3),
-        "run_s": round(
-            min(_start("run", "excitation", "--set", "duration=1.0", "--no-review") for _ in range(2)), 3
-        ),
-    }  # fmt: skip
+        "run_s": round(min(_start(*_SHORT_RUN) for _ in range(2)), 3),
+    }
 
 
 def best_of(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:

@@ -123,7 +123,9 @@ def validate(
 def export(
     machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
     tool: ToolName = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="MJCF file; default stdout.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="MJCF file; default stdout.")
+    ] = None,
     picture: Annotated[
         Path | None, typer.Option("--picture", help="Write a PNG of the machine instead.")
     ] = None,
@@ -135,7 +137,9 @@ def export(
     export_machine(machine, tool, out, picture, camera)
 
 
-@app.command(epilog="Example:  hydrotele bench --save base.json; hydrotele bench --compare base.json")
+@app.command(
+    epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json"
+)
 def bench(
     save: Annotated[Path | None, typer.Option("--save", help="Write the figures.")] = None,
     compare: Annotated[Path | None, typer.Option("--compare", help="Compare with these.")] = None,
@@ -170,7 +174,7 @@ def _options(
 
 
 def main() -> None:
-    """Entry point: errors of the user exit with 2, failed simulations with 3, interrupts with 130."""
+    """Entry point: the user's errors exit with 2, failed runs with 3, interrupts with 130."""
     try:
         app()
     except InputError as error:

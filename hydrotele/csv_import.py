@@ -1,4 +1,4 @@
-"""CSV from a data logger or a spreadsheet, as a table; units that it states are scaled to SI later."""
+"""CSV from a data logger or a spreadsheet, as a table; the checks scale its units to SI."""
 
 import re
 from collections.abc import Sequence

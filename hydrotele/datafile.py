@@ -90,7 +90,10 @@ class Facts(pydantic.BaseModel):
         return result
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # libyaml: ten times as fast
+_BASE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml: ten times as fast
+
+
+class _Loader(_BASE):
     """SafeLoader that reads 28.0e6 as a number, as YAML 1.2 does, and refuses repeated keys."""
 
     def __init__(self, stream):
@@ -122,12 +125,14 @@ _Loader.add_implicit_resolver(
 
 def _key_lines(root) -> dict[tuple, int]:
     """Line of every key; what an alias repeats has the line of the key that holds the alias."""
-    lines, opened, waiting = {(): root.start_mark.line + 1}, set(), [(root, ())]
+    lines: dict[tuple, int] = {(): root.start_mark.line + 1}
+    opened: set = set()
+    waiting: list[tuple[Any, tuple]] = [(root, ())]
     for node, path in waiting:  # grows on the way
         if node in opened:
             continue
         opened.add(node)
-        children = []
+        children: list[tuple] = []
         if isinstance(node, yaml.MappingNode):
             children = [(str(key.value), key, value) for key, value in node.value]
         elif isinstance(node, yaml.SequenceNode):

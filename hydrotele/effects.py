@@ -10,7 +10,12 @@ from typing import Any
 
 from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
-from hydrotele.machine import Machine
+from hydrotele.machine import Link, Machine
+
+PAYLOAD = "payload"
+"""Name of the link that the effect `payload` adds."""
+
+_POINT = 1.0e-3  # m, radius of gyration of a point mass: a body needs some inertia
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,23 +106,16 @@ def _leakage(machine: Machine, location: str, p: Mapping[str, float]) -> Machine
 
 
 def _payload(machine: Machine, location: str, p: Mapping[str, float]) -> Machine:
-    """Point mass at the arm's tip: mass, centre and inertia of the link that carries it."""
+    """Point mass at the arm's tip: one more link, welded there."""
     assert machine.arm
-    tip = machine.arm.tip
-    link = machine.links[tip.link]
-    added = p["mass"]
-    total = link.mass + added
-    centre = [
-        (link.mass * c + added * t) / total for c, t in zip(link.com, tip.position, strict=True)
-    ]
-    way = [t - c for c, t in zip(link.com, tip.position, strict=True)]
-    reduced = link.mass * added / total
-    squares = [w * w for w in way]
-    inertia = tuple(
-        i + reduced * (sum(squares) - s) for i, s in zip(link.inertia, squares, strict=True)
-    )
-    patched = link.model_copy(update={"mass": total, "com": tuple(centre), "inertia": inertia})
-    return _changed(machine, f"links.{tip.link}", patched)
+    tip, mass = machine.arm.tip, p["mass"]
+    if mass == 0.0:
+        return machine
+    if PAYLOAD in machine.links:
+        mass += machine.links[PAYLOAD].mass
+    size = mass * _POINT**2
+    load = Link(parent=tip.link, position=tip.position, mass=mass, inertia=(size, size, size))
+    return machine.model_copy(update={"links": {**machine.links, PAYLOAD: load}})
 
 
 def _supply_place(machine: Machine) -> tuple[str, ...]:
@@ -208,16 +206,16 @@ def apply_effect(
     if not location and len(places) == 1:
         location = places[0]
     if location not in places:
-        raise InputError(f"effect {name}", f"cannot sit at {location!r}; {suggest(location, places)}")
+        message = f"cannot sit at {location!r}; {suggest(location, places)}"
+        raise InputError(f"effect {name}", message)
     for key in parameters.keys() ^ effect.parameters.keys():
-        raise InputError(
-            f"effect {name}", f"needs exactly the parameters {', '.join(effect.parameters)}: {key!r}"
-        )
+        names = ", ".join(effect.parameters)
+        raise InputError(f"effect {name}", f"needs exactly the parameters {names}: {key!r}")
     for key, value in parameters.items():
         limits = effect.parameters[key]
         if not limits.low <= value <= limits.high:
             raise InputError(
                 f"effect {name}: {key}",
-                f"{value:g} {limits.unit} is outside {limits.low:g} .. {limits.high:g} {limits.unit}",
+                f"{value:g} is outside {limits.low:g} .. {limits.high:g} {limits.unit}",
             )
     return effect.apply(machine, location, parameters)

@@ -119,8 +119,8 @@ def load_log(
 
     Args:
         path: the file.
-        aliases: the file's own column name -> channel name, with a minus before it where the sign is
-            the other way round; names that the file lacks are ignored, and so
+        aliases: the file's own column name -> channel name, with a minus before it where the sign
+            is the other way round; names that the file lacks are ignored, and so
             are all of them for logs that hydrotele wrote.
         required: channels that must be there, after renaming.
         minimum_rows: fewer rows are refused.

@@ -96,6 +96,16 @@ class Cylinder(Facts):
     tube: Bar
     rod: Bar
 
+    @property
+    def areas(self) -> tuple[float, float]:
+        """Head-side and rod-side piston area [m^2]."""
+        return self.area_head, self.area_rod
+
+    def volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Head and rod chamber volumes [m^3] at piston displacements x [m], any shape."""
+        left = self.stroke - x
+        return self.dead_volume + self.area_head * x, self.dead_volume + self.area_rod * left
+
 
 class Motor(Facts):
     """A hydraulic motor on a joint: displacement [m^3/rad], constant chamber volumes [m^3]."""
@@ -104,6 +114,16 @@ class Motor(Facts):
     dead_volume: Positive
     leakage: NonNegative
     friction: Friction = Friction()
+
+    @property
+    def areas(self) -> tuple[float, float]:
+        """Displacement of port A and of port B [m^3/rad], in the place of piston areas."""
+        return self.displacement, self.displacement
+
+    def volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Constant chamber volumes [m^3], in the shape of the motor angles x [rad]."""
+        constant = np.full_like(x, self.dead_volume)
+        return constant, constant
 
 
 class ForceDrive(Facts):
@@ -162,6 +182,13 @@ class Axis(Facts):
     def hydraulic(self) -> bool:
         """Whether the axis has a valve and chambers."""
         return self.valve is not None
+
+    @property
+    def hydraulic_drive(self) -> Cylinder | Motor:
+        """The cylinder or the motor of a hydraulic axis."""
+        drive = self.cylinder or self.motor
+        assert drive is not None
+        return drive
 
     @property
     def drive(self) -> Cylinder | Motor | ForceDrive:

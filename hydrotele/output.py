@@ -38,21 +38,21 @@ def whole_folder(target: str | Path) -> Iterator[Path]:
         part = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=target.parent))
     except OSError as error:
         raise InputError(asked, f"cannot be made: {error.strerror}") from None
+    old = part.with_suffix(".old.part")
     try:
         part.chmod(0o755)
         yield part
-        old = None
         if target.exists():
-            old = part.with_suffix(".old.part")
             target.rename(old)
         part.rename(target)
-        if old:
-            shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
     except BaseException as error:
+        if old.exists() and not target.exists():
+            old.rename(target)
         shutil.rmtree(part, ignore_errors=True)
         if isinstance(error, OSError):
             reason = error.strerror or str(error)
-            raise InputError(asked, f"cannot be written, nothing is left of it: {reason}") from error
+            raise InputError(asked, f"cannot be written, nothing is left: {reason}") from error
         raise
 
 

@@ -197,5 +197,3 @@ def _span(machine: Machine, channel: str) -> float | None:
     if kind == "length" and axis in machine.axes and machine.axes[axis].cylinder:
         return machine.axes[axis].cylinder.stroke  # type: ignore[union-attr]
     return None
-
-

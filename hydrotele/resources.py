@@ -1,4 +1,4 @@
-"""Where the shipped models and scenarios lie: inside the wheel, or beside the package in a checkout."""
+"""Where the shipped models and scenarios lie: inside the wheel, or beside a checkout's package."""
 
 from pathlib import Path
 

@@ -36,6 +36,7 @@ from hydrotele.simulate.sensors import (
 )
 
 AUDIT_SECONDS = 5.0
+_DEEPEST_START = 0.05  # m: contact is soft, so a tool may rest a little in the ground
 Progress = Callable[[float, float], None]
 
 
@@ -115,7 +116,8 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
     record, commands, pins, wall = _loop(plant, scenario, plan, data, progress)
     values, units = true_channels(plant, record)
     truth = _log(scenario, machine, record.time, values, units, "ideal")
-    truth.metadata["initial_state"] = json.dumps(_initial_state(plant, record))
+    state = json.dumps(_initial_state(plant, record))
+    truth = dataclasses.replace(truth, metadata={**truth.metadata, "initial_state": state})
     sensors = sensor_set(machine, scenario.sensors)
     seen = {c: v for c, v in values.items() if not c.startswith(("truth.", "command."))}
     readings = measure(machine, sensors, scenario.seed, seen, _row_errors(plant, scenario))
@@ -149,11 +151,16 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
             raise InputError(
                 "start", f"{name} {joints[name]:.4g} is outside its range {low:.4g} .. {high:.4g}"
             )
-    return rest_state(plant, joints), joints
+    data = rest_state(plant, joints)
+    mujoco.mj_fwdPosition(plant.model, data)
+    depth = -min((data.contact[k].dist for k in range(data.ncon)), default=0.0)
+    if depth > _DEEPEST_START:
+        raise InputError("start", f"the machine would stand {depth:.2f} m deep in the ground")
+    return data, joints
 
 
 def _feedback_errors(plant: Plant, scenario: Scenario) -> dict[str, np.ndarray]:
-    """Errors of the fed-back channels at every control tick; the log shows every so many of them."""
+    """Errors of the fed-back channels at every control tick; the log shows some of them."""
     sensors = sensor_set(plant.machine, scenario.sensors)
     names = [f"{plant.machine.position_kind(a)}.{a}" for a in plant.axes]
     for axis in plant.axes[: plant.hydraulic]:
@@ -184,9 +191,11 @@ def _converter_steps(plant: Plant, scenario: Scenario, names: list[str]) -> np.n
 
 
 def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress | None):
-    """Step through the run; returns the record, all commands (n, nu), the largest opening [m] and
+    """Step through the run.
 
-    the wall time [s] from the second control tick on (the first one loads compiled code).
+    Returns:
+        (record, commands (n, nu), largest pin opening [m], wall time [s] from the second control
+        tick on, since the first one loads compiled code).
     """
     model, dt = plant.model, 1.0 / scenario.control_rate
     steps = round(dt / scenario.timestep)
@@ -291,7 +300,7 @@ def _tracking(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
     for i, name in enumerate(plan.axes):
         if plan.closed[i]:
             error = record.qpos[:, plant.qpos[i]] - plan.reference[rows, i]
-            result[name] = {"rms": float(np.sqrt(np.mean(error**2))), "max": float(abs(error).max())}
+            result[name] = _size(error)
     if plan.pose is not None and record.tip.shape[1]:
         desired = plan.pose[rows]
         r = np.hypot(record.tip[:, 0], record.tip[:, 1]) - desired[:, 0]
@@ -299,11 +308,14 @@ def _tracking(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
         joints = [j for j in (arm.boom, arm.stick, arm.tool) if j] if arm else []
         places = [plant.model.joint(j).qposadr[0] for j in joints]
         attitude = record.qpos[:, places].sum(axis=1) - desired[:, 3]
-        for key, error in (("r", r), ("z", record.tip[:, 2] - desired[:, 2]), ("attitude", attitude)):
-            result[f"tip_{key}"] = {
-                "rms": float(np.sqrt(np.mean(error**2))), "max": float(abs(error).max()),
-            }  # fmt: skip
+        z = record.tip[:, 2] - desired[:, 2]
+        errors = {"tip_r": r, "tip_z": z, "tip_attitude": attitude}
+        result |= {name: _size(error) for name, error in errors.items()}
     return result
+
+
+def _size(error: np.ndarray) -> dict[str, float]:
+    return {"rms": float(np.sqrt(np.mean(error**2))), "max": float(np.abs(error).max())}
 
 
 def _versions() -> dict[str, str]:
@@ -318,12 +330,11 @@ def _git_commit() -> str | None:
     folder = Path(hydrotele.__file__).parent.parent
     if not (folder / ".git").exists():
         return None
-    ask = ["git", "-C", str(folder)]
+    git = ["git", "-C", str(folder)]
+    how: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 5}
     try:
-        head = subprocess.run([*ask, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
-        dirty = subprocess.run(
-            [*ask, "status", "--porcelain", "-uno"], capture_output=True, text=True, timeout=5
-        )
+        head = subprocess.run([*git, "rev-parse", "HEAD"], **how)
+        dirty = subprocess.run([*git, "status", "--porcelain", "-uno"], **how)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return head.stdout.strip() + ("+" if dirty.stdout.strip() else "") or None

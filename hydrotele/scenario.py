@@ -19,7 +19,7 @@ from hydrotele.signals import parse_channel
 
 
 class Pose(Facts):
-    """Where the arm's tip is: r, z [m] from the swing axis and the ground, theta, attitude [rad]."""
+    """The arm's tip: r from the swing axis, z above ground [m], theta and attitude [rad]."""
 
     r: Positive
     z: float
@@ -143,8 +143,8 @@ class Servo(Facts):
     """Joint servo.
 
     position_gain [1/s], velocity_gain (force drives only) [N s/m] or [N m s/rad], feedforward and
-    deadband_compensation as fractions, lead [s] that makes up for the spool's lag, pressure_feedback
-    [1/s] (damping) with load_time [s] of the slow mean force.
+    deadband_compensation as fractions, lead [s] that makes up for the spool's lag,
+    pressure_feedback [1/s] (damping) with load_time [s] of the slow mean force.
     """
 
     position_gain: NonNegative = 4.0
@@ -157,7 +157,7 @@ class Servo(Facts):
 
 
 class PlantedEffect(Facts):
-    """An effect that the simulated machine has and its model lacks; see `hydrotele list effects`."""
+    """An effect that the simulated machine has and its model lacks (`hydrotele list effects`)."""
 
     name: str
     location: str = ""

@@ -15,7 +15,7 @@ PACKAGE = "hydrotele"
 # Bottom first. A room is a file or folder directly under hydrotele; it sees every floor below its
 # own. Rooms of one floor see each other, in one direction only, unless the floor is in WALLED.
 FLOORS = (
-    ("errors", "signals", "resources", "datafile"),
+    ("errors", "signals", "resources", "datafile", "output"),
     ("machine", "machine_file", "effects", "scenario", "csv_import", "log_checks", "log"),
     ("kinematics",),
     ("simulate", "operate"),

@@ -95,7 +95,8 @@ def test_straight_lines_reach_their_speed(name):
     cruise = (truth.time >= begin) & (truth.time <= end)
     times, way = truth.time[cruise], along[cruise]
     assert abs(way[-1] - way[0]) / (times[-1] - times[0]) == pytest.approx(0.5, rel=0.02)
-    assert along[-1] - along[0] == pytest.approx(move.z + move.r, abs=0.01)
+    # 2 cm: what is asked of the controller.
+    assert along[-1] - along[0] == pytest.approx(move.z + move.r, abs=0.02)
 
 
 def radius(log):
@@ -145,7 +146,9 @@ def test_grapple_swings_as_a_compound_pendulum():
         moment += link.mass * centre
         inertia += link.inertia[1] + link.mass * centre**2
     period = 2 * math.pi * math.sqrt(inertia / (moment * 9.81))
-    angle, time = run.truth["truth.angle.grapple_pitch"] - pitch, run.truth.time
+    log, time = run.truth, run.truth.time
+    arm = log["angle.boom"] + log["angle.stick"]  # it sinks by leakage meanwhile
+    angle = arm + log["truth.angle.grapple_pitch"] + math.pi / 2
     crossings = time[:-1][np.diff(np.sign(angle)) != 0]
     # 5 %: the arm that it hangs from gives way by some milliradians on its oil.
     assert 2 * np.diff(crossings).mean() == pytest.approx(period, rel=0.05)
@@ -312,7 +315,7 @@ REFUSED = {
     "start_range": ({"start": {"joints": {"boom": 3}}}, "boom 3 is outside its range"),
     "start_list": ({"start": [1]}, "start"),
     "pose_far": ({"start": {"pose": {"r": 30, "z": 0}}}, r"start\.pose: .*reachable"),
-    "pose_joint": ({"start": {"pose": {"r": 4.1, "z": -1.5}}}, r"start\.pose: needs stick at -15"),
+    "pose_joint": ({"start": {"pose": {"r": 4, "z": 5}}}, r"start\.pose: needs boom at 60.6 deg.* to 58.0"),
     "pose_waypoint": (
         {"pilot": {"kind": "waypoints", "points": [{"duration": 1, "pose": {"r": 30, "z": 0}}]}},
         r"pilot\.points\.0\.pose: .*reachable",

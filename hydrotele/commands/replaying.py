@@ -42,7 +42,8 @@ def replay_logs(
     if target:
         with whole_folder(target) as folder:
             for number, (the_machine, result) in enumerate(results):
-                name = result.measured.name if len(paths) == 1 else f"{number}_{result.measured.name}"
+                prefix = f"{number}_" if len(paths) > 1 else ""
+                name = prefix + result.measured.name
                 _write(folder, name, the_machine, result)
             import json
 

@@ -80,7 +80,8 @@ def _print_summary(summary: dict[str, Any]) -> None:
         rows.add_row(label, "-" if value is None else f"{value:.1e}")
     for name, error in summary["tracking"].items():
         unit, factor = ("mm", 1e3) if name in ("tip_r", "tip_z") else ("deg", 57.29577951308232)
-        rows.add_row(f"tracking {name}", f"rms {error['rms'] * factor:.2f}, max {error['max'] * factor:.2f} {unit}")
+        rms, largest = error["rms"] * factor, error["max"] * factor
+        rows.add_row(f"tracking {name}", f"rms {rms:.2f}, max {largest:.2f} {unit}")
     out.print(rows)
     for note in summary["notes"]:
         out.print(f"[yellow]note[/] {note}")

@@ -65,8 +65,8 @@ def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
         name: axis name.
 
     Returns:
-        Two-bar, four-bar or slider with `length`, `rate`, `angle` of the pin-to-pin length; `Direct`
-        for motors and force drives.
+        Two-bar, four-bar or slider with `length`, `rate`, `angle` of the pin-to-pin length;
+        `Direct` for motors and force drives.
 
     Raises:
         InputError: the pins of the cylinder are not on the two links that the joint connects.
@@ -155,7 +155,8 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
     arm = machine.arm
     if arm is None:
         raise InputError(f"machine {machine.name}", "has no arm: give arm.swing, boom, stick, tip")
-    swing, boom, stick = (machine.links[machine.link_of(j)] for j in (arm.swing, arm.boom, arm.stick))
+    joints = (arm.swing, arm.boom, arm.stick)
+    swing, boom, stick = (machine.links[machine.link_of(j)] for j in joints)
     if arm.tool:
         tool_pin = machine.links[machine.link_of(arm.tool)].position
         offset = _plane(arm.tip.position)

@@ -1,0 +1,1 @@
+"""The operator's side: plans, resolved motion, servo."""

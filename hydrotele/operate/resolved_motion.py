@@ -1,4 +1,4 @@
-"""Resolved motion in cylindrical coordinates (r, theta, z, attitude), under rate or position command.
+"""Resolved motion in cylindrical coordinates (r, theta, z, attitude), by rate or position.
 
 Inverse kinematics gives the joint references and the inverse Jacobian their rates, so that no error
 is integrated. A step that would leave the reach or a joint's range is not made: the reference stays
@@ -118,7 +118,8 @@ class ResolvedMotion:
 
 def _pose(geometry: ArmGeometry, joints) -> tuple[float, float, float, float]:
     pose = forward(geometry, joints)
-    return (*pose, sum(joints[1:])) if len(pose) == 3 else pose
+    attitude = pose[3] if len(pose) == 4 else sum(joints[1:])
+    return pose[0], pose[1], pose[2], attitude
 
 
 def arm_axes(machine: Machine) -> tuple[str, ...]:

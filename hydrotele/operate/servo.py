@@ -1,10 +1,10 @@
 """Joint servo on valve commands: velocity feedforward, position feedback, dead-band compensation.
 
 The wanted piston velocity becomes the valve opening that, at the pressures measured now, keeps the
-drive's force constant while the piston moves at that velocity. That holds through the compression of
-the oil when the direction changes, where a steady flow gain would be wrong by centimetres. Since it
-also takes away the damping that orifices give, the deviation of the force from its slow mean is fed
-back as a velocity.
+drive's force constant while the piston moves at that velocity. That holds through the compression
+of the oil when the direction changes, where a steady flow gain would be wrong by centimetres. Since
+it also takes away the damping that orifices give, the deviation of the force from its slow mean is
+fed back as a velocity.
 """
 
 import math
@@ -44,16 +44,13 @@ def servo_numbers(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: flo
         gains = [servo.position_gain, servo.velocity_gain, servo.deadband_compensation, filtered]
         gains += [machine.supply.bulk_modulus if machine.supply else 0.0, servo.pressure_feedback]
         if axis.valve and machine.supply:
-            head = axis.cylinder.area_head if axis.cylinder else axis.motor.displacement  # type: ignore[union-attr]
-            rod = axis.cylinder.area_rod if axis.cylinder else axis.motor.displacement  # type: ignore[union-attr]
+            head, rod = axis.hydraulic_drive.areas
             flow_gain = axis.valve.rated_flow / math.sqrt(axis.valve.rated_pressure_drop)
             facts = [_MOTOR_OR_CYLINDER, head, rod, flow_gain, axis.valve.deadband]
             rows.append([*facts, machine.supply.tank_pressure, 1.0, 0.0, *gains])
         else:
             assert axis.force
-            rows.append(
-                [_FORCE, 0, 0, 0, 0, 0, axis.force.command_limit, axis.force.gain, *gains]
-            )
+            rows.append([_FORCE, 0, 0, 0, 0, 0, axis.force.command_limit, axis.force.gain, *gains])
     return np.array(rows, dtype=float)
 
 
@@ -95,14 +92,11 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
         speed = arm[:, column] * plan.rate[:, column]
         velocity[:, column] = servo.feedforward * np.interp(ahead, plan.time, speed)
         axis = machine.axes[name]
-        if axis.motor:
-            head[:, column] = rod[:, column] = axis.motor.dead_volume
-        elif axis.cylinder:
-            length = linkage.length(plan.reference[:, column]) - axis.cylinder.closed_length
-            x = np.clip(length, 0.0, axis.cylinder.stroke)
-            left = axis.cylinder.stroke - x
-            head[:, column] = axis.cylinder.dead_volume + axis.cylinder.area_head * x
-            rod[:, column] = axis.cylinder.dead_volume + axis.cylinder.area_rod * left
+        if axis.hydraulic:
+            x = np.asarray(linkage.length(plan.reference[:, column]))
+            if axis.cylinder:
+                x = np.clip(x - axis.cylinder.closed_length, 0.0, axis.cylinder.stroke)
+            head[:, column], rod[:, column] = axis.hydraulic_drive.volumes(x)
     return DriveReferences(velocity, arm, head, rod)
 
 
@@ -189,9 +183,7 @@ def servo_step(
         load[i] += numbers[i, 11] * (force - load[i])
         if not closed[i]:
             continue
-        stiffness = numbers[i, 12] * (
-            area_head**2 / volume_head[i] + area_rod**2 / volume_rod[i]
-        )
+        stiffness = numbers[i, 12] * (area_head**2 / volume_head[i] + area_rod**2 / volume_rod[i])
         wanted = velocity[i] + gain * arm[i] * error
         wanted -= numbers[i, 13] * (force - load[i]) / stiffness
         opening = wanted_opening(

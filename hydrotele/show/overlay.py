@@ -9,6 +9,7 @@ import numpy as np
 
 from hydrotele.errors import InputError
 from hydrotele.log import Log
+from hydrotele.output import replacing
 from hydrotele.show.channels import (
     TITLES,
     Trace,
@@ -19,7 +20,6 @@ from hydrotele.show.channels import (
     padded_range,
     shown,
 )
-from hydrotele.output import replacing
 from hydrotele.signals import parse_channel
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def _drawing(path: str | os.PathLike, size: tuple[int, int]) -> Iterator["Figure
     from matplotlib.figure import Figure
 
     # No pyplot: neither a window nor a global state is wanted.
-    with replacing(path, ".png") as part, matplotlib.rc_context(_STYLE):
+    with replacing(path, ".png") as part, matplotlib.rc_context(_STYLE):  # pyright: ignore - its keys are checked by matplotlib
         figure = Figure(figsize=(size[0] / _DPI, size[1] / _DPI), dpi=_DPI, facecolor="white")
         FigureCanvasAgg(figure)
         yield figure
@@ -174,7 +174,7 @@ def _grid(figure: "Figure", rows: int, columns: int):
     )  # fmt: skip
 
 
-def _heading(figure: "Figure", title: str, keys: Sequence[tuple[str, object]]) -> None:
+def _heading(figure: "Figure", title: str, keys: Sequence[tuple[str, tuple[float, ...] | str]]) -> None:
     """Title and one legend for all plots."""
     from matplotlib.lines import Line2D
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
-from hydrotele.show.looks import bounds
 from hydrotele.output import replacing
+from hydrotele.show.looks import bounds
 from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.closure import close_loops
 

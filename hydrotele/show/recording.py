@@ -15,10 +15,10 @@ import numpy as np
 from hydrotele.errors import InputError
 from hydrotele.log import Log
 from hydrotele.machine import Machine
+from hydrotele.output import replacing
 from hydrotele.show.channels import colours, common_channels, difference, grouped, shown
 from hydrotele.show.layout import Plot, Scene, blueprint
 from hydrotele.show.looks import bounds
-from hydrotele.output import replacing
 from hydrotele.show.pose import (
     Poses,
     body_poses,
@@ -129,6 +129,7 @@ def _log_machines(stream, entries) -> Scene:
             ground = log_ground(stream, model)
             scene = Scene(_scene_title(list(entries)), contents, trails, eye, target, ground)
     contents.append("/ground/**")
+    assert scene is not None  # there is at least one entry
     return scene
 
 

@@ -1,0 +1,1 @@
+"""The machine side: hydraulics, mechanism, sensors, and their states."""

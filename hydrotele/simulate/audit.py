@@ -13,6 +13,7 @@ from hydrotele.simulate.hydraulics import port_flow
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import drive_motion, state_flows
 
+_LOOK_EVERY = 10  # steps, to see whether the machine touches something: a hit lasts longer
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
@@ -74,19 +75,16 @@ def _hydraulic_balance(plant, qpos, qvel, act, controls, dt):
 def _volume_errors(plant, i, table, act, x, v, dt):
     axis = plant.machine.axes[plant.axes[i]]
     valve, supply = axis.valve, plant.machine.supply
-    drive = axis.drive
-    head = axis.cylinder.area_head if axis.cylinder else drive.displacement
-    rod = axis.cylinder.area_rod if axis.cylinder else drive.displacement
-    left = axis.cylinder.stroke - x[:, i] if axis.cylinder else 0.0
+    drive = axis.hydraulic_drive
+    head, rod = drive.areas
+    volume_head, volume_rod = drive.volumes(x[:, i])
     p_head, p_rod = act[:, ACTIVATIONS * i + 2], act[:, ACTIVATIONS * i + 3]
     leak = drive.leakage * (p_head - p_rod)
     sides = (
-        (p_head, table[:, 1 + 3 * i] - leak, head, head * v[:, i], drive.dead_volume + head * x[:, i]),
-        (p_rod, table[:, 2 + 3 * i] + leak, rod, -rod * v[:, i], drive.dead_volume + rod * left),
+        (p_head, table[:, 1 + 3 * i] - leak, head * v[:, i], volume_head),
+        (p_rod, table[:, 2 + 3 * i] + leak, -rod * v[:, i], volume_rod),
     )
-    for pressure, inflow, _, swept, volume in sides:
-        if axis.motor:
-            volume = np.full_like(pressure, drive.dead_volume)
+    for pressure, inflow, swept, volume in sides:
         port = np.array([
             port_flow(p, valve.port_relief, valve.port_relief_gain, supply.tank_pressure,
                       valve.makeup_gain)[0] for p in pressure
@@ -102,16 +100,18 @@ def _volume_errors(plant, i, table, act, x, v, dt):
 def _energy_balance(plant, qpos, qvel, work, dt):
     model = plant.model
     data = mujoco.MjData(model)
+    last = len(qpos) - 1
     energy = np.empty(2)
-    for row in (0, len(qpos) - 1):
+    for row in (*range(0, last, _LOOK_EVERY), last):
         data.qpos[:], data.qvel[:] = qpos[row], qvel[row]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         if data.ncon or data.nefc > 3 * model.neq:
             return None
-        mujoco.mj_energyPos(model, data)
-        mujoco.mj_energyVel(model, data)
-        energy[min(row, 1)] = data.energy.sum()
+        if row in (0, last):
+            mujoco.mj_energyPos(model, data)
+            mujoco.mj_energyVel(model, data)
+            energy[min(row, 1)] = data.energy.sum()
     lost = np.sum(model.dof_damping * np.sum(qvel[1:] ** 2, axis=0)) * dt
     done = np.sum(np.abs(np.diff(work)))
     return float(abs(work[-1] - lost - (energy[1] - energy[0])) / done) if done > 1.0 else None

@@ -57,10 +57,16 @@ def assemble(
         _connect(root, name, closure.a, closure.b, timestep)
     if machine.arm:
         tip = machine.arm.tip
-        _body(root, tip.link).add("site", name="tip", pos=tip.position, size=(0.03,), group=4)
+        body = _body(root, tip.link)
+        add_element(body, "site", name="tip", pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
     _write_scene(root, ground, looks)
     return root
+
+
+def add_element(parent, kind: str, **attributes):
+    """Add an MJCF element; `dm_control` makes its classes at run time, unseen by type checks."""
+    return parent.add(kind, **attributes)
 
 
 def mjcf_text(root: mjcf.RootElement) -> str:

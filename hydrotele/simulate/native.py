@@ -2,11 +2,13 @@
 
 Every hydraulic actuator has four activations and carries its numbers in `actuator_user`
 (`circuit.Slot`). The last one advances all of them, because they share the supply (MuJoCo clears an
-actuator's rates just before it calls back for it); the force is that of the pressures at the end of the step, as `actearly` does, or explicit stepping would add
-negative damping. The callbacks touch nothing but the mjModel and mjData that they are given, so
-they are thread-safe, and a model can be randomised through `actuator_user`. Actuators without the
-marker are left alone.
+actuator's rates just before it calls back for it); the force is that of the pressures at the end of
+the step, as `actearly` does, or explicit stepping would add negative damping. The callbacks touch
+nothing but the mjModel and mjData that they are given, so they are thread-safe, and a model can be
+randomised through `actuator_user`. Actuators without the marker are left alone.
 """
+# pyright: reportCallIssue=false, reportPrivateImportUsage=false
+# numba's intrinsics are called without their typing context, and carray is its documented API.
 
 import ctypes
 import functools

@@ -53,19 +53,12 @@ def _write_friction(numbers: np.ndarray, axis: Axis) -> None:
 def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     valve = axis.valve
     assert valve is not None
-    if axis.cylinder:
-        cylinder = axis.cylinder
-        numbers[Slot.KIND] = Kind.CYLINDER
-        numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = cylinder.area_head, cylinder.area_rod
-        numbers[Slot.STROKE] = cylinder.stroke
-        volume, leakage = cylinder.dead_volume, cylinder.leakage
-    else:
-        assert axis.motor is not None
-        numbers[Slot.KIND] = Kind.MOTOR
-        numbers[Slot.AREA_HEAD] = numbers[Slot.AREA_ROD] = axis.motor.displacement
-        volume, leakage = axis.motor.dead_volume, axis.motor.leakage
-    numbers[Slot.VOLUME_HEAD] = numbers[Slot.VOLUME_ROD] = volume
-    numbers[Slot.LEAKAGE] = leakage
+    drive = axis.hydraulic_drive
+    numbers[Slot.KIND] = Kind.CYLINDER if axis.cylinder else Kind.MOTOR
+    numbers[Slot.STROKE] = axis.cylinder.stroke if axis.cylinder else 0.0
+    numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = drive.areas
+    numbers[Slot.VOLUME_HEAD] = numbers[Slot.VOLUME_ROD] = drive.dead_volume
+    numbers[Slot.LEAKAGE] = drive.leakage
     numbers[Slot.BANDWIDTH], numbers[Slot.DAMPING] = valve.bandwidth, valve.damping
     numbers[Slot.DEADBAND] = valve.deadband
     numbers[Slot.FLOW_GAIN] = valve.rated_flow / math.sqrt(valve.rated_pressure_drop)

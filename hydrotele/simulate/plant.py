@@ -16,7 +16,7 @@ from hydrotele.simulate.closure import (
     independent_dofs,
     motion_basis,
 )
-from hydrotele.simulate.mechanism import assemble, mjcf_text
+from hydrotele.simulate.mechanism import add_element, assemble, mjcf_text
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.simulate.parameters import actuator_order
 
@@ -52,9 +52,8 @@ class Plant:
         """The complete MJCF as text, with looks and the `home` keyframe, made when asked for."""
         root = assemble(self.machine, self.model.opt.timestep, self.ground)
         home = rest_state(self)
-        key = root.keyframe.add("key", name="home", qpos=home.qpos)
-        if self.model.na:
-            key.act = home.act
+        pressures = {"act": home.act} if self.model.na else {}
+        add_element(root.keyframe, "key", name="home", qpos=home.qpos, **pressures)
         return mjcf_text(root)
 
 
@@ -112,15 +111,14 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
     close_loops(plant.machine, plant.model, data, dict(joints or {}))
     forces = holding_forces(plant.machine, plant.model, data)
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
-        drive = plant.machine.axes[name].drive
-        head = getattr(drive, "area_head", None) or drive.displacement
-        rod = getattr(drive, "area_rod", None) or drive.displacement
+        head, rod = plant.machine.axes[name].hydraulic_drive.areas
         p_head, p_rod = (forces[i] + rod * REST_PRESSURE) / head, REST_PRESSURE
         if p_head < REST_PRESSURE:
             p_head, p_rod = REST_PRESSURE, (head * REST_PRESSURE - forces[i]) / rod
         data.act[ACTIVATIONS * i + 2 : ACTIVATIONS * i + 4] = p_head, p_rod
     for i in range(plant.hydraulic, len(plant.axes)):
         drive = plant.machine.axes[plant.axes[i]].force
+        assert drive
         data.ctrl[i] = (forces[i] + drive.offset) / drive.gain
     return data
 

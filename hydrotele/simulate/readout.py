@@ -210,5 +210,3 @@ def drive_motion(plant: Plant, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.n
             columns[i] = plant.rod_qpos[i]
             dofs[i] = model.joint(f"{name}_rod").dofadr[0]
     return np.ascontiguousarray(qpos[:, columns]), np.ascontiguousarray(qvel[:, dofs])
-
-

@@ -109,8 +109,8 @@ class Recorder:
     def _story(self, row: int) -> str:
         lines = [f"the simulation became unstable at {self.time[row]:.3f} s; the last states:"]
         for r in range(max(0, row - 3), row + 1):
-            lines.append(f"  t={self.time[r]:.3f} qpos={np.array2string(self.qpos[r], precision=4)}")
-            lines.append(f"    pressures and spools={np.array2string(self.act[r], precision=4)}")
+            qpos, act = (np.array2string(a[r], precision=4) for a in (self.qpos, self.act))
+            lines += [f"  t={self.time[r]:.3f} qpos={qpos}", f"    spools and pressures={act}"]
         return "\n".join(lines)
 
     def record(self) -> Record:
