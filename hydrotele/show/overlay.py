@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -174,7 +174,7 @@ def _grid(figure: "Figure", rows: int, columns: int):
     )  # fmt: skip
 
 
-def _heading(figure: "Figure", title: str, keys: Sequence[tuple[str, tuple[float, ...] | str]]) -> None:
+def _heading(figure: "Figure", title: str, keys: Sequence[tuple[str, Any]]) -> None:
     """Title and one legend for all plots."""
     from matplotlib.lines import Line2D
 
