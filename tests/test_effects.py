@@ -1,5 +1,6 @@
 """Each effect changes what it says and nothing else, everywhere it can sit."""
 
+import functools
 import math
 
 import mujoco
@@ -137,6 +138,11 @@ def short(machine, tool, effects=()):
     )  # fmt: skip
 
 
+@functools.cache
+def plain_run(machine, tool):
+    return run_scenario(short(machine, tool))
+
+
 @pytest.mark.parametrize(("machine", "tool", "name", "place"), CASES)
 def test_is_felt(machine, tool, name, place):
     """A machine that has it moves, and not as the one without it."""
@@ -144,7 +150,7 @@ def test_is_felt(machine, tool, name, place):
     if name == "pump_flow_limit":  # felt only where it is less than what the valves ask for
         given["pump_flow"] = 0.3 * load_machine(machine, tool).supply.pump_flow
     planted = {"name": name, "location": place, "parameters": given}
-    plain = run_scenario(short(machine, tool)).truth
+    plain = plain_run(machine, tool).truth
     moved = run_scenario(short(machine, tool, [planted])).truth
     assert any(not np.array_equal(plain[c], moved[c]) for c in plain.columns)
     assert all(np.isfinite(v).all() for v in moved.columns.values())

@@ -5,6 +5,7 @@ A plan holds either open-loop commands or joint references for every axis at eve
 
 import dataclasses
 import math
+from itertools import zip_longest
 
 import numpy as np
 
@@ -137,7 +138,8 @@ def _fourier(plan: Plan, pilot: FourierPilot) -> Plan:
         column = _column(plan.axes, name, "pilot.axes")
         wave = np.full_like(plan.time, harmonics.mean)
         slope = np.zeros_like(plan.time)
-        for order, (a, b) in enumerate(_pairs(harmonics.sin, harmonics.cos), start=1):
+        pairs = zip_longest(harmonics.sin, harmonics.cos, fillvalue=0.0)
+        for order, (a, b) in enumerate(pairs, start=1):
             phase = order * omega * plan.time
             wave += a * np.sin(phase) + b * np.cos(phase)
             slope += order * omega * (a * np.cos(phase) - b * np.sin(phase))
@@ -147,18 +149,12 @@ def _fourier(plan: Plan, pilot: FourierPilot) -> Plan:
     return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool))
 
 
-def _pairs(sines: list[float], cosines: list[float]) -> list[tuple[float, float]]:
-    count = max(len(sines), len(cosines))
-    pad = lambda values: [*values, *[0.0] * (count - len(values))]  # noqa: E731 - used twice, here
-    return list(zip(pad(sines), pad(cosines), strict=True))
-
-
 def quintic(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """Smooth step from 0 to 1 with zero speed and acceleration at both ends, and its rate.
 
     Args:
         time: (n,) [s].
-        duration: [s]; 0 gives a step that is done at once.
+        duration: [s]; less than a microsecond gives a step that is done at once.
 
     Returns:
         (s (n,) [1], ds/dt (n,) [1/s]).
@@ -166,7 +162,7 @@ def quintic(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
     >>> quintic(np.array([0.0, 1.0, 2.0, 3.0]), 2.0)[0]
     array([0. , 0.5, 1. , 1. ])
     """
-    if duration <= 0.0:
+    if duration < 1.0e-6:
         return np.ones_like(time), np.zeros_like(time)
     x = np.clip(time / duration, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2 / duration
