@@ -15,6 +15,7 @@ from hydrotele.machine import Link, Machine
 PAYLOAD = "payload"
 """Name of the link that the effect `payload` adds."""
 
+_LEAST = 1.0e-3  # kg, below which a load is none: MuJoCo takes no body without mass
 _POINT = 1.0e-3  # m, radius of gyration of a point mass: a body needs some inertia
 
 
@@ -109,7 +110,7 @@ def _payload(machine: Machine, location: str, p: Mapping[str, float]) -> Machine
     """Point mass at the arm's tip: one more link, welded there."""
     assert machine.arm
     tip, mass = machine.arm.tip, p["mass"]
-    if mass == 0.0:
+    if mass < _LEAST:
         return machine
     if PAYLOAD in machine.links:
         mass += machine.links[PAYLOAD].mass

@@ -1,4 +1,4 @@
-"""Replay: a log's commands from its start through the model; differences that mean what they say."""
+"""Replay: a log's commands from its start through the model; differences mean what they say."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Servo: the opening that keeps a piston's force, dead band, limits, and closed loops that follow."""
+"""Servo: the opening that keeps a piston's force, dead band, limits, closed loops that follow."""
 
 import math
 
@@ -104,7 +104,7 @@ def test_saturation(axis):
 
 
 def test_sign_of_the_feedback():
-    """A joint that is short of its reference is driven towards it, whichever way its piston acts."""
+    """A joint short of its reference is driven towards it, whichever way its piston acts."""
     for arm in (0.5, -0.5):
         assert math.copysign(1, one_step("stick", error=0.01, arm=arm)) == math.copysign(1, arm)
     assert one_step("boom", velocity=0.1) > one_step("boom", velocity=0.05) > 0
