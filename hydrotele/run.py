@@ -15,6 +15,7 @@ import hydrotele
 from hydrotele.datafile import suggest
 from hydrotele.effects import apply_effect
 from hydrotele.errors import InputError
+from hydrotele.hydraulics.circuit import ACTIVATIONS, circuit_scratch
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
@@ -23,7 +24,6 @@ from hydrotele.operate.resolved_motion import pose_to_joints
 from hydrotele.operate.servo import drive_references, servo_numbers, servo_step
 from hydrotele.scenario import Scenario, own_machine
 from hydrotele.simulate.audit import audit, full_state
-from hydrotele.simulate.circuit import ACTIVATIONS, circuit_scratch
 from hydrotele.simulate.closure import pin_opening
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.readout import read_feedback, true_channels

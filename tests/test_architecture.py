@@ -15,9 +15,9 @@ PACKAGE = "hydrotele"
 # Bottom first. A room is a file or folder directly under hydrotele; it sees every floor below its
 # own. Rooms of one floor see each other, in one direction only, unless the floor is in WALLED.
 FLOORS = (
-    ("errors", "signals", "resources", "datafile", "output"),
+    ("errors", "signals", "resources", "datafile", "output", "compiled"),
     ("machine", "machine_file", "effects", "scenario", "csv_import", "log_checks", "log"),
-    ("kinematics",),
+    ("kinematics", "hydraulics"),
     ("simulate", "operate"),
     ("run", "replay"),
     ("calibrate", "identify", "gap"),
@@ -26,7 +26,7 @@ FLOORS = (
     ("cli",),
 )
 WALLED = {"simulate", "operate", "calibrate", "identify", "gap"}
-_FACTS = {*FLOORS[0], *FLOORS[1], "kinematics"}
+_FACTS = {*FLOORS[0], *FLOORS[1], *FLOORS[2]}
 # Rooms that see less than all the floors below.
 ONLY = {
     "errors": set(),

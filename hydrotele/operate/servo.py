@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from hydrotele.compiled import compiled
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.machine import Machine
 from hydrotele.operate.plan import Plan
@@ -100,7 +100,7 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
     return DriveReferences(velocity, arm, head, rod)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def wanted_opening(
     velocity, head, rod, supply, tank, area_head, area_rod, volume_head, volume_rod, flow_gain
 ):
@@ -138,7 +138,7 @@ def wanted_opening(
     return velocity * swept / (flow_gain * max(flow, least))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def servo_step(
     numbers, closed, velocity, arm, volume_head, volume_rod, reference, joint, last, head, rod,
     supply, dt, load, out,

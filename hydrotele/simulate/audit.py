@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from hydrotele.simulate.circuit import ACTIVATIONS
-from hydrotele.simulate.hydraulics import port_flow
+from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.hydraulics.laws import port_flow
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import drive_motion, state_flows
 

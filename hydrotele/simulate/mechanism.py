@@ -10,10 +10,10 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from hydrotele.errors import InputError
+from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS
+from hydrotele.hydraulics.parameters import actuator_numbers
 from hydrotele.machine import Axis, Cylinder, Link, Machine, Pin
-from hydrotele.simulate.circuit import ACTIVATIONS, SLOTS
 from hydrotele.simulate.looks import name_geoms, without_looks
-from hydrotele.simulate.parameters import actuator_numbers
 
 with warnings.catch_warnings():  # glfw warns when there is no screen, which nobody needs here
     warnings.simplefilter("ignore")

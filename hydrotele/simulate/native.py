@@ -20,15 +20,15 @@ from numba import carray, cfunc, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.simulate.circuit import (
+from hydrotele.hydraulics.circuit import (
     SCRATCH,
     SLOTS,
     Slot,
     actuator_friction,
     step_circuit,
 )
+from hydrotele.hydraulics.parameters import MARKER
 from hydrotele.simulate.layout import field_offsets, option_offset, verify_layout
-from hydrotele.simulate.parameters import MARKER
 
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
 _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)

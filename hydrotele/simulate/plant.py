@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 
 from hydrotele.errors import InputError
+from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
-from hydrotele.simulate.circuit import ACTIVATIONS
 from hydrotele.simulate.closure import (
     close_loops,
     holding_forces,
@@ -18,7 +19,6 @@ from hydrotele.simulate.closure import (
 )
 from hydrotele.simulate.mechanism import add_element, assemble, mjcf_text
 from hydrotele.simulate.native import install_hydraulics
-from hydrotele.simulate.parameters import actuator_order
 
 REST_PRESSURE = 2.0e6  # Pa, in the chamber that carries no load when a machine stands
 

@@ -1,9 +1,9 @@
 """What a run shows: true channels from recorded states."""
 
 import numpy as np
-from numba import njit
 
-from hydrotele.simulate.circuit import (
+from hydrotele.compiled import compiled
+from hydrotele.hydraulics.circuit import (
     ACTIVATIONS,
     SCRATCH,
     Slot,
@@ -18,7 +18,7 @@ from hydrotele.simulate.record import Record
 _D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def state_supply(user, count, act, scratch):
     """Supply pressure in a state.
 
@@ -37,12 +37,12 @@ def state_supply(user, count, act, scratch):
     return supply_pressure(scratch, count, user[_D], user[_RELIEF], user[_PUMP])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _convert(value, grain):
     return value if grain == 0.0 else np.rint(value / grain) * grain
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def read_feedback(qpos, places, act, user, count, errors, grain, joint, head, rod, scratch):
     """What the controller's sensors read in a state: joint positions and pressures.
 
@@ -77,7 +77,7 @@ def read_feedback(qpos, places, act, user, count, errors, grain, joint, head, ro
     return _convert(state_supply(user, count, act, scratch) + errors[c], grain[c])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def state_flows(user, count, act, x, v):
     """Supply pressure, valve flows and drive forces of many states.
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from hydrotele.errors import InputError
+from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.arm import forward
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.machine_file import load_machine
 from hydrotele.operate.plan import lines_duration, make_plan, quintic
 from hydrotele.operate.resolved_motion import pose_to_joints
 from hydrotele.scenario import Pose, Scenario
-from hydrotele.simulate.parameters import actuator_order
 
 RATE = 200.0
 

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hydrotele.hydraulics.circuit import Slot, chamber_flows
+from hydrotele.hydraulics.laws import valve_opening
+from hydrotele.hydraulics.parameters import actuator_numbers
 from hydrotele.machine_file import load_machine
 from hydrotele.operate.servo import servo_numbers, servo_step, wanted_opening
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario, Servo
-from hydrotele.simulate.circuit import Slot, chamber_flows
-from hydrotele.simulate.hydraulics import valve_opening
-from hydrotele.simulate.parameters import actuator_numbers
 
 CAT = load_machine("cat215", "bucket")
 AXES = ("swing", "boom", "stick", "bucket")

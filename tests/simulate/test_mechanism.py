@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 
-from hydrotele.simulate.circuit import Kind, Slot
+from hydrotele.hydraulics.circuit import Kind, Slot
 from hydrotele.simulate.closure import independent_dofs, motion_basis, pin_opening
 from hydrotele.simulate.plant import REST_PRESSURE, rest_state
 

@@ -10,7 +10,7 @@ import pytest
 from mujoco import rollout
 from mujoco.batch import Batch
 
-from hydrotele.simulate.circuit import (
+from hydrotele.hydraulics.circuit import (
     ACTIVATIONS,
     SLOTS,
     Slot,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from hydrotele.simulate.circuit import Slot
+from hydrotele.hydraulics.circuit import Slot
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import rest_state
 

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
 from hydrotele.machine import Axis, Machine, Supply
-from hydrotele.simulate.circuit import SLOTS, Kind, Slot
 
 MARKER = 215325.0  # CAT 215, CAT 325: no other model writes this into actuator_user[0]
 

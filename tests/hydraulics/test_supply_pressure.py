@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.simulate.circuit import SLOTS, Slot, axis_state, open_ports, supply_pressure
+from hydrotele.hydraulics.circuit import SLOTS, Slot, axis_state, open_ports, supply_pressure
 
 RELIEF, SMOOTHING = 28.0e6, 5.0e4
 GAINS = st.one_of(st.just(0.0), st.floats(1e-9, 1e-5))  # [m^3/(s sqrt(Pa))], rated 2.3e-6

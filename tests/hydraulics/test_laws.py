@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from hydrotele.simulate import circuit, hydraulics
-from hydrotele.simulate.hydraulics import (
+from hydrotele.hydraulics import circuit
+from hydrotele.hydraulics import laws as hydraulics
+from hydrotele.hydraulics.laws import (
     friction,
     orifice,
     port_flow,

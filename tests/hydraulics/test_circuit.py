@@ -5,8 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hydrotele.machine_file import load_machine
-from hydrotele.simulate.circuit import (
+from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
     axis_state,
@@ -15,8 +14,9 @@ from hydrotele.simulate.circuit import (
     step_circuit,
     supply_pressure,
 )
-from hydrotele.simulate.hydraulics import port_flow
-from hydrotele.simulate.parameters import actuator_numbers
+from hydrotele.hydraulics.laws import port_flow
+from hydrotele.hydraulics.parameters import actuator_numbers
+from hydrotele.machine_file import load_machine
 
 SWING, BOOM, STICK = range(3)
 RELIEF, TANK, PUMP, BETA = 28.0e6, 0.3e6, 5.0e-3, 0.9e9

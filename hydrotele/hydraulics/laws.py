@@ -7,12 +7,10 @@ Equations: Merritt, *Hydraulic Control Systems* (1967); the set is fixed as the 
 
 import math
 
-from numba import njit
-
-law = njit(cache=True, error_model="numpy")
+from hydrotele.compiled import compiled
 
 
-@law
+@compiled
 def valve_opening(spool, deadband):
     """Opening of a valve with overlap: 0 inside the dead band, then linear up to 1.
 
@@ -36,7 +34,7 @@ def valve_opening(spool, deadband):
     return math.copysign(beyond / (1.0 - deadband), spool)
 
 
-@law
+@compiled
 def orifice(pressure_drop, flow_gain, smoothing):
     """Turbulent orifice flow, made smooth through zero pressure drop, and its slope.
 
@@ -63,7 +61,7 @@ def orifice(pressure_drop, flow_gain, smoothing):
     return scaled * pressure_drop, scaled * (1.0 - 0.5 * pressure_drop * pressure_drop / square)
 
 
-@law
+@compiled
 def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
     """Flow into a chamber through port relief (outward) and make-up valve (inward), and its slope.
 
@@ -91,7 +89,7 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
     return 0.0, 0.0
 
 
-@law
+@compiled
 def friction(velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity):
     """Coulomb, Stribeck and viscous friction that opposes a velocity.
 
@@ -119,7 +117,7 @@ def friction(velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_ve
     return dry * math.tanh(velocity / coulomb_velocity) + viscous * velocity
 
 
-@law
+@compiled
 def spool_step(spool, spool_rate, command, bandwidth, damping, dt):
     """One step of the spool `s'' = w^2 (u - s) - 2 z w s'` with the command held.
 

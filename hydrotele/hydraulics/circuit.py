@@ -10,9 +10,9 @@ import enum
 import math
 
 import numpy as np
-from numba import njit
 
-from hydrotele.simulate.hydraulics import (
+from hydrotele.compiled import compiled
+from hydrotele.hydraulics.laws import (
     friction,
     orifice,
     port_flow,
@@ -67,8 +67,6 @@ class Kind(enum.IntEnum):
     MOTOR = 2
     FORCE = 3
 
-
-compiled = njit(cache=True, error_model="numpy")
 
 _ROS2 = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approximate Jacobian
 _NEWTON_STEPS = 60
