@@ -308,7 +308,7 @@ REFUSED = {
         {"effects": [{"name": "payload", "parameters": {"mas": 3}}]}, "exactly.*mass",
     ),
     "effect_out_of_range": (
-        {"effects": [{"name": "payload", "parameters": {"mass": -3}}]}, "-3.* is outside 0 .. 3000 kg",
+        {"effects": [{"name": "payload", "parameters": {"mass": -3}}]}, "-3.* is outside 0",
     ),
     "effect_nan": ({"effects": [{"name": "payload", "parameters": {"mass": NAN}}]}, "finite"),
     "effects_text": ({"effects": "payload"}, "effects"),
