@@ -17,6 +17,8 @@ from hydrotele.machine_file import load_machine
 from hydrotele.output import replacing
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
+from hydrotele.simulate.mechanism import assemble, mjcf_text
+from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 
 STEPS = 1000
@@ -38,6 +40,8 @@ def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json
         InputError: the file to compare with cannot be read.
     """
     earlier = _read(compare) if compare else None
+    if save and not save.parent.is_dir():
+        raise InputError(save, f"cannot be written: {save.parent} is not a folder")
     figures = measure(5 if quick else 25)
     if save:
         with replacing(save, ".json") as part:
@@ -58,6 +62,7 @@ def measure(repeats: int) -> dict:
         mechanism_us, hydraulics_us, ratio, scenario_realtime_factor, batch_steps_per_s by thread
         count, batch_scaling, help_s, run_s.
     """
+    stop_profiling_clock()
     notes.print("mechanism with and without hydraulics ...", style="dim")
     plant = build_plant(load_machine("cat215", "none"))
     bare, full = best_of(repeats, [_bare_stepper(plant), _full_stepper(plant)])
@@ -94,10 +99,11 @@ def _full_stepper(plant: Plant) -> Callable[[], float]:
 
 
 def _bare_stepper(plant: Plant) -> Callable[[], float]:
-    """The same mechanism with its actuators switched off, coasting without gravity."""
-    model = build_plant(plant.machine).model
-    model.actuator_dyntype[:] = mujoco.mjtDyn.mjDYN_NONE
-    model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_NONE
+    """The same mechanism without any actuator, coasting without gravity."""
+    root = assemble(plant.machine, plant.model.opt.timestep, plant.ground, looks=False)
+    for actuator in root.find_all("actuator"):
+        actuator.remove()
+    model = mujoco.MjModel.from_xml_string(mjcf_text(root))
     model.opt.gravity[:] = 0.0
     start = rest_state(plant)
     start.qvel[plant.dof[0]] = 0.1
@@ -109,8 +115,9 @@ def _stepper(model: mujoco.MjModel, start: mujoco.MjData) -> Callable[[], float]
 
     def job() -> float:
         mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = start.qpos, start.qvel, start.ctrl
-        data.act[:] = start.act
+        data.qpos[:], data.qvel[:] = start.qpos, start.qvel
+        if model.nu:
+            data.ctrl[:], data.act[:] = start.ctrl, start.act
         begin = time.perf_counter()
         mujoco.mj_step(model, data, nstep=STEPS)
         return time.perf_counter() - begin
@@ -155,9 +162,12 @@ def _start(*arguments: str) -> float:
 
 def _read(path: Path) -> dict:
     try:
-        return json.loads(path.read_text())
+        figures = json.loads(path.read_text())
+        if not isinstance(figures, dict) or "ratio" not in figures:
+            raise ValueError("it has no ratio")
     except (OSError, ValueError) as error:
         raise InputError(path, f"is no saved benchmark: {error}") from None
+    return figures
 
 
 def _flat(figures: dict) -> dict[str, float]:

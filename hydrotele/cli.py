@@ -62,9 +62,14 @@ def replay(
     logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv) or run folders.")],
     machine: MachineName = None,
     tool: ToolName = None,
-    timestep: Annotated[float, typer.Option(help="Physics step [s].")] = 1.0e-3,
+    timestep: Annotated[float, typer.Option(help="Physics step in seconds.")] = 1.0e-3,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the overlay plot and recording.")
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for plots and recordings; default runs/replay_LOG, with --json none.",
+        ),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -181,9 +186,6 @@ def main() -> None:
         typer.secho("error ", fg="red", bold=True, err=True, nl=False)
         typer.echo(str(error), err=True)
         sys.exit(2)
-    except KeyboardInterrupt:
-        typer.echo("interrupted", err=True)
-        sys.exit(130)
     except RuntimeError as error:
         if type(error).__name__ != "SimulationFailed":
             raise

@@ -7,14 +7,32 @@ calls compiled code of other files, so a checkout's caches are dropped when any 
 import hashlib
 from pathlib import Path
 
-from numba import njit
+from numba import cfunc, njit
 
 _STAMP = "compiled.stamp"
 
 
 def compiled(function):
-    """Compile a function on its first call for each kind of argument, with a cache on disk."""
-    return njit(cache=True, error_model="numpy")(function)
+    """Compile a function on its first call for each kind of argument, with a cache on disk.
+
+    Where no folder for the cache can be written, it is compiled anew in every process.
+    """
+    try:
+        return njit(cache=True, error_model="numpy")(function)
+    except RuntimeError:
+        return njit(error_model="numpy")(function)
+
+
+def callback(signature):
+    """Decorator that compiles a function for C to call, cached on disk where that is possible."""
+
+    def decorate(function):
+        try:
+            return cfunc(signature, cache=True, error_model="numpy")(function)
+        except RuntimeError:
+            return cfunc(signature, error_model="numpy")(function)
+
+    return decorate
 
 
 def _drop_stale_caches() -> None:

@@ -25,15 +25,23 @@ UNIT_SUFFIXES = {
     "_cm2": 1.0e-4,
     "_psi": PSI,
     "_bar": 1.0e5,
-    "_hz": 2.0 * math.pi,
+    "_hz": 1.0,
     "_l_min": 1.0e-3 / 60.0,
     "_ms": 1.0e-3,
 }
-"""Suffix of a key -> factor to SI."""
+"""Suffix of a key -> factor to SI; `_hz` of an angular frequency counts 2 pi."""
+
+ANGULAR_FREQUENCIES = ("bandwidth",)
 
 
 def to_si(value: Any, factor: float) -> Any:
-    """Multiply a number, or every number of nested lists, by a factor; leave the rest alone."""
+    """Multiply a number, or every number of nested lists, by a factor; leave the rest alone.
+
+    Raises:
+        ValueError: the value is a text, which no unit suits.
+    """
+    if isinstance(value, str):
+        raise ValueError(f"{value!r} is a text, not a number")
     if isinstance(value, list):
         return [to_si(item, factor) for item in value]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -52,7 +60,9 @@ def split_unit(key: str) -> tuple[str, float | None]:
     """
     for suffix, factor in UNIT_SUFFIXES.items():
         if key.endswith(suffix):
-            return key.removesuffix(suffix), factor
+            stem = key.removesuffix(suffix)
+            turns = suffix == "_hz" and stem in ANGULAR_FREQUENCIES
+            return stem, 2.0 * math.pi if turns else factor
     return key, None
 
 
@@ -177,6 +187,15 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
     if not isinstance(data, dict) or node is None:
         raise InputError(str(path), "must be a mapping of keys to values")
     return data, _key_lines(node)
+
+
+def read_value(text: str) -> Any:
+    """A single YAML value, read as in files.
+
+    Raises:
+        yaml.YAMLError: the text is no YAML.
+    """
+    return yaml.load(text, Loader=_Loader)
 
 
 Model = TypeVar("Model", bound=Facts)

@@ -130,7 +130,7 @@ class ForceDrive(Facts):
     """A plain force or torque drive: `gain command = load + friction + offset` [N] or [N m]."""
 
     gain: float
-    command_unit: Literal["1", "V", "N", "A"] = "1"
+    command_unit: Literal["1", "V", "N"] = "1"
     command_limit: Positive = 1.0
     friction: Friction = Friction()
     offset: float = 0.0
@@ -230,7 +230,16 @@ class SensorSet(Facts):
     position: Sensor = Sensor()
     length: Sensor = Sensor()
     pressure: Sensor = Sensor()
-    force: Sensor = Sensor()
+
+    @model_validator(mode="after")
+    def _check(self):
+        for kind in ("angle", "position", "pressure"):
+            sensor: Sensor = getattr(self, kind)
+            if sensor.bits is not None and sensor.span is None:
+                raise ValueError(
+                    f"{kind}: {sensor.bits} bits need a span (only length has its own)"
+                )
+        return self
 
 
 class Arm(Facts):

@@ -23,6 +23,8 @@ MACHINE_FILE = "machine.yaml"
 def machine_path(name_or_path: str | Path) -> Path:
     """File of a shipped machine (by name) or of a user's (folder or YAML file).
 
+    A bare name means the shipped machine, whatever the working folder holds; `./name` the folder.
+
     Raises:
         InputError: there is no such machine; lists those that are shipped.
     """
@@ -31,11 +33,10 @@ def machine_path(name_or_path: str | Path) -> Path:
         if path.is_file():
             return path
         raise InputError(path, "no such machine file")
+    if str(name_or_path) in shipped_machines():
+        return models_folder() / path / MACHINE_FILE
     if (path / MACHINE_FILE).is_file():
         return path / MACHINE_FILE
-    shipped = models_folder() / str(name_or_path) / MACHINE_FILE
-    if shipped.is_file():
-        return shipped
     raise InputError(
         f"machine {str(name_or_path)!r}",
         f"is neither a folder with {MACHINE_FILE} nor a shipped machine;"

@@ -1,8 +1,11 @@
 """Files and folders that appear whole or not at all."""
 
 import contextlib
+import fnmatch
 import glob
+import json
 import os
+import re
 import secrets
 import shutil
 import tempfile
@@ -11,24 +14,30 @@ from pathlib import Path
 
 from hydrotele.errors import InputError
 
+OURS = {
+    "run": ("measured.parquet", "truth.parquet", "review.rrd", "scenario.yaml", "machine.*"),
+    "replay": ("*.png", "*.rrd", "*_simulated.parquet"),
+}
+"""Kind of folder -> files that it holds beside `summary.json`, which states the kind."""
+
 
 @contextlib.contextmanager
-def whole_folder(target: str | Path) -> Iterator[Path]:
+def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
     """Write into a hidden folder beside the target and rename it when everything is there.
 
     Args:
-        target: folder to make; an older one of that name is replaced, if it is one of ours.
+        target: folder to make; an older one of that name and kind is replaced.
+        kind: a key of `OURS`.
 
     Yields:
         The folder to write into. A killed run leaves only `.NAME.*.part`, which the next run of the
         same name removes.
 
     Raises:
-        InputError: the target is a file, a folder that was not written by a run, or cannot be
-            written.
+        InputError: as `check_target`.
     """
     asked, target = target, Path(target).resolve()
-    check_target(asked)
+    check_target(asked, kind)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         for stale in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
@@ -56,11 +65,15 @@ def whole_folder(target: str | Path) -> Iterator[Path]:
         raise
 
 
-def check_target(target: str | Path) -> None:
+def check_target(target: str | Path, kind: str) -> None:
     """Refuse to replace what is not ours, or to write where one cannot.
 
+    Args:
+        target: the folder to be written.
+        kind: a key of `OURS`.
+
     Raises:
-        InputError: the target is a file, or a folder with something in it but no summary.json, or
+        InputError: the target is a file, a folder of another kind or with other files in it, or
             lies where no folder can be made.
     """
     place = Path(target).resolve()
@@ -69,15 +82,29 @@ def check_target(target: str | Path) -> None:
         if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
             raise InputError(target, f"cannot be made: {above} is no folder that can be written to")
         return
-    if (place / "summary.json").is_file():
-        return
-    if not place.is_dir() or next(place.iterdir(), None) is not None:
-        raise InputError(target, "exists and was not written by a run; choose another --out")
+    if not place.is_dir():
+        raise InputError(target, "exists and is no folder; choose another --out")
+    inside = sorted(path.name for path in place.iterdir())
+    if inside and _kind(place) != kind:
+        raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
+    patterns = ("summary.json", *OURS[kind])
+    strange = [n for n in inside if not any(fnmatch.fnmatch(n, p) for p in patterns)]
+    if strange:
+        message = f"holds {', '.join(strange[:3])}, which no {kind} wrote; choose another --out"
+        raise InputError(target, message)
+
+
+def _kind(folder: Path) -> str | None:
+    try:
+        summary = json.loads((folder / "summary.json").read_text())
+        return summary.get("kind")
+    except (OSError, ValueError, AttributeError):
+        return None
 
 
 def _alive(part: Path) -> bool:
     try:
-        pid = int(part.name.split(".")[-3])
+        pid = int(re.findall(r"\.(\d+)\.[^.]+(?:\.old)?\.part$", part.name)[0])
         os.kill(pid, 0)
     except (ValueError, IndexError, ProcessLookupError):
         return False

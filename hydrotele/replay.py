@@ -30,7 +30,8 @@ class ChannelDifference:
         rms: RMS difference [unit].
         max: largest difference [unit].
         unit: SI unit.
-        range: full scale of the sensor, or else the span of the measured values [unit].
+        range: main relief pressure for pressures, stroke for lengths, else the span of the measured
+            values [unit].
         noise_rms: standard deviation of one reading of the log's sensors [unit], 0 if ideal.
     """
 

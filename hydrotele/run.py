@@ -2,10 +2,8 @@
 
 import dataclasses
 import json
-import subprocess
 import time as clock
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -15,7 +13,7 @@ import hydrotele
 from hydrotele.datafile import suggest
 from hydrotele.effects import apply_effect
 from hydrotele.errors import InputError
-from hydrotele.hydraulics.circuit import ACTIVATIONS, circuit_scratch
+from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
@@ -25,15 +23,12 @@ from hydrotele.operate.servo import drive_references, servo_numbers, servo_step
 from hydrotele.scenario import Scenario, own_machine
 from hydrotele.simulate.audit import audit, full_state
 from hydrotele.simulate.closure import pin_opening
+from hydrotele.simulate.feedback import Feedback, feedback
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
-from hydrotele.simulate.readout import read_feedback, true_channels
+from hydrotele.simulate.readout import true_channels
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
-from hydrotele.simulate.sensors import (
-    channel_sensor,
-    measure,
-    sensor_errors,
-    sensor_set,
-)
+from hydrotele.simulate.sensors import measure, sensor_set
+from hydrotele.summary import summarise
 
 AUDIT_SECONDS = 5.0
 _DEEPEST_START = 0.05  # m: contact is soft, so a tool may rest a little in the ground
@@ -79,6 +74,7 @@ class Prepared(NamedTuple):
     plant: Plant
     data: mujoco.MjData
     plan: Plan
+    seen: Feedback
 
 
 def prepare(scenario: Scenario) -> Prepared:
@@ -88,11 +84,16 @@ def prepare(scenario: Scenario) -> Prepared:
         InputError: the scenario asks for what the machine has not.
     """
     machine = scenario_machine(scenario)
-    sensor_set(machine, scenario.sensors)
+    sensors = sensor_set(machine, scenario.sensors)
     plant = build_plant(machine, scenario.timestep, scenario.ground)
     data, start = _start(plant, scenario)
     times = np.arange(scenario.ticks) / scenario.control_rate
-    return Prepared(plant, data, make_plan(machine, plant.axes, scenario.pilot, start, times))
+    plan = make_plan(machine, plant.axes, scenario.pilot, start, times)
+    seen = feedback(plant, sensors, scenario.seed, scenario.ticks, scenario.control_rate)
+    if sensors and round(scenario.control_rate / scenario.log_rate) % seen.every:
+        message = f"sample at {sensors.rate:g} Hz; log_rate {scenario.log_rate:g} Hz must divide it"
+        raise InputError(f"sensors {scenario.sensors}", message)
+    return Prepared(plant, data, plan, seen)
 
 
 def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
@@ -109,27 +110,34 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
         InputError: the scenario asks for what the machine has not.
         SimulationFailed: states became infinite or not a number.
     """
-    plant, data, plan = prepare(scenario)
-    machine = plant.machine
+    prepared = prepare(scenario)
+    plant, data, plan, seen = prepared
     begin_leapfrog(plant.model, data)
     begin = full_state(plant.model, data)
-    record, commands, pins, wall = _loop(plant, scenario, plan, data, progress)
-    values, units = true_channels(plant, record)
-    truth = _log(scenario, machine, record.time, values, units, "ideal")
-    state = json.dumps(_initial_state(plant, record))
-    truth = dataclasses.replace(truth, metadata={**truth.metadata, "initial_state": state})
-    sensors = sensor_set(machine, scenario.sensors)
-    seen = {c: v for c, v in values.items() if not c.startswith(("truth.", "command."))}
-    readings = measure(machine, sensors, scenario.seed, seen, _row_errors(plant, scenario))
-    readings = {c: values[c] for c in values if c.startswith("command.")} | readings
-    measured = _log(
-        scenario, machine, record.time, readings, {c: units[c] for c in readings}, scenario.sensors
-    )
-    summary = _summary(plant, scenario, plan, record, pins, wall, data)
+    record, commands, pins, wall = _loop(prepared, scenario, progress)
+    truth, measured = _logs(plant, scenario, record, seen)
+    summary = summarise(plant, scenario, plan, record, pins, wall)
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
     window = np.repeat(commands[: round(AUDIT_SECONDS * scenario.control_rate)], steps, axis=0)
     summary["balance"] = audit(plant, begin, window)
     return Run(scenario, plant, plan, measured, truth, summary)
+
+
+def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> tuple[Log, Log]:
+    """What was true and what the sensors say; the latter with the errors that were fed back."""
+    machine = plant.machine
+    values, units = true_channels(plant, record)
+    truth = _log(scenario, machine, record.time, values, units, "ideal")
+    state = json.dumps(_initial_state(plant, record))
+    truth = dataclasses.replace(truth, metadata={**truth.metadata, "initial_state": state})
+    per_row = round(scenario.control_rate / scenario.log_rate) // seen.every
+    errors = {name: e[::per_row][: scenario.rows] for name, e in seen.errors.items()}
+    visible = {c: v for c, v in values.items() if not c.startswith(("truth.", "command."))}
+    sensors = sensor_set(machine, scenario.sensors)
+    readings = {c: v for c, v in values.items() if c.startswith("command.")}
+    readings |= measure(machine, sensors, scenario.seed, visible, errors)
+    units = {c: units[c] for c in readings}
+    return truth, _log(scenario, machine, record.time, readings, units, scenario.sensors)
 
 
 def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, float]]:
@@ -144,6 +152,8 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
     if scenario.start.pose:
         here = {a: joints[machine.axes[a].joint] for a in plant.axes}
         there = pose_to_joints(machine, scenario.start.pose, here, "start.pose")
+        if twice := scenario.start.joints.keys() & {machine.axes[a].joint for a in there}:
+            raise InputError("start", f"{', '.join(sorted(twice))} follow from the pose; give one")
         joints |= {machine.axes[a].joint: value for a, value in there.items()}
     for name, joint in machine.joints.items():
         if joint.range and not joint.range[0] <= joints[name] <= joint.range[1]:
@@ -159,78 +169,39 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
     return data, joints
 
 
-def _feedback_errors(plant: Plant, scenario: Scenario) -> dict[str, np.ndarray]:
-    """Errors of the fed-back channels at every control tick; the log shows some of them."""
-    sensors = sensor_set(plant.machine, scenario.sensors)
-    names = [f"{plant.machine.position_kind(a)}.{a}" for a in plant.axes]
-    for axis in plant.axes[: plant.hydraulic]:
-        names += [f"pressure_head.{axis}", f"pressure_rod.{axis}"]
-    if plant.hydraulic:
-        names.append("pressure_supply")
-    return {
-        name: sensor_errors(
-            channel_sensor(plant.machine, sensors, name), scenario.seed, name, scenario.ticks
-        )
-        for name in names
-    }
-
-
-def _row_errors(plant: Plant, scenario: Scenario) -> dict[str, np.ndarray]:
-    every = round(scenario.control_rate / scenario.log_rate)
-    return {k: v[::every][: scenario.rows] for k, v in _feedback_errors(plant, scenario).items()}
-
-
-def _converter_steps(plant: Plant, scenario: Scenario, names: list[str]) -> np.ndarray:
-    sensors = sensor_set(plant.machine, scenario.sensors)
-    steps = []
-    for name in names:
-        sensor = channel_sensor(plant.machine, sensors, name)
-        exact = not (sensor.bits and sensor.span)
-        steps.append(0.0 if exact else sensor.span / 2.0**sensor.bits)  # type: ignore[operator]
-    return np.array(steps)
-
-
-def _loop(plant: Plant, scenario: Scenario, plan: Plan, data, progress: Progress | None):
+def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None):
     """Step through the run.
 
     Returns:
         (record, commands (n, nu), largest pin opening [m], wall time [s] from the second control
         tick on, since the first one loads compiled code).
     """
+    plant, data, plan, seen = prepared
     model, dt = plant.model, 1.0 / scenario.control_rate
     steps = round(dt / scenario.timestep)
     every = round(scenario.control_rate / scenario.log_rate)
-    ticks, rows, count = scenario.ticks, scenario.rows, plant.hydraulic
+    ticks, rows = scenario.ticks, scenario.rows
     numbers = servo_numbers(plant.machine, plant.axes, scenario.servo, dt)
     drives = drive_references(plant.machine, plan, scenario.servo)
-    errors = _feedback_errors(plant, scenario)
-    feedback = np.column_stack(list(errors.values()))
-    grain = _converter_steps(plant, scenario, list(errors))
-    user, scratch = model.actuator_user.ravel(), circuit_scratch()
     k = len(plant.axes)
-    joint, last, load = np.empty(k), np.empty(k), np.zeros(k)
-    head, rod = np.zeros(k), np.zeros(k)
-    command, commands = np.zeros(k), np.empty((ticks, k))
+    load, command, commands = np.zeros(k), np.zeros(k), np.empty((ticks, k))
     recorder = Recorder(plant, rows)
-    qpos, qvel, act, ctrl = data.qpos, data.qvel, data.act, data.ctrl
+    ctrl = data.ctrl
     worst, begin = 0.0, 0.0
     for tick in range(ticks):
         if tick % every == 0 and tick // every < rows:
             recorder.take(tick // every, tick * dt, data)
             if progress and tick % (every * 50) == 0:
                 progress(tick * dt, scenario.duration)
-        supply = read_feedback(
-            qpos - scenario.timestep * qvel, plant.qpos, act, user, count, feedback[tick], grain,
-            joint, head, rod, scratch,
-        )  # fmt: skip
+        seen.update(tick, data)
         if tick == 0:
-            last[:] = joint
-            load[:] = numbers[:, 1] * head - numbers[:, 2] * rod
+            load[:] = numbers[:, 1] * seen.head - numbers[:, 2] * seen.rod
         command[:] = plan.command[tick]
         servo_step(
             numbers, plan.closed, drives.velocity[tick], drives.arm[tick],
-            drives.volume_head[tick], drives.volume_rod[tick], plan.reference[tick], joint, last,
-            head, rod, supply, dt, load, command,
+            drives.volume_head[tick], drives.volume_rod[tick],
+            plan.reference[tick - tick % seen.every], seen.joint, seen.rate, seen.head, seen.rod,
+            seen.supply, load, command,
         )  # fmt: skip
         ctrl[:] = command
         commands[tick] = command
@@ -270,71 +241,3 @@ def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
         **{key: act[:, column].tolist() for column, key in enumerate(keys)},
         "joints": {n: float(record.qpos[0, plant.model.joint(n).qposadr[0]]) for n in free},
     }
-
-
-def _summary(plant, scenario, plan: Plan, record: Record, pins, wall, data) -> dict[str, Any]:
-    summary: dict[str, Any] = {
-        "scenario": scenario.name,
-        "machine": plant.machine.name,
-        "tool": plant.machine.tool,
-        "seed": scenario.seed,
-        "simulated_seconds": scenario.duration,
-        "wall_seconds": round(wall, 4),
-        "realtime_factor": round(scenario.duration / wall, 1),
-        "physics_steps": round(scenario.duration / scenario.timestep),
-        "largest_pin_opening_mm": pins * 1e3,
-        "warnings": int(data.warning.number.sum()),
-        "notes": list(plan.notes),
-        "largest_contact_force_N": float(np.linalg.norm(record.contact, axis=1).max()),
-        "tracking": _tracking(plant, plan, record),
-        "versions": _versions(),
-        "git_commit": _git_commit(),
-    }
-    return summary
-
-
-def _tracking(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
-    """Largest and RMS deviation of every followed axis, and of the tip from its desired pose."""
-    rows = np.searchsorted(plan.time, record.time - 1e-9)
-    result: dict[str, Any] = {}
-    for i, name in enumerate(plan.axes):
-        if plan.closed[i]:
-            error = record.qpos[:, plant.qpos[i]] - plan.reference[rows, i]
-            result[name] = _size(error)
-    if plan.pose is not None and record.tip.shape[1]:
-        desired = plan.pose[rows]
-        r = np.hypot(record.tip[:, 0], record.tip[:, 1]) - desired[:, 0]
-        arm = plant.machine.arm
-        joints = [j for j in (arm.boom, arm.stick, arm.tool) if j] if arm else []
-        places = [plant.model.joint(j).qposadr[0] for j in joints]
-        attitude = record.qpos[:, places].sum(axis=1) - desired[:, 3]
-        z = record.tip[:, 2] - desired[:, 2]
-        errors = {"tip_r": r, "tip_z": z, "tip_attitude": attitude}
-        result |= {name: _size(error) for name, error in errors.items()}
-    return result
-
-
-def _size(error: np.ndarray) -> dict[str, float]:
-    return {"rms": float(np.sqrt(np.mean(error**2))), "max": float(np.abs(error).max())}
-
-
-def _versions() -> dict[str, str]:
-    from importlib.metadata import version
-
-    names = ("mujoco", "dm-control", "numpy", "scipy", "numba", "pyarrow", "rerun-sdk")
-    return {"hydrotele": hydrotele.__version__, **{n: version(n) for n in names}}
-
-
-def _git_commit() -> str | None:
-    """Commit of the checkout that this package runs from, with `+` if it has changes."""
-    folder = Path(hydrotele.__file__).parent.parent
-    if not (folder / ".git").exists():
-        return None
-    git = ["git", "-C", str(folder)]
-    how: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 5}
-    try:
-        head = subprocess.run([*git, "rev-parse", "HEAD"], **how)
-        dirty = subprocess.run([*git, "status", "--porcelain", "-uno"], **how)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return head.stdout.strip() + ("+" if dirty.stdout.strip() else "") or None

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field, model_validator
 
-from hydrotele.datafile import Facts, parse, read_yaml, suggest
+from hydrotele.datafile import Facts, parse, read_value, read_yaml, suggest
 from hydrotele.errors import InputError
 from hydrotele.log import load_log
 from hydrotele.machine import Name, NonNegative, Positive
@@ -226,11 +226,10 @@ def scenario_path(name_or_path: str | Path) -> Path:
         InputError: there is no such scenario; lists those that are shipped.
     """
     path = Path(name_or_path)
+    if str(name_or_path) in shipped_scenarios():
+        return scenarios_folder() / f"{name_or_path}.yaml"
     if path.is_file():
         return path
-    shipped = scenarios_folder() / f"{name_or_path}.yaml"
-    if path.name == str(name_or_path) and shipped.is_file():
-        return shipped
     raise InputError(
         f"scenario {str(name_or_path)!r}",
         f"is neither a file nor a shipped scenario; {suggest(path.stem, shipped_scenarios())}",
@@ -260,7 +259,8 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
     kind = data["pilot"].get("kind") if isinstance(data.get("pilot"), dict) else None
     if isinstance(kind, str):  # pydantic names the pilot's kind in its key paths
         lines |= {("pilot", kind, *k[1:]): n for k, n in lines.items() if k[:1] == ("pilot",)}
-    scenario = parse(Scenario, data, str(path), lines)
+    source = f"{path} with --set {' '.join(overrides)}" if overrides else str(path)
+    scenario = parse(Scenario, data, source, {} if overrides else lines)
     return _with_table(scenario, _at(path, lines, "pilot", "file"))
 
 
@@ -318,8 +318,8 @@ def _override(data: dict[str, Any], key: str, text: str) -> None:
         else:
             raise InputError(f"--set {key}", f"there is nothing below {part!r} to set")
     try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
+        value = read_value(text)
+    except (yaml.YAMLError, ValueError):
         raise InputError(f"--set {key}", f"{text!r} is not a YAML value") from None
     if isinstance(where, list) and parts[-1].isdigit() and int(parts[-1]) < len(where):
         where[int(parts[-1])] = value

@@ -127,7 +127,7 @@ class Limits(NamedTuple):
 _LIMITS: Mapping[str, tuple[Limits, Limits]] = {
     unit: (Limits(low, high, looks), Limits(low_unstated, high_unstated, looks))
     for unit, low, low_unstated, high, high_unstated, looks in (
-        ("rad", 0.0, 0.0, 100.0, 4 * math.pi, "degrees"),
+        ("rad", 0.0, 0.0, 1.0e4, 4 * math.pi, "degrees"),
         ("rad/s", 0.0, 0.0, 100.0, 4 * math.pi, "degrees per second"),
         ("m", 0.0, 0.0, 50.0, 10.0, "millimetres"),
         ("m/s", 0.0, 0.0, 50.0, 10.0, "millimetres per second"),

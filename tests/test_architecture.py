@@ -19,7 +19,7 @@ FLOORS = (
     ("machine", "machine_file", "effects", "scenario", "csv_import", "log_checks", "log"),
     ("kinematics", "hydraulics"),
     ("simulate", "operate"),
-    ("run", "replay"),
+    ("run", "replay", "summary"),
     ("calibrate", "identify", "gap"),
     ("show",),
     ("envs", "bench", "sweep", "commands"),

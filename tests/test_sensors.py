@@ -15,7 +15,8 @@ from hydrotele.simulate.sensors import (
     channel_sensor,
     measure,
     noise_rms,
-    quantise,
+    _convert_all,
+    converter,
     sensor_errors,
     sensor_set,
 )
@@ -105,9 +106,11 @@ def test_longer_run_begins_like_the_shorter_one():
 def test_converter_ends_and_goes_round():
     """Lengths and pressures end at 0 and the span; an angle goes on."""
     sensor, values = Sensor(bits=4, span=1.6), np.array([-0.3, 0.04, 0.06, 0.149, 9.0])
-    np.testing.assert_allclose(quantise(values, sensor, True), [0, 0, 0.1, 0.1, 1.6], atol=1e-15)
-    np.testing.assert_allclose(quantise(values, sensor, False), [-0.3, 0, 0.1, 0.1, 9], atol=1e-15)
-    assert quantise(values, Sensor(), True) is values
+    clipped = _convert_all(values, *converter(sensor, "pressure_rod.boom"))
+    np.testing.assert_allclose(clipped, [0, 0, 0.1, 0.1, 1.6], atol=1e-15)
+    free = _convert_all(values, *converter(sensor, "angle.boom"))
+    np.testing.assert_allclose(free, [-0.3, 0, 0.1, 0.1, 9], atol=1e-15)
+    assert np.array_equal(_convert_all(values, *converter(Sensor(), "length.boom")), values)
     machine = load_machine("cat215")
     readings = measure(
         machine, sensor_set(machine, "khoshzaban1992"), 1,

@@ -77,23 +77,32 @@ def _effects() -> list[dict]:
 
 
 def validate_files(paths: list[Path], as_json: bool) -> None:
-    """Check machines (with all their tools), scenarios and logs.
+    """Check machines (with all their tools), scenarios and logs, and say of each what it is.
 
     Raises:
-        InputError: the first thing that is wrong.
+        InputError: something is wrong; all files have been reported by then.
     """
-    checked = []
+    checked: list[dict] = []
+    wrong: list[InputError] = []
     for path in paths:
-        kind, said = _validate(path)
-        checked.append({"file": str(path), "kind": kind, "valid": True, "contents": said})
-        if not as_json:
-            out.print(f"[green]valid[/] {kind} {path}: {said}")
+        try:
+            kind, said = _validate(path)
+            checked.append({"file": str(path), "kind": kind, "valid": True, "contents": said})
+            if not as_json:
+                out.print(f"[green]valid[/] {kind} {path}: {said}", soft_wrap=True)
+        except InputError as error:
+            checked.append({"file": str(path), "valid": False, "error": str(error)})
+            wrong.append(error)
     if as_json:
         print_json(checked)
+    for error in wrong[:-1]:
+        notes.print(f"error {error}", markup=False, soft_wrap=True)
+    if wrong:
+        raise wrong[-1]
 
 
 def _validate(path: Path) -> tuple[str, str]:
-    if path.suffix in (".parquet", ".csv"):
+    if path.suffix.lower() in (".parquet", ".csv"):
         from hydrotele.log import load_log
 
         log = load_log(path)
@@ -114,6 +123,8 @@ def _validate(path: Path) -> tuple[str, str]:
 
 
 def _check_machine(path: Path) -> str:
+    import mujoco
+
     from hydrotele.kinematics.from_machine import axis_linkage
     from hydrotele.simulate.plant import build_plant, rest_state
 
@@ -122,6 +133,7 @@ def _check_machine(path: Path) -> str:
         machine = load_machine(path, tool)
         plant = build_plant(machine)
         rest_state(plant)
+        mujoco.MjModel.from_xml_string(plant.mjcf)
         for axis in machine.axes:
             axis_linkage(machine, axis)
     tools = "" if first.tools == ("none",) else f", tools {', '.join(first.tools)}"

@@ -18,7 +18,10 @@ def run_demo(target: Path) -> None:
     Raises:
         InputError: the folder cannot be written.
     """
-    target.mkdir(parents=True, exist_ok=True)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(target, f"cannot be made: {error.strerror}") from None
     _say(1, "the bucket goes straight up at 0.5 m/s (Zhu 1994, Fig. 6.45)")
     run_to_folder("zhu_up", target / "zhu_up", {}, True, False)
     _say(2, "the bucket digs")

@@ -33,7 +33,7 @@ def open_log(
     Args:
         path: log file or run folder.
         machine: name or folder of a machine, None to find it.
-        tool: its tool, None for the log's.
+        tool: its tool, None for the log's if the machine has it.
         which: `measured` or `truth`, for run folders.
 
     Returns:
@@ -50,9 +50,11 @@ def open_log(
         chosen = log.metadata.get("machine")
         if not chosen:
             raise InputError(file, "its metadata names no machine: give --machine")
-    if tool is None and not beside.is_file():
-        tool = log.metadata.get("tool")
-    return load_machine(chosen, tool), log
+    found = load_machine(chosen, tool)
+    logged = log.metadata.get("tool")
+    if tool is None and logged in found.tools:
+        found = load_machine(chosen, logged)
+    return found, log
 
 
 def _aliases(machine: str) -> dict[str, str]:

@@ -1,13 +1,15 @@
 """`hydrotele replay`: logged commands through the model, differences per channel."""
 
 import dataclasses
+import json
 from pathlib import Path
 
-from hydrotele.commands.console import notes, out, print_json, progress_bar, table
+from hydrotele.commands.console import notes, out, plain, print_json, progress_bar, table
 from hydrotele.commands.opening import log_path, open_log
 from hydrotele.log import save_log
 from hydrotele.output import check_target, whole_folder
 from hydrotele.replay import Replay, replay_log
+from hydrotele.simulate.native import stop_profiling_clock
 
 _SHOWN = {"rad": ("deg", 57.29577951308232), "m": ("mm", 1e3), "Pa": ("kPa", 1e-3)}
 
@@ -23,32 +25,38 @@ def replay_logs(
         machine: machine to drive, None for the logs' own.
         tool: its tool, None for the log's.
         timestep: physics step [s].
-        target: folder for overlay plots and recordings, None for none.
+        target: folder for overlay plots and recordings; default is runs/replay_<log>, or none with
+            `as_json`.
         as_json: print JSON: one object for one log, a list for several.
 
     Raises:
         InputError: a log or machine is not usable.
     """
+    if target is None and not as_json:
+        one = log_path(paths[0])
+        name = one.parent.name if paths[0].is_dir() else one.stem
+        target = Path("runs", f"replay_{name}" if len(paths) == 1 else "replay_logs")
     if target:
-        check_target(target)
+        check_target(target, "replay")
+    stop_profiling_clock()
     results = []
     for path in paths:
         the_machine, log = open_log(path, machine, tool)
         with progress_bar(f"replay {log.name}", quiet=as_json) as progress:
             result = replay_log(log, the_machine, timestep, progress)
         results.append((the_machine, result))
+        if log.metadata.get("command", "held") != "held":
+            notes.print(f"[yellow]note[/] {path}: its commands are means over a row, not held ones")
         if not as_json:
             _print(str(log_path(path)), result)
     if target:
-        with whole_folder(target) as folder:
+        with whole_folder(target, "replay") as folder:
             for number, (the_machine, result) in enumerate(results):
                 prefix = f"{number}_" if len(paths) > 1 else ""
                 name = prefix + result.measured.name
                 _write(folder, name, the_machine, result)
-            import json
-
-            data = [as_data(result) for _, result in results]
-            (folder / "summary.json").write_text(json.dumps(data, indent=2) + "\n")
+            data = {"kind": "replay", "replays": [as_data(result) for _, result in results]}
+            (folder / "summary.json").write_text(json.dumps(plain(data), indent=2) + "\n")
         notes.print(f"written to {target}")
     if as_json:
         data = [as_data(result) for _, result in results]

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from hydrotele.commands.console import notes, out
 from hydrotele.commands.opening import open_log
+from hydrotele.errors import InputError
 
 
 def review_logs(
@@ -26,6 +27,8 @@ def review_logs(
     Raises:
         InputError: a log, machine or viewer is not usable.
     """
+    if screenshot and screenshot.suffix.lower() != ".png":
+        raise InputError(screenshot, "give it a name that ends in .png")
     recording = _recording(first, second, machine, tool, target)
     if screenshot:
         from hydrotele.show.screenshot import take_screenshot
@@ -40,14 +43,16 @@ def review_logs(
     elif target is None:
         from hydrotele.show.serve import open_viewer
 
-        open_viewer(recording)
+        if open_viewer(recording):
+            message = "no viewer could be opened here; try --serve or --screenshot PNG"
+            raise InputError(recording, message)
 
 
 def _recording(first, second, machine, tool, target) -> Path:
     from hydrotele.show.recording import write_recording
 
     made = first / "review.rrd"
-    if second is None and target is None and made.is_file():
+    if made.is_file() and not any((second, target, machine, tool)):
         return made
     which = "truth" if second is None and (first / "truth.parquet").is_file() else "measured"
     entries = {which: open_log(first, machine, tool, which)}

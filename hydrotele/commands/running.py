@@ -17,6 +17,7 @@ from hydrotele.machine_file import save_machine
 from hydrotele.output import check_target, whole_folder
 from hydrotele.run import Run, run_scenario
 from hydrotele.scenario import load_scenario, save_scenario
+from hydrotele.simulate.native import stop_profiling_clock
 
 
 def run_to_folder(
@@ -38,12 +39,13 @@ def run_to_folder(
         InputError: scenario, machine or target are not usable.
         SimulationFailed: the simulation left the finite numbers.
     """
+    stop_profiling_clock()
     scenario = load_scenario(name, overrides)
     target = target or Path("runs", scenario.name)
-    check_target(target)
+    check_target(target, "run")
     with progress_bar(f"run {scenario.name}", quiet=as_json) as progress:
         result = run_scenario(scenario, progress)
-    with whole_folder(target) as folder:
+    with whole_folder(target, "run") as folder:
         write_run(result, folder, review)
     if as_json:
         print_json({**result.summary, "folder": str(target)})
@@ -79,7 +81,7 @@ def _print_summary(summary: dict[str, Any]) -> None:
         value = summary["balance"][key]
         rows.add_row(label, "-" if value is None else f"{value:.1e}")
     for name, error in summary["tracking"].items():
-        unit, factor = ("mm", 1e3) if name in ("tip_r", "tip_z") else ("deg", 57.29577951308232)
+        unit, factor = ("mm", 1e3) if error["unit"] == "m" else ("deg", 57.29577951308232)
         rms, largest = error["rms"] * factor, error["max"] * factor
         rows.add_row(f"tracking {name}", f"rms {rms:.2f}, max {largest:.2f} {unit}")
     out.print(rows)

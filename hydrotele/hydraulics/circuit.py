@@ -264,7 +264,8 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
         count: number of hydraulic actuators, <= MAX_AXES.
         act: (4 count,) spool [1], spool rate [1/s] and pressures [Pa] at the start of the step.
         command: (nu,) valve commands, clipped here to [-1, 1] [1].
-        length: (nu,) piston displacements x [m] (joint angle for a motor).
+        length: (nu,) piston displacements x at the end of the step, where MuJoCo's leapfrog has
+            them [m] (joint angle for a motor).
         velocity: (nu,) piston velocities [m/s] or [rad/s].
         dt: step, scalar [s].
         act_dot: (4 count,) written: mean rates over the step, in the unit of `act` per [s].
@@ -290,7 +291,7 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
         u, a = (first + i) * SLOTS, 4 * i
         head, rod, j_head, j_rod = pressure_rates(
             user, u, valve_opening(act[a], user[u + _DB]), p_start, act[a + 2], act[a + 3],
-            length[first + i], velocity[first + i], dt,
+            length[first + i] - dt * velocity[first + i], velocity[first + i], dt,
         )  # fmt: skip
         scratch[a + 2] = 1.0 / (1.0 - gamma_h * j_head)
         scratch[a + 3] = 1.0 / (1.0 - gamma_h * j_rod)
@@ -304,7 +305,7 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
         head, rod, _, _ = pressure_rates(
             user, u, valve_opening(act_dot[a], user[u + _DB]), p_end,
             act[a + 2] + dt * k_head, act[a + 3] + dt * k_rod,
-            length[first + i] + dt * velocity[first + i], velocity[first + i], 0.0,
+            length[first + i], velocity[first + i], 0.0,
         )  # fmt: skip
         act_dot[a + 2] = 1.5 * k_head + 0.5 * scratch[a + 2] * (head - 2.0 * k_head)
         act_dot[a + 3] = 1.5 * k_rod + 0.5 * scratch[a + 3] * (rod - 2.0 * k_rod)

@@ -134,12 +134,6 @@ def _plane(point) -> tuple[float, float]:
     return point[0], point[2]
 
 
-def closed_length(machine: Machine, name: str) -> float:
-    """Pin-to-pin length at zero piston displacement [m]; 0 for motors and force drives."""
-    cylinder = machine.axes[name].cylinder
-    return cylinder.closed_length if cylinder else 0.0
-
-
 def arm_geometry(machine: Machine) -> ArmGeometry:
     """Dimensions of the machine's arm, heights counted from the ground.
 

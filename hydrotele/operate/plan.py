@@ -126,7 +126,6 @@ def _table(plan: Plan, pilot: TablePilot) -> Plan:
             plan.reference[:, column] = wanted
             if pilot.interpolate == "linear":
                 plan.rate[:, column] = np.gradient(wanted, plan.time)
-            closed[column] = True
     return dataclasses.replace(plan, closed=closed | (pilot.of == "joint"))
 
 

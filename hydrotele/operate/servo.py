@@ -140,8 +140,8 @@ def wanted_opening(
 
 @compiled
 def servo_step(
-    numbers, closed, velocity, arm, volume_head, volume_rod, reference, joint, last, head, rod,
-    supply, dt, load, out,
+    numbers, closed, velocity, arm, volume_head, volume_rod, reference, joint, rate, head, rod,
+    supply, load, out,
 ):  # fmt: skip
     """Commands of all axes for one control period.
 
@@ -152,13 +152,12 @@ def servo_step(
         arm: (k,) d(drive)/d(joint) at the reference.
         volume_head: (k,) [m^3].
         volume_rod: (k,) [m^3].
-        reference: (k,) joint reference [rad] or [m].
+        reference: (k,) joint reference when `joint` was measured [rad] or [m].
         joint: (k,) measured joint position [rad] or [m].
-        last: (k,) measured joint position one period ago, updated [rad] or [m].
+        rate: (k,) measured joint velocity [rad/s] or [m/s].
         head: (k,) measured head-side pressures [Pa].
         rod: (k,) measured rod-side pressures [Pa].
         supply: measured supply pressure, scalar [Pa].
-        dt: control period, scalar [s].
         load: (k,) slow mean of the drive force, updated [N] or [N m].
         out: (k,) commands, written where closed [1] or in the drive's unit.
 
@@ -168,13 +167,11 @@ def servo_step(
     Source: this module's docstring; dynamic pressure feedback after Merritt 1967, section 8.
     """
     for i in range(numbers.shape[0]):
-        measured_rate = (joint[i] - last[i]) / dt
-        last[i] = joint[i]
         error = reference[i] - joint[i]
         gain, rate_gain = numbers[i, 8], numbers[i, 9]
         if numbers[i, 0] == _FORCE:
             if closed[i]:
-                force = rate_gain * (gain * error + velocity[i] - measured_rate)
+                force = rate_gain * (gain * error + velocity[i] - rate[i])
                 limit = numbers[i, 6]
                 out[i] = min(limit, max(-limit, force / numbers[i, 7]))
             continue

@@ -35,8 +35,8 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
     Returns:
         `seconds`; `flow_balance`: largest |in - out - compressed| of a chamber over the volume that
         went through it; `energy_balance`: |work of the drives - damping - change of mechanical
-        energy| over the work of all drives (None if the machine touched something or hit a limit);
-        `pin_opening` [m].
+        energy| over the work of all drives (None if the machine touched something, hit a limit, or
+        has drives without hydraulics).
     """
     model = plant.model
     data = mujoco.MjData(model)
@@ -49,7 +49,7 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
     dt = model.opt.timestep
     qpos = qpos[1:] - dt * qvel[1:]  # states at equal times, see record.py
     qvel, act = 0.5 * (qvel[1:] + qvel[:-1]), act[1:]
-    work, flow = _hydraulic_balance(plant, qpos, qvel, act, controls, dt)
+    work, flow = _hydraulic_balance(plant, qpos, qvel, act, dt)
     return {
         "seconds": len(controls) * dt,
         "flow_balance": flow,
@@ -57,7 +57,7 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
     }
 
 
-def _hydraulic_balance(plant, qpos, qvel, act, controls, dt):
+def _hydraulic_balance(plant, qpos, qvel, act, dt):
     """Work of the drives (n,) [J] and the largest relative volume error."""
     user, count = plant.model.actuator_user, plant.hydraulic
     x, v = drive_motion(plant, qpos, qvel)
@@ -98,6 +98,8 @@ def _volume_errors(plant, i, table, act, x, v, dt):
 
 
 def _energy_balance(plant, qpos, qvel, work, dt):
+    if plant.hydraulic < len(plant.axes):
+        return None
     model = plant.model
     data = mujoco.MjData(model)
     last = len(qpos) - 1

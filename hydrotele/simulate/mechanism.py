@@ -9,6 +9,8 @@ import warnings
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import numpy as np
+
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS
 from hydrotele.hydraulics.parameters import actuator_numbers
@@ -44,10 +46,11 @@ def assemble(
     """
     root = _read_mjcf(machine, looks)
     root.model = machine.name
-    _set_options(root, machine, timestep)
     for name in machine.removed_bodies:
         if body := root.find("body", name):
             body.remove()
+    _refuse_foreign_parts(root, machine)
+    _set_options(root, machine, timestep)
     for name, link in machine.links.items():
         _write_link(root, name, link)
     for name, axis in machine.axes.items():
@@ -91,8 +94,27 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
         raise InputError(path, f"is not an MJCF that dm_control reads: {error}") from None
 
 
+def _refuse_foreign_parts(root, machine: Machine) -> None:
+    """Refuse what the machine file has to say, or what no log would show."""
+    known = set(machine.joints)
+    for name, axis in machine.axes.items():
+        known |= {f"{name}_tube", f"{name}_rod"} if axis.cylinder else set()
+    joints = [j.name or "a joint without name" for j in root.find_all("joint")]
+    strange = {
+        "actuators": [a.name for a in root.find_all("actuator")],
+        "equality constraints": [e.name for e in root.find_all("equality")],
+        "keyframes": [k.name for k in root.find_all("key")],
+        "joints that are not in machine.yaml": [j for j in joints if j not in known],
+    }
+    for what, names in strange.items():
+        if names:
+            listed = ", ".join(str(name) for name in names[:5])
+            message = f"has {what} ({listed}); describe them in machine.yaml or remove them"
+            raise InputError(Path(machine.folder, str(machine.mjcf)), message)
+
+
 def _set_options(root, machine: Machine, timestep: float) -> None:
-    root.compiler.angle = "radian"
+    root.compiler.angle = root.compiler.angle or "degree"  # MuJoCo's default, and the file's choice
     root.compiler.autolimits = True
     del root.compiler.boundmass, root.compiler.boundinertia  # a forgotten inertia is an error
     root.option.timestep = timestep
@@ -127,7 +149,8 @@ def _write_link(root, name: str, link: Link) -> None:
         joint = body.add("joint", name=link.joint.name)
     joint.type, joint.axis, joint.damping = link.joint.type, link.joint.axis, link.joint.damping
     if link.joint.range:
-        joint.range = link.joint.range
+        turn = link.joint.type == "hinge" and root.compiler.angle == "degree"
+        joint.range = np.degrees(link.joint.range) if turn else link.joint.range
 
 
 def _set_inertial(body, mass, com, inertia) -> None:

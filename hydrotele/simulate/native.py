@@ -16,10 +16,11 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numba import carray, cfunc, types
+from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from hydrotele.compiled import callback
 from hydrotele.hydraulics.circuit import (
     SCRATCH,
     SLOTS,
@@ -68,7 +69,7 @@ def _compile_callbacks():
     d_ctrl, d_act, d_act_dot = data_at["ctrl"], data_at["act"], data_at["act_dot"]
     d_length, d_velocity = data_at["actuator_length"], data_at["actuator_velocity"]
 
-    @cfunc(_SIGNATURE, cache=True, error_model="numpy")
+    @callback(_SIGNATURE)
     def advance(m, d, i):
         if carray(_pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
@@ -101,7 +102,7 @@ def _compile_callbacks():
         )
         return 0.0
 
-    @cfunc(_SIGNATURE, cache=True, error_model="numpy")
+    @callback(_SIGNATURE)
     def force(m, d, i):
         if carray(_pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
@@ -159,6 +160,5 @@ def install_hydraulics() -> None:
             "another package has installed mjcb_act_dyn or mjcb_act_bias in this process;"
             " run hydrotele in a process of its own"
         )
-    stop_profiling_clock()
     mujoco.set_mjcb_act_dyn(ours[0])
     mujoco.set_mjcb_act_bias(ours[1])

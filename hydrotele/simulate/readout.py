@@ -38,46 +38,6 @@ def state_supply(user, count, act, scratch):
 
 
 @compiled
-def _convert(value, grain):
-    return value if grain == 0.0 else np.rint(value / grain) * grain
-
-
-@compiled
-def read_feedback(qpos, places, act, user, count, errors, grain, joint, head, rod, scratch):
-    """What the controller's sensors read in a state: joint positions and pressures.
-
-    Args:
-        qpos: (nq,) positions [rad] or [m].
-        places: (k,) place of each axis' joint in `qpos`.
-        act: (na,) activations; pressures [Pa].
-        user: (k * SLOTS,) actuator numbers.
-        count: number of hydraulic axes.
-        errors: (k + 2 count + 1,) sensor errors: joints, then head and rod of every axis, supply.
-        grain: same shape, converter steps; 0 for none.
-        joint: (k,) written [rad] or [m].
-        head: (k,) written [Pa].
-        rod: (k,) written [Pa].
-        scratch: (SCRATCH,) work space.
-
-    Returns:
-        Measured supply pressure, scalar [Pa]; 0 without hydraulic axes.
-
-    Source: nominal model, "Sensors".
-    """
-    k = len(places)
-    for i in range(k):
-        joint[i] = _convert(qpos[places[i]] + errors[i], grain[i])
-    for i in range(count):
-        c = k + 2 * i
-        head[i] = _convert(act[4 * i + 2] + errors[c], grain[c])
-        rod[i] = _convert(act[4 * i + 3] + errors[c + 1], grain[c + 1])
-    if count == 0:
-        return 0.0
-    c = k + 2 * count
-    return _convert(state_supply(user, count, act, scratch) + errors[c], grain[c])
-
-
-@compiled
 def state_flows(user, count, act, x, v):
     """Supply pressure, valve flows and drive forces of many states.
 

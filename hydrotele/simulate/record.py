@@ -95,7 +95,7 @@ class Recorder:
         """
         h = self.model.opt.timestep
         self.time[row] = time
-        self.qpos[row] = data.qpos - h * data.qvel
+        self.qpos[row] = aligned_positions(self.model, data)
         self.qvel[row] = data.qvel - 0.5 * h * data.qacc
         self.qacc[row] = data.qacc
         self.act[row] = data.act
@@ -128,5 +128,7 @@ def _contact_force(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         contact = data.contact[k]
         mujoco.mj_contactForce(model, data, k, wrench)
         force = contact.frame.reshape(3, 3).T @ wrench[:3]
-        total += force if model.geom_bodyid[contact.geom[0]] == 0 else -force
+        grounded = model.body_weldid[model.geom_bodyid[contact.geom]] == 0
+        if grounded[0] != grounded[1]:  # the machine touching itself is no ground force
+            total += force if grounded[0] else -force
     return total

@@ -7,9 +7,11 @@ that leaving a channel out changes no other.
 import math
 import zlib
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
+from hydrotele.compiled import compiled
 from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine, Sensor, SensorSet
@@ -23,7 +25,6 @@ _KINDS = {
     "pressure_head": "pressure",
     "pressure_rod": "pressure",
     "pressure_supply": "pressure",
-    "force": "force",
 }
 
 
@@ -74,25 +75,56 @@ def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.nda
     return stream.uniform(-1.0, 1.0, count) * sensor.accuracy
 
 
-def quantise(values: np.ndarray, sensor: Sensor, clip: bool) -> np.ndarray:
-    """Nearest of 2^bits equal steps of the span; lengths and pressures clipped to 0 .. span.
+class Converter(NamedTuple):
+    """An analogue-to-digital converter: nearest step, kept inside low .. high [channel's unit].
+
+    A step of 0 passes everything unchanged.
+    """
+
+    step: float
+    low: float
+    high: float
+
+
+def converter(sensor: Sensor, channel: str) -> Converter:
+    """Converter of a channel: 2^bits steps of the span; lengths and pressures end at 0 and span."""
+    if sensor.bits is None or sensor.span is None:
+        return Converter(0.0, -math.inf, math.inf)
+    step = sensor.span / 2.0**sensor.bits
+    if channel.startswith(("angle", "position")):
+        return Converter(step, -math.inf, math.inf)
+    return Converter(step, 0.0, sensor.span)
+
+
+@compiled
+def convert(value, step, low, high):
+    """Reading of a converter.
 
     Args:
-        values: any shape [channel's unit].
-        sensor: bits and span.
-        clip: whether the converter ends at its span (an angle goes round instead).
+        value: what comes in, scalar [channel's unit].
+        step: converter step, scalar [channel's unit]; 0 for none.
+        low: lowest reading, scalar [channel's unit].
+        high: highest reading, scalar [channel's unit].
 
     Returns:
-        Same shape as values.
+        The reading, scalar [channel's unit].
 
-    >>> quantise(np.array([0.30, 1.2]), Sensor(bits=2, span=1.0), clip=True)
-    array([0.25, 1.  ])
+    Source: nominal model, "Sensors".
+
+    >>> convert(0.30, 0.25, 0.0, 1.0), convert(1.2, 0.25, 0.0, 1.0), convert(0.3, 0.0, 0.0, 1.0)
+    (0.25, 1.0, 0.3)
     """
-    if sensor.bits is None or sensor.span is None:
-        return values
-    step = sensor.span / 2.0**sensor.bits
-    rounded = np.round(values / step) * step
-    return np.clip(rounded, 0.0, sensor.span) if clip else rounded
+    if step == 0.0:
+        return value
+    return min(high, max(low, np.rint(value / step) * step))
+
+
+@compiled
+def _convert_all(values, step, low, high):
+    readings = np.empty(len(values))
+    for row in range(len(values)):
+        readings[row] = convert(values[row], step, low, high)
+    return readings
 
 
 def measure(
@@ -120,8 +152,7 @@ def measure(
             error = (errors or {}).get(channel)
             if error is None:
                 error = sensor_errors(sensor, seed, channel, len(values))
-            clip = not channel.startswith(("angle", "position"))
-            values = quantise(values + error, sensor, clip)
+            values = _convert_all(values + error, *converter(sensor, channel))
         readings[channel] = np.asarray(values, dtype=float)
     return readings
 
@@ -129,5 +160,4 @@ def measure(
 def noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
     """Standard deviation of one reading [channel's unit]: uniform error plus converter."""
     sensor = channel_sensor(machine, sensors, channel)
-    step = sensor.span / 2.0**sensor.bits if sensor.bits and sensor.span else 0.0
-    return math.sqrt(sensor.accuracy**2 / 3.0 + step**2 / 12.0)
+    return math.sqrt(sensor.accuracy**2 / 3.0 + converter(sensor, channel).step ** 2 / 12.0)

@@ -35,7 +35,7 @@ def run(user, act, command, x, v, dt, steps, count=3):
     act, x, v = np.array(act, float), np.array(x, float), np.array(v, float)
     states, rate, scratch = [act.copy()], np.zeros_like(act), circuit_scratch()
     for k in range(steps):
-        step_circuit(user, 0, count, act, command, x + k * dt * v, v, dt, rate, scratch)
+        step_circuit(user, 0, count, act, command, x + (k + 1) * dt * v, v, dt, rate, scratch)
         act = act + dt * rate
         states.append(act)
     return np.array(states)

@@ -8,7 +8,7 @@ import pytest
 
 from hydrotele.errors import InputError
 from hydrotele.kinematics.arm import forward, inverse, jacobian
-from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, closed_length
+from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage
 from hydrotele.machine_file import load_machine, shipped_machines
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
