@@ -83,7 +83,7 @@ def check_target(target: str | Path, kind: str) -> None:
             raise InputError(target, f"cannot be made: {above} is no folder that can be written to")
         return
     if not place.is_dir():
-        raise InputError(target, "exists and is no folder; choose another --out")
+        raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
     inside = sorted(path.name for path in place.iterdir())
     if inside and _kind(place) != kind:
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")

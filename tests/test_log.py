@@ -289,7 +289,7 @@ REFUSED = {
     "pressure unit": (good(), {"pressure_head.boom": "bar"}, ["multiply by 100000", "Pa"]),
     "wrong dimension": (good(), {"angle.boom": "m"}, ["'angle.boom'", "'m'", "rad", "correct"]),
     "unknown unit": (good(), {"angle.boom": "furlong"}, ["'furlong'", "rad"]),
-    "degrees": (changed("angle.boom", 11, 101.0), {}, ["'angle.boom', row 11", "degrees"]),
+    "degrees": (changed("angle.boom", 11, 10100.0), {}, ["'angle.boom', row 11", "degrees"]),
     "unstated degrees": (
         changed("angle.boom", 11, 45.0),
         {"angle.boom": None},

@@ -17,13 +17,13 @@ def names(folder: Path) -> list[str]:
 
 
 def write(target: Path, text: str = "{}") -> None:
-    with whole_folder(target) as folder:
-        (folder / "a.txt").write_text(text)
-        (folder / "summary.json").write_text(text)
+    with whole_folder(target, "run") as folder:
+        (folder / "measured.parquet").write_text(text)
+        (folder / "summary.json").write_text('{"kind": "run"}')
 
 
 def test_appears_at_the_end(tmp_path):
-    with whole_folder(tmp_path / "deep" / "run") as folder:
+    with whole_folder(tmp_path / "deep" / "run", "run") as folder:
         (folder / "summary.json").write_text("{}")
         assert not (tmp_path / "deep" / "run").exists()
     assert names(tmp_path / "deep") == ["run"]
@@ -32,10 +32,22 @@ def test_appears_at_the_end(tmp_path):
 
 def test_replaces_its_own_kind_wholly(tmp_path):
     write(tmp_path / "run", "1")
-    (tmp_path / "run" / "older.txt").write_text("left over")
+    (tmp_path / "run" / "truth.parquet").write_text("left over")
     write(tmp_path / "run", "2")
-    assert names(tmp_path / "run") == ["a.txt", "summary.json"]
-    assert (tmp_path / "run" / "a.txt").read_text() == "2" and names(tmp_path) == ["run"]
+    assert names(tmp_path / "run") == ["measured.parquet", "summary.json"]
+    assert (tmp_path / "run" / "measured.parquet").read_text() == "2" and names(tmp_path) == ["run"]
+
+
+def test_keeps_what_no_run_wrote(tmp_path):
+    """Notes in a run folder, and a run folder where a replay should go, are left alone."""
+    write(tmp_path / "run", "1")
+    with pytest.raises(InputError, match="was not written by a replay; choose another --out"):
+        check_target(tmp_path / "run", "replay")
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds notes.txt, which no run wrote"):
+        write(tmp_path / "run", "2")
+    assert names(tmp_path / "run") == ["measured.parquet", "notes.txt", "summary.json"]
+    assert (tmp_path / "run" / "measured.parquet").read_text() == "1"
 
 
 def test_empty_folder_may_be_used(tmp_path):
@@ -60,7 +72,9 @@ def test_link_is_followed(tmp_path):
     write(tmp_path / "run", "1")
     (tmp_path / "latest").symlink_to("run")
     write(tmp_path / "latest", "2")
-    assert (tmp_path / "latest").is_symlink() and (tmp_path / "run" / "a.txt").read_text() == "2"
+    assert (tmp_path / "latest").is_symlink() and (
+        tmp_path / "run" / "measured.parquet"
+    ).read_text() == "2"
     assert names(tmp_path) == ["latest", "run"]
 
 
@@ -68,19 +82,19 @@ def test_link_is_followed(tmp_path):
 def test_failure_leaves_nothing_and_the_old_one(failure, tmp_path):
     write(tmp_path / "run", "1")
     for target in ("run", "new"):
-        with pytest.raises(type(failure)), whole_folder(tmp_path / target) as folder:
-            (folder / "a.txt").write_text("half")
+        with pytest.raises(type(failure)), whole_folder(tmp_path / target, "run") as folder:
+            (folder / "measured.parquet").write_text("half")
             raise failure
-    assert names(tmp_path) == ["run"] and (tmp_path / "run" / "a.txt").read_text() == "1"
+    assert names(tmp_path) == ["run"] and (tmp_path / "run" / "measured.parquet").read_text() == "1"
 
 
 def test_full_disk_is_an_error_of_the_user(tmp_path):
     write(tmp_path / "run", "1")
     with pytest.raises(InputError, match="run: cannot be written, nothing .*No space left"):
-        with whole_folder(tmp_path / "run") as folder:
-            (folder / "a.txt").write_text("half")
+        with whole_folder(tmp_path / "run", "run") as folder:
+            (folder / "measured.parquet").write_text("half")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    assert names(tmp_path) == ["run"] and (tmp_path / "run" / "a.txt").read_text() == "1"
+    assert names(tmp_path) == ["run"] and (tmp_path / "run" / "measured.parquet").read_text() == "1"
 
 
 def test_failing_rename_keeps_the_old_one(tmp_path, monkeypatch):
@@ -97,7 +111,7 @@ def test_failing_rename_keeps_the_old_one(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="cannot be written"):
         write(tmp_path / "run", "2")
     monkeypatch.undo()
-    assert (tmp_path / "run" / "a.txt").read_text() == "1"
+    assert (tmp_path / "run" / "measured.parquet").read_text() == "1"
     assert names(tmp_path) == ["run"]
 
 
@@ -105,7 +119,7 @@ def test_place_where_nothing_can_be_made(tmp_path):
     (tmp_path / "file").write_text("x")
     for target in (tmp_path / "file" / "run", tmp_path / "file" / "a" / "run"):
         with pytest.raises(InputError, match="cannot be made: .*file is no folder"):
-            check_target(target)
+            check_target(target, "run")
         with pytest.raises(InputError, match="cannot be made"):
             write(target)
 
@@ -114,7 +128,7 @@ def test_folder_without_permission(tmp_path, monkeypatch):
     """Seen before the simulation where the system tells, else when the folder is made."""
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(InputError, match=f"cannot be made: {tmp_path} is no folder that can be"):
-        check_target(tmp_path / "run")
+        check_target(tmp_path / "run", "run")
     monkeypatch.undo()
 
     def refuse(*_, **__):
@@ -142,21 +156,27 @@ def test_odd_names(tmp_path):
     (tmp_path / f".other.{2**22}.abc.part").mkdir()
     for name in ("*", "[a]", "a b", "ä", ".hidden", "-x"):
         write(tmp_path / name)
-        assert (tmp_path / name / "a.txt").is_file()
+        assert (tmp_path / name / "measured.parquet").is_file()
     assert (tmp_path / f".other.{2**22}.abc.part").is_dir()
 
 
 def test_file_appears_whole_or_not_at_all(tmp_path):
-    (tmp_path / "a.txt").write_text("old")
-    with pytest.raises(RuntimeError), replacing(tmp_path / "a.txt", "") as part:
+    (tmp_path / "measured.parquet").write_text("old")
+    with pytest.raises(RuntimeError), replacing(tmp_path / "measured.parquet", "") as part:
         part.write_text("half")
         raise RuntimeError
-    assert names(tmp_path) == ["a.txt"] and (tmp_path / "a.txt").read_text() == "old"
-    with replacing(tmp_path / "a.txt", ".txt") as part:
+    assert (
+        names(tmp_path) == ["measured.parquet"]
+        and (tmp_path / "measured.parquet").read_text() == "old"
+    )
+    with replacing(tmp_path / "measured.parquet", ".parquet") as part:
         part.write_text("new")
-    assert names(tmp_path) == ["a.txt"] and (tmp_path / "a.txt").read_text() == "new"
+    assert (
+        names(tmp_path) == ["measured.parquet"]
+        and (tmp_path / "measured.parquet").read_text() == "new"
+    )
     for path, suffix, message in (
-        ("a.txt", ".png", "ends in .png"), ("no/a.txt", "", "not a folder"),
+        ("measured.parquet", ".png", "ends in .png"), ("no/measured.parquet", "", "not a folder"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=message), replacing(tmp_path / path, suffix):
             pass

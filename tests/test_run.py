@@ -234,7 +234,7 @@ def test_books_of_a_run_with_contact_claim_nothing():
 
 def _books(change=None, swap=None):
     """The audit of two seconds of motion, after forging the model or the machine."""
-    plant, data, _ = prepare(load_scenario("excitation", {"duration": "2"}))
+    plant, data, *_ = prepare(load_scenario("excitation", {"duration": "2"}))
     begin_leapfrog(plant.model, data)
     start = full_state(plant.model, data)
     window = np.zeros((2000, plant.model.nu))

@@ -55,7 +55,6 @@ def test_shipped_scenario_keeps_its_pins(name, monkeypatch):
     reported = summary["largest_pin_opening_mm"] * 1e-3
     # It is read once per control period, and a pin rings through many of them.
     assert 0.5 * worst[0] <= reported <= worst[0] or plant.model.neq == 0
-    assert summary["warnings"] == 0
 
 
 @pytest.mark.parametrize("name", shipped_scenarios())
@@ -517,7 +516,6 @@ def test_random_valid_scenario_runs_or_says_why_not(facts):
     except (InputError, SimulationFailed):
         return
     assert all(np.isfinite(v).all() for v in run.truth.columns.values())
-    assert run.summary["warnings"] == 0
 
 
 leaves = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8)

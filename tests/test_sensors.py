@@ -12,11 +12,11 @@ from hydrotele.machine_file import load_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
 from hydrotele.simulate.sensors import (
+    _convert_all,
     channel_sensor,
+    converter,
     measure,
     noise_rms,
-    _convert_all,
-    converter,
     sensor_errors,
     sensor_set,
 )

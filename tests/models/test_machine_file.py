@@ -141,7 +141,7 @@ def test_unit_suffixes_have_their_definitions():
     assert PSI == pytest.approx(0.45359237 * 9.80665 / 0.0254**2, rel=1e-15)
     expected = {
         "_deg": math.pi / 180, "_mm": 1e-3, "_in2": 6.4516e-4, "_cm2": 1e-4, "_psi": PSI,
-        "_bar": 1e5, "_hz": math.tau, "_l_min": 1 / 60000, "_ms": 1e-3,
+        "_bar": 1e5, "_hz": 1.0, "_l_min": 1 / 60000, "_ms": 1e-3,
     }  # fmt: skip
     assert pytest.approx(expected) == UNIT_SUFFIXES
 
@@ -151,6 +151,12 @@ def test_split_unit_takes_the_suffix_off(suffix, stem):
     """Any stem, any suffix."""
     assert split_unit(stem + suffix) == (stem, UNIT_SUFFIXES[suffix])
     assert split_unit(stem) == (stem, None)
+
+
+def test_hertz_of_an_angular_frequency_counts_two_pi():
+    """A spool's bandwidth is in rad/s, a sensor's rate in Hz."""
+    assert split_unit("bandwidth_hz") == ("bandwidth", math.tau)
+    assert split_unit("rate_hz") == ("rate", 1.0)
 
 
 def test_tool_adds_its_parts(write):
