@@ -304,6 +304,35 @@ def test_replay_with_another_machine_of_the_same_axes(finished, tmp_path):
     assert json.loads(out)["channels"]["angle.boom"]["rms"] > 2 * plain
 
 
+def test_replay_with_a_named_machine_keeps_the_logs_tool(finished):
+    """A log of the bucket machine is not replayed without its bucket."""
+    own = json.loads(invoke("replay", finished, "--json")[1])["channels"]
+    named = json.loads(invoke("replay", finished, "--machine", "cat215", "--json")[1])["channels"]
+    assert named == own and "angle.bucket" in named
+
+
+def test_replay_writes_into_runs_by_default(finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert invoke("replay", finished / "measured.parquet")[0] == 0
+    assert any(n.endswith(".rrd") for n in names(tmp_path / "runs" / "replay_measured"))
+    assert json.loads((tmp_path / "runs/replay_measured/summary.json").read_text())["kind"] == (
+        "replay"
+    )
+
+
+def test_replay_does_not_replace_the_run_that_it_reads(finished):
+    before = names(finished)
+    code, _, err = invoke("replay", finished, "--out", finished)
+    assert code == 2 and "was not written by a replay" in err and names(finished) == before
+
+
+def test_validate_reports_every_file(tmp_path):
+    (tmp_path / "bad.yaml").write_text("name: x\npilot: 3\n")
+    code, out, err = invoke("validate", tmp_path / "bad.yaml", "zhu_up", "--json")
+    found = json.loads(out)
+    assert code == 2 and [entry["valid"] for entry in found] == [False, True] and "bad.yaml" in err
+
+
 @pytest.mark.parametrize("what", ["machines", "scenarios", "effects"])
 def test_list(what):
     code, out, _ = invoke("list", what, "--json")

@@ -541,3 +541,16 @@ def test_garbage_is_refused_politely(facts, usual, tmp_path_factory):
         prepare(load_scenario(path))
     except InputError as error:
         assert str(error)
+
+
+def test_quoted_numbers_with_units_are_refused():
+    """As texts they would pass without their unit; exponents are read as in files."""
+    with pytest.raises(InputError, match="'-1.7' is a text, not a number"):
+        load_scenario("zhu_up", {"start.pose.attitude_deg": "'-1.7'"})
+    scenario = load_scenario("zhu_up", {"start.pose.attitude_deg": "-1e2"})
+    assert scenario.start.pose.attitude == pytest.approx(-1.7453292519943295, rel=1e-15)
+
+
+def test_a_pose_and_its_joints_are_not_given_twice():
+    with pytest.raises(InputError, match="boom follow from the pose; give one"):
+        prepare(load_scenario("zhu_up", {"start.joints.boom": "0.3"}))

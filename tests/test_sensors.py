@@ -9,7 +9,7 @@ from scipy import stats
 from hydrotele.errors import InputError
 from hydrotele.machine import Sensor
 from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
+from hydrotele.run import prepare, run_scenario
 from hydrotele.scenario import load_scenario
 from hydrotele.simulate.sensors import (
     _convert_all,
@@ -136,3 +136,37 @@ def test_ideal_and_unknown_sensors():
     assert noise_rms(machine, None, "angle.boom") == 0.0
     with pytest.raises(InputError, match="did you mean 'khoshzaban1992'"):
         sensor_set(machine, "khoshzaban92")
+
+
+def test_slow_sensors_are_held_for_the_controller():
+    """50 Hz sensors under a 200 Hz controller: four ticks see one reading, then a new one."""
+    plant, data, _, seen = prepare(load_scenario("zhu_up"))
+    assert seen.every == 4 and seen.period == pytest.approx(0.02)
+    readings = []
+    for tick in range(9):
+        data.qpos[plant.qpos] += 0.01
+        seen.update(tick, data)
+        readings.append(seen.joint.copy())
+    assert np.ptp(readings[:4], axis=0).max() == 0.0 and np.ptp(readings[4:8], axis=0).max() == 0.0
+    assert np.all(np.abs(readings[4] - readings[0] - 0.04) < 2 * np.radians(0.1) + 4e-4)
+    np.testing.assert_allclose(seen.rate, (readings[8] - readings[4]) / 0.02, rtol=1e-12)
+
+
+def test_the_log_shows_what_the_controller_saw():
+    """Feedback and log share sampling, errors and converter, clipped pressures included."""
+    scenario = load_scenario("steps", {"duration": "3.0"})
+    plant, data, _, seen = prepare(scenario)
+    seen.update(0, data)
+    log = run_scenario(scenario).measured
+    for i, axis in enumerate(plant.axes):
+        assert log[f"pressure_head.{axis}"][0] == seen.head[i]
+        assert log[f"pressure_rod.{axis}"][0] == seen.rod[i]
+        # the run's first row stands at the same instant, but after half a leapfrog step
+        assert log[f"angle.{axis}"][0] == pytest.approx(seen.joint[i], abs=4e-4)
+
+
+def test_a_log_faster_than_its_sensors_is_refused():
+    with pytest.raises(InputError, match="sample at 50 Hz; log_rate 200 Hz must divide it"):
+        prepare(load_scenario("zhu_up", {"log_rate": "200"}))
+    with pytest.raises(InputError, match="sample at 50 Hz, which must divide 125 Hz"):
+        prepare(load_scenario("zhu_up", {"control_rate": "125", "log_rate": "25"}))
