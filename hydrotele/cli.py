@@ -93,11 +93,14 @@ def review(
     screenshot: Annotated[
         Path | None, typer.Option("--screenshot", help="Write a PNG of the viewer, headless.")
     ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Write a PNG of all channels instead.")
+    ] = None,
 ) -> None:
     """Look at a run: the machine moving in 3D, joints, pressures, flows and forces, in rerun."""
     from hydrotele.commands.reviewing import review_logs
 
-    review_logs(log, log2, machine, tool, out, serve, port, screenshot)
+    review_logs(log, log2, machine, tool, out, serve, port, screenshot, plot)
 
 
 @app.command("list", epilog="Example:  hydrotele list scenarios --json")

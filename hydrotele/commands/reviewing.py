@@ -10,7 +10,7 @@ from hydrotele.errors import InputError
 
 def review_logs(
     first: Path, second: Path | None, machine: str | None, tool: str | None, target: Path | None,
-    serve: bool, port: int, screenshot: Path | None,
+    serve: bool, port: int, screenshot: Path | None, plot: Path | None,
 ) -> None:  # fmt: skip
     """Make a recording and show it.
 
@@ -22,13 +22,19 @@ def review_logs(
         target: recording to write; default is review.rrd in the run folder or a temporary file.
         serve: serve the web viewer until interrupted.
         port: of the web viewer.
-        screenshot: PNG to write, headless.
+        screenshot: PNG of the viewer to write, headless.
+        plot: PNG of the channels to write instead: of both logs with their difference, or of all
+            channels of one.
 
     Raises:
         InputError: a log, machine or viewer is not usable.
     """
     if screenshot and screenshot.suffix.lower() != ".png":
         raise InputError(screenshot, "give it a name that ends in .png")
+    if plot:
+        _plot(first, second, machine, tool, plot)
+        out.print(f"written to [bold]{plot}[/]")
+        return
     recording = _recording(first, second, machine, tool, target)
     if screenshot:
         from hydrotele.show.screenshot import take_screenshot
@@ -46,6 +52,16 @@ def review_logs(
         if open_viewer(recording):
             message = "no viewer could be opened here; try --serve or --screenshot PNG"
             raise InputError(recording, message)
+
+
+def _plot(first, second, machine, tool, path: Path) -> None:
+    from hydrotele.show.overlay import plot_log, plot_overlay
+
+    _, log = open_log(first, machine, tool)
+    if second is None:
+        plot_log(log, path, title=log.metadata.get("run", log.name))
+    else:
+        plot_overlay(log, open_log(second, machine, tool)[1], path, names=("first", "second"))
 
 
 def _recording(first, second, machine, tool, target) -> Path:

@@ -67,23 +67,6 @@ class TwoBar:
         included = self.direction * theta + self.angle_offset
         return self.direction * self.lower * self.upper * m.sin(included) / self.length(theta)
 
-    def second(self, theta: Scalar) -> Scalar:
-        """Second derivative d2c/dtheta2 = (a b cos(B) - (dc/dtheta)^2) / c.
-
-        Args:
-            theta: joint angle, any shape [rad].
-
-        Returns:
-            Second derivative of the pin-to-pin length, shape of theta [m/rad^2].
-
-        >>> round(TwoBar(0.625, 2.000, math.radians(78.6), 1).second(math.radians(27.8)), 6)
-        -0.281311
-        """
-        m = library(theta)
-        included = self.direction * theta + self.angle_offset
-        bend = self.lower * self.upper * m.cos(included)
-        return (bend - self.rate(theta) ** 2) / self.length(theta)
-
     def angle(self, length: Scalar) -> Scalar:
         """Joint angle, theta = direction (B - angle_offset), on the branch B in [0, pi].
 

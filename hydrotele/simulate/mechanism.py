@@ -24,7 +24,8 @@ with warnings.catch_warnings():  # glfw warns when there is no screen, which nob
 # Default softness opens the pins of a 10 t machine by decimetres. A time constant of two steps is
 # the stiffest that MuJoCo takes, and makes the softness vanish with the step.
 _IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2)
-_CONTACT_SOLREF = (0.02, 1.0)
+_CONTACT_SOLREF = (0.02, 1.0)  # s, 1: firm soil; an impact force grows as one over the time
+_SOIL_FRICTION = (0.4, 0.02, 0.001)  # steel sliding on soil: friction angle of some 22 deg
 
 
 def assemble(
@@ -209,7 +210,7 @@ def _write_scene(root, ground: bool, looks: bool) -> None:
     touch = {"contype": 1, "conaffinity": 2} if ground else {"contype": 0, "conaffinity": 0}
     if ground or looks:
         root.worldbody.add(
-            "geom", name="ground", type="plane", size=(40, 40, 1), friction=(0.8, 0.02, 0.001),
+            "geom", name="ground", type="plane", size=(40, 40, 1), friction=_SOIL_FRICTION,
             solref=_CONTACT_SOLREF, **touch,
         )  # fmt: skip
     if not looks:

@@ -62,14 +62,6 @@ def test_rate_is_the_derivative(linkage, span):
     np.testing.assert_allclose(linkage.rate(theta), numeric, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize(("linkage", "span"), [CASES[0], CASES[1]])
-def test_second_is_the_derivative_of_rate(linkage, span):
-    """Central difference of the rate, tolerance as above."""
-    theta, step = np.linspace(*span, 301), 1e-5
-    numeric = (linkage.rate(theta + step) - linkage.rate(theta - step)) / (2 * step)
-    np.testing.assert_allclose(linkage.second(theta), numeric, rtol=0, atol=1e-9)
-
-
 @pytest.mark.parametrize(("linkage", "span"), CASES)
 def test_virtual_work_of_a_constant_force(linkage, span):
     """F times the stroke equals the torque integrated over the angle; quad is asked for 1e-10."""
