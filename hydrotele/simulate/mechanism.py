@@ -211,7 +211,7 @@ def _write_scene(root, ground: bool, looks: bool) -> None:
     if ground or looks:
         root.worldbody.add(
             "geom", name="ground", type="plane", size=(40, 40, 1), friction=_SOIL_FRICTION,
-            solref=_CONTACT_SOLREF, **touch,
+            solref=_CONTACT_SOLREF, priority=1, **touch,
         )  # fmt: skip
     if not looks:
         return
