@@ -1,19 +1,21 @@
 """The rerun program as a child process: started with its own settings, ended without orphans."""
 
 import contextlib
+import ctypes
 import os
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from hydrotele.errors import InputError
 
 _PATIENCE = 5.0  # s that the program has to end by itself
+_PR_SET_PDEATHSIG = 1  # of Linux's prctl: a signal when the parent dies
 
 
 class Viewer(NamedTuple):
@@ -96,11 +98,20 @@ def running(arguments: Sequence[str], clean: bool = False) -> Iterator[Viewer]:
                 stderr=subprocess.STDOUT,
                 env=environment,
                 start_new_session=True,
+                preexec_fn=_die_with_parent(),
             )
         try:
             yield Viewer(process, output)
         finally:
             _end(process)
+
+
+def _die_with_parent() -> Callable[[], object] | None:
+    """What a child on Linux does first, so that it ends even when this program is killed."""
+    if sys.platform != "linux":
+        return None
+    prctl = ctypes.CDLL(None, use_errno=True).prctl
+    return lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _end(process: subprocess.Popen) -> None:
