@@ -96,6 +96,17 @@ class Cylinder(Facts):
     tube: Bar
     rod: Bar
 
+    @model_validator(mode="after")
+    def _check(self):
+        if self.area_rod > self.area_head:
+            raise ValueError(f"area_rod {self.area_rod:g} exceeds area_head {self.area_head:g}")
+        if self.stroke >= self.closed_length:
+            raise ValueError(
+                f"a stroke of {self.stroke:g} m does not fit into a closed_length of"
+                f" {self.closed_length:g} m"
+            )
+        return self
+
     @property
     def areas(self) -> tuple[float, float]:
         """Head-side and rod-side piston area [m^2]."""
@@ -211,7 +222,16 @@ class Supply(Facts):
     relief_pressure: Positive
     tank_pressure: NonNegative
     pump_flow: Positive
-    bulk_modulus: Positive
+    bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.tank_pressure >= self.relief_pressure:
+            raise ValueError(
+                f"tank_pressure {self.tank_pressure:g} Pa is not below relief_pressure"
+                f" {self.relief_pressure:g} Pa; are both in Pa?"
+            )
+        return self
 
 
 class Sensor(Facts):
@@ -312,6 +332,11 @@ class Machine(Facts):
                 _expect(end.link, known, f"closures.{name}")
         for joint in self.home:
             _expect(joint, joints, "home")
+            low, high = joints[joint].range or (-np.inf, np.inf)
+            if not low <= self.home[joint] <= high:
+                raise ValueError(
+                    f"home.{joint}: {self.home[joint]:g} is outside its range {low:g} .. {high:g}"
+                )
         if self.arm:
             for part in ("swing", "boom", "stick", "tool"):
                 joint = getattr(self.arm, part)

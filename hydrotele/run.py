@@ -56,13 +56,22 @@ class Run:
     summary: dict[str, Any]
 
 
+def scenario_model(scenario: Scenario) -> Machine:
+    """The machine of a scenario as its model has it, without the planted effects.
+
+    Raises:
+        InputError: unknown machine or tool.
+    """
+    return load_machine(own_machine(scenario) or scenario.machine, scenario.tool)
+
+
 def scenario_machine(scenario: Scenario) -> Machine:
-    """The machine of a scenario, with its planted effects.
+    """The machine of a scenario that is simulated, with its planted effects.
 
     Raises:
         InputError: unknown machine, tool, effect or location.
     """
-    machine = load_machine(own_machine(scenario) or scenario.machine, scenario.tool)
+    machine = scenario_model(scenario)
     for planted in scenario.effects:
         machine = apply_effect(machine, planted.name, planted.location, planted.parameters)
     return machine

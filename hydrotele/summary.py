@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 
 import hydrotele
+from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.operate.plan import Plan
 from hydrotele.scenario import Scenario
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record
+
+_VACUUM = -1.0e5  # Pa below the atmosphere, as far as pressure can fall
 
 
 def summarise(
@@ -36,17 +39,29 @@ def summarise(
         "machine": plant.machine.name,
         "tool": plant.machine.tool,
         "seed": scenario.seed,
+        "effects": [planted.model_dump() for planted in scenario.effects],
         "simulated_seconds": scenario.duration,
         "wall_seconds": round(wall, 4),
         "realtime_factor": round(scenario.duration / wall, 1),
         "physics_steps": round(scenario.duration / scenario.timestep),
         "largest_pin_opening_mm": pins * 1e3,
-        "notes": list(plan.notes),
+        "notes": [*plan.notes, *_doubts(plant, record)],
         "largest_contact_force_N": float(np.linalg.norm(record.contact, axis=1).max()),
         "tracking": _tracking(plant, plan, record),
         "versions": _versions(),
         "git_commit": _git_commit(),
     }
+
+
+def _doubts(plant: Plant, record: Record) -> list[str]:
+    """Sentences about states that no machine can have."""
+    if not plant.hydraulic:
+        return []
+    pressures = record.act.reshape(len(record.time), -1, ACTIVATIONS)[:, : plant.hydraulic, 2:]
+    lowest = pressures.min(initial=0.0)
+    if lowest < _VACUUM:
+        return [f"a chamber falls to {lowest / 1e6:.1f} MPa, which oil cannot: check the machine"]
+    return []
 
 
 def _tracking(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:

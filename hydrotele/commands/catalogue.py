@@ -25,14 +25,21 @@ def list_things(what: str, as_json: bool) -> None:
         print_json(data if what == "all" else data[what])
         return
     for kind, rows in data.items():
-        columns = [key for key in rows[0] if key != "parameters"] if rows else ["name"]
+        columns = list(rows[0]) if rows else ["name"]
         shown = table(kind, *columns)
         for column in shown.columns:
             column.justify = "left"
         for row in rows:
-            cells = (row[c] for c in columns)
-            shown.add_row(*(", ".join(c) if isinstance(c, list) else str(c) for c in cells))
+            shown.add_row(*(_cell(row[c]) for c in columns))
         out.print(shown)
+
+
+def _cell(value) -> str:
+    if isinstance(value, dict):
+        return ", ".join(
+            f"{n} [{p['unit']}] {p['low']:g} .. {p['high']:g}" for n, p in value.items()
+        )
+    return ", ".join(value) if isinstance(value, list) else str(value)
 
 
 def _machines() -> list[dict]:
@@ -125,7 +132,7 @@ def _validate(path: Path) -> tuple[str, str]:
 def _check_machine(path: Path) -> str:
     import mujoco
 
-    from hydrotele.kinematics.from_machine import axis_linkage
+    from hydrotele.kinematics.from_machine import axis_linkage, check_strokes
     from hydrotele.simulate.plant import build_plant, rest_state
 
     first = load_machine(path)
@@ -136,6 +143,7 @@ def _check_machine(path: Path) -> str:
         mujoco.MjModel.from_xml_string(plant.mjcf)
         for axis in machine.axes:
             axis_linkage(machine, axis)
+        check_strokes(machine)
     tools = "" if first.tools == ("none",) else f", tools {', '.join(first.tools)}"
     return f"axes {', '.join(first.axes)}{tools}; all assemble and stand at rest at home"
 

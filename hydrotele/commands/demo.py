@@ -37,9 +37,10 @@ def run_demo(target: Path) -> None:
     except InputError as error:
         notes.print(f"[yellow]no picture[/] {error}")
     out.print(f"\n[bold green]done[/] Everything is in [bold]{target}[/]. Look at it with")
-    out.print(f"  hydrotele review {target}/dig                   (rerun viewer)")
-    out.print(f"  hydrotele review {target}/dig --serve           (web viewer)")
-    out.print(f"  {target}/replay/measured.png             (measured against replayed)")
+    out.print("  source .venv/bin/activate             (in a checkout, once per shell)")
+    out.print(f"  hydrotele review {target}/dig             (rerun viewer)")
+    out.print(f"  hydrotele review {target}/dig --serve     (web viewer)")
+    out.print(f"and see measured against replayed in {target}/replay/measured.png")
 
 
 def _say(step: int, text: str) -> None:

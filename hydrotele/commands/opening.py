@@ -19,6 +19,8 @@ def log_path(path: Path, which: str = "measured") -> Path:
         if inside.is_file():
             return inside
         raise InputError(path, f"holds no {which}.parquet; give a log file or a run folder")
+    if not path.is_file():
+        raise InputError(path, "is neither a log file (.parquet, .csv) nor a run folder")
     return path
 
 
@@ -54,6 +56,10 @@ def open_log(
     logged = log.metadata.get("tool")
     if tool is None and logged in found.tools:
         found = load_machine(chosen, logged)
+    positions = [f"{found.position_kind(axis)}.{axis}" for axis in found.axes]
+    if not any(name in log for name in positions):
+        message = f"is no log of {found.name}: it has none of {', '.join(positions)}"
+        raise InputError(file, message)
     return found, log
 
 

@@ -46,7 +46,10 @@ def replay_logs(
             result = replay_log(log, the_machine, timestep, progress)
         results.append((the_machine, result))
         if log.metadata.get("command", "held") != "held":
-            notes.print(f"[yellow]note[/] {path}: its commands are means over a row, not held ones")
+            notes.print(
+                f"[yellow]note[/] {path}: commands changed faster than the log has rows, so their"
+                " means are replayed; log with log_rate = control_rate for an exact replay"
+            )
         if not as_json:
             _print(str(log_path(path)), result)
     if target:

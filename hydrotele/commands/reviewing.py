@@ -1,11 +1,15 @@
 """`hydrotele review`: a recording of one or two logs, opened, served or photographed."""
 
+import contextlib
+import re
 import tempfile
 from pathlib import Path
 
 from hydrotele.commands.console import notes, out
 from hydrotele.commands.opening import open_log
 from hydrotele.errors import InputError
+from hydrotele.log import Log
+from hydrotele.machine import Machine
 
 
 def review_logs(
@@ -35,7 +39,16 @@ def review_logs(
         _plot(first, second, machine, tool, plot)
         out.print(f"written to [bold]{plot}[/]")
         return
-    recording = _recording(first, second, machine, tool, target)
+    with contextlib.ExitStack() as stack:
+        made = first / "review.rrd"
+        if not (made.is_file() and not any((second, target, machine, tool))):
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="hydrotele_"))
+            made = target or Path(folder, "review.rrd")
+            _record(first, second, machine, tool, made)
+        _show(made, serve, port, screenshot, quiet=target is not None)
+
+
+def _show(recording: Path, serve: bool, port: int, screenshot: Path | None, quiet: bool) -> None:
     if screenshot:
         from hydrotele.show.screenshot import take_screenshot
 
@@ -45,37 +58,48 @@ def review_logs(
     elif serve:
         from hydrotele.show.serve import serve_recording
 
-        serve_recording(recording, port)
-    elif target is None:
+        tell = "open {} in a browser on this machine; Ctrl-C stops serving"
+        serve_recording(recording, port, lambda url: out.print(tell.format(url), soft_wrap=True))
+    elif quiet:
+        out.print(f"written to [bold]{recording}[/]")
+    else:
         from hydrotele.show.serve import open_viewer
 
         if open_viewer(recording):
             message = "no viewer could be opened here; try --serve or --screenshot PNG"
-            raise InputError(recording, message)
+            raise InputError("review", message)
 
 
 def _plot(first, second, machine, tool, path: Path) -> None:
     from hydrotele.show.overlay import plot_log, plot_overlay
 
-    _, log = open_log(first, machine, tool)
     if second is None:
+        _, log = open_log(first, machine, tool)
         plot_log(log, path, title=log.metadata.get("run", log.name))
     else:
-        plot_overlay(log, open_log(second, machine, tool)[1], path, names=("first", "second"))
+        (a, (_, one)), (b, (_, two)) = _pair(first, second, machine, tool, "measured").items()
+        plot_overlay(one, two, path, names=(a, b), title=f"{a} and {b}")
 
 
-def _recording(first, second, machine, tool, target) -> Path:
+def _record(first, second, machine, tool, path: Path) -> None:
     from hydrotele.show.recording import write_recording
 
-    made = first / "review.rrd"
-    if made.is_file() and not any((second, target, machine, tool)):
-        return made
-    which = "truth" if second is None and (first / "truth.parquet").is_file() else "measured"
-    entries = {which: open_log(first, machine, tool, which)}
-    if second is not None:
-        other = open_log(second, machine, tool, "measured")
-        entries = {"first": entries[which], "second": other}
-    path = target or Path(tempfile.mkdtemp(prefix="hydrotele_"), "review.rrd")
+    if second is None:
+        which = "truth" if (first / "truth.parquet").is_file() else "measured"
+        entries = {which: open_log(first, machine, tool, which)}
+    else:
+        entries = _pair(first, second, machine, tool, "measured")
     write_recording(path, entries)
-    out.print(f"recording: [bold]{path}[/]")
-    return path
+
+
+def _pair(first, second, machine, tool, which: str) -> dict[str, tuple[Machine, Log]]:
+    """Two logs of one kind of machine under names that tell them apart."""
+    logs = [open_log(path, machine, tool, which) for path in (first, second)]
+    kinds = [found.name for found, _ in logs]
+    if kinds[0] != kinds[1]:
+        raise InputError(second, f"is of a {kinds[1]}, {first} of a {kinds[0]}: nothing to compare")
+    names = [re.sub(r"[^a-z0-9_]+", "_", path.stem.lower()) for path in (first, second)]
+    usable = names[0] != names[1] and all(re.match(r"[a-z]", n) for n in names)
+    if not usable or {"about", "difference", "ground"} & set(names):
+        names = ["first", "second"]
+    return dict(zip(names, logs, strict=True))

@@ -15,7 +15,7 @@ from hydrotele.commands.console import (
 from hydrotele.log import save_log
 from hydrotele.machine_file import save_machine
 from hydrotele.output import check_target, whole_folder
-from hydrotele.run import Run, run_scenario
+from hydrotele.run import Run, run_scenario, scenario_model
 from hydrotele.scenario import load_scenario, save_scenario
 from hydrotele.simulate.native import stop_profiling_clock
 
@@ -56,12 +56,16 @@ def run_to_folder(
 
 
 def write_run(result: Run, folder: Path, review: bool = True) -> None:
-    """Write logs, summary, scenario, machine, MJCF and recording of a run into a folder."""
+    """Write logs, summary, scenario, machine, MJCF and recording of a run into a folder.
+
+    `machine.yaml` is the model, without the effects that the scenario planted: what they are is
+    truth, which a replay must not know. `machine.xml` is what was simulated.
+    """
     save_log(result.measured, folder / "measured.parquet")
     save_log(result.truth, folder / "truth.parquet")
     save_scenario(result.scenario, folder / "scenario.yaml")
     (folder / "machine.xml").write_text(result.plant.mjcf)
-    save_machine(result.plant.machine, folder / "machine.yaml")
+    save_machine(scenario_model(result.scenario), folder / "machine.yaml")
     if review:
         from hydrotele.show.recording import write_recording
 
@@ -75,6 +79,8 @@ def _print_summary(summary: dict[str, Any]) -> None:
     rows.show_header = False
     rows.add_row("simulated", f"{summary['simulated_seconds']:g} s")
     rows.add_row("real-time factor", f"{summary['realtime_factor']:.0f}")
+    if summary["effects"]:
+        rows.add_row("planted effects", ", ".join(e["name"] for e in summary["effects"]))
     rows.add_row("largest pin opening", f"{summary['largest_pin_opening_mm']:.4f} mm")
     rows.add_row("largest contact force", f"{summary['largest_contact_force_N'] / 1e3:.1f} kN")
     for key, label in (("flow_balance", "flow balance"), ("energy_balance", "energy balance")):

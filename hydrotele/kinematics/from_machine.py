@@ -11,6 +11,8 @@ from hydrotele.kinematics.arm import ArmGeometry
 from hydrotele.kinematics.linkage import FourBar, TwoBar, two_bar_from_points
 from hydrotele.machine import Axis, Machine
 
+_PLAY = 2.0e-3  # m: joint ranges are given in whole degrees
+
 
 @dataclass(frozen=True)
 class Direct:
@@ -132,6 +134,30 @@ def _four_bar(machine: Machine, axis: Axis) -> FourBar:
 
 def _plane(point) -> tuple[float, float]:
     return point[0], point[2]
+
+
+def check_strokes(machine: Machine) -> None:
+    """Refuse a cylinder whose stroke does not span the range of its joint.
+
+    Args:
+        machine: the machine; joints without a range are not checked.
+
+    Raises:
+        InputError: names axis, end of the range, piston displacement and stroke.
+    """
+    for name, axis in machine.axes.items():
+        limits = machine.joints[axis.joint].range
+        if axis.cylinder is None or limits is None:
+            continue
+        linkage = axis_linkage(machine, name)
+        for end in limits:
+            x = float(linkage.length(end)) - axis.cylinder.closed_length
+            if not -_PLAY <= x <= axis.cylinder.stroke + _PLAY:
+                raise InputError(
+                    f"machine {machine.name}: axes.{name}.cylinder",
+                    f"at {axis.joint} = {end:.4g} its piston would be at {x:.4g} m, outside its"
+                    f" stroke 0 .. {axis.cylinder.stroke:g} m",
+                )
 
 
 def arm_geometry(machine: Machine) -> ArmGeometry:

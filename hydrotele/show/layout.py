@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 # Tab -> kinds of plots in it, from top to bottom.
 _TABS: Mapping[str, tuple[str, ...]] = {
-    "Overview": ("command", "angle", "pressure_head", "pressure_rod"),
+    "Overview": ("command", "angle", "position", "pressure_head", "pressure_rod"),
     "Hydraulics": ("pressure_supply", "flow_supply", "flow_head", "flow_rod", "spool"),
     "Mechanics": ("length", "position", "force", "torque", "contact_force", "tip"),
     "Rates": ("velocity", "acceleration", "piston_velocity", "spool_rate", "reference"),
@@ -154,7 +154,7 @@ def _view(plot: Plot, minus: str, legend: bool) -> "rrb.TimeSeriesView":
     import rerun.blueprint as rrb
 
     units = ", ".join("-" if unit == "1" else unit for unit in plot.units)
-    fixed = None if minus else _FIXED_RANGES.get(plot.kind)
+    fixed = None if minus or units != "-" else _FIXED_RANGES.get(plot.kind)
     note = f", {minus}" if minus else ""
     return rrb.TimeSeriesView(
         name=f"{TITLES.get(plot.kind, plot.kind)}{note} [{units}]",

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 COMPARED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
 _DPI = 100
 _CELL, _PANEL = (560, 270), (820, 220)  # pixel
-_HEADER, _FOOTER, _LEFT, _RIGHT = 84, 56, 72, 28  # pixel
+_HEADER, _FOOTER, _LEFT, _RIGHT, _LABEL = 84, 56, 72, 28, 46  # pixel
 _STYLE = {
     "font.size": 9.5,
     "axes.titlesize": 10.5,
@@ -74,7 +74,7 @@ def plot_overlay(
         raise InputError(other.source, f"has no {', '.join(kinds)} in common with {first.source}")
     axes_shown = [parse_channel(name).axis for some in rows for name in some]
     columns = [axis for axis in dict.fromkeys(axes_shown) if axis] or [""]
-    default = len(columns) * _CELL[0], len(rows) * _CELL[1] + _HEADER + _FOOTER
+    default = max(2, len(columns)) * _CELL[0], len(rows) * _CELL[1] + _HEADER + _FOOTER
     runs = " and ".join(dict.fromkeys(log.name for log in (first, other)))
     with _drawing(path, size or default) as figure:
         grid = _grid(figure, len(rows), len(columns))
@@ -145,7 +145,8 @@ def _finish(axes: "Axes", time: np.ndarray, traces: Sequence[Trace], title: str)
     units = dict.fromkeys("" if trace.unit == "1" else trace.unit for trace in traces)
     axes.set_title(title)
     axes.set_ylabel(", ".join(units))
-    axes.yaxis.set_label_coords(-0.105, 0.5)
+    width = axes.get_window_extent().width
+    axes.yaxis.set_label_coords(-_LABEL / width, 0.5)
     axes.set_xlim(time[0], time[-1])
     axes.set_ylim(padded_range([trace.values for trace in traces], traces[0].unit))
     axes.locator_params(axis="y", nbins=5 if title else 3)

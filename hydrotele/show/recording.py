@@ -220,7 +220,8 @@ def _line_style(colour: tuple[int, int, int], name: str, rank: int, width: float
     import rerun as rr
 
     paler = [round(c + (_PALENESS if rank else 0.0) * (255 - c)) for c in colour]
-    return rr.SeriesLines(colors=paler, names=name, widths=width)
+    peaks = rr.components.AggregationPolicy.MinMax  # an average would hide them when zoomed out
+    return rr.SeriesLines(colors=paler, names=name, widths=width, aggregation_policy=peaks)
 
 
 def _about(entries: Mapping[str, tuple[Machine, Log]]) -> "rr.TextDocument":

@@ -25,7 +25,7 @@ with warnings.catch_warnings():  # glfw warns when there is no screen, which nob
 # the stiffest that MuJoCo takes, and makes the softness vanish with the step.
 _IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2)
 _CONTACT_SOLREF = (0.02, 1.0)  # s, 1: firm soil; an impact force grows as one over the time
-_SOIL_FRICTION = (0.4, 0.02, 0.001)  # steel sliding on soil: friction angle of some 22 deg
+_SOIL_FRICTION = (0.3, 0.02, 0.001)  # steel sliding on loam: friction angle of some 17 deg
 
 
 def assemble(

@@ -41,7 +41,7 @@ axes:
       base_pin: {link: post, position: [0.3, 0.0, 1.0]}
       rod_pin: {link: jib, position_mm: [1000, 0, 0]}
       closed_length: 0.7
-      stroke: 0.9
+      stroke: 0.65
       area_head_in2: 10
       area_rod_cm2: 40
       dead_volume: 1.0e-3
