@@ -326,6 +326,22 @@ def test_replay_does_not_replace_the_run_that_it_reads(finished):
     assert code == 2 and "was not written by a replay" in err and names(finished) == before
 
 
+def test_planted_effects_stay_out_of_the_runs_model(tmp_path):
+    """What was planted is truth: a replay of the run folder shows the gap."""
+    effect = "effects=[{name: payload, location: tool, parameters: {mass: 2000}}]"
+    words = ["run", "zhu_up", *QUICK, "--set", effect, "--out", tmp_path / "heavy", "--json"]
+    code, out, _ = invoke(*words)
+    assert code == 0 and json.loads(out)["effects"][0]["name"] == "payload"
+    assert "payload" not in (tmp_path / "heavy" / "machine.yaml").read_text()
+    channel = json.loads(invoke("replay", tmp_path / "heavy", "--json")[1])["channels"]
+    assert channel["pressure_head.boom"]["rms"] > 5 * channel["pressure_head.boom"]["noise_rms"]
+
+
+def test_review_refuses_a_log_of_another_machine(finished):
+    code, _, err = invoke("review", finished, "--machine", "rig", "--plot", "x.png")
+    assert code == 2 and "is no log of rig: it has none of position.slide" in err
+
+
 def test_validate_reports_every_file(tmp_path):
     (tmp_path / "bad.yaml").write_text("name: x\npilot: 3\n")
     code, out, err = invoke("validate", tmp_path / "bad.yaml", "zhu_up", "--json")

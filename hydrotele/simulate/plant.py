@@ -54,7 +54,11 @@ class Plant:
         home = rest_state(self)
         pressures = {"act": home.act} if self.model.na else {}
         add_element(root.keyframe, "key", name="home", qpos=home.qpos, **pressures)
-        return mjcf_text(root)
+        note = (
+            "Without hydrotele's native hydraulics the actuators of this file give no force: call"
+            " hydrotele.simulate.native.install_hydraulics() before stepping it."
+        )
+        return mjcf_text(root).replace(">", f">\n  <!-- {note} -->", 1)
 
 
 def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True) -> Plant:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hydrotele import datafile
 from hydrotele.datafile import PSI, UNIT_SUFFIXES, read_yaml, split_unit, suggest
 from hydrotele.errors import InputError
+from hydrotele.kinematics.from_machine import check_strokes
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine, machine_path, save_machine, shipped_machines
 from hydrotele.simulate.mechanism import assemble, mjcf_text
@@ -40,8 +41,8 @@ axes:
     cylinder:
       base_pin: {link: post, position: [0.3, 0.0, 1.0]}
       rod_pin: {link: jib, position_mm: [1000, 0, 0]}
-      closed_length: 0.7
-      stroke: 0.65
+      closed_length: 0.9
+      stroke: 0.85
       area_head_in2: 10
       area_rod_cm2: 40
       dead_volume: 1.0e-3
@@ -173,7 +174,7 @@ def test_runs_without_mjcf(write):
     plant = build_plant(load_machine(write()))
     data = rest_state(plant)
     assert data.qpos[plant.qpos[0]] == pytest.approx(0.3)
-    assert 0 < data.qpos[plant.rod_qpos[0]] < 0.9
+    assert 0 < data.qpos[plant.rod_qpos[0]] < 0.65
 
 
 def test_mjcf_completes_the_links(write):
@@ -201,7 +202,7 @@ REFUSALS = {
         r"'closed_length_psy'.*valid",
     ),
     "unit twice": (
-        (("stroke: 0.9", "stroke: 0.9\n      stroke_mm: 900"),),
+        (("stroke: 0.85", "stroke: 0.85\n      stroke_mm: 850"),),
         r"'stroke' is given twice",
     ),
     "unknown link of a pin": (
@@ -522,3 +523,27 @@ def test_facts_refuse_infinity(write):
     """Numbers in a machine are finite."""
     assert np.isfinite(load_machine(write()).links["jib"].mass)
     assert "finite" in refusal(write(edited(("mass: 200", "mass: .inf"))))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("area_rod_cm2: 40", "area_rod_cm2: 70"), "area_rod 0.007 exceeds area_head 0.0064516"),
+        (("stroke: 0.85", "stroke: 0.91"), "a stroke of 0.91 m does not fit into a closed_length"),
+        (("relief_pressure_bar: 200", "relief_pressure: 200"), "is not below relief_pressure 200"),
+        (("bulk_modulus: 0.9e9", "bulk_modulus: 900"), "greater than or equal to 10000000"),
+        (("home: {jib: 0.3}", "home: {jib: 1.3}"), "home.jib: 1.3 is outside its range"),
+    ],
+)
+def test_impossible_machines_are_refused(write, change, said):
+    """Slips of unit and sign that would simulate nonsense."""
+    assert said in refusal(write(edited(change)))
+
+
+def test_stroke_must_span_the_range_of_the_joint(write):
+    """The piston would leave its tube at an end of the joint's range."""
+    check_strokes(load_machine(write(edited(("range_deg: [-20, 60]", "range_deg: [-10, 30]")))))
+    with pytest.raises(
+        InputError, match="at jib = 1.047 its piston would be at .* outside its str"
+    ):
+        check_strokes(load_machine(write(edited(("range_deg: [-20, 60]", "range_deg: [-10, 60]")))))
