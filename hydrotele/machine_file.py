@@ -88,7 +88,8 @@ def save_machine(machine: Machine, path: str | Path) -> None:
     Args:
         machine: the machine.
         path: file to write. A shipped MJCF is referred to by its place among the shipped models, so
-            that the file works with any installation; a user's by absolute path.
+            that the file works with any installation. A user's is copied beside it as
+            `<stem>.tree.xml`, so that the folder can be handed on, unless it needs further files.
     """
     data = machine.model_dump(mode="json", exclude_defaults=True)
     tool = data.pop("tool", "none")
@@ -98,8 +99,15 @@ def save_machine(machine: Machine, path: str | Path) -> None:
     if machine.mjcf:
         mjcf = Path(machine.folder, machine.mjcf).resolve()
         shipped = models_folder().resolve()
-        inside = mjcf.is_relative_to(shipped)
-        data["mjcf"] = str(mjcf.relative_to(shipped) if inside else mjcf)
+        text = mjcf.read_text(encoding="utf-8")
+        if mjcf.is_relative_to(shipped):
+            data["mjcf"] = str(mjcf.relative_to(shipped))
+        elif " file=" in text:
+            data["mjcf"] = str(mjcf)
+        else:
+            copy = Path(path).with_suffix(".tree.xml")
+            copy.write_text(text, encoding="utf-8")
+            data["mjcf"] = copy.name
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 

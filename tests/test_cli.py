@@ -5,6 +5,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 import hydrotele
 from hydrotele import cli
 from hydrotele.errors import InputError
+from hydrotele.resources import models_folder, scenarios_folder
 
 ROOT = Path(hydrotele.__file__).parents[1]
 COMMANDS = [c.name or c.callback.__name__.strip("_") for c in cli.app.registered_commands]
@@ -335,6 +337,17 @@ def test_planted_effects_stay_out_of_the_runs_model(tmp_path):
     assert "payload" not in (tmp_path / "heavy" / "machine.yaml").read_text()
     channel = json.loads(invoke("replay", tmp_path / "heavy", "--json")[1])["channels"]
     assert channel["pressure_head.boom"]["rms"] > 5 * channel["pressure_head.boom"]["noise_rms"]
+
+
+def test_a_run_of_ones_own_machine_can_be_handed_on(tmp_path):
+    """The run folder works where the machine's folder does not exist."""
+    shutil.copytree(models_folder() / "rig", tmp_path / "mine")
+    text = (scenarios_folder() / "rig_steps.yaml").read_text()
+    (tmp_path / "s.yaml").write_text(text.replace("machine: rig", "machine: mine"))
+    assert invoke("run", tmp_path / "s.yaml", *QUICK, "--out", tmp_path / "run")[0] == 0
+    shutil.rmtree(tmp_path / "mine")
+    code, out, _ = invoke("replay", tmp_path / "run", "--json")
+    assert code == 0 and "position.slide" in json.loads(out)["channels"]
 
 
 def test_review_refuses_a_log_of_another_machine(finished):
