@@ -67,9 +67,9 @@ def measure(repeats: int) -> dict:
     plant = build_plant(load_machine("cat215", "none"))
     bare, full = best_of(repeats, [_bare_stepper(plant), _full_stepper(plant)])
     notes.print("whole scenario ...", style="dim")
-    factor = max(_scenario_factor() for _ in range(1 + repeats // 5))
+    factor = max(_scenario_factor() for _ in range(max(2, repeats // 2)))
     notes.print("batches ...", style="dim")
-    one, two = best_of(max(3, repeats // 3), [_batch_stepper(plant, n) for n in (1, 2)])
+    one, two = best_of(max(3, repeats), [_batch_stepper(plant, n) for n in (1, 2)])
     notes.print("start-up ...", style="dim")
     steps = SIMULATIONS * STEPS / 5
     return {
