@@ -25,7 +25,7 @@ def without_looks(root: Element) -> None:
         for element in list(asset):
             if element.tag != "mesh" or element.get("name") not in kept:
                 asset.remove(element)
-    for geom in (*world.iter("geom"), *root.iter("geom")):
+    for geom in root.iter("geom"):  # in bodies and in default classes
         geom.attrib.pop("material", None)
 
 
