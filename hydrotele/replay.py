@@ -13,11 +13,11 @@ import numpy as np
 from hydrotele.errors import InputError
 from hydrotele.log import Log
 from hydrotele.machine import Machine
+from hydrotele.noise import noise_rms, sensor_set
 from hydrotele.signals import usual_unit
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.readout import true_channels
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
-from hydrotele.simulate.sensors import noise_rms, sensor_set
 
 PREDICTED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
 

@@ -17,6 +17,7 @@ from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
+from hydrotele.noise import sensor_set
 from hydrotele.operate.plan import Plan, make_plan
 from hydrotele.operate.resolved_motion import pose_to_joints
 from hydrotele.operate.servo import drive_references, servo_numbers, servo_step
@@ -27,7 +28,7 @@ from hydrotele.simulate.feedback import Feedback, feedback
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.readout import true_channels
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
-from hydrotele.simulate.sensors import measure, sensor_set
+from hydrotele.simulate.sensors import measure
 from hydrotele.summary import summarise
 
 AUDIT_SECONDS = 5.0

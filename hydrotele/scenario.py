@@ -10,10 +10,18 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field, model_validator
 
-from hydrotele.datafile import Facts, parse, read_value, read_yaml, suggest
+from hydrotele.datafile import (
+    Facts,
+    Name,
+    NonNegative,
+    Positive,
+    parse,
+    read_value,
+    read_yaml,
+    suggest,
+)
 from hydrotele.errors import InputError
 from hydrotele.log import load_log
-from hydrotele.machine import Name, NonNegative, Positive
 from hydrotele.resources import scenarios_folder
 from hydrotele.signals import parse_channel
 

@@ -16,8 +16,19 @@ PACKAGE = "hydrotele"
 # own. Rooms of one floor see each other, in one direction only, unless the floor is in WALLED.
 FLOORS = (
     ("errors", "signals", "resources", "datafile", "output", "compiled"),
-    ("machine", "machine_file", "effects", "scenario", "csv_import", "log_checks", "log"),
-    ("kinematics", "hydraulics"),
+    (
+        "drives",
+        "sensors",
+        "machine",
+        "noise",
+        "machine_file",
+        "effects",
+        "scenario",
+        "csv_import",
+        "log_checks",
+        "log",
+    ),
+    ("kinematics", "hydraulics", "dynamics"),
     ("simulate", "operate"),
     ("run", "replay", "summary"),
     ("calibrate", "identify", "gap"),

@@ -7,19 +7,12 @@ import pytest
 from scipy import stats
 
 from hydrotele.errors import InputError
-from hydrotele.machine import Sensor
 from hydrotele.machine_file import load_machine
+from hydrotele.noise import channel_sensor, converter, noise_rms, sensor_set
 from hydrotele.run import prepare, run_scenario
 from hydrotele.scenario import load_scenario
-from hydrotele.simulate.sensors import (
-    _convert_all,
-    channel_sensor,
-    converter,
-    measure,
-    noise_rms,
-    sensor_errors,
-    sensor_set,
-)
+from hydrotele.sensors import Sensor
+from hydrotele.simulate.sensors import _convert_all, measure, sensor_errors
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import numpy as np
 from hydrotele.compiled import compiled
 from hydrotele.hydraulics.laws import (
     friction,
+    friction_slope,
     orifice,
     port_flow,
     spool_step,
@@ -52,6 +53,10 @@ class Slot(enum.IntEnum):
     VISCOUS = 25
     COULOMB_VELOCITY = 26
     OFFSET = 27
+    COULOMB_ASYMMETRY = 28
+    VISCOUS_ASYMMETRY = 29
+    HOSE_COMPLIANCE = 30
+    DRIVE_INERTIA = 31
 
 
 SLOTS = 32
@@ -76,6 +81,7 @@ _FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the flow balance of 1e-
     _AH, _AR, _VH, _VR, _STROKE, _LEAK, _W, _Z, _DB, _K, _D, _PORT, _KR, _KM, _BETA, _TANK,
     _RELIEF, _PUMP, _FC, _FS, _VS, _B, _V0,
 ) = (int(slot) for slot in list(Slot)[4:27])  # fmt: skip
+_AC, _AV, _HOSE = (int(slot) for slot in list(Slot)[28:31])
 
 
 @compiled
@@ -204,7 +210,8 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
 def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
     """Pressure rates of both chambers and their slopes with respect to their own pressure.
 
-    `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`.
+    `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`,
+    where a hose of compliance C_h counts as `beta C_h` of volume.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
@@ -235,7 +242,8 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
     if user[u + 1] == 1.0:  # Kind.CYLINDER
         volume_head += swept_head * x
         volume_rod += swept_rod * (user[u + _STROKE] - x)
-    head, rod = beta / volume_head, beta / volume_rod
+    hose = beta * user[u + _HOSE]
+    head, rod = beta / (volume_head + hose), beta / (volume_rod + hose)
     rate_head = head * (q_head - swept_head * v - leak + r_head)
     rate_rod = rod * (q_rod + swept_rod * v + leak + r_rod)
     if k_head == 0.0:
@@ -329,8 +337,35 @@ def actuator_friction(user, u, velocity):
     Source: nominal model, "Piston force".
     """
     return friction(
-        velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _B], user[u + _V0]
+        velocity,
+        user[u + _FC],
+        user[u + _FS],
+        user[u + _VS],
+        user[u + _B],
+        user[u + _V0],
+        user[u + _AC],
+        user[u + _AV],
     )
+
+
+@compiled
+def actuator_friction_slope(user, u, velocity):
+    """Slope of `actuator_friction` with respect to the velocity.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        u: place of this actuator in `user`.
+        velocity: scalar [m/s] or [rad/s].
+
+    Returns:
+        dF_f/dv, scalar [N s/m] or [N m s/rad].
+
+    Source: derivative of the nominal model's "Piston force".
+    """
+    return friction_slope(
+        velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _B], user[u + _V0],
+        user[u + _AC], user[u + _AV],
+    )  # fmt: skip
 
 
 @compiled

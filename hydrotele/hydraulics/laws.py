@@ -90,10 +90,13 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
 
 
 @compiled
-def friction(velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity):
+def friction(
+    velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
+    coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
+):  # fmt: skip
     """Coulomb, Stribeck and viscous friction that opposes a velocity.
 
-    `F_f = (F_c + F_s exp(-(v/v_s)^2)) tanh(v/v_0) + b v`.
+    `F_f = (F_c + F_s exp(-(v/v_s)^2)) t (1 + a_c t) + b v (1 + a_v t)` with `t = tanh(v/v_0)`.
 
     Args:
         velocity: v, scalar [m/s] or [rad/s].
@@ -102,6 +105,8 @@ def friction(velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_ve
         stribeck_velocity: v_s, scalar [m/s] or [rad/s], > 0.
         viscous: b, scalar [N s/m] or [N m s/rad].
         coulomb_velocity: v_0, smoothing of the sign function, scalar [m/s] or [rad/s], > 0.
+        coulomb_asymmetry: a_c, by how much the dry part is larger forwards, scalar [1].
+        viscous_asymmetry: a_v, the same of the viscous part, scalar [1].
 
     Returns:
         Friction force, scalar [N] or [N m], with the sign of the velocity.
@@ -114,7 +119,48 @@ def friction(velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_ve
     dry = coulomb
     if stribeck != 0.0:
         dry += stribeck * math.exp(-((velocity / stribeck_velocity) ** 2))
-    return dry * math.tanh(velocity / coulomb_velocity) + viscous * velocity
+    way = math.tanh(velocity / coulomb_velocity)
+    dry *= way * (1.0 + coulomb_asymmetry * way)
+    return dry + viscous * velocity * (1.0 + viscous_asymmetry * way)
+
+
+@compiled
+def friction_slope(
+    velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
+    coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
+):  # fmt: skip
+    """Slope of `friction` with respect to the velocity.
+
+    Args:
+        velocity: v, scalar [m/s] or [rad/s].
+        coulomb: F_c, scalar [N] or [N m].
+        stribeck: F_s, scalar [N] or [N m].
+        stribeck_velocity: v_s, scalar [m/s] or [rad/s], > 0.
+        viscous: b, scalar [N s/m] or [N m s/rad].
+        coulomb_velocity: v_0, scalar [m/s] or [rad/s], > 0.
+        coulomb_asymmetry: a_c, scalar [1].
+        viscous_asymmetry: a_v, scalar [1].
+
+    Returns:
+        dF_f/dv, scalar [N s/m] or [N m s/rad].
+
+    Source: derivative of the nominal model's "Piston force".
+
+    >>> friction_slope(0.0, 3000.0, 1500.0, 0.02, 6000.0, 0.005)
+    906000.0
+    """
+    dry, steep = coulomb, 0.0
+    if stribeck != 0.0:
+        ratio = velocity / stribeck_velocity
+        extra = stribeck * math.exp(-ratio * ratio)
+        dry += extra
+        steep = -2.0 * ratio / stribeck_velocity * extra
+    way = math.tanh(velocity / coulomb_velocity)
+    turn = (1.0 - way * way) / coulomb_velocity
+    slope = steep * way * (1.0 + coulomb_asymmetry * way)
+    slope += dry * turn * (1.0 + 2.0 * coulomb_asymmetry * way)
+    lean = viscous_asymmetry * (way + velocity * turn)
+    return slope + viscous * (1.0 + lean)
 
 
 @compiled

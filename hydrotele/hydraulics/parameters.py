@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
+from hydrotele.drives import Axis
 from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
-from hydrotele.machine import Axis, Machine, Supply
+from hydrotele.machine import Machine, Supply
 
 MARKER = 215325.0  # CAT 215, CAT 325: no other model writes this into actuator_user[0]
 
@@ -32,6 +33,8 @@ def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
         numbers[Slot.MARKER] = MARKER
         numbers[Slot.COUNT] = count if axis.hydraulic else 0
         _write_friction(numbers, axis)
+        if axis.transmission:
+            numbers[Slot.DRIVE_INERTIA] = axis.transmission.inertia
         if axis.hydraulic and machine.supply:
             _write_hydraulics(numbers, axis, machine.supply)
         else:
@@ -48,6 +51,8 @@ def _write_friction(numbers: np.ndarray, axis: Axis) -> None:
     numbers[Slot.STRIBECK_VELOCITY] = friction.stribeck_velocity
     numbers[Slot.VISCOUS] = friction.viscous
     numbers[Slot.COULOMB_VELOCITY] = friction.smoothing_velocity
+    numbers[Slot.COULOMB_ASYMMETRY] = friction.coulomb_asymmetry
+    numbers[Slot.VISCOUS_ASYMMETRY] = friction.viscous_asymmetry
 
 
 def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
@@ -59,6 +64,7 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = drive.areas
     numbers[Slot.VOLUME_HEAD] = numbers[Slot.VOLUME_ROD] = drive.dead_volume
     numbers[Slot.LEAKAGE] = drive.leakage
+    numbers[Slot.HOSE_COMPLIANCE] = drive.hose_compliance
     numbers[Slot.BANDWIDTH], numbers[Slot.DAMPING] = valve.bandwidth, valve.damping
     numbers[Slot.DEADBAND] = valve.deadband
     numbers[Slot.FLOW_GAIN] = valve.rated_flow / math.sqrt(valve.rated_pressure_drop)

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from hydrotele.drives import Axis
 from hydrotele.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry
 from hydrotele.kinematics.linkage import FourBar, TwoBar, two_bar_from_points
-from hydrotele.machine import Axis, Machine
+from hydrotele.machine import Machine
 
 _PLAY = 2.0e-3  # m: joint ranges are given in whole degrees
 

@@ -8,11 +8,12 @@ import numpy as np
 from hydrotele.compiled import compiled
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import circuit_scratch
-from hydrotele.machine import SensorSet
+from hydrotele.noise import channel_sensor, converter
+from hydrotele.sensors import SensorSet
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import state_supply
 from hydrotele.simulate.record import aligned_positions
-from hydrotele.simulate.sensors import channel_sensor, convert, converter, sensor_errors
+from hydrotele.simulate.sensors import convert, sensor_errors
 
 
 @compiled

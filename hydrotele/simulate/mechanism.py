@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hydrotele.drives import Axis, Cylinder, Pin
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS
 from hydrotele.hydraulics.parameters import actuator_numbers
-from hydrotele.machine import Axis, Cylinder, Link, Machine, Pin
+from hydrotele.machine import Link, Machine
 from hydrotele.simulate.looks import name_geoms, without_looks
 
 with warnings.catch_warnings():  # glfw warns when there is no screen, which nobody needs here

@@ -1,0 +1,1 @@
+"""The reduced model of a Machine: closed chains in independent coordinates, compiled."""

@@ -1,0 +1,159 @@
+"""The reduced model of a Machine: its mechanism, drives, delays and sensors as flat arrays."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.dynamics.mechanism import Mechanism, mechanism
+from hydrotele.dynamics.motion import Motion, motion_space
+from hydrotele.hydraulics.circuit import SCRATCH
+from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
+from hydrotele.machine import Machine
+from hydrotele.sensors import SensorError
+from hydrotele.signals import parse_channel
+
+POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)
+_KINDS = {
+    "angle": POSITION, "position": POSITION, "length": LENGTH, "pressure_head": HEAD,
+    "pressure_rod": ROD, "pressure_supply": SUPPLY,
+}  # fmt: skip
+
+
+class Model(NamedTuple):
+    """Numbers of the reduced model; n independent coordinates, t transmissions, h valves.
+
+    A state is `(n positions, t drive positions, n rates, t drive rates, 4 h activations)`.
+
+    Attributes:
+        mech: the mechanism.
+        user: (nu * SLOTS,) actuator numbers.
+        hydraulic: h, number of valves, which come first.
+        gain: (nu,) force per command of the plain force drives, 0 for valves [N/V].
+        delay: (nu,) command delays [s].
+        gear: (nu,) transmission of every drive, -1 if rigid.
+        transmission: (t, 4) inertia, stiffness, damping, backlash.
+        kind: (c,) what every channel shows: POSITION, LENGTH, HEAD, ROD or SUPPLY.
+        drive: (c,) drive of every channel.
+        scale: (c,) sensor scales [1].
+        offset: (c,) sensor offsets [channel's unit].
+        lag: (c,) sensor delays [s].
+    """
+
+    mech: Mechanism
+    user: np.ndarray
+    hydraulic: int
+    gain: np.ndarray
+    delay: np.ndarray
+    gear: np.ndarray
+    transmission: np.ndarray
+    kind: np.ndarray
+    drive: np.ndarray
+    scale: np.ndarray
+    offset: np.ndarray
+    lag: np.ndarray
+
+
+class Space(NamedTuple):
+    """Work space of the reduced model.
+
+    Attributes:
+        motion: work space of the mechanism.
+        q: (N,) tree positions.
+        rates: (N,) tree rates.
+        x: (nu,) drive positions [m] or [rad].
+        v: (nu,) drive velocities [m/s] or [rad/s].
+        row: (nu, n) d(load-side drive velocity) / d(independent rates).
+        mass: (n + t, n + t) mass matrix, then its factor.
+        force: (n + t,) forces, then acceleration.
+        command: (nu,) commands that have arrived.
+        act_dot: (4 h,) rates of the activations.
+        scratch: (SCRATCH,) work space of the circuit.
+    """
+
+    motion: Motion
+    q: np.ndarray
+    rates: np.ndarray
+    x: np.ndarray
+    v: np.ndarray
+    row: np.ndarray
+    mass: np.ndarray
+    force: np.ndarray
+    command: np.ndarray
+    act_dot: np.ndarray
+    scratch: np.ndarray
+
+
+def predicted_channels(machine: Machine) -> tuple[str, ...]:
+    """Channels that the reduced model predicts: positions, lengths, pressures, supply."""
+    order = actuator_order(machine)
+    valves = list(machine.hydraulic_axes)
+    names = [f"{machine.position_kind(a)}.{a}" for a in order]
+    names += [f"length.{a}" for a in order if machine.axes[a].cylinder]
+    names += [f"pressure_{side}.{a}" for a in valves for side in ("head", "rod")]
+    return (*names, "pressure_supply") if valves else tuple(names)
+
+
+def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
+    """Reduced model of a machine for some of its channels.
+
+    Args:
+        machine: the machine.
+        channels: names out of `predicted_channels(machine)`.
+
+    Returns:
+        The model.
+    """
+    order = actuator_order(machine)
+    axes = [machine.axes[name] for name in order]
+    gears = [axis.transmission for axis in axes if axis.transmission]
+    parsed = [parse_channel(name) for name in channels]
+    errors = [machine.sensor_errors.get(name, SensorError()) for name in channels]
+    index, count = [], 0
+    for axis in axes:
+        index.append(count if axis.transmission else -1)
+        count += axis.transmission is not None
+    return Model(
+        mech=mechanism(machine),
+        user=np.concatenate(list(actuator_numbers(machine).values())),
+        hydraulic=len(machine.hydraulic_axes),
+        gain=np.array([axis.force.gain if axis.force else 0.0 for axis in axes]),
+        delay=np.array([axis.command_delay for axis in axes], float),
+        gear=np.array(index, int),
+        transmission=np.array(
+            [(g.inertia, g.stiffness, g.damping, g.backlash) for g in gears], float
+        ).reshape(-1, 4),
+        kind=np.array([_KINDS[c.kind] for c in parsed], int),
+        drive=np.array([order.index(c.axis) if c.axis else 0 for c in parsed], int),
+        scale=np.array([e.scale for e in errors], float),
+        offset=np.array([e.offset for e in errors], float),
+        lag=np.array([e.delay for e in errors], float),
+    )
+
+
+def model_space(model: Model) -> Space:
+    """Fresh work space for a model."""
+    nu, n, size = len(model.gear), len(model.mech.free), state_size(model)
+    total = (size - 4 * model.hydraulic) // 2
+    return Space(
+        motion_space(model.mech), model.mech.home.copy(), np.zeros(len(model.mech.home)),
+        np.zeros(nu), np.zeros(nu), np.zeros((nu, n)), np.zeros((total, total)),
+        np.zeros(total), np.zeros(nu), np.zeros(4 * model.hydraulic), np.zeros(SCRATCH),
+    )  # fmt: skip
+
+
+def state_size(model: Model) -> int:
+    """Number of states."""
+    return 2 * (len(model.mech.free) + len(model.transmission)) + 4 * model.hydraulic
+
+
+def state_names(machine: Machine) -> list[str]:
+    """Names of the states of `reduced_model(machine, ...)`, such as `rate.boom`, `spool.boom`."""
+    from hydrotele.dynamics.mechanism import coordinate_names
+
+    names, mech = coordinate_names(machine), mechanism(machine)
+    free = [names[i] for i in mech.free]
+    gears = [n for n in actuator_order(machine) if machine.axes[n].transmission]
+    out = [f"position.{n}" for n in free] + [f"drive.{n}" for n in gears]
+    out += [f"rate.{n}" for n in free] + [f"drive_rate.{n}" for n in gears]
+    kinds = ("spool", "spool_rate", "pressure_head", "pressure_rod")
+    return out + [f"{k}.{n}" for n in machine.hydraulic_axes for k in kinds]

@@ -1,0 +1,1 @@
+"""Finds where a model and measured logs disagree, names the missing effect and patches the model."""

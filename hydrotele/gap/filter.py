@@ -1,0 +1,194 @@
+"""Extended Kalman filter on the reduced model: one-step prediction errors, whitened.
+
+A run is crossed row by row. Readings are taken one after the other, so that a missing one is simply
+left out. A second pass with another model may keep the gains and whiteners of the first: then the
+whitened errors are smooth functions of the model's numbers, and their change is a signature.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.dynamics.integrate import advance, place, read_channels
+from hydrotele.dynamics.integrate import _write_trail as write_trail
+
+
+class Gains(NamedTuple):
+    """What a pass of the filter keeps for later passes; n rows, c channels, nz states.
+
+    Attributes:
+        slope: (n, c, nz) d reading / d state.
+        gain: (n, c, nz) correction of the state per prediction error.
+        spread: (n, c) predicted standard deviation of the prediction error [channel's unit].
+    """
+
+    slope: np.ndarray
+    gain: np.ndarray
+    spread: np.ndarray
+
+
+@compiled
+def _differentiate(model, sp, z, command, row, period, steps, nudge, trail, after, columns):
+    """Columns d z(next row) / d z(this row) by forward differences, transposed."""
+    base = z.copy()
+    advance(model, sp, base, command, row, period, steps, trail, False)
+    for s in range(len(z)):
+        after[:] = z
+        after[s] += nudge[s]
+        advance(model, sp, after, command, row, period, steps, trail, False)
+        for r in range(len(z)):
+            columns[s, r] = (after[r] - base[r]) / nudge[s]
+
+
+@compiled
+def _slopes(model, sp, z, reading, nudge, steps, h, trail, slope, moved, shown):
+    """d reading / d state in a state."""
+    first = 2 * (len(model.mech.free) + len(model.transmission))
+    slope[:] = 0.0
+    n = len(model.mech.free)
+    place(model, sp, z)
+    for c in range(len(model.kind)):
+        i = model.drive[c]
+        if model.kind[c] == 0:
+            for f in range(n):
+                slope[c, f] = model.scale[c] * sp.motion.basis[model.mech.drive_joint[i], f]
+        elif model.kind[c] == 1:
+            if model.gear[i] >= 0:
+                slope[c, n + model.gear[i]] = model.scale[c]
+            else:
+                for f in range(n):
+                    slope[c, f] = model.scale[c] * sp.row[i, f]
+        elif model.kind[c] < 4:
+            slope[c, first + 4 * i + model.kind[c]] = model.scale[c]
+    for c in range(len(model.kind)):
+        if model.kind[c] != 4:
+            continue
+        for s in range(first, len(z)):
+            if (s - first) % 4 == 1:
+                continue
+            moved[:] = z
+            moved[s] += nudge[s]
+            read_channels(model, sp, moved, -1, steps, h, trail, shown)
+            slope[c, s] = shown[c]
+            moved[s] -= 2.0 * nudge[s]
+            read_channels(model, sp, moved, -1, steps, h, trail, shown)
+            slope[c, s] = (slope[c, s] - shown[c]) / (2.0 * nudge[s])
+
+
+@compiled
+def filter_run(
+    model, sp, z, spread, command, known, reading, noise, drift, startle, period, steps, coarse,
+    nudge, slope, gain, width, fresh, whitened, predicted, corrected,
+):  # fmt: skip
+    """Cross a run.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state before the first row's readings; overwritten.
+        spread: (nz, nz) its covariance; overwritten.
+        command: (n, nu) commands.
+        known: (n,) whether the row's command is known.
+        reading: (n, c) readings, NaN where missing [channel's unit].
+        noise: (c,) variance of a reading.
+        drift: (nz,) variance that a row adds to the state.
+        startle: (nz,) variance that a row with unknown command adds.
+        period: scalar [s].
+        steps: steps per row of the mean.
+        coarse: steps per row of the covariance.
+        nudge: (nz,) differences for derivatives.
+        slope: (n, c, nz), gain: (n, c, nz), width: (n, c): see `Gains`; written if `fresh`, else
+            used.
+        gain: see slope.
+        width: see slope.
+        fresh: whether to compute gains; False keeps the given ones.
+        whitened: (n, c) written; NaN where missing.
+        predicted: (n, c) written: readings predicted from the rows before.
+        corrected: (n, nz) written: states after the row's readings.
+
+    Returns:
+        -2 log likelihood without its constant; infinite if the states broke down.
+
+    Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings.
+    """
+    rows, channels, size = reading.shape[0], reading.shape[1], len(z)
+    h = period / steps
+    trail = np.zeros((rows * steps + 1, channels))
+    columns, after = np.zeros((size, size)), np.zeros(size)
+    moved, shown, work = np.zeros(size), np.zeros(channels), np.zeros((size, size))
+    delta, pull = np.zeros(size), np.zeros(size)
+    place(model, sp, z)
+    write_trail(model, sp, z, trail[0])
+    loss = 0.0
+    for row in range(rows):
+        read_channels(model, sp, z, row, steps, h, trail, predicted[row])
+        if fresh:
+            _slopes(model, sp, z, reading, nudge, steps, h, trail, slope[row], moved, shown)
+        delta[:] = 0.0
+        for c in range(channels):
+            if math.isnan(reading[row, c]):
+                whitened[row, c] = math.nan
+                continue
+            hc = slope[row, c]
+            error = reading[row, c] - predicted[row, c]
+            for s in range(size):
+                error -= hc[s] * delta[s]
+            if fresh:
+                total = noise[c]
+                for s in range(size):
+                    pull[s] = 0.0
+                    for k in range(size):
+                        if hc[k] != 0.0:
+                            pull[s] += spread[s, k] * hc[k]
+                    total += 0.0
+                for s in range(size):
+                    total += hc[s] * pull[s]
+                width[row, c] = math.sqrt(total)
+                for s in range(size):
+                    gain[row, c, s] = pull[s] / total
+                for s in range(size):
+                    for k in range(size):
+                        spread[s, k] -= pull[s] * pull[k] / total
+            for s in range(size):
+                delta[s] += gain[row, c, s] * error
+            whitened[row, c] = error / width[row, c]
+            loss += whitened[row, c] ** 2 + 2.0 * math.log(width[row, c])
+        for s in range(size):
+            z[s] += delta[s]
+        corrected[row] = z
+        if not math.isfinite(loss):
+            return math.inf
+        if row == rows - 1:
+            break
+        if fresh:
+            _differentiate(
+                model, sp, z, command, row, period, coarse, nudge, trail, after, columns
+            )
+            _carry(columns, spread, work, drift)
+            if not known[row]:
+                for s in range(size):
+                    spread[s, s] += startle[s]
+        advance(model, sp, z, command, row, period, steps, trail, True)
+    return loss
+
+
+@compiled
+def _carry(columns, spread, work, drift):
+    """`P = F P F' + Q` with F' given, kept symmetric."""
+    size = len(drift)
+    for a in range(size):
+        for b in range(size):
+            total = 0.0
+            for k in range(size):
+                total += columns[k, a] * spread[k, b]
+            work[a, b] = total
+    for a in range(size):
+        for b in range(a + 1):
+            total = 0.0
+            for k in range(size):
+                total += work[a, k] * columns[k, b]
+            spread[a, b] = total
+            spread[b, a] = total
+        spread[a, a] += drift[a]

@@ -1,0 +1,93 @@
+"""Runs of a dataset through the filter: where it starts, what it trusts, what it yields."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.dynamics.model import Model, Space, model_space, reduced_model, state_names
+from hydrotele.gap.dataset import Dataset, RunData
+from hydrotele.gap.filter import Gains, filter_run
+from hydrotele.gap.start import start_state
+from hydrotele.machine import Machine
+
+STEP = 2.0e-3  # s: the integrator is of second order; 1 ms changes no innovation by 2 % of its noise
+COARSE = 4.0e-3  # s, for the covariance
+
+
+@dataclass(frozen=True)
+class Track:
+    """One run crossed by one model.
+
+    Attributes:
+        run: the run.
+        loss: -2 log likelihood without its constant.
+        whitened: (n, c) prediction errors over their predicted spread, NaN where missing.
+        predicted: (n, c) one-step predictions [channel's unit].
+        states: (n, nz) states after each row's readings.
+        gains: gains and whiteners used.
+        start: (nz,) state before the first reading.
+    """
+
+    run: RunData
+    loss: float
+    whitened: np.ndarray
+    predicted: np.ndarray
+    states: np.ndarray
+    gains: Gains
+    start: np.ndarray
+
+
+_NUDGE = {
+    "position": 1e-6, "drive": 1e-6, "rate": 1e-5, "drive_rate": 1e-5, "spool": 1e-5,
+    "spool_rate": 1e-3, "pressure_head": 100.0, "pressure_rod": 100.0,
+}  # fmt: skip
+# What a row of 20 ms may add to a state beyond the model: integrator error, not physics.
+_DRIFT = {
+    "position": 2e-6, "drive": 2e-6, "rate": 2e-4, "drive_rate": 2e-4, "spool": 1e-4,
+    "spool_rate": 1e-2, "pressure_head": 5e3, "pressure_rod": 5e3,
+}  # fmt: skip
+_STARTLE = {"spool": 0.2, "spool_rate": 5.0, "pressure_head": 2e6, "pressure_rod": 2e6, "rate": 0.02}
+
+
+def by_kind(names: list[str], table: dict[str, float]) -> np.ndarray:
+    """(nz,) numbers of a table by kind of state; 0 for kinds that it lacks."""
+    return np.array([table.get(name.partition(".")[0], 0.0) for name in names])
+
+
+def track_run(
+    machine: Machine, data: Dataset, run: RunData, kept: Track | None = None,
+    model: Model | None = None, space: Space | None = None,
+) -> Track:  # fmt: skip
+    """Cross a run with a machine.
+
+    Args:
+        machine: the machine to try.
+        data: the dataset that the run belongs to.
+        run: the run.
+        kept: a track whose gains, whiteners and start are kept; None computes them anew.
+        model: the machine's reduced model, if already made.
+        space: its work space.
+
+    Returns:
+        The track.
+    """
+    model = model or reduced_model(machine, data.channels)
+    space = space or model_space(model)
+    names = state_names(machine)
+    rows, c, size = len(run.command), len(data.channels), len(names)
+    start, spread = start_state(machine, data, run, model, names)
+    if kept is None:
+        gains = Gains(
+            np.zeros((rows, c, size)), np.zeros((rows, c, size)), np.zeros((rows, c))
+        )
+    else:
+        gains = kept.gains
+    whitened, predicted = np.empty((rows, c)), np.empty((rows, c))
+    states = np.empty((rows, size))
+    loss = filter_run(
+        model, space, start.copy(), spread, run.command, run.command_known, run.reading,
+        data.noise**2, by_kind(names, _DRIFT) ** 2, by_kind(names, _STARTLE) ** 2, run.period,
+        max(1, round(run.period / STEP)), max(1, round(run.period / COARSE)),
+        by_kind(names, _NUDGE), *gains, kept is None, whitened, predicted, states,
+    )  # fmt: skip
+    return Track(run, loss, whitened, predicted, states, gains, start)

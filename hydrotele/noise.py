@@ -1,0 +1,76 @@
+"""How well a machine's sensors read: which sensor a channel has, its converter, its noise."""
+
+import math
+from typing import NamedTuple
+
+from hydrotele.datafile import suggest
+from hydrotele.errors import InputError
+from hydrotele.machine import Machine
+from hydrotele.sensors import Sensor, SensorSet
+
+IDEAL = "ideal"
+
+_KINDS = {
+    "angle": "angle",
+    "position": "position",
+    "length": "length",
+    "pressure_head": "pressure",
+    "pressure_rod": "pressure",
+    "pressure_supply": "pressure",
+}
+
+
+def sensor_set(machine: Machine, name: str) -> SensorSet | None:
+    """A machine's sensors by name; None for ideal ones.
+
+    Raises:
+        InputError: the machine has no such sensors; lists those it has.
+    """
+    if name == IDEAL:
+        return None
+    if name not in machine.sensors:
+        raise InputError(
+            f"sensors {name!r}",
+            f"machine {machine.name} has none; {suggest(name, [IDEAL, *machine.sensors])}",
+        )
+    return machine.sensors[name]
+
+
+def channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) -> Sensor:
+    """Sensor of a channel with its span filled in: a length spans its cylinder's stroke."""
+    if sensors is None:
+        return Sensor()
+    kind, _, axis = channel.partition(".")
+    sensor: Sensor = getattr(sensors, _KINDS[kind])
+    if kind == "length" and sensor.bits and sensor.span is None:
+        cylinder = machine.axes[axis].cylinder
+        assert cylinder
+        return sensor.model_copy(update={"span": cylinder.stroke})
+    return sensor
+
+
+class Converter(NamedTuple):
+    """An analogue-to-digital converter: nearest step, kept inside low .. high [channel's unit].
+
+    A step of 0 passes everything unchanged.
+    """
+
+    step: float
+    low: float
+    high: float
+
+
+def converter(sensor: Sensor, channel: str) -> Converter:
+    """Converter of a channel: 2^bits steps of the span; lengths and pressures end at 0 and span."""
+    if sensor.bits is None or sensor.span is None:
+        return Converter(0.0, -math.inf, math.inf)
+    step = sensor.span / 2.0**sensor.bits
+    if channel.startswith(("angle", "position")):
+        return Converter(step, -math.inf, math.inf)
+    return Converter(step, 0.0, sensor.span)
+
+
+def noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
+    """Standard deviation of one reading [channel's unit]: uniform error plus converter."""
+    sensor = channel_sensor(machine, sensors, channel)
+    return math.sqrt(sensor.accuracy**2 / 3.0 + converter(sensor, channel).step ** 2 / 12.0)
