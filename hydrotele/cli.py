@@ -2,6 +2,7 @@
 
 import signal
 import sys
+from json import dumps as json_text
 from pathlib import Path
 from typing import Annotated
 
@@ -36,6 +37,19 @@ def _overrides(items: list[str]) -> dict[str, str]:
     return pairs
 
 
+def _chosen(machine: str | None, tool: str | None) -> dict[str, str]:
+    """Overrides of a scenario's machine; a path counts from here, not from the scenario's file."""
+    from hydrotele.machine_file import shipped_machines
+
+    pairs = {}
+    if machine is not None:
+        named = machine in shipped_machines()
+        pairs["machine"] = json_text(machine if named else str(Path(machine).resolve()))
+    if tool is not None:
+        pairs["tool"] = json_text(tool)
+    return pairs
+
+
 @app.command(
     epilog="Examples:  hydrotele run zhu_up   |   hydrotele run my.yaml --out runs/a --set seed=7"
 )
@@ -47,13 +61,20 @@ def run(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override key=value; may be repeated.")
     ] = None,
+    machine: Annotated[
+        str | None,
+        typer.Option(
+            "--machine", "-m", help="Machine instead of the scenario's, such as patched/."
+        ),
+    ] = None,
+    tool: ToolName = None,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
     json: Json = False,
 ) -> None:
     """Simulate a scenario; write both logs, the rerun recording, the summary and the MJCF."""
     from hydrotele.commands.running import run_to_folder
 
-    run_to_folder(scenario, out, _overrides(set_ or []), review, json)
+    run_to_folder(scenario, out, _overrides(set_ or []) | _chosen(machine, tool), review, json)
 
 
 @app.command(
@@ -78,6 +99,43 @@ def replay(
     from hydrotele.commands.replaying import replay_logs
 
     replay_logs(logs, machine, tool, timestep, out, json)
+
+
+@app.command(
+    epilog="Examples:  hydrotele gap --machine cat215 --data measured/site_a   |   "
+    "hydrotele gap --data runs/a runs/b --heldout b"
+)
+def gap(
+    data: Annotated[
+        list[Path], typer.Option("--data", "-d", help="Folder of logs, log file or run folder.")
+    ],
+    more: Annotated[list[Path] | None, typer.Argument(help="More of them.")] = None,
+    machine: MachineName = None,
+    tool: ToolName = None,
+    heldout: Annotated[
+        str | None, typer.Option(help="Run to judge on, not fitted; default test*, or the last.")
+    ] = None,
+    sensors: Annotated[str | None, typer.Option(help="Sensors of the machine.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write; default gap_DATA.")
+    ] = None,
+    effect: Annotated[
+        list[str] | None, typer.Option("--effect", help="Try only this effect; may be repeated.")
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Accept logs that name another machine or tool.")
+    ] = False,
+    recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
+    json: Json = False,
+) -> None:
+    """Find where the model and measured logs disagree, name the effect, patch the model."""
+    from hydrotele.commands.gapping import gap_to_folder
+
+    gap_to_folder(
+        [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,
+        effect or [], jobs, force,
+    )  # fmt: skip
 
 
 @app.command(

@@ -18,9 +18,9 @@ def compiled(function):
     Where no folder for the cache can be written, it is compiled anew in every process.
     """
     try:
-        return njit(cache=True, error_model="numpy")(function)
+        return njit(cache=True, error_model="numpy", nogil=True)(function)
     except RuntimeError:
-        return njit(error_model="numpy")(function)
+        return njit(error_model="numpy", nogil=True)(function)
 
 
 def callback(signature):

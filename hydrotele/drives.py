@@ -136,7 +136,8 @@ class Transmission(Facts):
 
     The drive acts on its own inertia [kg] or [kg m^2]; spring [N/m] or [N m/rad] and damper
     [N s/m] or [N m s/rad] carry the force on to the load; inside the gap, `backlash` [m] or [rad]
-    wide from end to end, only the damper does.
+    wide from end to end, only the damper does. Friction and oil act on the drive side, and a
+    cylinder's length sensor reads it; the joint's own sensor reads the load.
     """
 
     inertia: Positive

@@ -128,6 +128,15 @@ class Machine(Facts):
         """`angle` for a hinge axis, `position` for a slide."""
         return "angle" if self.joints[self.axes[axis].joint].type == "hinge" else "position"
 
+    @property
+    def sensed_channels(self) -> tuple[str, ...]:
+        """Channels that sensors of this machine can show."""
+        names = [f"{self.position_kind(axis)}.{axis}" for axis in self.axes]
+        names += [f"length.{name}" for name, axis in self.axes.items() if axis.cylinder]
+        for side in ("head", "rod"):
+            names += [f"pressure_{side}.{axis}" for axis in self.hydraulic_axes]
+        return (*names, "pressure_supply") if self.hydraulic_axes else tuple(names)
+
     @model_validator(mode="after")
     def _check(self):
         _refuse_names(self.links)
@@ -160,6 +169,8 @@ class Machine(Facts):
                 if joint is not None:
                     _expect(joint, joints, f"arm.{part}")
             _expect(self.arm.tip.link, known, "arm.tip.link")
+        for channel in self.sensor_errors:
+            _expect(channel, self.sensed_channels, "sensor_errors")
         if self.hydraulic_axes and self.supply is None:
             raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
         if len(self.hydraulic_axes) > 8:

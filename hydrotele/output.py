@@ -17,7 +17,11 @@ from hydrotele.errors import InputError
 OURS = {
     "run": ("measured.parquet", "truth.parquet", "review.rrd", "scenario.yaml", "machine.*"),
     "replay": ("*.png", "*.rrd", "*_simulated.parquet"),
-}
+    "gap": (
+        "gap.json", "report.html", "recording.rrd", "next_experiment.yaml",
+        "patched/machine.*", "patched/effects.yaml",
+    ),
+}  # fmt: skip
 """Kind of folder -> files that it holds beside `summary.json`, which states the kind."""
 
 
@@ -84,14 +88,20 @@ def check_target(target: str | Path, kind: str) -> None:
         return
     if not place.is_dir():
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
-    inside = sorted(path.name for path in place.iterdir())
+    inside = sorted(path.relative_to(place).as_posix() for path in place.rglob("*"))
     if inside and _kind(place) != kind:
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
     patterns = ("summary.json", *OURS[kind])
-    strange = [n for n in inside if not any(fnmatch.fnmatch(n, p) for p in patterns)]
+    strange = [name for name in inside if not any(_matches(name, p) for p in patterns)]
     if strange:
         message = f"holds {', '.join(strange[:3])}, which no {kind} wrote; choose another --out"
         raise InputError(target, message)
+
+
+def _matches(name: str, pattern: str) -> bool:
+    """Whether a path is of a pattern, or is a folder on the way to it."""
+    parts, wanted = name.split("/"), pattern.split("/")
+    return len(parts) <= len(wanted) and all(map(fnmatch.fnmatch, parts, wanted))
 
 
 def _kind(folder: Path) -> str | None:

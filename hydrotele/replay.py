@@ -7,17 +7,20 @@ import time as clock
 from collections.abc import Callable
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from hydrotele.errors import InputError
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.noise import noise_rms, sensor_set
+from hydrotele.sensors import SensorError
 from hydrotele.signals import usual_unit
+from hydrotele.simulate.drive_side import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
-from hydrotele.simulate.readout import true_channels
+from hydrotele.simulate.readout import late_channels, true_channels
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
+from hydrotele.simulate.sensors import defective
+from hydrotele.simulate.stepping import Stepper
 
 PREDICTED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
 
@@ -61,8 +64,12 @@ def replay_log(
     """Drive a machine with a log's commands.
 
     Starts from the log's `initial_state` metadata if it has one, else from its first row: measured
-    positions, measured pressures, zero velocity, closed spools. There is a ground to touch only if
-    the log's metadata says `ground: yes`, as logs of scenarios with a ground do.
+    positions, measured pressures, zero velocity, closed spools. Before it the machine stood still
+    with the commands of rest, which matters where commands are delayed. There is a ground to touch
+    only if the log's metadata says `ground: yes`, as logs of scenarios with a ground do.
+
+    What is compared is what the machine's sensors would read without noise, with their offsets,
+    scales and delays; in a log of the truth, with `truth.*` columns, the true values themselves.
 
     Args:
         log: the log; needs the command and the position of every axis.
@@ -99,6 +106,8 @@ def replay_log(
     record = _drive(plant, data, log.time, commands, steps, progress)
     factor = (log.time[-1] - log.time[0]) / max(clock.perf_counter() - begin, 1e-9)
     values, units = true_channels(plant, record)
+    if not any(name.startswith("truth.") for name in log.columns):
+        values |= defective(machine, values | late_channels(plant, record))
     simulated = Log(
         time=log.time, columns=values, units=units, source=f"replay of {log.source}",
         metadata={"machine": machine.name, "tool": machine.tool, "run": f"replay {log.name}"},
@@ -117,14 +126,20 @@ def _start(plant: Plant, log: Log) -> dict[str, Any]:
     axes = list(plant.axes)
     state: dict[str, Any] = {
         "order": axes,
-        "angle": [float(log[f"{plant.machine.position_kind(a)}.{a}"][0]) for a in axes],
+        "angle": [_first(plant, log, f"{plant.machine.position_kind(a)}.{a}") for a in axes],
     }
     valves = axes[: plant.hydraulic]
     names = [f"pressure_{side}.{a}" for side in ("head", "rod") for a in valves]
     if valves and all(n in log for n in names):
-        state["pressure_head"] = [float(log[f"pressure_head.{a}"][0]) for a in valves]
-        state["pressure_rod"] = [float(log[f"pressure_rod.{a}"][0]) for a in valves]
+        state["pressure_head"] = [_first(plant, log, f"pressure_head.{a}") for a in valves]
+        state["pressure_rod"] = [_first(plant, log, f"pressure_rod.{a}") for a in valves]
     return state
+
+
+def _first(plant: Plant, log: Log, channel: str) -> float:
+    """True value behind the first reading of a channel, as its scale and offset have it."""
+    error = plant.machine.sensor_errors.get(channel, SensorError())
+    return (float(log[channel][0]) - error.offset) / error.scale
 
 
 def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
@@ -140,6 +155,10 @@ def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
                 start[key] = _vector(state, key, size, len(order))
         joints = dict(state.get("joints", {}))
         start["joints"] = {name: float(_vector(joints, name)) for name in joints}
+        for key in ("drive", "drive_velocity"):
+            sides = dict(state.get(key, {}))
+            known = flexible_axes(plant.machine)
+            start[key] = {name: float(_vector(sides, name)) for name in sides if name in known}
     except (ValueError, KeyError, TypeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         where = f"{log.source}: metadata initial_state"
@@ -159,12 +178,12 @@ def _drive(plant: Plant, data, times, commands, steps, progress) -> Record:
     recorder = Recorder(plant, len(times))
     recorder.command[:] = commands
     begin_leapfrog(plant.model, data)
+    stepper = Stepper(plant, data, steps)
     for row, time in enumerate(times):
-        recorder.take(row, time, data)
+        recorder.take(row, time, data, stepper.past)
         if progress and row % 100 == 0:
             progress(time - times[0], times[-1] - times[0])
-        data.ctrl[:] = commands[row]
-        mujoco.mj_step(plant.model, data, nstep=steps)
+        stepper.advance(commands[row])
     if progress:
         progress(times[-1] - times[0], times[-1] - times[0])
     return recorder.record()

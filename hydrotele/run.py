@@ -24,11 +24,13 @@ from hydrotele.operate.servo import drive_references, servo_numbers, servo_step
 from hydrotele.scenario import Scenario, own_machine
 from hydrotele.simulate.audit import audit, full_state
 from hydrotele.simulate.closure import pin_opening
+from hydrotele.simulate.drive_side import flexible_axes
 from hydrotele.simulate.feedback import Feedback, feedback
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
-from hydrotele.simulate.readout import true_channels
+from hydrotele.simulate.readout import late_channels, true_channels
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
 from hydrotele.simulate.sensors import measure
+from hydrotele.simulate.stepping import DelayLine, Stepper
 from hydrotele.summary import summarise
 
 AUDIT_SECONDS = 5.0
@@ -123,13 +125,14 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
     prepared = prepare(scenario)
     plant, data, plan, seen = prepared
     begin_leapfrog(plant.model, data)
-    begin = full_state(plant.model, data)
+    begin, line = full_state(plant.model, data), DelayLine(plant, data.ctrl)
     record, commands, pins, wall = _loop(prepared, scenario, progress)
     truth, measured = _logs(plant, scenario, record, seen)
     summary = summarise(plant, scenario, plan, record, pins, wall)
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
-    window = np.repeat(commands[: round(AUDIT_SECONDS * scenario.control_rate)], steps, axis=0)
-    summary["balance"] = audit(plant, begin, window)
+    window = commands[: round(AUDIT_SECONDS * scenario.control_rate)]
+    controls = np.concatenate([line.controls(command, steps) for command in window])
+    summary["balance"] = audit(plant, begin, controls)
     return Run(scenario, plant, plan, measured, truth, summary)
 
 
@@ -145,6 +148,7 @@ def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> t
     visible = {c: v for c, v in values.items() if not c.startswith(("truth.", "command."))}
     sensors = sensor_set(machine, scenario.sensors)
     readings = {c: v for c, v in values.items() if c.startswith("command.")}
+    visible |= late_channels(plant, record)
     readings |= measure(machine, sensors, scenario.seed, visible, errors)
     units = {c: units[c] for c in readings}
     return truth, _log(scenario, machine, record.time, readings, units, scenario.sensors)
@@ -195,15 +199,14 @@ def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None):
     drives = drive_references(plant.machine, plan, scenario.servo)
     k = len(plant.axes)
     load, command, commands = np.zeros(k), np.zeros(k), np.empty((ticks, k))
-    recorder = Recorder(plant, rows)
-    ctrl = data.ctrl
+    recorder, stepper = Recorder(plant, rows), Stepper(plant, data, steps)
     worst, begin = 0.0, 0.0
     for tick in range(ticks):
         if tick % every == 0 and tick // every < rows:
-            recorder.take(tick // every, tick * dt, data)
+            recorder.take(tick // every, tick * dt, data, stepper.past)
             if progress and tick % (every * 50) == 0:
                 progress(tick * dt, scenario.duration)
-        seen.update(tick, data)
+        seen.update(tick, data, stepper.past)
         if tick == 0:
             load[:] = numbers[:, 1] * seen.head - numbers[:, 2] * seen.rod
         command[:] = plan.command[tick]
@@ -213,10 +216,9 @@ def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None):
             plan.reference[tick - tick % seen.every], seen.joint, seen.rate, seen.head, seen.rod,
             seen.supply, load, command,
         )  # fmt: skip
-        ctrl[:] = command
         commands[tick] = command
         begin = begin if tick else clock.perf_counter()
-        mujoco.mj_step(model, data, nstep=steps)
+        stepper.advance(command)
         worst = max(worst, pin_opening(model, data))
     recorder.command[:] = commands[: rows * every].reshape(rows, every, k).mean(axis=1)
     if progress:
@@ -244,10 +246,17 @@ def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
     keys = ("spool", "spool_rate", "pressure_head", "pressure_rod")
     driven = {axis.joint for axis in plant.machine.axes.values()}
     free = [n for n in plant.machine.joints if n not in driven]
+    flexible = {n: plant.axes.index(n) for n in flexible_axes(plant.machine)}
+    qpos, qvel = record.qpos[0], record.qvel[0]
+    drives = {
+        "drive": {n: float(qpos[plant.drive_qpos[i]]) for n, i in flexible.items()},
+        "drive_velocity": {n: float(qvel[plant.drive_dof[i]]) for n, i in flexible.items()},
+    }
     return {
         "order": list(plant.axes),
         "angle": record.qpos[0, plant.qpos].tolist(),
         "velocity": record.qvel[0, plant.dof].tolist(),
         **{key: act[:, column].tolist() for column, key in enumerate(keys)},
         "joints": {n: float(record.qpos[0, plant.model.joint(n).qposadr[0]]) for n in free},
+        **(drives if flexible else {}),
     }

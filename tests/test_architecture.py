@@ -31,7 +31,8 @@ FLOORS = (
     ("kinematics", "hydraulics", "dynamics"),
     ("simulate", "operate"),
     ("run", "replay", "summary"),
-    ("calibrate", "identify", "gap"),
+    ("identify",),
+    ("calibrate", "gap"),
     ("show",),
     ("envs", "bench", "sweep", "commands"),
     ("cli",),
@@ -42,10 +43,10 @@ _FACTS = {*FLOORS[0], *FLOORS[1], *FLOORS[2]}
 ONLY = {
     "errors": set(),
     "signals": set(),
-    "kinematics": {"errors", "machine"},
-    "calibrate": _FACTS,
+    "kinematics": {"errors", "drives", "machine"},
     "identify": _FACTS,
-    "gap": _FACTS,
+    "calibrate": {*_FACTS, "identify"},
+    "gap": {*_FACTS, "identify"},
 }
 
 HEAVY = {"rerun": {"show", "envs"}, "matplotlib": {"show", "envs"}, "gymnasium": {"show", "envs"}}

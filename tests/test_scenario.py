@@ -471,14 +471,13 @@ def effects_of(draw, machine):
     """Up to two effects, anywhere, with any value in their range."""
     possible = [e for e in EFFECTS.values() if e.locations(machine)]
     chosen = draw(st.lists(st.sampled_from(possible), max_size=2)) if possible else []
-    return [
-        {
-            "name": e.name,
-            "location": draw(st.sampled_from(e.locations(machine))),
-            "parameters": {k: draw(st.floats(p.low, p.high)) for k, p in e.parameters.items()},
-        }
-        for e in chosen
-    ]
+    planted = []
+    for effect in chosen:
+        place = draw(st.sampled_from(effect.locations(machine)))
+        numbers = effect.parameters(machine, place)
+        values = {name: draw(st.floats(p.low, p.high)) for name, p in numbers.items()}
+        planted.append({"name": effect.name, "location": place, "parameters": values})
+    return planted
 
 
 @st.composite

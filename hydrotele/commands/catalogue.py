@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from rich.markup import escape
+
 from hydrotele.commands.console import notes, out, print_json, table
 from hydrotele.datafile import read_yaml, suggest
 from hydrotele.errors import InputError
@@ -36,8 +38,10 @@ def list_things(what: str, as_json: bool) -> None:
 
 def _cell(value) -> str:
     if isinstance(value, dict):
-        return ", ".join(
-            f"{n} [{p['unit']}] {p['low']:g} .. {p['high']:g}" for n, p in value.items()
+        return escape(
+            ", ".join(
+                f"{n} [{p['unit']}] {p['low']:.4g} .. {p['high']:.4g}" for n, p in value.items()
+            )
         )
     return ", ".join(value) if isinstance(value, list) else str(value)
 
@@ -66,21 +70,25 @@ def _scenarios() -> list[dict]:
 
 
 def _effects() -> list[dict]:
+    """Effects as they can sit on the CAT 215 with bucket, ranges at the last of the places."""
     from hydrotele.effects import EFFECTS
 
     machine = load_machine("cat215", "bucket")
-    return [
-        {
-            "name": effect.name,
-            "what": effect.sentence,
-            "locations": list(effect.locations(machine)),
-            "parameters": {
-                n: {"unit": p.unit, "low": p.low, "high": p.high}
-                for n, p in effect.parameters.items()
-            },
-        }
-        for effect in EFFECTS.values()
-    ]
+    rows = []
+    for effect in EFFECTS.values():
+        places = effect.locations(machine)
+        numbers = effect.parameters(machine, places[-1])
+        rows.append(
+            {
+                "name": effect.name,
+                "what": effect.sentence,
+                "locations": list(places),
+                "parameters": {
+                    n: {"unit": p.unit, "low": p.low, "high": p.high} for n, p in numbers.items()
+                },
+            }
+        )
+    return rows
 
 
 def validate_files(paths: list[Path], as_json: bool) -> None:

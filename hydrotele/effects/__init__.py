@@ -2,4 +2,92 @@
 
 One type for three uses: planted in a scenario, tried as a hypothesis, written into a patched
 machine.
+
+To add an effect, write one file here that defines `EFFECT = Effect(...)` (or `EFFECTS`, a tuple of
+a tight family); it is found by itself. Such a file says
+
+1. the fixed name, one sentence, and the law of the model that the effect changes;
+2. `locations(machine)`: where it can sit, nothing where the machine has no such part;
+3. `parameters(machine, location)`: for every number its unit, its value in the machine as it is,
+   and its sizes relative to the machine, with the reason for the smallest one worth naming;
+4. `apply(machine, location, values)`: the changed machine, made with `changed`. With the nominal
+   values it must behave as the given machine does.
+
+Whatever the facts of `Machine` can already say is simulated, estimated, saved and loaded without
+further code. A file whose name begins with an underscore holds helpers. Tests of all effects
+(`tests/effects/test_library.py`) take a new one along; a test of its own shows its physics.
 """
+
+import importlib
+import math
+import pkgutil
+from collections.abc import Mapping
+
+from hydrotele.datafile import suggest
+from hydrotele.effects.effect import Effect, Parameter
+from hydrotele.errors import InputError
+from hydrotele.machine import Machine
+
+__all__ = ["EFFECTS", "Effect", "Parameter", "apply_effect"]
+
+
+def _discover() -> dict[str, Effect]:
+    found: dict[str, Effect] = {}
+    for module in pkgutil.iter_modules(__path__):
+        if module.name.startswith("_") or module.name == "effect":
+            continue
+        content = importlib.import_module(f"{__name__}.{module.name}")
+        single = getattr(content, "EFFECT", None)
+        family = getattr(content, "EFFECTS", ()) if single is None else (single,)
+        if not family:
+            raise RuntimeError(f"{content.__name__} defines neither EFFECT nor EFFECTS")
+        for effect in family:
+            if effect.name in found:
+                raise RuntimeError(f"{content.__name__}: effect {effect.name} exists already")
+            found[effect.name] = effect
+    return found
+
+
+EFFECTS: dict[str, Effect] = _discover()
+"""Effects by name."""
+
+
+def apply_effect(
+    machine: Machine, name: str, location: str, parameters: Mapping[str, float]
+) -> Machine:
+    """A machine that has an effect.
+
+    Args:
+        machine: the machine without it.
+        name: name of the effect.
+        location: where; may be left empty where there is only one place.
+        parameters: parameter name -> value in the effect's unit.
+
+    Returns:
+        The changed machine.
+
+    Raises:
+        InputError: unknown effect, location or parameter, or a value out of range; lists what is
+            valid.
+    """
+    if name not in EFFECTS:
+        raise InputError(f"effect {name!r}", f"is not known; {suggest(name, EFFECTS)}")
+    effect = EFFECTS[name]
+    places = effect.locations(machine)
+    if not location and len(places) == 1:
+        location = places[0]
+    if location not in places:
+        message = f"cannot sit at {location!r}; {suggest(location, places)}"
+        raise InputError(f"effect {name}", message)
+    known = effect.parameters(machine, location)
+    for key in sorted(parameters.keys() ^ known.keys()):
+        names = ", ".join(known)
+        raise InputError(f"effect {name}", f"needs exactly the parameters {names}: {key!r}")
+    for key, value in parameters.items():
+        limits = known[key]
+        if math.isnan(value) or not limits.low <= value <= limits.high:
+            raise InputError(
+                f"effect {name}: {key}",
+                f"{value:g} is outside {limits.low:g} .. {limits.high:g} {limits.unit}",
+            )
+    return effect.apply(machine, location, parameters)

@@ -1,1 +1,1 @@
-"""Finds where a model and measured logs disagree, names the missing effect and patches the model."""
+"""Finds where a model and measured logs disagree, names what is missing and patches the model."""

@@ -1,11 +1,24 @@
 """Logs of one machine, made ready for the filter: one clock, one set of channels, gaps marked."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from hydrotele.errors import InputError
+from hydrotele.gap import data_channels
+from hydrotele.gap.data_files import RunFiles, check_commands, read_runs
+from hydrotele.gap.data_log import measured_only, piece_log
+from hydrotele.gap.data_mend import mend
+from hydrotele.gap.data_range import check_range
+from hydrotele.gap.data_rows import Rows, run_rows
+from hydrotele.gap.data_split import SHORTEST, seconds, split
+from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.log import Log
 from hydrotele.machine import Machine
+
+_MOST_MISSING = 0.3  # of the rows of a run; beyond it the commands are not known well enough
 
 
 @dataclass(frozen=True)
@@ -44,6 +57,7 @@ class Dataset:
         fit: the runs to learn from.
         heldout: the run to judge on.
         notes: what was left out or mended, one sentence each.
+        sensors: name of the machine's sensors, or None if their noise is unknown.
     """
 
     machine: Machine
@@ -53,3 +67,115 @@ class Dataset:
     fit: tuple[RunData, ...]
     heldout: RunData
     notes: tuple[str, ...]
+    sensors: str | None = None
+
+
+def load_dataset(
+    paths: str | Path | Sequence[str | Path],
+    machine: Machine,
+    sensors: str | None = None,
+    heldout: str | None = None,
+    aliases: Mapping[str, str] | None = None,
+    *,
+    force: bool = False,
+) -> Dataset:
+    """Read logs and put them in order; whatever is left out or mended leaves a note.
+
+    The noise is that of the machine's sensors. A sensor without a stated accuracy has noise NaN,
+    even if its converter's step is known: a fine converter says nothing of the noise before it.
+
+    Args:
+        paths: folder with logs, run folder, file, or several of them; see `data_files`.
+        machine: the model.
+        sensors: name of the machine's sensors, or `ideal` if unknown; else what the logs'
+            metadata say, else the machine's first.
+        heldout: name of the run to judge on; see `data_split`.
+        aliases: the files' own column name -> channel, besides the machine's `log_columns`.
+        force: accept logs whose metadata names another machine or tool.
+
+    Raises:
+        InputError: a file is unusable, is of another machine, lacks a command, reads what the
+            machine cannot do, or there is too little; says what to do.
+    """
+    several = [paths] if isinstance(paths, str | Path) else list(paths)
+    names = {**machine.log_columns, **(aliases or {})}
+    return make_dataset(read_runs(several, machine, names, force), machine, sensors, heldout)
+
+
+def make_dataset(
+    files: Sequence[RunFiles],
+    machine: Machine,
+    sensors: str | None = None,
+    heldout: str | None = None,
+) -> Dataset:
+    """As `load_dataset`, of logs in memory; their readings may be NaN where missing.
+
+    Args:
+        files: the runs, sorted by name.
+        machine: the model.
+        sensors: as of `load_dataset`.
+        heldout: as of `load_dataset`.
+
+    Raises:
+        InputError: as `load_dataset`.
+    """
+    files = [measured_only(run) for run in files]
+    axes, channels = tuple(actuator_order(machine)), data_channels.channels(files, machine)
+    for run in files:
+        check_commands(run, machine)
+    known, notes = data_channels.sensors(files, machine, sensors)
+    noise = np.array([data_channels.noise(machine, known, channel) for channel in channels])
+    runs, origin, said = _runs(files, machine, axes, channels)
+    mended, more = mend(machine, known, axes, channels, noise, runs)
+    notes += data_channels.strangers(files, machine) + said + list(more)
+    notes += data_channels.still(mended, channels, noise)
+    kept = np.array([any(np.isfinite(rows.reading[:, column]).any() for rows in mended.values())
+                     for column in range(len(channels))])  # fmt: skip
+    notes += [f"{c} has no good reading in any run; it was dropped."
+              for c, keep in zip(channels, kept, strict=True) if not keep]  # fmt: skip
+    channels = tuple(c for c, keep in zip(channels, kept, strict=True) if keep)
+    notes += data_channels.blind_axes(machine, axes, channels)
+    whole = {n: rows._replace(reading=rows.reading[:, kept]) for n, rows in mended.items()}
+    parts, left = split(whole, origin, heldout)
+    logs = {run.name: run.logs for run in files}
+    made = {
+        part.name: RunData(
+            part.name, *part.rows,
+            piece_log(logs[origin[part.piece]], part.name, part.rows, axes, channels),
+        )
+        for part in (*parts.fit, parts.heldout)
+    }  # fmt: skip
+    judge = made.pop(parts.heldout.name)
+    notes += left
+    return Dataset(machine, axes, channels, noise[kept], tuple(made.values()), judge, tuple(notes),
+                   next((n for n, s in machine.sensors.items() if s is known), None))  # fmt: skip
+
+
+def _runs(
+    files: Sequence[RunFiles], machine: Machine, axes: Sequence[str], channels: Sequence[str]
+) -> tuple[dict[str, Rows], dict[str, str], list[str]]:
+    """Runs and pieces of runs by name, the run each comes from, and notes."""
+    runs, origin, notes = {}, {}, []
+    for run in files:
+        pieces, said = run_rows(run, axes, channels)
+        notes += said
+        where = ", ".join(log.source for log in run.logs)
+        for number, rows in enumerate(pieces, start=1):
+            name = run.name if len(pieces) == 1 else f"{run.name}_part{number}"
+            if seconds(rows) < SHORTEST - 1e-9:
+                message = f"{seconds(rows):.3g} s long; {SHORTEST:.0f} s are needed"
+                if len(pieces) == 1:
+                    raise InputError(where, f"is {message}: log longer, or leave it out")
+                notes.append(f"{name} is only {message}; it was left out.")
+            elif np.mean(~rows.known) > _MOST_MISSING:
+                raise InputError(
+                    where, f"lacks {100 * np.mean(~rows.known):.0f} % of its rows, and with them"
+                    f" the commands; {100 * _MOST_MISSING:.0f} % can be bridged: log every row",
+                )  # fmt: skip
+            else:
+                for channel, reading in zip(channels, rows.reading.T, strict=True):
+                    check_range(machine, channel, reading, where)
+                runs[name], origin[name] = rows, run.name
+    if not runs:
+        raise InputError("the data", f"no run has {SHORTEST:.0f} s without a pause: log longer")
+    return runs, origin, notes

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.compiled import compiled
-from hydrotele.dynamics.integrate import advance, place, read_channels
 from hydrotele.dynamics.integrate import _write_trail as write_trail
+from hydrotele.dynamics.integrate import advance, load_position, place, read_channels
 
 
 class Gains(NamedTuple):
@@ -44,7 +44,7 @@ def _differentiate(model, sp, z, command, row, period, steps, nudge, trail, afte
 
 @compiled
 def _slopes(model, sp, z, reading, nudge, steps, h, trail, slope, moved, shown):
-    """d reading / d state in a state."""
+    """D reading / d state in a state."""
     first = 2 * (len(model.mech.free) + len(model.transmission))
     slope[:] = 0.0
     n = len(model.mech.free)
@@ -80,7 +80,7 @@ def _slopes(model, sp, z, reading, nudge, steps, h, trail, slope, moved, shown):
 @compiled
 def filter_run(
     model, sp, z, spread, command, known, reading, noise, drift, startle, period, steps, coarse,
-    nudge, slope, gain, width, fresh, whitened, predicted, corrected,
+    nudge, own, slope, gain, width, fresh, whitened, predicted, corrected,
 ):  # fmt: skip
     """Cross a run.
 
@@ -99,7 +99,9 @@ def filter_run(
         steps: steps per row of the mean.
         coarse: steps per row of the covariance.
         nudge: (nz,) differences for derivatives.
-        slope: (n, c, nz), gain: (n, c, nz), width: (n, c): see `Gains`; written if `fresh`, else
+        own: (ng,) states that the gains know; those of a transmission that they lack follow the
+            load. All states where `fresh`.
+        slope: (n, c, ng), gain: (n, c, ng), width: (n, c): see `Gains`; written if `fresh`, else
             used.
         gain: see slope.
         width: see slope.
@@ -118,7 +120,8 @@ def filter_run(
     trail = np.zeros((rows * steps + 1, channels))
     columns, after = np.zeros((size, size)), np.zeros(size)
     moved, shown, work = np.zeros(size), np.zeros(channels), np.zeros((size, size))
-    delta, pull = np.zeros(size), np.zeros(size)
+    few = len(own)
+    delta, pull = np.zeros(few), np.zeros(size)
     place(model, sp, z)
     write_trail(model, sp, z, trail[0])
     loss = 0.0
@@ -133,7 +136,7 @@ def filter_run(
                 continue
             hc = slope[row, c]
             error = reading[row, c] - predicted[row, c]
-            for s in range(size):
+            for s in range(few):
                 error -= hc[s] * delta[s]
             if fresh:
                 total = noise[c]
@@ -142,7 +145,6 @@ def filter_run(
                     for k in range(size):
                         if hc[k] != 0.0:
                             pull[s] += spread[s, k] * hc[k]
-                    total += 0.0
                 for s in range(size):
                     total += hc[s] * pull[s]
                 width[row, c] = math.sqrt(total)
@@ -151,27 +153,46 @@ def filter_run(
                 for s in range(size):
                     for k in range(size):
                         spread[s, k] -= pull[s] * pull[k] / total
-            for s in range(size):
+            for s in range(few):
                 delta[s] += gain[row, c, s] * error
             whitened[row, c] = error / width[row, c]
             loss += whitened[row, c] ** 2 + 2.0 * math.log(width[row, c])
-        for s in range(size):
-            z[s] += delta[s]
+        _correct(model, sp, z, own, delta)
         corrected[row] = z
         if not math.isfinite(loss):
             return math.inf
         if row == rows - 1:
             break
         if fresh:
-            _differentiate(
-                model, sp, z, command, row, period, coarse, nudge, trail, after, columns
-            )
+            _differentiate(model, sp, z, command, row, period, coarse, nudge, trail, after, columns)
             _carry(columns, spread, work, drift)
             if not known[row]:
                 for s in range(size):
                     spread[s, s] += startle[s]
         advance(model, sp, z, command, row, period, steps, trail, True)
     return loss
+
+
+@compiled
+def _correct(model, sp, z, own, delta):
+    """Add a correction to a state; drives that it does not know follow their loads."""
+    n, t = len(model.mech.free), len(model.transmission)
+    if len(own) == len(z):
+        for s in range(len(z)):
+            z[s] += delta[s]
+        return
+    for sign in (-1.0, 1.0):
+        place(model, sp, z)
+        for i in range(len(model.gear)):
+            gear = model.gear[i]
+            if gear < 0:
+                continue
+            z[n + gear] += sign * load_position(model, sp, i)
+            for f in range(n):
+                z[n + t + n + gear] += sign * sp.row[i, f] * z[n + t + f]
+        if sign < 0.0:
+            for s in range(len(own)):
+                z[own[s]] += delta[s]
 
 
 @compiled

@@ -2,8 +2,10 @@
 
 import numpy as np
 
-from hydrotele.dynamics.model import HEAD, LENGTH, POSITION, ROD, Model
+from hydrotele.dynamics.integrate import load_position, place
+from hydrotele.dynamics.model import Model, model_space
 from hydrotele.gap.dataset import Dataset, RunData
+from hydrotele.hydraulics.circuit import SLOTS, Slot
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
 
@@ -50,7 +52,22 @@ def start_state(
             state[s] = shown.get(f"{kind}.{axis}", 3e6)
             if f"{kind}.{axis}" not in shown:
                 wide[s] = _BLIND[kind]
+    _stretch_transmissions(model, state, names)
     return state, np.diag(wide**2)
 
 
-__all__ = ["HEAD", "LENGTH", "POSITION", "ROD", "start_state"]
+def _stretch_transmissions(model: Model, state: np.ndarray, names: list[str]) -> None:
+    """Put every drive where its spring carries what the pressures push."""
+    space = model_space(model)
+    place(model, space, state)
+    n = len(model.mech.free)
+    first = len(names) - 4 * model.hydraulic
+    for i, gear in enumerate(model.gear):
+        if gear < 0 or i >= model.hydraulic:
+            continue
+        numbers = model.user[i * SLOTS : (i + 1) * SLOTS]
+        p_head, p_rod = state[first + 4 * i + 2 : first + 4 * i + 4]
+        push = numbers[Slot.AREA_HEAD] * p_head - numbers[Slot.AREA_ROD] * p_rod
+        _, stiffness, _, backlash = model.transmission[gear]
+        twist = push / stiffness + np.sign(push) * 0.5 * backlash
+        state[n + gear] = load_position(model, space, i) + twist

@@ -4,13 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.dynamics.model import Model, Space, model_space, reduced_model, state_names
+from hydrotele.dynamics.model import model_space, reduced_model, state_names
 from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.gap.filter import Gains, filter_run
 from hydrotele.gap.start import start_state
 from hydrotele.machine import Machine
 
-STEP = 2.0e-3  # s: the integrator is of second order; 1 ms changes no innovation by 2 % of its noise
+STEP = (
+    2.0e-3  # s: the integrator is of second order; 1 ms changes no innovation by 2 % of its noise
+)
 COARSE = 4.0e-3  # s, for the covariance
 
 
@@ -25,6 +27,7 @@ class Track:
         predicted: (n, c) one-step predictions [channel's unit].
         states: (n, nz) states after each row's readings.
         gains: gains and whiteners used.
+        names: the states that the gains know.
         start: (nz,) state before the first reading.
     """
 
@@ -34,6 +37,7 @@ class Track:
     predicted: np.ndarray
     states: np.ndarray
     gains: Gains
+    names: tuple[str, ...]
     start: np.ndarray
 
 
@@ -46,7 +50,13 @@ _DRIFT = {
     "position": 2e-6, "drive": 2e-6, "rate": 2e-4, "drive_rate": 2e-4, "spool": 1e-4,
     "spool_rate": 1e-2, "pressure_head": 5e3, "pressure_rod": 5e3,
 }  # fmt: skip
-_STARTLE = {"spool": 0.2, "spool_rate": 5.0, "pressure_head": 2e6, "pressure_rod": 2e6, "rate": 0.02}
+_STARTLE = {
+    "spool": 0.2,
+    "spool_rate": 5.0,
+    "pressure_head": 2e6,
+    "pressure_rod": 2e6,
+    "rate": 0.02,
+}
 
 
 def by_kind(names: list[str], table: dict[str, float]) -> np.ndarray:
@@ -56,7 +66,7 @@ def by_kind(names: list[str], table: dict[str, float]) -> np.ndarray:
 
 def track_run(
     machine: Machine, data: Dataset, run: RunData, kept: Track | None = None,
-    model: Model | None = None, space: Space | None = None,
+    step: float = STEP,
 ) -> Track:  # fmt: skip
     """Cross a run with a machine.
 
@@ -65,29 +75,28 @@ def track_run(
         data: the dataset that the run belongs to.
         run: the run.
         kept: a track whose gains, whiteners and start are kept; None computes them anew.
-        model: the machine's reduced model, if already made.
-        space: its work space.
+        step: largest step of the integrator [s].
 
     Returns:
         The track.
     """
-    model = model or reduced_model(machine, data.channels)
-    space = space or model_space(model)
+    model = reduced_model(machine, data.channels)
+    space = model_space(model)
     names = state_names(machine)
     rows, c, size = len(run.command), len(data.channels), len(names)
     start, spread = start_state(machine, data, run, model, names)
     if kept is None:
-        gains = Gains(
-            np.zeros((rows, c, size)), np.zeros((rows, c, size)), np.zeros((rows, c))
-        )
+        gains = Gains(np.zeros((rows, c, size)), np.zeros((rows, c, size)), np.zeros((rows, c)))
     else:
         gains = kept.gains
+    known = kept.names if kept else tuple(names)
     whitened, predicted = np.empty((rows, c)), np.empty((rows, c))
     states = np.empty((rows, size))
     loss = filter_run(
         model, space, start.copy(), spread, run.command, run.command_known, run.reading,
         data.noise**2, by_kind(names, _DRIFT) ** 2, by_kind(names, _STARTLE) ** 2, run.period,
-        max(1, round(run.period / STEP)), max(1, round(run.period / COARSE)),
-        by_kind(names, _NUDGE), *gains, kept is None, whitened, predicted, states,
+        max(1, round(run.period / step)), max(1, round(run.period / COARSE)),
+        by_kind(names, _NUDGE), np.array([names.index(name) for name in known]), *gains,
+        kept is None, whitened, predicted, states,
     )  # fmt: skip
-    return Track(run, loss, whitened, predicted, states, gains, start)
+    return Track(run, loss, whitened, predicted, states, gains, known, start)

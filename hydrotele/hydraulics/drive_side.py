@@ -40,8 +40,8 @@ def settled_friction(user, u, velocity, push, inertia, dt):
         if high - low <= _ROUNDING * abs(free):
             break
         slope = 1.0 + per_force * actuator_friction_slope(user, u, v)
-        guess = v - excess / slope if slope > 0.0 else low
-        if abs(guess - v) <= _ROUNDING * abs(free):
+        guess = v - excess / slope if slope > 0.0 else high
+        if slope > 0.0 and abs(guess - v) <= _ROUNDING * abs(free):
             break
         v = guess if low < guess < high else 0.5 * (low + high)
     return actuator_friction(user, u, v)

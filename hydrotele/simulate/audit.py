@@ -10,6 +10,7 @@ from mujoco import rollout
 
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import port_flow
+from hydrotele.simulate.drive_side import drive_and_load_dofs
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import drive_motion, state_flows
 
@@ -92,7 +93,8 @@ def _volume_errors(plant, i, table, act, x, v, dt):
         net = inflow + port - swept
         entered = np.sum(0.5 * dt * (net[1:] + net[:-1]))
         middle = 0.5 * (volume[1:] + volume[:-1])
-        compressed = np.sum(middle * np.diff(pressure)) / supply.bulk_modulus
+        soft = middle / supply.bulk_modulus + drive.hose_compliance
+        compressed = np.sum(soft * np.diff(pressure))
         through = np.sum(np.abs(inflow) + np.abs(port) + np.abs(swept)) * dt
         yield abs(entered - compressed) / max(through, 1e-12)
 
@@ -115,5 +117,8 @@ def _energy_balance(plant, qpos, qvel, work, dt):
             mujoco.mj_energyVel(model, data)
             energy[min(row, 1)] = data.energy.sum()
     lost = np.sum(model.dof_damping * np.sum(qvel[1:] ** 2, axis=0)) * dt
+    drives, loads = drive_and_load_dofs(plant.machine, model)
+    slip = qvel[1:, drives] - qvel[1:, loads]
+    lost += np.sum(model.tendon_damping * np.sum(slip**2, axis=0)) * dt
     done = np.sum(np.abs(np.diff(work)))
     return float(abs(work[-1] - lost - (energy[1] - energy[0])) / done) if done > 1.0 else None

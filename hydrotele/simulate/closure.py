@@ -10,6 +10,7 @@ import numpy as np
 
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
+from hydrotele.simulate.drive_side import drive_and_load_dofs, lock_drives
 
 _STEP = 0.2  # largest move of an independent joint between two Newton solutions [rad] or [m]
 _CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
@@ -85,7 +86,7 @@ def close_loops(
     Args:
         machine: the machine.
         model: its model.
-        data: written: `qpos`.
+        data: written: `qpos`; drive sides of transmissions stand where their loads do.
         target: joint name -> angle [rad] or position [m]; others stay at home.
 
     Raises:
@@ -107,6 +108,7 @@ def close_loops(
         if not _newton(model, data, following):
             where = ", ".join(f"{n} {v:.3f}" for n, v in zip(names, data.qpos[places], strict=True))
             raise InputError(f"machine {machine.name}", f"its linkages do not close at {where}")
+    lock_drives(machine, model, data)
 
 
 def follow_loops(
@@ -150,6 +152,7 @@ def follow_loops(
                 close_loops(machine, model, data, dict(zip(joints, target, strict=True)))
             except InputError as error:
                 raise InputError(f"{error.where}, row {row}", error.message) from None
+        lock_drives(machine, model, data)
         poses[row] = data.qpos
     return poses
 
@@ -185,9 +188,13 @@ def _newton(model, data, following, closed: float = _CLOSED) -> bool:
 
 
 def independent_dofs(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
-    """Places in `qvel` of the joints that the closures leave free, ascending."""
+    """Places in `qvel` of the joints that the closures leave free, ascending.
+
+    Drive sides of transmissions are not among them: they count as locked to their loads.
+    """
     dependent = [model.joint(n).dofadr[0] for n in following_joints(machine)]
-    return np.setdiff1d(np.arange(model.nv), dependent)
+    drives, _ = drive_and_load_dofs(machine, model)
+    return np.setdiff1d(np.arange(model.nv), [*dependent, *drives])
 
 
 def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
@@ -199,10 +206,11 @@ def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -
         data: a configuration with closed loops.
 
     Returns:
-        N, (nv, n), with `qvel = N @ qvel[independent_dofs]`.
+        N, (nv, n), with `qvel = N @ qvel[independent_dofs]`; drive sides move with their loads.
     """
     independent = independent_dofs(machine, model)
-    dependent = np.setdiff1d(np.arange(model.nv), independent)
+    drives, loads = drive_and_load_dofs(machine, model)
+    dependent = np.setdiff1d(np.arange(model.nv), [*independent, *drives])
     basis = np.zeros((model.nv, len(independent)))
     basis[independent, np.arange(len(independent))] = 1.0
     if len(dependent):
@@ -210,6 +218,7 @@ def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -
         basis[dependent] = -np.linalg.lstsq(
             jacobian[:, dependent], jacobian[:, independent], rcond=1e-10
         )[0]
+    basis[drives] = basis[loads]
     return basis
 
 

@@ -9,24 +9,30 @@ from hydrotele.compiled import compiled
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import circuit_scratch
 from hydrotele.noise import channel_sensor, converter
-from hydrotele.sensors import SensorSet
+from hydrotele.sensors import SensorError, SensorSet
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import state_supply
-from hydrotele.simulate.record import aligned_positions
+from hydrotele.simulate.record import Past, aligned_positions
 from hydrotele.simulate.sensors import convert, sensor_errors
 
 
 @compiled
-def read_sensors(qpos, places, act, user, count, errors, steps, low, high, joint, head, rod, work):
+def read_sensors(
+    qpos, places, act, supply_act, user, count, scales, offsets, errors, steps, low, high, joint,
+    head, rod, work,
+):  # fmt: skip
     """Readings of the fed-back sensors in a state.
 
     Args:
         qpos: (nq,) positions [rad] or [m].
         places: (k,) place of each axis' joint in `qpos`.
         act: (na,) activations; pressures [Pa].
+        supply_act: (na,) activations that the supply's sensor sees.
         user: (k * SLOTS,) actuator numbers.
         count: number of hydraulic axes.
-        errors: (c,) sensor errors: joints, then head and rod of every axis, then supply.
+        scales: (c,) scales of the sensors [1], in the order of `errors`.
+        offsets: (c,) offsets of the sensors.
+        errors: (c,) random errors: joints, then head and rod of every axis, then supply.
         steps: (c,) converter steps.
         low: (c,) lowest readings.
         high: (c,) highest readings.
@@ -42,16 +48,20 @@ def read_sensors(qpos, places, act, user, count, errors, steps, low, high, joint
     """
     k = len(places)
     for i in range(k):
-        joint[i] = convert(qpos[places[i]] + errors[i], steps[i], low[i], high[i])
+        value = scales[i] * qpos[places[i]] + offsets[i]
+        joint[i] = convert(value + errors[i], steps[i], low[i], high[i])
     for i in range(count):
         c = k + 2 * i
-        head[i] = convert(act[4 * i + 2] + errors[c], steps[c], low[c], high[c])
+        value = scales[c] * act[4 * i + 2] + offsets[c]
+        head[i] = convert(value + errors[c], steps[c], low[c], high[c])
         c += 1
-        rod[i] = convert(act[4 * i + 3] + errors[c], steps[c], low[c], high[c])
+        value = scales[c] * act[4 * i + 3] + offsets[c]
+        rod[i] = convert(value + errors[c], steps[c], low[c], high[c])
     if count == 0:
         return 0.0
     c = k + 2 * count
-    return convert(state_supply(user, count, act, work) + errors[c], steps[c], low[c], high[c])
+    value = scales[c] * state_supply(user, count, supply_act, work) + offsets[c]
+    return convert(value + errors[c], steps[c], low[c], high[c])
 
 
 @dataclasses.dataclass
@@ -85,22 +95,50 @@ class Feedback:
     def __post_init__(self) -> None:
         """Lay out what every update needs."""
         self._table = np.column_stack(list(self.errors.values()))
+        defects = [self.plant.machine.sensor_errors.get(n, SensorError()) for n in self.errors]
+        self._scales = np.array([d.scale for d in defects])
+        self._offsets = np.array([d.offset for d in defects])
+        self._late = [(place, d.delay) for place, d in enumerate(defects) if d.delay]
         self._user = self.plant.model.actuator_user.ravel()
         self._work = circuit_scratch()
 
-    def update(self, tick: int, data: mujoco.MjData) -> None:
-        """Take a new sample if one is due at this control tick; otherwise hold the last one."""
+    def update(self, tick: int, data: mujoco.MjData, past: Past | None = None) -> None:
+        """Take a new sample if one is due at this control tick; otherwise hold the last one.
+
+        Args:
+            tick: the control tick.
+            data: the staggered state.
+            past: the states before; needed only where sensors read late.
+        """
         if tick % self.every:
             return
         before = self.joint.copy()
         plant, (steps, low, high) = self.plant, self.converters
+        qpos, act, supply_act = aligned_positions(plant.model, data), data.act, data.act
+        if past and self._late:
+            qpos, act, supply_act = self._seen_late(qpos, act, past)
         self.supply = read_sensors(
-            aligned_positions(plant.model, data), plant.qpos, data.act, self._user, plant.hydraulic,
-            self._table[tick // self.every], steps, low, high, self.joint, self.head, self.rod,
-            self._work,
+            qpos, plant.qpos, act, supply_act, self._user, plant.hydraulic, self._scales,
+            self._offsets, self._table[tick // self.every], steps, low, high, self.joint, self.head,
+            self.rod, self._work,
         )  # fmt: skip
         if tick:
             self.rate[:] = (self.joint - before) / self.period
+
+    def _seen_late(self, qpos, act, past: Past):
+        """States in which what every sensor reads stands as it was its delay ago."""
+        qpos, act, supply_act = qpos.copy(), act.copy(), act
+        axes = len(self.plant.axes)
+        for place, lag in self._late:
+            old_qpos, old_act = past.at(lag)
+            if place < axes:
+                qpos[self.plant.qpos[place]] = old_qpos[self.plant.qpos[place]]
+            elif place < axes + 2 * self.plant.hydraulic:
+                i, side = divmod(place - axes, 2)
+                act[4 * i + 2 + side] = old_act[4 * i + 2 + side]
+            else:
+                supply_act = old_act
+        return qpos, act, supply_act
 
 
 def feedback(

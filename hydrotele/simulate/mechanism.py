@@ -16,6 +16,7 @@ from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS
 from hydrotele.hydraulics.parameters import actuator_numbers
 from hydrotele.machine import Link, Machine
+from hydrotele.simulate.drive_side import drive_joint, flexible_axes, write_drive_side
 from hydrotele.simulate.looks import name_geoms, without_looks
 
 with warnings.catch_warnings():  # glfw warns when there is no screen, which nobody needs here
@@ -58,6 +59,8 @@ def assemble(
     for name, axis in machine.axes.items():
         if axis.cylinder:
             _write_cylinder(root, name, axis.cylinder, timestep)
+    for name in flexible_axes(machine):
+        write_drive_side(root, machine, name)
     for name, closure in machine.closures.items():
         _connect(root, name, closure.a, closure.b, timestep)
     if machine.arm:
@@ -196,7 +199,7 @@ def _write_actuators(root, machine: Machine) -> None:
         axis: Axis = machine.axes[name]
         actuator = root.actuator.add(
             "general", name=name, user=numbers, biastype="user",
-            joint=f"{name}_rod" if axis.cylinder else axis.joint,
+            joint=drive_joint(machine, name),
         )  # fmt: skip
         if axis.hydraulic:
             actuator.dyntype, actuator.actdim = "user", ACTIVATIONS

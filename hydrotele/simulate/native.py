@@ -20,7 +20,7 @@ from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.compiled import callback
+from hydrotele.compiled import callback, compiled
 from hydrotele.hydraulics.circuit import (
     SCRATCH,
     SLOTS,
@@ -28,12 +28,14 @@ from hydrotele.hydraulics.circuit import (
     actuator_friction,
     step_circuit,
 )
+from hydrotele.hydraulics.drive_side import settled_friction
 from hydrotele.hydraulics.parameters import MARKER
 from hydrotele.simulate.layout import field_offsets, option_offset, verify_layout
 
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
 _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
-_OFFSET = int(Slot.OFFSET)
+_OFFSET, _INERTIA = int(Slot.OFFSET), int(Slot.DRIVE_INERTIA)
+_GAINS = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
 
 
@@ -65,9 +67,37 @@ def _compile_callbacks():
     model_at, data_at = field_offsets("mjModel"), field_offsets("mjData")
     m_user, m_actadr = model_at["actuator_user"], model_at["actuator_actadr"]
     m_nuser, m_timestep = model_at["nuser_actuator"], option_offset("timestep")
-    m_nu = model_at["nu"]
+    m_nu, m_dofadr, m_nv = model_at["nu"], model_at["jnt_dofadr"], model_at["nv"]
+    m_trnid, m_njnt, m_gainprm = (
+        model_at["actuator_trnid"],
+        model_at["njnt"],
+        model_at["actuator_gainprm"],
+    )
+    d_passive = data_at["qfrc_passive"]
     d_ctrl, d_act, d_act_dot = data_at["ctrl"], data_at["act"], data_at["act_dot"]
     d_length, d_velocity = data_at["actuator_length"], data_at["actuator_velocity"]
+
+    @compiled
+    def passive_force(m, d, i):
+        """Spring and damper force on the joint of actuator i."""
+        nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
+        nv = carray(_pointer(m + m_nv), (1,), np.int64)[0]
+        joints = carray(_pointer(m + m_njnt), (1,), np.int64)[0]
+        at_trnid = carray(_pointer(m + m_trnid), (1,), np.int64)[0]
+        joint = carray(_pointer(at_trnid), (2 * nu,), np.int32)[2 * i]
+        at_dofadr = carray(_pointer(m + m_dofadr), (1,), np.int64)[0]
+        dof = carray(_pointer(at_dofadr), (joints,), np.int32)[joint]
+        at_passive = carray(_pointer(d + d_passive), (1,), np.int64)[0]
+        return carray(_pointer(at_passive), (nv,), np.float64)[dof]
+
+    @compiled
+    def gained_command(m, d, i):
+        """Drive force of a plain force drive: its gain times its command."""
+        nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
+        at_gain = carray(_pointer(m + m_gainprm), (1,), np.int64)[0]
+        at_ctrl = carray(_pointer(d + d_ctrl), (1,), np.int64)[0]
+        gain = carray(_pointer(at_gain), (nu * _GAINS,), np.float64)[i * _GAINS]
+        return gain * carray(_pointer(at_ctrl), (nu,), np.float64)[i]
 
     @callback(_SIGNATURE)
     def advance(m, d, i):
@@ -113,21 +143,26 @@ def _compile_callbacks():
         if user[u] != MARKER:
             return 0.0
         at_velocity = carray(_pointer(d + d_velocity), (1,), np.int64)[0]
-        resisting = actuator_friction(user, u, carray(_pointer(at_velocity), (nu,), np.float64)[i])
-        if user[u + _KIND] > 2.0:  # Kind.FORCE: MuJoCo's own gain gives the drive force
-            return -resisting - user[u + _OFFSET]
-        at_actadr = carray(_pointer(m + m_actadr), (1,), np.int64)[0]
-        start = 8 * carray(_pointer(at_actadr), (nu,), np.int32)[i]
-        at_act = carray(_pointer(d + d_act), (1,), np.int64)[0]
-        at_act_dot = carray(_pointer(d + d_act_dot), (1,), np.int64)[0]
-        act = carray(_pointer(at_act + start), (4,), np.float64)
-        rate = carray(_pointer(at_act_dot + start), (4,), np.float64)
+        velocity = carray(_pointer(at_velocity), (nu,), np.float64)[i]
         dt = carray(_pointer(m + m_timestep), (1,), np.float64)[0]
-        return (
-            user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
-            - user[u + _AREA_ROD] * (act[3] + dt * rate[3])
-            - resisting
-        )
+        drive = 0.0
+        if user[u + _KIND] > 2.0:  # Kind.FORCE: MuJoCo's own gain gives the drive force
+            drive = -user[u + _OFFSET]
+        else:
+            at_actadr = carray(_pointer(m + m_actadr), (1,), np.int64)[0]
+            start = 8 * carray(_pointer(at_actadr), (nu,), np.int32)[i]
+            at_act = carray(_pointer(d + d_act), (1,), np.int64)[0]
+            at_act_dot = carray(_pointer(d + d_act_dot), (1,), np.int64)[0]
+            act = carray(_pointer(at_act + start), (4,), np.float64)
+            rate = carray(_pointer(at_act_dot + start), (4,), np.float64)
+            drive = user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
+            drive -= user[u + _AREA_ROD] * (act[3] + dt * rate[3])
+        if user[u + _INERTIA] == 0.0:
+            return drive - actuator_friction(user, u, velocity)
+        push = drive + passive_force(m, d, i)
+        if user[u + _KIND] > 2.0:
+            push += gained_command(m, d, i)
+        return drive - settled_friction(user, u, velocity, push, user[u + _INERTIA], dt)
 
     return advance, force
 

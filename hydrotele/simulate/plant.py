@@ -17,6 +17,7 @@ from hydrotele.simulate.closure import (
     independent_dofs,
     motion_basis,
 )
+from hydrotele.simulate.drive_side import drive_joint, flexible_axes, wind_up
 from hydrotele.simulate.mechanism import add_element, assemble, mjcf_text
 from hydrotele.simulate.native import install_hydraulics
 
@@ -34,6 +35,9 @@ class Plant:
         axes: axis names in actuator order.
         qpos: (nu,) place of each axis' joint in `qpos`.
         dof: (nu,) place of each axis' joint in `qvel`.
+        drive_qpos: (nu,) place of each drive's own coordinate in `qpos`: the piston displacement,
+            the rotor's angle, else that of the joint.
+        drive_dof: (nu,) the same in `qvel`.
         rod_qpos: (nu,) place of the piston displacement in `qpos`, -1 without cylinder.
         hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i+3.
     """
@@ -44,6 +48,8 @@ class Plant:
     axes: tuple[str, ...]
     qpos: np.ndarray
     dof: np.ndarray
+    drive_qpos: np.ndarray
+    drive_dof: np.ndarray
     rod_qpos: np.ndarray
     hydraulic: int
 
@@ -58,6 +64,10 @@ class Plant:
             "Without hydrotele's native hydraulics the actuators of this file give no force: call"
             " hydrotele.simulate.native.install_hydraulics() before stepping it."
         )
+        if any(axis.command_delay for axis in self.machine.axes.values()):
+            note += (
+                " Commands act in it without the delays that hydrotele run and replay give them."
+            )
         return mjcf_text(root).replace(">", f">\n  <!-- {note} -->", 1)
 
 
@@ -84,7 +94,9 @@ def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True)
         raise InputError(f"machine {machine.name}", f"does not compile: {error}") from None
     axes = tuple(actuator_order(machine))
     joints = [model.joint(machine.axes[name].joint) for name in axes]
-    rods = [model.joint(f"{n}_rod").qposadr[0] if machine.axes[n].cylinder else -1 for n in axes]
+    drives = [model.joint(drive_joint(machine, name)) for name in axes]
+    places = np.array([joint.qposadr[0] for joint in drives], dtype=int)
+    piston = np.array([machine.axes[name].cylinder is not None for name in axes])
     return Plant(
         machine=machine,
         model=model,
@@ -92,7 +104,9 @@ def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True)
         axes=axes,
         qpos=np.array([j.qposadr[0] for j in joints], dtype=int),
         dof=np.array([j.dofadr[0] for j in joints], dtype=int),
-        rod_qpos=np.array(rods, dtype=int),
+        drive_qpos=places,
+        drive_dof=np.array([joint.dofadr[0] for joint in drives], dtype=int),
+        rod_qpos=np.where(piston, places, -1),
         hydraulic=len(machine.hydraulic_axes),
     )
 
@@ -106,7 +120,7 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
 
     Returns:
         A new MjData. The unloaded chamber of each axis is at REST_PRESSURE, the other one carries
-        the static load.
+        the static load, and transmissions are wound up by it.
 
     Raises:
         InputError: the linkages do not close there.
@@ -114,6 +128,7 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
     data = mujoco.MjData(plant.model)
     close_loops(plant.machine, plant.model, data, dict(joints or {}))
     forces = holding_forces(plant.machine, plant.model, data)
+    wind_up(plant.machine, plant.model, data, dict(zip(plant.axes, forces, strict=True)))
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
         head, rod = plant.machine.axes[name].hydraulic_drive.areas
         p_head, p_rod = (forces[i] + rod * REST_PRESSURE) / head, REST_PRESSURE
@@ -134,7 +149,8 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
         plant: the plant.
         state: `order` (axis names) and, in that order, `angle` [rad] or [m], `velocity`, `spool`,
             `spool_rate`, `pressure_head`, `pressure_rod`; any but `order` and `angle` may lack and
-            is then that of rest. `joints` (name -> value) may give undriven joints.
+            is then that of rest. `joints` (name -> value) may give undriven joints, `drive` and
+            `drive_velocity` (axis -> value) the drive sides of transmissions.
 
     Returns:
         A new MjData.
@@ -149,6 +165,11 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
         data.qvel[[plant.dof[plant.axes.index(n)] for n in order]] = state["velocity"]
         basis = motion_basis(plant.machine, plant.model, data)
         data.qvel[:] = basis @ data.qvel[independent_dofs(plant.machine, plant.model)]
+    for name in flexible_axes(plant.machine):
+        i = plant.axes.index(name)
+        place, dof = plant.drive_qpos[i], plant.drive_dof[i]
+        data.qpos[place] = state.get("drive", {}).get(name, data.qpos[place])
+        data.qvel[dof] = state.get("drive_velocity", {}).get(name, data.qvel[dof])
     for column, key in enumerate(("spool", "spool_rate", "pressure_head", "pressure_rod")):
         for name, value in zip(order, state.get(key, ()), strict=False):
             i = plant.axes.index(name)

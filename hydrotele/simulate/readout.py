@@ -8,6 +8,7 @@ from hydrotele.hydraulics.circuit import (
     SCRATCH,
     Slot,
     axis_state,
+    circuit_scratch,
     open_ports,
     supply_pressure,
 )
@@ -87,19 +88,49 @@ def _measurable(plant: Plant, record: Record):
         axis = machine.axes[name]
         values[f"command.{name}"] = record.command[:, i]
         units[f"command.{name}"] = axis.force.command_unit if axis.force else "1"
+    sensed = _sensed(plant, record.qpos, record.act)
+    sizes = {"angle": "rad", "position": "m", "length": "m"}
+    units |= {name: sizes.get(name.partition(".")[0], "Pa") for name in sensed}
+    return {**values, **sensed}, units
+
+
+def _sensed(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.ndarray]:
+    """Positions, lengths and chamber pressures in states (n, nq), (n, na)."""
+    values = {}
     for i, name in enumerate(plant.axes):
-        kind = machine.position_kind(name)
-        values[f"{kind}.{name}"] = record.qpos[:, plant.qpos[i]]
-        units[f"{kind}.{name}"] = "rad" if kind == "angle" else "m"
+        values[f"{plant.machine.position_kind(name)}.{name}"] = qpos[:, plant.qpos[i]]
     for i, name in enumerate(plant.axes):
-        if machine.axes[name].cylinder:
-            values[f"length.{name}"] = record.qpos[:, plant.rod_qpos[i]]
-            units[f"length.{name}"] = "m"
+        if plant.machine.axes[name].cylinder:
+            values[f"length.{name}"] = qpos[:, plant.rod_qpos[i]]
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
         for column, side in ((2, "head"), (3, "rod")):
-            values[f"pressure_{side}.{name}"] = record.act[:, ACTIVATIONS * i + column]
-            units[f"pressure_{side}.{name}"] = "Pa"
-    return values, units
+            values[f"pressure_{side}.{name}"] = act[:, ACTIVATIONS * i + column]
+    return values
+
+
+def late_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
+    """True values of the channels whose sensors read late, as they stood that long ago.
+
+    Args:
+        plant: the plant that ran.
+        record: its states, with those before.
+
+    Returns:
+        Channel -> (n,) values in SI; only channels with a delay.
+    """
+    values = {}
+    for channel, error in plant.machine.sensor_errors.items():
+        if not error.delay:
+            continue
+        qpos, act = record.late[error.delay]
+        if channel == "pressure_supply":
+            user, scratch = plant.model.actuator_user.ravel(), circuit_scratch()
+            values[channel] = np.array(
+                [state_supply(user, plant.hydraulic, row, scratch) for row in act]
+            )
+        else:
+            values[channel] = _sensed(plant, qpos, act)[channel]
+    return values
 
 
 def _hidden(plant: Plant, record: Record):
@@ -160,13 +191,10 @@ def drive_motion(plant: Plant, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.n
         qvel: (n, nv).
 
     Returns:
-        (x (n, nu), v (n, nu)): piston displacement [m] and velocity, joint coordinate without
-        cylinder.
+        (x (n, nu), v (n, nu)): displacement and velocity of piston or rotor, which are those of the
+        load where nothing gives.
     """
-    model = plant.model
-    columns, dofs = plant.qpos.copy(), plant.dof.copy()
-    for i, name in enumerate(plant.axes):
-        if plant.rod_qpos[i] >= 0:
-            columns[i] = plant.rod_qpos[i]
-            dofs[i] = model.joint(f"{name}_rod").dofadr[0]
-    return np.ascontiguousarray(qpos[:, columns]), np.ascontiguousarray(qvel[:, dofs])
+    return (
+        np.ascontiguousarray(qpos[:, plant.drive_qpos]),
+        np.ascontiguousarray(qvel[:, plant.drive_dof]),
+    )

@@ -8,11 +8,15 @@ but for friction.
 """
 
 import dataclasses
+import math
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 
 from hydrotele.simulate.plant import Plant
+
+_WHOLE = 1.0e-9  # of a step, by which a delay may miss a whole number of steps through rounding
 
 
 class SimulationFailed(RuntimeError):
@@ -32,6 +36,7 @@ class Record:
         command: (n, nu) mean command over the row's interval.
         contact: (n, 3) sum of the ground's forces on the machine, world frame [N].
         tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
+        late: sensor delay [s] -> (qpos (n, nq), act (n, na)) that long before each row.
     """
 
     time: np.ndarray
@@ -42,6 +47,7 @@ class Record:
     command: np.ndarray
     contact: np.ndarray
     tip: np.ndarray
+    late: Mapping[float, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
 
 
 def begin_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -63,6 +69,46 @@ def aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     return data.qpos - model.opt.timestep * data.qvel
 
 
+def split_delay(delay: float, timestep: float) -> tuple[int, float]:
+    """Whole steps of a delay [s] and the fraction of a step [s] that is left, in [0, 1)."""
+    steps = math.floor(delay / timestep + _WHOLE)
+    rest = delay / timestep - steps
+    return steps, rest if rest > _WHOLE else 0.0
+
+
+class Past:
+    """States of the last physics steps, for sensors that read late.
+
+    Args:
+        plant: the plant, with the delays of its `sensor_errors`.
+        data: state at the start, as `begin_leapfrog` left it; it stands for all times before.
+    """
+
+    def __init__(self, plant: Plant, data: mujoco.MjData) -> None:
+        """Make room for the longest delay."""
+        self._model = plant.model
+        h = plant.model.opt.timestep
+        self.lags = tuple(sorted({e.delay for e in plant.machine.sensor_errors.values()} - {0.0}))
+        self._parts = {lag: split_delay(lag, h) for lag in self.lags}
+        size = 2 + max((steps for steps, _ in self._parts.values()), default=0)
+        self._qpos = np.tile(aligned_positions(plant.model, data), (size, 1))
+        self._act = np.tile(data.act, (size, 1))
+        self._now = 0
+
+    def keep(self, data: mujoco.MjData) -> None:
+        """Remember the state after a step."""
+        self._now = (self._now + 1) % len(self._qpos)
+        self._qpos[self._now] = aligned_positions(self._model, data)
+        self._act[self._now] = data.act
+
+    def at(self, lag: float) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (nq,) and activations (na,) that long ago, linear between two steps."""
+        steps, part = self._parts[lag]
+        new, old = (self._now - steps) % len(self._qpos), (self._now - steps - 1) % len(self._qpos)
+        qpos = self._qpos[new] + part * (self._qpos[old] - self._qpos[new])
+        return qpos, self._act[new] + part * (self._act[old] - self._act[new])
+
+
 class Recorder:
     """Arrays that a run fills, one row per log sample.
 
@@ -81,14 +127,19 @@ class Recorder:
         self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
         self.command, self.contact = np.zeros((rows, model.nu)), np.zeros((rows, 3))
         self.tip = np.zeros((rows, 3 if self.tip_site >= 0 else 0))
+        lags = {error.delay for error in plant.machine.sensor_errors.values()} - {0.0}
+        self.late = {
+            lag: (np.zeros((rows, model.nq)), np.zeros((rows, model.na))) for lag in sorted(lags)
+        }
 
-    def take(self, row: int, time: float, data: mujoco.MjData) -> None:
+    def take(self, row: int, time: float, data: mujoco.MjData, past: Past) -> None:
         """Keep the present state, before the next step is made.
 
         Args:
             row: which row.
             time: its time [s].
             data: staggered state, as `begin_leapfrog` or a step left it.
+            past: the states before, for sensors that read late.
 
         Raises:
             SimulationFailed: the state is not finite, or MuJoCo warns.
@@ -99,6 +150,8 @@ class Recorder:
         self.qvel[row] = data.qvel - 0.5 * h * data.qacc
         self.qacc[row] = data.qacc
         self.act[row] = data.act
+        for lag, (qpos, act) in self.late.items():
+            qpos[row], act[row] = past.at(lag)
         if self.tip_site >= 0:
             self.tip[row] = data.site_xpos[self.tip_site]
         if data.ncon:
@@ -117,7 +170,7 @@ class Recorder:
         """All rows as a Record."""
         return Record(
             self.time, self.qpos, self.qvel, self.qacc, self.act, self.command, self.contact,
-            self.tip,
+            self.tip, self.late,
         )  # fmt: skip
 
 

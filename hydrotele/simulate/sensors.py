@@ -1,4 +1,4 @@
-"""Sensors: uniform error inside a bound, then an analogue-to-digital converter.
+"""Sensors: scale and offset, uniform error inside a bound, then an analogue-to-digital converter.
 
 Every channel draws from its own stream, keyed by the scenario's seed and the channel's name, so
 that leaving a channel out changes no other.
@@ -64,6 +64,21 @@ def _convert_all(values, step, low, high):
     return readings
 
 
+def defective(machine: Machine, truth: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What sensors without noise read: `scale * value + offset` of the machine's sensor errors.
+
+    Args:
+        machine: the machine.
+        truth: channel -> (n,) values at the times at which they are read.
+
+    Returns:
+        Channel -> (n,) values.
+    """
+    errors = machine.sensor_errors
+    return {c: errors[c].scale * v + errors[c].offset if c in errors else v
+            for c, v in truth.items()}  # fmt: skip
+
+
 def measure(
     machine: Machine, sensors: SensorSet | None, seed: int, truth: Mapping[str, np.ndarray],
     errors: Mapping[str, np.ndarray] | None = None,
@@ -74,16 +89,18 @@ def measure(
         machine: the machine (strokes).
         sensors: the set, None for ideal.
         seed: the scenario's seed.
-        truth: channel -> (n,) true values.
+        truth: channel -> (n,) true values; where a sensor reads late, those that it reads
+            (`readout.late_channels`).
         errors: channel -> (n,) errors already drawn; others are drawn here.
 
     Returns:
         Channel -> (n,) readings.
 
-    Source: nominal model, "Sensors": noise first, then the converter.
+    Source: nominal model, "Sensors": noise first, then the converter; defects (`sensor_errors` of
+        the machine, ideal sensors have them too) before both.
     """
     readings = {}
-    for channel, values in truth.items():
+    for channel, values in defective(machine, truth).items():
         sensor = channel_sensor(machine, sensors, channel)
         if sensor.accuracy or sensor.bits:
             error = (errors or {}).get(channel)

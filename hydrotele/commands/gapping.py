@@ -1,0 +1,189 @@
+"""`hydrotele gap`: where model and measured logs disagree, and the machine that agrees better."""
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import yaml
+
+import hydrotele
+from hydrotele.commands.console import notes, out, print_json, table
+from hydrotele.datafile import suggest
+from hydrotele.effects import EFFECTS
+from hydrotele.errors import InputError
+from hydrotele.gap.customary import said
+from hydrotele.gap.dataset import Dataset, load_dataset
+from hydrotele.gap.gap_json import finite, gap_document
+from hydrotele.gap.patched import has_patch, write_patch
+from hydrotele.gap.result import Gap
+from hydrotele.gap.words import effect_title, headline, verdict_words
+from hydrotele.log import Log, load_log
+from hydrotele.machine import Machine
+from hydrotele.machine_file import MACHINE_FILE, load_machine
+from hydrotele.output import check_target, whole_folder
+from hydrotele.replay import replay_log
+from hydrotele.simulate.native import stop_profiling_clock
+
+_COLOURS = {"named": "blue", "no_gap": "green", "ambiguous": "yellow", "unknown": "red"}
+_COLUMNS = ("effect", "parameter", "model had", "found", "95 % interval", "unit")
+_LOGS = (".parquet", ".csv")
+
+
+def gap_to_folder(
+    data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
+    sensors: str | None, target: Path | None, as_json: bool, recording: bool,
+    effects: Sequence[str] = (), jobs: int | None = None, force: bool = False,
+) -> Path:  # fmt: skip
+    """Find the gap between a model and logs; write everything into a folder, whole or not at all.
+
+    Args:
+        data: log files, folders of logs, run folders.
+        machine: the model, None for the one that the logs name.
+        tool: its tool, None for the logs'.
+        heldout: name of the run to judge on, None to choose.
+        sensors: name of the machine's sensors, None for those that the logs name.
+        target: folder, default `gap_<data>`.
+        as_json: print `gap.json` instead of words.
+        recording: whether to write the rerun recording.
+        effects: names of the effects to try; none means all.
+        jobs: processes to use, None to let the search choose.
+        force: accept logs whose metadata name another machine or tool.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: data, machine, effects or target are not usable.
+    """
+    for name in effects:
+        if name not in EFFECTS:
+            raise InputError(f"--effect {name}", f"is not known; {suggest(name, EFFECTS)}")
+    target = target or Path(f"gap_{_name(data)}")
+    check_target(target, "gap")
+    stop_profiling_clock()
+    model = _open_machine(data, machine, tool)
+    dataset = load_dataset(list(data), model, sensors, heldout, force=force)
+    gap = _search(dataset, effects, jobs, quiet=as_json)
+    with whole_folder(target, "gap") as folder:
+        write_gap(gap, dataset, folder, recording, data)
+    if as_json:
+        print_json(gap_document(gap))
+    else:
+        _print(gap)
+        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    return target
+
+
+def write_gap(
+    gap: Gap, dataset: Dataset, folder: Path, recording: bool = True, data: Sequence[Path] = ()
+) -> None:
+    """Write gap.json, the report, the patched machine, the next experiment and the recording."""
+    document = json.dumps(gap_document(gap), indent=2, allow_nan=False)
+    (folder / "gap.json").write_text(document + "\n", encoding="utf-8")
+    if has_patch(gap):
+        from hydrotele.simulate.plant import build_plant
+
+        patched = folder / "patched"
+        patched.mkdir()
+        write_patch(gap, patched)
+        (patched / "machine.xml").write_text(build_plant(gap.patched).mjcf, encoding="utf-8")
+    if scenario := (gap.next_experiment or {}).get("scenario"):
+        text = yaml.safe_dump(finite(scenario), sort_keys=False)
+        (folder / "next_experiment.yaml").write_text(text, encoding="utf-8")
+    from hydrotele.show.gap_report import write_report
+
+    notes.print("writing report.html ...", style="dim")
+    write_report(gap, folder / "report.html")
+    if recording:
+        from hydrotele.show.gap_recording import write_gap_recording
+
+        notes.print("writing recording.rrd ...", style="dim")
+        write_gap_recording(folder / "recording.rrd", gap, dataset.heldout, dataset.axes)
+    summary = {
+        "kind": "gap",
+        "machine": gap.machine.name,
+        "tool": gap.machine.tool,
+        "data": [str(path) for path in data],
+        "heldout": dataset.heldout.name,
+        "verdict": gap.verdict,
+        "hydrotele": hydrotele.__version__,
+    }
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def predict(machine: Machine, log: Log) -> Log:
+    """What a machine does when it is driven with a log's commands, open loop from its start."""
+    return replay_log(log, machine).simulated.without_truth()
+
+
+def _search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool) -> Gap:
+    from hydrotele.gap.find import find_gap
+
+    with _stages(f"gap {dataset.machine.name}", quiet) as progress:
+        return find_gap(dataset, predict, progress, tuple(effects), jobs or 2)
+
+
+def _name(data: Sequence[Path]) -> str:
+    """Name of the data: of the folder, or of the folder that holds the files."""
+    first = data[0].resolve()
+    return first.name if first.is_dir() else first.parent.name or first.stem
+
+
+def _open_machine(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
+    """The machine named, else the one beside the first log, else the one that the log names."""
+    log = _first_log(data[0])
+    metadata: Mapping[str, str] = {}
+    if log and log.suffix.lower() == ".parquet":
+        metadata = load_log(log, maximum_dropped=1.0).metadata
+    if name is None and log and (log.parent / MACHINE_FILE).is_file():
+        name = str(log.parent / MACHINE_FILE)
+    name = name or metadata.get("machine")
+    if not name:
+        raise InputError(data[0], "its metadata names no machine: give --machine")
+    found = load_machine(name, tool)
+    logged = metadata.get("tool")
+    return load_machine(name, logged) if tool is None and logged in found.tools else found
+
+
+def _first_log(path: Path) -> Path | None:
+    if not path.is_dir():
+        return path if path.is_file() else None
+    files = [p for p in sorted(path.rglob("*")) if p.suffix.lower() in _LOGS]
+    return next((p for p in files if not p.stem.startswith((".", "truth"))), None)
+
+
+@contextlib.contextmanager
+def _stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | None]:
+    """A bar with the stage of the search on stderr; None where nobody watches."""
+    if quiet or not notes.is_terminal:
+        yield None
+        return
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn(label), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
+    stage = TextColumn("{task.description}")
+    with Progress(*columns, stage, console=notes, transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+
+        def update(said: str, fraction: float) -> None:
+            bar.update(task, completed=fraction, description=said)
+
+        yield update
+
+
+def _print(gap: Gap) -> None:
+    out.print(f"[bold {_COLOURS[gap.verdict]}]{headline(gap)}[/]", soft_wrap=True)
+    for words in verdict_words(gap):
+        out.print(words, markup=False)
+    if gap.effects:
+        rows = table("what was found", *_COLUMNS)
+        for effect in gap.effects:
+            for name, estimate in effect.parameters.items():
+                s = said(estimate, name)
+                between = f"{s.low} .. {s.high}"
+                rows.add_row(effect_title(effect), name, s.nominal, s.value, between, s.unit)
+        rows.columns[4].no_wrap = True
+        out.print(rows)
+    for note in gap.notes:
+        out.print(f"[yellow]note[/] {note}")

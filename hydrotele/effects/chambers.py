@@ -1,0 +1,70 @@
+"""Chambers that leak or give more than in the model."""
+
+from hydrotele.effects._sizes import drive_kind, valves
+from hydrotele.effects.effect import Effect, Parameter, Values, changed
+from hydrotele.machine import Machine
+
+_SOFTEST = 1.0e7  # Pa, oil full of air: the lowest bulk modulus that a machine may state
+
+
+def _leakage(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Fractions of what makes the rated flow leak at full pressure; a good seal lets 1 % pass."""
+    valve = machine.axes[location].valve
+    assert valve and machine.supply
+    whole = valve.rated_flow / machine.supply.relief_pressure
+    present = machine.axes[location].hydraulic_drive.leakage
+    high = present + 0.5 * whole
+    return {"leakage": Parameter("m^3/(s Pa)", present, 0.0, high, 0.05 * whole, 0.005 * whole)}
+
+
+def _hose(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Relative to the oil in the middle of the stroke; 5 % is the scatter of a hose's rating."""
+    drive, cylinder = machine.axes[location].hydraulic_drive, machine.axes[location].cylinder
+    assert machine.supply
+    middle = 0.5 * cylinder.stroke if cylinder else 0.0
+    volume = drive.dead_volume + drive.areas[0] * middle
+    oil = volume / machine.supply.bulk_modulus
+    present = drive.hose_compliance
+    return {"compliance": Parameter("m^3/Pa", present, 0.0, present + 3 * oil, 0.3 * oil,
+                                    0.05 * oil)}  # fmt: skip
+
+
+def _set(field: str, parameter: str):
+    def apply(machine: Machine, location: str, values: Values) -> Machine:
+        path = f"axes.{location}.{drive_kind(machine, location)}.{field}"
+        return changed(machine, path, values[parameter])
+
+    return apply
+
+
+def _everywhere(machine: Machine) -> tuple[str, ...]:
+    return ("all",) if machine.supply and machine.hydraulic_axes else ()
+
+
+def _bulk_modulus(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Entrained air takes tens of per cent; 5 % is what 1 MPa of pressure changes."""
+    assert machine.supply
+    present = machine.supply.bulk_modulus
+    low = max(_SOFTEST, 0.1 * present)
+    return {"bulk_modulus": Parameter("Pa", present, low, 2.5 * present, 0.25 * present,
+                                      0.05 * present)}  # fmt: skip
+
+
+def _set_bulk_modulus(machine: Machine, location: str, values: Values) -> Machine:
+    return changed(machine, "supply.bulk_modulus", values["bulk_modulus"])
+
+
+EFFECTS = (
+    Effect(
+        "internal_leakage", "another leakage between the chambers of a drive", "flow", valves,
+        _leakage, _set("leakage", "leakage"),
+    ),
+    Effect(
+        "hose_compliance", "hoses that swell with pressure", "flow", valves, _hose,
+        _set("hose_compliance", "compliance"),
+    ),
+    Effect(
+        "bulk_modulus", "another stiffness of the oil", "flow", _everywhere, _bulk_modulus,
+        _set_bulk_modulus,
+    ),
+)  # fmt: skip

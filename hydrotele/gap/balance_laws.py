@@ -1,0 +1,128 @@
+"""Residuals of the model's laws on given signals, compiled; nothing here knows of logs."""
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.dynamics.integrate import place
+from hydrotele.dynamics.motion import gather_forces
+from hydrotele.hydraulics.circuit import (
+    SLOTS,
+    Slot,
+    actuator_friction,
+    chamber_flows,
+    supply_pressure,
+)
+from hydrotele.hydraulics.laws import port_flow, valve_opening
+
+_AH, _AR, _LEAK = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.LEAKAGE)
+_PORT, _KR = int(Slot.PORT_RELIEF), int(Slot.RELIEF_GAIN)
+_TANK, _KM = int(Slot.TANK_PRESSURE), int(Slot.MAKEUP_GAIN)
+_BETA, _HOSE, _DB, _K = (
+    int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE), int(Slot.DEADBAND), int(Slot.FLOW_GAIN)
+)  # fmt: skip
+_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
+
+
+@compiled
+def load_forces(model, space, motion):
+    """Force of every drive that a motion needs, its own friction included.
+
+    `J' F = N' (M (N q'' + c) + h + D q')`, where N maps independent to tree rates, c is what the
+    closures add, D the dampers of the joints and J the drives' Jacobian; a transmission counts as
+    rigid.
+
+    Args:
+        model: Model of the reduced dynamics with as many drives as independent coordinates.
+        space: its Space.
+        motion: (n, 3, f) positions, rates and accelerations of the independent coordinates.
+
+    Returns:
+        (n, nu) forces [N] or torques [N m].
+
+    Source: virtual work on the closed chains.
+    """
+    mech, m = model.mech, space.motion
+    rows, free, drives = len(motion), len(mech.free), len(model.gear)
+    total = free + len(model.transmission)
+    z, load = np.zeros(2 * total + 4 * model.hydraulic), np.zeros(free)
+    forces = np.empty((rows, drives))
+    for k in range(rows):
+        z[:free] = motion[k, 0]
+        z[total : total + free] = motion[k, 1]
+        place(model, space, z)
+        gather_forces(mech, m)
+        acceleration = m.drift + m.basis @ motion[k, 2]
+        tree = m.mass @ acceleration + m.bias + mech.damping * space.rates
+        load[:] = m.basis.T @ tree
+        forces[k] = np.linalg.solve(space.row.T.copy(), load)
+        for i in range(drives):
+            velocity, change = 0.0, 0.0
+            for f in range(free):
+                velocity += space.row[i, f] * motion[k, 1, f]
+                change += space.row[i, f] * motion[k, 2, f]
+            if mech.drive_bar[i] >= 0:
+                change += m.length_bias[mech.drive_bar[i]]
+                change += np.sum(m.length_row[mech.drive_bar[i]] * m.drift)
+            forces[k, i] += actuator_friction(model.user, i * SLOTS, velocity)
+            if model.gear[i] >= 0:
+                forces[k, i] += model.transmission[model.gear[i], 0] * change
+    return forces
+
+
+@compiled
+def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
+    """What a chamber's oil does not account for: `V p'/beta + A v + leak - valve - port`.
+
+    Args:
+        user: (SLOTS,) numbers of the axis' actuator.
+        spool: (n,) spool positions [1].
+        supply: (n,) supply pressure [Pa].
+        head: (2, n) head-side pressure [Pa] and its rate [Pa/s].
+        rod: (2, n) the same of the rod side.
+        volumes: (2, n) volumes of head and rod chamber [m^3].
+        velocity: (n,) piston velocity [m/s] or [rad/s].
+
+    Returns:
+        (2, n) residual flows of head and rod chamber [m^3/s]; positive: oil is missing.
+
+    Source: nominal model, "Chambers".
+    """
+    out = np.empty((2, len(spool)))
+    tank, hose, beta = user[_TANK], user[_HOSE], user[_BETA]
+    for k in range(len(spool)):
+        p_head, p_rod = head[0, k], rod[0, k]
+        opening = valve_opening(spool[k], user[_DB])
+        q_head, q_rod, _, _ = chamber_flows(user, 0, opening, supply[k], p_head, p_rod)
+        r_head, _ = port_flow(p_head, user[_PORT], user[_KR], tank, user[_KM])
+        r_rod, _ = port_flow(p_rod, user[_PORT], user[_KR], tank, user[_KM])
+        leak = user[_LEAK] * (p_head - p_rod)
+        stored_head = (volumes[0, k] / beta + hose) * head[1, k]
+        stored_rod = (volumes[1, k] / beta + hose) * rod[1, k]
+        out[0, k] = stored_head + user[_AH] * velocity[k] + leak - q_head - r_head
+        out[1, k] = stored_rod - user[_AR] * velocity[k] - leak - q_rod - r_rod
+    return out
+
+
+@compiled
+def supply_pressures(user, spools, pressures):
+    """Supply pressure from spools and chamber pressures.
+
+    Args:
+        user: (h * SLOTS,) numbers of the h valves.
+        spools: (h, n) [1].
+        pressures: (h, 2, n) head and rod pressures [Pa].
+
+    Returns:
+        (n,) [Pa].
+
+    Source: nominal model, "Supply".
+    """
+    count, rows = spools.shape
+    ports, out = np.zeros(4 * count), np.empty(rows)
+    for k in range(rows):
+        for i in range(count):
+            opening = valve_opening(spools[i, k], user[i * SLOTS + _DB])
+            ports[4 * i] = user[i * SLOTS + _K] * abs(opening)
+            ports[4 * i + 1] = pressures[i, 0 if opening > 0.0 else 1, k]
+        out[k] = supply_pressure(ports, count, user[_D], user[_RELIEF], user[_PUMP])
+    return out

@@ -1,0 +1,212 @@
+"""Balances of a log, law by law and axis by axis: which law of the model fails, where and when.
+
+A balance is computed from smoothed signals, without any simulation of the machine; its noise is
+what the sensors' noise, and what smoothing takes from the signals, would make of it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from hydrotele.dynamics.model import model_space, reduced_model
+from hydrotele.gap.balance_laws import chamber_residuals, load_forces, supply_pressures
+from hydrotele.gap.balance_signals import (
+    Signals,
+    joint_motion,
+    read_signals,
+    spool_positions,
+)
+from hydrotele.gap.balance_timing import window_lags
+from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
+from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.log import Log
+from hydrotele.machine import Machine
+
+# Hz: below the 2.5 Hz at which an excavator rings on its oil and accelerations drown in the noise
+BAND = 1.5
+_AVERAGE = 1.0  # s: the draws' scatter is averaged over it
+_SUPPLY = "supply"
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Residual of one law at one place over a run.
+
+    Attributes:
+        time: (n,) [s].
+        residual: (n,) [unit].
+        noise: (n,) standard deviation that the residual has where the law holds [unit]: from the
+            sensors' noise and, but for `closure`, from random errors of the smoother.
+        unit: SI unit of residual and noise.
+        rms: root mean square of the residual [unit].
+        normalised_rms: the same of residual over noise [1]; about 1 where the law holds.
+    """
+
+    time: np.ndarray
+    residual: np.ndarray
+    noise: np.ndarray
+    unit: str
+    rms: float
+    normalised_rms: float
+
+
+def balances(machine: Machine, log: Log, sensors: str | None) -> dict[str, dict[str, Balance]]:
+    """Balances of all laws that a log's channels allow.
+
+    `closure`: measured cylinder length minus that from the measured angle. `force`: force of the
+    pressures (or of a plain drive's command) minus what the smoothed motion needs, below `BAND`.
+    `flow_head`, `flow_rod`: oil that a chamber lacks, below `BAND`. `supply`: measured supply
+    pressure minus that from spools and chamber pressures. `timing`: by how much the motion comes
+    later than the flow of the valve says.
+
+    Args:
+        machine: the model.
+        log: one run of the machine.
+        sensors: name of the machine's sensors; None to find their noise from the data.
+
+    Returns:
+        Law -> axis (or "supply") -> Balance; what lacks a channel is absent.
+
+    Raises:
+        InputError: the time stamps follow no clock, or the machine has no such sensors.
+    """
+    signals = read_signals(machine, log, sensors)
+    found: dict[str, dict[str, Balance]] = {}
+    for law in (_closure, _force, _flow_and_timing, _supply):
+        for name, place, balance in law(machine, signals):
+            found.setdefault(name, {})[place] = balance
+    return found
+
+
+Found = Iterator[tuple[str, str, Balance]]
+
+
+def _balance(time: np.ndarray, residual: np.ndarray, noise: np.ndarray, unit: str) -> Balance:
+    ratio = np.divide(residual, noise, out=np.full(len(noise), np.nan), where=noise > 0)
+    rms, normalised = (
+        float(np.sqrt(np.nanmean(v**2))) if np.isfinite(v).any() else np.nan
+        for v in (residual, ratio)
+    )
+    return Balance(time, residual, noise, unit, rms, normalised)
+
+
+def _closure(machine: Machine, signals: Signals) -> Found:
+    for name, axis in machine.axes.items():
+        length, angle = f"length.{name}", f"{machine.position_kind(name)}.{name}"
+        if not (axis.cylinder and signals.has(length, angle)):
+            continue
+        linkage, readings = axis_linkage(machine, name), signals.reading
+        lever = linkage.rate(signals.smoothed[angle][0, 0])
+        # to first order about the smoothed angle, as one reading may lie where no loop closes
+        geometric = linkage.length(signals.smoothed[angle][0, 0]) - axis.cylinder.closed_length
+        geometric = geometric + lever * (readings[angle] - signals.smoothed[angle][0, 0])
+        noise = np.hypot(signals.noise[length], lever * signals.noise[angle])
+        yield (
+            "closure",
+            name,
+            _balance(signals.time, readings[length] - geometric, noise, "m"),
+        )
+
+
+def _force(machine: Machine, signals: Signals) -> Found:
+    order, model = actuator_order(machine), reduced_model(machine, ())
+    motions = {name: joint_motion(machine, signals, name) for name in order}
+    driven = {int(j): name for j, name in zip(model.mech.drive_joint, order, strict=True)}
+    free = [driven.get(int(j), "") for j in model.mech.free]
+    parts = [motions[name] for name in free if name and motions[name] is not None]
+    pushes = {name: _push(machine, signals, name) for name in order}
+    known = {name: push for name, push in pushes.items() if push is not None}
+    if len(parts) < len(free) or len(order) != len(free) or not known:
+        return
+    motion = np.stack([part for part in parts if part is not None], axis=-1)
+    space = model_space(model)
+    needed = np.stack([load_forces(model, space, m.swapaxes(0, 1).copy()) for m in motion])
+    for name, push in known.items():
+        rotary = machine.axes[name].cylinder is None and machine.position_kind(name) == "angle"
+        lacks = push - needed[:, :, order.index(name)]
+        residual, noise = _in_band(lacks, signals.period)
+        yield "force", name, _balance(signals.time, residual, noise, "N m" if rotary else "N")
+
+
+def _push(machine: Machine, signals: Signals, name: str) -> np.ndarray | None:
+    """(d, n) or (n,) force of a drive before friction, or None where nothing tells it."""
+    axis = machine.axes[name]
+    if axis.force:
+        if name not in signals.command:
+            return None
+        held = np.concatenate([signals.command[name][:1], signals.command[name]])
+        now = np.arange(len(held) - 1) + 0.5 - axis.command_delay / signals.period
+        arrived = np.interp(now, np.arange(len(held)), held)  # mean over a period about the row
+        return axis.force.gain * arrived - axis.force.offset
+    channels = f"pressure_head.{name}", f"pressure_rod.{name}"
+    if not signals.has(*channels):
+        return None
+    head, rod = (signals.smoothed[c][:, 0] for c in channels)
+    area_head, area_rod = axis.hydraulic_drive.areas
+    return area_head * head - area_rod * rod
+
+
+def _flow_and_timing(machine: Machine, signals: Signals) -> Found:
+    numbers = actuator_numbers(machine)
+    for name, axis in machine.hydraulic_axes.items():
+        channels = f"pressure_head.{name}", f"pressure_rod.{name}", "pressure_supply"
+        motion = joint_motion(machine, signals, name)
+        if motion is None or name not in signals.command or not signals.has(*channels):
+            continue
+        head, rod, supply = (signals.smoothed[c] for c in channels)
+        linkage, spool = axis_linkage(machine, name), spool_positions(machine, signals, name)
+        drive = axis.hydraulic_drive
+        closed = axis.cylinder.closed_length if axis.cylinder else 0.0
+        displacement = np.asarray(linkage.length(motion[:, 0])) - closed
+        velocity = np.asarray(linkage.rate(motion[:, 0])) * motion[:, 1]
+        lacks = np.stack(
+            [
+                chamber_residuals(
+                    numbers[name], spool, supply[d, 0], head[d, :2].copy(), rod[d, :2].copy(),
+                    np.stack(drive.volumes(displacement[d])), velocity[d],
+                )
+                for d in range(len(velocity))
+            ]
+        )  # fmt: skip
+        for side, law in enumerate(("flow_head", "flow_rod")):
+            residual, noise = _in_band(lacks[:, side], signals.period)
+            yield law, name, _balance(signals.time, residual, noise, "m^3/s")
+        expected = velocity - lacks[:, 0] / drive.areas[0]
+        lags = window_lags(expected, velocity, signals.period)
+        if lags is not None:
+            yield "timing", name, _balance(signals.time, *lags, "s")
+
+
+def _supply(machine: Machine, signals: Signals) -> Found:
+    names = list(machine.hydraulic_axes)
+    chambers = [f"pressure_{side}.{name}" for name in names for side in ("head", "rod")]
+    commanded = all(name in signals.command for name in names)
+    if not (names and commanded and signals.has("pressure_supply", *chambers)):
+        return
+    numbers = actuator_numbers(machine)
+    user = np.concatenate([numbers[name] for name in names])
+    spools = np.stack([spool_positions(machine, signals, name) for name in names])
+    table = np.stack([signals.smoothed[c][:, 0] for c in chambers], axis=1)
+    expected = np.stack(
+        [supply_pressures(user, spools, p.reshape(len(names), 2, -1)) for p in table]
+    )
+    residual = signals.smoothed["pressure_supply"][:, 0] - expected
+    yield _SUPPLY, _SUPPLY, _balance(signals.time, *_in_band(residual, signals.period), "Pa")
+
+
+def _in_band(sets: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """(d, n) residuals -> (n,) residual of the first set and its noise from the others."""
+    if BAND < 0.4 / period:
+        filtered = butter(2, BAND, fs=1.0 / period, output="sos")
+        pad = min(sets.shape[1] - 1, round(1.0 / (BAND * period)))
+        sets = sosfiltfilt(filtered, sets, axis=1, padlen=pad)
+    return sets[0], _scatter(sets, period)
+
+
+def _scatter(sets: np.ndarray, period: float) -> np.ndarray:
+    square = np.mean((sets[1:] - sets[0]) ** 2, axis=0)
+    width = max(1, round(_AVERAGE / period))
+    edges = np.convolve(np.ones(len(square)), np.ones(width), "same")
+    return np.sqrt(np.convolve(square, np.ones(width), "same") / edges)

@@ -1,0 +1,116 @@
+"""Which runs are fitted and which one judges; a single run is split in time."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.datafile import suggest
+from hydrotele.errors import InputError
+from hydrotele.gap.data_rows import Rows
+
+SHORTEST = 5.0  # [s] of a run; the start, whose state is unknown, takes up to a second of it
+_SHORTEST_PIECE = 10.0  # [s] of a piece of a single run
+_PIECES = 3
+_FIT = 0.75  # of a single run
+_HELD_OUT = ("test", "heldout", "validation")
+
+
+class Part(NamedTuple):
+    """A run, a piece of one, or a part of a split piece.
+
+    Attributes:
+        name: its own name.
+        piece: name of the run or piece that it was split from; its own name if it was not.
+        rows: its rows.
+    """
+
+    name: str
+    piece: str
+    rows: Rows
+
+
+class Split(NamedTuple):
+    """Runs to fit, and the run held out."""
+
+    fit: tuple[Part, ...]
+    heldout: Part
+
+
+def seconds(rows: Rows) -> float:
+    """Length of a run [s]."""
+    return len(rows.command) * rows.period
+
+
+def split(
+    runs: Mapping[str, Rows], origin: Mapping[str, str], heldout: str | None
+) -> tuple[Split, tuple[str, ...]]:
+    """Hold one run out: the one named, else the first of the runs `test*`, `heldout*`,
+    `validation*`, else the last by name. A single run is fitted on its first three quarters.
+
+    Args:
+        runs: name of run or of piece -> rows, at least one.
+        origin: the same names -> the run as logged, of which it may be a piece.
+        heldout: name of a run, or None.
+
+    Returns:
+        (split, notes on runs that are neither fitted nor held out).
+
+    Raises:
+        InputError: there is no such run, nothing is left to fit, or a single run is too short.
+    """  # noqa: D205 - the rule is one sentence
+    names = sorted(set(origin.values()))
+    if heldout is not None and heldout not in names:
+        raise InputError(f"held-out run {heldout!r}", f"is not there; {suggest(heldout, names)}")
+    if len(runs) == 1:
+        name, rows = next(iter(runs.items()))
+        if heldout is not None:
+            raise InputError(
+                f"held-out run {heldout!r}",
+                "is the only run: leave the name away to split it in time, or add a run to fit",
+            )
+        return _split_in_time(name, rows), ()
+    marked = [name for name in names if name.lower().startswith(_HELD_OUT)]
+    if marked == names:
+        marked = []
+    chosen = heldout or (marked or [sorted(runs)[-1] if len(names) == 1 else names[-1]])[0]
+    pieces = [n for n in runs if chosen in (n, origin[n])]
+    judge = max(pieces, key=lambda n: seconds(runs[n]))
+    aside = set(marked if heldout is None else ()) | {chosen}
+    fit = [n for n in runs if n != judge and not {n, origin[n]} & aside]
+    unused = [n for n in runs if n not in fit and n != judge]
+    notes = (
+        (f"{', '.join(unused)}: neither fitted nor judged on; {judge} is held out.",)
+        if unused else ()
+    )  # fmt: skip
+    if not fit:
+        raise InputError(f"held-out run {chosen!r}", "leaves no run to fit: add one")
+    parts = tuple(Part(n, n, runs[n]) for n in fit)
+    return Split(parts, Part(judge, judge, runs[judge])), notes
+
+
+def _split_in_time(name: str, rows: Rows) -> Split:
+    total = seconds(rows)
+    if total * (1.0 - _FIT) < SHORTEST - 1e-9:
+        raise InputError(
+            name,
+            f"is the only run and {total:.3g} s long; its last quarter is held out, which asks for"
+            f" {SHORTEST / (1 - _FIT):.0f} s or more: log longer, or a second run",
+        )
+    n = len(rows.command)
+    count = int(np.clip(_FIT * total // _SHORTEST_PIECE, 1, _PIECES))
+    edges = np.linspace(0, round(_FIT * n), count + 1).astype(int)
+    fit = tuple(
+        Part(f"{name}_{i + 1}", name, cut(rows, a, b))
+        for i, (a, b) in enumerate(zip(edges, edges[1:], strict=False))
+    )
+    return Split(fit, Part(f"{name}_heldout", name, cut(rows, edges[-1], n)))
+
+
+def cut(rows: Rows, first: int, last: int) -> Rows:
+    """Rows first .. last - 1 of a run, with their own start."""
+    part = slice(int(first), int(last))
+    return Rows(
+        rows.start + int(first) * rows.period, rows.period, rows.command[part], rows.known[part],
+        rows.reading[part],
+    )  # fmt: skip

@@ -1,0 +1,159 @@
+"""How well a guess explains the fit runs: prediction errors, slopes, and a step to a better one.
+
+Errors are whitened with gains that are kept while a guess moves, so that they are smooth functions
+of its deviations d. The loss is `sum e(d)^2 + d'd` (a unit-normal prior); a hypothesis is charged
+`log det(1 + S'S)` for the room that its parameters take (Laplace's approximation of the evidence).
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.gap.dataset import Dataset, RunData
+from hydrotele.gap.hypothesis import Guess
+from hydrotele.gap.tracking import STEP, Track, track_run
+from hydrotele.machine import Machine
+
+_CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
+_STEPS = 6
+_CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A guess fitted with kept gains.
+
+    Attributes:
+        guess: the guess.
+        loss: `sum e^2 + d'd`.
+        gain: fall of the loss against the guess without its last part.
+        charge: what the last part's parameters cost.
+        information: (P, P) `S'S + 1` of all parts.
+    """
+
+    guess: Guess
+    loss: float
+    gain: float
+    charge: float
+    information: np.ndarray
+
+    @property
+    def score(self) -> float:
+        """Twice the log of the evidence gained."""
+        return self.gain - self.charge
+
+
+class Evidence:
+    """Runs of a dataset, tracks of a base guess, and workers to try other guesses."""
+
+    def __init__(self, data: Dataset, runs: Sequence[RunData], jobs: int = 2):
+        """Take the runs to judge by; `close` ends the workers."""
+        self.data, self.runs = data, tuple(runs)
+        self._pool = ThreadPoolExecutor(jobs)
+        self.tracks: tuple[Track, ...] = ()
+
+    def close(self) -> None:
+        """End the workers."""
+        self._pool.shutdown()
+
+    def track(self, machine: Machine, runs: Sequence[RunData] | None = None) -> tuple[Track, ...]:
+        """Tracks with gains of their own."""
+        runs = self.runs if runs is None else runs
+        return tuple(self._pool.map(lambda run: track_run(machine, self.data, run), runs))
+
+    def set_base(self, guess: Guess) -> None:
+        """Compute gains anew for a guess; later errors are whitened with them."""
+        self.tracks = self.track(guess.machine(self.data.machine))
+
+    @property
+    def base_loss(self) -> float:
+        """-2 log likelihood of the base with its own gains, without constant."""
+        return sum(track.loss for track in self.tracks)
+
+    @property
+    def base_errors(self) -> np.ndarray:
+        """(E,) whitened errors of the base, all runs."""
+        return np.concatenate([flat(track.whitened) for track in self.tracks])
+
+    def errors(
+        self, guess: Guess, step: float = STEP, tracks: Sequence[Track] | None = None
+    ) -> np.ndarray:
+        """(E,) whitened errors of a guess with the base's gains, in all or some of its tracks."""
+        machine = guess.machine(self.data.machine)
+        tracks = self.tracks if tracks is None else tracks
+        return np.concatenate(
+            [flat(track_run(machine, self.data, t.run, t, step).whitened) for t in tracks]
+        )
+
+    def map(self, function: Callable, items: Sequence) -> list:
+        """Apply a function to items on the workers."""
+        return list(self._pool.map(function, items))
+
+    def slopes(self, guess: Guess, errors: np.ndarray, parallel: bool = True) -> np.ndarray:
+        """(E, P) change of the errors per deviation."""
+
+        def column(index: int) -> np.ndarray:
+            moved = guess.deviation
+            step = guess.nudges[index]
+            moved[index] += step
+            return (self.errors(guess.at(moved)) - errors) / step
+
+        columns = range(len(guess.deviation))
+        found = self.map(column, columns) if parallel else [column(i) for i in columns]
+        return np.column_stack(found) if found else np.zeros((len(errors), 0))
+
+    def fit(self, guess: Guess, before: float, parallel: bool = True, steps: int = _STEPS) -> Fit:
+        """Gauss-Newton with halved steps, from the guess.
+
+        Args:
+            guess: where to start.
+            before: loss of the guess without its last part, for the gain.
+            parallel: whether this may use the workers (not from within one).
+            steps: largest number of steps.
+
+        Returns:
+            The fit.
+        """
+        errors = self.errors(guess)
+        loss = _loss(errors, guess)
+        slopes = self.slopes(guess, errors, parallel)
+        for _ in range(steps):
+            d = guess.deviation
+            step = -np.linalg.solve(slopes.T @ slopes + np.eye(len(d)), slopes.T @ errors + d)
+            better = None
+            for shrink in (1.0, 0.5, 0.2, 0.05):
+                moved = guess.at(d + shrink * step)
+                tried = self.errors(moved)
+                if (lower := _loss(tried, moved)) < loss - 1e-9:
+                    better = (moved, tried, lower)
+                    break
+            if better is None:
+                break
+            fall = loss - better[2]
+            guess, errors, loss = better
+            if fall < _CLOSE:
+                break
+            slopes = self.slopes(guess, errors, parallel)
+        information = slopes.T @ slopes + np.eye(slopes.shape[1])
+        last = guess.parts[-1][0].size if guess.parts else 0
+        return Fit(guess, loss, before - loss, charge(information, last), information)
+
+
+def charge(information: np.ndarray, last: int) -> float:
+    """Occam's charge of the last parameters, given the others: `log det` of their information."""
+    if last == 0:
+        return 0.0
+    whole = np.linalg.slogdet(information)[1]
+    rest = np.linalg.slogdet(information[:-last, :-last])[1] if last < len(information) else 0.0
+    return float(whole - rest)
+
+
+def flat(whitened: np.ndarray) -> np.ndarray:
+    """Whitened errors (n, c) as one row (n c,), 0 where missing."""
+    return np.clip(np.nan_to_num(whitened.ravel(), nan=0.0), -_CLIP, _CLIP)
+
+
+def _loss(errors: np.ndarray, guess: Guess) -> float:
+    return float(errors @ errors + guess.deviation @ guess.deviation)

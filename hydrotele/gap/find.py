@@ -1,0 +1,209 @@
+"""The workflow: find, name, add, show; from a Dataset to a Gap."""
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from hydrotele.gap.balances import balances
+from hydrotele.gap.dataset import Dataset
+from hydrotele.gap.evidence import Evidence, Fit
+from hydrotele.gap.experiment import next_experiment
+from hydrotele.gap.floor import noise_floor
+from hydrotele.gap.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.gap.residuals import residual_tests, rms
+from hydrotele.gap.result import (
+    Alternative,
+    Candidate,
+    Estimate,
+    Gap,
+    GapSize,
+    NamedEffect,
+    Prediction,
+    Verdict,
+)
+from hydrotele.gap.search import Found, search
+from hydrotele.gap.tracking import Track
+from hydrotele.gap.unknown import describe_unknown
+from hydrotele.log import Log
+from hydrotele.machine import Machine
+
+SURE = 0.95  # probability below which an effect is called ambiguous
+DOUBTFUL = 0.5  # largest probability of an effect next to an unknown one
+_WORTH_TELLING = 0.005  # probability below which an alternative is left out
+_NORMAL95 = 1.96
+Progress = Callable[[str, float], None]
+
+
+def find_gap(
+    data: Dataset,
+    predict: Callable[[Machine, Log], Log] | None = None,
+    progress: Progress | None = None,
+    effects: Sequence[str] = (),
+    jobs: int = 2,
+) -> Gap:
+    """Find where a model and its logs disagree.
+
+    Args:
+        data: the logs; the fit runs decide, the held-out run judges.
+        predict: (machine, log) -> what a simulator makes of the log's commands; unused where None.
+        progress: called with (what is being done, share done).
+        effects: names of the effects to try; all if empty.
+        jobs: threads.
+
+    Returns:
+        The gap, named or not.
+    """
+    begin = time.perf_counter()
+    del predict
+    tell = progress or (lambda text, share: None)
+    candidates = hypotheses(data.machine, effects)
+    evidence = Evidence(data, data.fit, jobs)
+    try:
+        found = search(evidence, candidates, progress)
+        runs = (data.heldout, *data.fit)
+        tell("judge on the held-out run", 0.95)
+        before = evidence.track(data.machine, runs)
+        patched = found.guess.machine(data.machine)
+        after = evidence.track(patched, runs) if found.guess.parts else before
+    finally:
+        evidence.close()
+    floor = noise_floor(patched, data)
+    tests = residual_tests(after, data.channels)
+    failed = any(not test["passed"] for test in tests.values())
+    named = _named(found, failed)
+    verdict = _verdict(named, failed)
+    predictions = tuple(_prediction(t, data) for t in before)
+    improved = tuple(_prediction(t, data) for t in after)
+    unknown = describe_unknown(patched, data, improved) if failed else None
+    laws, units = _laws(data, patched)
+    tell("done", 1.0)
+    return Gap(
+        machine=data.machine,
+        patched=patched,
+        verdict=verdict,
+        effects=named,
+        unknown=unknown,
+        size=GapSize(rms(before[0].whitened), rms(after[0].whitened), floor),
+        ranking=tuple(
+            Candidate(
+                s.hypothesis.name, s.hypothesis.location, s.gain, s.gain - s.score,
+                s.hypothesis.values(s.start),
+            )
+            for s in found.ranking[:15]
+        ),
+        before=predictions,
+        after=improved,
+        laws=laws,
+        law_units=units,
+        tests=tests,
+        next_experiment=_experiment(data.machine, verdict, named, unknown),
+        notes=(*data.notes, *_notes(found)),
+        seconds=time.perf_counter() - begin,
+    )  # fmt: skip
+
+
+def _verdict(named: Sequence[NamedEffect], failed: bool) -> Verdict:
+    if failed:
+        return "unknown"
+    if not named:
+        return "no_gap"
+    return "named" if all(effect.probability >= SURE for effect in named) else "ambiguous"
+
+
+def _named(found: Found, failed: bool) -> tuple[NamedEffect, ...]:
+    if not found.fit:
+        return ()
+    spread = np.sqrt(np.diag(np.linalg.inv(found.fit.information)))
+    effects, first = [], 0
+    for index, (hypothesis, deviation) in enumerate(found.guess.parts):
+        own = spread[first : first + hypothesis.size]
+        first += hypothesis.size
+        chance, others = _chances(found.scores[index], found.rivals[index])
+        if failed:
+            chance = min(chance, DOUBTFUL)
+        effects.append(
+            NamedEffect(
+                hypothesis.name, hypothesis.location, chance,
+                _estimates(hypothesis, deviation, own), others,
+            )
+        )  # fmt: skip
+    return tuple(sorted(effects, key=lambda effect: -effect.probability))
+
+
+def _estimates(hypothesis: Hypothesis, deviation: np.ndarray, spread: np.ndarray):
+    values = hypothesis.values(deviation)
+    table = {}
+    for (key, p), own in zip(hypothesis.parameters.items(), spread, strict=True):
+        reach = _NORMAL95 * own * p.scale
+        low, high = max(p.low, values[key] - reach), min(p.high, values[key] + reach)
+        table[key] = Estimate(values[key], p.unit, low, high, p.nominal)
+    return table
+
+
+def _chances(score: float, rivals: Sequence[Fit]) -> tuple[float, tuple[Alternative, ...]]:
+    """Probability of an effect and of its rivals, from their evidence."""
+    scores = np.array([score, *(fit.score for fit in rivals)])
+    weights = np.exp(0.5 * (scores - scores.max()))
+    weights /= weights.sum()
+    others = []
+    for fit, weight in zip(rivals, weights[1:], strict=True):
+        rival = fit.guess.parts[-1][0]
+        if weight >= _WORTH_TELLING:
+            others.append(Alternative(rival.name, rival.location, float(weight)))
+    return float(weights[0]), tuple(others)
+
+
+def _prediction(track: Track, data: Dataset) -> Prediction:
+    run = track.run
+    clock = run.start + run.period * np.arange(len(run.command))
+    return Prediction(run.name, clock, data.channels, track.predicted, run.reading, track.whitened)
+
+
+def _laws(data: Dataset, patched: Machine):
+    """Balance residuals of the held-out run before and after."""
+    log = data.heldout.log
+    before = balances(data.machine, log, data.sensors)
+    after = balances(patched, log, data.sensors) if patched is not data.machine else before
+    laws, units = {}, {}
+    for law, places in before.items():
+        laws[law] = {
+            place: {
+                "before": found.rms,
+                "after": after[law][place].rms,
+                "noise": found.rms / found.normalised_rms if found.normalised_rms > 0 else 0.0,
+            }
+            for place, found in places.items()
+        }
+        units[law] = next(iter(places.values())).unit
+    return laws, units
+
+
+def _experiment(machine: Machine, verdict: Verdict, named: Sequence[NamedEffect], unknown):
+    if verdict == "unknown" and unknown:
+        place = unknown.channel.partition(".")[2] or "supply"
+        return next_experiment(machine, "no known effect explains the data", [(unknown.law, place)])
+    if verdict != "ambiguous":
+        return None
+    unsure = [e for e in named if e.probability < SURE]
+    pairs = [(e.name, e.location) for e in unsure]
+    pairs += [(a.name, a.location) for e in unsure for a in e.alternatives]
+    return next_experiment(machine, "these effects cannot be told apart with this data", pairs)
+
+
+def _notes(found: Found) -> list[str]:
+    if not found.weak:
+        return []
+    hypothesis, deviation = found.weak.guess.parts[-1]
+    values = hypothesis.values(deviation)
+    told = ", ".join(
+        f"{key} {values[key]:.4g} {p.unit} (model: {p.nominal:.4g})"
+        for key, p in hypothesis.parameters.items()
+    )
+    return [
+        f"A trace of {hypothesis.name} at {hypothesis.location}, {told}, is smaller than worth"
+        " naming and was left out."
+    ]
+
+
+__all__ = ["Guess", "find_gap"]

@@ -1,0 +1,132 @@
+"""A hypothesis: an effect at a place, its numbers counted in typical deviations from nominal."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.effects import EFFECTS, Parameter
+from hydrotele.machine import Machine
+
+_CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect at a place of the given machine, with p parameters.
+
+    Deviations are `(value - nominal) / scale`, so that the prior is a unit normal.
+    """
+
+    name: str
+    location: str
+    parameters: dict[str, Parameter]
+
+    @property
+    def size(self) -> int:
+        """Number of parameters p."""
+        return len(self.parameters)
+
+    @property
+    def low(self) -> np.ndarray:
+        """(p,) smallest deviation."""
+        return np.array([(p.low - p.nominal) / p.scale for p in self.parameters.values()])
+
+    @property
+    def high(self) -> np.ndarray:
+        """(p,) largest deviation."""
+        return np.array([(p.high - p.nominal) / p.scale for p in self.parameters.values()])
+
+    @property
+    def least(self) -> np.ndarray:
+        """(p,) deviation worth naming."""
+        return np.array([p.least / p.scale for p in self.parameters.values()])
+
+    @property
+    def starts(self) -> list[np.ndarray]:
+        """Deviations (p,) from which to search; nominal unless the effect says otherwise."""
+        tables = [p.starts for p in self.parameters.values()]
+        if not any(tables):
+            return [np.zeros(self.size)]
+        only = [(p, s) for p, s in zip(self.parameters.values(), tables, strict=True) if s]
+        return [np.array([(value - p.nominal) / p.scale for p, _ in only]) for value in only[0][1]]
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Name and location."""
+        return self.name, self.location
+
+    def values(self, deviation: np.ndarray) -> dict[str, float]:
+        """Parameter values at a deviation (p,)."""
+        return {
+            key: float(np.clip(p.nominal + d * p.scale, p.low, p.high))
+            for (key, p), d in zip(self.parameters.items(), deviation, strict=True)
+        }
+
+    def nudges(self, deviation: np.ndarray) -> np.ndarray:
+        """(p,) signed steps for slopes at a deviation, away from the nearer bound."""
+        step = np.minimum(_CURVE, 0.1 * (self.high - self.low))
+        return np.where(deviation + step > self.high, -step, step)
+
+
+def hypotheses(machine: Machine, names: Sequence[str] = ()) -> list[Hypothesis]:
+    """All hypotheses about a machine.
+
+    Args:
+        machine: the given machine.
+        names: effects to restrict them to; all if empty.
+
+    Returns:
+        One per effect and location that has parameters.
+    """
+    found = []
+    for effect in EFFECTS.values():
+        if names and effect.name not in names:
+            continue
+        for location in effect.locations(machine):
+            parameters = effect.parameters(machine, location)
+            if parameters:
+                found.append(Hypothesis(effect.name, location, parameters))
+    return found
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Hypotheses taken together, each at a deviation (p,)."""
+
+    parts: tuple[tuple[Hypothesis, np.ndarray], ...] = ()
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """(P,) all deviations, in order."""
+        return np.concatenate([d for _, d in self.parts]) if self.parts else np.zeros(0)
+
+    def at(self, deviation: np.ndarray) -> "Guess":
+        """The same hypotheses at other deviations (P,), kept inside their bounds."""
+        parts, first = [], 0
+        for hypothesis, old in self.parts:
+            part = deviation[first : first + len(old)]
+            parts.append((hypothesis, np.clip(part, hypothesis.low, hypothesis.high)))
+            first += len(old)
+        return Guess(tuple(parts))
+
+    def plus(self, hypothesis: Hypothesis, deviation: np.ndarray) -> "Guess":
+        """With one more hypothesis."""
+        return Guess((*self.parts, (hypothesis, deviation)))
+
+    def without(self, index: int) -> "Guess":
+        """Without the hypothesis at an index."""
+        return Guess(self.parts[:index] + self.parts[index + 1 :])
+
+    @property
+    def nudges(self) -> np.ndarray:
+        """(P,) signed steps for slopes."""
+        steps = [h.nudges(d) for h, d in self.parts]
+        return np.concatenate(steps) if steps else np.zeros(0)
+
+    def machine(self, nominal: Machine) -> Machine:
+        """The machine that has all these effects."""
+        for hypothesis, deviation in self.parts:
+            effect = EFFECTS[hypothesis.name]
+            nominal = effect.apply(nominal, hypothesis.location, hypothesis.values(deviation))
+        return nominal

@@ -1,0 +1,277 @@
+"""From the errors of the given model to named effects: screen, fit, add, prune, compare rivals."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from hydrotele.gap.evidence import Evidence, Fit, charge, flat
+from hydrotele.gap.hypothesis import Guess, Hypothesis
+from hydrotele.gap.tracking import COARSE
+
+ENTER = 30.0  # twice the log evidence that an effect must bring; see docs/results/gap_calibration
+MOST = 3  # effects that one search names
+_WIDE = 24  # candidates that are tried on all runs
+_SHORT = 5  # candidates that are fitted after a screening
+_RIVALS = 6  # candidates that are compared with a named effect
+_WORTH = 0.25  # of the best screened score: below it a candidate is not fitted
+Progress = Callable[[str, float], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Screened:
+    """A candidate by its signature alone.
+
+    Attributes:
+        hypothesis: the candidate.
+        score: twice the log of the evidence it would bring if its signature were a straight line.
+        gain: fall of the loss by the same token.
+        start: (p,) deviation from which to fit it.
+    """
+
+    hypothesis: Hypothesis
+    score: float
+    gain: float
+    start: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What a search leaves.
+
+    Attributes:
+        guess: the effects.
+        fit: its last fit, or None without effects.
+        ranking: the first screening, best first.
+        rivals: for each effect, fits in which another hypothesis takes its place, best first; the
+            score counts against the guess without either.
+        scores: score of each effect, counted likewise.
+        weak: a candidate that was clear but smaller than worth naming, or None.
+    """
+
+    guess: Guess
+    fit: Fit | None
+    ranking: tuple[Screened, ...]
+    rivals: tuple[tuple[Fit, ...], ...]
+    scores: tuple[float, ...]
+    weak: Fit | None
+
+
+def screen(evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis]) -> list[Screened]:
+    """Rank candidates by their signatures in the base's errors.
+
+    All are tried on the run that fits worst, the best of them on all runs.
+
+    Args:
+        evidence: with the guess as its base.
+        guess: what is already there.
+        candidates: what may be added.
+
+    Returns:
+        The candidates that were tried on all runs and are not there yet, best first.
+    """
+    taken = {h.key for h, _ in guess.parts}
+    open_ones = [h for h in candidates if h.key not in taken]
+    worst = max(evidence.tracks, key=lambda t: float(np.nanmean(t.whitened**2)))
+    if len(evidence.tracks) > 1 and len(open_ones) > _WIDE:
+        first = _rank(evidence, guess, open_ones, (worst,))
+        open_ones = [s.hypothesis for s in first[:_WIDE]]
+    return _rank(evidence, guess, open_ones, evidence.tracks)
+
+
+def _rank(evidence: Evidence, guess: Guess, candidates, tracks) -> list[Screened]:
+    def errors_of(moved: Guess) -> np.ndarray:
+        return evidence.errors(moved, COARSE, tracks)
+
+    base = errors_of(guess)
+    errors = np.concatenate([flat(track.whitened) for track in tracks])
+    present = range(len(guess.deviation))
+    here = np.zeros((len(base), 0))
+    if present:
+        columns = evidence.map(lambda i: _slope(errors_of, guess, base, i), present)
+        here = np.column_stack(columns)
+
+    def rank(hypothesis: Hypothesis) -> Screened:
+        best = None
+        for start in hypothesis.starts:
+            moved = guess.plus(hypothesis, start)
+            if np.any(start):
+                slopes = ((errors_of(moved) - base) / start[0])[:, None]
+            else:
+                own = range(len(present), len(moved.deviation))
+                slopes = np.column_stack([_slope(errors_of, moved, base, i) for i in own])
+            found = _line(hypothesis, start, here, slopes, errors, guess.deviation)
+            if best is None or found.score > best.score:
+                best = found
+        assert best
+        return best
+
+    return sorted(evidence.map(rank, candidates), key=lambda s: -s.score)
+
+
+def _slope(errors_of, guess: Guess, base: np.ndarray, index: int) -> np.ndarray:
+    moved, step = guess.deviation, guess.nudges[index]
+    moved[index] += step
+    return (errors_of(guess.at(moved)) - base) / step
+
+
+def _line(hypothesis, start, here, slopes, errors, present) -> Screened:
+    """Best deviation inside the bounds, with straight signatures, the others following."""
+    both = np.column_stack([here, slopes])
+    matrix = both.T @ both + np.eye(both.shape[1])
+    right = both.T @ errors + np.concatenate([present, np.zeros(hypothesis.size)])
+    p = here.shape[1]
+    if p:  # eliminate what is already there
+        inner = np.linalg.solve(matrix[:p, :p], np.column_stack([matrix[:p, p:], right[:p]]))
+        own = matrix[p:, p:] - matrix[p:, :p] @ inner[:, :-1]
+        pull = right[p:] - matrix[p:, :p] @ inner[:, -1]
+    else:
+        own, pull = matrix, right
+    d = np.clip(-np.linalg.solve(own, pull), hypothesis.low, hypothesis.high)
+    for _ in range(20):  # coordinate descent in the box
+        for k in range(len(d)):
+            rest = pull[k] + own[k] @ d - own[k, k] * d[k]
+            d[k] = np.clip(-rest / own[k, k], hypothesis.low[k], hypothesis.high[k])
+    gain = float(-(d @ own @ d + 2.0 * pull @ d))
+    cost = float(np.linalg.slogdet(own)[1])
+    return Screened(hypothesis, gain - cost, gain, start if np.any(start) else d)
+
+
+def search(
+    evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None
+) -> Found:
+    """Add effects as long as one brings enough, then prune, then compare rivals.
+
+    Args:
+        evidence: on the fit runs.
+        candidates: the hypotheses.
+        progress: called with (what is done, share done).
+
+    Returns:
+        What was found.
+    """
+    tell = progress or (lambda text, share: None)
+    guess, fit, weak = Guess(), None, None
+    tell("filter the runs with the given model", 0.0)
+    evidence.set_base(guess)
+    ranking: tuple[Screened, ...] = ()
+    for depth in range(MOST + 1):
+        tell(f"try every effect ({depth} named so far)", (0.1, 0.5, 0.7, 0.85)[depth])
+        ranked = screen(evidence, guess, candidates)
+        ranking = ranking or tuple(ranked)
+        best = _best_addition(evidence, guess, ranked)
+        if best is None or best.score < ENTER or depth == MOST:
+            break
+        if not worth_naming(best.guess, len(best.guess.parts) - 1):
+            weak = best
+            break
+        tell(f"fit {best.guess.parts[-1][0].name}", (0.3, 0.6, 0.75, 0.9)[depth])
+        guess, fit = settle(evidence, best.guess)
+    guess, fit = _prune(evidence, guess, fit)
+    rivals, scores = [], []
+    tell("compare rivals", 0.92)
+    for index in range(len(guess.parts)):
+        score, others = compare(evidence, guess, index, ranking, candidates)
+        scores.append(score)
+        rivals.append(others)
+    return Found(guess, fit, ranking, tuple(rivals), tuple(scores), weak)
+
+
+def _best_addition(evidence: Evidence, guess: Guess, ranked: list[Screened]) -> Fit | None:
+    """The best of the first few candidates, fitted."""
+    bar = max(0.5 * ENTER, _WORTH * ranked[0].score) if ranked else 0.0
+    short = [s for s in ranked[:_SHORT] if s.score > bar]
+    if not short:
+        return None
+    before = _loss_of(evidence, guess)
+    fits = evidence.map(
+        lambda s: evidence.fit(guess.plus(s.hypothesis, s.start), before, parallel=False, steps=4),
+        short,
+    )
+    return max(fits, key=lambda fit: fit.score)
+
+
+def _loss_of(evidence: Evidence, guess: Guess) -> float:
+    errors = evidence.errors(guess)
+    return float(errors @ errors + guess.deviation @ guess.deviation)
+
+
+def settle(evidence: Evidence, guess: Guess) -> tuple[Guess, Fit]:
+    """Fit with gains computed anew until the gains no longer matter."""
+    fit = None
+    for _ in range(3):
+        evidence.set_base(guess)
+        fit = evidence.fit(guess, 0.0)
+        moved = fit.guess.deviation - guess.deviation
+        guess = fit.guess
+        spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+        if np.all(np.abs(moved) < 0.3 * spread):
+            break
+    assert fit
+    return guess, fit
+
+
+def worth_naming(guess: Guess, index: int) -> bool:
+    """Whether an effect is as large as its least size in any parameter."""
+    hypothesis, deviation = guess.parts[index]
+    return bool(np.any(np.abs(deviation) >= hypothesis.least))
+
+
+def _prune(evidence: Evidence, guess: Guess, fit: Fit | None) -> tuple[Guess, Fit | None]:
+    """Take out effects that the others have made needless."""
+    while len(guess.parts) > 1 and fit:
+        worst, worst_score, worst_rest = -1, np.inf, guess
+        for index in range(len(guess.parts)):
+            rest = evidence.fit(guess.without(index), 0.0)
+            size = guess.parts[index][0].size
+            score = rest.loss - fit.loss - charge(_last(fit.information, guess, index), size)
+            if not worth_naming(guess, index):
+                score = min(score, 0.0)
+            if score < worst_score:
+                worst, worst_score, worst_rest = index, score, rest.guess
+        if worst_score >= ENTER:
+            break
+        del worst
+        guess, fit = settle(evidence, worst_rest)
+    return guess, fit
+
+
+def _last(information: np.ndarray, guess: Guess, index: int) -> np.ndarray:
+    """Information with the parameters of one effect moved to the end."""
+    sizes = [h.size for h, _ in guess.parts]
+    first = sum(sizes[:index])
+    own = list(range(first, first + sizes[index]))
+    order = [i for i in range(len(information)) if i not in own] + own
+    return information[np.ix_(order, order)]
+
+
+def compare(
+    evidence: Evidence, guess: Guess, index: int, ranking: Sequence[Screened],
+    candidates: Sequence[Hypothesis],
+) -> tuple[float, tuple[Fit, ...]]:  # fmt: skip
+    """What else could stand in the place of an effect.
+
+    Args:
+        evidence: with the guess as base.
+        guess: all effects.
+        index: the one to replace.
+        ranking: the first screening, for candidates and starts.
+        candidates: all hypotheses; those like the effect in its place are always compared.
+
+    Returns:
+        (score of the effect, fits with rivals in its place, best first); scores count against the
+        guess without either.
+    """
+    rest = guess.without(index)
+    taken = {h.key for h, _ in guess.parts}
+    before = _loss_of(evidence, rest)
+    own_part = guess.parts[index]
+    pool = [s for s in ranking if s.hypothesis.key not in taken and s.score > 0.0]
+    short = pool[:_RIVALS]
+    fits = evidence.map(
+        lambda s: evidence.fit(rest.plus(s.hypothesis, s.start), before, parallel=False, steps=4),
+        short,
+    )
+    own = evidence.fit(rest.plus(*own_part), before, steps=2)
+    del candidates
+    return own.score, tuple(sorted(fits, key=lambda fit: -fit.score))

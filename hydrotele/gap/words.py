@@ -1,0 +1,234 @@
+"""The verdict in plain words, as the console, the report and the README say it."""
+
+import math
+
+from hydrotele.effects import EFFECTS
+from hydrotele.gap.customary import said
+from hydrotele.gap.result import Alternative, Candidate, Estimate, Gap, GapSize, NamedEffect
+
+_PLACES = {"tool": "at the tool", "base": "of the base", "all": "of all axes"}
+_SIDES = {"head": "head side", "rod": "rod side"}
+_COUNTS = ("no place", "one place", "two places", "three places", "four places")
+_QUANTITIES = {
+    "command": "command",
+    "angle": "angle",
+    "position": "position",
+    "length": "piston position",
+    "velocity": "velocity",
+    "pressure_head": "head side pressure",
+    "pressure_rod": "rod side pressure",
+    "pressure_supply": "supply pressure",
+}
+_SLIGHT = 0.1  # of the noise: a gap below it hardly shows in single predictions
+
+_LAWS = {
+    "force": "the balance of forces",
+    "flow": "the balance of oil flows",
+    "valve": "the flow through the valve",
+    "supply": "the pump and its relief valve",
+    "geometry": "the geometry of the linkage",
+    "timing": "the timing of the signals",
+    "sensor": "what the sensors read",
+}
+
+
+def law_words(law: str) -> str:
+    """What a law is about, in plain words."""
+    return _LAWS.get(law, f"the law `{law}`")
+
+
+def channel_words(channel: str) -> str:
+    """A channel in plain words.
+
+    >>> channel_words("pressure_rod.boom"), channel_words("pressure_supply")
+    ('boom rod side pressure', 'supply pressure')
+    """
+    kind, _, axis = channel.partition(".")
+    return f"{axis} {_QUANTITIES.get(kind, kind.replace('_', ' '))}".strip()
+
+
+def effect_title(effect: NamedEffect | Alternative | Candidate) -> str:
+    """Name and place of an effect.
+
+    >>> effect_title(Alternative("pressure_offset", "boom.head", 0.5))
+    'pressure offset of the boom head side'
+    """
+    place = _PLACES.get(effect.location)
+    if place is None:
+        words = effect.location.replace(".", " ").replace("_", " ").replace("/", " ").split()
+        place = "of the " + " ".join(_SIDES.get(word, word) for word in words)
+    return f"{effect.name.replace('_', ' ')} {place}" if effect.location else effect.name
+
+
+def parameter_words(name: str, estimate: Estimate) -> str:
+    """A parameter with its interval and what the model has.
+
+    >>> parameter_words("mass", Estimate(251.2, "kg", 247.9, 254.5, 0.0))
+    'mass 251.2 kg (95 % sure between 247.9 and 254.5 kg; the model has 0 kg)'
+    """
+    s = said(estimate, name)
+    sure = f"95 % sure between {s.low} and {s.high} {s.unit}"
+    if "-" in (s.low, s.high):
+        sure = "no interval can be given"
+    model = "" if s.nominal == "-" else f"; the model has {s.nominal} {s.unit}"
+    return f"{name.replace('_', ' ')} {s.value} {s.unit} ({sure}{model})"
+
+
+def chance_words(probability: float) -> str:
+    """A probability in percent, never rounded to certainty.
+
+    >>> chance_words(0.62), chance_words(0.99999)
+    ('62 %', 'over 99.9 %')
+    """
+    if not math.isfinite(probability):
+        return "not known"
+    if probability > 0.999:
+        return "over 99.9 %"
+    return "under 0.1 %" if probability < 0.001 else f"{100 * probability:.3g} %"
+
+
+def gap_closed(size: GapSize) -> float:
+    """Part of the gap that the patch closes, at most 1; NaN where none is above the noise."""
+    above = size.before - size.noise_floor
+    return min((size.before - size.after) / above, 1.0) if above > 0 else math.nan
+
+
+def headline(gap: Gap) -> str:
+    """The verdict in one line."""
+    if gap.verdict == "no_gap":
+        return "Model and machine agree"
+    if gap.verdict == "unknown" or not gap.effects:
+        known = " and ".join(effect_title(effect) for effect in gap.effects)
+        also = f", besides {known}" if known else ""
+        return f"Model and machine disagree in a way that no known effect explains{also}"
+    titles = [effect_title(effect) for effect in gap.effects]
+    if gap.verdict == "ambiguous":
+        unsure = _unsure(gap)
+        rivals = [effect_title(a) for a in unsure.alternatives]
+        titles = [t for t in titles if t != effect_title(unsure)]
+        either = "Either " + " or ".join([effect_title(unsure), *rivals])
+        return ", and ".join([either, *titles])
+    return _capital("; ".join(map(_brief, gap.effects)))
+
+
+def verdict_words(gap: Gap) -> tuple[str, ...]:
+    """The verdict in a few sentences, one text per thought."""
+    if gap.verdict == "no_gap":
+        return (_agreement(gap),)
+    if gap.verdict == "unknown":
+        return (*_unknown(gap), *map(_effect, gap.effects), *_shrinking(gap), *_experiment(gap))
+    count = len(gap.effects)
+    where = _COUNTS[count] if count < len(_COUNTS) else f"{count} places"
+    first = f"The machine differs from its model in {where}."
+    if gap.verdict == "ambiguous":
+        first = f"{first[:-1]}, but these data do not settle which effect it is."
+    rivals = _rivals(gap) if gap.verdict == "ambiguous" else ()
+    rest = (*_shrinking(gap), *rivals, *_leftover(gap), *_experiment(gap))
+    return (first, *map(_effect, gap.effects), *rest)
+
+
+def failed_tests(gap: Gap) -> list[str]:
+    """Names of the residual tests that the final model does not pass."""
+    return [name for name, test in gap.tests.items() if not test.get("passed", True)]
+
+
+def _unsure(gap: Gap) -> NamedEffect:
+    """The effect with alternatives, or the least sure one."""
+    with_rivals = [effect for effect in gap.effects if effect.alternatives]
+    return min(with_rivals or gap.effects, key=lambda effect: effect.probability)
+
+
+def _brief(effect: NamedEffect) -> str:
+    numbers = [(name, said(e, name)) for name, e in effect.parameters.items()]
+    facts = ", ".join(f"{name.replace('_', ' ')} {s.value} {s.unit}" for name, s in numbers)
+    return f"{effect_title(effect)}: {facts}" if facts else effect_title(effect)
+
+
+def _effect(effect: NamedEffect) -> str:
+    facts = ", ".join(parameter_words(n, e) for n, e in effect.parameters.items())
+    known = EFFECTS.get(effect.name)
+    what = f"{effect_title(effect)} ({known.sentence})" if known else effect_title(effect)
+    return _capital(f"{what}: {facts}. Probability {chance_words(effect.probability)}.")
+
+
+def _agreement(gap: Gap) -> str:
+    size = gap.size
+    return (
+        f"There is no gap: on {_run(gap)}, which was not fitted, the model's predictions are off"
+        f" by {size.before:.2f} times what the sensors alone explain; a perfect model has"
+        f" {size.noise_floor:.2f}. Nothing in the model needs to change."
+    )
+
+
+def _shrinking(gap: Gap) -> tuple[str, ...]:
+    size, closed = gap.size, gap_closed(gap.size)
+    if not gap.effects:
+        return ()
+    text = (
+        f"With {'it' if len(gap.effects) == 1 else 'them'} in the model, the prediction errors on"
+        f" {_run(gap)}, which was not fitted, go from {size.before:.2f} to {size.after:.2f} times"
+        f" what the sensors alone explain (a perfect model has {size.noise_floor:.2f})"
+    )
+    if size.before - size.noise_floor < _SLIGHT:
+        return (f"{text}. The effect is weak: it hardly shows in this run.",)
+    return (f"{text}: {100 * max(closed, 0.0):.0f} % of the gap is closed.",)
+
+
+def _rivals(gap: Gap) -> tuple[str, ...]:
+    texts = []
+    for effect in gap.effects:
+        if effect.alternatives:
+            others = _listed(
+                [f"{effect_title(a)} ({chance_words(a.probability)})" for a in effect.alternatives],
+                "or",
+            )
+            texts.append(
+                f"These data cannot tell {effect_title(effect)} from {others}: they would look the"
+                " same to the sensors there are. The patched model has the first of them."
+            )
+    return tuple(texts)
+
+
+def _leftover(gap: Gap) -> tuple[str, ...]:
+    failed = failed_tests(gap)
+    if not failed:
+        return ()
+    tests = "test" if len(failed) == 1 else "tests"
+    return (
+        f"Not everything is explained: what is left fails the {tests} {_listed(failed, 'and')}.",
+    )
+
+
+def _unknown(gap: Gap) -> tuple[str, ...]:
+    unknown, size = gap.unknown, gap.size
+    first = (
+        "Model and machine disagree, and no effect that this program knows explains it: on"
+        f" {_run(gap)} the predictions are off by {size.before:.2f} times what the sensors alone"
+        f" explain (a perfect model has {size.noise_floor:.2f})."
+    )
+    if unknown is None:
+        return (first,)
+    where = (
+        f"What fails is {law_words(unknown.law)}, seen most in the {channel_words(unknown.channel)}"
+    )
+    if unknown.depends_on:
+        on = _listed([channel_words(name) for name in unknown.depends_on], "and")
+        where += f"; it changes with the {on}"
+    return (first, f"{where}.", unknown.description)
+
+
+def _experiment(gap: Gap) -> tuple[str, ...]:
+    reason = (gap.next_experiment or {}).get("reason")
+    return (f"Next experiment: {reason}",) if reason else ()
+
+
+def _run(gap: Gap) -> str:
+    return f"run {gap.before[0].run}" if gap.before else "the held-out run"
+
+
+def _listed(words: list[str], joint: str) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

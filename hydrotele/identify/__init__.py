@@ -1,0 +1,1 @@
+"""Dynamic identification from logs: signal processing first, then the force regressor."""

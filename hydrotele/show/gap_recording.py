@@ -1,0 +1,164 @@
+"""A gap as a rerun recording: measured, nominal, patched and residual on one clock.
+
+Entities: `/measured`, `/nominal` and `/patched` hold the readings and the one-step predictions,
+`/residual/nominal` and `/residual/patched` the whitened errors, `/gap` their size over time and the
+windows in which the given model is off. The machine moves as it was measured.
+"""
+
+import os
+from collections.abc import Sequence
+
+import numpy as np
+
+from hydrotele.gap.dataset import RunData
+from hydrotele.gap.patched import has_patch
+from hydrotele.gap.result import Gap, Prediction
+from hydrotele.gap.words import channel_words, headline, verdict_words
+from hydrotele.log import Log
+from hydrotele.output import replacing
+from hydrotele.show.channels import shown_unit
+from hydrotele.show.gap_layout import gap_blueprint
+from hydrotele.show.gap_windows import GapWindow, gap_windows, most_changed, windowed
+from hydrotele.show.recording import _log_machines, entity, time_column
+from hydrotele.signals import usual_unit
+
+_MEASURED, _NOMINAL, _PATCHED = (205, 210, 216), (240, 150, 0), (86, 160, 233)
+_LOUD, _FLOOR = (225, 70, 60), (120, 128, 136)
+_WIDTHS = {"measured": 3.0, "nominal": 1.4, "patched": 1.4}
+_LONGEST_ID = 180  # characters that rerun takes as an application id
+
+
+def write_gap_recording(
+    path: str | os.PathLike, gap: Gap, run: RunData, axes: Sequence[str]
+) -> None:
+    """Write the held-out run of a Gap as one `.rrd`, all or nothing.
+
+    Args:
+        path: the file to write, ending in `.rrd`.
+        gap: what the search yields.
+        run: the held-out run, whose commands are shown.
+        axes: names of the run's commands.
+
+    Raises:
+        InputError: a linkage does not close on the measured angles, or the file cannot be written.
+    """
+    import rerun as rr
+
+    before, after = gap.before[0], gap.after[0]
+    models = {"nominal": (before, _NOMINAL)}
+    if has_patch(gap):
+        models["patched"] = (after, _PATCHED)
+    windows = gap_windows(before, gap.size.noise_floor)
+    identity = f"hydrotele gap {gap.machine.name} {gap.machine.tool}"
+    with replacing(path, ".rrd") as part:
+        with rr.RecordingStream(identity.encode("ascii", "replace").decode()[:_LONGEST_ID]) as out:
+            out.save(part)
+            out.send_recording_name(f"{gap.machine.name} {before.run}: {headline(gap)}")
+            scene = _log_machines(out, {"measured": (gap.machine, _filled(before, run))})
+            _log_commands(out, run, axes)
+            _log_channels(out, models)
+            _log_sizes(out, models, gap.size.noise_floor)
+            _log_windows(out, gap, windows, before)
+            out.log("about", _about(gap), static=True)
+            worst = most_changed(before, after, 2)
+            out.send_blueprint(gap_blueprint(scene, before, models, worst))
+
+
+def _filled(prediction: Prediction, run: RunData) -> Log:
+    """The readings as a log, with missing ones interpolated so that the machine can move."""
+    columns = {}
+    for k, channel in enumerate(prediction.channels):
+        values = prediction.measured[:, k]
+        known = np.isfinite(values)
+        if known.any():
+            columns[channel] = np.interp(prediction.time, prediction.time[known], values[known])
+    units = {channel: usual_unit(channel) for channel in columns}
+    return Log(prediction.time, columns, units, run.log.metadata, run.log.source)
+
+
+def _log_commands(out, run: RunData, axes: Sequence[str]) -> None:
+    import rerun as rr
+
+    time = run.start + run.period * np.arange(len(run.command))
+    for k, axis in enumerate(axes):
+        path = f"/command/{axis}"
+        out.log(path, _style(_MEASURED, f"command {axis}", 1.4), static=True)
+        columns = rr.Scalars.columns(scalars=run.command[:, k])
+        out.send_columns(path, [time_column(time)], columns)
+
+
+def _log_channels(out, models) -> None:
+    """Readings, predictions and whitened errors, without the rows that were not measured."""
+    before, _ = models["nominal"]
+    for k, channel in enumerate(before.channels):
+        unit, factor = shown_unit(usual_unit(channel))
+        lines = {"measured": (before.measured[:, k], _MEASURED)}
+        for name, (prediction, colour) in models.items():
+            lines[name] = (prediction.predicted[:, k], colour)
+            error = prediction.whitened[:, k]
+            path = entity(f"residual/{name}", channel)
+            _send(out, path, prediction.time, error, _style(colour, f"{name} [x noise]", 1.2))
+        for name, (values, colour) in lines.items():
+            style = _style(colour, f"{name} [{unit}]", _WIDTHS[name])
+            _send(out, entity(name, channel), before.time, factor * values, style)
+
+
+def _log_sizes(out, models, floor: float) -> None:
+    """RMS over all channels in windows, of every model and of a perfect one."""
+    for name, (prediction, colour) in models.items():
+        found = windowed(prediction)
+        total = np.nansum(found.rms**2 * found.count, axis=1)
+        size = np.sqrt(total / np.maximum(found.count.sum(axis=1), 1))
+        middle = 0.5 * (found.edges[:-1] + found.edges[1:])
+        _send(out, f"/gap/{name}", middle, size, _style(colour, f"{name} [x noise]", 2.0))
+    ends = models["nominal"][0].time[[0, -1]]
+    _send(out, "/gap/perfect", ends, np.full(2, floor), _style(_FLOOR, "perfect model", 1.2))
+
+
+def _log_windows(out, gap: Gap, windows: Sequence[GapWindow], before: Prediction) -> None:
+    """A thick red line at zero where the given model is off, and a text where that begins."""
+    import rerun as rr
+
+    time = np.array([t for w in windows for t in (w.start, w.end, w.end + 1e-6)])
+    level = np.array([v for _ in windows for v in (0.0, 0.0, np.nan)])
+    name = "model as given is off"
+    out.log("/gap/window", _style(_LOUD, name, 7.0), static=True)
+    if len(time):
+        columns = rr.Scalars.columns(scalars=level)
+        out.send_columns("/gap/window", [time_column(time)], columns)
+    said = [
+        (w.start, f"{w.start:.1f} to {w.end:.1f} s: {channel_words(w.channel)} {w.rms:.1f} x noise")
+        for w in windows
+    ]
+    if gap.unknown:
+        said += [(start, f"{start:.1f} to {end:.1f} s: the unknown effect shows most")
+                 for start, end in gap.unknown.windows]  # fmt: skip
+    said = sorted(said) or [(float(before.time[0]), "no window in which the model is off")]
+    times, texts = zip(*said, strict=True)
+    levels = ["WARN" if windows or gap.unknown else "INFO"] * len(texts)
+    columns = rr.TextLog.columns(text=texts, level=levels)
+    out.send_columns("/gap/text", [time_column(np.array(times))], columns)
+
+
+def _send(out, path: str, time: np.ndarray, values: np.ndarray, style) -> None:
+    import rerun as rr
+
+    known = np.isfinite(values)
+    out.log(path, style, static=True)
+    if known.any():
+        columns = rr.Scalars.columns(scalars=values[known])
+        out.send_columns(path, [time_column(time[known])], columns)
+
+
+def _style(colour: tuple[int, int, int], name: str, width: float):
+    import rerun as rr
+
+    peaks = rr.components.AggregationPolicy.MinMax  # an average would hide them when zoomed out
+    return rr.SeriesLines(colors=colour, names=name, widths=width, aggregation_policy=peaks)
+
+
+def _about(gap: Gap):
+    import rerun as rr
+
+    lines = [f"# {headline(gap)}", *verdict_words(gap), "", *(f"- {note}" for note in gap.notes)]
+    return rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN)

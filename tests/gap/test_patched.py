@@ -1,0 +1,46 @@
+"""The patched folder is a machine like any other, and says what was changed."""
+
+import dataclasses
+
+import pytest
+import yaml
+
+from hydrotele.gap.patched import has_patch, write_patch
+from hydrotele.machine_file import load_machine
+
+
+@pytest.fixture
+def patched(tmp_path, gap_of):
+    write_patch(gap_of("named"), tmp_path)
+    return tmp_path
+
+
+def test_the_machine_comes_back_with_its_effects(patched, gap_of):
+    found = load_machine(patched)
+    kept = {"folder", "mjcf", "tools"}  # where it and its tree lie, and what else there was
+    expected = gap_of("named").patched.model_dump(exclude=kept)
+    assert found.model_dump(exclude=kept) == expected
+    assert found.links["payload"].mass == 250.0
+    assert found.axes["boom"].command_delay == 0.06
+    assert found.sensor_errors["length.boom"].offset == -0.006
+
+
+def test_its_head_says_what_was_changed(patched):
+    head = [t for t in (patched / "machine.yaml").read_text().splitlines() if t.startswith("#")]
+    assert any("payload at the tool" in line for line in head)
+    assert any("mass: 251.3 kg (95 %: 247.9 .. 254.6), was 0" in line for line in head)
+
+
+def test_effects_for_programs(patched):
+    record = yaml.safe_load((patched / "effects.yaml").read_text())
+    assert record["machine"] == "cat215" and record["verdict"] == "named"
+    (effect,) = record["effects"]
+    mass = {"value": 251.3, "unit": "kg", "ci95": [247.9, 254.6], "nominal": 0.0}
+    assert effect["name"] == "payload" and effect["parameters"] == {"mass": mass}
+
+
+def test_only_what_was_named_is_patched(gap_of):
+    wanted = {"named": True, "ambiguous": True, "no_gap": False, "unknown": False}
+    assert {verdict: has_patch(gap_of(verdict)) for verdict in wanted} == wanted
+    both = dataclasses.replace(gap_of("unknown"), effects=gap_of("named").effects)
+    assert has_patch(both)

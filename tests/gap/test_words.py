@@ -1,0 +1,104 @@
+"""The verdict says what a mechanic needs: which, where, how much, how sure, what next."""
+
+import dataclasses
+import math
+
+import pytest
+
+from hydrotele.effects import EFFECTS
+from hydrotele.gap.customary import amount, said
+from hydrotele.gap.result import Alternative, Estimate, GapSize
+from hydrotele.gap.words import effect_title, gap_closed, headline, verdict_words
+from hydrotele.machine_file import load_machine
+
+
+def text_of(gap) -> str:
+    return " ".join(verdict_words(gap))
+
+
+def test_a_named_effect_is_said_with_size_interval_and_proof(gap_of):
+    gap = gap_of("named")
+    words = text_of(gap)
+    assert headline(gap) == "Payload at the tool: mass 251.3 kg"
+    assert "between 247.9 and 254.6 kg; the model has 0 kg" in words
+    assert "over 99.9 %" in words and "run test_1, which was not fitted" in words
+    assert f"from {gap.size.before:.2f} to {gap.size.after:.2f} times" in words
+    assert EFFECTS["payload"].sentence in words
+    assert "nan" not in words and "not everything" not in words.lower()
+
+
+def test_no_gap_asks_for_no_change(gap_of):
+    gap = gap_of("no_gap")
+    assert headline(gap) == "Model and machine agree"
+    assert "Nothing in the model needs to change" in text_of(gap)
+
+
+def test_an_unknown_says_law_channel_and_dependence_in_plain_words(gap_of):
+    words = text_of(gap_of("unknown"))
+    for piece in ("balance of forces", "boom head side pressure", "boom piston position", "9 kN"):
+        assert piece in words
+    assert "pressure_head" not in words
+
+
+def test_an_ambiguity_names_both_and_the_experiment(gap_of):
+    gap = gap_of("ambiguous")
+    assert headline(gap) == "Either length offset of the boom or pin offset of the boom"
+    words = text_of(gap)
+    for piece in ("62 %", "(37 %)", "-6.10 mm", "patched model has the first", "Next experiment"):
+        assert piece in words
+
+
+def test_failed_tests_are_not_kept_quiet(gap_of):
+    tests = {"window means": {"value": 9.0, "limit": 4.0, "passed": False}}
+    gap = dataclasses.replace(gap_of("named"), tests=tests)
+    assert "what is left fails the test window means" in text_of(gap)
+
+
+def test_a_gap_within_the_noise_is_called_weak(gap_of):
+    gap = dataclasses.replace(gap_of("named"), size=GapSize(1.04, 1.0, 1.0))
+    assert "weak" in text_of(gap) and "of the gap is closed" not in text_of(gap)
+
+
+def test_closed_part():
+    assert gap_closed(GapSize(3.0, 1.1, 1.0)) == pytest.approx(0.95, abs=1e-12)  # rounding
+    assert gap_closed(GapSize(3.0, 0.99, 1.0)) == 1.0
+    assert math.isnan(gap_closed(GapSize(0.99, 0.99, 1.0)))
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "parameter", "expected"),
+    [
+        (0.0853, "1", "deadband", "8.53 %"),
+        (1.6e-11, "m^3/(s Pa)", "leakage", "9.6 L/min per 100 bar"),
+        (5e-3, "m^3/s", "pump_flow", "300 L/min"),
+        (24.5e6, "Pa", "relief_pressure", "24.5 MPa"),
+        (0.06, "s", "delay", "60 ms"),
+        (math.radians(1.0), "rad", "offset", "1 deg"),
+        (2 * math.pi * 8, "rad/s", "bandwidth", "8 Hz"),
+        (48000.0, "N s/m", "viscous", "48 kN s/m"),
+        (math.nan, "Pa", "offset", "- bar"),
+        (0.9e9, "Pa", "bulk_modulus", "900 MPa"),
+    ],
+)
+def test_customary_numbers(value, unit, parameter, expected):
+    shown = amount(value, unit, parameter)
+    assert shown == expected or (math.isnan(value) and shown.startswith("- "))
+
+
+def test_digits_follow_the_interval():
+    wide = said(Estimate(251.27, "kg", 210.0, 290.0, 0.0))
+    narrow = said(Estimate(251.27, "kg", 251.24, 251.3, 0.0))
+    assert (wide.value, narrow.value) == ("251", "251.270")
+    assert said(Estimate(1.0, "kg", math.nan, math.nan, 0.0)).low == "-"
+
+
+def test_every_effect_has_a_title_and_known_units():
+    """A unit that no mechanic uses would show up here when an effect is added."""
+    machine = load_machine("cat215", "none")
+    for effect in EFFECTS.values():
+        for location in effect.locations(machine):
+            title = effect_title(Alternative(effect.name, location, 1.0))
+            assert "_" not in title and "." not in title and title.startswith(effect.name[:3])
+            for name, facts in effect.parameters(machine, location).items():
+                size = max(abs(facts.nominal), facts.scale)
+                assert "Pa" not in amount(size, facts.unit, name).replace("MPa", ""), facts.unit

@@ -1,0 +1,130 @@
+"""The force regressor against inverse dynamics: MuJoCo's, and that of a body thrown by hand."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from hydrotele.drives import Transmission
+from hydrotele.effects.effect import changed
+from hydrotele.errors import InputError
+from hydrotele.hydraulics.laws import friction
+from hydrotele.identify.regressor import regressor
+from hydrotele.machine_file import load_machine
+from hydrotele.simulate.closure import independent_dofs, motion_basis
+from hydrotele.simulate.plant import build_plant, rest_state
+
+POSES = {
+    "none": ((0.2, 0.45, -1.6), (-1.0, -0.5, -0.7), (2.0, 0.8, -2.5)),
+    "bucket": ((0.2, 0.45, -1.6, -1.2), (-1.0, -0.4, -0.8, -2.0), (2.0, 0.8, -2.4, -0.2)),
+}
+
+
+def mujoco_forces(plant, pose, qd, qdd):
+    """Forces that MuJoCo's own inverse dynamics of the open tree asks of the drives."""
+    joints = [plant.machine.axes[name].joint for name in plant.axes]
+    data = rest_state(plant, dict(zip(joints, pose, strict=True)))
+    model, dofs = plant.model.__copy__(), independent_dofs(plant.machine, plant.model)
+    for part in ("EQUALITY", "LIMIT", "CONTACT", "ACTUATION"):
+        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}"))
+    places = [list(plant.dof).index(dof) for dof in dofs]
+    qd, qdd = np.array(qd)[places], np.array(qdd)[places]
+    basis = motion_basis(plant.machine, model, data)
+    tree, step, sides = mujoco.MjData(model), 1e-5, []
+    for sign in (1, -1):  # [s]: truncation 1e-10 and cancellation 1e-11 of the basis' rate
+        tree.qpos[:] = data.qpos
+        mujoco.mj_integratePos(model, tree.qpos, basis @ qd, sign * step)
+        sides.append(motion_basis(plant.machine, model, tree))
+    tree.qpos[:], tree.qvel[:] = data.qpos, basis @ qd
+    tree.qacc[:] = basis @ qdd + (sides[0] - sides[1]) / (2 * step) @ qd
+    mujoco.mj_inverse(model, tree)
+    moments = np.zeros((model.nu, model.nv))
+    moments[np.arange(model.nu), model.jnt_dofadr[model.actuator_trnid[:, 0]]] = 1.0
+    load, rows = basis.T @ tree.qfrc_inverse, moments @ basis
+    return np.linalg.solve(rows.T, load), rows @ qd
+
+
+def friction_of(machine, velocities):
+    found = []
+    for axis, velocity in zip(machine.hydraulic_axes.values(), velocities, strict=True):
+        f = axis.drive.friction
+        found.append(
+            friction(velocity, f.coulomb, f.stribeck_extra, f.stribeck_velocity, f.viscous,
+                     f.smoothing_velocity, f.coulomb_asymmetry, f.viscous_asymmetry)
+        )  # fmt: skip
+    return np.array(found)
+
+
+@pytest.mark.parametrize("tool", POSES)
+def test_regressor_times_parameters_is_the_inverse_dynamics_of_mujoco(tool):
+    machine = load_machine("cat215", tool)
+    machine = changed(machine, "axes.boom.cylinder.friction.coulomb_asymmetry", 0.3)
+    machine = changed(machine, "axes.stick.cylinder.friction.viscous_asymmetry", -0.2)
+    plant, rng = build_plant(machine), np.random.default_rng(4)
+    width = len(POSES[tool][0])
+    rates, accelerations = rng.uniform(-0.8, 0.8, (3, width)), rng.uniform(-3, 3, (3, width))
+    found = regressor(machine, np.array(POSES[tool]), rates, accelerations)
+    assert found.axes == tuple(plant.axes)
+    assert found.matrix.shape == (3, width, len(found.names))
+    for k, pose in enumerate(POSES[tool]):
+        forces, velocities = mujoco_forces(plant, pose, rates[k], accelerations[k])
+        expected = forces + friction_of(machine, velocities)
+        # MuJoCo's side knows the basis' rate to 1e-10 by differences; forces are 1e4 .. 1e5 N
+        error = found.matrix[k] @ found.nominal - expected
+        assert np.abs(error).max() < 1e-8 * np.abs(expected).max()
+
+
+def test_columns_are_named_with_their_units_and_values():
+    found = regressor(load_machine("cat215"), *(np.zeros((2, 3)) + v for v in (0.3, 0.0, 0.0)))
+    table = dict(zip(found.names, zip(found.units, found.nominal, strict=True), strict=True))
+    assert len(found.names) == len(set(found.names)) == len(found.units) == 7 * 10 + 3 * 3 + 2
+    assert table["mass.boom"] == ("kg", 1830.0)
+    assert table["moment_x.boom"] == ("kg m", pytest.approx(1830 * 2.3))
+    assert table["inertia_yy.boom"] == ("kg m^2", pytest.approx(5720 + 1830 * (2.3**2 + 0.2**2)))
+    assert table["inertia_xz.boom"] == ("kg m^2", pytest.approx(-1830 * 2.3 * 0.2))
+    assert table["moment_x.stick_rod"] == ("kg m", pytest.approx(-50.0))
+    assert table["coulomb.swing"] == ("N m", 4000.0)
+    assert table["viscous.stick"] == ("N s/m", 4000.0)
+    assert table["offset.boom"] == ("N", 0.0)
+
+
+def test_any_parameters_can_be_told_from_a_machine_that_has_them():
+    """A machine with other masses: its own regressor's forces come from the first one's matrix."""
+    first, rng = load_machine("cat215"), np.random.default_rng(0)
+    other = changed(changed(first, "links.stick.mass", 900.0), "links.boom.com", (2.0, 0.1, 0.3))
+    other = changed(other, "axes.boom.cylinder.rod.mass", 170.0)
+    motion = [rng.uniform(-0.5, 0.5, (20, 3)) + shift for shift in ((0, 0.3, -1.5), 0, 0)]
+    one, two = regressor(first, *motion), regressor(other, *motion)
+    assert np.abs(one.nominal - two.nominal).max() > 100
+    assert np.array_equal(one.matrix, two.matrix), "the matrix knows geometry only"
+
+
+def test_a_drive_behind_a_transmission_brings_its_inertia():
+    gear = Transmission(inertia=700.0, stiffness=1e7)
+    machine = changed(load_machine("cat215"), "axes.swing.transmission", gear)
+    motion = np.array([[0.0, 0.4, -1.5]]), np.zeros((1, 3)), np.array([[2.0, 0.0, 0.0]])
+    found, rigid = regressor(machine, *motion), regressor(load_machine("cat215"), *motion)
+    extra = found.matrix[0] @ found.nominal - rigid.matrix[0] @ rigid.nominal
+    assert extra == pytest.approx([1400.0, 0.0, 0.0], abs=1e-6)  # rounding of 1e5 N
+    assert "drive_inertia.swing" in found.names
+
+
+def test_a_plain_slide_needs_mass_times_acceleration_friction_and_offset():
+    machine = load_machine("emps")
+    rates, accelerations = np.array([[0.1], [-0.1]]), np.array([[2.0], [1.0]])
+    found = regressor(machine, np.zeros((2, 1)), rates, accelerations)
+    (axis,), (link,) = machine.axes.values(), machine.links.values()
+    drive = axis.force
+    f = drive.friction
+    dry = f.coulomb * np.sign(rates) * (1 + f.coulomb_asymmetry * np.sign(rates))
+    wet = f.viscous * rates * (1 + f.viscous_asymmetry * np.sign(rates))
+    expected = link.mass * accelerations + dry + wet + drive.offset
+    assert found.matrix @ found.nominal == pytest.approx(expected, rel=1e-9)
+
+
+def test_refuses_what_it_cannot_tell():
+    with pytest.raises(InputError, match="without a drive.*grapple_pitch"):
+        regressor(load_machine("cat215", "grapple"), *np.zeros((3, 2, 6)))
+    with pytest.raises(InputError, match="one column per axis"):
+        regressor(load_machine("cat215"), *np.zeros((3, 2, 4)))
+    with pytest.raises(InputError, match="row 1"):
+        regressor(load_machine("cat215"), *np.full((3, 2, 3), [[0.3], [np.nan]]))

@@ -1,0 +1,404 @@
+"""The blind trials: planting, hiding, judging; a small series with a stub for the workflow."""
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from hydrotele.effects import EFFECTS
+from hydrotele.machine_file import load_machine
+from tools.blind.draw import SMALLEST, Planted, draw_double, draw_effect, draw_outside, with_effects
+from tools.blind.generate import make_trial
+from tools.blind.judge import judge
+from tools.blind.motions import motions
+from tools.blind.outside import OUTSIDE
+from tools.blind.plant import record
+from tools.blind.score import closure, floor_scatter, score, share, swapped
+from tools.blind.trials import Place, Series
+from tools.blind.visibility import visibility
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "tools" / "blind_trials.py"
+MACHINE = load_machine("cat215", tool="none")
+
+
+def effect(name, location, probability=0.95, alternatives=(), value=1.0, ci=(0.5, 1.5)):
+    others = [{"name": n, "location": at, "probability": 0.3} for n, at in alternatives]
+    return {"name": name, "location": location, "probability": probability, "alternatives": others,
+            "parameters": {"mass": {"value": value, "unit": "kg", "ci95": list(ci)}}}  # fmt: skip
+
+
+def key(kind, *planted, visible=100.0, value=1.0):
+    effects = [
+        {"name": n, "location": at, "parameters": {"mass": {"value": value}},
+         "visibility": {"total_fit_runs": visible}} for n, at in planted
+    ]  # fmt: skip
+    return {"class": kind, "effects": effects}
+
+
+def result(verdict, *effects, trial="0000", before=2.0, after=1.0):
+    gap = {"before": before, "after": after, "noise_floor": 1.0}
+    answer = {"verdict": verdict, "effects": list(effects), "gap": gap, "seconds": 3.0}
+    return {"trial": trial, "answer": answer, "error": None}
+
+
+A, B, C = ("payload", "tool"), ("valve_gain", "boom"), ("valve_gain", "stick")
+
+
+@pytest.mark.parametrize(
+    ("planted", "answer", "right"),
+    [
+        (key("single", A), result("named", effect(*A)), True),
+        (key("single", B), result("named", effect(*C)), False),  # the wrong place
+        (key("single", A), result("named", effect(*A), effect(*B)), False),  # one too many
+        (key("single", A), result("ambiguous", effect(*B, 0.5, [A])), True),
+        (key("single", A), result("named", effect(*B, 0.9, [A])), False),  # not called ambiguous
+        (key("single", A), result("unknown", effect(*A)), False),
+        (key("single", A), result("no_gap"), False),
+        (key("double", A, B), result("named", effect(*A), effect(*B)), True),
+        (key("double", A, B), result("ambiguous", effect(*A), effect(*C, 0.6, [B])), True),
+        (key("double", A, B), result("ambiguous", effect(*A, 0.6, [B])), False),  # one for two
+        (key("double", A, B), result("named", effect(*A)), False),
+        (key("clean"), result("no_gap"), True),
+        (key("clean"), result("named", effect(*A)), False),
+        (key("clean"), result("unknown"), False),
+        (key("outside", ("pump_sag", "supply")), result("unknown"), True),
+        (key("outside", ("pump_sag", "supply")), result("unknown", effect(*A, 0.95)), False),
+        (key("outside", ("pump_sag", "supply")), result("unknown", effect(*A, 0.8)), True),
+        (key("outside", ("pump_sag", "supply")), result("named", effect(*A, 0.8)), False),
+        (key("single", A), {"trial": "0", "answer": None, "error": "crashed"}, False),
+    ],
+)
+def test_an_answer_is_right_or_not(planted, answer, right):
+    assert judge(planted, answer).right is right
+
+
+def perfect(count=12):
+    """Keys of several truths and the right answers to them."""
+    kinds = [key("single", A), key("single", B), key("clean"), key("outside", ("x", "y"))]
+    answers = [
+        lambda n: result("named", effect(*A), trial=n),
+        lambda n: result("ambiguous", effect(*C, 0.6, [B]), trial=n),
+        lambda n: result("no_gap", trial=n, before=1.0 + 0.001 * int(n)),
+        lambda n: result("unknown", trial=n, before=1.5, after=1.5),
+    ]
+    names = [f"{k:04d}" for k in range(4 * count)]
+    keys = {name: kinds[k % 4] for k, name in enumerate(names)}
+    return keys, {name: answers[k % 4](name) for k, name in enumerate(names)}
+
+
+def test_right_answers_score_full_and_swapped_keys_score_nothing():
+    keys, results = perfect()
+    scores = score([judge(keys[name], results[name]) for name in results])
+    for kind in ("single", "clean", "outside"):
+        assert scores["classes"][kind]["right"]["share"] == 1.0
+    assert scores["targets"]["clean falsely named"]["reached"]
+    assert scores["targets"]["outside surely named"]["value"] == 0.0
+    assert scores["targets"]["double right"]["reached"] is None
+    assert not any(v.right for v in swapped(keys, results))
+
+
+def test_weak_effects_stand_apart_and_count_in_the_total():
+    verdicts = [
+        judge(key("single", A, visible=3.0), result("no_gap")),
+        judge(key("single", A, visible=80.0), result("named", effect(*A))),
+    ]
+    single = score(verdicts)["classes"]["single"]
+    assert single["right"]["share"] == 0.5
+    assert single["right_without_weak"]["share"] == 1.0
+    assert single["weak"] == {"no_gap, wrong": 1}
+
+
+def test_coverage_counts_intervals_of_what_was_named_rightly():
+    inside = judge(key("single", A, value=1.4), result("named", effect(*A)))
+    outside = judge(key("single", A, value=1.6), result("named", effect(*A)))
+    wrong = judge(key("single", B), result("named", effect(*C)))
+    assert score([inside, inside, outside, wrong])["coverage"]["share"] == pytest.approx(
+        2 / 3, 1e-3
+    )
+
+
+def test_closure_regards_gaps_clear_of_the_floor():
+    rng = np.random.default_rng(0)
+    clean = [
+        judge(key("clean"), result("no_gap", before=1 + s)) for s in 0.01 * rng.normal(size=200)
+    ]
+    assert floor_scatter(clean) == pytest.approx(0.01, rel=0.2)  # 200 draws know it to 5 %
+    near = judge(key("single", A), result("named", effect(*A), before=1.05, after=1.05))
+    far = judge(key("single", A), result("named", effect(*A), before=2.0, after=1.02))
+    assert closure([*clean, near, far]) == pytest.approx(
+        {"median": 0.98, "tenth": 0.98, "of": 1, "floor_scatter": floor_scatter(clean)}, rel=1e-3
+    )
+
+
+def test_share_has_wilsons_interval():
+    # 95 % interval of 8 of 10 by Wilson's formula, worked by hand.
+    assert share([True] * 8 + [False] * 2) == {"share": 0.8, "of": 10, "ci95": [0.4902, 0.9433]}
+
+
+def test_drawn_sizes_are_plausible_and_never_tiny():
+    rng = np.random.default_rng(1)
+    signs, names = set(), set()
+    for _ in range(300):
+        planted = draw_effect(MACHINE, rng)
+        names.add(planted.name)
+        known = EFFECTS[planted.name].parameters(MACHINE, planted.location)
+        assert known.keys() == planted.parameters.keys()
+        for name, value in planted.parameters.items():
+            p = known[name]
+            assert p.low <= value <= p.high
+            assert abs(value - p.nominal) >= 0.999 * SMALLEST * p.least
+            signs.add((planted.name, np.sign(value - p.nominal)))
+    assert {("angle_offset", -1.0), ("angle_offset", 1.0)} <= signs
+    assert len(names) > 0.9 * len(EFFECTS)
+
+
+def test_doubles_do_not_overwrite_each_other():
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        one, two = draw_double(MACHINE, rng)
+        both = with_effects(MACHINE, [one, two])
+        assert both == with_effects(MACHINE, [two, one])
+        assert both != with_effects(MACHINE, [one]) and both != with_effects(MACHINE, [two])
+
+
+def test_motions_differ_from_trial_to_trial_and_are_of_four_kinds():
+    one, two, again = (motions(MACHINE, np.random.default_rng(s)) for s in (1, 2, 1))
+    assert one == again
+    assert [s.name for s in one] == ["fit_1", "fit_2", "fit_3", "test_1"]
+    assert all(a.pilot != b.pilot and a.seed != b.seed for a, b in zip(one, two, strict=True))
+    speeds = [np.std(np.diff(s.pilot.columns["stick"])) for s in one]
+    assert speeds[0] < speeds[1] < speeds[2]
+
+
+SHORT = 10.0  # s, enough for every effect to act
+
+
+@pytest.fixture(scope="module")
+def fast_run():
+    return motions(MACHINE, np.random.default_rng(4), SHORT)[2]
+
+
+def seen(scenario, planted):
+    runs = {scenario.name: record(MACHINE, scenario, planted)}
+    others = [p for p in planted if p.name not in OUTSIDE][1:]
+    return visibility(with_effects(MACHINE, others), runs)["total_fit_runs"]
+
+
+def test_an_unchanged_machine_shows_nothing(fast_run):
+    # Below one sigma in 6000 readings: states at equal times are of second order in the step.
+    assert seen(fast_run, []) < 1.0
+
+
+@pytest.mark.parametrize("turn", range(len(OUTSIDE)))
+def test_every_effect_outside_the_library_shows(fast_run, turn):
+    planted = draw_outside(MACHINE, turn, np.random.default_rng([3, turn]))
+    assert planted.name not in EFFECTS
+    assert seen(fast_run, [planted]) > 5.0  # what a test that knows it could tell from noise
+    assert mujoco.get_mjcb_control() is None
+
+
+def test_a_scored_bore_rubs_at_its_place_only(fast_run):
+    plain = record(MACHINE, fast_run, []).truth
+    passed = plain["length.stick"]
+
+    def change(centre):
+        parameters = {"force": 9000.0, "width": 0.05, "centre": centre}
+        run = record(MACHINE, fast_run, [Planted("bore_friction", "stick", parameters)]).truth
+        return np.abs(run["pressure_head.stick"] - plain["pressure_head.stick"]).max()
+
+    assert change(passed.mean()) > 1e5  # Pa: 9 kN on 0.015 m^2 is 6e5 Pa
+    assert change(passed.max() + 0.5) < 1.0  # ten widths away the bell is 2e-22 of 9 kN
+
+
+def test_a_key_tells_all_and_the_logs_nothing(tmp_path):
+    series = Series(seed=5, counts={"single": 0, "double": 1, "clean": 0, "outside": 0}, duration=4)
+    (tmp_path / "a" / "keys").mkdir(parents=True)
+    (tmp_path / "b" / "keys").mkdir(parents=True)
+    one, two = Place(tmp_path / "a", "0000"), Place(tmp_path / "b", "0000")
+    for place in (one, two):
+        make_trial(place, series)
+    sealed = json.loads(one.key.read_text())
+    assert len(sealed["effects"]) == 2
+    assert stat.S_IMODE(one.key.stat().st_mode) == 0o600
+    assert all(e["visibility"]["total_fit_runs"] > 0 for e in sealed["effects"])
+    assert sorted(p.name for p in one.folder.iterdir()) == ["data", "seal.txt"]
+    logs = sorted(one.data.iterdir())
+    assert [p.name for p in logs] == [f"{n}.parquet" for n in ("fit_1", "fit_2", "fit_3", "test_1")]
+    for log in logs:
+        assert log.read_bytes() == (two.data / log.name).read_bytes()
+        schema = pq.read_schema(log)
+        told = {k.decode() for k in schema.metadata if k != b"ARROW:schema"}
+        assert told == {"machine", "tool", "sample_rate_hz", "sensors", "run"}
+        assert not [name for name in schema.names if name.startswith("truth")]
+
+
+STUB = """
+import json, os, sys, time
+from pathlib import Path
+here = Path(__file__).parent
+data = Path(sys.argv[1])
+seen = {"arguments": sys.argv[1:], "environment": dict(os.environ), "folder": os.getcwd(),
+        "files": sorted(p.name for p in data.iterdir()),
+        "writable": [p.name for p in data.iterdir() if p.stat().st_mode & 0o222],
+        "beside": sorted(os.listdir(data.parent))}
+(here / f"seen_{time.time_ns()}.json").write_text(json.dumps(seen))
+print(json.dumps({"verdict": "no_gap", "effects": [], "unknown": None, "seconds": 0.1,
+                  "gap": {"metric": "", "before": 1.0, "after": 1.0, "noise_floor": 1.0}}))
+"""
+
+
+class SmallSeries:
+    """A series of short trials with a stub for the workflow."""
+
+    def __init__(self, folder: Path) -> None:
+        self.out, self.stub = folder / "series", folder / "stub" / "stub.py"
+        self.stub.parent.mkdir()
+        self.stub.write_text(STUB)
+        scratch = folder / "scratch"
+        scratch.mkdir()
+        self.environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(scratch)}
+
+    def command(self, *more: str) -> list[str]:
+        workflow = f"{sys.executable} {self.stub} {{data}} {{machine}}"
+        return [sys.executable, str(SCRIPT), "--out", str(self.out), "--workflow", workflow, *more]
+
+    def run(self, *more: str) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            self.command(*more), env=self.environment, capture_output=True, text=True, check=False
+        )
+
+    def results(self) -> dict[str, tuple[int, str]]:
+        found = sorted(self.out.glob("trials/*/result.json"))
+        return {p.parent.name: (p.stat().st_mtime_ns, p.read_text()) for p in found}
+
+
+@pytest.fixture(scope="module")
+def killed_and_resumed(tmp_path_factory):
+    """A series that was killed after its first trial and then started again."""
+    series = SmallSeries(tmp_path_factory.mktemp("blind"))
+    asked = ("--single", "1", "--clean", "1", "--seed", "7", "--duration", "4")
+    with subprocess.Popen(
+        series.command(*asked, "--jobs", "1"), env=series.environment,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    ) as process:  # fmt: skip
+        deadline = time.monotonic() + 120
+        while not series.results() and time.monotonic() < deadline:
+            assert process.poll() is None
+            time.sleep(0.02)
+        os.killpg(process.pid, signal.SIGKILL)
+    early = series.results()
+    assert len(early) == 1
+    return series, early, series.run("--jobs", "2")
+
+
+def test_a_killed_series_goes_on_where_it_was(killed_and_resumed):
+    series, early, again = killed_and_resumed
+    assert again.returncode == 0, again.stderr
+    assert "2 trials, 1 to run" in again.stdout
+    assert series.results().keys() == {"0000", "0001"}
+    assert early.items() <= series.results().items()
+    for name in ("summary.json", "summary.md", "confusion.png", "reliability.png", "closure.png"):
+        assert (series.out / name).stat().st_size > 0
+    summary = json.loads((series.out / "summary.json").read_text())
+    assert summary["classes"]["clean"]["right"]["share"] == 1.0
+    assert summary["classes"]["single"]["right"]["share"] == 0.0
+    assert "with the keys swapped" in again.stdout
+
+
+def test_the_workflow_sees_nothing_but_logs(killed_and_resumed):
+    series, _, _ = killed_and_resumed
+    folders = list(series.stub.parent.glob("seen_*.json"))
+    assert len(folders) >= 2
+    for path in folders:
+        text = path.read_text()
+        assert str(series.out) not in text and "keys" not in text
+        found = json.loads(text)
+        assert found["files"] == [f"{n}.parquet" for n in ("fit_1", "fit_2", "fit_3", "test_1")]
+        assert found["writable"] == [] and found["beside"] == ["data"]
+        assert found["arguments"][1] == "cat215"
+
+
+def test_one_trial_runs_anew_with_the_same_data(killed_and_resumed):
+    series, _, _ = killed_and_resumed
+    before, data = series.results(), (series.out / "trials/0001/data/fit_1.parquet").read_bytes()
+    done = series.run("--only", "0001", "--no-score")
+    assert done.returncode == 0, done.stderr
+    after = series.results()
+    assert after["0001"][0] > before["0001"][0] and after["0000"] == before["0000"]
+    assert (series.out / "trials/0001/data/fit_1.parquet").read_bytes() == data
+    wrong = series.run("--only", "0009")
+    assert wrong.returncode == 2 and "0000 .. 0001" in wrong.stderr
+
+
+def test_a_series_is_not_mixed_with_another(killed_and_resumed):
+    series, _, _ = killed_and_resumed
+    done = series.run("--single", "5", "--seed", "7")
+    assert done.returncode == 2 and "holds another series" in done.stderr
+
+
+def test_a_changed_key_is_found_out(killed_and_resumed):
+    series, _, _ = killed_and_resumed
+    path = series.out / "keys" / "0000.json"
+    sealed = path.read_bytes()
+    try:
+        path.write_bytes(sealed.replace(b'"class"', b'"Class"'))
+        done = series.run("--score-only")
+        assert done.returncode == 2 and "sealed" in done.stderr
+    finally:
+        path.write_bytes(sealed)
+
+
+CLUSTER = """
+import sys
+from distributed import LocalCluster
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.mark.slow
+def test_a_cluster_runs_the_trials(tmp_path):
+    pytest.importorskip("distributed", reason="needs the extra 'trials'")
+    series = SmallSeries(tmp_path)
+    script = tmp_path / "cluster.py"
+    script.write_text(CLUSTER)
+    with subprocess.Popen(
+        [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL, text=True, env=series.environment, cwd=tmp_path,
+    ) as cluster:  # fmt: skip
+        assert cluster.stdout and cluster.stdin
+        address = cluster.stdout.readline().strip()
+        done = series.run("--clean", "1", "--single", "1", "--duration", "4", "--dask", address)
+        cluster.stdin.close()
+    assert done.returncode == 0, done.stderr
+    assert len(series.results()) == 2
+    assert "single: 0.0 % of 1" in done.stdout
+
+
+@pytest.mark.slow
+def test_the_workflow_itself_answers_one_clean_and_one_planted_trial(tmp_path):
+    search = pytest.importorskip("hydrotele.gap.search", exc_type=ImportError)
+    if not hasattr(search, "find_gap"):
+        pytest.skip("there is no search yet")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    asked = ["--out", str(tmp_path / "o"), "--single", "1", "--clean", "1", "--seed", "8"]
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), *asked], env=environment, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "o" / "summary.json").read_text())
+    assert summary["failed"] == []
+    assert [row["right"] for row in summary["answers"]] == [True, True], summary["answers"]

@@ -1,0 +1,1 @@
+"""Blind trials: plant an effect in the simulated machine, hide it, let the workflow look for it."""

@@ -1,0 +1,116 @@
+"""Was one answer right? Pure functions of a key and a `gap.json` document."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+DETECTABLE = 10.0
+"""Least visibility (root of the summed squares over all samples and channels of the fit runs) at
+which an effect counts as detectable: 5 is the limit of a test that knows what to look for."""
+SURE = 0.9  # probability above which something outside the library must never be named
+
+Document = Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What one trial came to.
+
+    Attributes:
+        trial: its name.
+        kind: its class.
+        truth: `name(location)` of what was planted, sorted; empty for a clean machine.
+        answer: the same of what was named; else the verdict, or `failed`.
+        verdict: the workflow's own word, or `failed`.
+        right: whether the answer counts as right for its class.
+        found: how many of the planted effects were named, or stand in an ambiguous set.
+        visible: least visibility of what was planted, None for a clean machine.
+        weak: whether it is below what can be detected.
+        beliefs: (probability, whether it was planted) of every named effect.
+        covered: (parameter, value, low, high, truth) of every effect named rightly.
+        before: the gap of the given model on the held-out run.
+        after: that of the patched model.
+        floor: the noise floor that the workflow states.
+        seconds: what the search took.
+        error: why there is no answer.
+    """
+
+    trial: str
+    kind: str
+    truth: tuple[str, ...]
+    answer: tuple[str, ...]
+    verdict: str
+    right: bool
+    found: int
+    visible: float | None
+    weak: bool
+    beliefs: tuple[tuple[float, bool], ...]
+    covered: tuple[tuple[str, float, float, float, float], ...]
+    before: float | None
+    after: float | None
+    floor: float | None
+    seconds: float | None
+    error: str | None = None
+
+
+def judge(key: Document, result: Document) -> Verdict:
+    """Compare the key of a trial with the workflow's answer.
+
+    Args:
+        key: what was planted.
+        result: the trial's result; `answer` is a `gap.json` document or None.
+
+    Returns:
+        The verdict. Right is: for one or two effects, that exactly as many are named as were
+        planted and each planted one is among them, or in the ambiguous set of one of them; for a
+        clean machine, that the answer is `no_gap`; for an effect outside the library, that the
+        answer is `unknown` and nothing is named with more than 90 %.
+    """
+    planted = {_label(e): e for e in key["effects"]}
+    sizes = [e["visibility"]["total_fit_runs"] for e in key["effects"]]
+    visible = min(sizes, default=None)
+    answer = result["answer"] or {}
+    named = answer.get("effects", [])
+    verdict = answer.get("verdict", "failed")
+    found = _found(planted, named, verdict == "ambiguous")
+    match key["class"]:
+        case "clean":
+            right = verdict == "no_gap" and not named
+        case "outside":
+            right = verdict == "unknown" and all(e["probability"] <= SURE for e in named)
+        case _:
+            right = verdict in ("named", "ambiguous") and len(named) == len(planted) == len(found)
+    gap = answer.get("gap", {})
+    return Verdict(
+        trial=result["trial"], kind=key["class"], truth=tuple(sorted(planted)),
+        answer=tuple(sorted(map(_label, named))) or (verdict,), verdict=verdict, right=right,
+        found=len(found), visible=visible, weak=visible is not None and visible < DETECTABLE,
+        beliefs=tuple((e["probability"], _label(e) in planted) for e in named),
+        covered=tuple(x for e in named if _label(e) in planted
+                      for x in _intervals(planted[_label(e)], e)),
+        before=gap.get("before"), after=gap.get("after"), floor=gap.get("noise_floor"),
+        seconds=answer.get("seconds"), error=result["error"],
+    )  # fmt: skip
+
+
+def _label(effect: Document) -> str:
+    return f"{effect['name']}({effect['location']})"
+
+
+def _found(planted: Mapping[str, Any], named: list[Document], ambiguous: bool) -> set[str]:
+    """Planted effects that are named; in an ambiguous answer each name stands for its set."""
+    found = {_label(e) for e in named} & planted.keys()
+    if ambiguous:
+        for effect in named:
+            if _label(effect) not in planted:
+                others = {_label(a) for a in effect["alternatives"]}
+                found |= set(sorted(others & (planted.keys() - found))[:1])
+    return found
+
+
+def _intervals(planted: Document, named: Document):
+    for name, parameter in named["parameters"].items():
+        low, high = parameter["ci95"]
+        if name in planted["parameters"] and None not in (parameter["value"], low, high):
+            truth = planted["parameters"][name]["value"]
+            yield f"{_label(named)}.{name}", parameter["value"], low, high, truth
