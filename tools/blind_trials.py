@@ -40,7 +40,10 @@ def run_all(places: Sequence[Place], args: argparse.Namespace, series: Series) -
         return
     workflow = shlex.split(args.workflow) if args.workflow else WORKFLOW
     with ThreadPoolExecutor(args.jobs) as pool:
-        tasks = [pool.submit(run_trial, p, series.machine, workflow, args.limit) for p in places]
+        tasks = [
+            pool.submit(run_trial, p, series.machine, workflow, args.limit, args.threads)
+            for p in places
+        ]
         try:
             for task in as_completed(tasks):
                 yield task.result()["trial"]
@@ -56,7 +59,7 @@ def _run_on_cluster(places: Sequence[Place], args: argparse.Namespace) -> Iterat
     except ImportError:
         message = "needs dask.distributed: pip install 'hydrotele[trials]'"
         raise InputError("--dask", message) from None
-    options = ["--limit", str(args.limit)]
+    options = ["--limit", str(args.limit), "--threads", str(args.threads)]
     options += ["--workflow", args.workflow] if args.workflow else []
     with distributed.Client(args.dask, timeout="30s") as client:
         tasks = {
@@ -122,14 +125,15 @@ def main() -> int:
     parser.add_argument("--machine", help="of a new series (default cat215)")
     parser.add_argument("--duration", type=float, help="of each run [s] (default 40)")
     parser.add_argument("--jobs", type=int, default=2, help="trials at a time")
+    parser.add_argument("--threads", type=int, default=1, help="that one search may use")
     parser.add_argument("--only", nargs="+", metavar="ID", help="run these trials anew")
     parser.add_argument("--score-only", action="store_true")
     parser.add_argument("--no-score", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--limit", type=float, default=900.0, help="per answer [s]")
+    parser.add_argument("--limit", type=float, default=1800.0, help="per answer [s]")
     parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster")
     parser.add_argument(
         "--workflow",
-        help="another command that prints gap.json; {data} and {machine} are filled in",
+        help="another command that prints gap.json, with {data}, {machine}, {threads}",
     )
     args = parser.parse_args()
     try:

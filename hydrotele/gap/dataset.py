@@ -1,7 +1,7 @@
 """Logs of one machine, made ready for the filter: one clock, one set of channels, gaps marked."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +58,8 @@ class Dataset:
         heldout: the run to judge on.
         notes: what was left out or mended, one sentence each.
         sensors: name of the machine's sensors, or None if their noise is unknown.
+        drift: kind of state -> standard deviation that a row may add to it, where it was found from
+            the data; others as `tracking` has them.
     """
 
     machine: Machine
@@ -68,6 +70,7 @@ class Dataset:
     heldout: RunData
     notes: tuple[str, ...]
     sensors: str | None = None
+    drift: Mapping[str, float] = field(default_factory=dict)
 
 
 def load_dataset(

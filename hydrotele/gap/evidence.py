@@ -13,7 +13,7 @@ import numpy as np
 
 from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.gap.hypothesis import Guess
-from hydrotele.gap.tracking import STEP, Track, track_run
+from hydrotele.gap.tracking import STEP, Track, fine_enough, track_run
 from hydrotele.machine import Machine
 
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
@@ -87,45 +87,58 @@ class Evidence:
             [flat(track_run(machine, self.data, t.run, t, step).whitened) for t in tracks]
         )
 
+    def step_of(self, guess: Guess, step: float) -> float:
+        """Largest step that a guess takes where others take `step` [s].
+
+        Guesses are compared at equal steps, lest a finer one be taken for a better machine.
+        """
+        return fine_enough(guess.machine(self.data.machine), step)
+
     def map(self, function: Callable, items: Sequence) -> list:
         """Apply a function to items on the workers."""
         return list(self._pool.map(function, items))
 
-    def slopes(self, guess: Guess, errors: np.ndarray, parallel: bool = True) -> np.ndarray:
-        """(E, P) change of the errors per deviation."""
+    def slopes(
+        self, guess: Guess, errors: np.ndarray, parallel: bool = True, step: float = STEP
+    ) -> np.ndarray:
+        """(E, P) change of the errors per deviation; `step` as for the errors [s]."""
 
         def column(index: int) -> np.ndarray:
             moved = guess.deviation
-            step = guess.nudges[index]
-            moved[index] += step
-            return (self.errors(guess.at(moved)) - errors) / step
+            nudge = guess.nudges[index]
+            moved[index] += nudge
+            return (self.errors(guess.at(moved), step) - errors) / nudge
 
         columns = range(len(guess.deviation))
         found = self.map(column, columns) if parallel else [column(i) for i in columns]
         return np.column_stack(found) if found else np.zeros((len(errors), 0))
 
-    def fit(self, guess: Guess, before: float, parallel: bool = True, steps: int = _STEPS) -> Fit:
+    def fit(
+        self, guess: Guess, before: float, parallel: bool = True, steps: int = _STEPS,
+        step: float = STEP,
+    ) -> Fit:  # fmt: skip
         """Gauss-Newton with halved steps, from the guess.
 
         Args:
             guess: where to start.
             before: loss of the guess without its last part, for the gain.
             parallel: whether this may use the workers (not from within one).
-            steps: largest number of steps.
+            steps: largest number of Gauss-Newton steps.
+            step: largest step of the integrator [s].
 
         Returns:
             The fit.
         """
-        errors = self.errors(guess)
+        errors = self.errors(guess, step)
         loss = _loss(errors, guess)
-        slopes = self.slopes(guess, errors, parallel)
+        slopes = self.slopes(guess, errors, parallel, step)
         for _ in range(steps):
             d = guess.deviation
-            step = -np.linalg.solve(slopes.T @ slopes + np.eye(len(d)), slopes.T @ errors + d)
+            move = -np.linalg.solve(slopes.T @ slopes + np.eye(len(d)), slopes.T @ errors + d)
             better = None
             for shrink in (1.0, 0.5, 0.2, 0.05):
-                moved = guess.at(d + shrink * step)
-                tried = self.errors(moved)
+                moved = guess.at(d + shrink * move)
+                tried = self.errors(moved, step)
                 if (lower := _loss(tried, moved)) < loss - 1e-9:
                     better = (moved, tried, lower)
                     break
@@ -135,7 +148,7 @@ class Evidence:
             guess, errors, loss = better
             if fall < _CLOSE:
                 break
-            slopes = self.slopes(guess, errors, parallel)
+            slopes = self.slopes(guess, errors, parallel, step)
         information = slopes.T @ slopes + np.eye(slopes.shape[1])
         last = guess.parts[-1][0].size if guess.parts else 0
         return Fit(guess, loss, before - loss, charge(information, last), information)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -10,7 +11,8 @@ from hydrotele.gap.dataset import Dataset
 from hydrotele.gap.evidence import Evidence, Fit
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.floor import noise_floor
-from hydrotele.gap.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.gap.hypothesis import Hypothesis, hypotheses
+from hydrotele.gap.levels import find_levels, known_levels
 from hydrotele.gap.residuals import residual_tests, rms
 from hydrotele.gap.result import (
     Alternative,
@@ -22,12 +24,18 @@ from hydrotele.gap.result import (
     Prediction,
     Verdict,
 )
-from hydrotele.gap.search import Found, search
+from hydrotele.gap.search import MOST, Found, search
 from hydrotele.gap.tracking import Track
 from hydrotele.gap.unknown import describe_unknown
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 
+_MOST_UNFLOORED = 6  # real machines without stated noise lack more than one effect
+_NO_FLOOR = (
+    "The machine states no accuracy of its sensors: noise levels were found from the data, the"
+    " prediction errors of the given model have size 1 by construction, and it cannot be said"
+    " whether what remains is noise or another effect."
+)
 SURE = 0.95  # probability below which an effect is called ambiguous
 DOUBTFUL = 0.5  # largest probability of an effect next to an unknown one
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
@@ -58,9 +66,14 @@ def find_gap(
     del predict
     tell = progress or (lambda text, share: None)
     candidates = hypotheses(data.machine, effects)
+    floored = known_levels(data)
+    if not floored:
+        tell("find the noise levels", 0.0)
+        with ThreadPoolExecutor(jobs) as pool:
+            data = find_levels(data, pool.map)
     evidence = Evidence(data, data.fit, jobs)
     try:
-        found = search(evidence, candidates, progress)
+        found = search(evidence, candidates, progress, MOST if floored else _MOST_UNFLOORED)
         runs = (data.heldout, *data.fit)
         tell("judge on the held-out run", 0.95)
         before = evidence.track(data.machine, runs)
@@ -69,7 +82,7 @@ def find_gap(
     finally:
         evidence.close()
     floor = noise_floor(patched, data)
-    tests = residual_tests(after, data.channels)
+    tests = residual_tests(after, data.channels) if floored else {}
     failed = any(not test["passed"] for test in tests.values())
     named = _named(found, failed)
     verdict = _verdict(named, failed)
@@ -98,7 +111,7 @@ def find_gap(
         law_units=units,
         tests=tests,
         next_experiment=_experiment(data.machine, verdict, named, unknown),
-        notes=(*data.notes, *_notes(found)),
+        notes=(*data.notes, *_notes(found), *([] if floored else [_NO_FLOOR])),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 
@@ -204,6 +217,3 @@ def _notes(found: Found) -> list[str]:
         f"A trace of {hypothesis.name} at {hypothesis.location}, {told}, is smaller than worth"
         " naming and was left out."
     ]
-
-
-__all__ = ["Guess", "find_gap"]

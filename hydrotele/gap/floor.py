@@ -30,7 +30,7 @@ def clean_run(machine: Machine, data: Dataset, run: RunData, start: np.ndarray, 
     shown, states = np.empty((rows, len(data.channels))), np.empty((rows, state_size(model)))
     simulate_rows(
         model, model_space(model), start.copy(), run.command, run.period,
-        max(1, round(run.period / STEP)), shown, states,
+        max(1, round(run.period / (0.5 * STEP))), shown, states,
     )  # fmt: skip
     noise = np.random.default_rng(seed).uniform(-1.0, 1.0, shown.shape) * np.sqrt(3.0) * data.noise
     reading = np.where(np.isnan(run.reading), np.nan, shown + noise)

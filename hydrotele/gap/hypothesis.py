@@ -9,6 +9,7 @@ from hydrotele.effects import EFFECTS, Parameter
 from hydrotele.machine import Machine
 
 _CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
+_SMOOTH = ("timing", "sensor")  # laws whose effects have a slope at nominal, besides their starts
 
 
 @dataclass(frozen=True)
@@ -44,12 +45,15 @@ class Hypothesis:
 
     @property
     def starts(self) -> list[np.ndarray]:
-        """Deviations (p,) from which to search; nominal unless the effect says otherwise."""
+        """Deviations (p,) from which to search: nominal, and where the effect says so."""
         tables = [p.starts for p in self.parameters.values()]
         if not any(tables):
             return [np.zeros(self.size)]
+        slope = [np.zeros(self.size)] if EFFECTS[self.name].law in _SMOOTH else []
         only = [(p, s) for p, s in zip(self.parameters.values(), tables, strict=True) if s]
-        return [np.array([(value - p.nominal) / p.scale for p, _ in only]) for value in only[0][1]]
+        return slope + [
+            np.array([(value - p.nominal) / p.scale for p, _ in only]) for value in only[0][1]
+        ]
 
     @property
     def key(self) -> tuple[str, str]:

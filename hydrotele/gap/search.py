@@ -7,13 +7,14 @@ import numpy as np
 
 from hydrotele.gap.evidence import Evidence, Fit, charge, flat
 from hydrotele.gap.hypothesis import Guess, Hypothesis
-from hydrotele.gap.tracking import COARSE
+from hydrotele.gap.tracking import COARSE, FINE, STEP
 
 ENTER = 30.0  # twice the log evidence that an effect must bring; see docs/results/gap_calibration
 MOST = 3  # effects that one search names
 _WIDE = 24  # candidates that are tried on all runs
 _SHORT = 5  # candidates that are fitted after a screening
 _RIVALS = 6  # candidates that are compared with a named effect
+_HOPELESS = 500.0  # loss above the effect's after two steps, beyond which a rival is let go
 _WORTH = 0.25  # of the best screened score: below it a candidate is not fitted
 Progress = Callable[[str, float], None]
 
@@ -80,26 +81,33 @@ def screen(evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis]) -
 
 
 def _rank(evidence: Evidence, guess: Guess, candidates, tracks) -> list[Screened]:
-    def errors_of(moved: Guess) -> np.ndarray:
-        return evidence.errors(moved, COARSE, tracks)
-
-    base = errors_of(guess)
     errors = np.concatenate([flat(track.whitened) for track in tracks])
     present = range(len(guess.deviation))
-    here = np.zeros((len(base), 0))
-    if present:
-        columns = evidence.map(lambda i: _slope(errors_of, guess, base, i), present)
-        here = np.column_stack(columns)
+    bases: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+
+    def errors_of(moved: Guess, step: float) -> np.ndarray:
+        return evidence.errors(moved, step, tracks)
+
+    def base_of(step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Errors of the guess and their slopes, with the same steps as the candidate's."""
+        base = errors_of(guess, step)
+        columns = [_slope(errors_of, guess, base, i, step) for i in present]
+        return base, np.column_stack(columns) if columns else np.zeros((len(base), 0))
+
+    steps = {h.key: evidence.step_of(guess.plus(h, h.starts[-1]), COARSE) for h in candidates}
+    unlike = sorted(set(steps.values()))
+    bases.update(zip(unlike, evidence.map(base_of, unlike), strict=True))
 
     def rank(hypothesis: Hypothesis) -> Screened:
-        best = None
+        best, step = None, steps[hypothesis.key]
+        base, here = bases[step]
         for start in hypothesis.starts:
             moved = guess.plus(hypothesis, start)
             if np.any(start):
-                slopes = ((errors_of(moved) - base) / start[0])[:, None]
+                slopes = ((errors_of(moved, step) - base) / start[0])[:, None]
             else:
                 own = range(len(present), len(moved.deviation))
-                slopes = np.column_stack([_slope(errors_of, moved, base, i) for i in own])
+                slopes = np.column_stack([_slope(errors_of, moved, base, i, step) for i in own])
             found = _line(hypothesis, start, here, slopes, errors, guess.deviation)
             if best is None or found.score > best.score:
                 best = found
@@ -109,10 +117,10 @@ def _rank(evidence: Evidence, guess: Guess, candidates, tracks) -> list[Screened
     return sorted(evidence.map(rank, candidates), key=lambda s: -s.score)
 
 
-def _slope(errors_of, guess: Guess, base: np.ndarray, index: int) -> np.ndarray:
-    moved, step = guess.deviation, guess.nudges[index]
-    moved[index] += step
-    return (errors_of(guess.at(moved)) - base) / step
+def _slope(errors_of, guess: Guess, base: np.ndarray, index: int, step: float) -> np.ndarray:
+    moved, nudge = guess.deviation, guess.nudges[index]
+    moved[index] += nudge
+    return (errors_of(guess.at(moved), step) - base) / nudge
 
 
 def _line(hypothesis, start, here, slopes, errors, present) -> Screened:
@@ -138,14 +146,16 @@ def _line(hypothesis, start, here, slopes, errors, present) -> Screened:
 
 
 def search(
-    evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None
-) -> Found:
+    evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None,
+    most: int = MOST,
+) -> Found:  # fmt: skip
     """Add effects as long as one brings enough, then prune, then compare rivals.
 
     Args:
         evidence: on the fit runs.
         candidates: the hypotheses.
         progress: called with (what is done, share done).
+        most: how many effects to name at most.
 
     Returns:
         What was found.
@@ -154,27 +164,30 @@ def search(
     guess, fit, weak = Guess(), None, None
     tell("filter the runs with the given model", 0.0)
     evidence.set_base(guess)
-    ranking: tuple[Screened, ...] = ()
-    for depth in range(MOST + 1):
-        tell(f"try every effect ({depth} named so far)", (0.1, 0.5, 0.7, 0.85)[depth])
+    rankings: list[list[Screened]] = []
+    seen: dict[tuple[str, str], list[Screened]] = {}
+    for depth in range(most):
+        tell(f"try every effect ({depth} named so far)", 0.9 * (1.0 - 0.6**depth) + 0.05)
         ranked = screen(evidence, guess, candidates)
-        ranking = ranking or tuple(ranked)
+        rankings.append(ranked)
         best = _best_addition(evidence, guess, ranked)
-        if best is None or best.score < ENTER or depth == MOST:
+        if best is None or best.score < ENTER:
             break
         if not worth_naming(best.guess, len(best.guess.parts) - 1):
             weak = best
             break
-        tell(f"fit {best.guess.parts[-1][0].name}", (0.3, 0.6, 0.75, 0.9)[depth])
+        tell(f"fit {best.guess.parts[-1][0].name}", 0.9 * (1.0 - 0.6 ** (depth + 0.7)) + 0.05)
+        seen[best.guess.parts[-1][0].key] = ranked
         guess, fit = settle(evidence, best.guess)
     guess, fit = _prune(evidence, guess, fit)
     rivals, scores = [], []
     tell("compare rivals", 0.92)
     for index in range(len(guess.parts)):
-        score, others = compare(evidence, guess, index, ranking, candidates)
+        ranked = seen[guess.parts[index][0].key]
+        score, others = compare(evidence, guess, index, ranked)
         scores.append(score)
         rivals.append(others)
-    return Found(guess, fit, ranking, tuple(rivals), tuple(scores), weak)
+    return Found(guess, fit, tuple(rankings[0]), tuple(rivals), tuple(scores), weak)
 
 
 def _best_addition(evidence: Evidence, guess: Guess, ranked: list[Screened]) -> Fit | None:
@@ -183,16 +196,19 @@ def _best_addition(evidence: Evidence, guess: Guess, ranked: list[Screened]) -> 
     short = [s for s in ranked[:_SHORT] if s.score > bar]
     if not short:
         return None
-    before = _loss_of(evidence, guess)
-    fits = evidence.map(
-        lambda s: evidence.fit(guess.plus(s.hypothesis, s.start), before, parallel=False, steps=4),
-        short,
-    )
+
+    def fitted(candidate: Screened) -> Fit:
+        more = guess.plus(candidate.hypothesis, candidate.start)
+        step = evidence.step_of(more, COARSE)
+        before = _loss_of(evidence, guess, step)
+        return evidence.fit(more, before, parallel=False, steps=4, step=step)
+
+    fits = evidence.map(fitted, short)
     return max(fits, key=lambda fit: fit.score)
 
 
-def _loss_of(evidence: Evidence, guess: Guess) -> float:
-    errors = evidence.errors(guess)
+def _loss_of(evidence: Evidence, guess: Guess, step: float = STEP) -> float:
+    errors = evidence.errors(guess, step)
     return float(errors @ errors + guess.deviation @ guess.deviation)
 
 
@@ -201,7 +217,7 @@ def settle(evidence: Evidence, guess: Guess) -> tuple[Guess, Fit]:
     fit = None
     for _ in range(3):
         evidence.set_base(guess)
-        fit = evidence.fit(guess, 0.0)
+        fit = evidence.fit(guess, 0.0, step=FINE)
         moved = fit.guess.deviation - guess.deviation
         guess = fit.guess
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
@@ -246,32 +262,34 @@ def _last(information: np.ndarray, guess: Guess, index: int) -> np.ndarray:
 
 
 def compare(
-    evidence: Evidence, guess: Guess, index: int, ranking: Sequence[Screened],
-    candidates: Sequence[Hypothesis],
-) -> tuple[float, tuple[Fit, ...]]:  # fmt: skip
+    evidence: Evidence, guess: Guess, index: int, ranking: Sequence[Screened]
+) -> tuple[float, tuple[Fit, ...]]:
     """What else could stand in the place of an effect.
 
     Args:
         evidence: with the guess as base.
         guess: all effects.
         index: the one to replace.
-        ranking: the first screening, for candidates and starts.
-        candidates: all hypotheses; those like the effect in its place are always compared.
+        ranking: the screening in which the effect was found.
 
     Returns:
-        (score of the effect, fits with rivals in its place, best first); scores count against the
-        guess without either.
+        (score of the effect, fits with the rivals that come near it, best first); scores count
+        against the guess without either.
     """
     rest = guess.without(index)
     taken = {h.key for h, _ in guess.parts}
-    before = _loss_of(evidence, rest)
+    pool = [s for s in ranking if s.hypothesis.key not in taken and s.score > 0.0][:_RIVALS]
+
+    def glance(part: tuple[Hypothesis, np.ndarray]) -> Fit:
+        return evidence.fit(rest.plus(*part), 0.0, parallel=False, steps=2, step=COARSE)
+
     own_part = guess.parts[index]
-    pool = [s for s in ranking if s.hypothesis.key not in taken and s.score > 0.0]
-    short = pool[:_RIVALS]
-    fits = evidence.map(
-        lambda s: evidence.fit(rest.plus(s.hypothesis, s.start), before, parallel=False, steps=4),
-        short,
-    )
-    own = evidence.fit(rest.plus(*own_part), before, steps=2)
-    del candidates
+    glances = evidence.map(glance, [own_part, *((s.hypothesis, s.start) for s in pool)])
+    close = [f.guess for f in glances[1:] if f.loss < glances[0].loss + _HOPELESS]
+
+    def fitted(there: Guess) -> Fit:
+        before = _loss_of(evidence, rest, evidence.step_of(there, STEP))
+        return evidence.fit(there, before, parallel=False, steps=4)
+
+    own, *fits = evidence.map(fitted, [rest.plus(*own_part), *close])
     return own.score, tuple(sorted(fits, key=lambda fit: -fit.score))

@@ -13,7 +13,9 @@ from hydrotele.machine import Machine
 STEP = (
     2.0e-3  # s: the integrator is of second order; 1 ms changes no innovation by 2 % of its noise
 )
+FINE = 1.0e-3  # s, for final estimates, lest a delay of 0.2 ms be the integrator's
 COARSE = 4.0e-3  # s, for the covariance
+_STIFF = 1.0e-3  # s, where a transmission's spring is: with the oil it may ring at 150 Hz
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ _NUDGE = {
     "spool_rate": 1e-3, "pressure_head": 100.0, "pressure_rod": 100.0,
 }  # fmt: skip
 # What a row of 20 ms may add to a state beyond the model: integrator error, not physics.
-_DRIFT = {
+DRIFT = {
     "position": 2e-6, "drive": 2e-6, "rate": 2e-4, "drive_rate": 2e-4, "spool": 1e-4,
     "spool_rate": 1e-2, "pressure_head": 5e3, "pressure_rod": 5e3,
 }  # fmt: skip
@@ -62,6 +64,12 @@ _STARTLE = {
 def by_kind(names: list[str], table: dict[str, float]) -> np.ndarray:
     """(nz,) numbers of a table by kind of state; 0 for kinds that it lacks."""
     return np.array([table.get(name.partition(".")[0], 0.0) for name in names])
+
+
+def fine_enough(machine: Machine, step: float) -> float:
+    """A step [s], made smaller where a machine needs it."""
+    springs = any(axis.transmission for axis in machine.axes.values())
+    return min(step, _STIFF) if springs else step
 
 
 def track_run(
@@ -80,6 +88,7 @@ def track_run(
     Returns:
         The track.
     """
+    step, coarse = fine_enough(machine, step), fine_enough(machine, COARSE)
     model = reduced_model(machine, data.channels)
     space = model_space(model)
     names = state_names(machine)
@@ -89,13 +98,20 @@ def track_run(
         gains = Gains(np.zeros((rows, c, size)), np.zeros((rows, c, size)), np.zeros((rows, c)))
     else:
         gains = kept.gains
-    known = kept.names if kept else tuple(names)
+        if not set(kept.names) <= set(names):  # the model lacks a transmission that those had
+            there = [s for s, name in enumerate(kept.names) if name in names]
+            gains = Gains(
+                np.ascontiguousarray(gains.slope[:, :, there]),
+                np.ascontiguousarray(gains.gain[:, :, there]), gains.spread,
+            )  # fmt: skip
+    known = tuple(n for n in kept.names if n in names) if kept else tuple(names)
     whitened, predicted = np.empty((rows, c)), np.empty((rows, c))
     states = np.empty((rows, size))
     loss = filter_run(
         model, space, start.copy(), spread, run.command, run.command_known, run.reading,
-        data.noise**2, by_kind(names, _DRIFT) ** 2, by_kind(names, _STARTLE) ** 2, run.period,
-        max(1, round(run.period / step)), max(1, round(run.period / COARSE)),
+        data.noise**2, by_kind(names, {**DRIFT, **data.drift}) ** 2,
+        by_kind(names, _STARTLE) ** 2, run.period,
+        max(1, round(run.period / step)), max(1, round(run.period / coarse)),
         by_kind(names, _NUDGE), np.array([names.index(name) for name in known]), *gains,
         kept is None, whitened, predicted, states,
     )  # fmt: skip

@@ -23,16 +23,16 @@ _PLACES = {
         "stick": ((-2.00, -1.75), (0.32, 0.42)),
     },
     "fit_3": {
-        "swing": ((-0.6, 0.6), (0.40, 0.60)),
-        "boom": ((0.58, 0.66), (0.15, 0.22)),
+        "swing": ((-0.6, 0.6), (0.35, 0.55)),
+        "boom": ((0.58, 0.66), (0.11, 0.17)),
         "stick": ((-1.10, -0.98), (0.30, 0.38)),
     },
 }
 # Share of the time in which the motion asks for more oil than the pump gives.
-_STARVED = {"fit_2": (0.03, 0.12), "fit_3": (0.30, 0.50)}
+_STARVED = {"fit_2": (0.03, 0.12), "fit_3": (0.25, 0.45)}
 _EASY = (0.60, 0.85)  # largest demand of fit_1 as a share of the pump's flow
 _CYCLES = {"fit_1": (2.0, 7.0), "fit_2": (1.0, 6.0), "fit_3": (1.0, 5.0)}  # per 20 s at speed 1
-_SLOW_SWING = 0.6  # a loaded swing follows slower waves than the arm
+_SLOW = {"swing": 0.5, "boom": 0.7, "stick": 1.0}  # the more an axis carries, the slower its waves
 _STEPS = {  # middle, half width [rad] and speed of the steps [rad/s] in the held-out run
     "swing": ((-0.4, 0.4), 0.6, (0.15, 0.60)),
     "boom": ((0.35, 0.45), 0.28, (0.08, 0.30)),
@@ -78,7 +78,7 @@ def _waves(machine: Machine, rng, time, name: str) -> dict[str, np.ndarray]:
     """Sums of sines on a clock that starts and rests smoothly, at the speed the pump allows."""
     shape = {}
     for axis, (middle, half) in _PLACES[name].items():
-        orders = rng.uniform(*_CYCLES[name], 4) * (_SLOW_SWING if axis == "swing" else 1.0)
+        orders = rng.uniform(*_CYCLES[name], 4) * _SLOW[axis]
         size = rng.uniform(0.5, 1.0, 4) / orders**0.8
         shape[axis] = (rng.uniform(*middle), rng.uniform(*half), orders, size,
                        rng.uniform(0, 2 * np.pi, 4))  # fmt: skip

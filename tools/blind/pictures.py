@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 
 from tools.blind.judge import Verdict
-from tools.blind.score import closures, floor_scatter
+from tools.blind.score import closures, floor_scatter, share
 
 matplotlib.use("Agg")
 from matplotlib import pyplot  # noqa: E402 # the backend must be chosen first
@@ -48,8 +48,9 @@ def draw_reliability(verdicts: Sequence[Verdict], path: Path) -> None:
         inside = beliefs[(low <= beliefs[:, 0]) & (beliefs[:, 0] < high)]
         if len(inside):
             x, y = inside.mean(axis=0)
-            half = 1.96 * np.sqrt(max(y * (1 - y), 0.25 / len(inside)) / len(inside))
-            ends = [[min(half, y)], [min(half, 1 - y)]]
+            part = share(list(inside[:, 1] > 0.5))
+            assert part
+            ends = [[max(0.0, y - part["ci95"][0])], [max(0.0, part["ci95"][1] - y)]]
             axes.errorbar(x, y, ends, fmt="o", color="tab:blue", capsize=3)
             axes.annotate(f" {len(inside)}", (x, y), fontsize=8)
     axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="stated probability",
@@ -62,7 +63,7 @@ def draw_reliability(verdicts: Sequence[Verdict], path: Path) -> None:
 def draw_closure(verdicts: Sequence[Verdict], path: Path) -> None:
     """Gap above the floor on the held-out run, before and after."""
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4.5), layout="constrained")
-    least = 1e-4
+    least = 1e-4  # smaller and negative ones stand there
     for kind, colour in (("single", "tab:blue"), ("double", "tab:orange"), ("outside", "tab:red"),
                          ("clean", "tab:grey")):  # fmt: skip
         pairs = [
@@ -78,7 +79,10 @@ def draw_closure(verdicts: Sequence[Verdict], path: Path) -> None:
     left.plot(ends, 0.05 * ends, color="grey", lw=1, ls="--", label="95 % closed")
     left.axvline(10 * floor_scatter(verdicts), color="grey", lw=1, ls=":",
                  label="10 x scatter of the floor")  # fmt: skip
-    left.set(xlabel="gap above the floor before [1]", ylabel="gap above the floor after [1]")
+    left.set(
+        xlabel="gap above the floor before [1], at least 1e-4",
+        ylabel="gap above the floor after [1], at least 1e-4",
+    )
     left.legend(fontsize=8)
     values = [value for _, value in closures(verdicts)]
     right.hist(np.clip(values, -0.2, 1.2), bins=np.linspace(-0.2, 1.2, 29), color="tab:blue")

@@ -15,7 +15,8 @@ from hydrotele.errors import InputError
 from tools.blind.trials import Place, write_json
 
 ROOT = Path(__file__).resolve().parents[2]
-WORKFLOW = (sys.executable, str(ROOT / "tools" / "blind" / "workflow.py"), "{data}", "{machine}")
+_SCRIPT = ROOT / "tools" / "blind" / "workflow.py"
+WORKFLOW = (sys.executable, str(_SCRIPT), "{data}", "{machine}", "{threads}")
 _PASSED = (  # all of the environment that the workflow sees
     "PATH", "HOME", "LANG", "LC_ALL", "TMPDIR", "NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS",
     "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "MPLCONFIGDIR",
@@ -23,15 +24,20 @@ _PASSED = (  # all of the environment that the workflow sees
 
 
 def run_trial(
-    place: Place, machine: str, workflow: Sequence[str] = WORKFLOW, limit: float = 900.0
+    place: Place,
+    machine: str,
+    workflow: Sequence[str] = WORKFLOW,
+    limit: float = 1800.0,
+    threads: int = 1,
 ) -> dict[str, Any]:
     """Run one trial anew, with the data that it has or with new ones.
 
     Args:
         place: where its files lie.
         machine: name of the nominal machine.
-        workflow: command; `{data}` and `{machine}` stand for the folder of logs and the machine.
+        workflow: command; `{data}`, `{machine}` and `{threads}` are filled in.
         limit: wall time after which the workflow counts as failed [s].
+        threads: that the workflow may use.
 
     Returns:
         What the result file then holds: `answer` (a `gap.json` document, or None with the reason in
@@ -44,7 +50,10 @@ def run_trial(
         shutil.rmtree(place.data, ignore_errors=True)
         _make_data(place)
     begin = time.perf_counter()
-    answer, error = ask(place.data, machine, workflow, limit)
+    filled = {"machine": machine, "threads": threads}
+    answer, error = ask(
+        place.data, [part.format(data="{data}", **filled) for part in workflow], limit
+    )
     result = {"trial": place.trial, "answer": answer, "error": error,
               "wall_seconds": round(time.perf_counter() - begin, 2)}  # fmt: skip
     write_json(place.result, result)
@@ -59,12 +68,12 @@ def _make_data(place: Place) -> None:
 
 
 def ask(
-    data: Path, machine: str, workflow: Sequence[str], limit: float
+    data: Path, workflow: Sequence[str], limit: float
 ) -> tuple[dict[str, Any] | None, str | None]:
     """Let the workflow answer, from a read-only copy of the logs in an unnamed folder.
 
-    It sees neither the key's nor the series' folder in its arguments, environment or working
-    folder.
+    That folder takes the place of `{data}` in the command. The workflow sees neither the key's nor
+    the series' folder in its arguments, environment or working folder.
 
     Returns:
         (answer, None) or (None, what went wrong).
@@ -76,7 +85,7 @@ def ask(
             target = copy / log.name
             target.write_bytes(log.read_bytes())
             target.chmod(0o444)
-        command = [part.format(data=copy, machine=machine) for part in workflow]
+        command = [part.replace("{data}", str(copy)) for part in workflow]
         environment = {name: os.environ[name] for name in _PASSED if name in os.environ}
         try:
             done = subprocess.run(

@@ -1,0 +1,125 @@
+"""The filter: white errors of size 1 on clean data, missing readings, kept gains."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from hydrotele.dynamics.integrate import simulate_rows
+from hydrotele.dynamics.model import model_space, predicted_channels, reduced_model, state_names
+from hydrotele.effects import apply_effect
+from hydrotele.gap.dataset import Dataset, RunData
+from hydrotele.gap.tracking import track_run
+from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.log import Log
+from hydrotele.machine_file import load_machine
+
+PERIOD, ROWS = 0.02, 600
+
+
+def machine_data(machine, truth, seed=0):
+    """Readings of `truth` with the sensors' noise, as a dataset of the model `machine`."""
+    channels = predicted_channels(machine)
+    axes = tuple(actuator_order(machine))
+    time = PERIOD * np.arange(ROWS)
+    command = np.column_stack(
+        [0.4 * np.sin((1.1 + 0.4 * k) * time + k) for k in range(len(axes))]
+    )
+    model = reduced_model(truth, channels)
+    names = state_names(truth)
+    state = np.zeros(len(names))
+    for s, name in enumerate(names):
+        kind, _, place = name.partition(".")
+        if kind == "position":
+            state[s] = machine.home.get(place, 0.0)
+        elif kind.startswith("pressure"):
+            state[s] = 6e6
+    shown, states = np.empty((ROWS, len(channels))), np.empty((ROWS, len(names)))
+    simulate_rows(model, model_space(model), state, command, PERIOD, 20, shown, states)
+    noise = np.array([1e-3 if "angle" in c else 1.2e-3 if "length" in c else 1e5 for c in channels])
+    error = np.random.default_rng(seed).uniform(-1, 1, shown.shape) * np.sqrt(3) * noise
+    log = Log(time=time, columns={}, units={})
+    known = np.ones(ROWS, bool)
+    run = RunData("made", 0.0, PERIOD, command, known, shown + error, log)
+    return Dataset(machine, axes, channels, noise, (run,), run, ()), states
+
+
+@pytest.fixture(scope="module")
+def clean():
+    machine = load_machine("cat215")
+    return machine_data(machine, machine)
+
+
+def test_clean_errors_are_white_and_of_size_one(clean):
+    data, _ = clean
+    w = track_run(data.machine, data, data.heldout).whitened[50:]
+    # 550 uniform errors: the RMS scatters by sqrt(0.8/550)/2 = 0.02, the correlation by 0.043
+    assert np.sqrt(np.mean(w**2, axis=0)) == pytest.approx(np.ones(w.shape[1]), abs=0.08)
+    echo = np.mean(w[1:] * w[:-1], axis=0)
+    assert np.all(np.abs(echo) < 4.5 * 0.043)
+
+
+def test_states_are_nearer_to_the_truth_than_the_readings(clean):
+    data, truth = clean
+    found = track_run(data.machine, data, data.heldout).states
+    names = state_names(data.machine)
+    for s, name in enumerate(names):
+        if name.startswith("pressure"):
+            error = np.sqrt(np.mean((found[100:, s] - truth[100:, s]) ** 2))
+            assert error < 0.6e5, name  # of the 1e5 Pa of a reading
+
+
+def test_kept_gains_give_the_same_errors_again(clean):
+    data, _ = clean
+    first = track_run(data.machine, data, data.heldout)
+    again = track_run(data.machine, data, data.heldout, first)
+    np.testing.assert_allclose(again.whitened, first.whitened, atol=1e-9)  # rounding
+
+
+def test_missing_readings_are_left_out(clean):
+    data, _ = clean
+    reading = data.heldout.reading.copy()
+    gone = np.random.default_rng(1).random(reading.shape) < 0.3
+    gone[:5] = False
+    reading[gone] = np.nan
+    run = dataclasses.replace(data.heldout, reading=reading)
+    w = track_run(data.machine, data, run).whitened
+    assert np.array_equal(np.isnan(w), gone)
+    assert np.sqrt(np.nanmean(w[50:] ** 2)) == pytest.approx(1.0, abs=0.04)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "values"),
+    [
+        ("valve_deadband", "boom", {"deadband": 0.07}),
+        ("payload", "tool", {"mass": 200.0}),
+        ("pressure_offset", "stick.rod", {"offset": 2e5}),
+        ("angle_offset", "boom", {"offset": 0.01}),
+    ],
+)
+def test_the_true_machine_has_the_smallest_errors(clean, name, place, values):
+    nominal = load_machine("cat215")
+    truth = apply_effect(nominal, name, place, values)
+    data, _ = machine_data(nominal, truth, seed=3)
+    wrong = track_run(nominal, data, data.heldout)
+    right = track_run(truth, data, data.heldout)
+    assert right.loss < wrong.loss - 100.0  # twice the log likelihood: beyond any chance
+    assert np.sqrt(np.mean(right.whitened[50:] ** 2)) == pytest.approx(1.0, abs=0.04)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "values"),
+    [
+        ("backlash", "swing", {"gap": 0.01}),
+        ("joint_flexibility", "boom", {"compliance": 2e-8}),
+    ],
+)
+def test_a_transmission_adds_states_that_gains_without_it_can_carry(clean, name, place, values):
+    data, _ = clean
+    rigid = track_run(data.machine, data, data.heldout)
+    soft = apply_effect(data.machine, name, place, values)
+    other = track_run(soft, data, data.heldout, rigid)
+    assert np.isfinite(other.whitened).all()
+    assert np.sum(other.whitened**2) > np.sum(rigid.whitened**2) + 30.0
+    back = track_run(data.machine, data, data.heldout, track_run(soft, data, data.heldout))
+    assert np.isfinite(back.whitened).all()

@@ -1,0 +1,74 @@
+"""The workflow on measured logs whose answers are known, and on damaged copies of them."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hydrotele.gap.dataset import load_dataset
+from hydrotele.gap.find import find_gap
+from hydrotele.log import Log, load_log, save_log
+from hydrotele.machine_file import load_machine
+
+MEASURED = Path(__file__).resolve().parents[3] / "shared" / "measured"
+pytestmark = pytest.mark.skipif(not MEASURED.is_dir(), reason="../shared/measured is absent")
+
+
+def found(folder):
+    return find_gap(load_dataset([folder], load_machine("cat215")))
+
+
+def test_the_unchanged_machine_has_no_gap():
+    gap = found(MEASURED / "open_04")
+    assert gap.verdict == "no_gap"
+    assert gap.effects == () and gap.unknown is None and gap.patched is gap.machine
+    assert gap.size.before == pytest.approx(gap.size.noise_floor, abs=0.03)  # scatter 0.01
+    assert all(test["passed"] for test in gap.tests.values())
+
+
+def test_a_pressure_offset_below_one_reading_is_named():
+    gap = found(MEASURED / "open_06")
+    assert gap.verdict == "named"
+    (effect,) = gap.effects
+    assert (effect.name, effect.location) == ("pressure_offset", "boom.head")
+    offset = effect.parameters["offset"]
+    truth = yaml.safe_load((MEASURED / "answers.yaml").read_text())["open_06"]["effects"][0]
+    # three of its own standard deviations around the truth
+    assert abs(offset.value - truth["value"]) < 3 * (offset.high - offset.low) / (2 * 1.96)
+    assert gap.size.after < gap.size.before
+
+
+def test_an_effect_outside_the_library_is_unknown():
+    gap = found(MEASURED / "open_02")
+    assert gap.verdict == "unknown"
+    assert gap.unknown and "stick" in gap.unknown.channel
+    assert all(effect.probability <= 0.5 for effect in gap.effects)
+
+
+def test_missing_channels_and_rows_still_find_the_dead_band(tmp_path):
+    """No rod pressures, no lengths, no supply pressure, and 1 % of the rows dropped."""
+    for path in sorted((MEASURED / "open_05").glob("*.parquet")):
+        log = load_log(path)
+        kept = [c for c in log.columns if not c.startswith(("pressure_rod", "length", "pressure_s"))]
+        rows = [k for k in range(len(log)) if k % 100 != 57]
+        save_log(
+            Log(
+                time=log.time[rows],
+                columns={c: log[c][rows] for c in kept},
+                units={c: log.units[c] for c in kept},
+                metadata=log.metadata,
+            ),
+            tmp_path / path.name,
+        )
+    gap = found(tmp_path)
+    assert {(e.name, e.location) for e in gap.effects} == {("valve_deadband", "stick")}
+    # truth 0.085; a dead band is known to 0.001 even so
+    assert gap.effects[0].parameters["deadband"].value == pytest.approx(0.085, abs=0.002)
+
+
+def test_truth_columns_change_nothing(tmp_path):
+    """The search sees measured channels only."""
+    shutil.copytree(MEASURED / "open_04", tmp_path / "logs")
+    data = load_dataset([tmp_path / "logs"], load_machine("cat215"))
+    assert not any(c.startswith("truth") for run in data.fit for c in run.log.columns)
