@@ -182,7 +182,7 @@ def test_every_room_has_one_floor():
         ("operate/joystick.py", "from hydrotele.simulate.plant import Plant", "may not import"),
         ("simulate/plant.py", "import hydrotele.operate", "may not import"),
         ("gap/proof.py", "from hydrotele.simulate import plant", "may not import"),
-        ("gap/proof.py", "from hydrotele.identify import fit", "may not import"),
+        ("identify/proof.py", "from hydrotele.simulate import plant", "may not import"),
         ("gap/proof.py", "from hydrotele import run", "may not import"),
         ("signals.py", "from hydrotele.errors import InputError", "may not import"),
         ("run.py", "import importlib\nimportlib.import_module('hydrotele.cli')", "may not import"),

@@ -4,10 +4,26 @@ import math
 
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.dynamics.closures import close_chains
+from hydrotele.compiled import compiled, lean
+from hydrotele.dynamics.bars import move_bars, place_bars
+from hydrotele.dynamics.closures import close_chains, drift_chains
+from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.linear import factorise, solve
-from hydrotele.dynamics.motion import gather_forces
+from hydrotele.dynamics.mechanism import BAR, CLOSED, DAMPING, JOINT
+from hydrotele.dynamics.model import (
+    BACKLASH,
+    COMMAND,
+    GEAR_DAMPING,
+    GEAR_INERTIA,
+    LENGTH,
+    POSITION,
+    STIFFNESS,
+    SUPPLY,
+    V,
+    X,
+)
+from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_ROW, RATE, Q, move_links, place_links
+from hydrotele.dynamics.motion import LENGTH as BAR_LENGTH
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
@@ -22,14 +38,14 @@ _D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
 
 
-@compiled
+@lean
 def place(model, sp, z):
-    """Put the mechanism at a state: bodies, drive positions and their Jacobian rows.
+    """Put the mechanism at a state: frames, drive positions and their Jacobian rows.
 
     Args:
         model: Model.
-        sp: Space; `motion`, `q`, `rates`, `x`, `row` are written. `x` of a drive with a
-            transmission is its own position, not the load's.
+        sp: Space; `motion`, `row` and X of `drive` are written. X of a drive with a transmission
+            is its own position, not the load's.
         z: (nz,) state.
 
     Returns:
@@ -37,43 +53,50 @@ def place(model, sp, z):
 
     Source: kinematics of the closed chains.
     """
-    mech = model.mech
-    n, t = len(mech.free), len(model.transmission)
+    mech, m = model.mech, sp.motion
+    n, t, nt = len(mech.free), len(model.transmission), m.joint.shape[1]
     for f in range(n):
-        sp.q[mech.free[f]] = z[f]
-        sp.rates[mech.free[f]] = z[n + t + f]
-    close_chains(mech, sp.motion, sp.q, sp.rates)
+        m.joint[RATE, mech.free[f]] = z[n + t + f]
+    if nt > n:
+        close_chains(mech, m, z)
+    else:
+        for f in range(n):
+            m.joint[Q, f] = z[f]
+        place_links(mech.tree, mech.shape, mech.links, m.joint, m.frame, m.jacobian)
+    move_links(mech.tree, mech.links, m.joint, m.frame, m.jacobian)
+    if nt > n:
+        drift_chains(mech, m)
+    place_bars(mech.tree, mech.shape, 1 + mech.links, m.frame, m.jacobian, m.bar)
+    move_bars(mech.tree, 1 + mech.links, m.frame, m.bar)
     for i in range(len(model.gear)):
-        bar = mech.drive_bar[i]
-        if bar >= 0:
-            sp.x[i] = sp.motion.length[bar] - mech.bar_closed[bar]
-            for f in range(n):
+        bar, joint = mech.drive[i, BAR], mech.drive[i, JOINT]
+        for f in range(n):
+            if bar < 0:
+                sp.row[i, f] = m.basis[joint, f]
+            elif nt == n:
+                sp.row[i, f] = m.bar[bar, LENGTH_ROW + f]
+            else:
                 total = 0.0
-                for k in range(len(sp.q)):
-                    total += sp.motion.length_row[bar, k] * sp.motion.basis[k, f]
+                for k in range(nt):
+                    total += m.bar[bar, LENGTH_ROW + k] * m.basis[k, f]
                 sp.row[i, f] = total
-        else:
-            joint = mech.drive_joint[i]
-            sp.x[i] = sp.q[joint]
-            for f in range(n):
-                sp.row[i, f] = sp.motion.basis[joint, f]
-        if model.gear[i] >= 0:
-            sp.x[i] = z[n + model.gear[i]]
+        gear = model.gear[i]
+        sp.drive[X, i] = load_position(model, sp, i) if gear < 0 else z[n + gear]
 
 
-@compiled
+@lean
 def load_position(model, sp, i):
     """Position of a drive's load side, scalar [m] or [rad], at the state of the last `place`.
 
     Source: kinematics of the closed chains.
     """
-    bar = model.mech.drive_bar[i]
-    if bar >= 0:
-        return sp.motion.length[bar] - model.mech.bar_closed[bar]
-    return sp.q[model.mech.drive_joint[i]]
+    mech, bar = model.mech, model.mech.drive[i, BAR]
+    if bar < 0:
+        return sp.motion.joint[Q, mech.drive[i, JOINT]]
+    return sp.motion.bar[bar, BAR_LENGTH] - mech.shape[1 + mech.links + 2 * bar, CLOSED]
 
 
-@compiled
+@lean
 def accelerate(model, sp, z, dt):
     """Linearly implicit acceleration over a kick; leaves the mechanism where `place` put it.
 
@@ -92,61 +115,35 @@ def accelerate(model, sp, z, dt):
     Source: linearly implicit midpoint rule.
     """
     mech, m, user = model.mech, sp.motion, model.user
-    n, t, nt = len(mech.free), len(model.transmission), len(sp.q)
+    n, t, half = len(mech.free), len(model.transmission), 0.5 * dt
     gather_forces(mech, m)
-    half = 0.5 * dt
-    for f in range(n + t):
-        sp.force[f] = 0.0
-        for g in range(n + t):
-            sp.mass[f, g] = 0.0
-    for j in range(nt):
-        m.mass[j, j] += half * mech.damping[j]
-        m.bias[j] += mech.damping[j] * sp.rates[j]
-    if nt == n:
-        for f in range(n):
-            sp.force[f] = -m.bias[f]
-            for g in range(f + 1):
-                sp.mass[f, g] = m.mass[f, g]
-    else:
-        for j in range(nt):
-            bias = m.bias[j]
-            for k in range(nt):
-                bias += m.mass[j, k] * m.drift[k]
-            for f in range(n):
-                sp.force[f] -= m.basis[j, f] * bias
-                for k in range(nt):
-                    for g in range(f + 1):
-                        sp.mass[f, g] += m.basis[j, f] * m.mass[j, k] * m.basis[k, g]
-    rates = z[n + t : 2 * (n + t)]
+    _project(mech.joint, m.mass, m.joint, m.basis, half, n, sp.mass, sp.force)
+    first = n + t  # of the rates
     for i in range(len(model.gear)):
         u, gear = i * SLOTS, model.gear[i]
         if i < model.hydraulic:
-            a = 2 * (n + t) + 4 * i
+            a = 2 * first + 4 * i
             push = user[u + _AH] * z[a + 2] - user[u + _AR] * z[a + 3]
         else:
-            push = model.gain[i] * sp.command[i] - user[u + _OFFSET]
+            push = model.gain[i] * sp.drive[COMMAND, i] - user[u + _OFFSET]
         v = 0.0
         for f in range(n):
-            v += sp.row[i, f] * rates[f]
+            v += sp.row[i, f] * z[first + f]
+        own = v if gear < 0 else z[first + n + gear]
+        push -= actuator_friction(user, u, own)
+        slope = half * actuator_friction_slope(user, u, own)
         if gear >= 0:
-            inertia, stiffness, damping, backlash = model.transmission[gear]
-            own = rates[n + gear]
+            damping = model.transmission[gear, GEAR_DAMPING]
+            free = 0.5 * model.transmission[gear, BACKLASH]
             twist = z[n + gear] - load_position(model, sp, i)
-            free = 0.5 * backlash
-            spring = stiffness * (twist - min(free, max(-free, twist))) + damping * (own - v)
-            slope = half * damping
-            sp.mass[n + gear, n + gear] += inertia + slope + half * actuator_friction_slope(
-                user, u, own
-            )
-            sp.force[n + gear] += push - actuator_friction(user, u, own) - spring
+            twist -= min(free, max(-free, twist))
+            spring = model.transmission[gear, STIFFNESS] * twist + damping * (own - v)
+            sp.force[n + gear] += push - spring
+            inertia = model.transmission[gear, GEAR_INERTIA]
+            sp.mass[n + gear, n + gear] += inertia + slope + half * damping
+            push, slope = spring, half * damping
             for f in range(n):
-                sp.force[f] += sp.row[i, f] * spring
                 sp.mass[n + gear, f] -= slope * sp.row[i, f]
-                for g in range(f + 1):
-                    sp.mass[f, g] += slope * sp.row[i, f] * sp.row[i, g]
-            continue
-        push -= actuator_friction(user, u, v)
-        slope = half * actuator_friction_slope(user, u, v)
         for f in range(n):
             sp.force[f] += sp.row[i, f] * push
             for g in range(f + 1):
@@ -155,7 +152,38 @@ def accelerate(model, sp, z, dt):
     solve(sp.mass, sp.force)
 
 
-@compiled
+@lean
+def _project(facts, tree_mass, joint, basis, half, n, mass, force):
+    """Mass matrix and forces of the tree with its dampers, in independent coordinates."""
+    nt = len(tree_mass)
+    for f in range(len(force)):
+        force[f] = 0.0
+        for g in range(f + 1):
+            mass[f, g] = 0.0
+    for j in range(nt):
+        tree_mass[j, j] += half * facts[DAMPING, j]
+        joint[BIAS, j] += facts[DAMPING, j] * joint[RATE, j]
+    if nt == n:
+        for f in range(n):
+            force[f] = -joint[BIAS, f]
+            for g in range(f + 1):
+                mass[f, g] = tree_mass[f, g]
+        return
+    for j in range(nt):
+        bias = joint[BIAS, j]
+        for k in range(nt):
+            bias += tree_mass[j, k] * joint[DRIFT, k]
+        for f in range(n):
+            force[f] -= basis[j, f] * bias
+        for g in range(n):
+            total = 0.0
+            for k in range(nt):
+                total += tree_mass[j, k] * basis[k, g]
+            for f in range(g, n):
+                mass[f, g] += basis[j, f] * total
+
+
+@lean
 def arriving(command, row, begin, end, period, delay):
     """Mean of a held and delayed command over part of a row.
 
@@ -189,8 +217,8 @@ def arriving(command, row, begin, end, period, delay):
     return total / (stop - place)
 
 
-@compiled
-def advance(model, sp, z, command, row, period, steps, trail, keep):
+@lean
+def advance(model, sp, z, command, row, period, steps, trail):
     """Advance a state over one row of a log.
 
     Positions and pressures stand at the whole steps, rates half-way between them; at both ends of
@@ -204,83 +232,102 @@ def advance(model, sp, z, command, row, period, steps, trail, keep):
         row: index of the row to cross.
         period: length of a row, scalar [s].
         steps: steps per row.
-        trail: (>= steps (row + 1) + 1, c) values of the channels with a lag at every step.
-        keep: whether to write `trail`.
+        trail: (>= steps (row + 1) + 1, c) written: what the channels with a lag show at every
+            step; (0, c) keeps nothing.
 
     Returns:
         Nothing.
 
     Source: velocity Verlet; circuit: `hydraulics.circuit.step_circuit`.
     """
-    n, t = len(model.mech.free), len(model.transmission)
-    total, nu, count = n + t, len(model.gear), model.hydraulic
-    h = period / steps
-    act = z[2 * total :]
-    for i in range(nu):
-        sp.command[i] = arriving(command[:, i], row, 0.0, h, period, model.delay[i])
+    total = len(model.mech.free) + len(model.transmission)
+    nu, count, h = len(model.gear), model.hydraulic, period / steps
+    act, drive = z[2 * total :], sp.drive
+    _take_commands(model, drive, command, row, 0.0, h, period)
     place(model, sp, z)
     accelerate(model, sp, z, 0.5 * h)
     for f in range(total):
         z[total + f] += 0.5 * h * sp.force[f]
     for step in range(steps):
+        _take_commands(model, drive, command, row, step * h, (step + 1) * h, period)
         for i in range(nu):
-            sp.v[i] = sp.x[i]
-            if step:
-                sp.command[i] = arriving(
-                    command[:, i], row, step * h, (step + 1) * h, period, model.delay[i]
-                )
+            drive[V, i] = drive[X, i]
         for f in range(total):
             z[f] += h * z[total + f]
         place(model, sp, z)
         for i in range(nu):
-            sp.v[i] = (sp.x[i] - sp.v[i]) / h
-        if count:
+            drive[V, i] = (drive[X, i] - drive[V, i]) / h
+        if count > 0:
             step_circuit(
-                model.user, 0, count, act, sp.command, sp.x, sp.v, h, sp.act_dot, sp.scratch
-            )
+                model.user, 0, count, act, drive[COMMAND], drive[X], drive[V], h, sp.act_dot,
+                sp.scratch,
+            )  # fmt: skip
             for k in range(4 * count):
                 act[k] += h * sp.act_dot[k]
         kick = h if step < steps - 1 else 0.5 * h
         accelerate(model, sp, z, kick)
         for f in range(total):
             z[total + f] += kick * sp.force[f]
-        if keep:
-            _write_trail(model, sp, z, trail[row * steps + step + 1])
+        if len(trail) > 0:
+            write_trail(model, sp, z, trail[row * steps + step + 1])
 
 
-@compiled
-def _write_trail(model, sp, z, out):
-    first = 2 * (len(model.mech.free) + len(model.transmission))
+@lean
+def _take_commands(model, drive, command, row, begin, end, period):
+    """Commands that arrive over part of a row."""
+    for i in range(len(model.delay)):
+        if model.delay[i] == 0.0:
+            drive[COMMAND, i] = command[row, i]
+        else:
+            drive[COMMAND, i] = arriving(command[:, i], row, begin, end, period, model.delay[i])
+
+
+@lean
+def write_trail(model, sp, z, out):
+    """Keep what the channels with a lag show in a state, after `place`.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state.
+        out: (c,) written where a channel has a lag [channel's unit].
+
+    Returns:
+        Nothing.
+
+    Source: nominal model, "Sensors".
+    """
     for c in range(len(model.kind)):
         if model.lag[c] > 0.0:
-            out[c] = _plain(model, sp, z, c, first)
+            out[c] = _shown(model, sp, z, c)
 
 
-@compiled
-def _plain(model, sp, z, c, first):
-    """What an ideal sensor of a channel other than the supply shows, after `place`."""
+@lean
+def _shown(model, sp, z, c):
+    """What an ideal sensor of a channel shows, after `place`."""
     kind, i = model.kind[c], model.drive[c]
-    if kind == 0:
-        return sp.q[model.mech.drive_joint[i]]
-    if kind == 1:
-        return sp.x[i]
-    return z[first + 4 * i + kind]
+    if kind == POSITION:
+        return sp.motion.joint[Q, model.mech.drive[i, JOINT]]
+    if kind == LENGTH:
+        return sp.drive[X, i]
+    if kind == SUPPLY:
+        return supply_of(model, sp, z)
+    return z[len(z) - 4 * (model.hydraulic - i) + kind]
 
 
-@compiled
+@lean
 def supply_of(model, sp, z):
     """Supply pressure in a state, scalar [Pa].
 
     Source: nominal model, "Supply".
     """
-    first = 2 * (len(model.mech.free) + len(model.transmission))
-    act = z[first:]
-    open_ports(model.user, act, act, sp.scratch, 0, model.hydraulic, 0.0, act)
-    user = model.user
-    return supply_pressure(sp.scratch, model.hydraulic, user[_D], user[_RELIEF], user[_PUMP])
+    user, count = model.user, model.hydraulic
+    act = z[len(z) - 4 * count :]
+    open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
+    return supply_pressure(sp.scratch, count, user[_D], user[_RELIEF], user[_PUMP])
 
 
-@compiled
+@lean
 def read_channels(model, sp, z, row, steps, h, trail, out):
     """What the sensors show in a state, without noise.
 
@@ -291,7 +338,7 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
         row: index of the row, for channels with a lag.
         steps: steps per row.
         h: step, scalar [s].
-        trail: (rows, c) as in `advance`.
+        trail: as `advance` writes it; (0, c) shows channels with a lag without it.
         out: (c,) written [channel's unit].
 
     Returns:
@@ -300,11 +347,8 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
     Source: nominal model, "Sensors".
     """
     place(model, sp, z)
-    first = 2 * (len(model.mech.free) + len(model.transmission))
     for c in range(len(model.kind)):
-        if model.kind[c] == 4:
-            value = supply_of(model, sp, z)
-        elif model.lag[c] > 0.0 and row >= 0:
+        if model.lag[c] > 0.0 and len(trail) > 0:
             back = max(0.0, row * steps - model.lag[c] / h)
             low = int(math.floor(back))
             part = back - low
@@ -312,7 +356,7 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
             if part > 0.0:
                 value += part * (trail[low + 1, c] - value)
         else:
-            value = _plain(model, sp, z, c, first)
+            value = _shown(model, sp, z, c)
         out[c] = model.scale[c] * value + model.offset[c]
 
 
@@ -338,9 +382,10 @@ def simulate_rows(model, sp, z, command, period, steps, out, states):
     rows = len(command)
     trail = np.zeros((rows * steps + 1, len(model.kind)))
     place(model, sp, z)
-    _write_trail(model, sp, z, trail[0])
+    write_trail(model, sp, z, trail[0])
     for row in range(rows):
         read_channels(model, sp, z, row, steps, period / steps, trail, out[row])
-        states[row] = z
+        for s in range(len(z)):
+            states[row, s] = z[s]
         if row < rows - 1:
-            advance(model, sp, z, command, row, period, steps, trail, True)
+            advance(model, sp, z, command, row, period, steps, trail)

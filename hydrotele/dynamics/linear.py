@@ -2,22 +2,22 @@
 
 import math
 
-from hydrotele.compiled import compiled
+from hydrotele.compiled import lean
 
 
-@compiled
+@lean
 def factorise(matrix):
     """Replace a symmetric positive definite matrix by its lower Cholesky factor.
 
     Args:
-        matrix: (n, n), overwritten in its lower triangle.
+        matrix: (>= n, n), overwritten in its lower triangle; further rows are left alone.
 
     Returns:
         Nothing.
 
     Source: Golub and Van Loan, Matrix Computations, Algorithm 4.2.1.
     """
-    for i in range(matrix.shape[0]):
+    for i in range(matrix.shape[1]):
         for j in range(i + 1):
             total = matrix[i, j]
             for k in range(j):
@@ -25,12 +25,12 @@ def factorise(matrix):
             matrix[i, j] = math.sqrt(total) if i == j else total / matrix[j, j]
 
 
-@compiled
+@lean
 def solve(factor, right):
     """Solve with a Cholesky factor, in place.
 
     Args:
-        factor: (n, n) result of `factorise`.
+        factor: (>= n, n) result of `factorise`.
         right: (n,) right-hand side, overwritten by the solution.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The mechanical part of a Machine as flat arrays: links, cylinder bars, closures, drives."""
+"""The mechanical part of a Machine as tables: links, cylinder bars, pins of closures, drives."""
 
 from typing import NamedTuple
 
@@ -8,57 +8,49 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.loops import following_joints
 from hydrotele.machine import Machine
 
-WELD, HINGE, SLIDE = 0, 1, 2
+WELD, HINGE, SLIDE, TUBE, ROD, PIN = range(6)
 _KINDS = {"hinge": HINGE, "slide": SLIDE}
+
+PARENT, KIND, COORDINATE, REACH = range(4)  # columns of `tree`
+POSITION, AXIS, COM, INERTIA, MASS, CLOSED, SHAPE = 0, 3, 6, 9, 12, 13, 14  # columns of `shape`
+DAMPING, HOME = range(2)  # rows of `joint`
+BAR, JOINT = range(2)  # columns of `drive`
 
 
 class Mechanism(NamedTuple):
-    """Bodies 0 = world, 1 .. l = links, then tube and rod of every bar; N tree coordinates.
+    """Frames 0 = world, 1 .. l = links, tube and rod of every bar, both pins of every closure.
 
     Attributes:
-        parent: (1 + l,) body of the parent, -1 for the world.
-        kind: (1 + l,) WELD, HINGE or SLIDE.
-        coordinate: (1 + l,) tree coordinate of the joint, -1 without one.
-        position: (1 + l, 3) of the link's frame in its parent's [m].
-        axis: (1 + l, 3) of the joint.
-        damping: (N,) of the joints [N m s/rad] or [N s/m].
-        mass: (b,) of all bodies [kg].
-        com: (b, 3) in the body's frame [m].
-        inertia: (b, 3) about the centre of mass, axes of the body's frame [kg m^2].
-        bar_links: (bars, 2) bodies of base pin and rod pin.
-        bar_pins: (bars, 2, 3) the pins in their bodies' frames [m].
-        bar_closed: (bars,) pin-to-pin length at piston displacement 0 [m].
-        closure_links: (closures, 2) bodies.
-        closure_points: (closures, 2, 3) the points in their bodies' frames [m].
+        tree: (f, 4) of every frame: PARENT (a tube's is the link at its base pin, a rod's the one
+            at its rod pin), KIND, tree COORDINATE of its joint (-1 without one), REACH (only tree
+            coordinates below it move the frame).
+        shape: (f, SHAPE) of every frame: POSITION in its parent's [m] (of tube and rod: their
+            pins), AXIS of its joint, COM [m] and INERTIA about it [kg m^2] in its own axes, MASS
+            [kg], CLOSED (of a tube) pin-to-pin length at piston displacement 0 [m].
+        links: l, number of links.
+        bars: number of bars.
+        joint: (2, N) of every tree coordinate: DAMPING [N m s/rad] or [N s/m], HOME [rad] or [m].
         free: (n,) tree coordinates that are independent.
         bound: (N - n,) tree coordinates that the closures determine.
-        home: (N,) tree coordinates at home [rad] or [m].
         gravity: (3,) [m/s^2].
-        drive_bar: (nu,) bar of every drive, -1 if it acts on its joint itself.
-        drive_joint: (nu,) tree coordinate of every drive's joint.
-
+        drive: (nu, 2) of every drive: BAR, -1 if it acts on its joint itself, and JOINT, the tree
+            coordinate.
     """
 
-    parent: np.ndarray
-    kind: np.ndarray
-    coordinate: np.ndarray
-    position: np.ndarray
-    axis: np.ndarray
-    damping: np.ndarray
-    mass: np.ndarray
-    com: np.ndarray
-    inertia: np.ndarray
-    bar_links: np.ndarray
-    bar_pins: np.ndarray
-    bar_closed: np.ndarray
-    closure_links: np.ndarray
-    closure_points: np.ndarray
+    tree: np.ndarray
+    shape: np.ndarray
+    links: int
+    bars: int
+    joint: np.ndarray
     free: np.ndarray
     bound: np.ndarray
-    home: np.ndarray
     gravity: np.ndarray
-    drive_bar: np.ndarray
-    drive_joint: np.ndarray
+    drive: np.ndarray
+
+    @property
+    def bodies(self) -> int:
+        """Number of frames with a mass, and the world, which come first."""
+        return 1 + self.links + 2 * self.bars
 
 
 def body_names(machine: Machine) -> list[str]:
@@ -74,72 +66,76 @@ def coordinate_names(machine: Machine) -> list[str]:
 
 
 def mechanism(machine: Machine) -> Mechanism:
-    """Arrays of a machine's mechanism.
+    """Tables of a machine's mechanism.
 
     Args:
         machine: the machine. The pins of a cylinder are normal to its base link's x-z plane, as in
             the MuJoCo plant.
 
     Returns:
-        The arrays.
+        The tables.
     """
-    order = _tree_order(machine)
+    order, joints = _tree_order(machine), coordinate_names(machine)
     index = {"world": 0, **{name: 1 + i for i, name in enumerate(order)}}
-    joints = coordinate_names(machine)
-    links = [machine.links[name] for name in order]
-    bars = [n for n in actuator_order(machine) if machine.axes[n].cylinder]
-    cylinders = [c for n in bars if (c := machine.axes[n].cylinder)]
-    following = following_joints(machine)
-    kinds = [_KINDS[link.joint.type] if link.joint else WELD for link in links]
+    tree, shape = [(-1, WELD, -1)], [_row()]
+    for name in order:
+        link = machine.links[name]
+        kind = _KINDS[link.joint.type] if link.joint else WELD
+        coordinate = joints.index(link.joint.name) if link.joint else -1
+        tree.append((index[link.parent], kind, coordinate))
+        axis = link.joint.axis if link.joint else (0.0, 0.0, 1.0)
+        shape.append(_row(link.position, axis, link.com, link.inertia, link.mass))
     drives = actuator_order(machine)
-    ends = [(c.base_pin, c.rod_pin) for c in cylinders]
-    closures = [(c.a, c.b) for c in machine.closures.values()]
+    bars = [name for name in drives if machine.axes[name].cylinder]
+    for c in (machine.axes[name].cylinder for name in bars):
+        assert c
+        ends = (TUBE, c.base_pin, c.tube, c.tube.com), (ROD, c.rod_pin, c.rod, -c.rod.com)
+        for kind, pin, bar, com in ends:
+            tree.append((index[pin.link], kind, -1))
+            row = _row(pin.position, com=(com, 0, 0), inertia=bar.inertia, mass=bar.mass)
+            shape.append(row)
+        shape[-2][CLOSED] = c.closed_length
+    for pin in (pin for closure in machine.closures.values() for pin in (closure.a, closure.b)):
+        tree.append((index[pin.link], PIN, -1))
+        shape.append(_row(pin.position))
+    following = following_joints(machine)
     return Mechanism(
-        parent=np.array([-1, *(index[link.parent] for link in links)]),
-        kind=np.array([WELD, *kinds]),
-        coordinate=np.array(
-            [-1, *(joints.index(link.joint.name) if link.joint else -1 for link in links)]
-        ),
-        position=_table([(0, 0, 0), *(link.position for link in links)]),
-        axis=_table([(0, 0, 1), *(k.joint.axis if k.joint else (0, 0, 1) for k in links)]),
-        damping=np.array([link.joint.damping for link in links if link.joint], float),
-        mass=np.array([0, *(k.mass for k in links), *(m for c in cylinders for m in _masses(c))]),
-        com=_table(
-            [(0, 0, 0), *(k.com for k in links), *(m for c in cylinders for m in _centres(c))]
-        ),
-        inertia=_table(
+        tree=_with_reach(np.array(tree, int)),
+        shape=np.array(shape),
+        links=len(order),
+        bars=len(bars),
+        joint=np.array(
             [
-                (0, 0, 0),
-                *(k.inertia for k in links),
-                *(m for c in cylinders for m in (c.tube.inertia, c.rod.inertia)),
-            ]
-        ),
-        bar_links=np.array([[index[p.link] for p in pair] for pair in ends], int).reshape(-1, 2),
-        bar_pins=np.array([[p.position for p in pair] for pair in ends], float).reshape(-1, 2, 3),
-        bar_closed=np.array([c.closed_length for c in cylinders], float),
-        closure_links=np.array([[index[p.link] for p in c] for c in closures], int).reshape(-1, 2),
-        closure_points=np.array([[p.position for p in c] for c in closures], float).reshape(
-            -1, 2, 3
+                [machine.joints[name].damping for name in joints],
+                [machine.home.get(name, 0.0) for name in joints],
+            ],
+            float,
         ),
         free=np.array([i for i, name in enumerate(joints) if name not in following], int),
         bound=np.array([i for i, name in enumerate(joints) if name in following], int),
-        home=np.array([machine.home.get(name, 0.0) for name in joints], float),
         gravity=np.array(machine.gravity, float),
-        drive_bar=np.array([bars.index(n) if n in bars else -1 for n in drives], int),
-        drive_joint=np.array([joints.index(machine.axes[n].joint) for n in drives], int),
+        drive=np.array(
+            [
+                (bars.index(name) if name in bars else -1, joints.index(machine.axes[name].joint))
+                for name in drives
+            ],
+            int,
+        ).reshape(-1, 2),
     )
 
 
-def _masses(cylinder):
-    return cylinder.tube.mass, cylinder.rod.mass
+def _row(position=(0, 0, 0), axis=(0, 0, 1), com=(0, 0, 0), inertia=(0, 0, 0), mass=0.0):
+    return np.array([*position, *axis, *com, *inertia, mass, 0.0], float)
 
 
-def _centres(cylinder):
-    return (cylinder.tube.com, 0, 0), (-cylinder.rod.com, 0, 0)
-
-
-def _table(rows) -> np.ndarray:
-    return np.array(rows, float).reshape(-1, 3)
+def _with_reach(tree: np.ndarray) -> np.ndarray:
+    """`tree` with the column REACH; bars share that of their ends, parents come first."""
+    reach = np.zeros(len(tree), int)
+    for i, (parent, _, coordinate) in enumerate(tree[1:], start=1):
+        reach[i] = max(reach[parent], coordinate + 1)
+    for tube in np.flatnonzero(tree[:, KIND] == TUBE):
+        reach[tube : tube + 2] = max(reach[tube : tube + 2])
+    return np.column_stack([tree, reach])
 
 
 def _tree_order(machine: Machine) -> list[str]:

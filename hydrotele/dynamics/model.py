@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.dynamics.mechanism import Mechanism, mechanism
+from hydrotele.dynamics.mechanism import Mechanism, coordinate_names, mechanism
 from hydrotele.dynamics.motion import Motion, motion_space
 from hydrotele.hydraulics.circuit import SCRATCH
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
@@ -17,6 +17,8 @@ _KINDS = {
     "angle": POSITION, "position": POSITION, "length": LENGTH, "pressure_head": HEAD,
     "pressure_rod": ROD, "pressure_supply": SUPPLY,
 }  # fmt: skip
+GEAR_INERTIA, STIFFNESS, GEAR_DAMPING, BACKLASH = range(4)  # columns of `transmission`
+X, V, COMMAND = range(3)  # rows of `Space.drive`
 
 
 class Model(NamedTuple):
@@ -31,7 +33,7 @@ class Model(NamedTuple):
         gain: (nu,) force per command of the plain force drives, 0 for valves [N/V].
         delay: (nu,) command delays [s].
         gear: (nu,) transmission of every drive, -1 if rigid.
-        transmission: (t, 4) inertia, stiffness, damping, backlash.
+        transmission: (t, 4) GEAR_INERTIA, STIFFNESS, GEAR_DAMPING, BACKLASH in SI.
         kind: (c,) what every channel shows: POSITION, LENGTH, HEAD, ROD or SUPPLY.
         drive: (c,) drive of every channel.
         scale: (c,) sensor scales [1].
@@ -58,27 +60,19 @@ class Space(NamedTuple):
 
     Attributes:
         motion: work space of the mechanism.
-        q: (N,) tree positions.
-        rates: (N,) tree rates.
-        x: (nu,) drive positions [m] or [rad].
-        v: (nu,) drive velocities [m/s] or [rad/s].
+        drive: (3, nu) of every drive: position X [m] or [rad], velocity V, COMMAND that arrived.
         row: (nu, n) d(load-side drive velocity) / d(independent rates).
         mass: (n + t, n + t) mass matrix, then its factor.
         force: (n + t,) forces, then acceleration.
-        command: (nu,) commands that have arrived.
         act_dot: (4 h,) rates of the activations.
         scratch: (SCRATCH,) work space of the circuit.
     """
 
     motion: Motion
-    q: np.ndarray
-    rates: np.ndarray
-    x: np.ndarray
-    v: np.ndarray
+    drive: np.ndarray
     row: np.ndarray
     mass: np.ndarray
     force: np.ndarray
-    command: np.ndarray
     act_dot: np.ndarray
     scratch: np.ndarray
 
@@ -135,9 +129,8 @@ def model_space(model: Model) -> Space:
     nu, n, size = len(model.gear), len(model.mech.free), state_size(model)
     total = (size - 4 * model.hydraulic) // 2
     return Space(
-        motion_space(model.mech), model.mech.home.copy(), np.zeros(len(model.mech.home)),
-        np.zeros(nu), np.zeros(nu), np.zeros((nu, n)), np.zeros((total, total)),
-        np.zeros(total), np.zeros(nu), np.zeros(4 * model.hydraulic), np.zeros(SCRATCH),
+        motion_space(model.mech), np.zeros((3, nu)), np.zeros((nu, n)), np.zeros((total, total)),
+        np.zeros(total), np.zeros(4 * model.hydraulic), np.zeros(SCRATCH),
     )  # fmt: skip
 
 
@@ -148,8 +141,6 @@ def state_size(model: Model) -> int:
 
 def state_names(machine: Machine) -> list[str]:
     """Names of the states of `reduced_model(machine, ...)`, such as `rate.boom`, `spool.boom`."""
-    from hydrotele.dynamics.mechanism import coordinate_names
-
     names, mech = coordinate_names(machine), mechanism(machine)
     free = [names[i] for i in mech.free]
     gears = [n for n in actuator_order(machine) if machine.axes[n].transmission]

@@ -3,8 +3,10 @@
 import numpy as np
 
 from hydrotele.compiled import compiled
+from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.integrate import place
-from hydrotele.dynamics.motion import gather_forces
+from hydrotele.dynamics.mechanism import BAR, DAMPING
+from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_BIAS, LENGTH_ROW, RATE
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
@@ -51,8 +53,8 @@ def load_forces(model, space, motion):
         z[total : total + free] = motion[k, 1]
         place(model, space, z)
         gather_forces(mech, m)
-        acceleration = m.drift + m.basis @ motion[k, 2]
-        tree = m.mass @ acceleration + m.bias + mech.damping * space.rates
+        acceleration = m.joint[DRIFT] + m.basis @ motion[k, 2]
+        tree = m.mass @ acceleration + m.joint[BIAS] + mech.joint[DAMPING] * m.joint[RATE]
         load[:] = m.basis.T @ tree
         forces[k] = np.linalg.solve(space.row.T.copy(), load)
         for i in range(drives):
@@ -60,9 +62,9 @@ def load_forces(model, space, motion):
             for f in range(free):
                 velocity += space.row[i, f] * motion[k, 1, f]
                 change += space.row[i, f] * motion[k, 2, f]
-            if mech.drive_bar[i] >= 0:
-                change += m.length_bias[mech.drive_bar[i]]
-                change += np.sum(m.length_row[mech.drive_bar[i]] * m.drift)
+            bar = mech.drive[i, BAR]
+            if bar >= 0:
+                change += m.bar[bar, LENGTH_BIAS] + np.sum(m.bar[bar, LENGTH_ROW:] * m.joint[DRIFT])
             forces[k, i] += actuator_friction(model.user, i * SLOTS, velocity)
             if model.gear[i] >= 0:
                 forces[k, i] += model.transmission[model.gear[i], 0] * change

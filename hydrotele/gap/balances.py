@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from hydrotele.dynamics.mechanism import JOINT
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.gap.balance_laws import chamber_residuals, load_forces, supply_pressures
 from hydrotele.gap.balance_signals import (
@@ -113,7 +114,7 @@ def _closure(machine: Machine, signals: Signals) -> Found:
 def _force(machine: Machine, signals: Signals) -> Found:
     order, model = actuator_order(machine), reduced_model(machine, ())
     motions = {name: joint_motion(machine, signals, name) for name in order}
-    driven = {int(j): name for j, name in zip(model.mech.drive_joint, order, strict=True)}
+    driven = {int(j): name for j, name in zip(model.mech.drive[:, JOINT], order, strict=True)}
     free = [driven.get(int(j), "") for j in model.mech.free]
     parts = [motions[name] for name in free if name and motions[name] is not None]
     pushes = {name: _push(machine, signals, name) for name in order}

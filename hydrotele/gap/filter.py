@@ -10,9 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.dynamics.integrate import _write_trail as write_trail
-from hydrotele.dynamics.integrate import advance, load_position, place, read_channels
+from hydrotele.compiled import compiled, lean
+from hydrotele.dynamics.integrate import (
+    advance,
+    load_position,
+    place,
+    read_channels,
+    supply_of,
+    write_trail,
+)
+from hydrotele.dynamics.mechanism import JOINT
 
 
 class Gains(NamedTuple):
@@ -29,31 +36,17 @@ class Gains(NamedTuple):
     spread: np.ndarray
 
 
-@compiled
-def _differentiate(model, sp, z, command, row, period, steps, nudge, trail, after, columns):
-    """Columns d z(next row) / d z(this row) by forward differences, transposed."""
-    base = z.copy()
-    advance(model, sp, base, command, row, period, steps, trail, False)
-    for s in range(len(z)):
-        after[:] = z
-        after[s] += nudge[s]
-        advance(model, sp, after, command, row, period, steps, trail, False)
-        for r in range(len(z)):
-            columns[s, r] = (after[r] - base[r]) / nudge[s]
-
-
-@compiled
-def _slopes(model, sp, z, reading, nudge, steps, h, trail, slope, moved, shown):
-    """D reading / d state in a state."""
+@lean
+def _slopes(model, sp, z, nudge, slope, moved):
+    """Slopes of the readings in a state that was just read."""
     first = 2 * (len(model.mech.free) + len(model.transmission))
     slope[:] = 0.0
     n = len(model.mech.free)
-    place(model, sp, z)
     for c in range(len(model.kind)):
         i = model.drive[c]
         if model.kind[c] == 0:
             for f in range(n):
-                slope[c, f] = model.scale[c] * sp.motion.basis[model.mech.drive_joint[i], f]
+                slope[c, f] = model.scale[c] * sp.motion.basis[model.mech.drive[i, JOINT], f]
         elif model.kind[c] == 1:
             if model.gear[i] >= 0:
                 slope[c, n + model.gear[i]] = model.scale[c]
@@ -68,13 +61,13 @@ def _slopes(model, sp, z, reading, nudge, steps, h, trail, slope, moved, shown):
         for s in range(first, len(z)):
             if (s - first) % 4 == 1:
                 continue
-            moved[:] = z
+            for r in range(len(z)):
+                moved[r] = z[r]
             moved[s] += nudge[s]
-            read_channels(model, sp, moved, -1, steps, h, trail, shown)
-            slope[c, s] = shown[c]
+            above = supply_of(model, sp, moved)
             moved[s] -= 2.0 * nudge[s]
-            read_channels(model, sp, moved, -1, steps, h, trail, shown)
-            slope[c, s] = (slope[c, s] - shown[c]) / (2.0 * nudge[s])
+            below = supply_of(model, sp, moved)
+            slope[c, s] = model.scale[c] * (above - below) / (2.0 * nudge[s])
 
 
 @compiled
@@ -118,8 +111,9 @@ def filter_run(
     rows, channels, size = reading.shape[0], reading.shape[1], len(z)
     h = period / steps
     trail = np.zeros((rows * steps + 1, channels))
-    columns, after = np.zeros((size, size)), np.zeros(size)
-    moved, shown, work = np.zeros(size), np.zeros(channels), np.zeros((size, size))
+    nothing = trail[:0]
+    reached = np.zeros((size + 1, size))
+    moved, work = np.zeros(size), np.zeros((size, size))
     few = len(own)
     delta, pull = np.zeros(few), np.zeros(size)
     place(model, sp, z)
@@ -128,7 +122,7 @@ def filter_run(
     for row in range(rows):
         read_channels(model, sp, z, row, steps, h, trail, predicted[row])
         if fresh:
-            _slopes(model, sp, z, reading, nudge, steps, h, trail, slope[row], moved, shown)
+            _slopes(model, sp, z, nudge, slope[row], moved)
         delta[:] = 0.0
         for c in range(channels):
             if math.isnan(reading[row, c]):
@@ -158,22 +152,28 @@ def filter_run(
             whitened[row, c] = error / width[row, c]
             loss += whitened[row, c] ** 2 + 2.0 * math.log(width[row, c])
         _correct(model, sp, z, own, delta)
-        corrected[row] = z
+        for s in range(size):
+            corrected[row, s] = z[s]
         if not math.isfinite(loss):
             return math.inf
         if row == rows - 1:
             break
         if fresh:
-            _differentiate(model, sp, z, command, row, period, coarse, nudge, trail, after, columns)
-            _carry(columns, spread, work, drift)
+            for s in range(size + 1):  # the state itself is the last row
+                for r in range(size):
+                    reached[s, r] = z[r]
+                if s < size:
+                    reached[s, s] += nudge[s]
+                advance(model, sp, reached[s], command, row, period, coarse, nothing)
+            _carry(reached, nudge, spread, work, drift)
             if not known[row]:
                 for s in range(size):
                     spread[s, s] += startle[s]
-        advance(model, sp, z, command, row, period, steps, trail, True)
+        advance(model, sp, z, command, row, period, steps, trail)
     return loss
 
 
-@compiled
+@lean
 def _correct(model, sp, z, own, delta):
     """Add a correction to a state; drives that it does not know follow their loads."""
     n, t = len(model.mech.free), len(model.transmission)
@@ -195,10 +195,13 @@ def _correct(model, sp, z, own, delta):
                 z[own[s]] += delta[s]
 
 
-@compiled
-def _carry(columns, spread, work, drift):
-    """`P = F P F' + Q` with F' given, kept symmetric."""
+@lean
+def _carry(columns, nudge, spread, work, drift):
+    """`P = F P F' + Q`, kept symmetric, with the states reached from nudged ones and, last, z."""
     size = len(drift)
+    for s in range(size):
+        for r in range(size):
+            columns[s, r] = (columns[s, r] - columns[size, r]) / nudge[s]
     for a in range(size):
         for b in range(size):
             total = 0.0

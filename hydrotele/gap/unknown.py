@@ -49,15 +49,18 @@ def describe_unknown(machine: Machine, data: Dataset, after: Sequence[Prediction
         The law, channel, dependence and words; less of it the fewer channels there are.
     """
     try:
-        channel = worst_channel(after)
-        measured = measured_balances(machine, data)
-        verdict = judge(machine, data, excesses(measured, clean_balances(machine, data)), measured)
-        scenes = [
-            read_scene(machine, run_log(data, run), data.sensors)
-            for run in (data.heldout, *data.fit)
-        ]
-    except (InputError, LoopOpen, ValueError, ArithmeticError, np.linalg.LinAlgError):
-        return _plain(machine, after)
+        return _described(machine, data, after)
+    except (InputError, LoopOpen, ValueError, LookupError, ArithmeticError, np.linalg.LinAlgError):
+        return _plain(machine, after)  # readings far outside the model: only the errors are left
+
+
+def _described(machine: Machine, data: Dataset, after: Sequence[Prediction]) -> Unknown:
+    channel = worst_channel(after)
+    measured = measured_balances(machine, data)
+    verdict = judge(machine, data, excesses(measured, clean_balances(machine, data)), measured)
+    scenes = [
+        read_scene(machine, run_log(data, run), data.sensors) for run in (data.heldout, *data.fit)
+    ]
     if verdict is None:
         return _of_channel(machine, channel, scenes, after)
     return _of_law(machine, verdict, channel, scenes, measured, after)
@@ -87,7 +90,7 @@ def _of_law(
 ) -> Unknown:  # fmt: skip
     if verdict.law == "sensor":
         channel = f"pressure_{verdict.side}.{verdict.place}"
-    elif parse_channel(channel).axis not in ("", verdict.place) and not verdict.everywhere:
+    elif parse_channel(channel).axis != verdict.place and not verdict.everywhere:
         channel = _of_place(after, verdict.place) or channel
     told = Explained((), 0.0, 0.0)
     target = law_target(machine, verdict, scenes, measured)

@@ -16,6 +16,7 @@ _SETTLE = 1.0  # s at both ends of a run that filters and the unknown start spoi
 _BELOW_RELIEF = 0.97  # of the relief pressure: above it the supply pressure tells no flow
 _APART = 3.0 * BAND  # Hz: samples of a balance this often are nearly independent
 _LOUD = 4.0  # times the usual noise: an open port relief or make-up valve drowns all else
+_OPEN_APART = 10.0  # Hz, the same of the supply's flow, which only smoothing ties together
 _MEGA = 1e-6
 _MOST = 2000  # samples of a run: more only take time
 _ENOUGH = 40  # samples that a run needs to be judged
@@ -45,7 +46,8 @@ class Target:
     Attributes:
         law: `force`, `flow`, `supply`, `geometry` or `sensor`.
         unit: of what is wanted; `1` where it is in units of its spread.
-        parts: the held-out run, then the fit runs; runs that say nothing are absent.
+        parts: the held-out run, then the fit runs; fit runs that say nothing are absent, and all
+            are if the held-out run does.
         roles: role in a term -> name of the signal.
         banded: whether it was low-passed, as the terms must be then.
     """
@@ -94,25 +96,27 @@ def law_target(
     for scene, found in zip(scenes, measured, strict=True):
         balance = found.get(verdict.balance, {}).get(verdict.place)
         if balance is None:
+            parts.append(None)
             continue
         wanted, unit = balance.residual, balance.unit
         if verdict.law == "sensor":
             wanted, unit = lacking_pressure(machine, verdict.place, side, wanted), "Pa"
         if verdict.law == "supply":
             if "demand" not in scene.values or machine.supply is None:
+                parts.append(None)
                 continue
             wanted, unit = scene.values["demand"] - machine.supply.pump_flow, "m^3/s"
             open_pump = scene.values["pressure_supply"] < (
                 _BELOW_RELIEF * machine.supply.relief_pressure
             )
             wanted = np.where(open_pump, wanted, np.nan)
-        stride = 1 if verdict.law == "geometry" else max(1, round(1.0 / (_APART * scene.period)))
+        apart = {"geometry": np.inf, "supply": _OPEN_APART}.get(verdict.law, _APART)
         noise = None if verdict.law == "supply" else balance.noise
-        part = _part(scene, wanted, noise, stride)
-        if part:
-            parts.append(part)
+        stride = max(1, round(1.0 / (apart * scene.period)))
+        parts.append(_part(scene, wanted, noise, stride))
     banded = verdict.balance not in ("closure", "supply")
-    return Target(verdict.law, unit, parts, roles(machine, verdict.place, side), banded)
+    names = roles(machine, verdict.place, side)
+    return Target(verdict.law, unit, _usable(parts), names, banded)
 
 
 def channel_target(
@@ -130,10 +134,14 @@ def channel_target(
         size = min(len(wanted), len(scene.values["time"]))
         padded = np.full(len(scene.values["time"]), np.nan)
         padded[:size] = wanted[:size]
-        part = _part(scene, padded, None, 1)
-        if part:
-            parts.append(part)
-    return Target(law, "1", parts, roles(machine, parsed.axis or "supply", side), False)
+        parts.append(_part(scene, padded, None, 1))
+    names = roles(machine, parsed.axis or "supply", side)
+    return Target(law, "1", _usable(parts), names, False)
+
+
+def _usable(parts: Sequence[Part | None]) -> list[Part]:
+    """Nothing without the held-out run, which comes first: no term could be held to it."""
+    return [part for part in parts if part] if parts and parts[0] else []
 
 
 def _part(scene: Scene, wanted: np.ndarray, noise: np.ndarray | None, stride: int) -> Part | None:

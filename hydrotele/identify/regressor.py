@@ -6,8 +6,27 @@ import numpy as np
 
 from hydrotele.compiled import compiled
 from hydrotele.dynamics.integrate import place
-from hydrotele.dynamics.mechanism import body_names, coordinate_names
+from hydrotele.dynamics.mechanism import (
+    BAR,
+    COM,
+    DAMPING,
+    INERTIA,
+    JOINT,
+    MASS,
+    body_names,
+    coordinate_names,
+)
 from hydrotele.dynamics.model import Model, model_space, reduced_model
+from hydrotele.dynamics.motion import (
+    ACCELERATION,
+    DRIFT,
+    LENGTH_BIAS,
+    LENGTH_ROW,
+    RATE,
+    SPIN,
+    SPIN_RATE,
+    TURN,
+)
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.identify.friction_columns import friction_columns
@@ -69,7 +88,7 @@ def regressor(
     """
     axes, model = actuator_order(machine), reduced_model(machine, ())
     free = {int(joint): i for i, joint in enumerate(model.mech.free)}
-    if sorted(map(int, model.mech.drive_joint)) != sorted(free):
+    if sorted(map(int, model.mech.drive[:, JOINT])) != sorted(free):
         joints = coordinate_names(machine)
         loose = sorted({joints[i] for i in free} - {machine.axes[a].joint for a in axes})
         raise InputError(
@@ -80,17 +99,17 @@ def regressor(
     motion = [_table(v, len(axes)) for v in (positions, rates, accelerations)]
     if len({len(part) for part in motion}) > 1:
         raise InputError(_WHERE, "positions, rates and accelerations must have the same rows")
-    place_of = [free[int(joint)] for joint in model.mech.drive_joint]
+    place_of = [free[int(joint)] for joint in model.mech.drive[:, JOINT]]
     table = np.empty((len(motion[0]), 3, len(axes)))
     table[:, :, place_of] = np.stack(motion, axis=1)
-    damped = np.flatnonzero(model.mech.damping)
+    damped = np.flatnonzero(model.mech.joint[DAMPING])
     bodies = body_names(machine)[1:]
     width = 10 * len(bodies) + len(damped) + len(model.transmission)
     matrix = np.zeros((len(table), len(axes), width))
     velocities = _fill(model, model_space(model), table, damped, matrix)
     names = [f"{kind}.{body}" for body in bodies for kind in BODY_PARAMETERS]
     units = [*BODY_PARAMETERS.values()] * len(bodies)
-    nominal = [*_inertial(model), *model.mech.damping[damped], *model.transmission[:, 0]]
+    nominal = [*_inertial(model), *model.mech.joint[DAMPING][damped], *model.transmission[:, 0]]
     joints = coordinate_names(machine)
     hinges = [machine.joints[joints[i]].type == "hinge" for i in damped]
     names += [f"damping.{joints[i]}" for i in damped]
@@ -120,7 +139,8 @@ def _inertial(model: Model) -> np.ndarray:
     """(10 b,) parameters of all bodies but the world, about their frames."""
     mech = model.mech
     rows = []
-    for mass, com, inertia in zip(mech.mass[1:], mech.com[1:], mech.inertia[1:], strict=True):
+    for body in mech.shape[1 : mech.bodies]:
+        mass, com, inertia = body[MASS], body[COM : COM + 3], body[INERTIA : INERTIA + 3]
         about = np.diag(inertia) + mass * (com @ com * np.eye(3) - np.outer(com, com))
         rows.append([mass, *(mass * com), *about[_PAIRS[:, 0], _PAIRS[:, 1]]])
     return np.array(rows).ravel()
@@ -171,7 +191,7 @@ def _fill(model, space, motion, damped, matrix):
         (n, nu) drive velocities [m/s] or [rad/s].
     """
     mech, m = model.mech, space.motion
-    free, drives, bodies = len(mech.free), len(model.gear), len(mech.mass)
+    free, drives, bodies = len(mech.free), len(model.gear), 1 + mech.links + 2 * mech.bars
     total = free + len(model.transmission)
     z, velocities = np.zeros(2 * total + 4 * model.hydraulic), np.empty((len(motion), drives))
     forces, torques = np.empty((3, 10)), np.empty((3, 10))
@@ -179,26 +199,31 @@ def _fill(model, space, motion, damped, matrix):
         z[:free] = motion[k, 0]
         z[total : total + free] = motion[k, 1]
         place(model, space, z)
-        tree = m.drift + m.basis @ motion[k, 2]
+        tree = m.joint[DRIFT] + m.basis @ motion[k, 2]
         # virtual work: J' F = N' tau, with J the drives' Jacobian and N that of the tree
         share = np.linalg.inv(space.row.T.copy()) @ m.basis.T
         velocities[k] = space.row @ motion[k, 1]
         for body in range(1, bodies):
             first = 10 * (body - 1)
+            frame, jacobian = m.frame[body], m.jacobian[body]
+            change = tree @ jacobian
             _wrenches(
-                m.turn[body], m.acceleration[body] + m.moving[body] @ tree, m.spin[body],
-                m.spin_rate[body] + m.turning[body] @ tree, forces, torques,
+                frame[TURN : TURN + 9].copy().reshape(3, 3),
+                frame[ACCELERATION : ACCELERATION + 3] + change[:3], frame[SPIN : SPIN + 3].copy(),
+                frame[SPIN_RATE : SPIN_RATE + 3] + change[3:], forces, torques,
             )  # fmt: skip
-            load = m.moving[body].T @ forces + m.turning[body].T @ torques
+            moving, turning = jacobian[:, :3].copy(), jacobian[:, 3:].copy()
+            load = moving @ forces + turning @ torques
             matrix[k, :, first : first + 10] = share @ load
         first = 10 * (bodies - 1)
         for d in range(len(damped)):
-            matrix[k, :, first + d] = share[:, damped[d]] * space.rates[damped[d]]
+            matrix[k, :, first + d] = share[:, damped[d]] * m.joint[RATE, damped[d]]
         first += len(damped)
         for i in range(drives):
             if model.gear[i] >= 0:
-                bar, change = mech.drive_bar[i], np.sum(space.row[i] * motion[k, 2])
+                bar, speeding = mech.drive[i, BAR], np.sum(space.row[i] * motion[k, 2])
                 if bar >= 0:
-                    change += m.length_bias[bar] + np.sum(m.length_row[bar] * m.drift)
-                matrix[k, i, first + model.gear[i]] = change
+                    speeding += m.bar[bar, LENGTH_BIAS]
+                    speeding += np.sum(m.bar[bar, LENGTH_ROW:] * m.joint[DRIFT])
+                matrix[k, i, first + model.gear[i]] = speeding
     return velocities

@@ -46,7 +46,7 @@ def recorded(machine, seconds=20.0, seed=0):
         wanted = home + 0.22 * np.sin(beats * time) * np.sin(np.pi * time / seconds)
         error = (wanted - z[:free]) * np.where(np.arange(free) > 1, -1, 1)  # stick: out = angle up
         command[row] = np.clip(0.05 * np.tanh(200 * error) + 4 * error, -1, 1)
-        advance(model, space, z, command, row, PERIOD, steps, trail, True)
+        advance(model, space, z, command, row, PERIOD, steps, trail)
     rng, sensors = np.random.default_rng(seed), sensor_set(machine, SENSORS)
     columns = {f"command.{axis}": command[:, i] for i, axis in enumerate(plant.axes)}
     for i, name in enumerate(channels):

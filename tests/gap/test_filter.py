@@ -22,9 +22,7 @@ def machine_data(machine, truth, seed=0):
     channels = predicted_channels(machine)
     axes = tuple(actuator_order(machine))
     time = PERIOD * np.arange(ROWS)
-    command = np.column_stack(
-        [0.4 * np.sin((1.1 + 0.4 * k) * time + k) for k in range(len(axes))]
-    )
+    command = np.column_stack([0.4 * np.sin((1.1 + 0.4 * k) * time + k) for k in range(len(axes))])
     model = reduced_model(truth, channels)
     names = state_names(truth)
     state = np.zeros(len(names))

@@ -50,7 +50,9 @@ def test_missing_channels_and_rows_still_find_the_dead_band(tmp_path):
     """No rod pressures, no lengths, no supply pressure, and 1 % of the rows dropped."""
     for path in sorted((MEASURED / "open_05").glob("*.parquet")):
         log = load_log(path)
-        kept = [c for c in log.columns if not c.startswith(("pressure_rod", "length", "pressure_s"))]
+        kept = [
+            c for c in log.columns if not c.startswith(("pressure_rod", "length", "pressure_s"))
+        ]
         rows = [k for k in range(len(log)) if k % 100 != 57]
         save_log(
             Log(

@@ -1,0 +1,131 @@
+"""Free runs of the reduced model against the MuJoCo plant, with every part that drives can have."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hydrotele.dynamics.integrate import simulate_rows
+from hydrotele.dynamics.model import predicted_channels, state_names
+from hydrotele.effects import apply_effect
+from hydrotele.run import run_scenario
+from hydrotele.scenario import Scenario
+
+ROWS, PERIOD = 60, 0.02
+ANGLE, LENGTH, PRESSURE = np.radians(0.01), 0.2e-3, 0.1 * 25 * 6894.757
+CASES = {
+    "cat215/none": (),
+    "cat215/bucket": (),
+    "command_delay": (("command_delay", "all", {"delay": 0.0337}),),
+    "sensors": (
+        ("angle_offset", "boom", {"offset": 0.02}),
+        ("angle_scale", "stick", {"ratio": 1.01}),
+        ("angle_delay", "swing", {"delay": 0.0133}),
+        ("pressure_offset", "boom.head", {"offset": 60e3}),
+        ("pressure_delay", "stick", {"delay": 0.0275}),
+    ),
+    "backlash": (("backlash", "swing", {"gap": 0.02}),),
+    "joint_flexibility": (
+        ("joint_flexibility", "swing", {"compliance": 2e-7}),
+        ("joint_flexibility", "boom", {"compliance": 2e-8}),
+    ),
+}
+
+
+def scenario(name, axes, effects, timestep, size=0.4):
+    """All axes driven by held sines; shut at first, so that late commands have a past."""
+    time = PERIOD * np.arange(ROWS)
+    wave = np.where(np.arange(ROWS) > 3, size, 0.0)
+    columns = {a: (wave * np.sin(5.0 * time + i)).tolist() for i, a in enumerate(axes)}
+    machine, _, tool = name.partition("/")
+    keys = {
+        "name": "t",
+        "machine": machine,
+        "control_rate": 50,
+        "log_rate": 50,
+        "duration": ROWS * PERIOD,
+        "ground": False,
+        "timestep": timestep,
+        "pilot": {
+            "kind": "table",
+            "of": "command",
+            "interpolate": "hold",
+            "time": time.tolist(),
+            "columns": columns,
+        },
+        "effects": [dict(zip(("name", "location", "parameters"), e, strict=True)) for e in effects],
+    }
+    return Scenario.model_validate(keys | ({"tool": tool} if tool else {}))
+
+
+def begin(machine, model, z, state):
+    """Write a log's initial state into a state of the reduced model."""
+    joints = {axis.joint: name for name, axis in machine.axes.items()}
+    renamed = {"position": "angle", "rate": "velocity"}
+    for s, name in enumerate(state_names(machine)):
+        kind, _, where = name.partition(".")
+        axis = joints.get(where, where)
+        if kind in ("drive", "drive_rate"):
+            z[s] = state[kind.replace("rate", "velocity")][axis]
+        else:
+            z[s] = state[renamed.get(kind, kind)][state["order"].index(axis)]
+
+
+def differences(reduced_of, machine, plan, steps):
+    """Readings of plant and reduced model: channel -> (largest difference, travel)."""
+    run, channels = run_scenario(plan), predicted_channels(machine)
+    model, space, z = reduced_of(machine, channels)
+    begin(machine, model, z, json.loads(run.truth.metadata["initial_state"]))
+    command = np.column_stack([run.truth[f"command.{a}"] for a in run.plant.axes])
+    out, states = np.zeros((ROWS, len(channels))), np.zeros((ROWS, len(z)))
+    simulate_rows(model, space, z, command, PERIOD, steps, out, states)
+    read = [run.measured[c] for c in channels]
+    return {c: (np.abs(out[:, i] - read[i]).max(), np.ptp(read[i])) for i, c in enumerate(channels)}
+
+
+def beyond(found):
+    """Channels that are off by more than a tenth of 0.1 deg, 2 mm or 25 psi."""
+    bounds = {"angle": ANGLE, "position": LENGTH, "length": LENGTH}
+    return {
+        c: error / bounds.get(c.partition(".")[0], PRESSURE)
+        for c, (error, _) in found.items()
+        if error > bounds.get(c.partition(".")[0], PRESSURE)
+    }
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_readings_are_those_of_the_plant(case, machine_of, reduced_of):
+    name = case if "/" in case else "cat215/none"
+    machine = machine_of(name)
+    for effect in CASES[case]:
+        machine = apply_effect(machine, *effect)
+    plan = scenario(name, machine.axes, CASES[case], 1.25e-4)  # its own error is of first order
+    found = differences(reduced_of, machine, plan, 40)
+    assert not beyond(found)
+    for axis in machine.axes:
+        assert found[f"angle.{axis}"][1] > 50 * ANGLE, "a machine at rest would prove nothing"
+    if CASES[case]:
+        nominal = differences(reduced_of, machine_of(name), plan, 40)
+        assert beyond(nominal), "without the effect it would be seen"
+
+
+def test_a_plain_force_drive(machine_of, reduced_of):
+    machine = machine_of("emps")
+    plan = scenario("emps", machine.axes, (), 2.5e-4, size=2.0)
+    found = differences(reduced_of, machine, plan, 40)
+    error, travel = found["position.slide"]
+    assert error < 1e-3 * travel  # three times what the plant's first-order step leaves
+    assert travel > 1e-3
+
+
+def test_the_plant_converges_to_the_reduced_model(machine_of, reduced_of):
+    """What is left between the two is the plant's step, not another machine."""
+    machine = machine_of("cat215/none")
+    errors = []
+    for timestep in (1e-3, 5e-4, 2.5e-4):
+        plan = scenario("cat215/none", machine.axes, (), timestep)
+        found = differences(reduced_of, machine, plan, 80)
+        errors.append(np.linalg.norm([found[f"angle.{a}"][0] for a in machine.axes]))
+    ratios = np.array(errors[1:]) / errors[:-1]
+    # first order or better
+    assert np.all((ratios > 0.2) & (ratios < 0.6)), errors
