@@ -48,6 +48,7 @@ def test_an_effect_outside_the_library_is_unknown():
 
 def test_missing_channels_and_rows_still_find_the_dead_band(tmp_path):
     """No rod pressures, no lengths, no supply pressure, and 1 % of the rows dropped."""
+    gone = ("pressure_rod", "length", "pressure_supply")
     for path in sorted((MEASURED / "open_05").glob("*.parquet")):
         log = load_log(path)
         kept = [
