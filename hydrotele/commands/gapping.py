@@ -121,7 +121,7 @@ def _search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: b
     from hydrotele.gap.find import find_gap
 
     with _stages(f"gap {dataset.machine.name}", quiet) as progress:
-        return find_gap(dataset, predict, progress, tuple(effects), jobs or 2)
+        return find_gap(dataset, predict, progress, effects=tuple(effects), jobs=jobs or 2)
 
 
 def _name(data: Sequence[Path]) -> str:

@@ -67,7 +67,7 @@ def test_the_folder_is_named_after_the_data_and_complete(site, searching):
     assert "Payload at the tool: mass 251.3 kg" in said and "which was not fitted" in said
     assert "247.9 .. 254.6" in said and "written to gap_site" in said
     assert asked["dataset"].machine.name == "cat215" and asked["dataset"].heldout.name == "test_1"
-    assert "effects" not in asked and "jobs" not in asked
+    assert asked["effects"] == () and asked["jobs"] == 2
 
 
 def test_the_patched_machine_runs_and_is_replayed(site, searching):
