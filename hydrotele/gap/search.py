@@ -15,6 +15,8 @@ _WIDE = 24  # candidates that are tried on all runs
 _SHORT = 5  # candidates that are fitted after a screening
 _RIVALS = 6  # candidates that are compared with a named effect
 _HOPELESS = 500.0  # loss above the effect's after two steps, beyond which a rival is let go
+_LARGE = 0.05  # mean excess per reading from which an explanation must explain its share
+_SHARE = 0.1  # of the excess
 _WORTH = 0.25  # of the best screened score: below it a candidate is not fitted
 Progress = Callable[[str, float], None]
 
@@ -171,7 +173,7 @@ def search(
         ranked = screen(evidence, guess, candidates)
         rankings.append(ranked)
         best = _best_addition(evidence, guess, ranked)
-        if best is None or best.score < ENTER:
+        if best is None or best.score < ENTER or _beside_the_point(evidence, best):
             break
         if not worth_naming(best.guess, len(best.guess.parts) - 1):
             weak = best
@@ -188,6 +190,13 @@ def search(
         scores.append(score)
         rivals.append(others)
     return Found(guess, fit, tuple(rankings[0]), tuple(rivals), tuple(scores), weak)
+
+
+def _beside_the_point(evidence: Evidence, best: Fit) -> bool:
+    """Whether even the best effect leaves nearly all of a large excess of errors unexplained."""
+    errors = evidence.base_errors
+    excess = float(errors @ errors) - np.count_nonzero(errors)
+    return bool(excess > _LARGE * len(errors) and best.gain < _SHARE * excess)
 
 
 def _best_addition(evidence: Evidence, guess: Guess, ranked: list[Screened]) -> Fit | None:
