@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import stat
 import subprocess
@@ -153,7 +154,7 @@ class SmallSeries:
         self.environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(scratch)}
 
     def command(self, *more: str) -> list[str]:
-        workflow = f"{sys.executable} {self.stub} {{data}} {{machine}}"
+        workflow = shlex.join([sys.executable, str(self.stub), "{data}", "{machine}"])
         return [sys.executable, str(SCRIPT), "--out", str(self.out), "--workflow", workflow, *more]
 
     def run(self, *more: str) -> subprocess.CompletedProcess:
