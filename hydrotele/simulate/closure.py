@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.errors import InputError
+from hydrotele.kinematics import loops
 from hydrotele.machine import Machine
 from hydrotele.simulate.drive_side import drive_and_load_dofs, lock_drives
 
@@ -19,28 +20,9 @@ _FOLLOWED = 1.0e-9  # the same where only looks depend on it
 
 def following_joints(machine: Machine) -> tuple[str, ...]:
     """Names of the joints that the closures determine: tubes, rods and undriven links in a loop."""
-    driven = {axis.joint for axis in machine.axes.values()}
-    names: list[str] = []
-    for name, axis in machine.axes.items():
-        if axis.cylinder:
-            names += [f"{name}_tube", f"{name}_rod"]
-    for closure in machine.closures.values():
-        for link in _loop(machine, closure.a.link, closure.b.link):
-            joint = machine.links[link].joint
-            if joint and joint.name not in driven and joint.name not in names:
-                names.append(joint.name)
-    return tuple(names)
-
-
-def _loop(machine: Machine, a: str, b: str) -> list[str]:
-    chains = []
-    for link in (a, b):
-        chain = []
-        while link != "world":
-            chain.append(link)
-            link = machine.links[link].parent
-        chains.append(chain)
-    return [x for x in chains[0] + chains[1] if not (x in chains[0] and x in chains[1])]
+    cylinders = [name for name, axis in machine.axes.items() if axis.cylinder]
+    bars = [f"{name}_{part}" for name in cylinders for part in ("tube", "rod")]
+    return (*bars, *loops.following_joints(machine))
 
 
 def closure_error(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
