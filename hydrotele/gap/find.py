@@ -54,7 +54,7 @@ def find_gap(
 
     Args:
         data: the logs; the fit runs decide, the held-out run judges.
-        predict: (machine, log) -> what a simulator makes of the log's commands; unused where None.
+        predict: (machine, log) -> what a simulator makes of the log's commands; not used yet.
         progress: called with (what is being done, share done).
         effects: names of the effects to try; all if empty.
         jobs: threads.
