@@ -58,8 +58,8 @@ class Dataset:
         heldout: the run to judge on.
         notes: what was left out or mended, one sentence each.
         sensors: name of the machine's sensors, or None if their noise is unknown.
-        drift: kind of state -> standard deviation that a row may add to it, where it was found from
-            the data; others as `tracking` has them.
+        drift: state or kind of state -> standard deviation that a row may add to it, where it was
+            found from the data; others as `tracking` has them.
     """
 
     machine: Machine

@@ -25,6 +25,7 @@ from hydrotele.gap.result import (
     Verdict,
 )
 from hydrotele.gap.search import MOST, Found, search
+from hydrotele.gap.stretches import busiest
 from hydrotele.gap.tracking import Track
 from hydrotele.gap.unknown import describe_unknown
 from hydrotele.log import Log
@@ -32,9 +33,9 @@ from hydrotele.machine import Machine
 
 _MOST_UNFLOORED = 6  # real machines without stated noise lack more than one effect
 _NO_FLOOR = (
-    "The machine states no accuracy of its sensors: noise levels were found from the data, the"
-    " prediction errors of the given model have size 1 by construction, and it cannot be said"
-    " whether what remains is noise or another effect."
+    "The machine states no accuracy of its sensors: an error counts by its mean over half a second,"
+    " in units of the given model's errors, and it cannot be said whether what remains is noise or"
+    " another effect."
 )
 SURE = 0.95  # probability below which an effect is called ambiguous
 DOUBTFUL = 0.5  # largest probability of an effect next to an unknown one
@@ -66,6 +67,7 @@ def find_gap(
     del predict
     tell = progress or (lambda text, share: None)
     candidates = hypotheses(data.machine, effects)
+    data = busiest(data)
     floored = known_levels(data)
     if not floored:
         tell("find the noise levels", 0.0)
@@ -81,13 +83,14 @@ def find_gap(
         after = evidence.track(patched, runs) if found.guess.parts else before
     finally:
         evidence.close()
-    floor = noise_floor(patched, data)
+    floor = noise_floor(patched, data) if floored else None
+    unit = 1.0 if floored else rms(np.concatenate([t.whitened for t in before[1:]]))
     tests = residual_tests(after, data.channels) if floored else {}
     failed = any(not test["passed"] for test in tests.values())
     named = _named(found, failed)
     verdict = _verdict(named, failed)
-    predictions = tuple(_prediction(t, data) for t in before)
-    improved = tuple(_prediction(t, data) for t in after)
+    predictions = tuple(_prediction(t, data, unit) for t in before)
+    improved = tuple(_prediction(t, data, unit) for t in after)
     unknown = describe_unknown(patched, data, improved) if failed else None
     laws, units = _laws(data, patched)
     tell("done", 1.0)
@@ -97,7 +100,7 @@ def find_gap(
         verdict=verdict,
         effects=named,
         unknown=unknown,
-        size=GapSize(rms(before[0].whitened), rms(after[0].whitened), floor),
+        size=GapSize(rms(before[0].whitened) / unit, rms(after[0].whitened) / unit, floor),
         ranking=tuple(
             Candidate(
                 s.hypothesis.name, s.hypothesis.location, s.gain, s.gain - s.score,
@@ -167,10 +170,12 @@ def _chances(score: float, rivals: Sequence[Fit]) -> tuple[float, tuple[Alternat
     return float(weights[0]), tuple(others)
 
 
-def _prediction(track: Track, data: Dataset) -> Prediction:
+def _prediction(track: Track, data: Dataset, unit: float) -> Prediction:
     run = track.run
     clock = run.start + run.period * np.arange(len(run.command))
-    return Prediction(run.name, clock, data.channels, track.predicted, run.reading, track.whitened)
+    return Prediction(
+        run.name, clock, data.channels, track.predicted, run.reading, track.whitened / unit
+    )
 
 
 def _laws(data: Dataset, patched: Machine):

@@ -1,24 +1,24 @@
 """Noise levels from the data, where the machine states no accuracy of its sensors.
 
-Reading noise and model drift are those under which the given model makes the data most likely. The
-prediction errors then have size 1 by construction: effects can be compared, but there is no floor
-below which a model counts as perfect.
+Such a machine is usually known roughly, too: readings then differ from the model by what it lacks,
+not by noise. A filter that trusts every reading would follow them and see no difference; so here it
+forgets over a stated horizon, and an error counts by its mean over that horizon. The errors of the
+given model then have size 1 by construction: effects can be compared, but there is no floor below
+which a model counts as perfect.
 """
 
 import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import minimize
 
 from hydrotele.gap.dataset import Dataset, RunData
-from hydrotele.gap.tracking import DRIFT, track_run
+from hydrotele.gap.tracking import track_run
 from hydrotele.signals import parse_channel
 
-_ROWS = 3000  # rows of each run that are looked at: enough for a level within some 3 %
-_TRIES = 60
-_FINEST = 1e-7  # of the largest reading: single precision
-_FREE = ("rate", "pressure_head")  # kinds whose drift is free; the rod side drifts as the head side
+HORIZON = 0.5  # s over which the filter forgets: longer than a valve's lag, shorter than a motion
+_ROUNDS = 5
+_PRESSURES = ("pressure_head", "pressure_rod")
 
 
 def known_levels(data: Dataset) -> bool:
@@ -27,7 +27,7 @@ def known_levels(data: Dataset) -> bool:
 
 
 def find_levels(data: Dataset, each: Callable = map) -> Dataset:
-    """The dataset with the likeliest reading noise and drift filled in.
+    """The dataset with reading noise and drift for a filter that forgets over the horizon.
 
     Args:
         data: a dataset with unknown noise in some channels.
@@ -37,58 +37,40 @@ def find_levels(data: Dataset, each: Callable = map) -> Dataset:
         The dataset with finite `noise`, and `drift`.
     """
     unknown = ~np.isfinite(data.noise)
-    kinds = sorted(
-        {parse_channel(c).kind for c, u in zip(data.channels, unknown, strict=True) if u}
-    )
-    of_kind = {
-        kind: np.array([parse_channel(c).kind == kind for c in data.channels]) & unknown
-        for kind in kinds
-    }
-    runs = [_cut(run) for run in data.fit]
-    free = [k for k in _FREE if k == "rate" or data.machine.hydraulic_axes]
-
-    def filled(logs: np.ndarray) -> Dataset:
-        noise = data.noise.copy()
-        for kind, level in zip(kinds, np.exp(logs[: len(kinds)]), strict=True):
-            noise[of_kind[kind]] = max(level, finest[kind])
-        drift = dict(zip(free, np.exp(logs[len(kinds) :]), strict=True))
-        if "pressure_head" in drift:
-            drift["pressure_rod"] = drift["pressure_head"]
-        drift["drive_rate"] = drift["rate"]
-        return dataclasses.replace(data, noise=noise, drift=drift)
-
-    def loss(logs: np.ndarray) -> float:
-        tried = filled(logs)
-        total = sum(each(lambda run: track_run(data.machine, tried, run).loss, runs))
-        return total if np.isfinite(total) else 1e300
-
-    finest = {kind: _FINEST * _span(runs, mask) for kind, mask in of_kind.items()}
-    begin = np.log(
-        [max(_jitter(runs, mask), _FINEST * _span(runs, mask)) for mask in of_kind.values()]
-        + [DRIFT[k] for k in free]
-    )
-    start = np.vstack([begin, *(begin + 3.0 * row for row in np.eye(len(begin)))])
-    best = minimize(
-        loss, begin, method="Nelder-Mead",
-        options={"maxfev": _TRIES, "xatol": 0.05, "fatol": 2.0, "initial_simplex": start},
-    )  # fmt: skip
-    return filled(best.x)
+    readings = np.concatenate([run.reading for run in data.fit])
+    noise = np.where(unknown, 0.01 * np.nanstd(readings, axis=0) + 1e-12, data.noise)
+    found = _forgetful(data, noise, unknown)
+    for _ in range(_ROUNDS):
+        tracks = list(each(lambda run, now=found: track_run(now.machine, now, run), data.fit))
+        size = _size_over_horizon([t.whitened for t in tracks], data.fit)
+        noise = np.where(unknown, noise * size, noise)
+        found = _forgetful(data, noise, unknown)
+    return found
 
 
-def _cut(run: RunData) -> RunData:
-    rows = slice(0, _ROWS)
-    return dataclasses.replace(
-        run, command=run.command[rows], command_known=run.command_known[rows],
-        reading=run.reading[rows],
-    )  # fmt: skip
+def _forgetful(data: Dataset, noise: np.ndarray, unknown: np.ndarray) -> Dataset:
+    """Drift such that readings of unknown noise correct their state over the horizon."""
+    drift, machine = {}, data.machine
+    share = data.fit[0].period / HORIZON
+    for channel, level, free in zip(data.channels, noise, unknown, strict=True):
+        if not free:
+            continue
+        signal = parse_channel(channel)
+        if signal.kind in _PRESSURES:
+            drift[f"{signal.kind}.{signal.axis}"] = level * share
+        elif signal.axis in data.axes and signal.kind == machine.position_kind(signal.axis):
+            drift[f"position.{machine.axes[signal.axis].joint}"] = level * share
+    return dataclasses.replace(data, noise=noise, drift=drift)
 
 
-def _jitter(runs: list[RunData], mask: np.ndarray) -> float:
-    """Size of the third differences of some channels: noise, hardly motion."""
-    jumps = np.concatenate([np.diff(run.reading[:, mask], 3, axis=0).ravel() for run in runs])
-    jumps = np.abs(jumps[np.isfinite(jumps)])
-    return float(np.median(jumps) / 4.47 / 0.6745) if len(jumps) else 0.0
-
-
-def _span(runs: list[RunData], mask: np.ndarray) -> float:
-    return float(max(np.nanmax(np.abs(run.reading[:, mask])) for run in runs)) + 1e-9
+def _size_over_horizon(whitened: list[np.ndarray], runs: tuple[RunData, ...]) -> np.ndarray:
+    """Per channel (c,) size of the errors' sums over the horizon, were they white 1."""
+    sums, counts = [], []
+    for errors, run in zip(whitened, runs, strict=True):
+        rows = max(1, round(HORIZON / run.period))
+        windows = len(errors) // rows
+        cut = errors[: windows * rows].reshape(windows, rows, -1)[2:]
+        sums.append(np.nansum(cut, axis=1))
+        counts.append(np.isfinite(cut).sum(axis=1))
+    total, count = np.concatenate(sums), np.concatenate(counts)
+    return np.sqrt((total**2).sum(axis=0) / np.maximum(count.sum(axis=0), 1)) + 1e-9

@@ -65,11 +65,15 @@ class Unknown:
 
 @dataclass(frozen=True)
 class GapSize:
-    """RMS of normalised one-step prediction errors of the held-out run; a perfect model has 1."""
+    """RMS of normalised one-step prediction errors of the held-out run; a perfect model has 1.
+
+    Where the machine states no accuracy of its sensors, the given model's errors on the fitted runs
+    have size 1, and `noise_floor`, the size that a perfect model's have, is None.
+    """
 
     before: float
     after: float
-    noise_floor: float
+    noise_floor: float | None
     metric: str = "RMS of the whitened one-step prediction errors, all channels, held-out run"
 
 

@@ -7,11 +7,9 @@ import numpy as np
 
 from hydrotele.gap.evidence import Evidence, Fit, charge, flat
 from hydrotele.gap.hypothesis import Guess, Hypothesis
-from hydrotele.gap.tracking import COARSE, FINE, STEP
+from hydrotele.gap.tracking import COARSE, STEP
 
-ENTER = (
-    30.0  # twice the log evidence that an effect must bring; the clean open case brings 15 at most
-)
+ENTER = 15.0  # twice the log evidence an effect must bring; three times what 100 clean machines do
 MOST = 3  # effects that one search names
 _WIDE = 24  # candidates that are tried on all runs
 _SHORT = 5  # candidates that are fitted after a screening
@@ -174,7 +172,7 @@ def search(
         tell(f"try every effect ({depth} named so far)", 0.9 * (1.0 - 0.6**depth) + 0.05)
         ranked = screen(evidence, guess, candidates)
         rankings.append(ranked)
-        best = _best_addition(evidence, guess, ranked)
+        best = best_addition(evidence, guess, ranked)
         if best is None or best.score < ENTER or _beside_the_point(evidence, best):
             break
         if not worth_naming(best.guess, len(best.guess.parts) - 1):
@@ -184,14 +182,23 @@ def search(
         seen[best.guess.parts[-1][0].key] = ranked
         guess, fit = settle(evidence, best.guess)
     guess, fit = _prune(evidence, guess, fit)
-    rivals, scores = [], []
     tell("compare rivals", 0.92)
+    rivals, scores = [], []
     for index in range(len(guess.parts)):
-        ranked = seen[guess.parts[index][0].key]
+        ranked = seen.get(guess.parts[index][0].key, rankings[0])
         score, others = compare(evidence, guess, index, ranked)
+        if others and others[0].score > score and worth_naming(others[0].guess, -1):
+            guess, fit = settle(evidence, _exchanged(guess, index, others[0].guess))
+            score, others = compare(evidence, guess, index, ranked)
         scores.append(score)
         rivals.append(others)
     return Found(guess, fit, tuple(rankings[0]), tuple(rivals), tuple(scores), weak)
+
+
+def _exchanged(guess: Guess, index: int, other: Guess) -> Guess:
+    """A guess with the last part of another in one place, and the other's numbers."""
+    rest, last = list(other.parts[:-1]), other.parts[-1]
+    return Guess((*rest[:index], last, *rest[index:]))
 
 
 def _beside_the_point(evidence: Evidence, best: Fit) -> bool:
@@ -201,9 +208,23 @@ def _beside_the_point(evidence: Evidence, best: Fit) -> bool:
     return bool(excess > _LARGE * len(errors) and best.gain < _SHARE * excess)
 
 
-def _best_addition(evidence: Evidence, guess: Guess, ranked: list[Screened]) -> Fit | None:
-    """The best of the first few candidates, fitted."""
-    bar = max(0.5 * ENTER, _WORTH * ranked[0].score) if ranked else 0.0
+def best_addition(
+    evidence: Evidence, guess: Guess, ranked: list[Screened], bar: float | None = None
+) -> Fit | None:
+    """The best of the first few candidates, fitted.
+
+    Args:
+        evidence: with the guess as its base.
+        guess: what is already there.
+        ranked: a screening, best first.
+        bar: screened score below which a candidate is not fitted; by default what might still enter
+            and comes near the best.
+
+    Returns:
+        The best fit, at the full step; None if no candidate is above the bar.
+    """
+    if bar is None:
+        bar = max(0.5 * ENTER, _WORTH * ranked[0].score) if ranked else 0.0
     short = [s for s in ranked[:_SHORT] if s.score > bar]
     if not short:
         return None
@@ -215,7 +236,16 @@ def _best_addition(evidence: Evidence, guess: Guess, ranked: list[Screened]) -> 
         return evidence.fit(more, before, parallel=False, steps=4, step=step)
 
     fits = evidence.map(fitted, short)
-    return max(fits, key=lambda fit: fit.score)
+    inside = [fit for fit in fits if fit.score > ENTER and not _strained(fit.guess)]
+    best = max(inside or fits, key=lambda fit: fit.score).guess
+    return evidence.fit(best, _loss_of(evidence, guess, evidence.step_of(best, STEP)), steps=2)
+
+
+def _strained(guess: Guess) -> bool:
+    """Whether the last part stands at the edge of what is physically plausible."""
+    hypothesis, deviation = guess.parts[-1]
+    edge = (deviation <= hypothesis.low) | (deviation >= hypothesis.high)
+    return bool(np.any(edge & (np.abs(deviation) > hypothesis.least)))
 
 
 def _loss_of(evidence: Evidence, guess: Guess, step: float = STEP) -> float:
@@ -228,7 +258,7 @@ def settle(evidence: Evidence, guess: Guess) -> tuple[Guess, Fit]:
     fit = None
     for _ in range(3):
         evidence.set_base(guess)
-        fit = evidence.fit(guess, 0.0, step=FINE)
+        fit = evidence.fit(guess, 0.0)
         moved = fit.guess.deviation - guess.deviation
         guess = fit.guess
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))

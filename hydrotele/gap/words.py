@@ -92,7 +92,9 @@ def chance_words(probability: float) -> str:
 
 
 def gap_closed(size: GapSize) -> float:
-    """Part of the gap that the patch closes, at most 1; NaN where none is above the noise."""
+    """Part of the gap that the patch closes, at most 1; NaN where none is above the noise or that is not known."""
+    if size.noise_floor is None:
+        return math.nan
     above = size.before - size.noise_floor
     return min((size.before - size.after) / above, 1.0) if above > 0 else math.nan
 
@@ -159,8 +161,7 @@ def _agreement(gap: Gap) -> str:
     size = gap.size
     return (
         f"There is no gap: on {_run(gap)}, which was not fitted, the model's predictions are off"
-        f" by {size.before:.2f} times what the sensors alone explain; a perfect model has"
-        f" {size.noise_floor:.2f}. Nothing in the model needs to change."
+        f" by {_times(size.before, size)}. Nothing in the model needs to change."
     )
 
 
@@ -170,12 +171,23 @@ def _shrinking(gap: Gap) -> tuple[str, ...]:
         return ()
     text = (
         f"With {'it' if len(gap.effects) == 1 else 'them'} in the model, the prediction errors on"
-        f" {_run(gap)}, which was not fitted, go from {size.before:.2f} to {size.after:.2f} times"
-        f" what the sensors alone explain (a perfect model has {size.noise_floor:.2f})"
+        f" {_run(gap)}, which was not fitted, go from {size.before:.2f} to"
+        f" {_times(size.after, size)}"
     )
+    if size.noise_floor is None:
+        return (f"{text}.",)
     if size.before - size.noise_floor < _SLIGHT:
         return (f"{text}. The effect is weak: it hardly shows in this run.",)
     return (f"{text}: {100 * max(closed, 0.0):.0f} % of the gap is closed.",)
+
+
+def _times(value: float, size: GapSize) -> str:
+    if size.noise_floor is None:
+        return f"{value:.2f} times what the given model's were on the fitted runs"
+    return (
+        f"{value:.2f} times what the sensors alone explain (a perfect model has"
+        f" {size.noise_floor:.2f})"
+    )
 
 
 def _rivals(gap: Gap) -> tuple[str, ...]:
@@ -207,8 +219,7 @@ def _unknown(gap: Gap) -> tuple[str, ...]:
     unknown, size = gap.unknown, gap.size
     first = (
         "Model and machine disagree, and no effect that this program knows explains it: on"
-        f" {_run(gap)} the predictions are off by {size.before:.2f} times what the sensors alone"
-        f" explain (a perfect model has {size.noise_floor:.2f})."
+        f" {_run(gap)} the predictions are off by {_times(size.before, size)}."
     )
     if unknown is None:
         return (first,)

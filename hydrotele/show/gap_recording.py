@@ -48,7 +48,7 @@ def write_gap_recording(
     models = {"nominal": (before, _NOMINAL)}
     if has_patch(gap):
         models["patched"] = (after, _PATCHED)
-    windows = gap_windows(before, gap.size.noise_floor)
+    windows = gap_windows(before, gap.size.noise_floor or gap.size.before)
     identity = f"hydrotele gap {gap.machine.name} {gap.machine.tool}"
     with replacing(path, ".rrd") as part:
         with rr.RecordingStream(identity.encode("ascii", "replace").decode()[:_LONGEST_ID]) as out:
@@ -103,7 +103,7 @@ def _log_channels(out, models) -> None:
             _send(out, entity(name, channel), before.time, factor * values, style)
 
 
-def _log_sizes(out, models, floor: float) -> None:
+def _log_sizes(out, models, floor: float | None) -> None:
     """RMS over all channels in windows, of every model and of a perfect one."""
     for name, (prediction, colour) in models.items():
         found = windowed(prediction)
@@ -111,6 +111,8 @@ def _log_sizes(out, models, floor: float) -> None:
         size = np.sqrt(total / np.maximum(found.count.sum(axis=1), 1))
         middle = 0.5 * (found.edges[:-1] + found.edges[1:])
         _send(out, f"/gap/{name}", middle, size, _style(colour, f"{name} [x noise]", 2.0))
+    if floor is None:
+        return
     ends = models["nominal"][0].time[[0, -1]]
     _send(out, "/gap/perfect", ends, np.full(2, floor), _style(_FLOOR, "perfect model", 1.2))
 

@@ -79,7 +79,8 @@ def _header(gap: Gap) -> Markup:
         cards.append(("after", f"{size.after:.2f} × noise", "prediction error, patched"))
     if patched and math.isfinite(closed):
         cards.append(("", f"{100 * closed:.0f} %", "of the gap closed, on data not fitted"))
-    cards.append(("", f"{size.noise_floor:.2f} × noise", "prediction error of a perfect model"))
+    if size.noise_floor is not None:
+        cards.append(("", f"{size.noise_floor:.2f} × noise", "prediction error of a perfect model"))
     figures = [tag("div", tag("b", b), tag("span", s), class_=c) for c, b, s in cards]
     return tag(
         "header",
