@@ -103,11 +103,9 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
             lines.append(f"| {key} | {size:.2f} |")
         every = [v for p in pulled for pull in p.values() for v in pull]
         beyond = float(np.mean(np.abs(every) > 1.96))
-        document["pulls_rms"], document["beyond_1.96"] = (
-            float(np.sqrt(np.mean(np.square(every)))),
-            beyond,
-        )
-        lines += ["", f"All: RMS {document['pulls_rms']:.2f}, beyond 1.96: {beyond:.1%}."]
+        size = float(np.sqrt(np.mean(np.square(every))))
+        document |= {"pulls_rms": size, "beyond_1.96": beyond}
+        lines += ["", f"All: RMS {size:.2f}, beyond 1.96: {beyond:.1%}."]
     return document, "\n".join(lines) + "\n"
 
 

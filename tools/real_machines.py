@@ -69,9 +69,8 @@ def velocity_fit(machine: Machine, data: Dataset, cutoff: float) -> dict[str, fl
         rate = states[:, names.index(f"rate.{machine.axes[axis].joint}")]
         modelled = zero_phase(rate, run.period, cutoff).value
         gone = np.linalg.norm((measured - modelled)[hidden])
-        fits[axis] = float(
-            100.0 * (1.0 - gone / np.linalg.norm((measured - measured.mean())[hidden]))
-        )
+        whole = np.linalg.norm((measured - measured.mean())[hidden])
+        fits[axis] = float(100.0 * (1.0 - gone / whole))
     return fits
 
 

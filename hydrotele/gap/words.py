@@ -92,7 +92,7 @@ def chance_words(probability: float) -> str:
 
 
 def gap_closed(size: GapSize) -> float:
-    """Part of the gap that the patch closes, at most 1; NaN where none is above the noise or that is not known."""
+    """Part of the gap that the patch closes, at most 1; NaN where none is known above the noise."""
     if size.noise_floor is None:
         return math.nan
     above = size.before - size.noise_floor
