@@ -18,11 +18,10 @@ from hydrotele.gap.gap_json import finite, gap_document
 from hydrotele.gap.patched import has_patch, write_patch
 from hydrotele.gap.result import Gap
 from hydrotele.gap.words import effect_title, headline, verdict_words
-from hydrotele.log import Log, load_log
+from hydrotele.log import load_log
 from hydrotele.machine import Machine
 from hydrotele.machine_file import MACHINE_FILE, load_machine
 from hydrotele.output import check_target, whole_folder
-from hydrotele.replay import replay_log
 from hydrotele.simulate.native import stop_profiling_clock
 
 _COLOURS = {"named": "blue", "no_gap": "green", "ambiguous": "yellow", "unknown": "red"}
@@ -112,16 +111,11 @@ def write_gap(
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
-def predict(machine: Machine, log: Log) -> Log:
-    """What a machine does when it is driven with a log's commands, open loop from its start."""
-    return replay_log(log, machine).simulated.without_truth()
-
-
 def _search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool) -> Gap:
     from hydrotele.gap.find import find_gap
 
     with _stages(f"gap {dataset.machine.name}", quiet) as progress:
-        return find_gap(dataset, predict, progress, effects=tuple(effects), jobs=jobs or 2)
+        return find_gap(dataset, progress, effects=tuple(effects), jobs=jobs or 2)
 
 
 def _name(data: Sequence[Path]) -> str:

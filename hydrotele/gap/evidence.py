@@ -48,8 +48,11 @@ class Fit:
 class Evidence:
     """Runs of a dataset, tracks of a base guess, and workers to try other guesses."""
 
-    def __init__(self, data: Dataset, runs: Sequence[RunData], jobs: int = 2):
-        """Take the runs to judge by; `close` ends the workers."""
+    def __init__(
+        self, data: Dataset, runs: Sequence[RunData], jobs: int = 2, step: float = STEP
+    ):  # fmt: skip
+        """Take the runs to judge by and the largest step [s]; `close` ends the workers."""
+        self.step = step
         self.data, self.runs = data, tuple(runs)
         self._pool = ThreadPoolExecutor(jobs)
         self.tracks: tuple[Track, ...] = ()
@@ -61,7 +64,9 @@ class Evidence:
     def track(self, machine: Machine, runs: Sequence[RunData] | None = None) -> tuple[Track, ...]:
         """Tracks with gains of their own."""
         runs = self.runs if runs is None else runs
-        return tuple(self._pool.map(lambda run: track_run(machine, self.data, run), runs))
+        return tuple(
+            self._pool.map(lambda run: track_run(machine, self.data, run, None, self.step), runs)
+        )
 
     def set_base(self, guess: Guess) -> None:
         """Compute gains anew for a guess; later errors are whitened with them."""
@@ -78,13 +83,16 @@ class Evidence:
         return np.concatenate([flat(track.whitened) for track in self.tracks])
 
     def errors(
-        self, guess: Guess, step: float = STEP, tracks: Sequence[Track] | None = None
+        self, guess: Guess, step: float | None = None, tracks: Sequence[Track] | None = None
     ) -> np.ndarray:
         """(E,) whitened errors of a guess with the base's gains, in all or some of its tracks."""
         machine = guess.machine(self.data.machine)
         tracks = self.tracks if tracks is None else tracks
         return np.concatenate(
-            [flat(track_run(machine, self.data, t.run, t, step).whitened) for t in tracks]
+            [
+                flat(track_run(machine, self.data, t.run, t, step or self.step).whitened)
+                for t in tracks
+            ]
         )
 
     def step_of(self, guess: Guess, step: float) -> float:
@@ -99,7 +107,7 @@ class Evidence:
         return list(self._pool.map(function, items))
 
     def slopes(
-        self, guess: Guess, errors: np.ndarray, parallel: bool = True, step: float = STEP
+        self, guess: Guess, errors: np.ndarray, parallel: bool = True, step: float | None = None
     ) -> np.ndarray:
         """(E, P) change of the errors per deviation; `step` as for the errors [s]."""
 
@@ -115,7 +123,7 @@ class Evidence:
 
     def fit(
         self, guess: Guess, before: float, parallel: bool = True, steps: int = _STEPS,
-        step: float = STEP,
+        step: float | None = None,
     ) -> Fit:  # fmt: skip
         """Gauss-Newton with halved steps, from the guess.
 
@@ -124,7 +132,7 @@ class Evidence:
             before: loss of the guess without its last part, for the gain.
             parallel: whether this may use the workers (not from within one).
             steps: largest number of Gauss-Newton steps.
-            step: largest step of the integrator [s].
+            step: largest step of the integrator [s]; the evidence's own if None.
 
         Returns:
             The fit.

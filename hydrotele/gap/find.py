@@ -26,12 +26,12 @@ from hydrotele.gap.result import (
 )
 from hydrotele.gap.search import MOST, Found, search
 from hydrotele.gap.stretches import busiest
-from hydrotele.gap.tracking import Track
+from hydrotele.gap.tracking import STEP, Track
 from hydrotele.gap.unknown import describe_unknown
-from hydrotele.log import Log
 from hydrotele.machine import Machine
 
 _MOST_UNFLOORED = 6  # real machines without stated noise lack more than one effect
+_ROUGH_STEP = 2.0e-3  # s, where the noise is not known and far above the integrator's errors
 _NO_FLOOR = (
     "The machine states no accuracy of its sensors: an error counts by its mean over half a second,"
     " in units of the given model's errors, and it cannot be said whether what remains is noise or"
@@ -46,7 +46,6 @@ Progress = Callable[[str, float], None]
 
 def find_gap(
     data: Dataset,
-    predict: Callable[[Machine, Log], Log] | None = None,
     progress: Progress | None = None,
     effects: Sequence[str] = (),
     jobs: int = 2,
@@ -55,7 +54,6 @@ def find_gap(
 
     Args:
         data: the logs; the fit runs decide, the held-out run judges.
-        predict: (machine, log) -> what a simulator makes of the log's commands; not used yet.
         progress: called with (what is being done, share done).
         effects: names of the effects to try; all if empty.
         jobs: threads.
@@ -64,7 +62,6 @@ def find_gap(
         The gap, named or not.
     """
     begin = time.perf_counter()
-    del predict
     tell = progress or (lambda text, share: None)
     candidates = hypotheses(data.machine, effects)
     data = busiest(data)
@@ -73,7 +70,7 @@ def find_gap(
         tell("find the noise levels", 0.0)
         with ThreadPoolExecutor(jobs) as pool:
             data = find_levels(data, pool.map)
-    evidence = Evidence(data, data.fit, jobs)
+    evidence = Evidence(data, data.fit, jobs, STEP if floored else _ROUGH_STEP)
     try:
         found = search(evidence, candidates, progress, MOST if floored else _MOST_UNFLOORED)
         runs = (data.heldout, *data.fit)

@@ -7,11 +7,14 @@ import numpy as np
 
 from hydrotele.gap.evidence import Evidence, Fit, charge, flat
 from hydrotele.gap.hypothesis import Guess, Hypothesis
-from hydrotele.gap.tracking import COARSE, STEP
+from hydrotele.gap.tracking import COARSE
 
 ENTER = 15.0  # twice the log evidence an effect must bring; three times what 100 clean machines do
 MOST = 3  # effects that one search names
 _WIDE = 24  # candidates that are tried on all runs
+_ODDS = 6.0  # score by which a candidate too small to name must lead another, 20 to 1
+_BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
+# order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
 _SHORT = 5  # candidates that are fitted after a screening
 _RIVALS = 6  # candidates that are compared with a named effect
 _HOPELESS = 500.0  # loss above the effect's after two steps, beyond which a rival is let go
@@ -175,7 +178,7 @@ def search(
         best = best_addition(evidence, guess, ranked)
         if best is None or best.score < ENTER or _beside_the_point(evidence, best):
             break
-        if not worth_naming(best.guess, len(best.guess.parts) - 1):
+        if not worth_naming(best.guess, -1, best.score):
             weak = best
             break
         tell(f"fit {best.guess.parts[-1][0].name}", 0.9 * (1.0 - 0.6 ** (depth + 0.7)) + 0.05)
@@ -187,8 +190,9 @@ def search(
     for index in range(len(guess.parts)):
         ranked = seen.get(guess.parts[index][0].key, rankings[0])
         score, others = compare(evidence, guess, index, ranked)
-        if others and others[0].score > score and worth_naming(others[0].guess, -1):
-            guess, fit = settle(evidence, _exchanged(guess, index, others[0].guess))
+        best = others[0] if others else None
+        if best and best.score > score and worth_naming(best.guess, -1, best.score):
+            guess, fit = settle(evidence, _exchanged(guess, index, best.guess))
             score, others = compare(evidence, guess, index, ranked)
         scores.append(score)
         rivals.append(others)
@@ -237,8 +241,13 @@ def best_addition(
 
     fits = evidence.map(fitted, short)
     inside = [fit for fit in fits if fit.score > ENTER and not _strained(fit.guess)]
-    best = max(inside or fits, key=lambda fit: fit.score).guess
-    return evidence.fit(best, _loss_of(evidence, guess, evidence.step_of(best, STEP)), steps=2)
+    inside = sorted(inside or fits, key=lambda fit: -fit.score)
+    as_likely = [fit for fit in inside if fit.score > inside[0].score - _ODDS]
+    large = [fit for fit in as_likely if worth_naming(fit.guess, -1, fit.score)]
+    best = (large or inside)[0].guess
+    return evidence.fit(
+        best, _loss_of(evidence, guess, evidence.step_of(best, evidence.step)), steps=2
+    )
 
 
 def _strained(guess: Guess) -> bool:
@@ -248,7 +257,7 @@ def _strained(guess: Guess) -> bool:
     return bool(np.any(edge & (np.abs(deviation) > hypothesis.least)))
 
 
-def _loss_of(evidence: Evidence, guess: Guess, step: float = STEP) -> float:
+def _loss_of(evidence: Evidence, guess: Guess, step: float) -> float:
     errors = evidence.errors(guess, step)
     return float(errors @ errors + guess.deviation @ guess.deviation)
 
@@ -268,10 +277,10 @@ def settle(evidence: Evidence, guess: Guess) -> tuple[Guess, Fit]:
     return guess, fit
 
 
-def worth_naming(guess: Guess, index: int) -> bool:
-    """Whether an effect is as large as its least size in any parameter."""
+def worth_naming(guess: Guess, index: int, score: float) -> bool:
+    """Whether an effect is as large as its least size in any parameter, or beyond doubt."""
     hypothesis, deviation = guess.parts[index]
-    return bool(np.any(np.abs(deviation) >= hypothesis.least))
+    return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
 
 
 def _prune(evidence: Evidence, guess: Guess, fit: Fit | None) -> tuple[Guess, Fit | None]:
@@ -282,7 +291,7 @@ def _prune(evidence: Evidence, guess: Guess, fit: Fit | None) -> tuple[Guess, Fi
             rest = evidence.fit(guess.without(index), 0.0)
             size = guess.parts[index][0].size
             score = rest.loss - fit.loss - charge(_last(fit.information, guess, index), size)
-            if not worth_naming(guess, index):
+            if not worth_naming(guess, index, score):
                 score = min(score, 0.0)
             if score < worst_score:
                 worst, worst_score, worst_rest = index, score, rest.guess
@@ -329,7 +338,7 @@ def compare(
     close = [f.guess for f in glances[1:] if f.loss < glances[0].loss + _HOPELESS]
 
     def fitted(there: Guess) -> Fit:
-        before = _loss_of(evidence, rest, evidence.step_of(there, STEP))
+        before = _loss_of(evidence, rest, evidence.step_of(there, evidence.step))
         return evidence.fit(there, before, parallel=False, steps=4)
 
     own, *fits = evidence.map(fitted, [rest.plus(*own_part), *close])

@@ -46,8 +46,8 @@ def searching(monkeypatch, gap_of):
     def put(verdict):
         asked = {}
 
-        def find_gap(dataset, predict=None, progress=None, **chosen):
-            asked.update(chosen, dataset=dataset, predict=predict)
+        def find_gap(dataset, progress=None, **chosen):
+            asked.update(chosen, dataset=dataset)
             return gap_of(verdict)
 
         module = types.ModuleType("hydrotele.gap.find")
@@ -115,14 +115,6 @@ def test_choices_reach_the_search(site, searching):
     assert invoke("gap", "--data", "site", "--no-recording", *words)[0] == 0
     assert asked["effects"] == ("payload", "pin_offset") and asked["jobs"] == 2
     assert asked["dataset"].heldout.name == "fit_1"
-
-
-def test_predictions_come_from_a_replay(site, searching, heldout):
-    asked = searching("no_gap")
-    assert invoke("gap", "--data", "site", "--no-recording")[0] == 0
-    log = asked["predict"](load_machine("cat215", "none"), heldout.log)
-    assert len(log) == len(heldout.log) and "pressure_head.boom" in log
-    assert not any(name.startswith("truth") for name in log.columns)
 
 
 @pytest.mark.parametrize(

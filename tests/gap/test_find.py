@@ -68,6 +68,48 @@ def test_missing_channels_and_rows_still_find_the_dead_band(tmp_path):
     assert gap.effects[0].parameters["deadband"].value == pytest.approx(0.085, abs=0.002)
 
 
+def test_stuck_sensor_and_files_with_unlike_clocks_still_find_the_dead_band(tmp_path):
+    """Pressures in files of their own, 2.5 s off; the boom's angle stands still in one run."""
+    for path in sorted((MEASURED / "open_05").glob("*.parquet")):
+        log = load_log(path)
+        columns = {c: log[c].copy() for c in log.columns if not c.startswith("truth")}
+        if path.stem == "fit_1":
+            columns["angle.boom"][600:] = columns["angle.boom"][600]
+        for part, later in (("motion", 0.0), ("pressures", 2.5)):
+            kept = [c for c in columns if c.startswith("command")]
+            kept += [c for c in columns if c not in kept
+                     and c.startswith("pressure") == (part == "pressures")]  # fmt: skip
+            named = f"{path.stem}.{part}.parquet"
+            units = {c: log.units[c] for c in kept}
+            save_log(
+                Log(log.time + later, {c: columns[c] for c in kept}, units, log.metadata),
+                tmp_path / named,
+            )
+    data = load_dataset([tmp_path], load_machine("cat215"))
+    assert len([note for note in data.notes if "-2.5 s" in note]) == 4
+    assert any(note.startswith("fit_1: angle.boom is stuck") for note in data.notes)
+    gap = find_gap(data)
+    assert {(e.name, e.location) for e in gap.effects} == {("valve_deadband", "stick")}
+    assert gap.effects[0].parameters["deadband"].value == pytest.approx(0.085, abs=0.002)
+
+
+def test_a_length_offset_as_small_as_a_pin_may_be_off_is_ambiguous(tmp_path):
+    """1.5 mm of the stick's length sensor look like its cylinder's pin 1.5 mm off."""
+    for path in sorted((MEASURED / "open_04").glob("*.parquet")):
+        log = load_log(path)
+        columns = {c: log[c] + (0.0015 if c == "length.stick" else 0.0) for c in log.columns}
+        save_log(Log(log.time, columns, log.units, log.metadata), tmp_path / path.name)
+    gap = found(tmp_path)
+    assert gap.verdict == "ambiguous"
+    (effect,) = gap.effects
+    likely = {(effect.name, effect.location): effect.probability}
+    likely |= {(a.name, a.location): a.probability for a in effect.alternatives}
+    assert {("length_offset", "stick"), ("pin_offset", "stick")} <= likely.keys()
+    assert sum(likely.values()) < 1.0 + 1e-9
+    assert max(likely, key=likely.__getitem__) == (effect.name, effect.location)
+    assert gap.next_experiment and gap.next_experiment["scenario"]
+
+
 def test_truth_columns_change_nothing(tmp_path):
     """The search sees measured channels only."""
     shutil.copytree(MEASURED / "open_04", tmp_path / "logs")
