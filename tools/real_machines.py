@@ -10,6 +10,7 @@ not fitted.
 
 import argparse
 import dataclasses
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -96,13 +97,19 @@ def emps(folder: Path, jobs: int) -> None:
         print(f"  relative force error, held out, {cutoff:.0f} Hz: {before:.2f} -> {after:.2f} %")
 
 
-def ec20(folder: Path, jobs: int) -> None:
-    """Name what a valve without delay and dead band lacks."""
+def plain_valves(record: Path) -> Dataset:
+    """The EC20's record with a machine whose valves have neither delay nor dead band."""
     machine = load_machine("ec20")
     for axis in ("boom", "stick"):
         machine = apply_effect(machine, "valve_deadband", axis, {"deadband": 0.0})
-    data = load_dataset(folder / "volvo_ec20" / "long.parquet", machine)
-    gap = find_gap(data, jobs=jobs)
+    return load_dataset(record, machine)
+
+
+def ec20(folder: Path, jobs: int) -> None:
+    """Name what a valve without delay and dead band lacks."""
+    data = plain_valves(folder / "volvo_ec20" / "long.parquet")
+    machine = data.machine
+    gap = find_gap(data, lambda text, _: print(f"  {text}", file=sys.stderr), jobs=jobs)
     print(f"EC20: {gap.verdict}: {named(gap)}  ({gap.seconds:.0f} s)")
     judged = find_levels(busiest(data))
     before, after = (velocity_fit(m, judged, 2.0) for m in (machine, gap.patched))

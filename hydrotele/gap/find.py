@@ -10,7 +10,7 @@ from hydrotele.gap.balances import balances
 from hydrotele.gap.dataset import Dataset
 from hydrotele.gap.evidence import Evidence, Fit
 from hydrotele.gap.experiment import next_experiment
-from hydrotele.gap.floor import noise_floor
+from hydrotele.gap.floor import perfect_tracks
 from hydrotele.gap.hypothesis import Hypothesis, hypotheses
 from hydrotele.gap.levels import find_levels, known_levels
 from hydrotele.gap.residuals import residual_tests, rms
@@ -30,7 +30,7 @@ from hydrotele.gap.tracking import STEP, Track
 from hydrotele.gap.unknown import describe_unknown
 from hydrotele.machine import Machine
 
-_MOST_UNFLOORED = 6  # real machines without stated noise lack more than one effect
+_MOST_UNFLOORED = 4  # real machines without stated noise lack more than one effect
 _ROUGH_STEP = 2.0e-3  # s, where the noise is not known and far above the integrator's errors
 _NO_FLOOR = (
     "The machine states no accuracy of its sensors: an error counts by its mean over half a second,"
@@ -80,9 +80,10 @@ def find_gap(
         after = evidence.track(patched, runs) if found.guess.parts else before
     finally:
         evidence.close()
-    floor = noise_floor(patched, data) if floored else None
+    perfect = perfect_tracks(patched, data, after) if floored else ()
+    floor = rms(perfect[0].whitened) if perfect else None
     unit = 1.0 if floored else rms(np.concatenate([t.whitened for t in before[1:]]))
-    tests = residual_tests(after, data.channels) if floored else {}
+    tests = residual_tests(after, data.channels, perfect) if floored else {}
     failed = any(not test["passed"] for test in tests.values())
     named = _named(found, failed)
     verdict = _verdict(named, failed)

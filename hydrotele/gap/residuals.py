@@ -13,39 +13,60 @@ import numpy as np
 
 from hydrotele.gap.tracking import Track
 
+_EXPECTED = (1.0, 1.0, 0.0)  # of white noise of size 1, in the order of LIMITS
+_ALLOWED = 5.0  # times what the filter leaves on simulated readings, which varies by two
+
 _SETTLE = 25  # rows until the start no longer matters
 _WINDOW = 50  # rows, 1 s at 50 Hz: longer than any ringing of the errors, shorter than a motion
 _LAGS = 5
 LIMITS = {"mean_square": 1.12, "window_means": 1.8, "autocorrelation": 60.0}
-"""Largest value of a test in any channel that still passes."""
+"""Largest value of a test in any channel that still passes, for a smooth model."""
 
 
-def residual_tests(tracks: Sequence[Track], channels: Sequence[str]) -> dict[str, dict[str, Any]]:
+def residual_tests(
+    tracks: Sequence[Track], channels: Sequence[str], perfect: Sequence[Track] = ()
+) -> dict[str, dict[str, Any]]:
     """Tests of a model's errors over all runs.
+
+    Where a model has backlash or late sensors, a filter that takes everything for locally straight
+    leaves errors even on readings that the model itself made. A test then allows five times what
+    those leave in a channel beyond white noise.
 
     Args:
         tracks: the model's tracks, each with gains of its own.
         channels: the c channels.
+        perfect: the model's tracks of the same runs with readings that it made itself.
 
     Returns:
-        Test -> "value" (the worst channel's), "channel", "limit", "passed". `mean_square` of the
-        errors; `window_means`: mean square of the means over 1 s, times their length;
-        `autocorrelation`: sum over 5 lags of n r^2, mean over the runs, less its expectation 5.
+        Test -> "value" (of the channel nearest to or farthest above its limit), "channel", "limit",
+        "passed". `mean_square` of the errors; `window_means`: mean square of the means over 1 s,
+        times their length; `autocorrelation`: sum over 5 lags of n r^2, mean over the runs, less
+        its expectation 5.
     """
+    values = _values(tracks)
+    own = _values(perfect) if perfect else [np.full(len(channels), e) for e in _EXPECTED]
+    found = {}
+    for name, measured, made, white in zip(LIMITS, values, own, _EXPECTED, strict=True):
+        limits = np.maximum(LIMITS[name], white + _ALLOWED * (made - white))
+        worst = int(np.argmax(measured / limits))
+        found[name] = {
+            "value": float(measured[worst]),
+            "channel": channels[worst],
+            "limit": float(limits[worst]),
+            "passed": bool(measured[worst] <= limits[worst]),
+        }
+    return found
+
+
+def _values(tracks: Sequence[Track]) -> list[np.ndarray]:
+    """Per test the values (c,) of all channels over all runs."""
     parts = [_measures(track.whitened) for track in tracks]
     weights = np.array([p[0] for p in parts])
     total = np.maximum(weights.sum(axis=0), 1.0)
-    found = {}
-    for index, name in enumerate(("mean_square", "window_means", "autocorrelation"), 1):
-        values = np.sum(weights * np.array([p[index] for p in parts]), axis=0) / total
-        worst = int(np.argmax(values))
-        found[name] = {
-            "value": float(values[worst]),
-            "channel": channels[worst],
-            "limit": LIMITS[name],
-            "passed": bool(values[worst] <= LIMITS[name]),
-        }
-    return found
+    return [
+        np.sum(weights * np.array([p[index] for p in parts]), axis=0) / total
+        for index in range(1, 1 + len(LIMITS))
+    ]
 
 
 def _measures(whitened: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

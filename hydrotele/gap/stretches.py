@@ -6,7 +6,7 @@ import numpy as np
 
 from hydrotele.gap.dataset import Dataset, RunData
 
-MOST_SECONDS = 360.0  # of all fitted runs together: nine runs of a usual length
+MOST_SECONDS = 720.0  # of all fitted runs together: eighteen runs of a usual length
 
 
 def busiest(data: Dataset, most: float = MOST_SECONDS) -> Dataset:
