@@ -7,11 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from hydrotele.gap.balances import balances
+from hydrotele.gap.constancy import constancy
 from hydrotele.gap.dataset import Dataset
 from hydrotele.gap.evidence import Evidence, Fit
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.floor import perfect_tracks
-from hydrotele.gap.hypothesis import Hypothesis, hypotheses
+from hydrotele.gap.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.gap.levels import find_levels, known_levels
 from hydrotele.gap.residuals import residual_tests, rms
 from hydrotele.gap.result import (
@@ -78,12 +79,10 @@ def find_gap(
         before = evidence.track(data.machine, runs)
         patched = found.guess.machine(data.machine)
         after = evidence.track(patched, runs) if found.guess.parts else before
+        tests, floor = _tests(evidence, found.guess, after) if floored else ({}, None)
     finally:
         evidence.close()
-    perfect = perfect_tracks(patched, data, after) if floored else ()
-    floor = rms(perfect[0].whitened) if perfect else None
     unit = 1.0 if floored else rms(np.concatenate([t.whitened for t in before[1:]]))
-    tests = residual_tests(after, data.channels, perfect) if floored else {}
     failed = any(not test["passed"] for test in tests.values())
     named = _named(found, failed)
     verdict = _verdict(named, failed)
@@ -115,6 +114,22 @@ def find_gap(
         notes=(*data.notes, *_notes(found), *([] if floored else [_NO_FLOOR])),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
+
+
+def _tests(evidence: Evidence, guess: Guess, tracks: Sequence[Track]):
+    """Tests of what a guess leaves, and the noise floor, against readings made by the guess."""
+    data = evidence.data
+    perfect = perfect_tracks(guess.machine(data.machine), data, tracks)
+    tests = residual_tests(tracks, data.channels, perfect)
+    if guess.parts:
+        made = Evidence(data, [track.run for track in perfect[1:]], 1, evidence.step)
+        try:
+            evidence.set_base(guess)
+            made.set_base(guess)
+            tests["constancy"] = constancy(evidence, guess, made)
+        finally:
+            made.close()
+    return tests, rms(perfect[0].whitened)
 
 
 def _verdict(named: Sequence[NamedEffect], failed: bool) -> Verdict:

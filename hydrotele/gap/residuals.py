@@ -14,7 +14,7 @@ import numpy as np
 from hydrotele.gap.tracking import Track
 
 _EXPECTED = (1.0, 1.0, 0.0)  # of white noise of size 1, in the order of LIMITS
-_ALLOWED = 5.0  # times what the filter leaves on simulated readings, which varies by two
+ALLOWED = 5.0  # times what the filter leaves on simulated readings, which varies by two
 
 _SETTLE = 25  # rows until the start no longer matters
 _WINDOW = 50  # rows, 1 s at 50 Hz: longer than any ringing of the errors, shorter than a motion
@@ -47,7 +47,7 @@ def residual_tests(
     own = _values(perfect) if perfect else [np.full(len(channels), e) for e in _EXPECTED]
     found = {}
     for name, measured, made, white in zip(LIMITS, values, own, _EXPECTED, strict=True):
-        limits = np.maximum(LIMITS[name], white + _ALLOWED * (made - white))
+        limits = np.maximum(LIMITS[name], white + ALLOWED * (made - white))
         worst = int(np.argmax(measured / limits))
         found[name] = {
             "value": float(measured[worst]),
