@@ -50,7 +50,7 @@ def _pull(evidence: Evidence, guess: Guess, index: int) -> tuple[np.ndarray, np.
     tracks = (evidence.tracks[index],)
     errors = evidence.errors(guess, tracks=tracks)
     columns = []
-    for place, nudge in enumerate(guess.nudges):
+    for place, nudge in enumerate(guess.nudges()):
         moved = guess.deviation
         moved[place] += nudge
         columns.append((evidence.errors(guess.at(moved), tracks=tracks) - errors) / nudge)

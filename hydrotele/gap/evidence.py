@@ -110,10 +110,11 @@ class Evidence:
         self, guess: Guess, errors: np.ndarray, parallel: bool = True, step: float | None = None
     ) -> np.ndarray:
         """(E, P) change of the errors per deviation; `step` as for the errors [s]."""
+        nudges = guess.nudges()
 
         def column(index: int) -> np.ndarray:
             moved = guess.deviation
-            nudge = guess.nudges[index]
+            nudge = nudges[index]
             moved[index] += nudge
             return (self.errors(guess.at(moved), step) - errors) / nudge
 

@@ -9,6 +9,7 @@ from hydrotele.effects import EFFECTS, Parameter
 from hydrotele.machine import Machine
 
 _CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
+WIDE = 0.3  # of it: for a first look, where friction that sticks or slips makes slopes steep
 _SMOOTH = ("timing", "sensor")  # laws whose effects have a slope at nominal, besides their starts
 
 
@@ -67,9 +68,9 @@ class Hypothesis:
             for (key, p), d in zip(self.parameters.items(), deviation, strict=True)
         }
 
-    def nudges(self, deviation: np.ndarray) -> np.ndarray:
+    def nudges(self, deviation: np.ndarray, size: float = _CURVE) -> np.ndarray:
         """(p,) signed steps for slopes at a deviation, away from the nearer bound."""
-        step = np.minimum(_CURVE, 0.1 * (self.high - self.low))
+        step = np.minimum(size, 0.1 * (self.high - self.low))
         return np.where(deviation + step > self.high, -step, step)
 
 
@@ -122,10 +123,9 @@ class Guess:
         """Without the hypothesis at an index."""
         return Guess(self.parts[:index] + self.parts[index + 1 :])
 
-    @property
-    def nudges(self) -> np.ndarray:
-        """(P,) signed steps for slopes."""
-        steps = [h.nudges(d) for h, d in self.parts]
+    def nudges(self, size: float = _CURVE) -> np.ndarray:
+        """(P,) signed steps for slopes, of a size in typical deviations."""
+        steps = [h.nudges(d, size) for h, d in self.parts]
         return np.concatenate(steps) if steps else np.zeros(0)
 
     def machine(self, nominal: Machine) -> Machine:

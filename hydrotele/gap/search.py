@@ -6,15 +6,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from hydrotele.gap.evidence import Evidence, Fit, charge, flat
-from hydrotele.gap.hypothesis import Guess, Hypothesis
+from hydrotele.gap.hypothesis import WIDE, Guess, Hypothesis
 from hydrotele.gap.tracking import COARSE
 
 ENTER = 15.0  # twice the log evidence an effect must bring; three times what 100 clean machines do
 MOST = 3  # effects that one search names
-_WIDE = 24  # candidates that are tried on all runs
+_FEW = 24  # candidates that are tried on all runs
 _ODDS = 6.0  # score by which a candidate too small to name must lead another, 20 to 1
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
+_MIDDLE = 2.0e-3  # s, step for the fits that choose between candidates
 _SHORT = 5  # candidates that are fitted after a screening
 _RIVALS = 6  # candidates that are compared with a named effect
 _HOPELESS = 500.0  # loss above the effect's after two steps, beyond which a rival is let go
@@ -79,9 +80,9 @@ def screen(evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis]) -
     taken = {h.key for h, _ in guess.parts}
     open_ones = [h for h in candidates if h.key not in taken]
     worst = max(evidence.tracks, key=lambda t: float(np.nanmean(t.whitened**2)))
-    if len(evidence.tracks) > 1 and len(open_ones) > _WIDE:
+    if len(evidence.tracks) > 1 and len(open_ones) > _FEW:
         first = _rank(evidence, guess, open_ones, (worst,))
-        open_ones = [s.hypothesis for s in first[:_WIDE]]
+        open_ones = [s.hypothesis for s in first[:_FEW]]
     return _rank(evidence, guess, open_ones, evidence.tracks)
 
 
@@ -123,7 +124,7 @@ def _rank(evidence: Evidence, guess: Guess, candidates, tracks) -> list[Screened
 
 
 def _slope(errors_of, guess: Guess, base: np.ndarray, index: int, step: float) -> np.ndarray:
-    moved, nudge = guess.deviation, guess.nudges[index]
+    moved, nudge = guess.deviation, guess.nudges(WIDE)[index]
     moved[index] += nudge
     return (errors_of(guess.at(moved), step) - base) / nudge
 
@@ -235,9 +236,9 @@ def best_addition(
 
     def fitted(candidate: Screened) -> Fit:
         more = guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, COARSE)
+        step = evidence.step_of(more, _MIDDLE)
         before = _loss_of(evidence, guess, step)
-        return evidence.fit(more, before, parallel=False, steps=4, step=step)
+        return evidence.fit(more, before, parallel=False, step=step)
 
     fits = evidence.map(fitted, short)
     inside = [fit for fit in fits if fit.score > ENTER and not _strained(fit.guess)]
