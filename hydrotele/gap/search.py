@@ -183,8 +183,14 @@ def search(
             weak = best
             break
         tell(f"fit {best.guess.parts[-1][0].name}", 0.9 * (1.0 - 0.6 ** (depth + 0.7)) + 0.05)
-        seen[best.guess.parts[-1][0].key] = ranked
-        guess, fit = settle(evidence, best.guess)
+        added = best.guess.parts[-1][0]
+        grown = settle(evidence, best.guess)
+        if _strained(grown[0]):
+            candidates = [c for c in candidates if c.key != added.key]
+            evidence.set_base(guess)
+            continue
+        seen[added.key] = ranked
+        guess, fit = grown
     guess, fit = _prune(evidence, guess, fit)
     tell("compare rivals", 0.92)
     rivals, scores = [], []
@@ -193,8 +199,12 @@ def search(
         score, others = compare(evidence, guess, index, ranked)
         best = others[0] if others else None
         if best and best.score > score and worth_naming(best.guess, -1, best.score):
-            guess, fit = settle(evidence, _exchanged(guess, index, best.guess))
-            score, others = compare(evidence, guess, index, ranked)
+            kept, swapped = guess, settle(evidence, _exchanged(guess, index, best.guess))
+            if _strained(swapped[0]):
+                evidence.set_base(kept)
+            else:
+                guess, fit = swapped
+                score, others = compare(evidence, guess, index, ranked)
         scores.append(score)
         rivals.append(others)
     return Found(guess, fit, tuple(rankings[0]), tuple(rivals), tuple(scores), weak)
@@ -252,10 +262,10 @@ def best_addition(
 
 
 def _strained(guess: Guess) -> bool:
-    """Whether the last part stands at the edge of what is physically plausible."""
-    hypothesis, deviation = guess.parts[-1]
-    edge = (deviation <= hypothesis.low) | (deviation >= hypothesis.high)
-    return bool(np.any(edge & (np.abs(deviation) > hypothesis.least)))
+    """Whether any part stands at the edge of what is physically plausible."""
+    return any(
+        np.any(((d <= h.low) | (d >= h.high)) & (np.abs(d) > h.least)) for h, d in guess.parts
+    )
 
 
 def _loss_of(evidence: Evidence, guess: Guess, step: float) -> float:
@@ -343,4 +353,5 @@ def compare(
         return evidence.fit(there, before, parallel=False, steps=4)
 
     own, *fits = evidence.map(fitted, [rest.plus(*own_part), *close])
-    return own.score, tuple(sorted(fits, key=lambda fit: -fit.score))
+    plausible = [fit for fit in fits if not _strained(fit.guess)]
+    return own.score, tuple(sorted(plausible, key=lambda fit: -fit.score))
