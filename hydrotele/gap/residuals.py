@@ -1,7 +1,7 @@
 """Are the prediction errors of a model those of a perfect one? Several tests, none on one block.
 
 Whitened errors of a perfect model are white noise of size 1 in every channel. The limits lie well
-above what integrators and linearisation leave on 100 clean simulated machines, whose worst channels
+above what integrators and linearisation leave on clean simulated machines, whose worst channels
 reach 1.03, 1.3 and 25 (`docs/results/gap_calibration.md`), and far below what an effect of some
 size leaves (3, 54 and 3100 on open_02).
 """
