@@ -38,7 +38,7 @@ def _spread(evidence: Evidence, guess: Guess) -> tuple[float, str]:
     """Chi-square per degree of freedom, and the run that departs most."""
     table = [_pull(evidence, guess, index) for index in range(len(evidence.tracks))]
     gains = [_gain(g, information) for g, information in table]
-    whole, _ = _gain(sum(g for g, _ in table), sum(i for _, i in table))
+    whole, _ = _gain(np.sum([g for g, _ in table], axis=0), np.sum([i for _, i in table], axis=0))
     freedom = sum(rank for _, rank in gains) - len(guess.deviation)
     value = (sum(gain for gain, _ in gains) - whole) / freedom if freedom > 0 else 0.0
     worst = int(np.argmax([gain for gain, _ in gains]))
