@@ -128,10 +128,11 @@ def _open_machine(data: Sequence[Path], name: str | None, tool: str | None) -> M
     """The machine named, else the one beside the first log, else the one that the log names."""
     log = _first_log(data[0])
     metadata: Mapping[str, str] = {}
-    if log and log.suffix.lower() == ".parquet":
-        metadata = load_log(log, maximum_dropped=1.0).metadata
     if name is None and log and (log.parent / MACHINE_FILE).is_file():
         name = str(log.parent / MACHINE_FILE)
+    if log and log.suffix.lower() == ".parquet":
+        columns = load_machine(name, tool).log_columns if name else None
+        metadata = load_log(log, aliases=columns, maximum_dropped=1.0).metadata
     name = name or metadata.get("machine")
     if not name:
         raise InputError(data[0], "its metadata names no machine: give --machine")

@@ -9,7 +9,7 @@ from hydrotele.gap.evidence import Evidence, Fit, charge, flat
 from hydrotele.gap.hypothesis import WIDE, Guess, Hypothesis
 from hydrotele.gap.tracking import COARSE
 
-ENTER = 15.0  # twice the log evidence an effect must bring; three times what clean machines reach
+ENTER = 15.0  # twice the log evidence an effect must bring; thrice what 56 clean machines reach
 MOST = 3  # effects that one search names
 _FEW = 24  # candidates that are tried on all runs
 _ODDS = 6.0  # score by which a candidate too small to name must lead another, 20 to 1
