@@ -1,10 +1,13 @@
 """The workflow on public records of real machines; a full run is `tools/real_machines.py`."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from hydrotele.cli import app
 from hydrotele.gap.dataset import load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.levels import find_levels
@@ -30,6 +33,17 @@ def test_emps_names_friction_that_depends_on_the_direction():
     # published 4.08 % before and 3.11 % after, all samples fitted; here none of these was
     assert force_error(machine, data.heldout, 20.0) > 3.5
     assert force_error(gap.patched, data.heldout, 20.0) < 3.2
+
+
+def test_the_command_reads_a_record_whose_columns_only_the_machine_can_name(tmp_path):
+    """The record calls its columns `position` and `drive_voltage`; there is no noise floor."""
+    out = tmp_path / "gap"
+    words = ["--machine", "emps", "--data", str(REAL / "emps" / "main.parquet"), "--no-recording"]
+    done = CliRunner().invoke(app, ["gap", *words, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    document = json.loads((out / "gap.json").read_text())
+    assert document["verdict"] == "named" and document["gap"]["noise_floor"] is None
+    assert "prediction error of a perfect model" not in (out / "report.html").read_text()
 
 
 def test_ec20_names_delay_and_dead_band_of_a_valve_without_them():
