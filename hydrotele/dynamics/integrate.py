@@ -232,8 +232,8 @@ def advance(model, sp, z, command, row, period, steps, trail):
         row: index of the row to cross.
         period: length of a row, scalar [s].
         steps: steps per row.
-        trail: (>= steps (row + 1) + 1, c) written: what the channels with a lag show at every
-            step; (0, c) keeps nothing.
+        trail: (>= steps + 1, c) written: what the channels with a lag show at every step of the
+            row; (0, c) keeps nothing.
 
     Returns:
         Nothing.
@@ -245,6 +245,8 @@ def advance(model, sp, z, command, row, period, steps, trail):
     act, drive = z[2 * total :], sp.drive
     _take_commands(model, drive, command, row, 0.0, h, period)
     place(model, sp, z)
+    if len(trail) > 0:
+        write_trail(model, sp, z, trail[0])
     accelerate(model, sp, z, 0.5 * h)
     for f in range(total):
         z[total + f] += 0.5 * h * sp.force[f]
@@ -269,7 +271,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
         for f in range(total):
             z[total + f] += kick * sp.force[f]
         if len(trail) > 0:
-            write_trail(model, sp, z, trail[row * steps + step + 1])
+            write_trail(model, sp, z, trail[step + 1])
 
 
 @lean
@@ -312,7 +314,7 @@ def _shown(model, sp, z, c):
         return sp.drive[X, i]
     if kind == SUPPLY:
         return supply_of(model, sp, z)
-    return z[len(z) - 4 * (model.hydraulic - i) + kind]
+    return z[2 * (len(model.mech.free) + len(model.transmission)) + 4 * i + kind]
 
 
 @lean
@@ -322,7 +324,7 @@ def supply_of(model, sp, z):
     Source: nominal model, "Supply".
     """
     user, count = model.user, model.hydraulic
-    act = z[len(z) - 4 * count :]
+    act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
     open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
     return supply_pressure(sp.scratch, count, user[_D], user[_RELIEF], user[_PUMP])
 
@@ -338,7 +340,8 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
         row: index of the row, for channels with a lag.
         steps: steps per row.
         h: step, scalar [s].
-        trail: as `advance` writes it; (0, c) shows channels with a lag without it.
+        trail: as `advance` writes it, of all rows so far; (0, c) shows channels with a lag
+            without it.
         out: (c,) written [channel's unit].
 
     Returns:
@@ -388,4 +391,4 @@ def simulate_rows(model, sp, z, command, period, steps, out, states):
         for s in range(len(z)):
             states[row, s] = z[s]
         if row < rows - 1:
-            advance(model, sp, z, command, row, period, steps, trail)
+            advance(model, sp, z, command, row, period, steps, trail[row * steps :])

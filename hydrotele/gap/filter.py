@@ -17,9 +17,9 @@ from hydrotele.dynamics.integrate import (
     place,
     read_channels,
     supply_of,
-    write_trail,
 )
 from hydrotele.dynamics.mechanism import JOINT
+from hydrotele.gap.late import begin_late, move_late, spread_late
 
 
 class Gains(NamedTuple):
@@ -72,14 +72,15 @@ def _slopes(model, sp, z, nudge, slope, moved):
 
 @compiled
 def filter_run(
-    model, sp, z, spread, command, known, reading, noise, drift, startle, period, steps, coarse,
-    nudge, own, slope, gain, width, fresh, whitened, predicted, corrected,
+    model, sp, late, z, spread, command, known, reading, noise, drift, startle, period, steps,
+    coarse, nudge, own, slope, gain, width, fresh, whitened, predicted, corrected,
 ):  # fmt: skip
     """Cross a run.
 
     Args:
         model: Model.
         sp: Space.
+        late: Late; its q readings are the last of the nz states, and are set here at first.
         z: (nz,) state before the first row's readings; overwritten.
         spread: (nz, nz) its covariance; overwritten.
         command: (n, nu) commands.
@@ -92,8 +93,8 @@ def filter_run(
         steps: steps per row of the mean.
         coarse: steps per row of the covariance.
         nudge: (nz,) differences for derivatives.
-        own: (ng,) states that the gains know; those of a transmission that they lack follow the
-            load. All states where `fresh`.
+        own: (ng,) states that the gains know; of those that they lack, a transmission's follow
+            the load. All states where `fresh`.
         slope: (n, c, ng), gain: (n, c, ng), width: (n, c): see `Gains`; written if `fresh`, else
             used.
         gain: see slope.
@@ -101,28 +102,39 @@ def filter_run(
         fresh: whether to compute gains; False keeps the given ones.
         whitened: (n, c) written; NaN where missing.
         predicted: (n, c) written: readings predicted from the rows before.
-        corrected: (n, nz) written: states after the row's readings.
+        corrected: (n, nz - q) written: the model's states after the row's readings.
 
     Returns:
         -2 log likelihood without its constant; infinite if the states broke down.
 
     Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings.
     """
-    rows, channels, size = reading.shape[0], reading.shape[1], len(z)
-    h = period / steps
-    trail = np.zeros((rows * steps + 1, channels))
-    nothing = trail[:0]
-    reached = np.zeros((size + 1, size))
-    moved, work = np.zeros(size), np.zeros((size, size))
-    few = len(own)
-    delta, pull = np.zeros(few), np.zeros(size)
+    rows, channels, full = reading.shape[0], reading.shape[1], len(z)
+    size, h, few = full - len(late.channel), period / steps, len(own)
+    trail = np.zeros((steps + 1, channels))
+    rough = np.zeros((coarse + 1, channels))
+    if size == full:  # nothing is late
+        trail, rough = trail[:0], rough[:0]
+    reached = np.zeros((full + 1, full))
+    moved, work = np.zeros(size), np.zeros((full, full))
+    delta, pull = np.zeros(few), np.zeros(full)
     place(model, sp, z)
-    write_trail(model, sp, z, trail[0])
+    read_channels(model, sp, z, 0, steps, h, trail[:0], predicted[0])
+    begin_late(late, size, predicted[0], z)
+    if fresh:
+        _slopes(model, sp, z[:size], nudge, slope[0], moved)
+        spread_late(late, size, slope[0], spread)
     loss = 0.0
     for row in range(rows):
-        read_channels(model, sp, z, row, steps, h, trail, predicted[row])
+        read_channels(model, sp, z, row, steps, h, trail[:0], predicted[row])
         if fresh:
-            _slopes(model, sp, z, nudge, slope[row], moved)
+            _slopes(model, sp, z[:size], nudge, slope[row], moved)
+        for c in range(channels):
+            if late.first[c] >= 0:
+                predicted[row, c] = z[size + late.first[c]]
+                if fresh:
+                    slope[row, c, :] = 0.0
+                    slope[row, c, size + late.first[c]] = 1.0
         delta[:] = 0.0
         for c in range(channels):
             if math.isnan(reading[row, c]):
@@ -134,18 +146,18 @@ def filter_run(
                 error -= hc[s] * delta[s]
             if fresh:
                 total = noise[c]
-                for s in range(size):
+                for s in range(full):
                     pull[s] = 0.0
-                    for k in range(size):
+                    for k in range(full):
                         if hc[k] != 0.0:
                             pull[s] += spread[s, k] * hc[k]
-                for s in range(size):
+                for s in range(full):
                     total += hc[s] * pull[s]
                 width[row, c] = math.sqrt(total)
-                for s in range(size):
+                for s in range(full):
                     gain[row, c, s] = pull[s] / total
-                for s in range(size):
-                    for k in range(size):
+                for s in range(full):
+                    for k in range(full):
                         spread[s, k] -= pull[s] * pull[k] / total
             for s in range(few):
                 delta[s] += gain[row, c, s] * error
@@ -159,17 +171,23 @@ def filter_run(
         if row == rows - 1:
             break
         if fresh:
-            for s in range(size + 1):  # the state itself is the last row
-                for r in range(size):
-                    reached[s, r] = z[r]
+            for s in range(full, -1, -1):  # the state itself is the last row
+                moves = s < size or s == full
+                for r in range(full):
+                    reached[s, r] = z[r] if moves else reached[full, r]
                 if s < size:
                     reached[s, s] += nudge[s]
-                advance(model, sp, reached[s], command, row, period, coarse, nothing)
+                if moves:
+                    advance(model, sp, reached[s], command, row, period, coarse, rough)
+                    move_late(model, late, size, rough, period / coarse, reached[s])
+                elif s > size and late.due[s - size - 1] < 0.0:
+                    reached[s, s - 1] += nudge[s]
             _carry(reached, nudge, spread, work, drift)
             if not known[row]:
-                for s in range(size):
+                for s in range(full):
                     spread[s, s] += startle[s]
         advance(model, sp, z, command, row, period, steps, trail)
+        move_late(model, late, size, trail, h, z)
     return loss
 
 
@@ -185,7 +203,7 @@ def _correct(model, sp, z, own, delta):
         place(model, sp, z)
         for i in range(len(model.gear)):
             gear = model.gear[i]
-            if gear < 0:
+            if gear < 0 or _among(own, n + gear):
                 continue
             z[n + gear] += sign * load_position(model, sp, i)
             for f in range(n):
@@ -193,6 +211,15 @@ def _correct(model, sp, z, own, delta):
         if sign < 0.0:
             for s in range(len(own)):
                 z[own[s]] += delta[s]
+
+
+@lean
+def _among(numbers, number):
+    """Whether a number is one of (n,) numbers."""
+    for other in numbers:
+        if other == number:
+            return True
+    return False
 
 
 @lean

@@ -68,6 +68,11 @@ class Hypothesis:
             for (key, p), d in zip(self.parameters.items(), deviation, strict=True)
         }
 
+    def sides(self, index: int, size: float) -> list[float]:
+        """Steps of a parameter from nominal to either side, as far as its bounds allow."""
+        steps = (min(size, self.high[index]), max(-size, self.low[index]))
+        return [float(step) for step in steps if step != 0.0]
+
     def nudges(self, deviation: np.ndarray, size: float = _CURVE) -> np.ndarray:
         """(p,) signed steps for slopes at a deviation, away from the nearer bound."""
         step = np.minimum(size, 0.1 * (self.high - self.low))

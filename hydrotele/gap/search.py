@@ -5,17 +5,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from hydrotele.gap.evidence import Evidence, Fit, charge, flat
-from hydrotele.gap.hypothesis import WIDE, Guess, Hypothesis
+from hydrotele.gap.evidence import Evidence, Fit, charge
+from hydrotele.gap.hypothesis import Guess, Hypothesis
+from hydrotele.gap.screening import Screened, screen
 from hydrotele.gap.tracking import COARSE
 
 ENTER = 15.0  # twice the log evidence an effect must bring; thrice what 56 clean machines reach
 MOST = 3  # effects that one search names
-_FEW = 24  # candidates that are tried on all runs
 _ODDS = 6.0  # score by which a candidate too small to name must lead another, 20 to 1
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
 _MIDDLE = 2.0e-3  # s, step for the fits that choose between candidates
+_REFUSED = 4  # effects that may turn out to be none once gains are computed anew
 _SHORT = 5  # candidates that are fitted after a screening
 _RIVALS = 6  # candidates that are compared with a named effect
 _HOPELESS = 500.0  # loss above the effect's after two steps, beyond which a rival is let go
@@ -23,23 +24,6 @@ _LARGE = 0.05  # mean excess per reading from which an explanation must explain 
 _SHARE = 0.1  # of the excess
 _WORTH = 0.25  # of the best screened score: below it a candidate is not fitted
 Progress = Callable[[str, float], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class Screened:
-    """A candidate by its signature alone.
-
-    Attributes:
-        hypothesis: the candidate.
-        score: twice the log of the evidence it would bring if its signature were a straight line.
-        gain: fall of the loss by the same token.
-        start: (p,) deviation from which to fit it.
-    """
-
-    hypothesis: Hypothesis
-    score: float
-    gain: float
-    start: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,93 +48,6 @@ class Found:
     weak: Fit | None
 
 
-def screen(evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis]) -> list[Screened]:
-    """Rank candidates by their signatures in the base's errors.
-
-    All are tried on the run that fits worst, the best of them on all runs.
-
-    Args:
-        evidence: with the guess as its base.
-        guess: what is already there.
-        candidates: what may be added.
-
-    Returns:
-        The candidates that were tried on all runs and are not there yet, best first.
-    """
-    taken = {h.key for h, _ in guess.parts}
-    open_ones = [h for h in candidates if h.key not in taken]
-    worst = max(evidence.tracks, key=lambda t: float(np.nanmean(t.whitened**2)))
-    if len(evidence.tracks) > 1 and len(open_ones) > _FEW:
-        first = _rank(evidence, guess, open_ones, (worst,))
-        open_ones = [s.hypothesis for s in first[:_FEW]]
-    return _rank(evidence, guess, open_ones, evidence.tracks)
-
-
-def _rank(evidence: Evidence, guess: Guess, candidates, tracks) -> list[Screened]:
-    errors = np.concatenate([flat(track.whitened) for track in tracks])
-    present = range(len(guess.deviation))
-    bases: dict[float, tuple[np.ndarray, np.ndarray]] = {}
-
-    def errors_of(moved: Guess, step: float) -> np.ndarray:
-        return evidence.errors(moved, step, tracks)
-
-    def base_of(step: float) -> tuple[np.ndarray, np.ndarray]:
-        """Errors of the guess and their slopes, with the same steps as the candidate's."""
-        base = errors_of(guess, step)
-        columns = [_slope(errors_of, guess, base, i, step) for i in present]
-        return base, np.column_stack(columns) if columns else np.zeros((len(base), 0))
-
-    steps = {h.key: evidence.step_of(guess.plus(h, h.starts[-1]), COARSE) for h in candidates}
-    unlike = sorted(set(steps.values()))
-    bases.update(zip(unlike, evidence.map(base_of, unlike), strict=True))
-
-    def rank(hypothesis: Hypothesis) -> Screened:
-        best, step = None, steps[hypothesis.key]
-        base, here = bases[step]
-        for start in hypothesis.starts:
-            moved = guess.plus(hypothesis, start)
-            if np.any(start):
-                slopes = ((errors_of(moved, step) - base) / start[0])[:, None]
-            else:
-                own = range(len(present), len(moved.deviation))
-                slopes = np.column_stack([_slope(errors_of, moved, base, i, step) for i in own])
-            found = _line(hypothesis, start, here, slopes, errors, guess.deviation)
-            if best is None or found.score > best.score:
-                best = found
-        assert best
-        return best
-
-    return sorted(evidence.map(rank, candidates), key=lambda s: -s.score)
-
-
-def _slope(errors_of, guess: Guess, base: np.ndarray, index: int, step: float) -> np.ndarray:
-    moved, nudge = guess.deviation, guess.nudges(WIDE)[index]
-    moved[index] += nudge
-    return (errors_of(guess.at(moved), step) - base) / nudge
-
-
-def _line(hypothesis, start, here, slopes, errors, present) -> Screened:
-    """Best deviation inside the bounds, with straight signatures, the others following."""
-    both = np.column_stack([here, slopes])
-    matrix = both.T @ both + np.eye(both.shape[1])
-    right = both.T @ errors + np.concatenate([present, np.zeros(hypothesis.size)])
-    p = here.shape[1]
-    if p:  # eliminate what is already there
-        inner = np.linalg.solve(matrix[:p, :p], np.column_stack([matrix[:p, p:], right[:p]]))
-        own = matrix[p:, p:] - matrix[p:, :p] @ inner[:, :-1]
-        pull = right[p:] - matrix[p:, :p] @ inner[:, -1]
-    else:
-        own, pull = matrix, right
-    d = np.clip(-np.linalg.solve(own, pull), hypothesis.low, hypothesis.high)
-    for _ in range(20):  # coordinate descent in the box
-        for k in range(len(d)):
-            rest = pull[k] + own[k] @ d - own[k, k] * d[k]
-            d[k] = np.clip(-rest / own[k, k], hypothesis.low[k], hypothesis.high[k])
-    gain = float(-(d @ own @ d + 2.0 * pull @ d))
-    cost = float(np.linalg.slogdet(own)[1])
-    return Screened(hypothesis, gain - cost, gain, start if np.any(start) else d)
-
-
 def search(
     evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None,
     most: int = MOST,
@@ -172,7 +69,10 @@ def search(
     evidence.set_base(guess)
     rankings: list[list[Screened]] = []
     seen: dict[tuple[str, str], list[Screened]] = {}
-    for depth in range(most):
+    for _ in range(most + _REFUSED):
+        depth = len(guess.parts)
+        if depth == most:
+            break
         tell(f"try every effect ({depth} named so far)", 0.9 * (1.0 - 0.6**depth) + 0.05)
         ranked = screen(evidence, guess, candidates)
         rankings.append(ranked)
@@ -184,10 +84,9 @@ def search(
             break
         tell(f"fit {best.guess.parts[-1][0].name}", 0.9 * (1.0 - 0.6 ** (depth + 0.7)) + 0.05)
         added = best.guess.parts[-1][0]
-        grown = settle(evidence, best.guess)
-        if _strained(grown[0]):
+        grown = _settled_better(evidence, guess, best.guess, best.charge + ENTER)
+        if grown is None:
             candidates = [c for c in candidates if c.key != added.key]
-            evidence.set_base(guess)
             continue
         seen[added.key] = ranked
         guess, fit = grown
@@ -199,15 +98,32 @@ def search(
         score, others = compare(evidence, guess, index, ranked)
         best = others[0] if others else None
         if best and best.score > score and worth_naming(best.guess, -1, best.score):
-            kept, swapped = guess, settle(evidence, _exchanged(guess, index, best.guess))
-            if _strained(swapped[0]):
-                evidence.set_base(kept)
-            else:
+            swapped = _settled_better(evidence, guess, _exchanged(guess, index, best.guess), 0.0)
+            if swapped:
                 guess, fit = swapped
                 score, others = compare(evidence, guess, index, ranked)
         scores.append(score)
         rivals.append(others)
     return Found(guess, fit, tuple(rankings[0]), tuple(rivals), tuple(scores), weak)
+
+
+def _settled_better(
+    evidence: Evidence, guess: Guess, other: Guess, asked: float
+) -> tuple[Guess, Fit] | None:
+    """Another guess settled, or None, and the base as it was, if that is no improvement.
+
+    Kept gains can flatter a guess that moves far, so likelihoods with gains of their own decide.
+    """
+    before = evidence.base_loss + _prior(guess)
+    grown, fit = settle(evidence, other)
+    if _strained(grown) or before - evidence.base_loss - _prior(grown) < asked:
+        evidence.set_base(guess)
+        return None
+    return grown, fit
+
+
+def _prior(guess: Guess) -> float:
+    return float(guess.deviation @ guess.deviation)
 
 
 def _exchanged(guess: Guess, index: int, other: Guess) -> Guess:
@@ -270,7 +186,7 @@ def _strained(guess: Guess) -> bool:
 
 def _loss_of(evidence: Evidence, guess: Guess, step: float) -> float:
     errors = evidence.errors(guess, step)
-    return float(errors @ errors + guess.deviation @ guess.deviation)
+    return float(errors @ errors) + _prior(guess)
 
 
 def settle(evidence: Evidence, guess: Guess) -> tuple[Guess, Fit]:

@@ -8,6 +8,7 @@ import numpy as np
 from hydrotele.dynamics.model import model_space, reduced_model, state_names
 from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.gap.filter import Gains, filter_run
+from hydrotele.gap.late import late_readings
 from hydrotele.gap.start import start_state
 from hydrotele.machine import Machine
 
@@ -29,7 +30,7 @@ class Track:
         predicted: (n, c) one-step predictions [channel's unit].
         states: (n, nz) states after each row's readings.
         gains: gains and whiteners used.
-        names: the states that the gains know.
+        names: the states that the gains know, those of readings on their way included.
         start: (nz,) state before the first reading.
     """
 
@@ -46,6 +47,7 @@ class Track:
 _NUDGE = {
     "position": 1e-6, "drive": 1e-6, "rate": 1e-5, "drive_rate": 1e-5, "spool": 1e-5,
     "spool_rate": 1e-3, "pressure_head": 100.0, "pressure_rod": 100.0,
+    "late": 1.0,
 }  # fmt: skip
 # What a row of 20 ms may add to a state beyond the model: integrator error, not physics.
 DRIFT = {
@@ -91,14 +93,20 @@ def track_run(
     step, coarse = fine_enough(machine, step), fine_enough(machine, COARSE)
     model = reduced_model(machine, data.channels)
     space = model_space(model)
-    names = state_names(machine)
+    names, late = state_names(machine), late_readings(model, run.period)
     rows, c, size = len(run.command), len(data.channels), len(names)
     start, spread = start_state(machine, data, run, model, names)
+    shown = [data.channels[k] for k in late.channel]
+    names += [
+        f"late.{channel}.{i - late.first[k]}"
+        for i, (channel, k) in enumerate(zip(shown, late.channel, strict=True))
+    ]
+    full = len(names)
     if kept is None:
-        gains = Gains(np.zeros((rows, c, size)), np.zeros((rows, c, size)), np.zeros((rows, c)))
+        gains = Gains(np.zeros((rows, c, full)), np.zeros((rows, c, full)), np.zeros((rows, c)))
     else:
         gains = kept.gains
-        if not set(kept.names) <= set(names):  # the model lacks a transmission that those had
+        if not set(kept.names) <= set(names):  # the model lacks a transmission or a lag of theirs
             there = [s for s, name in enumerate(kept.names) if name in names]
             gains = Gains(
                 np.ascontiguousarray(gains.slope[:, :, there]),
@@ -107,8 +115,10 @@ def track_run(
     known = tuple(n for n in kept.names if n in names) if kept else tuple(names)
     whitened, predicted = np.empty((rows, c)), np.empty((rows, c))
     states = np.empty((rows, size))
+    state, covariance = np.zeros(full), np.zeros((full, full))
+    state[:size], covariance[:size, :size] = start, spread
     loss = filter_run(
-        model, space, start.copy(), spread, run.command, run.command_known, run.reading,
+        model, space, late, state, covariance, run.command, run.command_known, run.reading,
         data.noise**2, by_kind(names, {**DRIFT, **data.drift}) ** 2,
         by_kind(names, _STARTLE) ** 2, run.period,
         max(1, round(run.period / step)), max(1, round(run.period / coarse)),

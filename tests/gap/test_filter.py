@@ -121,3 +121,24 @@ def test_a_transmission_adds_states_that_gains_without_it_can_carry(clean, name,
     assert np.sum(other.whitened**2) > np.sum(rigid.whitened**2) + 30.0
     back = track_run(data.machine, data, data.heldout, track_run(soft, data, data.heldout))
     assert np.isfinite(back.whitened).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "delay", "sd"),
+    [
+        ("pressure_delay", "boom", 0.0149, 0.23e-3),
+        ("pressure_delay", "boom", 0.0340, 0.23e-3),
+        ("angle_delay", "stick", 0.0270, 0.19e-3),
+    ],
+)
+def test_the_delay_of_late_readings_is_found_without_bias(name, place, delay, sd):
+    """The likelihood is a parabola over the delay; `sd` is its width for these 12 s."""
+    nominal = load_machine("cat215")
+    late = [apply_effect(nominal, name, place, {"delay": delay + d}) for d in (-1e-3, 0.0, 1e-3)]
+    data, _ = machine_data(nominal, late[1])
+    below, there, above = (track_run(m, data, data.heldout) for m in late)
+    curvature = (above.loss + below.loss - 2.0 * there.loss) / 1e-3**2
+    lowest = -(above.loss - below.loss) / (2.0 * 1e-3) / curvature
+    assert 1.0 / np.sqrt(0.5 * curvature) == pytest.approx(sd, rel=0.3)
+    assert abs(lowest) < 3.0 * sd
+    assert np.sqrt(np.mean(there.whitened[50:] ** 2)) == pytest.approx(1.0, abs=0.04)
