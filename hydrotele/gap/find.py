@@ -13,6 +13,7 @@ from hydrotele.gap.evidence import Evidence, Fit
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.floor import perfect_tracks
 from hydrotele.gap.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.gap.intervals import spreads
 from hydrotele.gap.levels import find_levels, known_levels
 from hydrotele.gap.residuals import residual_tests, rms
 from hydrotele.gap.result import (
@@ -80,11 +81,13 @@ def find_gap(
         patched = found.guess.machine(data.machine)
         after = evidence.track(patched, runs) if found.guess.parts else before
         tests, floor = _tests(evidence, found.guess, after) if floored else ({}, None)
+        scatter = tests.get("constancy", {}).get("value", 1.0)
+        spread = spreads(evidence, found.fit, scatter) if found.fit else np.zeros(0)
     finally:
         evidence.close()
     unit = 1.0 if floored else rms(np.concatenate([t.whitened for t in before[1:]]))
     failed = any(not test["passed"] for test in tests.values())
-    named = _named(found, failed)
+    named = _named(found, spread, failed)
     verdict = _verdict(named, failed)
     predictions = tuple(_prediction(t, data, unit) for t in before)
     improved = tuple(_prediction(t, data, unit) for t in after)
@@ -140,10 +143,7 @@ def _verdict(named: Sequence[NamedEffect], failed: bool) -> Verdict:
     return "named" if all(effect.probability >= SURE for effect in named) else "ambiguous"
 
 
-def _named(found: Found, failed: bool) -> tuple[NamedEffect, ...]:
-    if not found.fit:
-        return ()
-    spread = np.sqrt(np.diag(np.linalg.inv(found.fit.information)))
+def _named(found: Found, spread: np.ndarray, failed: bool) -> tuple[NamedEffect, ...]:
     effects, first = [], 0
     for index, (hypothesis, deviation) in enumerate(found.guess.parts):
         own = spread[first : first + hypothesis.size]

@@ -131,15 +131,13 @@ def _around_nominal(
     return Screened(hypothesis, max(line.score, best.score), max(line.gain, best.gain), best.start)
 
 
-def _point(
-    hypothesis: Hypothesis, ground: _Ground, d: np.ndarray, shift: np.ndarray
-) -> Screened:
+def _point(hypothesis: Hypothesis, ground: _Ground, d: np.ndarray, shift: np.ndarray) -> Screened:
     """As tried, what is there following."""
     now = _without_present(ground, ground.errors)
     moved = _without_present(ground, ground.errors + shift)
     along = shift / np.linalg.norm(d)
-    cost = np.log1p(along @ along - _explained(ground, along))
-    gain = now - moved - d @ d
+    cost = float(np.log1p(along @ along - _explained(ground, along)))
+    gain = now - moved - float(d @ d)
     return Screened(hypothesis, gain - cost, gain, d)
 
 

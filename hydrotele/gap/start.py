@@ -1,6 +1,9 @@
 """The state before a run's first reading: from its first rows, with a wide spread."""
 
+from collections.abc import Callable
+
 import numpy as np
+from scipy.optimize import fminbound
 
 from hydrotele.dynamics.integrate import load_position, place
 from hydrotele.dynamics.model import Model, model_space
@@ -11,15 +14,20 @@ from hydrotele.machine import Machine
 
 _LOOK = 5  # rows whose mean starts the filter
 _WIDE = {
-    "position": 0.02, "drive": 0.02, "rate": 0.05, "drive_rate": 0.05, "spool": 0.02,
+    "position": 0.02, "drive": 0.0, "rate": 0.05, "drive_rate": 0.0, "spool": 0.02,
     "spool_rate": 0.2, "pressure_head": 1e6, "pressure_rod": 1e6,
 }  # fmt: skip
+_SLIP = 0.01  # m/s or rad/s, rate at which a drive may leave its load
+_LOOSE = 0.02  # of the backlash, within which a drive's rest is known once it was looked for
+_ROUGH = 1e5  # Pa, of a pressure's mean over the first rows
+_GRID, _FINE = 7, 0.01  # rests that are tried at first, and how fine they are at last
 _BLIND = {"pressure_head": 5e6, "pressure_rod": 5e6}
 
 
 def start_state(
-    machine: Machine, data: Dataset, run: RunData, model: Model, names: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
+    machine: Machine, data: Dataset, run: RunData, model: Model, names: list[str],
+    rest: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """State and covariance before the first reading.
 
     Args:
@@ -28,6 +36,8 @@ def start_state(
         run: the run.
         model: the machine's reduced model.
         names: its states.
+        rest: (t,) where the drive of each transmission rests in its backlash, from -1 to 1; by
+            default in the middle.
 
     Returns:
         ((nz,) state, (nz, nz) covariance), wide enough to let the first readings decide.
@@ -52,22 +62,62 @@ def start_state(
             state[s] = shown.get(f"{kind}.{axis}", 3e6)
             if f"{kind}.{axis}" not in shown:
                 wide[s] = _BLIND[kind]
-    _stretch_transmissions(model, state, names)
-    return state, np.diag(wide**2)
+    spread = np.diag(wide**2)
+    _place_drives(model, state, spread, np.zeros(len(model.transmission)) if rest is None else rest)
+    return state, spread
 
 
-def _stretch_transmissions(model: Model, state: np.ndarray, names: list[str]) -> None:
-    """Put every drive where its spring carries what the pressures push."""
+def _place_drives(model: Model, state: np.ndarray, spread: np.ndarray, rest: np.ndarray) -> None:
+    """Put every drive where it rests in its backlash; at its end, where its spring pushes back.
+
+    A drive is as uncertain as its load, and by what backlash, friction and pressures leave open.
+    """
     space = model_space(model)
     place(model, space, state)
-    n = len(model.mech.free)
-    first = len(names) - 4 * model.hydraulic
+    n, t = len(model.mech.free), len(model.transmission)
+    first = 2 * (n + t)
     for i, gear in enumerate(model.gear):
-        if gear < 0 or i >= model.hydraulic:
+        if gear < 0:
             continue
-        numbers = model.user[i * SLOTS : (i + 1) * SLOTS]
-        p_head, p_rod = state[first + 4 * i + 2 : first + 4 * i + 4]
-        push = numbers[Slot.AREA_HEAD] * p_head - numbers[Slot.AREA_ROD] * p_rod
         _, stiffness, _, backlash = model.transmission[gear]
-        twist = push / stiffness + np.sign(push) * 0.5 * backlash
+        numbers = model.user[i * SLOTS : (i + 1) * SLOTS]
+        twist, held = 0.5 * rest[gear] * backlash, numbers[Slot.COULOMB] + numbers[Slot.STRIBECK]
+        if i < model.hydraulic and (abs(rest[gear]) == 1.0 or backlash == 0.0):
+            head, rod = first + 4 * i + 2, first + 4 * i + 3
+            areas = numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD]
+            twist += (areas[0] * state[head] - areas[1] * state[rod]) / stiffness
+            held += np.hypot(*areas) * _ROUGH
         state[n + gear] = load_position(model, space, i) + twist
+        loose = _LOOSE * backlash + held / stiffness
+        for at, size in ((0, loose), (n + t, _SLIP)):
+            drive, row = at + n + gear, space.row[i]
+            spread[drive, :] = row @ spread[at : at + n, :]
+            spread[:, drive] = spread[drive, :]
+            spread[drive, drive] = row @ spread[at : at + n, drive] + size**2
+
+
+def find_rest(loss: Callable[[np.ndarray], float], free: np.ndarray) -> np.ndarray:
+    """Where drives rest in their backlash, one after the other.
+
+    Args:
+        loss: of the run's first seconds, for (t,) rests.
+        free: (t,) whether a transmission has backlash.
+
+    Returns:
+        (t,) rests from -1 to 1.
+    """
+    rest = np.zeros(len(free))
+    for gear in np.flatnonzero(free):
+
+        def at(value: float, gear: int = int(gear)) -> float:
+            moved = rest.copy()
+            moved[gear] = value
+            return loss(moved)
+
+        grid = np.linspace(-1.0, 1.0, _GRID)
+        tried = [at(value) for value in grid]
+        best, width = grid[np.argmin(tried)], grid[1] - grid[0]
+        inside = max(-1.0, best - width), min(1.0, best + width)
+        value, least, _, _ = fminbound(at, *inside, xtol=_FINE, full_output=True)
+        rest[gear] = value if least < min(tried) else best
+    return rest

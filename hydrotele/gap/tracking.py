@@ -1,15 +1,16 @@
 """Runs of a dataset through the filter: where it starts, what it trusts, what it yields."""
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.dynamics.model import model_space, reduced_model, state_names
+from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
 from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.gap.filter import Gains, filter_run
 from hydrotele.gap.late import late_readings
-from hydrotele.gap.start import start_state
+from hydrotele.gap.start import find_rest, start_state
 from hydrotele.machine import Machine
 
 STEP = (
@@ -32,6 +33,7 @@ class Track:
         gains: gains and whiteners used.
         names: the states that the gains know, those of readings on their way included.
         start: (nz,) state before the first reading.
+        rest: (t,) where the drives of transmissions rested in their backlash, see `start_state`.
     """
 
     run: RunData
@@ -42,6 +44,7 @@ class Track:
     gains: Gains
     names: tuple[str, ...]
     start: np.ndarray
+    rest: np.ndarray
 
 
 _NUDGE = {
@@ -61,6 +64,8 @@ _STARTLE = {
     "pressure_rod": 2e6,
     "rate": 0.02,
 }
+
+_LOOK = 3.0  # s at a run's start that tell where drives rested in their backlash
 
 
 def by_kind(names: list[str], table: Mapping[str, float]) -> np.ndarray:
@@ -90,12 +95,30 @@ def track_run(
     Returns:
         The track.
     """
-    step, coarse = fine_enough(machine, step), fine_enough(machine, COARSE)
     model = reduced_model(machine, data.channels)
+    play = model.transmission[:, BACKLASH] > 0.0
+    rest = np.zeros(len(play))
+    if kept is not None and len(kept.rest) == len(play):
+        rest = kept.rest
+    elif kept is None and play.any():
+        rows = slice(0, round(_LOOK / run.period))
+        first = dataclasses.replace(
+            run, command=run.command[rows], command_known=run.command_known[rows],
+            reading=run.reading[rows],
+        )  # fmt: skip
+        rest = find_rest(lambda r: _cross(machine, model, data, first, None, step, r).loss, play)
+    return _cross(machine, model, data, run, kept, step, rest)
+
+
+def _cross(
+    machine: Machine, model: Model, data: Dataset, run: RunData, kept: Track | None, step: float,
+    rest: np.ndarray,
+) -> Track:  # fmt: skip
+    step, coarse = fine_enough(machine, step), fine_enough(machine, COARSE)
     space = model_space(model)
     names, late = state_names(machine), late_readings(model, run.period)
     rows, c, size = len(run.command), len(data.channels), len(names)
-    start, spread = start_state(machine, data, run, model, names)
+    start, spread = start_state(machine, data, run, model, names, rest)
     shown = [data.channels[k] for k in late.channel]
     names += [
         f"late.{channel}.{i - late.first[k]}"
@@ -125,4 +148,4 @@ def track_run(
         by_kind(names, _NUDGE), np.array([names.index(name) for name in known]), *gains,
         kept is None, whitened, predicted, states,
     )  # fmt: skip
-    return Track(run, loss, whitened, predicted, states, gains, known, start)
+    return Track(run, loss, whitened, predicted, states, gains, known, start, rest)

@@ -13,8 +13,9 @@ _PICTURES = (
 
 _WEAK = (
     f"Weak: visibility below {DETECTABLE:g} (root of the summed squares of what the effect changes,"
-    " in standard deviations of the noise, over all samples and channels of the fit runs). Singles"
-    " by visibility:"
+    " in standard deviations of the noise, over all samples and channels of the fit runs). Not to"
+    " name a weak one is no error; to name something else instead is. Singles by visibility, weak"
+    " ones included:"
 )
 
 

@@ -107,7 +107,7 @@ def _class(chosen: Sequence[Verdict]) -> dict[str, Any]:
     scores: dict[str, Any] = {"right": share([v.right for v in chosen])}
     kind = chosen[0].kind
     if kind in ("single", "double"):
-        clear = [v for v in chosen if not v.weak]
+        clear = [v for v in chosen if not v.weak or _forced(v)]
         scores["right_without_weak"] = share([v.right for v in clear])
         scores["weak"] = _words([v for v in chosen if v.weak])
         scores["found"] = share([k < v.found for v in chosen for k in range(len(v.truth))])
@@ -118,6 +118,11 @@ def _class(chosen: Sequence[Verdict]) -> dict[str, Any]:
         scores["surely_named"] = share([any(p > SURE for p, _ in v.beliefs) for v in chosen])
     scores["verdicts"] = _words(chosen)
     return scores
+
+
+def _forced(v: Verdict) -> bool:
+    """Whether an answer names what was not planted: weak effects excuse silence, not that."""
+    return not v.right and any(not planted for _, planted in v.beliefs)
 
 
 def _words(chosen: Sequence[Verdict]) -> dict[str, int]:
@@ -140,8 +145,10 @@ def _targets(scores: dict[str, Any], by: dict[str, list[Verdict]]) -> dict[str, 
         return part and part["share"]
 
     asked = [
-        ("single right", of("single", "right"), True, 0.95),
-        ("double right", of("double", "right"), True, 0.85),
+        ("single right", of("single", "right_without_weak"), True, 0.95),
+        ("single right, silence on weak ones counted as wrong", of("single", "right"), True, 0.95),
+        ("double right", of("double", "right_without_weak"), True, 0.85),
+        ("double right, silence on weak ones counted as wrong", of("double", "right"), True, 0.85),
         ("clean falsely named", of("clean", "falsely_named"), False, 0.02),
         ("outside called unknown", of("outside", "called_unknown"), True, 0.85),
         ("outside surely named", of("outside", "surely_named"), False, 0.0),

@@ -1,0 +1,32 @@
+"""How well the numbers of named effects are known: noise, run-to-run scatter, integrator steps."""
+
+import numpy as np
+
+from hydrotele.gap.evidence import Evidence, Fit
+
+_CHANCE = 3.0  # chi-square per degree of freedom that two degrees exceed in 5 % of all cases
+
+
+def spreads(evidence: Evidence, fit: Fit, scatter: float = 1.0) -> np.ndarray:
+    """Standard deviations of a fit's numbers.
+
+    Where runs by themselves ask for sizes that scatter beyond chance, the noise's part is widened
+    to that scatter (Birge 1932, The calculation of errors by the method of least squares, Phys.
+    Rev. 40). What halving the integrator's step would change is added: neither step is the truth.
+
+    Args:
+        evidence: with the fit's guess as its base.
+        fit: the fit.
+        scatter: chi-square per degree of freedom of the sizes that the runs ask for.
+
+    Returns:
+        (P,) standard deviations, in typical deviations.
+    """
+    guess, step = fit.guess, evidence.step_of(fit.guess, evidence.step)
+    errors = evidence.errors(guess, step)
+    slopes = evidence.slopes(guess, errors, step=step)
+    information = slopes.T @ slopes + np.eye(slopes.shape[1])
+    covariance = np.linalg.inv(information)
+    shift = covariance @ (slopes.T @ (evidence.errors(guess, 0.5 * step) - errors))
+    widened = scatter if scatter > _CHANCE else 1.0
+    return np.sqrt(widened * np.diag(covariance) + shift**2)
