@@ -17,8 +17,11 @@ from hydrotele.machine_file import load_machine
 PERIOD, ROWS = 0.02, 600
 
 
-def machine_data(machine, truth, seed=0):
-    """Readings of `truth` with the sensors' noise, as a dataset of the model `machine`."""
+def machine_data(machine, truth, seed=0, twist=0.0):
+    """Readings of `truth` with the sensors' noise, as a dataset of the model `machine`.
+
+    `twist` is how far the drives of transmissions stand ahead of their loads at first.
+    """
     channels = predicted_channels(machine)
     axes = tuple(actuator_order(machine))
     time = PERIOD * np.arange(ROWS)
@@ -32,6 +35,8 @@ def machine_data(machine, truth, seed=0):
             state[s] = machine.home.get(place, 0.0)
         elif kind.startswith("pressure"):
             state[s] = 6e6
+        elif kind == "drive":
+            state[s] = twist
     shown, states = np.empty((ROWS, len(channels))), np.empty((ROWS, len(names)))
     simulate_rows(model, model_space(model), state, command, PERIOD, 20, shown, states)
     noise = np.array([1e-3 if "angle" in c else 1.2e-3 if "length" in c else 1e5 for c in channels])
@@ -142,3 +147,16 @@ def test_the_delay_of_late_readings_is_found_without_bias(name, place, delay, sd
     assert 1.0 / np.sqrt(0.5 * curvature) == pytest.approx(sd, rel=0.3)
     assert abs(lowest) < 3.0 * sd
     assert np.sqrt(np.mean(there.whitened[50:] ** 2)) == pytest.approx(1.0, abs=0.04)
+
+
+@pytest.mark.parametrize("rest", [-1.0, -0.45, 0.0, 1.0])
+def test_a_drive_may_rest_anywhere_in_its_backlash(rest):
+    gap = 0.012
+    machine = apply_effect(load_machine("cat215"), "backlash", "swing", {"gap": gap})
+    data, _ = machine_data(machine, machine, seed=5, twist=0.5 * rest * gap)
+    track = track_run(machine, data, data.heldout)
+    # 1 mrad of noise over the 5 rows of the start is 0.07 of half the gap
+    assert track.rest == pytest.approx([rest], abs=0.2)
+    w = track.whitened[20:]
+    assert np.sqrt(np.mean(w**2)) == pytest.approx(1.0, abs=0.04)
+    assert np.abs(w).max() < 6.0  # no reading is a surprise; from a wrong rest some are 20

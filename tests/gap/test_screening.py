@@ -1,0 +1,97 @@
+"""Screening on made-up signatures, where the best candidate and its size are known."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hydrotele.effects import Parameter
+from hydrotele.gap.hypothesis import Guess, Hypothesis
+from hydrotele.gap.screening import screen
+
+ROWS, CHANNELS = 400, 3
+
+
+def candidate(name, low=-3.0):
+    return Hypothesis(name, "boom", {"size": Parameter("1", 0.0, low, 3.0, 1.0, 0.01)})
+
+
+class MadeUp:
+    """Evidence whose errors are `errors - sum of signature(d)`; one run, no machine."""
+
+    def __init__(self, errors, signatures):
+        self.tracks = (SimpleNamespace(whitened=errors.reshape(ROWS, CHANNELS)),)
+        self.signatures = signatures
+
+    def errors(self, guess, step, tracks):
+        del step
+        left = np.concatenate([track.whitened.ravel() for track in tracks])
+        for hypothesis, (d,) in guess.parts:
+            left = left - self.signatures[hypothesis.name](d)
+        return left
+
+    def step_of(self, guess, step):
+        del guess
+        return step
+
+    def map(self, function, items):
+        return [function(item) for item in items]
+
+
+@pytest.fixture
+def parts():
+    generator = np.random.default_rng(0)
+    return generator.normal(size=(3, ROWS * CHANNELS))
+
+
+def test_a_straight_signature_is_rated_by_its_best_size(parts):
+    noise, signature, other = parts
+    evidence = MadeUp(
+        noise + 0.7 * signature, {"true": lambda d: d * signature, "other": lambda d: d * other}
+    )
+    best, _ = screen(evidence, Guess(), [candidate("other"), candidate("true")])
+    assert best.hypothesis.name == "true"
+    # 1200 readings with a signature of size 1: known to 0.03
+    assert best.start == pytest.approx([0.7], abs=0.1)
+    assert best.gain == pytest.approx(0.7**2 * 1200.0, rel=0.15)
+
+
+def test_friction_that_sticks_on_one_side_only_is_rated_by_what_was_tried(parts):
+    """To one side the errors fall like a root, to the other they jump somewhere else."""
+    noise, signature, elsewhere = parts
+
+    def funnel(d):
+        return np.sqrt(min(-d, 1.0)) * signature if d < 0.0 else 3.0 * d * elsewhere
+
+    evidence = MadeUp(
+        noise + signature, {"true": funnel, "decoy": lambda d: d * (signature + 2.0 * elsewhere)}
+    )
+    best, second = screen(evidence, Guess(), [candidate("decoy"), candidate("true")])
+    assert (best.hypothesis.name, second.hypothesis.name) == ("true", "decoy")
+    assert best.start[0] < 0.0
+    assert best.gain > second.gain > 100.0
+
+
+def test_what_is_there_may_follow_a_candidate(parts):
+    """A candidate that looks like a named effect brings nothing on top of it."""
+    noise, signature, other = parts
+    there = candidate("there")
+    evidence = MadeUp(
+        noise, {"there": lambda d: d * signature, "twin": lambda d: d * (signature + 0.01 * other)}
+    )
+    (twin,) = screen(evidence, Guess(((there, np.array([0.3])),)), [there, candidate("twin")])
+    assert twin.gain < 5.0  # noise alone: chi-square of one degree
+
+
+def test_a_candidate_at_its_bound_is_tried_to_the_other_side_only(parts):
+    noise, signature, _ = parts
+    seen = []
+
+    def signature_of(d):
+        seen.append(d)
+        return d * signature
+
+    evidence = MadeUp(noise + 0.4 * signature, {"true": signature_of})
+    (only,) = screen(evidence, Guess(), [candidate("true", low=0.0)])
+    assert only.start == pytest.approx([0.4], abs=0.1)
+    assert min(seen) >= 0.0
