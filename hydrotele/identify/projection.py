@@ -7,37 +7,29 @@ drives by virtual work.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from hydrotele.compiled import compiled, lean
 from hydrotele.errors import InputError
 from hydrotele.identify.chain import Chain
-from hydrotele.identify.space import (
-    about,
-    add,
-    after,
-    cross,
-    dot,
-    less,
-    put,
-    put_rotation,
-    rotation,
-    swept,
-    times,
-    turned,
-    turned_back,
-    vector,
+from hydrotele.identify.small_least_squares import factor, least
+from hydrotele.identify.space import dot, less, vector
+from hydrotele.identify.tree_motion import (
+    gaps,
+    move_tree,
+    new_frames,
+    parting,
+    point_column,
+    wrenches,
 )
 
 _CLOSED = 1e-11  # m, gap of a loop that counts as closed: rounding at a machine's size
 _ROUNDS = 50
 _STRIDE = 0.1  # rad or m, to which the given joints move at once, lest a loop change its branch
 _LEAP = 0.5  # rad or m, by which a hidden joint may then move at once: five times as far
-_STIFF = 1e-7  # least ratio of a closure Jacobian's singular values; below, the pose is singular
+_SMALL = 1e-7  # least ratio of singular values in use when a start is closed
 _WHERE = "closures"
-_PAIRS = np.array([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)])
 
 
 @dataclass(frozen=True)
@@ -142,188 +134,6 @@ def _table(values: np.ndarray, width: int) -> np.ndarray:
     return table
 
 
-class _Frames(NamedTuple):
-    """Where bodies are and how they move, all in the world; b bodies, v joints.
-
-    Attributes:
-        place: (b, 3) origins.
-        turn: (b, 3, 3) orientations.
-        spin: (b, 3) angular velocities.
-        spin_rate: (b, 3) their rates.
-        pull: (b, 3) accelerations of the origins.
-        axis: (v, 3) joint axes.
-        anchor: (v, 3) points on them.
-    """
-
-    place: np.ndarray
-    turn: np.ndarray
-    spin: np.ndarray
-    spin_rate: np.ndarray
-    pull: np.ndarray
-    axis: np.ndarray
-    anchor: np.ndarray
-
-
-@lean
-def _move(tree, q, rate, acceleration, ground, frames):
-    """Place and move all bodies, from (v,) positions, rates, accelerations; ground: (3,)."""
-    put(frames.place, 0, (0.0, 0.0, 0.0))
-    put(frames.spin, 0, (0.0, 0.0, 0.0))
-    put(frames.spin_rate, 0, (0.0, 0.0, 0.0))
-    put(frames.pull, 0, (ground[0], ground[1], ground[2]))
-    put_rotation(frames.turn, 0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-    for b in range(1, len(tree.parent)):
-        up = tree.parent[b]
-        t, w, dw = rotation(frames.turn, up), vector(frames.spin, up), vector(frames.spin_rate, up)
-        arm = turned(t, vector(tree.offset, b))
-        p = add(vector(frames.place, up), arm)
-        a = add(vector(frames.pull, up), swept(w, dw, arm))
-        t = after(t, rotation(tree.turn, b))
-        for j in range(tree.first[b], tree.first[b + 1]):
-            own, center = vector(tree.axis, j), vector(tree.anchor, j)
-            way, arm = turned(t, own), turned(t, center)
-            put(frames.axis, j, way)
-            put(frames.anchor, j, add(p, arm))
-            step, turning = q[j] - tree.zero[j], cross(w, way)
-            if tree.slides[j]:
-                arm = times(step, way)
-                a = add(a, swept(w, dw, arm))
-                a = add(a, add(times(2.0 * rate[j], turning), times(acceleration[j], way)))
-                p = add(p, arm)
-                continue
-            a = add(a, swept(w, dw, arm))
-            dw = add(dw, add(times(acceleration[j], way), times(rate[j], turning)))
-            w = add(w, times(rate[j], way))
-            t = after(t, about(own, step))
-            back = times(-1.0, turned(t, center))
-            a = add(a, swept(w, dw, back))
-            p = add(add(p, arm), back)
-        put(frames.place, b, p)
-        put_rotation(frames.turn, b, t)
-        put(frames.spin, b, w)
-        put(frames.spin_rate, b, dw)
-        put(frames.pull, b, a)
-
-
-@lean
-def _column(tree, frames, j, point):
-    """Velocity of a point per unit rate of a joint that moves it."""
-    way = vector(frames.axis, j)
-    return way if tree.slides[j] else cross(way, less(point, vector(frames.anchor, j)))
-
-
-@lean
-def _gaps(tree, frames, gap, slope):
-    """How far closures gape (3 c, 1), and its slopes (3 c, v)."""
-    slope[:, :] = 0.0
-    gap[:, 0] = 0.0
-    for c in range(len(tree.ends)):
-        for side in range(2):
-            body, sign = tree.ends[c, side], 1.0 - 2.0 * side
-            arm = turned(rotation(frames.turn, body), vector(tree.points[c], side))
-            point = add(vector(frames.place, body), arm)
-            for k in range(3):
-                gap[3 * c + k, 0] += sign * point[k]
-            for j in range(len(frames.axis)):
-                if tree.above[body, j]:
-                    column = _column(tree, frames, j, point)
-                    for k in range(3):
-                        slope[3 * c + k, j] += sign * column[k]
-
-
-@lean
-def _parting(tree, frames, out):
-    """Acceleration (3 c, 1) with which closures part."""
-    out[:, 0] = 0.0
-    for c in range(len(tree.ends)):
-        for side in range(2):
-            body, sign = tree.ends[c, side], 1.0 - 2.0 * side
-            arm = turned(rotation(frames.turn, body), vector(tree.points[c], side))
-            w, dw = vector(frames.spin, body), vector(frames.spin_rate, body)
-            part = add(vector(frames.pull, body), swept(w, dw, arm))
-            for k in range(3):
-                out[3 * c + k, 0] += sign * part[k]
-
-
-@lean
-def _factor(matrix, columns, q, r):
-    """QR of chosen columns by modified Gram-Schmidt, twice; False if they lack rank."""
-    rows, count, size = len(matrix), len(columns), 0.0
-    for j in range(count):
-        total = 0.0
-        for m in range(rows):
-            q[m, j] = matrix[m, columns[j]]
-            total += q[m, j] ** 2
-        size = max(size, math.sqrt(total))
-    for j in range(count):
-        for i in range(j):
-            r[i, j] = 0.0
-        for _ in range(2):
-            for i in range(j):
-                along = 0.0
-                for m in range(rows):
-                    along += q[m, i] * q[m, j]
-                r[i, j] += along
-                for m in range(rows):
-                    q[m, j] -= along * q[m, i]
-        total = 0.0
-        for m in range(rows):
-            total += q[m, j] ** 2
-        r[j, j] = math.sqrt(total)
-        if not r[j, j] > _STIFF * size:
-            return False
-        for m in range(rows):
-            q[m, j] /= r[j, j]
-    return True
-
-
-@lean
-def _least(q, r, count, right, column, answer, k):
-    """Least squares after `_factor`, of one column of the right side into one of the answer."""
-    for j in range(count - 1, -1, -1):
-        total = 0.0
-        for m in range(len(right)):
-            total += q[m, j] * right[m, column]
-        for i in range(j + 1, count):
-            total -= r[j, i] * answer[i, k]
-        answer[j, k] = total / r[j, j]
-
-
-@lean
-def _wrenches(frames, body, forces, torques):
-    """Force and torque (3, 10) at a body's origin per unit of an inertial parameter, in the world.
-
-    `f = m a + alpha x s + w x (w x s)` and `n = I alpha + w x I w + s x a` with s = m c.
-    """
-    t, a = rotation(frames.turn, body), vector(frames.pull, body)
-    w, dw = vector(frames.spin, body), vector(frames.spin_rate, body)
-    for k in range(3):
-        forces[k, 0], torques[k, 0] = a[k], 0.0
-        way = (t[0][k], t[1][k], t[2][k])
-        f, n = swept(w, dw, way), cross(way, a)
-        for m in range(3):
-            forces[m, 1 + k], torques[m, 1 + k] = f[m], n[m]
-    v, dv = turned_back(t, w), turned_back(t, dw)
-    for p in range(6):
-        i, j = _PAIRS[p, 0], _PAIRS[p, 1]
-        x, y, z = 0.0, 0.0, 0.0  # I w, with a unit at (i, j) and (j, i)
-        dx, dy, dz = 0.0, 0.0, 0.0
-        if i == 0:
-            x, dx = v[j], dv[j]
-        elif i == 1:
-            y, dy = v[j], dv[j]
-        else:
-            z, dz = v[j], dv[j]
-        if i != j:
-            if j == 1:
-                y, dy = v[i], dv[i]
-            else:
-                z, dz = v[i], dv[i]
-        n = turned(t, add((dx, dy, dz), cross(v, (x, y, z))))
-        for m in range(3):
-            forces[m, 4 + p], torques[m, 4 + p] = 0.0, n[m]
-
-
 @compiled
 def _project(
     tree, given, others, drives, q, positions, rates, accelerations, all_q, all_rate,
@@ -332,7 +142,7 @@ def _project(
     """Fill a `Projection` row by row; the row that failed, or -1."""
     b, v, k, c = len(tree.parent), len(tree.zero), len(given), 3 * len(tree.ends)
     hidden = len(others)
-    frames = _frames(tree)
+    frames = new_frames(tree)
     still, none, ground = np.zeros(v), np.zeros(3), -tree.gravity
     gap, slope = np.zeros((c, 1)), np.zeros((c, v))
     q_factor, r_factor = np.empty((c, hidden)), np.empty((hidden, hidden))
@@ -356,7 +166,7 @@ def _project(
             ):
                 return row
         for i in range(k if hidden else 0):
-            _least(q_factor, r_factor, hidden, slope, given[i], part, i)
+            least(q_factor, r_factor, hidden, slope, given[i], part, i)
             for o in range(hidden):
                 moves[others[o], i] = -part[o, i]
         rate, acceleration = all_rate[row], all_acceleration[row]
@@ -365,20 +175,20 @@ def _project(
             for i in range(k):
                 rate[j] += moves[j, i] * rates[row, i]
         if hidden:
-            _move(tree, q, rate, still, none, frames)
-            _parting(tree, frames, gap)
-            _least(q_factor, r_factor, hidden, gap, 0, part, 0)
+            move_tree(tree, q, rate, still, none, frames)
+            parting(tree, frames, gap)
+            least(q_factor, r_factor, hidden, gap, 0, part, 0)
             for o in range(hidden):
                 acceleration[others[o]] = -part[o, 0]
         for j in range(v):
             all_q[row, j] = q[j]
             for i in range(k):
                 acceleration[j] += moves[j, i] * accelerations[row, i]
-        _move(tree, q, rate, acceleration, ground, frames)
-        if not _factor(moves[drives].T.copy(), every, q_drive, r_drive):
+        move_tree(tree, q, rate, acceleration, ground, frames)
+        if not factor(moves[drives].T.copy(), every, q_drive, r_drive):
             return row
         for i in range(k):
-            _least(q_drive, r_drive, k, unit, i, inverse, i)
+            least(q_drive, r_drive, k, unit, i, inverse, i)
         for i in range(k):
             for j in range(v):
                 total = 0.0
@@ -386,7 +196,7 @@ def _project(
                     total += inverse[i, m] * moves[j, m]
                 share[row, i, j] = total
         for body in range(1, b):
-            _wrenches(frames, body, forces, torques)
+            wrenches(frames, body, forces, torques)
             _load(tree, frames, body, forces, torques, share[row], bodies[row])
         for m in range(len(tree.ends)):
             twist[row, m] = _rub(tree, frames, m, share[row], pins[row])
@@ -397,43 +207,33 @@ def _project(
 def _settle(tree, q):
     """Close the loops of a start by moving all joints (v,) a little; whether that worked."""
     v, c = len(q), 3 * len(tree.ends)
-    frames, gap, slope = _frames(tree), np.zeros((c, 1)), np.zeros((c, v))
+    frames, gap, slope = new_frames(tree), np.zeros((c, 1)), np.zeros((c, v))
     still, none = np.zeros(v), np.zeros(3)
     for _ in range(_ROUNDS if c else 0):
-        _move(tree, q, still, still, none, frames)
-        _gaps(tree, frames, gap, slope)
+        move_tree(tree, q, still, still, none, frames)
+        gaps(tree, frames, gap, slope)
         if np.max(np.abs(gap)) < _CLOSED:
             return True
-        q -= np.linalg.lstsq(slope, gap, _STIFF)[0][:, 0]
+        q -= np.linalg.lstsq(slope, gap, _SMALL)[0][:, 0]
     return c == 0
-
-
-@compiled
-def _frames(tree):
-    """Room for the frames of a tree."""
-    b, v = len(tree.parent), len(tree.zero)
-    return _Frames(
-        np.empty((b, 3)), np.empty((b, 3, 3)), np.empty((b, 3)), np.empty((b, 3)),
-        np.empty((b, 3)), np.empty((v, 3)), np.empty((v, 3)),
-    )  # fmt: skip
 
 
 @lean
 def _close(tree, q, others, still, none, frames, gap, slope, q_factor, r_factor, part):
     """Close the loops near a position; False if that fails or leads to another branch."""
     for _ in range(_ROUNDS):
-        _move(tree, q, still, still, none, frames)
+        move_tree(tree, q, still, still, none, frames)
         if len(gap) == 0:
             return True
-        _gaps(tree, frames, gap, slope)
-        if not _factor(slope, others, q_factor, r_factor):
+        gaps(tree, frames, gap, slope)
+        if not factor(slope, others, q_factor, r_factor):
             return False
         open_by = 0.0
         for m in range(len(gap)):
             open_by = max(open_by, abs(gap[m, 0]))
         if open_by < _CLOSED:
             return True
-        _least(q_factor, r_factor, len(others), gap, 0, part, 0)
+        least(q_factor, r_factor, len(others), gap, 0, part, 0)
         for o in range(len(others)):
             if not abs(part[o, 0]) < _LEAP:
                 return False
@@ -451,7 +251,7 @@ def _load(tree, frames, body, forces, torques, share, out):
     for j in range(share.shape[1]):
         if not tree.above[body, j]:
             continue
-        way, turn = _column(tree, frames, j, point), vector(frames.axis, j)
+        way, turn = point_column(tree, frames, j, point), vector(frames.axis, j)
         for m in range(10):
             effort = way[0] * forces[0, m] + way[1] * forces[1, m] + way[2] * forces[2, m]
             if not tree.slides[j]:
