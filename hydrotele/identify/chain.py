@@ -54,6 +54,7 @@ class Chain:
         tree: its numbers.
         bodies: names of the bodies that move or carry mass, without the world.
         joints: names of the v joints.
+        closures: names of the c closures.
         start: (v,) positions in which the loops are closed, as the file has them.
         inertia: (b - 1, 10) inertial parameters of the bodies, about their frames' origins.
         armature: (v,) inertia of a joint's drive [kg] or [kg m^2].
@@ -65,6 +66,7 @@ class Chain:
     tree: Tree
     bodies: tuple[str, ...]
     joints: tuple[str, ...]
+    closures: tuple[str, ...]
     start: np.ndarray
     inertia: np.ndarray
     armature: np.ndarray
@@ -123,6 +125,9 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         tree=tree,
         bodies=tuple(model.body(b).name or f"body{b}" for b in range(1, model.nbody)),
         joints=joints,
+        closures=tuple(
+            model.equality(e).name or f"closure{e}" for e in range(model.neq) if model.eq_active0[e]
+        ),
         start=model.key_qpos[0].copy() if model.nkey else model.qpos0.copy(),
         inertia=np.array([_inertia(model, b) for b in range(1, model.nbody)]).reshape(-1, 10),
         armature=model.dof_armature.copy(),

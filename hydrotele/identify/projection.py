@@ -95,14 +95,16 @@ def project(
         )
     n, v, k = len(tables[0]), len(chain.joints), len(columns)
     others = np.setdiff1d(np.arange(v), columns)
-    if 3 * len(chain.tree.ends) < len(others):
-        names = ", ".join(chain.joints[i] for i in others)
-        raise InputError(_WHERE, f"nothing determines all of the joints {names}")
     q = np.array(chain.start if start is None else start, float)
     if not _settle(chain.tree, q):
         raise InputError(
             _WHERE, f"the loops of {chain.name} cannot be closed from where they start"
         )
+    loose = np.linalg.svd(_start_slope(chain.tree, q)[:, others], full_matrices=True)
+    hidden = np.linalg.norm(loose[2][np.sum(loose[1] > _SMALL) :], axis=0)
+    if (hidden > _SMALL).any():
+        names = ", ".join(chain.joints[j] for j in others[hidden > _SMALL])
+        raise InputError(_WHERE, f"neither given nor determined by a closure: {names}")
     out = Projection(
         np.empty((n, v)), np.empty((n, v)), np.empty((n, v)), np.empty((n, k, v)),
         np.empty((n, k, 10 * len(chain.bodies))), np.empty((n, len(chain.tree.ends))),
@@ -110,8 +112,7 @@ def project(
     )  # fmt: skip
     failed = _project(
         chain.tree, columns, others, moved, q, tables[0], tables[1], tables[2], out.position,
-        out.rate, out.acceleration,
-        out.share, out.bodies, out.twist, out.pins,
+        out.rate, out.acceleration, out.share, out.bodies, out.twist, out.pins,
     )  # fmt: skip
     if failed >= 0:
         raise InputError(
@@ -216,6 +217,16 @@ def _settle(tree, q):
             return True
         q -= np.linalg.lstsq(slope, gap, _SMALL)[0][:, 0]
     return c == 0
+
+
+@compiled
+def _start_slope(tree, q):
+    """Slopes (3 c, v) of the closures at positions (v,)."""
+    v, c = len(q), 3 * len(tree.ends)
+    frames, gap, slope, still = new_frames(tree), np.zeros((c, 1)), np.zeros((c, v)), np.zeros(v)
+    move_tree(tree, q, still, still, np.zeros(3), frames)
+    gaps(tree, frames, gap, slope)
+    return slope
 
 
 @lean

@@ -250,5 +250,7 @@ def test_refusals_say_what_is_wrong():
                 "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
             )
         )
-    with pytest.raises(InputError, match="nothing determines"):
+    with pytest.raises(
+        InputError, match="neither given nor determined by a closure: boom_rod|stick_tube"
+    ):
         project(opened(chain), given, q, v, a)

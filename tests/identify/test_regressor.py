@@ -1,14 +1,18 @@
 """The force regressor against inverse dynamics: MuJoCo's, and that of a body thrown by hand."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.drives import Transmission
 from hydrotele.effects.effect import changed
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.laws import friction
-from hydrotele.identify.regressor import regressor
+from hydrotele.identify.chain import load_chain
+from hydrotele.identify.machine_friction import drive_friction, pin_friction
+from hydrotele.identify.projection import project
+from hydrotele.identify.regressor import Rubbing, regressor
 from hydrotele.machine_file import load_machine
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
@@ -54,6 +58,19 @@ def friction_of(machine, velocities):
     return np.array(found)
 
 
+def closed_chain(machine):
+    plant = build_plant(machine)
+    return dataclasses.replace(load_chain(plant.model), start=rest_state(plant).qpos.copy()), plant
+
+
+def of_machine(machine, positions, rates, accelerations, **more):
+    """Regressor of a machine with the friction of its drives."""
+    chain, plant = closed_chain(machine)
+    given = tuple(machine.axes[name].joint for name in plant.axes)
+    found = project(chain, given, positions, rates, accelerations)
+    return regressor(chain, found, rubbing=drive_friction(machine, chain), **more)
+
+
 @pytest.mark.parametrize("tool", POSES)
 def test_regressor_times_parameters_is_the_inverse_dynamics_of_mujoco(tool):
     machine = load_machine("cat215", tool)
@@ -62,8 +79,7 @@ def test_regressor_times_parameters_is_the_inverse_dynamics_of_mujoco(tool):
     plant, rng = build_plant(machine), np.random.default_rng(4)
     width = len(POSES[tool][0])
     rates, accelerations = rng.uniform(-0.8, 0.8, (3, width)), rng.uniform(-3, 3, (3, width))
-    found = regressor(machine, np.array(POSES[tool]), rates, accelerations)
-    assert found.axes == tuple(plant.axes)
+    found = of_machine(machine, np.array(POSES[tool]), rates, accelerations)
     assert found.matrix.shape == (3, width, len(found.names))
     for k, pose in enumerate(POSES[tool]):
         forces, velocities = mujoco_forces(plant, pose, rates[k], accelerations[k])
@@ -74,17 +90,18 @@ def test_regressor_times_parameters_is_the_inverse_dynamics_of_mujoco(tool):
 
 
 def test_columns_are_named_with_their_units_and_values():
-    found = regressor(load_machine("cat215"), *(np.zeros((2, 3)) + v for v in (0.3, 0.0, 0.0)))
+    found = of_machine(load_machine("cat215"), *(np.zeros((2, 3)) + v for v in (0.3, 0.0, 0.0)))
     table = dict(zip(found.names, zip(found.units, found.nominal, strict=True), strict=True))
-    assert len(found.names) == len(set(found.names)) == len(found.units) == 7 * 10 + 3 * 3 + 2
-    assert table["mass.boom"] == ("kg", 1830.0)
+    # eight bodies; a motor; two cylinders with Stribeck friction; offsets
+    assert len(found.names) == len(set(found.names)) == len(found.units) == 8 * 10 + 2 + 2 * 3 + 3
+    assert table["mass.boom"] == ("kg", pytest.approx(1830.0))
     assert table["moment_x.boom"] == ("kg m", pytest.approx(1830 * 2.3))
     assert table["inertia_yy.boom"] == ("kg m^2", pytest.approx(5720 + 1830 * (2.3**2 + 0.2**2)))
     assert table["inertia_xz.boom"] == ("kg m^2", pytest.approx(-1830 * 2.3 * 0.2))
     assert table["moment_x.stick_rod"] == ("kg m", pytest.approx(-50.0))
     assert table["coulomb.swing"] == ("N m", 4000.0)
-    assert table["viscous.stick"] == ("N s/m", 4000.0)
-    assert table["offset.boom"] == ("N", 0.0)
+    assert table["viscous.stick_rod"] == ("N s/m", 4000.0)
+    assert table["offset.boom_rod"] == ("N", 0.0)
 
 
 def test_any_parameters_can_be_told_from_a_machine_that_has_them():
@@ -93,38 +110,61 @@ def test_any_parameters_can_be_told_from_a_machine_that_has_them():
     other = changed(changed(first, "links.stick.mass", 900.0), "links.boom.com", (2.0, 0.1, 0.3))
     other = changed(other, "axes.boom.cylinder.rod.mass", 170.0)
     motion = [rng.uniform(-0.5, 0.5, (20, 3)) + shift for shift in ((0, 0.3, -1.5), 0, 0)]
-    one, two = regressor(first, *motion), regressor(other, *motion)
+    one, two = of_machine(first, *motion), of_machine(other, *motion)
     assert np.abs(one.nominal - two.nominal).max() > 100
-    assert np.array_equal(one.matrix, two.matrix), "the matrix knows geometry only"
+    np.testing.assert_allclose(one.matrix, two.matrix, atol=1e-9, rtol=1e-9)  # geometry only
 
 
-def test_a_drive_behind_a_transmission_brings_its_inertia():
-    gear = Transmission(inertia=700.0, stiffness=1e7)
-    machine = changed(load_machine("cat215"), "axes.swing.transmission", gear)
+def test_the_inertia_of_a_drive_is_a_column():
+    machine = load_machine("cat215")
     motion = np.array([[0.0, 0.4, -1.5]]), np.zeros((1, 3)), np.array([[2.0, 0.0, 0.0]])
-    found, rigid = regressor(machine, *motion), regressor(load_machine("cat215"), *motion)
-    extra = found.matrix[0] @ found.nominal - rigid.matrix[0] @ rigid.nominal
-    assert extra == pytest.approx([1400.0, 0.0, 0.0], abs=1e-6)  # rounding of 1e5 N
-    assert "drive_inertia.swing" in found.names
+    found = of_machine(machine, *motion, drive_inertia=("swing",))
+    column = found.matrix[0, :, found.names.index("drive_inertia.swing")]
+    assert column == pytest.approx([2.0, 0.0, 0.0])
 
 
 def test_a_plain_slide_needs_mass_times_acceleration_friction_and_offset():
     machine = load_machine("emps")
     rates, accelerations = np.array([[0.1], [-0.1]]), np.array([[2.0], [1.0]])
-    found = regressor(machine, np.zeros((2, 1)), rates, accelerations)
+    found = of_machine(machine, np.zeros((2, 1)), rates, accelerations)
     (axis,), (link,) = machine.axes.values(), machine.links.values()
-    drive = axis.force
-    f = drive.friction
+    f = axis.force.friction
     dry = f.coulomb * np.sign(rates) * (1 + f.coulomb_asymmetry * np.sign(rates))
     wet = f.viscous * rates * (1 + f.viscous_asymmetry * np.sign(rates))
-    expected = link.mass * accelerations + dry + wet + drive.offset
+    expected = link.mass * accelerations + dry + wet
     assert found.matrix @ found.nominal == pytest.approx(expected, rel=1e-9)
+    offset = found.matrix[:, 0, found.names.index(f"offset.{axis.joint}")]
+    assert np.array_equal(offset, [1.0, 1.0])
+
+
+def test_friction_of_a_pin_resists_whichever_way_it_turns():
+    """Its torque is carried to the cylinder by the angle that a metre of stroke turns the pin."""
+    machine = load_machine("cat215")
+    chain, _ = closed_chain(machine)
+    pose = np.array([[0.0, 0.4, -1.5]])
+    for sign in (1.0, -1.0):
+        found = project(chain, chain.joints[:3], pose, sign * np.array([[0, 0.2, 0]]), 0 * pose)
+        table = regressor(chain, found, bodies=(), rubbing=pin_friction(chain), offsets=False)
+        boom_pin = table.matrix[0, :, table.names.index("coulomb.boom_pin")]
+        speed = found.rate[0, chain.index("boom_rod")]
+        assert boom_pin[1] == pytest.approx(found.twist[0, 0] / speed)
+        assert np.sign(boom_pin[1]) == np.sign(speed)
+    assert set(table.names) == {
+        f"coulomb.{p}" for p in
+        ("boom", "stick", "boom_tube", "stick_tube", "boom_pin", "stick_pin")
+    }  # fmt: skip
 
 
 def test_refuses_what_it_cannot_tell():
-    with pytest.raises(InputError, match="without a drive.*grapple_pitch"):
-        regressor(load_machine("cat215", "grapple"), *np.zeros((3, 2, 6)))
-    with pytest.raises(InputError, match="one column per axis"):
-        regressor(load_machine("cat215"), *np.zeros((3, 2, 4)))
-    with pytest.raises(InputError, match="row 1"):
-        regressor(load_machine("cat215"), *np.full((3, 2, 3), [[0.3], [np.nan]]))
+    chain, _ = closed_chain(load_machine("cat215"))
+    found = project(chain, chain.joints[:3], *(np.zeros((1, 3)) + v for v in (0.3, 0.0, 0.0)))
+    with pytest.raises(InputError, match="cat215 has no body bucket"):
+        regressor(chain, found, bodies=("bucket",))
+    with pytest.raises(InputError, match="friction has no sticky"):
+        regressor(chain, found, rubbing=[Rubbing("boom", {"sticky": 0.0})])
+    with pytest.raises(InputError, match="closure, which has no sides"):
+        regressor(chain, found, rubbing=[Rubbing("boom_pin", {"viscous_asymmetry": 0.0})])
+    grapple, plant = closed_chain(load_machine("cat215", "grapple"))
+    given = tuple(plant.machine.axes[a].joint for a in plant.axes)
+    with pytest.raises(InputError, match="closure: grapple_pitch, grapple_roll"):
+        project(grapple, given, *np.zeros((3, 2, len(given))))

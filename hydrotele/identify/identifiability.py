@@ -1,0 +1,122 @@
+"""Which parameters a regressor tells: each by itself, in combination with others, or not at all."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+UNIDENTIFIABLE, COMBINATION, FULL = "unidentifiable", "combination", "full"
+_NOTHING = 1e-11  # of the largest column of its kind: rounding
+_RANK = 1e-8  # of the largest singular value of columns of length 1: the square root of rounding
+_SHARE = 1e-5  # part of a parameter in the null space that puts it into a combination
+_COEFFICIENT = 1e-7  # below it a coefficient is rounding
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What a regressor tells; m parameters, rank r.
+
+    Attributes:
+        names: the m parameters.
+        status: (m,) `unidentifiable`, `combination` or `full`.
+        base: (r,) places of the parameters that stand for the base parameters.
+        combination: (r, m) base parameters as combinations of all parameters.
+        condition: ratio of the largest to the smallest singular value of the base columns, each
+            of length 1.
+        gap: singular values on either side of the rank, over the largest; 0 without null space.
+    """
+
+    names: tuple[str, ...]
+    status: tuple[str, ...]
+    base: np.ndarray
+    combination: np.ndarray
+    condition: float
+    gap: tuple[float, float]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Status -> number of parameters."""
+        return {s: self.status.count(s) for s in (UNIDENTIFIABLE, COMBINATION, FULL)}
+
+    def text(self, base: int) -> str:
+        """A base parameter written out, such as `inertia_zz.swing + 2.5 mass.boom`."""
+        row = self.combination[base]
+        parts = []
+        for k in [self.base[base], *np.flatnonzero(row)]:
+            if parts and k == self.base[base]:
+                continue
+            sign = "-" if row[k] < 0 else "+"
+            size = "" if abs(abs(row[k]) - 1.0) < 1e-6 else f"{abs(row[k]):.6g} "
+            parts.append(f"{sign} {size}{self.names[k]}")
+        return " ".join(parts).removeprefix("+ ")
+
+
+def identifiability(
+    matrix: np.ndarray, names: Sequence[str], units: Sequence[str], first: Sequence[str] = ()
+) -> Identifiability:
+    """Classify parameters by the null space of a noise-free regressor.
+
+    Args:
+        matrix: (N, m) equations of a motion that excites whatever can be excited.
+        names: the m parameters.
+        units: (m,) theirs; columns are compared with others of the same unit only.
+        first: parameters that shall stand for a base parameter if they can, in this order.
+
+    Returns:
+        The classification.
+
+    Source: Khoshzaban 1992, 4.4.2 (null space); Gautier 1991, Numerical calculation of the base
+    inertial parameters of robots (QR with pivots).
+    """
+    triangle = np.asarray(
+        np.linalg.qr(matrix, mode="r") if len(matrix) > matrix.shape[1] else matrix
+    )
+    size = np.linalg.norm(triangle, axis=0)
+    largest = {unit: max(size[k] for k, u in enumerate(units) if u == unit) for unit in units}
+    there = np.array(
+        [s > _NOTHING * max(largest[u], 1e-300) for s, u in zip(size, units, strict=True)]
+    )
+    scaled = triangle[:, there] / size[there]
+    _, values, directions = np.linalg.svd(scaled, full_matrices=True)
+    rank = int(np.sum(values > _RANK * values[0])) if len(values) else 0
+    hidden = np.linalg.norm(directions[rank:], axis=0)
+    status = np.full(len(names), UNIDENTIFIABLE, dtype=object)
+    status[there] = np.where(hidden > _SHARE, COMBINATION, FULL)
+    base, combination = _base(triangle, size, there, rank, [list(names).index(n) for n in first])
+    kept = np.linalg.svd(triangle[:, base] / size[base], compute_uv=False) if rank else np.ones(1)
+    gap = (
+        (values[rank - 1] / values[0], values[rank] / values[0])
+        if rank < len(values)
+        else ((values[-1] / values[0] if rank else 0.0), 0.0)
+    )
+    return Identifiability(
+        tuple(names), tuple(status), base, combination, float(kept[0] / kept[-1]),
+        (float(gap[0]), float(gap[1])),
+    )  # fmt: skip
+
+
+def _base(triangle, size, there, rank, first):
+    """Places of independent columns, and all parameters' combinations in them."""
+    order = [k for k in first if there[k]] + [k for k in np.flatnonzero(there) if k not in first]
+    chosen: list[int] = []
+    span = np.zeros((len(triangle), 0))
+    for k in order:  # in the given order, so that the first of a combination stands for it
+        if len(chosen) == rank:
+            break
+        column = triangle[:, k] / size[k]
+        rest = column - span @ (span.T @ column)
+        rest -= span @ (span.T @ rest)
+        if np.linalg.norm(rest) > np.sqrt(_RANK) * 1e-2:
+            chosen.append(k)
+            span = np.column_stack([span, rest / np.linalg.norm(rest)])
+    base = np.array(chosen, int)
+    combination = np.zeros((len(base), triangle.shape[1]))
+    q, r = np.linalg.qr(triangle[:, base] / size[base])
+    for k in np.flatnonzero(there):
+        if k in chosen:
+            combination[chosen.index(int(k)), k] = 1.0
+            continue
+        row = np.linalg.solve(r, q.T @ triangle[:, k]) / size[base]
+        weights = np.abs(row) * size[base] / size[k]
+        combination[:, k] = np.where(weights > _COEFFICIENT, row, 0.0)
+    return base, combination
