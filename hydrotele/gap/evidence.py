@@ -56,6 +56,7 @@ class Evidence:
         self.data, self.runs = data, tuple(runs)
         self._pool = ThreadPoolExecutor(jobs)
         self.tracks: tuple[Track, ...] = ()
+        self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
 
     def close(self) -> None:
         """End the workers."""
@@ -71,6 +72,7 @@ class Evidence:
     def set_base(self, guess: Guess) -> None:
         """Compute gains anew for a guess; later errors are whitened with them."""
         self.tracks = self.track(guess.machine(self.data.machine))
+        self._base, self._steps = guess, {}
 
     @property
     def base_loss(self) -> float:
@@ -85,15 +87,37 @@ class Evidence:
     def errors(
         self, guess: Guess, step: float | None = None, tracks: Sequence[Track] | None = None
     ) -> np.ndarray:
-        """(E,) whitened errors of a guess with the base's gains, in all or some of its tracks."""
-        machine = guess.machine(self.data.machine)
+        """(E,) whitened errors of a guess with the base's gains, in all or some of its tracks.
+
+        What another step than the evidence's own changes for the base is taken out, lest an effect
+        be preferred because it makes up for the integrator.
+        """
+        step, machine = step or self.step, guess.machine(self.data.machine)
         tracks = self.tracks if tracks is None else tracks
         return np.concatenate(
-            [
-                flat(track_run(machine, self.data, t.run, t, step or self.step).whitened)
-                for t in tracks
-            ]
+            [self._errors(machine, t, step) + self._made_by(step, t) for t in tracks]
         )
+
+    def step_effect(self, guess: Guess, step: float) -> np.ndarray:
+        """(E,) what another step than the evidence's own changes for a guess near the base."""
+        machine = guess.machine(self.data.machine)
+        return np.concatenate(
+            [self._errors(machine, t, step) - self._errors(machine, t, self.step)
+             for t in self.tracks]
+        )  # fmt: skip
+
+    def _errors(self, machine: Machine, track: Track, step: float) -> np.ndarray:
+        return flat(track_run(machine, self.data, track.run, track, step).whitened)
+
+    def _made_by(self, step: float, track: Track) -> np.ndarray | float:
+        """What the evidence's own step takes back from the errors of the base in a track."""
+        if step == self.step:
+            return 0.0
+        key = track.run.name, step
+        if key not in self._steps:
+            machine = self._base.machine(self.data.machine)
+            self._steps[key] = flat(track.whitened) - self._errors(machine, track, step)
+        return self._steps[key]
 
     def step_of(self, guess: Guess, step: float) -> float:
         """Largest step that a guess takes where others take `step` [s].

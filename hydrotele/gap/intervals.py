@@ -27,6 +27,6 @@ def spreads(evidence: Evidence, fit: Fit, scatter: float = 1.0) -> np.ndarray:
     slopes = evidence.slopes(guess, errors, step=step)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])
     covariance = np.linalg.inv(information)
-    shift = covariance @ (slopes.T @ (evidence.errors(guess, 0.5 * step) - errors))
+    shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))
     widened = scatter if scatter > _CHANCE else 1.0
     return np.sqrt(widened * np.diag(covariance) + shift**2)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.gap.evidence import Evidence, flat
+from hydrotele.gap.evidence import Evidence
 from hydrotele.gap.hypothesis import WIDE, Guess, Hypothesis
 from hydrotele.gap.tracking import COARSE, Track
 
@@ -57,13 +57,9 @@ def screen(evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis]) -
 
 @dataclass(frozen=True)
 class _Ground:
-    """Where candidates start: errors (E,), slopes (E, P) and deviation (P,) of what is there.
-
-    `errors` are at the evidence's own step, `base` at the candidates', from which shifts count.
-    """
+    """Where candidates start: errors (E,), slopes (E, P) and deviation (P,) of what is there."""
 
     errors: np.ndarray
-    base: np.ndarray
     slopes: np.ndarray
     present: np.ndarray
 
@@ -71,19 +67,17 @@ class _Ground:
 def _rank(
     evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis], tracks: Sequence[Track]
 ) -> list[Screened]:
-    errors = np.concatenate([flat(track.whitened) for track in tracks])
-
     def errors_of(moved: Guess, step: float) -> np.ndarray:
         return evidence.errors(moved, step, tracks)
 
     def ground_of(step: float) -> _Ground:
-        base, now, nudges = errors_of(guess, step), guess.deviation, guess.nudges(WIDE)
-        slopes = np.zeros((len(base), len(now)))
+        errors, now, nudges = errors_of(guess, step), guess.deviation, guess.nudges(WIDE)
+        slopes = np.zeros((len(errors), len(now)))
         for i, nudge in enumerate(nudges):
             moved = now.copy()
             moved[i] += nudge
-            slopes[:, i] = (errors_of(guess.at(moved), step) - base) / nudge
-        return _Ground(errors, base, slopes, now)
+            slopes[:, i] = (errors_of(guess.at(moved), step) - errors) / nudge
+        return _Ground(errors, slopes, now)
 
     steps = {h.key: evidence.step_of(guess.plus(h, h.starts[-1]), COARSE) for h in candidates}
     unlike = sorted(set(steps.values()))
@@ -94,7 +88,7 @@ def _rank(
         ground = grounds[step]
 
         def shift_to(d: np.ndarray) -> np.ndarray:
-            return errors_of(guess.plus(hypothesis, d), step) - ground.base
+            return errors_of(guess.plus(hypothesis, d), step) - ground.errors
 
         rated = []
         for start in hypothesis.starts:
@@ -112,7 +106,7 @@ def _around_nominal(
     hypothesis: Hypothesis, ground: _Ground, shift_to: Callable[[np.ndarray], np.ndarray]
 ) -> Screened:
     """By both sides of nominal, parameter by parameter."""
-    slopes, tried, bent = np.zeros((len(ground.base), hypothesis.size)), [], False
+    slopes, tried, bent = np.zeros((len(ground.errors), hypothesis.size)), [], False
     for k in range(hypothesis.size):
         shifts = []
         for side in hypothesis.sides(k, WIDE):
