@@ -12,7 +12,8 @@ def spreads(evidence: Evidence, fit: Fit, scatter: float = 1.0) -> np.ndarray:
 
     Where runs by themselves ask for sizes that scatter beyond chance, the noise's part is widened
     to that scatter (Birge 1932, The calculation of errors by the method of least squares, Phys.
-    Rev. 40). What halving the integrator's step would change is added: neither step is the truth.
+    Rev. 40). What halving the integrator's step would change is added as the half-width of a uniform
+    error: neither step is the truth (Guide to the expression of uncertainty in measurement, 4.3.7).
 
     Args:
         evidence: with the fit's guess as its base.
@@ -29,4 +30,4 @@ def spreads(evidence: Evidence, fit: Fit, scatter: float = 1.0) -> np.ndarray:
     covariance = np.linalg.inv(information)
     shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))
     widened = scatter if scatter > _CHANCE else 1.0
-    return np.sqrt(widened * np.diag(covariance) + shift**2)
+    return np.sqrt(widened * np.diag(covariance) + shift**2 / 3.0)

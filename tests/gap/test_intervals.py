@@ -43,5 +43,5 @@ def test_what_half_the_step_changes_is_added():
     finer.close()
     assert np.abs(moved) > 3.0 * noise
     # one Gauss-Newton step against a whole fit, and gains of the other step
-    assert np.sqrt(wide**2 - noise**2) == pytest.approx(np.abs(moved), rel=0.2)
+    assert np.sqrt(3.0 * (wide**2 - noise**2)) == pytest.approx(np.abs(moved), rel=0.2)
     evidence.close()
