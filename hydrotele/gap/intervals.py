@@ -11,9 +11,9 @@ def spreads(evidence: Evidence, fit: Fit, scatter: float = 1.0) -> np.ndarray:
     """Standard deviations of a fit's numbers.
 
     Where runs by themselves ask for sizes that scatter beyond chance, the noise's part is widened
-    to that scatter (Birge 1932, The calculation of errors by the method of least squares, Phys.
-    Rev. 40). What halving the integrator's step would change is added as the half-width of a uniform
-    error: neither step is the truth (Guide to the expression of uncertainty in measurement, 4.3.7).
+    to that scatter (Birge 1932, Phys. Rev. 40, 207). What halving the integrator's step would
+    change is added as the half-width of a uniform error, for neither step is the truth (Guide to
+    the expression of uncertainty in measurement, 4.3.7).
 
     Args:
         evidence: with the fit's guess as its base.
