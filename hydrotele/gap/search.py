@@ -95,14 +95,15 @@ def search(
     rivals, scores = [], []
     for index in range(len(guess.parts)):
         ranked = seen.get(guess.parts[index][0].key, rankings[0])
-        score, others = compare(evidence, guess, index, ranked)
+        own, others = compare(evidence, guess, index, ranked)
         best = others[0] if others else None
-        if best and best.score > score and worth_naming(best.guess, -1, best.score):
-            swapped = _settled_better(evidence, guess, _exchanged(guess, index, best.guess), 0.0)
+        if best and best.score > own.score and worth_naming(best.guess, -1, best.score):
+            other, asked = _exchanged(guess, index, best.guess), best.charge - own.charge
+            swapped = _settled_better(evidence, guess, other, asked)
             if swapped:
                 guess, fit = swapped
-                score, others = compare(evidence, guess, index, ranked)
-        scores.append(score)
+                own, others = compare(evidence, guess, index, ranked)
+        scores.append(own.score)
         rivals.append(others)
     return Found(guess, fit, tuple(rankings[0]), tuple(rivals), tuple(scores), weak)
 
@@ -240,7 +241,7 @@ def _last(information: np.ndarray, guess: Guess, index: int) -> np.ndarray:
 
 def compare(
     evidence: Evidence, guess: Guess, index: int, ranking: Sequence[Screened]
-) -> tuple[float, tuple[Fit, ...]]:
+) -> tuple[Fit, tuple[Fit, ...]]:
     """What else could stand in the place of an effect.
 
     Args:
@@ -250,7 +251,7 @@ def compare(
         ranking: the screening in which the effect was found.
 
     Returns:
-        (score of the effect, fits with the rivals that come near it, best first); scores count
+        (fit of the effect, fits with the rivals that come near it, best first); scores count
         against the guess without either.
     """
     rest = guess.without(index)
@@ -270,4 +271,4 @@ def compare(
 
     own, *fits = evidence.map(fitted, [rest.plus(*own_part), *close])
     plausible = [fit for fit in fits if not _strained(fit.guess)]
-    return own.score, tuple(sorted(plausible, key=lambda fit: -fit.score))
+    return own, tuple(sorted(plausible, key=lambda fit: -fit.score))

@@ -179,7 +179,7 @@ def test_late_scaled_and_shifted_channels(machine_of, reduced_of):
                 value = np.interp(back, np.arange(len(trail)), trail[:, c])
             # rounding of a straight line between two steps
             assert out[c] == pytest.approx(error.scale * value + error.offset, rel=1e-12)
-        advance(model, space, z, command, row, PERIOD, steps, trail)
+        advance(model, space, z, command, row, PERIOD, steps, trail[row * steps :])
     assert supply_of(ideal, room, z) > 0
 
 
