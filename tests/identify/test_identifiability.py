@@ -64,8 +64,8 @@ def complete():
 def test_counts_of_the_complete_model(complete):
     """Of the physical model on a wide motion; Khoshzaban's Table 13 has 31, 24 and 27.
 
-    On a narrow one, where the tube of the stick's cylinder never turns back against its rod, the
-    friction of its three pins shows in two combinations only: 9, 56 and 17.
+    On another motion it was 9, 56 and 17: the friction of the stick's three pins then showed in two
+    combinations only.
     """
     told = identifiability(complete.matrix.reshape(-1, 82), complete.names, complete.units)
     assert told.counts == {UNIDENTIFIABLE: 9, COMBINATION: 53, FULL: 20}

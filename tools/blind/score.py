@@ -145,9 +145,19 @@ def _targets(scores: dict[str, Any], by: dict[str, list[Verdict]]) -> dict[str, 
         return part and part["share"]
 
     asked = [
-        ("single right", of("single", "right_without_weak"), True, 0.95),
+        (
+            "single right, silence on weak ones set aside",
+            of("single", "right_without_weak"),
+            True,
+            0.95,
+        ),
         ("single right, silence on weak ones counted as wrong", of("single", "right"), True, 0.95),
-        ("double right", of("double", "right_without_weak"), True, 0.85),
+        (
+            "double right, silence on weak ones set aside",
+            of("double", "right_without_weak"),
+            True,
+            0.85,
+        ),
         ("double right, silence on weak ones counted as wrong", of("double", "right"), True, 0.85),
         ("clean falsely named", of("clean", "falsely_named"), False, 0.02),
         ("outside called unknown", of("outside", "called_unknown"), True, 0.85),
