@@ -29,6 +29,7 @@ FLOORS = (
         "log",
     ),
     ("kinematics", "hydraulics", "dynamics"),
+    ("dataset",),
     ("simulate", "operate"),
     ("run", "replay", "summary"),
     ("identify",),
@@ -38,7 +39,7 @@ FLOORS = (
     ("cli",),
 )
 WALLED = {"simulate", "operate", "calibrate", "identify", "gap"}
-_FACTS = {*FLOORS[0], *FLOORS[1], *FLOORS[2]}
+_FACTS = {*FLOORS[0], *FLOORS[1], *FLOORS[2], *FLOORS[3]}
 # Rooms that see less than all the floors below.
 ONLY = {
     "errors": set(),

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.gap.dataset import load_dataset
+from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.evidence import Evidence
 from hydrotele.gap.hypothesis import Guess, hypotheses
 from hydrotele.gap.residuals import LIMITS, residual_tests

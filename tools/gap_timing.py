@@ -10,7 +10,7 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from hydrotele.gap.dataset import Dataset, RunData, load_dataset
+from hydrotele.dataset.load import Dataset, RunData, load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.machine_file import load_machine
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import yaml
 
-from hydrotele.gap.dataset import load_dataset
+from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
 from hydrotele.machine_file import load_machine

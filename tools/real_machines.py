@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hydrotele.dataset.load import Dataset, RunData, load_dataset
 from hydrotele.dynamics.model import state_names
 from hydrotele.effects import apply_effect
-from hydrotele.gap.dataset import Dataset, RunData, load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.levels import find_levels
 from hydrotele.gap.result import Gap

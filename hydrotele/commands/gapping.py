@@ -10,10 +10,10 @@ import yaml
 import hydrotele
 from hydrotele.commands.console import notes, out, print_json, table
 from hydrotele.datafile import suggest
+from hydrotele.dataset.load import Dataset, load_dataset
 from hydrotele.effects import EFFECTS
 from hydrotele.errors import InputError
 from hydrotele.gap.customary import said
-from hydrotele.gap.dataset import Dataset, load_dataset
 from hydrotele.gap.gap_json import finite, gap_document
 from hydrotele.gap.patched import has_patch, write_patch
 from hydrotele.gap.result import Gap

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hydrotele.dataset.clock import fit_clock
 from hydrotele.dynamics.integrate import arriving
-from hydrotele.gap.data_clock import fit_clock
 from hydrotele.hydraulics.laws import spool_step
 from hydrotele.identify import smoothing
 from hydrotele.kinematics.from_machine import axis_linkage

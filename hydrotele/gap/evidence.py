@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.gap.dataset import Dataset, RunData
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.gap.hypothesis import Guess
 from hydrotele.gap.tracking import STEP, Track, fine_enough, track_run
 from hydrotele.machine import Machine

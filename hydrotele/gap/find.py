@@ -6,9 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from hydrotele.dataset.load import Dataset
 from hydrotele.gap.balances import balances
 from hydrotele.gap.constancy import constancy
-from hydrotele.gap.dataset import Dataset
 from hydrotele.gap.evidence import Evidence, Fit
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.floor import perfect_tracks

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model, state_size
-from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.gap.tracking import STEP, Track, track_run
 from hydrotele.machine import Machine
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hydrotele.gap.dataset import Dataset, RunData
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.gap.tracking import track_run
 from hydrotele.signals import parse_channel
 

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import fminbound
 
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import load_position, place
 from hydrotele.dynamics.model import Model, model_space
-from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.hydraulics.circuit import SLOTS, Slot
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine

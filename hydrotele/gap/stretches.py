@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from hydrotele.gap.dataset import Dataset, RunData
+from hydrotele.dataset.load import Dataset, RunData
 
 MOST_SECONDS = 720.0  # of all fitted runs together: eighteen runs of a usual length
 

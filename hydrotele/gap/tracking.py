@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
-from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.gap.filter import Gains, filter_run
 from hydrotele.gap.late import late_readings
 from hydrotele.gap.start import find_rest, start_state

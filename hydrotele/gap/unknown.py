@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import spearmanr
 
+from hydrotele.dataset.load import Dataset
 from hydrotele.errors import InputError
-from hydrotele.gap.dataset import Dataset
 from hydrotele.gap.result import Prediction, Unknown
 from hydrotele.gap.unknown_fit import Explained, explain
 from hydrotele.gap.unknown_laws import (

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model, state_names, state_size
 from hydrotele.errors import InputError
 from hydrotele.gap.balances import Balance, balances
-from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.gap.start import start_state
 from hydrotele.gap.tracking import STEP
 from hydrotele.gap.unknown_signals import run_log

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from hydrotele.compiled import compiled
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.gap.balance_signals import Signals, joint_motion, read_signals, spool_positions
 from hydrotele.gap.balances import BAND
-from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.hydraulics.circuit import Slot, chamber_flows
 from hydrotele.hydraulics.laws import valve_opening
 from hydrotele.hydraulics.parameters import actuator_numbers

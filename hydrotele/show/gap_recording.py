@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.gap.dataset import RunData
+from hydrotele.dataset.load import RunData
 from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Gap, Prediction
 from hydrotele.gap.words import channel_words, headline, verdict_words

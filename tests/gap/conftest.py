@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from hydrotele.dataset.load import RunData
 from hydrotele.effects import apply_effect
-from hydrotele.gap.dataset import RunData
 from hydrotele.gap.result import (
     Alternative,
     Candidate,

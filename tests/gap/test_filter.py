@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, predicted_channels, reduced_model, state_names
 from hydrotele.effects import apply_effect
-from hydrotele.gap.dataset import Dataset, RunData
 from hydrotele.gap.tracking import track_run
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.log import Log

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hydrotele.gap.dataset import load_dataset
+from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.log import Log, load_log, save_log
 from hydrotele.machine_file import load_machine

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hydrotele.cli import app
-from hydrotele.gap.dataset import load_dataset
+from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.levels import find_levels
 from hydrotele.gap.stretches import busiest

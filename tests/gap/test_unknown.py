@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hydrotele.gap.data_files import RunFiles
-from hydrotele.gap.dataset import Dataset, load_dataset, make_dataset
+from hydrotele.dataset.files import RunFiles
+from hydrotele.dataset.load import Dataset, load_dataset, make_dataset
 from hydrotele.gap.result import Prediction
 from hydrotele.gap.tracking import track_run
 from hydrotele.gap.unknown import describe_unknown, loud_windows, worst_channel

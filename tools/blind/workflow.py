@@ -8,7 +8,7 @@ Prints the `gap.json` document. Nothing of the generator is imported here.
 import argparse
 import json
 
-from hydrotele.gap.dataset import load_dataset
+from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.gap_json import gap_document
 from hydrotele.machine_file import load_machine

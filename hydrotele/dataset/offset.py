@@ -4,7 +4,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 
-from hydrotele.gap.data_clock import Clock
+from hydrotele.dataset.clock import Clock
 
 _LEAST_OVERLAP = 5.0  # [s] that both must have in common
 _ALIKE = 0.95  # correlation of commands that are the same signal, sampled twice

@@ -1,4 +1,4 @@
-"""Logs of one machine, made ready for the filter: one clock, one set of channels, gaps marked."""
+"""Logs of one machine, made ready for learning: one clock, one set of channels, gaps marked."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from hydrotele.dataset import channel_facts
+from hydrotele.dataset.files import RunFiles, check_commands, read_runs
+from hydrotele.dataset.mend import mend
+from hydrotele.dataset.piece_log import measured_only, piece_log
+from hydrotele.dataset.rows import Rows, run_rows
+from hydrotele.dataset.split import SHORTEST, seconds, split
+from hydrotele.dataset.value_range import check_range
 from hydrotele.errors import InputError
-from hydrotele.gap import data_channels
-from hydrotele.gap.data_files import RunFiles, check_commands, read_runs
-from hydrotele.gap.data_log import measured_only, piece_log
-from hydrotele.gap.data_mend import mend
-from hydrotele.gap.data_range import check_range
-from hydrotele.gap.data_rows import Rows, run_rows
-from hydrotele.gap.data_split import SHORTEST, seconds, split
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.log import Log
 from hydrotele.machine import Machine
@@ -88,11 +88,11 @@ def load_dataset(
     even if its converter's step is known: a fine converter says nothing of the noise before it.
 
     Args:
-        paths: folder with logs, run folder, file, or several of them; see `data_files`.
+        paths: folder with logs, run folder, file, or several of them; see `files`.
         machine: the model.
         sensors: name of the machine's sensors, or `ideal` if unknown; else what the logs'
             metadata say, else the machine's first.
-        heldout: name of the run to judge on; see `data_split`.
+        heldout: name of the run to judge on; see `split`.
         aliases: the files' own column name -> channel, besides the machine's `log_columns`.
         force: accept logs whose metadata names another machine or tool.
 
@@ -123,21 +123,21 @@ def make_dataset(
         InputError: as `load_dataset`.
     """
     files = [measured_only(run) for run in files]
-    axes, channels = tuple(actuator_order(machine)), data_channels.channels(files, machine)
+    axes, channels = tuple(actuator_order(machine)), channel_facts.channels(files, machine)
     for run in files:
         check_commands(run, machine)
-    known, notes = data_channels.sensors(files, machine, sensors)
-    noise = np.array([data_channels.noise(machine, known, channel) for channel in channels])
+    known, notes = channel_facts.sensors(files, machine, sensors)
+    noise = np.array([channel_facts.noise(machine, known, channel) for channel in channels])
     runs, origin, said = _runs(files, machine, axes, channels)
     mended, more = mend(machine, known, axes, channels, noise, runs)
-    notes += data_channels.strangers(files, machine) + said + list(more)
-    notes += data_channels.still(mended, channels, noise)
+    notes += channel_facts.strangers(files, machine) + said + list(more)
+    notes += channel_facts.still(mended, channels, noise)
     kept = np.array([any(np.isfinite(rows.reading[:, column]).any() for rows in mended.values())
                      for column in range(len(channels))])  # fmt: skip
     notes += [f"{c} has no good reading in any run; it was dropped."
               for c, keep in zip(channels, kept, strict=True) if not keep]  # fmt: skip
     channels = tuple(c for c, keep in zip(channels, kept, strict=True) if keep)
-    notes += data_channels.blind_axes(machine, axes, channels)
+    notes += channel_facts.blind_axes(machine, axes, channels)
     whole = {n: rows._replace(reading=rows.reading[:, kept]) for n, rows in mended.items()}
     parts, left = split(whole, origin, heldout)
     logs = {run.name: run.logs for run in files}

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.datafile import suggest
+from hydrotele.dataset.rows import Rows
 from hydrotele.errors import InputError
-from hydrotele.gap.data_rows import Rows
 
 SHORTEST = 5.0  # [s] of a run; the start, whose state is unknown, takes up to a second of it
 _SHORTEST_PIECE = 10.0  # [s] of a piece of a single run

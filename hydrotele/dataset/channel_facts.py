@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from hydrotele.datafile import suggest
+from hydrotele.dataset.files import RunFiles
+from hydrotele.dataset.rows import Rows
 from hydrotele.errors import InputError
-from hydrotele.gap.data_files import RunFiles
-from hydrotele.gap.data_rows import Rows
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
 from hydrotele.noise import IDEAL, channel_sensor, noise_rms, sensor_set

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.gap.data_files import RunFiles
-from hydrotele.gap.data_rows import Rows
+from hydrotele.dataset.files import RunFiles
+from hydrotele.dataset.rows import Rows
 from hydrotele.log import Log
 
 _SECRET = ("initial_state",)  # metadata that only a simulator can know

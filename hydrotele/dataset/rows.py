@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.gap.data_clock import Clock, fit_clock
-from hydrotele.gap.data_files import RunFiles
-from hydrotele.gap.data_offset import clock_offset
+from hydrotele.dataset.clock import Clock, fit_clock
+from hydrotele.dataset.files import RunFiles
+from hydrotele.dataset.offset import clock_offset
 from hydrotele.log import Log
 
 LONGEST_GAP = 1.0  # [s] without rows, after which the commands' history is lost and a run is cut

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hydrotele.dataset.clock import fit_clock
+from hydrotele.dataset.files import RunFiles
+from hydrotele.dataset.load import Dataset, load_dataset, make_dataset
+from hydrotele.dataset.offset import clock_offset
 from hydrotele.errors import InputError
-from hydrotele.gap.data_clock import fit_clock
-from hydrotele.gap.data_files import RunFiles
-from hydrotele.gap.data_offset import clock_offset
-from hydrotele.gap.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.log import Log, load_log, save_log
 from hydrotele.machine_file import load_machine

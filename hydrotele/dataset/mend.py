@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.gap import data_range, data_stuck
-from hydrotele.gap.data_rows import Rows
+from hydrotele.dataset import stuck, value_range
+from hydrotele.dataset.rows import Rows
 from hydrotele.machine import Machine
 from hydrotele.noise import channel_sensor, converter
 from hydrotele.sensors import Sensor, SensorSet
@@ -85,9 +85,9 @@ def _out_of_sensor(data: _Data, run: str, channel: str, noise: float) -> list[st
         notes.append(f"{run}: {bad} infinite readings of {channel} were left out.")
     for what, noted, rows in (
         ("at the end of its sensor", _CLIPPED,
-         data_range.clipped(data.sensor(channel), channel, reading)),
+         value_range.clipped(data.sensor(channel), channel, reading)),
         ("which nothing physical explains", 0.0,
-         data_range.spikes(data.machine, channel, reading, period, noise)),
+         value_range.spikes(data.machine, channel, reading, period, noise)),
     ):  # fmt: skip
         if rows.mean() > noted:
             first = data.runs[run].start + period * int(np.flatnonzero(rows)[0])
@@ -101,13 +101,13 @@ def _count(data: _Data) -> int:
     return sum(rows.reading.size for rows in data.runs.values())
 
 
-def _frozen(data: _Data, run: str, channel: str) -> list[data_stuck.Stretch]:
+def _frozen(data: _Data, run: str, channel: str) -> list[stuck.Stretch]:
     """Stretches of a run in which a channel is frozen, by the strictest test that applies."""
     reading, sensor, period = data.column(channel, run), data.sensor(channel), data.runs[run].period
     assert reading is not None
-    probability = data_stuck.repeat_probability(sensor, channel)
-    if probability and data_stuck.as_noisy_as_stated(sensor, channel, _floors(data, run, channel)):
-        return data_stuck.frozen_by_noise(reading, probability, _count(data), period)
+    probability = stuck.repeat_probability(sensor, channel)
+    if probability and stuck.as_noisy_as_stated(sensor, channel, _floors(data, run, channel)):
+        return stuck.frozen_by_noise(reading, probability, _count(data), period)
     kind, _, axis = channel.partition(".")
     if kind == "pressure_supply":  # rests at its relief for as long as it likes
         return []
@@ -118,13 +118,13 @@ def _frozen(data: _Data, run: str, channel: str) -> list[data_stuck.Stretch]:
         lowest = data.machine.supply.tank_pressure + _STARVED
         if partner is None:
             return []
-        return data_stuck.frozen_chamber(reading, partner, lowest, period)
+        return stuck.frozen_chamber(reading, partner, lowest, period)
     if not np.isfinite(reading).any():
         return []
     return _frozen_position(data, run, channel, axis)
 
 
-def _frozen_position(data: _Data, run: str, channel: str, axis: str) -> list[data_stuck.Stretch]:
+def _frozen_position(data: _Data, run: str, channel: str, axis: str) -> list[stuck.Stretch]:
     position = f"{data.machine.position_kind(axis)}.{axis}"
     partner = position if channel != position else f"length.{axis}"
     force = data.machine.axes[axis].force
@@ -134,7 +134,7 @@ def _frozen_position(data: _Data, run: str, channel: str, axis: str) -> list[dat
     span = data.span(channel)
     reading = data.column(channel, run)
     assert reading is not None
-    return data_stuck.frozen_by_motion(
+    return stuck.frozen_by_motion(
         reading, data.column(partner, run), command / (force.command_limit if force else 1.0),
         np.column_stack(apart) if apart else np.empty((len(command), 0)),
         converter(data.sensor(channel), channel).step or _RESOLVED * span,
@@ -151,7 +151,7 @@ def _floors(data: _Data, run: str, channel: str) -> list[float]:
         (c, r) for c in data.channels for r in data.runs
         if c != channel and c.startswith(kind) and data.sensor(c).accuracy == sensor.accuracy
     ]  # fmt: skip
-    floors = (data_stuck.noise_floor(v) for c, r in witnesses
+    floors = (stuck.noise_floor(v) for c, r in witnesses
               if (v := data.column(c, r)) is not None)  # fmt: skip
     return [next((floor for floor in floors if math.isfinite(floor)), math.nan)]
 
@@ -172,10 +172,10 @@ def _take_out_frozen(data: _Data, run: str, channel: str, parts) -> list[str]:
 
 def _take_out_repeated_rows(data: _Data, run: str) -> list[str]:
     rows = data.runs[run]
-    odds = [data_stuck.repeat_probability(data.sensor(c), c) for c in data.channels]
-    odds = [p if p and data_stuck.as_noisy_as_stated(data.sensor(c), c, _floors(data, run, c))
+    odds = [stuck.repeat_probability(data.sensor(c), c) for c in data.channels]
+    odds = [p if p and stuck.as_noisy_as_stated(data.sensor(c), c, _floors(data, run, c))
             else None for c, p in zip(data.channels, odds, strict=True)]  # fmt: skip
-    again = data_stuck.repeated_rows(rows.reading, odds, _count(data))
+    again = stuck.repeated_rows(rows.reading, odds, _count(data))
     if not again.any():
         return []
     rows.reading[again] = np.nan

@@ -1,0 +1,1 @@
+"""Logs of one machine, in order for learning: clocks, channels, gaps, the held-out run."""
