@@ -30,6 +30,7 @@ FLOORS = (
     ),
     ("kinematics", "hydraulics", "dynamics"),
     ("dataset",),
+    ("prediction",),
     ("simulate", "operate"),
     ("run", "replay", "summary"),
     ("identify",),
@@ -39,7 +40,7 @@ FLOORS = (
     ("cli",),
 )
 WALLED = {"simulate", "operate", "calibrate", "identify", "gap"}
-_FACTS = {*FLOORS[0], *FLOORS[1], *FLOORS[2], *FLOORS[3]}
+_FACTS = set().union(*FLOORS[:5])
 # Rooms that see less than all the floors below.
 ONLY = {
     "errors": set(),

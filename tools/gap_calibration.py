@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.dataset.load import load_dataset
-from hydrotele.gap.evidence import Evidence
-from hydrotele.gap.hypothesis import Guess, hypotheses
 from hydrotele.gap.residuals import LIMITS, residual_tests
 from hydrotele.gap.screening import screen
 from hydrotele.gap.search import ENTER, best_addition
 from hydrotele.machine_file import load_machine
+from hydrotele.prediction.evidence import Evidence
+from hydrotele.prediction.hypothesis import Guess, hypotheses
 from tools.blind.run_trial import ROOT
 from tools.blind.trials import Place, Series, begin_series, load_series, write_json
 

@@ -19,13 +19,13 @@ from hydrotele.dataset.load import Dataset, RunData, load_dataset
 from hydrotele.dynamics.model import state_names
 from hydrotele.effects import apply_effect
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.levels import find_levels
 from hydrotele.gap.result import Gap
-from hydrotele.gap.stretches import busiest
-from hydrotele.gap.tracking import track_run
 from hydrotele.identify.zero_phase import zero_phase
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
+from hydrotele.prediction.levels import find_levels
+from hydrotele.prediction.stretches import busiest
+from hydrotele.prediction.track import track_run
 
 WINDOW, LEAD = 5.0, 0.5  # s; of each window the lead has readings, the rest none
 _EDGE = 100  # rows that the filters' ends spoil

@@ -59,7 +59,7 @@ class Dataset:
         notes: what was left out or mended, one sentence each.
         sensors: name of the machine's sensors, or None if their noise is unknown.
         drift: state or kind of state -> standard deviation that a row may add to it, where it was
-            found from the data; others as `tracking` has them.
+            found from the data; others as `prediction.track` has them.
     """
 
     machine: Machine

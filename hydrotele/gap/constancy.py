@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from hydrotele.gap.evidence import Evidence
-from hydrotele.gap.hypothesis import Guess
 from hydrotele.gap.residuals import ALLOWED
+from hydrotele.prediction.evidence import Evidence
+from hydrotele.prediction.hypothesis import Guess
 
 LIMIT = 8.0
 """Largest chi-square per degree of freedom that still passes; noise alone leaves 1."""

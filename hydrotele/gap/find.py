@@ -9,12 +9,8 @@ import numpy as np
 from hydrotele.dataset.load import Dataset
 from hydrotele.gap.balances import balances
 from hydrotele.gap.constancy import constancy
-from hydrotele.gap.evidence import Evidence, Fit
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.floor import perfect_tracks
-from hydrotele.gap.hypothesis import Guess, Hypothesis, hypotheses
-from hydrotele.gap.intervals import spreads
-from hydrotele.gap.levels import find_levels, known_levels
 from hydrotele.gap.residuals import residual_tests, rms
 from hydrotele.gap.result import (
     Alternative,
@@ -27,10 +23,14 @@ from hydrotele.gap.result import (
     Verdict,
 )
 from hydrotele.gap.search import MOST, Found, search
-from hydrotele.gap.stretches import busiest
-from hydrotele.gap.tracking import STEP, Track
 from hydrotele.gap.unknown import describe_unknown
 from hydrotele.machine import Machine
+from hydrotele.prediction.evidence import Evidence, Fit
+from hydrotele.prediction.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.prediction.intervals import spreads
+from hydrotele.prediction.levels import find_levels, known_levels
+from hydrotele.prediction.stretches import busiest
+from hydrotele.prediction.track import STEP, Track
 
 _MOST_UNFLOORED = 4  # real machines without stated noise lack more than one effect
 _ROUGH_STEP = 2.0e-3  # s, where the noise is not known and far above the integrator's errors

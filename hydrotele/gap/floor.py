@@ -7,8 +7,8 @@ import numpy as np
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model, state_size
-from hydrotele.gap.tracking import STEP, Track, track_run
 from hydrotele.machine import Machine
+from hydrotele.prediction.track import STEP, Track, track_run
 
 _SEED = 0  # of the first run; any: the floor's scatter over seeds is 0.003
 

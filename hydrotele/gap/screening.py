@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.gap.evidence import Evidence
-from hydrotele.gap.hypothesis import WIDE, Guess, Hypothesis
-from hydrotele.gap.tracking import COARSE, Track
+from hydrotele.prediction.evidence import Evidence
+from hydrotele.prediction.hypothesis import WIDE, Guess, Hypothesis
+from hydrotele.prediction.track import COARSE, Track
 
 _FEW = 24  # candidates that are tried on all runs
 _BENT = 0.5  # sides of nominal that differ by this share of their squares are no straight line

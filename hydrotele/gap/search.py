@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from hydrotele.gap.evidence import Evidence, Fit, charge
-from hydrotele.gap.hypothesis import Guess, Hypothesis
 from hydrotele.gap.screening import Screened, screen
-from hydrotele.gap.tracking import COARSE
+from hydrotele.prediction.evidence import Evidence, Fit, charge
+from hydrotele.prediction.hypothesis import Guess, Hypothesis
+from hydrotele.prediction.track import COARSE
 
 ENTER = 15.0  # twice the log evidence an effect must bring; thrice what 56 clean machines reach
 MOST = 3  # effects that one search names

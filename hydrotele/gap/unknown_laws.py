@@ -10,11 +10,11 @@ from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model, state_names, state_size
 from hydrotele.errors import InputError
 from hydrotele.gap.balances import Balance, balances
-from hydrotele.gap.start import start_state
-from hydrotele.gap.tracking import STEP
 from hydrotele.gap.unknown_signals import run_log
 from hydrotele.kinematics.triangle import LoopOpen
 from hydrotele.machine import Machine
+from hydrotele.prediction.start import start_state
+from hydrotele.prediction.track import STEP
 
 CLEAR = 1.25  # excess from which a law counts as broken; clean machines stay below 1.2
 _LATE = 2.0  # the same for timing, whose noise is known less well

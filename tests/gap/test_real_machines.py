@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 from hydrotele.cli import app
 from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.levels import find_levels
-from hydrotele.gap.stretches import busiest
 from hydrotele.machine_file import load_machine
+from hydrotele.prediction.levels import find_levels
+from hydrotele.prediction.stretches import busiest
 from tools.real_machines import force_error, plain_valves, velocity_fit
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "real"

@@ -10,13 +10,13 @@ import pytest
 from hydrotele.dataset.files import RunFiles
 from hydrotele.dataset.load import Dataset, load_dataset, make_dataset
 from hydrotele.gap.result import Prediction
-from hydrotele.gap.tracking import track_run
 from hydrotele.gap.unknown import describe_unknown, loud_windows, worst_channel
 from hydrotele.gap.unknown_fit import explain
 from hydrotele.gap.unknown_signals import Scene
 from hydrotele.gap.unknown_target import Part, Target, roles
 from hydrotele.gap.unknown_terms import TERMS, held_spool
 from hydrotele.machine_file import load_machine
+from hydrotele.prediction.track import track_run
 from tools.blind.draw import Planted
 from tools.blind.motions import motions
 from tools.blind.plant import record

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.gap.evidence import Evidence
-from hydrotele.gap.hypothesis import Guess, hypotheses
 from hydrotele.machine_file import load_machine
-from tests.gap.test_filter import machine_data
+from hydrotele.prediction.evidence import Evidence
+from hydrotele.prediction.hypothesis import Guess, hypotheses
+from tests.prediction.test_filter import machine_data
 
 
 @pytest.fixture(scope="module")

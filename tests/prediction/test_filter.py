@@ -9,10 +9,10 @@ from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, predicted_channels, reduced_model, state_names
 from hydrotele.effects import apply_effect
-from hydrotele.gap.tracking import track_run
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.log import Log
 from hydrotele.machine_file import load_machine
+from hydrotele.prediction.track import track_run
 
 PERIOD, ROWS = 0.02, 600
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.gap.evidence import Evidence
-from hydrotele.gap.hypothesis import Guess, hypotheses
-from hydrotele.gap.intervals import spreads
 from hydrotele.machine_file import load_machine
-from tests.gap.test_filter import machine_data
+from hydrotele.prediction.evidence import Evidence
+from hydrotele.prediction.hypothesis import Guess, hypotheses
+from hydrotele.prediction.intervals import spreads
+from tests.prediction.test_filter import machine_data
 
 
 def fitted(name, location, values, step=1e-3):

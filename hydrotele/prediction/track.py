@@ -8,10 +8,10 @@ import numpy as np
 
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
-from hydrotele.gap.filter import Gains, filter_run
-from hydrotele.gap.late import late_readings
-from hydrotele.gap.start import find_rest, start_state
 from hydrotele.machine import Machine
+from hydrotele.prediction.filter import Gains, filter_run
+from hydrotele.prediction.late import late_readings
+from hydrotele.prediction.start import find_rest, start_state
 
 STEP = (
     1.0e-3  # s: 2 ms leaves errors of 1000 in the loss where the pump is starved, 1 ms none of 100

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.gap.evidence import Evidence, Fit
+from hydrotele.prediction.evidence import Evidence, Fit
 
 _CHANCE = 3.0  # chi-square per degree of freedom that two degrees exceed in 5 % of all cases
 

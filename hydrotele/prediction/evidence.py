@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hydrotele.dataset.load import Dataset, RunData
-from hydrotele.gap.hypothesis import Guess
-from hydrotele.gap.tracking import STEP, Track, fine_enough, track_run
 from hydrotele.machine import Machine
+from hydrotele.prediction.hypothesis import Guess
+from hydrotele.prediction.track import STEP, Track, fine_enough, track_run
 
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
 _STEPS = 6

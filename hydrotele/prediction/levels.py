@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hydrotele.dataset.load import Dataset, RunData
-from hydrotele.gap.tracking import track_run
+from hydrotele.prediction.track import track_run
 from hydrotele.signals import parse_channel
 
 HORIZON = 0.5  # s over which the filter forgets: longer than a valve's lag, shorter than a motion

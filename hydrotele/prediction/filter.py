@@ -19,7 +19,7 @@ from hydrotele.dynamics.integrate import (
     supply_of,
 )
 from hydrotele.dynamics.mechanism import JOINT
-from hydrotele.gap.late import begin_late, move_late, spread_late
+from hydrotele.prediction.late import begin_late, move_late, spread_late
 
 
 class Gains(NamedTuple):

@@ -1,0 +1,168 @@
+"""What logs tell of the drives: position of every joint and force of every drive, row by row."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.dataset.load import Dataset, RunData
+from hydrotele.errors import InputError
+from hydrotele.kinematics.from_machine import DriveLinkage, axis_linkage
+from hydrotele.kinematics.triangle import LoopOpen
+from hydrotele.machine import Machine
+from hydrotele.sensors import SensorError
+
+_WHERE = "identification"
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run of k axes over n rows of a uniform clock.
+
+    Attributes:
+        name: the run's.
+        period: time between rows [s].
+        axes: names of the axes.
+        position: (n, k) of their joints [rad] or [m], NaN where not known.
+        position_noise: (k,) standard deviation of one position; NaN where the sensors state none.
+        force: (n, k) of their drives [N] or [N m], NaN where not known: of the oil, or of a plain
+            drive's command, friction included.
+        force_noise: (k,) standard deviation of one force; 0 where a command tells it, NaN where
+            the sensors state none.
+        clipped: (k,) share of rows in which a pressure sensor stood at an end of its range.
+    """
+
+    name: str
+    period: float
+    axes: tuple[str, ...]
+    position: np.ndarray
+    position_noise: np.ndarray
+    force: np.ndarray
+    force_noise: np.ndarray
+
+
+def records(dataset: Dataset) -> tuple[tuple[Record, ...], Record, tuple[str, ...]]:
+    """Positions and forces of all runs.
+
+    A joint with its own sensor and a sensor of its cylinder's length is told by both, each weighted
+    by its noise.
+
+    Args:
+        dataset: logs of a machine.
+
+    Returns:
+        Records of the runs to fit, of the held-out run, and notes on what could not be used.
+
+    Raises:
+        InputError: no axis has both a position and a force.
+    """
+    axes = tuple(axis for axis in dataset.axes if _positions(dataset, axis))
+    forced = [axis for axis in axes if _force_channels(dataset, axis) is not None]
+    notes = [f"{a} has no position sensor: nothing is known of it." for a in dataset.axes
+             if a not in axes]  # fmt: skip
+    notes += [f"{a} lacks a pressure of one side: its motion is used, its force is not known."
+              for a in axes if a not in forced]  # fmt: skip
+    if len(axes) < len(dataset.axes):
+        missing = ", ".join(a for a in dataset.axes if a not in axes)
+        raise InputError(
+            _WHERE,
+            f"the position of {missing} is not in the logs; forces of all axes depend on it:"
+            " log its angle or its length",
+        )
+    if not forced:
+        raise InputError(
+            _WHERE,
+            "no axis has the pressures of both its sides (or a drive command): no force is known",
+        )
+    made = [_record(dataset, run, axes) for run in (*dataset.fit, dataset.heldout)]
+    return tuple(made[:-1]), made[-1], tuple(notes)
+
+
+def _record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> Record:
+    rows = len(run.command)
+    position, force = np.full((2, rows, len(axes)), np.nan)
+    position_noise, force_noise = np.full((2, len(axes)), np.nan)
+    for k, axis in enumerate(axes):
+        position[:, k], position_noise[k] = _position(dataset, run, axis)
+        force[:, k], force_noise[k] = _force(dataset, run, axis)
+    return Record(run.name, run.period, tuple(axes), position, position_noise, force, force_noise)
+
+
+def _positions(dataset: Dataset, axis: str) -> list[str]:
+    names = (f"{dataset.machine.position_kind(axis)}.{axis}", f"length.{axis}")
+    return [name for name in names if name in dataset.channels]
+
+
+def _position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
+    """Position (n,) of an axis' joint and its noise."""
+    machine = dataset.machine
+    values, noises = [], []
+    for channel in _positions(dataset, axis):
+        reading, noise = _reading(dataset, run, channel)
+        if not np.isfinite(reading).any():
+            continue
+        if channel.startswith("length."):
+            linkage = axis_linkage(machine, axis)
+            reading = _joint(machine, axis, linkage, reading)
+            middle = reading[np.isfinite(reading)]
+            noise = noise / float(np.sqrt(np.mean(linkage.rate(middle) ** 2)))
+        values.append(reading)
+        noises.append(noise)
+    if not values:
+        return np.full(len(run.command), np.nan), float("nan")
+    known = np.isfinite(noises)
+    if not known.any():
+        return values[0], float("nan")
+    weight = np.where(known, 1.0 / np.maximum(np.where(known, noises, 1.0), 1e-12) ** 2, 0.0)
+    weights = weight[:, None] * np.isfinite(values)
+    total = weights.sum(axis=0)
+    out = np.nansum(weights * np.nan_to_num(values), axis=0) / np.where(total > 0, total, np.nan)
+    return out, float(weight.sum() ** -0.5)
+
+
+def _joint(machine: Machine, axis: str, linkage: DriveLinkage, length: np.ndarray) -> np.ndarray:
+    """Joint positions (n,) at piston displacements (n,) [m]."""
+    cylinder = machine.axes[axis].cylinder
+    assert cylinder is not None
+    out, known = np.full(len(length), np.nan), np.isfinite(length)
+    try:
+        out[known] = linkage.angle(length[known] + cylinder.closed_length)
+    except LoopOpen as error:
+        raise InputError(f"length.{axis}", f"does not fit the machine's linkage: {error}") from None
+    return out
+
+
+def _force_channels(dataset: Dataset, axis: str) -> tuple[str, ...] | None:
+    """Channels that tell the force of a drive, () for a plain one, None where some lack."""
+    if not dataset.machine.axes[axis].hydraulic:
+        return ()
+    names = (f"pressure_head.{axis}", f"pressure_rod.{axis}")
+    return names if all(name in dataset.channels for name in names) else None
+
+
+def _force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
+    """Force (n,) of an axis' drive and its noise."""
+    machine = dataset.machine
+    channels = _force_channels(dataset, axis)
+    facts = machine.axes[axis]
+    if channels is None:
+        return np.full(len(run.command), np.nan), float("nan")
+    if facts.force:
+        command = run.command[:, dataset.axes.index(axis)]
+        return np.where(run.command_known, facts.force.gain * command, np.nan), 0.0
+    (head, noise_head), (rod, noise_rod) = (_reading(dataset, run, c) for c in channels)
+    area_head, area_rod = facts.hydraulic_drive.areas
+    return area_head * head - area_rod * rod, float(
+        np.hypot(area_head * noise_head, area_rod * noise_rod)
+    )
+
+
+def _reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, float]:
+    """Readings (n,) freed of the sensor defects that the machine states, and their noise."""
+    column = dataset.channels.index(channel)
+    error = dataset.machine.sensor_errors.get(channel, SensorError())
+    values = (run.reading[:, column] - error.offset) / error.scale
+    if error.delay:
+        rows = np.arange(len(values), dtype=float)
+        values = np.interp(rows + error.delay / run.period, rows, values, right=np.nan)
+    return values, float(dataset.noise[column]) / error.scale

@@ -1,0 +1,1 @@
+"""Prediction errors of a machine along measured runs, and effects fitted to them."""
