@@ -64,3 +64,22 @@ def progress_bar(label: str, quiet: bool = False) -> Iterator[Progress | None]:
             bar.update(task, completed=done, total=total, factor=f"{factor:.0f} x real time")
 
         yield update
+
+
+@contextlib.contextmanager
+def stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | None]:
+    """A bar with the stage of the search on stderr; None where nobody watches."""
+    if quiet or not notes.is_terminal:
+        yield None
+        return
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn(label), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
+    stage = TextColumn("{task.description}")
+    with Progress(*columns, stage, console=notes, transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+
+        def update(said: str, fraction: float) -> None:
+            bar.update(task, completed=fraction, description=said)
+
+        yield update

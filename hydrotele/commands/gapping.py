@@ -1,14 +1,14 @@
 """`hydrotele gap`: where model and measured logs disagree, and the machine that agrees better."""
 
-import contextlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
 
 import hydrotele
-from hydrotele.commands.console import notes, out, print_json, table
+from hydrotele.commands.console import notes, out, print_json, stages, table
+from hydrotele.commands.opening import data_name, machine_of
 from hydrotele.datafile import suggest
 from hydrotele.dataset.load import Dataset, load_dataset
 from hydrotele.effects import EFFECTS
@@ -18,15 +18,11 @@ from hydrotele.gap.gap_json import finite, gap_document
 from hydrotele.gap.patched import has_patch, write_patch
 from hydrotele.gap.result import Gap
 from hydrotele.gap.words import effect_title, headline, verdict_words
-from hydrotele.log import load_log
-from hydrotele.machine import Machine
-from hydrotele.machine_file import MACHINE_FILE, load_machine
 from hydrotele.output import check_target, whole_folder
 from hydrotele.simulate.native import stop_profiling_clock
 
 _COLOURS = {"named": "blue", "no_gap": "green", "ambiguous": "yellow", "unknown": "red"}
 _COLUMNS = ("effect", "parameter", "model had", "found", "95 % interval", "unit")
-_LOGS = (".parquet", ".csv")
 
 
 def gap_to_folder(
@@ -58,10 +54,10 @@ def gap_to_folder(
     for name in effects:
         if name not in EFFECTS:
             raise InputError(f"--effect {name}", f"is not known; {suggest(name, EFFECTS)}")
-    target = target or Path(f"gap_{_name(data)}")
+    target = target or Path(f"gap_{data_name(data)}")
     check_target(target, "gap")
     stop_profiling_clock()
-    model = _open_machine(data, machine, tool)
+    model = machine_of(data, machine, tool)
     dataset = load_dataset(list(data), model, sensors, heldout, force=force)
     gap = _search(dataset, effects, jobs, quiet=as_json)
     with whole_folder(target, "gap") as folder:
@@ -114,57 +110,8 @@ def write_gap(
 def _search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool) -> Gap:
     from hydrotele.gap.find import find_gap
 
-    with _stages(f"gap {dataset.machine.name}", quiet) as progress:
+    with stages(f"gap {dataset.machine.name}", quiet) as progress:
         return find_gap(dataset, progress, effects=tuple(effects), jobs=jobs or 2)
-
-
-def _name(data: Sequence[Path]) -> str:
-    """Name of the data: of the folder, or of the folder that holds the files."""
-    first = data[0].resolve()
-    return first.name if first.is_dir() else first.parent.name or first.stem
-
-
-def _open_machine(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
-    """The machine named, else the one beside the first log, else the one that the log names."""
-    log = _first_log(data[0])
-    metadata: Mapping[str, str] = {}
-    if name is None and log and (log.parent / MACHINE_FILE).is_file():
-        name = str(log.parent / MACHINE_FILE)
-    if log and log.suffix.lower() == ".parquet":
-        columns = load_machine(name, tool).log_columns if name else None
-        metadata = load_log(log, aliases=columns, maximum_dropped=1.0).metadata
-    name = name or metadata.get("machine")
-    if not name:
-        raise InputError(data[0], "its metadata names no machine: give --machine")
-    found = load_machine(name, tool)
-    logged = metadata.get("tool")
-    return load_machine(name, logged) if tool is None and logged in found.tools else found
-
-
-def _first_log(path: Path) -> Path | None:
-    if not path.is_dir():
-        return path if path.is_file() else None
-    files = [p for p in sorted(path.rglob("*")) if p.suffix.lower() in _LOGS]
-    return next((p for p in files if not p.stem.startswith((".", "truth"))), None)
-
-
-@contextlib.contextmanager
-def _stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | None]:
-    """A bar with the stage of the search on stderr; None where nobody watches."""
-    if quiet or not notes.is_terminal:
-        yield None
-        return
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
-    columns = TextColumn(label), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
-    stage = TextColumn("{task.description}")
-    with Progress(*columns, stage, console=notes, transient=True) as bar:
-        task = bar.add_task("", total=1.0)
-
-        def update(said: str, fraction: float) -> None:
-            bar.update(task, completed=fraction, description=said)
-
-        yield update
 
 
 def _print(gap: Gap) -> None:

@@ -1,11 +1,14 @@
 """Logs and their machines, as a user names them: run folders, log files, shipped machines."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hydrotele.errors import InputError
 from hydrotele.log import Log, load_log
 from hydrotele.machine import Machine
 from hydrotele.machine_file import MACHINE_FILE, load_machine, machine_path
+
+_LOGS = (".parquet", ".csv")
 
 
 def log_path(path: Path, which: str = "measured") -> Path:
@@ -68,3 +71,33 @@ def _aliases(machine: str) -> dict[str, str]:
 
     columns = read_yaml(machine_path(machine))[0].get("log_columns")
     return dict(columns) if isinstance(columns, dict) else {}
+
+
+def data_name(data: Sequence[Path]) -> str:
+    """Name of the data: of the folder, or of the folder that holds the files."""
+    first = data[0].resolve()
+    return first.name if first.is_dir() else first.parent.name or first.stem
+
+
+def machine_of(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
+    """The machine named, else the one beside the first log, else the one that the log names."""
+    log = _first_log(data[0])
+    metadata: Mapping[str, str] = {}
+    if name is None and log and (log.parent / MACHINE_FILE).is_file():
+        name = str(log.parent / MACHINE_FILE)
+    if log and log.suffix.lower() == ".parquet":
+        columns = load_machine(name, tool).log_columns if name else None
+        metadata = load_log(log, aliases=columns, maximum_dropped=1.0).metadata
+    name = name or metadata.get("machine")
+    if not name:
+        raise InputError(data[0], "its metadata names no machine: give --machine")
+    found = load_machine(name, tool)
+    logged = metadata.get("tool")
+    return load_machine(name, logged) if tool is None and logged in found.tools else found
+
+
+def _first_log(path: Path) -> Path | None:
+    if not path.is_dir():
+        return path if path.is_file() else None
+    files = [p for p in sorted(path.rglob("*")) if p.suffix.lower() in _LOGS]
+    return next((p for p in files if not p.stem.startswith((".", "truth"))), None)

@@ -29,7 +29,6 @@ class Record:
             drive's command, friction included.
         force_noise: (k,) standard deviation of one force; 0 where a command tells it, NaN where
             the sensors state none.
-        clipped: (k,) share of rows in which a pressure sensor stood at an end of its range.
     """
 
     name: str

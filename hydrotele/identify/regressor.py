@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.polynomial.hermite_e import hermegauss
 
 from hydrotele.errors import InputError
 from hydrotele.identify.chain import Chain
@@ -17,6 +18,7 @@ BODY_PARAMETERS = {
 }  # fmt: skip
 _SLOPES = ("viscous", "viscous_asymmetry")
 _WHERE = "regressor"
+_NODES, _WEIGHTS = hermegauss(21)  # a sign that is blurred tenfold is then averaged to 1e-3
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,9 @@ class Regressor:
 
 def regressor(
     chain: Chain, found: Projection, drives: Sequence[str] | None = None,
-    bodies: Sequence[str] | None = None, rubbing: Sequence[Rubbing] = (), offsets: bool = True,
-    drive_inertia: Sequence[str] = (),
+    bodies: Sequence[str] | None = None, rubbing: Sequence[Rubbing] = (),
+    offsets: Mapping[str, float] | bool = True, drive_inertia: Sequence[str] = (),
+    rate_std: np.ndarray | None = None,
 ) -> Regressor:  # fmt: skip
     """Columns of inertial parameters, friction, drive inertia and offsets.
 
@@ -77,8 +80,12 @@ def regressor(
         drives: names of the drives that it was projected on; the chain's own by default.
         bodies: bodies whose ten inertial parameters get columns; all by default.
         rubbing: friction, place by place.
-        offsets: whether every drive gets a constant force, such as that of a transducer's offset.
+        offsets: whether every drive gets a constant force, such as that of a transducer's offset;
+            or the given ones, drive by drive [N] or [N m].
         drive_inertia: joints whose drive has an inertia of its own.
+        rate_std: (n, v) standard deviation of the joints' rates [rad/s] or [m/s]. Friction of a
+            joint is then its mean over what the rate may be, lest it be underrated wherever noise
+            hides on which side of zero the rate is. Pins of closures are taken as they are.
 
     Returns:
         The regressor.
@@ -86,7 +93,8 @@ def regressor(
     Raises:
         InputError: a body, joint or closure is not there, or a parameter is not known.
 
-    Source: Newton-Euler about the body frames; Khoshzaban 1992, chapter 4.
+    Source: Newton-Euler about the body frames; Khoshzaban 1992, chapter 4; regression calibration:
+    Carroll et al. 2006, Measurement error in nonlinear models, chapter 4.
     """
     drives = tuple(chain.drives if drives is None else drives)
     columns, names, units, nominal = [], [], [], []
@@ -109,18 +117,19 @@ def regressor(
         column = found.share[:, :, j] * found.acceleration[:, None, j]
         add(column, f"drive_inertia.{joint}", unit, chain.armature[j])
     for one in rubbing:
-        for kind, (column, unit) in _rubbing(chain, found, one).items():
+        for kind, (column, unit) in _rubbing(chain, found, one, rate_std).items():
             add(column, f"{kind}.{one.place}", unit, one.nominal[kind])
-    for i, drive in enumerate(drives if offsets else ()):
+    given = offsets if isinstance(offsets, Mapping) else {}
+    for i, drive in enumerate(drives if offsets is not False else ()):
         column = np.zeros(found.share.shape[:2])
         column[:, i] = 1.0
         unit = "N" if chain.tree.slides[chain.index(drive)] else "N m"
-        add(column, f"offset.{drive}", unit, 0.0)
+        add(column, f"offset.{drive}", unit, given.get(drive, 0.0))
     matrix = np.stack(columns, axis=2) if columns else np.zeros((*found.share.shape[:2], 0))
     return Regressor(matrix, drives, tuple(names), tuple(units), np.array(nominal))
 
 
-def _rubbing(chain: Chain, found: Projection, one: Rubbing):
+def _rubbing(chain: Chain, found: Projection, one: Rubbing, rate_std: np.ndarray | None):
     """Parameter -> (column (n, k), unit)."""
     strange = [kind for kind in one.nominal if kind not in RUBBING]
     if strange:
@@ -129,18 +138,30 @@ def _rubbing(chain: Chain, found: Projection, one: Rubbing):
         return _pin(chain.closures.index(one.place), found, one)
     j = chain.index(one.place)
     velocity, share = found.rate[:, j], found.share[:, :, j]
-    way = np.tanh(velocity / one.smoothing) if one.smoothing else np.sign(velocity)
-    slow = np.exp(-((velocity / one.stribeck) ** 2))
-    shapes = {
-        "coulomb": way, "stribeck": slow * way, "coulomb_asymmetry": way**2,
-        "stribeck_asymmetry": slow * way**2, "viscous": velocity,
-        "viscous_asymmetry": velocity * way,
-    }  # fmt: skip
+    if rate_std is None:
+        shapes = {kind: _shape(one, kind, velocity) for kind in one.nominal}
+    else:
+        maybe = velocity[:, None] + rate_std[:, j, None] * _NODES
+        weights = _WEIGHTS / _WEIGHTS.sum()
+        shapes = {kind: _shape(one, kind, maybe) @ weights for kind in one.nominal}
     dry, wet = ("N", "N s/m") if chain.tree.slides[j] else ("N m", "N m s/rad")
     return {
         kind: (share * shapes[kind][:, None], wet if kind in _SLOPES else dry)
         for kind in one.nominal
     }
+
+
+def _shape(one: Rubbing, kind: str, velocity: np.ndarray) -> np.ndarray:
+    """Friction per unit of a parameter at velocities of any shape."""
+    if kind == "viscous":
+        return velocity
+    way = np.tanh(velocity / one.smoothing) if one.smoothing else np.sign(velocity)
+    if kind == "viscous_asymmetry":
+        return velocity * way
+    side = way**2 if kind.endswith("_asymmetry") else way
+    if kind.startswith("stribeck"):
+        return np.exp(-((velocity / one.stribeck) ** 2)) * side
+    return side
 
 
 def _pin(closure: int, found: Projection, one: Rubbing):

@@ -1,8 +1,5 @@
 """The pictures of a gap report: heat map of prediction errors, and predictions over readings."""
 
-import contextlib
-import io
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,33 +8,15 @@ from hydrotele.gap.result import Prediction
 from hydrotele.gap.words import channel_words
 from hydrotele.show.channels import padded_range, shown_unit
 from hydrotele.show.gap_windows import windowed
+from hydrotele.show.report_figure import drawing, png
 from hydrotele.signals import usual_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 MEASURED, NOMINAL, PATCHED = "#262b33", "#e07b00", "#1769aa"
-_DPI = 200
-_WIDTH = 11.0  # inch, the width of the report's text
 _ZOOM = 2.0  # s
 _LOUDEST = 6.0  # times noise, where the colours of the heat map end at the latest
-_FONTS = ("Helvetica Neue", "Helvetica", "Arial", "Liberation Sans")
-_STYLE = {
-    "font.size": 9.0,
-    "axes.titlesize": 10.0,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.edgecolor": "0.55",
-    "axes.labelcolor": "0.25",
-    "xtick.color": "0.25",
-    "ytick.color": "0.25",
-    "grid.color": "0.9",
-    "grid.linewidth": 0.7,
-}
 
 
 def draw_heat_map(before: Prediction, after: Prediction, changed: bool) -> bytes:
@@ -55,7 +34,7 @@ def draw_heat_map(before: Prediction, after: Prediction, changed: bool) -> bytes
     labels = [channel_words(channel) for channel in before.channels]
     loudest = np.nanpercentile(windowed(before).rms, 99.5)
     top = float(np.clip(np.ceil(loudest), 2.0, _LOUDEST))
-    with _drawing(0.24 * len(labels) + 1.3) as figure:
+    with drawing(0.24 * len(labels) + 1.3) as figure:
         rows = figure.subplots(1, len(pairs), sharey=True, squeeze=False)[0]
         meshes = []
         for axes, (title, prediction) in zip(rows, pairs, strict=True):
@@ -76,7 +55,7 @@ def draw_heat_map(before: Prediction, after: Prediction, changed: bool) -> bytes
         bar = figure.colorbar(meshes[0], ax=rows.tolist(), pad=0.015, aspect=26, extend="max")
         bar.set_label("error / sensor noise")
         bar.outline.set_visible(False)  # pyright: ignore - stubs lack the outline's type
-        return _png(figure)
+        return png(figure)
 
 
 def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: bool) -> bytes:
@@ -98,7 +77,7 @@ def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: b
     if changed:
         lines.append(("patched model", PATCHED, factor * after.predicted[:, column]))
     low, high = _worst(before, column)
-    with _drawing(3.0) as figure:
+    with drawing(3.0) as figure:
         places = figure.subplots(2, 2, height_ratios=(1.7, 1.0), width_ratios=(1.55, 1.0))
         for side, span in enumerate(((before.time[0], before.time[-1]), (low, high))):
             inside = (before.time >= span[0]) & (before.time <= span[1])
@@ -116,7 +95,7 @@ def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: b
         places[0, 1].set_title(f"worst window, {low:.1f} to {high:.1f} s")
         places[1, 0].set_ylabel(f"reading -\nprediction\n[{unit}]")
         figure.align_ylabels()
-        return _png(figure)
+        return png(figure)
 
 
 def _signals(axes: "Axes", time, measured, lines, inside, dots: bool) -> None:
@@ -165,30 +144,3 @@ def _colours(top: float):
     steps = [(1.5 + (top - 1.5) * (k + 1) / len(rest), rest[k]) for k in range(len(rest))]
     scaled = [(level / top, colour) for level, colour in (*stops, *steps)]
     return LinearSegmentedColormap.from_list("gap", scaled)
-
-
-def _font() -> str:
-    """The page's font where matplotlib has it, else matplotlib's own."""
-    from matplotlib.font_manager import fontManager
-
-    present = {font.name for font in fontManager.ttflist}
-    return next((name for name in _FONTS if name in present), "DejaVu Sans")
-
-
-def _png(figure: "Figure") -> bytes:
-    stream = io.BytesIO()
-    figure.savefig(stream, dpi=_DPI, format="png")
-    return stream.getvalue()
-
-
-@contextlib.contextmanager
-def _drawing(height: float) -> Iterator["Figure"]:
-    """A figure of the report's width and a height [inch], in the report's style."""
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context({**_STYLE, "font.family": _font()}):  # pyright: ignore - its keys are checked by matplotlib
-        figure = Figure(figsize=(_WIDTH, height), facecolor="white", layout="constrained")
-        FigureCanvasAgg(figure)
-        yield figure

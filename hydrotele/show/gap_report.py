@@ -20,10 +20,10 @@ from hydrotele.gap.words import (
     verdict_words,
 )
 from hydrotele.show.gap_figures import draw_heat_map, draw_overlay
-from hydrotele.show.gap_html import Markup, interval, picture, table, tag, text
-from hydrotele.show.gap_style import STYLE
 from hydrotele.show.gap_tables import channel_table, law_table, ranking_table, test_table
 from hydrotele.show.gap_windows import most_changed
+from hydrotele.show.report_html import Markup, interval, picture, table, tag, text
+from hydrotele.show.report_style import STYLE
 
 _CHANNELS = 4
 _CHIPS = {

@@ -10,8 +10,8 @@ from hydrotele.effects import EFFECTS
 from hydrotele.gap.customary import amount
 from hydrotele.gap.result import Candidate, Gap, Prediction
 from hydrotele.gap.words import channel_words, effect_title, law_words
-from hydrotele.show.gap_html import Cell, Markup, bar, dumbbell, table, tag
 from hydrotele.show.gap_windows import channel_rms
+from hydrotele.show.report_html import Cell, Markup, bar, dumbbell, table, tag
 
 _CANDIDATES = 12
 _LOUDEST = 10.0  # times noise, where the colour of a cell is darkest

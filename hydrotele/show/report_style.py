@@ -1,4 +1,4 @@
-"""The style of a gap report, for a screen of 1200 px and for A4 paper."""
+"""The style of reports, for a screen of 1200 px and for A4 paper."""
 
 STYLE = """
 :root { --ink: #1d232b; --soft: #5c6672; --line: #dfe3e8; --pale: #f5f7f9;

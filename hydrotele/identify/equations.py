@@ -1,0 +1,167 @@
+"""Equations of a run: regressor and forces, low-passed alike and thinned out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import firwin, upfirdn
+
+from hydrotele.errors import InputError
+from hydrotele.identify.motion import (
+    Processing,
+    Resolution,
+    joint_motion,
+    motion_errors,
+    rate_spread,
+)
+from hydrotele.identify.projection import project
+from hydrotele.identify.record import Record
+from hydrotele.identify.regressor import Regressor, regressor
+from hydrotele.identify.setup import Setup
+
+_TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
+_KAISER = 5.0  # its ripple is 50 dB down
+_SPARE = 1.25  # equations per second over twice the band
+_CHUNK = 8000  # rows at a time, so that long logs need little memory
+_MISSING = 0.1  # part of a low-pass' weight that may lie on missing forces
+_DRAWS = 4  # of the motion's errors: an RMS over thousands of rows needs no more
+_WHERE = "equations"
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Low-passed equations of one run; n of them, k drives, m parameters.
+
+    Attributes:
+        name: the run's.
+        matrix: (n, k, m).
+        force: (n, k) [N] or [N m]; NaN where unknown.
+        time: (n,) [s] from the run's start.
+        force_noise: (k,) standard deviation that the force sensors' noise leaves; NaN if unknown.
+        motion_noise: (k, p) draws of what the motion's errors leave per parameter; see
+            `noise_of`. Empty where not asked for or not known.
+    """
+
+    name: str
+    matrix: np.ndarray
+    force: np.ndarray
+    time: np.ndarray
+    force_noise: np.ndarray
+    motion_noise: np.ndarray
+
+    def noise_of(self, value: np.ndarray) -> np.ndarray:
+        """RMS (k,) [N] or [N m] that a perfect model with parameters (m,) would show."""
+        if not self.motion_noise.size:
+            return np.full(len(self.force_noise), np.nan)
+        moved = np.einsum("m,kml,l->k", value, self.motion_noise, value)
+        return np.sqrt(self.force_noise**2 + np.maximum(moved, 0.0))
+
+
+def build_equations(
+    record: Record, setup: Setup, processing: Processing, found: Resolution,
+    with_noise: bool = False,
+) -> tuple[Equations, Regressor]:  # fmt: skip
+    """Equations of a run.
+
+    Args:
+        record: the run.
+        setup: what the regressor is built of.
+        processing: how positions are differentiated.
+        found: what the positions of all runs resolve.
+        with_noise: whether to find what the motion's errors leave.
+
+    Returns:
+        The equations, and a regressor without rows that has names, units and nominal values.
+
+    Raises:
+        InputError: the run is too short for the band, or cannot be followed by the chain.
+    """
+    band = processing.band or found.band
+    motion = joint_motion(record.position, record.period, found, processing)
+    motions = np.stack([motion.value, motion.rate, motion.acceleration])
+    low, thin = _low_pass(band, record.period)
+    count = (len(record.force) - len(low)) // thin + 1
+    if count < 1:
+        raise InputError(
+            record.name, f"{len(record.force)} rows are too few for a band of {band:g} Hz, which"
+            f" needs {len(low)}",
+        )  # fmt: skip
+    start, last, parts = None, None, []
+    errors, draws = [], ()
+    if with_noise:
+        draws = motion_errors(record.position, record.period, found, processing, _DRAWS)
+    for first in range(0, count, per_chunk := max(1, _CHUNK // thin)):
+        some = min(per_chunk, count - first)
+        rows = slice(first * thin, (first + some - 1) * thin + len(low))
+        last, pose = _rows(setup, motions[:, rows], motion.rate_std[rows], start)
+        parts.append(_thinned(last.matrix, low, thin))
+        truth = _rows(setup, motions[:, rows], None, start)[0] if len(draws) else last
+        for draw in draws:  # the motion found is taken for the true one, whose rates are certain
+            moved, _ = _rows(setup, motions[:, rows] + draw[:, rows], motion.rate_std[rows], start)
+            errors.append(_thinned(moved.matrix - truth.matrix, low, thin))
+        start = pose
+    assert last is not None
+    noise = np.sqrt(np.sum(low**2)) * record.force_noise
+    spread = np.zeros(0)
+    if errors:
+        spread = sum(np.einsum("nkm,nkl->kml", e, e) for e in errors) / (count * _DRAWS)
+    time = (np.arange(count) * thin + (len(low) - 1) / 2) * record.period
+    made = Equations(
+        record.name, np.concatenate(parts), _forces(record.force, low, thin), time, noise, spread
+    )
+    empty = Regressor(last.matrix[:0], last.drives, last.names, last.units, last.nominal)
+    return made, empty
+
+
+def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start: np.ndarray | None):
+    """Regressor of some rows (3, n, k), and the pose (v,) of the last of them."""
+    chain = setup.chain
+    found = project(chain, setup.given, *motions, start=start)
+    given = [chain.index(name) for name in setup.given]
+    spread = None
+    if rate_std is not None and np.isfinite(rate_std).all():
+        spread = rate_spread(found, given, rate_std)
+    table = regressor(
+        chain, found, bodies=setup.bodies, rubbing=setup.rubbing, offsets=setup.offsets,
+        drive_inertia=setup.drive_inertia, rate_std=spread,
+    )  # fmt: skip
+    return table, found.position[-1]
+
+
+def _low_pass(band: float, period: float) -> tuple[np.ndarray, int]:
+    """Weights of a low-pass without lag, and how many rows make one equation."""
+    half = round(_TAPS / (band * period))
+    if half < 1:
+        return np.ones(1), 1
+    weights = firwin(2 * half + 1, band, fs=1.0 / period, window=("kaiser", _KAISER))
+    return weights, max(1, int(1.0 / (2.0 * _SPARE * band * period)))
+
+
+def _thinned(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
+    """Low-passed rows, as far as all of the weights lie on rows, every `thin`-th."""
+    count = (len(values) - len(low)) // thin + 1
+    flat = values.reshape(len(values), -1)
+    # upfirdn puts out a row for every input; the first whole one ends at row len(low) - 1
+    shift = (len(low) - 1) % thin
+    padded = np.concatenate([np.zeros(((thin - shift) % thin, flat.shape[1])), flat])
+    out = upfirdn(low, padded, down=thin, axis=0)
+    first = (len(low) - 1 + (thin - shift) % thin) // thin
+    return out[first : first + count].reshape(count, *values.shape[1:])
+
+
+def _forces(force: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
+    """Low-passed forces (n, k); short gaps are bridged, long ones leave NaN."""
+    known = np.isfinite(force)
+    filled, rows = np.zeros_like(force), np.arange(len(force))
+    for k in range(force.shape[1]):
+        if known[:, k].any():
+            filled[:, k] = np.interp(rows, rows[known[:, k]], force[known[:, k], k])
+    out = _thinned(filled, low, thin)
+    missing = _thinned((~known).astype(float), np.abs(low) / np.abs(low).sum(), thin)
+    out[missing > _MISSING] = np.nan
+    return out
+
+
+def stacked(parts: Sequence[Equations], of: Callable[[Equations], np.ndarray]) -> np.ndarray:
+    """A field of several runs, one below the other."""
+    return np.concatenate([of(part) for part in parts])

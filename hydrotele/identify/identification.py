@@ -1,0 +1,214 @@
+"""Identification: from records of runs to parameters, what they tell of them, and how well."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from hydrotele.errors import InputError
+from hydrotele.identify.equations import Equations, build_equations, stacked
+from hydrotele.identify.estimators import Estimate, estimate
+from hydrotele.identify.identifiability import Identifiability, identifiability
+from hydrotele.identify.motion import Processing, resolution
+from hydrotele.identify.record import Record
+from hydrotele.identify.reference_size import reference_sizes
+from hydrotele.identify.regressor import Regressor
+from hydrotele.identify.setup import Setup
+
+Weighting = Literal["gauss_markov", "drives", "none"]
+_LOST = 1.0  # own sizes of standard deviation from which data tell nothing of a parameter
+_WORSE = 1.5  # times the noise; beyond it the model lacks something
+_WHERE = "identification"
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Force of one drive on the run that was not fitted, in the band of the equations.
+
+    Attributes:
+        rms: of measured less predicted force [N] or [N m].
+        unit: its unit.
+        noise_rms: what a perfect model would show with these sensors; NaN if not known.
+        relative: the error's norm over the force's [1].
+        nominal_rms: the same as rms, with the given parameters.
+    """
+
+    rms: float
+    unit: str
+    noise_rms: float
+    relative: float
+    nominal_rms: float
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Result; m parameters, r of them in the base.
+
+    Attributes:
+        names: the m parameters.
+        units: (m,) SI units.
+        nominal: (m,) as given.
+        value: (m,) identified; what the data do not tell stays as given.
+        structure: what this motion would tell without noise, and the base parameters.
+        told: the same with those base parameters only that these data tell in spite of their noise.
+        estimate: of the base parameters, with covariance and residuals.
+        heldout: drive -> prediction of the held-out run.
+        band: of the equations [Hz].
+        whiteness: (k,) correlation of a residual with the one before it.
+        status: `ok`, or what is wrong and what to do about it.
+        notes: one sentence each.
+        seconds: that it took.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    nominal: np.ndarray
+    value: np.ndarray
+    told: Identifiability
+    structure: Identifiability
+    estimate: Estimate
+    heldout: dict[str, HeldOut]
+    band: float
+    whiteness: np.ndarray
+    status: str
+    notes: tuple[str, ...]
+    seconds: float
+
+
+def identify(
+    fit: Sequence[Record], heldout: Record, setup: Setup,
+    processing: Processing | None = None, *, ridge: float = 0.0, cut: float = 0.0,
+    notes: Sequence[str] = (),
+) -> Identification:  # fmt: skip
+    """Identify the parameters of a chain.
+
+    Args:
+        fit: records to learn from.
+        heldout: record to judge on.
+        setup: what the regressor is built of.
+        processing: how positions are differentiated, and the band; each run as its own positions
+            allow by default.
+        ridge: of the estimator, towards the given parameters.
+        cut: of the estimator: truncation of small singular values.
+        notes: to hand on.
+
+    Returns:
+        The identification.
+
+    Raises:
+        InputError: no drive has a force, or there are too few rows.
+
+    Source: Khoshzaban 1992, chapter 4; Abdellatif 2008, section 4.
+    """
+    started = time.perf_counter()
+    processing = processing or Processing()
+    resolved = [resolution(r.position, r.period, r.position_noise) for r in (*fit, heldout)]
+    band = processing.band or min(found.band for found in resolved[:-1])
+    processing = replace(processing, band=band)
+    made = [
+        build_equations(record, setup, processing, found)
+        for record, found in zip(fit, resolved, strict=False)
+    ]
+    table, runs = made[0][1], [equations for equations, _ in made]
+    matrix, force = stacked(runs, lambda e: e.matrix), stacked(runs, lambda e: e.force)
+    drives = [k for k in range(force.shape[1]) if np.isfinite(force[:, k]).any()]
+    if not drives:
+        raise InputError(_WHERE, "no drive has a known force in any run: log both its pressures")
+    matrix, force = matrix[:, drives], force[:, drives]
+    there = np.isfinite(force).all(axis=1)
+    matrix, force = matrix[there], force[there]
+    structure = identifiability(_flat(matrix), table.names, table.units)
+    kept = _strong(matrix, force, table, structure, setup)
+    told = replace(structure, base=structure.base[kept], combination=structure.combination[kept])
+    found = _fit(matrix, force, table, told, ridge, cut)
+    value = table.nominal.copy()
+    value[told.base] += found.value - told.combination @ table.nominal
+    judged, _ = build_equations(heldout, setup, processing, resolved[-1], with_noise=True)
+    predicted = _judge(judged, table, value, drives)
+    return Identification(
+        names=table.names, units=table.units, nominal=table.nominal, value=value, told=told,
+        structure=structure, estimate=found, heldout=predicted,
+        band=band,
+        whiteness=_whiteness(found.residual), status=_status(predicted, told),
+        notes=tuple(notes), seconds=time.perf_counter() - started,
+    )  # fmt: skip
+
+
+def _flat(matrix: np.ndarray) -> np.ndarray:
+    return matrix.reshape(-1, matrix.shape[2])
+
+
+def _fit(matrix, force, table: Regressor, told: Identifiability, ridge: float, cut: float):
+    """Base parameters; what the data do not tell of the others stays as given."""
+    base = matrix[:, :, told.base]
+    given = told.combination @ table.nominal
+    rest = force - matrix @ table.nominal + base @ given
+    return estimate(base, rest, ridge=ridge, cut=cut, prior=given)
+
+
+def _strong(
+    matrix: np.ndarray, force: np.ndarray, table: Regressor, structure: Identifiability,
+    setup: Setup,
+) -> np.ndarray:  # fmt: skip
+    """Which base parameters (r,) these data tell: those known better than their own size.
+
+    The least known is given up and kept as given, then the next, for each makes others known
+    better.
+    """
+    if not len(structure.base):
+        raise InputError(_WHERE, "no parameter has an effect on the forces of this motion")
+    first = _fit(matrix, force, table, structure, 0.0, 0.0)
+    sizes = reference_sizes(table, setup, np.sqrt(np.mean(force**2, axis=0)))
+    sizes = np.max(np.abs(structure.combination) * sizes, axis=1)
+    information = np.linalg.pinv(first.covariance / np.outer(sizes, sizes), hermitian=True)
+    kept = np.arange(len(sizes))
+    while len(kept):
+        spread = np.diag(np.linalg.pinv(information[np.ix_(kept, kept)], hermitian=True))
+        worst = int(np.argmax(spread))
+        if spread[worst] <= _LOST**2:
+            break
+        kept = np.delete(kept, worst)
+    if not len(kept):
+        raise InputError(_WHERE, "these data tell no parameter: log a motion with larger forces")
+    return kept
+
+
+def _judge(judged: Equations, table: Regressor, value: np.ndarray, drives: list[int]):
+    """Drive -> prediction of the held-out run."""
+    noise = judged.noise_of(value)
+    out = {}
+    for k in drives:
+        force = judged.force[:, k]
+        known = np.isfinite(force)
+        if not known.any():
+            continue
+        sizes = [
+            float(np.sqrt(np.mean((force - judged.matrix[:, k] @ p)[known] ** 2)))
+            for p in (value, table.nominal)
+        ]
+        whole = float(np.sqrt(np.mean(force[known] ** 2)))
+        unit = next(u for n, u in zip(table.names, table.units, strict=True)
+                    if n == f"coulomb.{table.drives[k]}")  # fmt: skip
+        out[table.drives[k]] = HeldOut(
+            sizes[0], unit, float(noise[k]), sizes[0] / max(whole, 1e-300), sizes[1]
+        )
+    return out
+
+
+def _whiteness(residual: np.ndarray) -> np.ndarray:
+    error = residual - residual.mean(axis=0)
+    return np.sum(error[1:] * error[:-1], axis=0) / np.sum(error**2, axis=0)
+
+
+def _status(heldout: dict[str, HeldOut], told: Identifiability) -> str:
+    worse = [d for d, h in heldout.items() if h.rms > _WORSE * h.noise_rms]
+    if worse:
+        return (
+            f"on the held-out run the force of {', '.join(worse)} differs by more than the sensors"
+            " explain: the model lacks something there; look for it with `hydrotele gap`"
+        )
+    if not np.isfinite(told.condition) or told.condition > 1e6:
+        return "badly conditioned: log a motion that moves all axes, fast and in many poses"
+    return "ok"

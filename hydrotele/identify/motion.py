@@ -1,0 +1,188 @@
+"""Motion of the joints from noisy positions: smoothed, differentiated, with its uncertainty."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hydrotele.errors import InputError
+from hydrotele.identify.periodic import periodic
+from hydrotele.identify.projection import Projection
+from hydrotele.identify.smoothed import Smoothed
+from hydrotele.identify.smoothing import OptimallySmoothed, error_draws, smooth
+from hydrotele.identify.zero_phase import zero_phase
+
+Method = Literal["optimal", "zero_phase", "periodic", "raw"]
+METHODS = ("optimal", "zero_phase", "periodic", "raw")
+_KEPT = 2.0  # times the resolved bandwidth: there the signal is a hundredth of the noise
+_BAND = 0.5  # of the bandwidth is compared: there accelerations still stand above their noise
+_CONTENT = 0.98  # of an acceleration's power, beyond which forces tell of other things than motion
+_MOVES = 10.0  # standard deviations of the noise, from which a joint counts as moved
+_GAP = 0.1  # s without samples that a filter may bridge
+_WHERE = "signal processing"
+
+
+@dataclass(frozen=True)
+class Processing:
+    """How positions become rates and accelerations, and which band of the forces is compared.
+
+    Attributes:
+        method: `zero_phase` filter, `optimal` smoother, `periodic` (frequency domain) or `raw`
+            differences. A smoother holds back the sharp corners of a motion, so that inertia and
+            friction near reversals are underrated; a filter twice as wide as it does not.
+        band: low-pass that regressor and forces pass alike [Hz]; None to take half of what the
+            positions resolve.
+        period: of the motion [s], where it is repeated.
+        harmonics: of it that are kept in the frequency domain.
+    """
+
+    method: Method = "zero_phase"
+    band: float | None = None
+    period: float | None = None
+    harmonics: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what is not known or lacks a number."""
+        if self.method not in METHODS:
+            raise InputError(_WHERE, f"{self.method!r} is not known: {', '.join(METHODS)}")
+        if self.band is not None and not (math.isfinite(self.band) and self.band > 0):
+            raise InputError(_WHERE, f"the band must be positive, got {self.band} Hz")
+        if self.method == "periodic" and not (self.period and self.harmonics):
+            raise InputError(_WHERE, "periodic needs the period [s] and the number of harmonics")
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """What positions tell of the motion.
+
+    Attributes:
+        bandwidth: frequency [Hz] at which the optimal smoother keeps half of the signal, of the
+            moving joint that is told least; at most 0.2 of the sample rate.
+        content: frequency [Hz] below which 98 % of the accelerations' power lie.
+        noise: (k,) standard deviation of one position [rad] or [m], stated or found.
+    """
+
+    bandwidth: float
+    content: float
+    noise: np.ndarray
+
+    @property
+    def band(self) -> float:
+        """Of the equations [Hz]."""
+        return min(_BAND * self.bandwidth, self.content)
+
+
+def resolution(positions: np.ndarray, period: float, noise: np.ndarray) -> Resolution:
+    """Bandwidth and noise of positions.
+
+    The optimal smoother's gain is `1 / (1 + (f/f_h)^(2 order))`.
+
+    Args:
+        positions: (n, k) [rad] or [m], NaN where missing.
+        period: time between rows [s].
+        noise: (k,) standard deviation of a position, NaN where to be found.
+
+    Returns:
+        The resolution; joints at rest are left out of the bandwidth.
+
+    Source: Wiener filter of an integrator chain in white noise.
+    """
+    smoothed = smooth(positions, period, _known(noise))
+    ratio = smoothed.input_std / smoothed.noise
+    halves = ratio ** (1.0 / smoothed.order) / (2.0 * math.pi)
+    moves = np.nanstd(smoothed.value, axis=0) > _MOVES * smoothed.noise
+    limit = 0.2 / period
+    power = np.cumsum(np.abs(np.fft.rfft(smoothed.acceleration[:, moves], axis=0)) ** 2, axis=0)
+    rows = np.argmax(power >= _CONTENT * power[-1], axis=0)
+    content = np.fft.rfftfreq(len(positions), period)[rows]
+    return Resolution(
+        float(min([limit, *halves[moves]])), float(max(content, default=limit)), smoothed.noise
+    )
+
+
+def joint_motion(
+    positions: np.ndarray, period: float, found: Resolution, processing: Processing
+) -> Smoothed:
+    """Motion of all joints.
+
+    Args:
+        positions: (n, k) [rad] or [m], NaN where missing.
+        period: time between rows [s].
+        found: their resolution.
+        processing: how.
+
+    Returns:
+        Position, rate, acceleration and their standard deviations, (n, k) each.
+
+    Raises:
+        InputError: the positions do not suit the method.
+    """
+    noise = found.noise
+    if processing.method == "optimal":
+        return smooth(positions, period, noise)
+    if processing.method == "zero_phase":
+        cutoff = min(_KEPT * found.bandwidth, 0.4 / period)
+        return zero_phase(positions, period, cutoff, noise, bridge=round(_GAP / period))
+    if processing.method == "periodic":
+        assert processing.period is not None
+        cycle = round(processing.period / period)
+        return periodic(positions, period, cycle, processing.harmonics, noise)
+    rate = np.gradient(positions, period, axis=0)
+    acceleration = np.gradient(rate, period, axis=0)
+    spread = np.broadcast_to(noise, positions.shape)
+    return Smoothed(
+        positions, rate, acceleration, spread, spread / (math.sqrt(2.0) * period),
+        spread * math.sqrt(6.0) / (4.0 * period**2),
+    )  # fmt: skip
+
+
+def motion_errors(
+    positions: np.ndarray, period: float, found: Resolution, processing: Processing, count: int,
+    seed: int = 0,
+) -> np.ndarray:  # fmt: skip
+    """Random errors that the positions' noise leaves in a motion.
+
+    Args:
+        positions: (n, k) [rad] or [m].
+        period: time between rows [s].
+        found: their resolution.
+        processing: how they become a motion.
+        count: number of draws [1].
+        seed: of the random numbers [1].
+
+    Returns:
+        (count, 3, n, k) errors of position, rate and acceleration.
+    """
+    clean = joint_motion(positions, period, found, processing)
+    if isinstance(clean, OptimallySmoothed):
+        return error_draws(clean, count, seed)
+    generator, out = np.random.default_rng(seed), np.empty((count, 3, *positions.shape))
+    for draw in out:
+        noise = found.noise * generator.standard_normal(positions.shape)
+        moved = joint_motion(positions + noise, period, found, processing)
+        draw[0] = moved.value - clean.value
+        draw[1] = moved.rate - clean.rate
+        draw[2] = moved.acceleration - clean.acceleration
+    return out
+
+
+def rate_spread(found: Projection, given: list[int], rate_std: np.ndarray) -> np.ndarray:
+    """Standard deviations of all joints' rates.
+
+    Args:
+        found: projection on k drives.
+        given: places of the k joints whose motion is known.
+        rate_std: (n, k) of theirs [rad/s] or [m/s].
+
+    Returns:
+        (n, v) [rad/s] or [m/s].
+    """
+    # share[n, d, v] = d q_v / d q_d for the drives d; with it d q_v / d q_g for the given joints g
+    moves = np.linalg.solve(found.share[:, :, given], found.share)
+    return np.sqrt(np.einsum("ngv,ng->nv", moves**2, rate_std**2))
+
+
+def _known(noise: np.ndarray) -> np.ndarray | None:
+    """Stated noise; None where it is to be found. An exact sensor counts as one to be found."""
+    return noise if (np.isfinite(noise) & (noise > 0.0)).all() else None

@@ -1,0 +1,80 @@
+"""Which parameters a machine's regressor has: complete or reduced, and its friction."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.identify.chain import Chain
+from hydrotele.identify.machine_friction import drive_friction, pin_friction
+from hydrotele.identify.regressor import Rubbing
+from hydrotele.machine import Machine
+
+Model = Literal["complete", "reduced"]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a regressor is built of.
+
+    Attributes:
+        chain: the mechanism.
+        given: the k joints whose motion is measured.
+        bodies: those with columns.
+        rubbing: friction, place by place.
+        offsets: constant forces of the drives as given [N] or [N m].
+        drive_inertia: joints whose drive has an inertia of its own.
+    """
+
+    chain: Chain
+    given: tuple[str, ...]
+    bodies: tuple[str, ...]
+    rubbing: tuple[Rubbing, ...]
+    offsets: Mapping[str, float] = field(default_factory=dict)
+    drive_inertia: tuple[str, ...] = ()
+
+
+def machine_setup(
+    machine: Machine, chain: Chain, model: Model = "complete", *, pins: bool = False,
+    asymmetry: bool = False,
+) -> Setup:  # fmt: skip
+    """Setup for a machine.
+
+    Args:
+        machine: the machine.
+        chain: its chain, with drives in actuator order.
+        model: `complete`, or `reduced` to the links, without tubes and rods.
+        pins: whether joints and closures without drive have Coulomb friction.
+        asymmetry: whether viscous friction of the drives may depend on the direction. Dry friction
+            that does cannot be told from a force offset.
+
+    Returns:
+        The setup. Bodies that no joint moves have no columns.
+
+    Source: Khoshzaban 1992, 4.3 (complete and reduced model).
+    """
+    moved = [b for k, b in enumerate(chain.bodies) if chain.tree.above[k + 1].any()]
+    bodies = tuple(b for b in moved if model == "complete" or b not in cylinder_bars(machine))
+    rubbing = drive_friction(machine, chain)
+    if asymmetry:
+        rubbing = [replace(r, nominal={"viscous_asymmetry": 0.0, **r.nominal}) for r in rubbing]
+    order = actuator_order(machine)
+    offsets = {
+        drive: facts.force.offset
+        for drive, facts in zip(chain.drives, (machine.axes[a] for a in order), strict=True)
+        if facts.force
+    }
+    return Setup(
+        chain=chain, given=tuple(machine.axes[a].joint for a in order), bodies=bodies,
+        rubbing=(*rubbing, *(pin_friction(chain) if pins else ())), offsets=offsets,
+    )  # fmt: skip
+
+
+def cylinder_bars(machine: Machine) -> dict[str, tuple[str, str]]:
+    """Body of a cylinder's tube or rod -> (axis, `tube` or `rod`)."""
+    return {
+        f"{name}_{part}": (name, part)
+        for name, axis in machine.axes.items()
+        if axis.cylinder
+        for part in ("tube", "rod")
+    }
