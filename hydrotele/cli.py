@@ -139,6 +139,65 @@ def gap(
 
 
 @app.command(
+    epilog="Examples:  hydrotele identify --machine cat215 --data logs   |   "
+    "hydrotele identify --machine emps --data main.parquet --asymmetry"
+)
+def identify(
+    data: Annotated[
+        list[Path], typer.Option("--data", "-d", help="Folder of logs, log file or run folder.")
+    ],
+    more: Annotated[list[Path] | None, typer.Argument(help="More of them.")] = None,
+    machine: MachineName = None,
+    tool: ToolName = None,
+    heldout: Annotated[
+        str | None, typer.Option(help="Run to judge on, not fitted; default test*, or the last.")
+    ] = None,
+    sensors: Annotated[str | None, typer.Option(help="Sensors of the machine.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write; default identify_DATA.")
+    ] = None,
+    reduced: Annotated[
+        bool, typer.Option("--reduced", help="Links only, without tubes and rods.")
+    ] = False,
+    pins: Annotated[
+        bool, typer.Option("--pins", help="Friction in joints and pins without drive, too.")
+    ] = False,
+    asymmetry: Annotated[
+        bool, typer.Option("--asymmetry", help="Viscous friction that depends on the direction.")
+    ] = False,
+    hydraulics: Annotated[
+        bool, typer.Option("--hydraulics", help="Identify valves, oil, leakage and supply, too.")
+    ] = False,
+    processing: Annotated[
+        str, typer.Option(help="zero_phase, optimal, periodic (needs period, harmonics) or raw.")
+    ] = "zero_phase",
+    band: Annotated[
+        float | None, typer.Option(help="Compare forces below this frequency [Hz].")
+    ] = None,
+    period: Annotated[float | None, typer.Option(help="Period of a repeated motion [s].")] = None,
+    harmonics: Annotated[int, typer.Option(help="Harmonics of it to keep.")] = 0,
+    ridge: Annotated[float, typer.Option(help="Ridge, share of the largest singular value.")] = 0.0,
+    truncate: Annotated[float, typer.Option(help="Leave out smaller singular values.")] = 0.0,
+    force: Annotated[
+        bool, typer.Option("--force", help="Accept logs that name another machine or tool.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Identify masses, friction and hydraulics from measured logs; write the identified machine."""
+    from hydrotele.commands.identifying import Choices, identify_to_folder
+    from hydrotele.identify.motion import Processing
+
+    choices = Choices(
+        model="reduced" if reduced else "complete", pins=pins, asymmetry=asymmetry,
+        processing=Processing(processing, band, period, harmonics),  # pyright: ignore - checks itself
+        ridge=ridge, cut=truncate, hydraulics=hydraulics,
+    )  # fmt: skip
+    identify_to_folder(
+        [*data, *(more or [])], machine, tool, heldout, sensors, out, json, choices, force
+    )
+
+
+@app.command(
     epilog="Examples:  hydrotele review runs/zhu_up   |   hydrotele review a.parquet b.parquet"
 )
 def review(

@@ -21,6 +21,7 @@ OURS = {
         "gap.json", "report.html", "recording.rrd", "next_experiment.yaml",
         "patched/machine.*", "patched/effects.yaml",
     ),
+    "identify": ("identify.json", "report.html", "identified/machine.*"),
 }  # fmt: skip
 """Kind of folder -> files that it holds beside `summary.json`, which states the kind."""
 

@@ -43,6 +43,27 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
+class Forces:
+    """Forces of the held-out run in the band of the equations; n rows, k drives [N] or [N m].
+
+    Attributes:
+        run: its name.
+        drives: the k drives.
+        time: (n,) [s] from its start.
+        measured: (n, k), NaN where unknown.
+        predicted: (n, k) with the identified parameters.
+        nominal: (n, k) with the given parameters.
+    """
+
+    run: str
+    drives: tuple[str, ...]
+    time: np.ndarray
+    measured: np.ndarray
+    predicted: np.ndarray
+    nominal: np.ndarray
+
+
+@dataclass(frozen=True)
 class Identification:
     """Result; m parameters, r of them in the base.
 
@@ -55,6 +76,7 @@ class Identification:
         told: the same with those base parameters only that these data tell in spite of their noise.
         estimate: of the base parameters, with covariance and residuals.
         heldout: drive -> prediction of the held-out run.
+        forces: of the held-out run.
         band: of the equations [Hz].
         whiteness: (k,) correlation of a residual with the one before it.
         status: `ok`, or what is wrong and what to do about it.
@@ -70,6 +92,7 @@ class Identification:
     structure: Identifiability
     estimate: Estimate
     heldout: dict[str, HeldOut]
+    forces: Forces
     band: float
     whiteness: np.ndarray
     status: str
@@ -130,6 +153,7 @@ def identify(
     return Identification(
         names=table.names, units=table.units, nominal=table.nominal, value=value, told=told,
         structure=structure, estimate=found, heldout=predicted,
+        forces=_forces(judged, table, value),
         band=band,
         whiteness=_whiteness(found.residual), status=_status(predicted, told),
         notes=tuple(notes), seconds=time.perf_counter() - started,
@@ -195,6 +219,13 @@ def _judge(judged: Equations, table: Regressor, value: np.ndarray, drives: list[
             sizes[0], unit, float(noise[k]), sizes[0] / max(whole, 1e-300), sizes[1]
         )
     return out
+
+
+def _forces(judged: Equations, table: Regressor, value: np.ndarray) -> Forces:
+    return Forces(
+        judged.name, table.drives, judged.time, judged.force, judged.matrix @ value,
+        judged.matrix @ table.nominal,
+    )  # fmt: skip
 
 
 def _whiteness(residual: np.ndarray) -> np.ndarray:

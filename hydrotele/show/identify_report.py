@@ -1,0 +1,173 @@
+"""`report.html` of an identification: one page that needs nothing else."""
+
+import math
+from pathlib import Path
+
+import hydrotele
+from hydrotele.dataset.load import Dataset
+from hydrotele.gap.customary import amount, said
+from hydrotele.gap.result import Estimate
+from hydrotele.identify.hydraulic import Hydraulics
+from hydrotele.identify.identification import Identification
+from hydrotele.identify.parameter_rows import MEANING, counts, parameter_rows
+from hydrotele.show.identify_figures import draw_forces
+from hydrotele.show.report_html import Markup, interval, picture, table, tag, text
+from hydrotele.show.report_style import STYLE
+
+_MEMBERS = 6  # of a combination that are written out
+
+
+def write_identify_report(
+    dataset: Dataset, found: Identification | None, hydraulics: Hydraulics | None, path: str | Path
+) -> None:
+    """Write an identification as one self-contained HTML file.
+
+    Args:
+        dataset: what it learned from.
+        found: the mechanism, None where no force is known.
+        hydraulics: the hydraulics, None where not asked for.
+        path: file to write.
+    """
+    sections = [_header(dataset, found, hydraulics)]
+    if found:
+        sections += [_proof(found), _parameters(found), _others(found)]
+    if hydraulics:
+        sections.append(_hydraulics(hydraulics))
+    notes = found.notes if found else dataset.notes
+    if notes:
+        items = tag("ul", *(tag("li", note) for note in notes))
+        sections.append(_section("Notes", "On the data and on what was left out.", items))
+    sections.append(_use(found, hydraulics))
+    title = f"{dataset.machine.name}: identification"
+    page = (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"{tag('title', title)}<style>{STYLE}</style></head>\n"
+        f"<body><main>{''.join(sections)}</main></body></html>\n"
+    )
+    Path(path).write_text(page, encoding="utf-8")
+
+
+def _section(heading: str, why: str, *inside: Markup) -> Markup:
+    return tag("section", tag("h2", heading), tag("p", why, class_="why"), *inside)
+
+
+def _header(
+    dataset: Dataset, found: Identification | None, hydraulics: Hydraulics | None
+) -> Markup:
+    machine, runs = dataset.machine, ", ".join(run.name for run in dataset.fit)
+    over = (
+        f"IDENTIFICATION REPORT  ·  machine {machine.name}, tool {machine.tool}  ·  judged on"
+        f" {dataset.heldout.name}, fitted on {runs}"
+    )
+    cards = []
+    for drive, h in list(found.heldout.items())[:3] if found else ():
+        against = f"{h.rms / h.noise_rms:.2f} × noise, " if h.noise_rms > 0.0 else ""
+        name = drive.replace("_", " ")
+        cards.append(
+            ("after", f"{100 * h.relative:.2f} %", f"{against}error of the {name}'s force")
+        )
+    if hydraulics:
+        said_of = f"one-step prediction errors ({hydraulics.before:.2f} as given)"
+        cards.append(("after", f"{hydraulics.after:.2f} × noise", said_of))
+    status = found.status if found else hydraulics.status if hydraulics else ""
+    good = status == "ok" and (hydraulics is None or hydraulics.status == "ok")
+    chip = tag(
+        "div",
+        "Identified" if good else "See below",
+        class_=f"chip {'no_gap' if good else 'ambiguous'}",
+    )
+    heading = "The machine's numbers, from its logs" if good else status
+    figures = [tag("div", tag("b", b), tag("span", s), class_=c) for c, b, s in cards]
+    return tag(
+        "header", tag("p", over, class_="over"), chip, tag("h1", heading),
+        tag("div", *figures, class_="figures"),
+    )  # fmt: skip
+
+
+def _proof(found: Identification) -> Markup:
+    rows = []
+    for drive, h in found.heldout.items():
+        noise = amount(h.noise_rms, h.unit) if math.isfinite(h.noise_rms) else "not stated"
+        rows.append((tag("b", drive.replace("_", " ")), amount(h.nominal_rms, h.unit),
+                     amount(h.rms, h.unit), noise, f"{100 * h.relative:.2f} %"))  # fmt: skip
+    head = ("drive", "as given", "identified", "noise alone", "relative error")
+    pictures = [
+        tag("figure", picture(draw_forces(found.forces, drive, h), f"force of {drive}"))
+        for drive, h in found.heldout.items()
+    ]
+    why = (
+        f"RMS of measured less predicted force on {found.forces.run}, below {found.band:.3g} Hz,"
+        " where the positions tell accelerations. Noise alone is what a perfect model would show"
+        " with these sensors; the grey band is twice that."
+    )
+    return _section("Forces on data that were not fitted", why,
+                    table(head, rows, numbers=" nnnn"), *pictures)  # fmt: skip
+
+
+def _parameters(found: Identification) -> Markup:
+    rows = []
+    for row in parameter_rows(found):
+        if row.value is None or row.ci95 is None:
+            continue
+        estimate = Estimate(row.value, row.unit, *row.ci95, row.nominal)
+        s = said(estimate)
+        rows.append((
+            Markup(tag("b", row.name) + tag("small", _short(row.combination))), s.nominal, s.value,
+            f"{s.low} to {s.high}", s.unit, interval(estimate), row.status,
+        ))  # fmt: skip
+    head = ("parameter", "given", "identified", "95 % interval", "unit", "given and identified",
+            "status")  # fmt: skip
+    why = (
+        "A combination stands under the name of its first member; all numbers in its row are those"
+        f" of the whole. Condition of the equations {found.estimate.condition:.3g}."
+    )
+    return _section("What the data tell", why, table(head, rows, numbers=" nnn"))
+
+
+def _others(found: Identification) -> Markup:
+    rows = parameter_rows(found)
+    parts = []
+    for status, number in counts(rows).items():
+        names = [row.name for row in rows if row.status == status and row.value is None]
+        parts.append((tag("b", status), str(number), MEANING[status], ", ".join(names) or "-"))
+    head = ("status", "number", "meaning", "those without a number of their own")
+    why = "Why some parameters have no number: the data do not hold one."
+    return _section("Identifiability", why, table(head, parts, numbers=" n"))
+
+
+def _short(combination: str) -> str:
+    """A combination, cut where it is long."""
+    parts = combination.replace(" - ", " + -").split(" + ")
+    if len(parts) <= _MEMBERS:
+        return combination
+    return " + ".join(parts[:_MEMBERS]).replace("+ -", "- ") + f" + {len(parts) - _MEMBERS} more"
+
+
+def _hydraulics(found: Hydraulics) -> Markup:
+    rows = []
+    for n in found.numbers:
+        estimate = Estimate(n.value, n.unit, *n.ci95, n.nominal)
+        s = said(estimate, n.parameter)
+        cells = (s.value, f"{s.low} to {s.high}") if n.told else ("not told", "")
+        drawn = interval(estimate) if n.told else Markup("")
+        rows.append(
+            (tag("b", n.name), n.parameter.replace("_", " "), s.nominal, *cells, s.unit, drawn)
+        )
+    head = ("number", "parameter", "given", "identified", "95 % interval", "unit",
+            "given and identified")  # fmt: skip
+    why = (
+        "All fitted together to one-step prediction errors of commands, pressures and motion,"
+        f" which fall from {found.before:.2f} to {found.after:.2f} times noise on the held-out run."
+    )
+    return _section("Valves, oil and supply", why, table(head, rows, numbers="  nnn"))
+
+
+def _use(found: Identification | None, hydraulics: Hydraulics | None) -> Markup:
+    commands = (
+        "hydrotele replay LOG --machine identified/\nhydrotele run SCENARIO --machine identified/"
+    )
+    seconds = sum(part.seconds for part in (found, hydraulics) if part)
+    took = text(f"hydrotele {hydrotele.__version__}, identified in {seconds:.1f} s.")
+    return tag("footer", tag("p", "The identified machine stands beside this page:"),
+               tag("pre", commands), tag("p", took))  # fmt: skip
