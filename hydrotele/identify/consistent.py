@@ -66,7 +66,9 @@ def consistent(found: Identification, freedom: Mapping[str, Freedom] | None = No
     pieces = [_Body(found, body, freedom.get(body, Freedom())) for body in bodies]
     taken = {k for piece in pieces for k in piece.places}
     others = np.array([k for k in range(len(found.names)) if k not in taken], int)
-    base, spread = found.told.combination, np.linalg.cholesky(found.estimate.covariance)
+    spread = np.linalg.cholesky(found.estimate.covariance)
+    base = np.linalg.solve(spread, found.told.combination)
+    wanted = np.linalg.solve(spread, found.estimate.value)
     sizes = _sizes(found, others)
     counts = [piece.size for piece in pieces]
     ends = np.cumsum([0, *counts])
@@ -79,7 +81,7 @@ def consistent(found: Identification, freedom: Mapping[str, Freedom] | None = No
         return value
 
     def misfit(x: np.ndarray) -> np.ndarray:
-        away = np.linalg.solve(spread, base @ value_of(x) - found.estimate.value)
+        away = base @ value_of(x) - wanted
         return np.concatenate([away, x[: ends[-1]] / _USUAL, 1e-3 * x[ends[-1] :]])
 
     low = np.full(ends[-1] + len(others), -np.inf)
@@ -91,10 +93,9 @@ def consistent(found: Identification, freedom: Mapping[str, Freedom] | None = No
     start[ends[-1] :] = np.maximum(
         (found.value[others] - found.nominal[others]) / sizes, low[ends[-1] :]
     )
-    solved = least_squares(misfit, start, bounds=(low - 1e-12, np.inf), x_scale="jac")
-    value = value_of(solved.x)
-    away = np.linalg.solve(spread, base @ value - found.estimate.value)
-    return Consistent(value, float(away @ away))
+    solved = least_squares(misfit, start, bounds=(low - 1e-9, np.inf))
+    value = value_of(np.maximum(solved.x, low))
+    return Consistent(value, float(np.sum((base @ value - wanted) ** 2)))
 
 
 class _Body:

@@ -22,6 +22,7 @@ from hydrotele.identify.setup import Setup
 _TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
 _KAISER = 5.0  # its ripple is 50 dB down
 _SPARE = 1.25  # equations per second over twice the band
+_FINE = 4  # times more rows where forces are judged and shown
 _CHUNK = 8000  # rows at a time, so that long logs need little memory
 _MISSING = 0.1  # part of a low-pass' weight that may lie on missing forces
 _DRAWS = 4  # of the motion's errors: an RMS over thousands of rows needs no more
@@ -68,7 +69,7 @@ def build_equations(
         setup: what the regressor is built of.
         processing: how positions are differentiated.
         found: what the positions of all runs resolve.
-        with_noise: whether to find what the motion's errors leave.
+        with_noise: whether to find what the motion's errors leave, and to thin out less.
 
     Returns:
         The equations, and a regressor without rows that has names, units and nominal values.
@@ -80,6 +81,7 @@ def build_equations(
     motion = joint_motion(record.position, record.period, found, processing)
     motions = np.stack([motion.value, motion.rate, motion.acceleration])
     low, thin = _low_pass(band, record.period)
+    thin = max(1, thin // _FINE) if with_noise else thin
     count = (len(record.force) - len(low)) // thin + 1
     if count < 1:
         raise InputError(

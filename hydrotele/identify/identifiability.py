@@ -6,9 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 UNIDENTIFIABLE, COMBINATION, FULL = "unidentifiable", "combination", "full"
+WEAK = "weak"  # an effect below the noise
 _NOTHING = 1e-11  # of the largest column of its kind: rounding
 _RANK = 1e-8  # of the largest singular value of columns of length 1: the square root of rounding
 _SHARE = 1e-5  # part of a parameter in the null space that puts it into a combination
+_HALF = 0.5  # of its size, within which a parameter must be known to be worth saying
+_SHIFT = 0.1  # standard deviations by which a parameter of its size must shift a combination
 _COEFFICIENT = 1e-7  # below it a coefficient is rounding
 
 
@@ -18,12 +21,13 @@ class Identifiability:
 
     Attributes:
         names: the m parameters.
-        status: (m,) `unidentifiable`, `combination` or `full`.
+        status: (m,) `unidentifiable`, `combination` or `full`; in noisy data also `weak`.
         base: (r,) places of the parameters that stand for the base parameters.
         combination: (r, m) base parameters as combinations of all parameters.
         condition: ratio of the largest to the smallest singular value of the base columns, each
             of length 1.
-        gap: singular values on either side of the rank, over the largest; 0 without null space.
+        gap: singular values on either side of the rank, over the largest; 0 without null space,
+            and in noisy data.
     """
 
     names: tuple[str, ...]
@@ -35,8 +39,9 @@ class Identifiability:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Status -> number of parameters."""
-        return {s: self.status.count(s) for s in (UNIDENTIFIABLE, COMBINATION, FULL)}
+        """Status -> number of parameters; `weak` only where there are any."""
+        known = (UNIDENTIFIABLE, COMBINATION, FULL, *([WEAK] if WEAK in self.status else []))
+        return {s: self.status.count(s) for s in known}
 
     def text(self, base: int) -> str:
         """A base parameter written out, such as `inertia_zz.swing + 2.5 mass.boom`."""
@@ -93,6 +98,67 @@ def identifiability(
         tuple(names), tuple(status), base, combination, float(kept[0] / kept[-1]),
         (float(gap[0]), float(gap[1])),
     )  # fmt: skip
+
+
+def told_in_noise(
+    matrix: np.ndarray, names: Sequence[str], sizes: np.ndarray, asked: np.ndarray
+) -> Identifiability:
+    """What noisy data tell: parameters that they tell to better than half of their own sizes.
+
+    Column by column, one is taken if its part that no earlier one explains stands above the noise;
+    then the least known are given up, for each makes others known better. All other columns are
+    combinations of those within the noise, and are named in them if they would shift them by a
+    tenth of a standard deviation.
+
+    Args:
+        matrix: (N, m) equations over the standard deviation of their errors.
+        names: the m parameters.
+        sizes: (m,) their sizes.
+        asked: (m,) whether a parameter may stand for a combination.
+
+    Returns:
+        The classification; `weak` is what shows by less than the noise, and stays as given.
+    """
+    whole = np.linalg.qr(matrix, mode="r") if len(matrix) > matrix.shape[1] else matrix
+    scaled = np.asarray(whole) * (_HALF * sizes)
+    length = np.linalg.norm(scaled, axis=0)
+    base = _above_noise(scaled, length, asked)
+    rows = scaled[:, base]
+    inverse = np.linalg.pinv(rows)
+    spread = np.linalg.norm(inverse, axis=1)
+    weights = inverse @ scaled
+    weights[:, base] = np.eye(len(base))
+    weights[np.abs(weights) < _SHIFT * spread[:, None]] = 0.0
+    weights[np.arange(len(base)), base] = 1.0
+    shared = np.count_nonzero(weights, axis=1) > 1
+    status = np.full(len(names), WEAK, dtype=object)
+    status[length <= _NOTHING * max(length.max(initial=0.0), 1.0)] = UNIDENTIFIABLE
+    status[np.any(weights != 0.0, axis=0)] = COMBINATION
+    status[base[~shared]] = FULL
+    combination = weights * sizes[base][:, None] / sizes
+    columns = rows / length[base] if len(base) else np.ones((1, 1))
+    return Identifiability(
+        tuple(names), tuple(status), base, combination, float(np.linalg.cond(columns)), (0.0, 0.0)
+    )
+
+
+def _above_noise(scaled: np.ndarray, length: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """Places of the columns that data tell, each to better than 1."""
+    chosen: list[int] = []
+    span = np.zeros((len(scaled), 0))
+    for k in np.flatnonzero(asked & (length > 1.0)):
+        rest = scaled[:, k] - span @ (span.T @ scaled[:, k])
+        rest -= span @ (span.T @ rest)
+        size = np.linalg.norm(rest)
+        if size > max(1.0, np.sqrt(_RANK) * 1e-2 * length[k]):
+            chosen.append(int(k))
+            span = np.column_stack([span, rest / size])
+    while chosen:
+        spread = np.linalg.norm(np.linalg.pinv(scaled[:, chosen]), axis=1)
+        if spread.max() <= 1.0:
+            break
+        chosen.pop(int(np.argmax(spread)))
+    return np.array(chosen, int)
 
 
 def _base(triangle, size, there, rank, first):

@@ -9,16 +9,15 @@ import numpy as np
 
 from hydrotele.errors import InputError
 from hydrotele.identify.equations import Equations, build_equations, stacked
-from hydrotele.identify.estimators import Estimate, estimate
-from hydrotele.identify.identifiability import Identifiability, identifiability
+from hydrotele.identify.estimators import Estimate, autoregression, estimate
+from hydrotele.identify.identifiability import Identifiability, identifiability, told_in_noise
 from hydrotele.identify.motion import Processing, resolution
 from hydrotele.identify.record import Record
 from hydrotele.identify.reference_size import reference_sizes
-from hydrotele.identify.regressor import Regressor
+from hydrotele.identify.regressor import RUBBING, Regressor
 from hydrotele.identify.setup import Setup
 
 Weighting = Literal["gauss_markov", "drives", "none"]
-_LOST = 1.0  # own sizes of standard deviation from which data tell nothing of a parameter
 _WORSE = 1.5  # times the noise; beyond it the model lacks something
 _WHERE = "identification"
 
@@ -73,7 +72,7 @@ class Identification:
         nominal: (m,) as given.
         value: (m,) identified; what the data do not tell stays as given.
         structure: what this motion would tell without noise, and the base parameters.
-        told: the same with those base parameters only that these data tell in spite of their noise.
+        told: what these data tell in spite of their noise.
         estimate: of the base parameters, with covariance and residuals.
         heldout: drive -> prediction of the held-out run.
         forces: of the held-out run.
@@ -143,8 +142,9 @@ def identify(
     there = np.isfinite(force).all(axis=1)
     matrix, force = matrix[there], force[there]
     structure = identifiability(_flat(matrix), table.names, table.units)
-    kept = _strong(matrix, force, table, structure, setup)
-    told = replace(structure, base=structure.base[kept], combination=structure.combination[kept])
+    still = ~np.any([part.moves for part in resolved[:-1]], axis=0)
+    resting = [d for d, stands in zip(table.drives, still, strict=True) if stands]
+    told = _told(matrix, force, table, structure, setup, resting)
     found = _fit(matrix, force, table, told, ridge, cut)
     value = table.nominal.copy()
     value[told.base] += found.value - told.combination @ table.nominal
@@ -155,7 +155,7 @@ def identify(
         structure=structure, estimate=found, heldout=predicted,
         forces=_forces(judged, table, value),
         band=band,
-        whiteness=_whiteness(found.residual), status=_status(predicted, told),
+        whiteness=_whiteness(found.residual), status=_status(predicted, still, setup),
         notes=tuple(notes), seconds=time.perf_counter() - started,
     )  # fmt: skip
 
@@ -172,31 +172,35 @@ def _fit(matrix, force, table: Regressor, told: Identifiability, ridge: float, c
     return estimate(base, rest, ridge=ridge, cut=cut, prior=given)
 
 
-def _strong(
+def _told(
     matrix: np.ndarray, force: np.ndarray, table: Regressor, structure: Identifiability,
-    setup: Setup,
-) -> np.ndarray:  # fmt: skip
-    """Which base parameters (r,) these data tell: those known better than their own size.
+    setup: Setup, resting: Sequence[str],
+) -> Identifiability:  # fmt: skip
+    """What these data tell in spite of their noise.
 
-    The least known is given up and kept as given, then the next, for each makes others known
-    better.
+    Friction of drives that rest is not asked for: whatever holds them is no sliding.
     """
     if not len(structure.base):
         raise InputError(_WHERE, "no parameter has an effect on the forces of this motion")
     first = _fit(matrix, force, table, structure, 0.0, 0.0)
+    noise = _long_run(first.residual)
     sizes = reference_sizes(table, setup, np.sqrt(np.mean(force**2, axis=0)))
-    sizes = np.max(np.abs(structure.combination) * sizes, axis=1)
-    information = np.linalg.pinv(first.covariance / np.outer(sizes, sizes), hermitian=True)
-    kept = np.arange(len(sizes))
-    while len(kept):
-        spread = np.diag(np.linalg.pinv(information[np.ix_(kept, kept)], hermitian=True))
-        worst = int(np.argmax(spread))
-        if spread[worst] <= _LOST**2:
-            break
-        kept = np.delete(kept, worst)
-    if not len(kept):
+    held = {f"{kind}.{drive}" for kind in RUBBING for drive in resting}
+    asked = np.array([name not in held for name in table.names])
+    told = told_in_noise(_flat(matrix / noise[:, None]), table.names, sizes, asked)
+    if not len(told.base):
         raise InputError(_WHERE, "these data tell no parameter: log a motion with larger forces")
-    return kept
+    return told
+
+
+def _long_run(residual: np.ndarray) -> np.ndarray:
+    """Standard deviations (k,) of independent errors that would tell slow changes as badly."""
+    follow = autoregression(residual)
+    fresh = residual.copy()
+    for q, weights in enumerate(follow, start=1):
+        fresh[q:] -= weights * residual[:-q]
+    spread = np.std(fresh[len(follow) :], axis=0) / np.abs(1.0 - follow.sum(axis=0))
+    return np.maximum(spread, np.std(residual, axis=0))
 
 
 def _judge(judged: Equations, table: Regressor, value: np.ndarray, drives: list[int]):
@@ -233,13 +237,17 @@ def _whiteness(residual: np.ndarray) -> np.ndarray:
     return np.sum(error[1:] * error[:-1], axis=0) / np.sum(error**2, axis=0)
 
 
-def _status(heldout: dict[str, HeldOut], told: Identifiability) -> str:
+def _status(heldout: dict[str, HeldOut], still: np.ndarray, setup: Setup) -> str:
+    if still.any():
+        names = ", ".join(j for j, stands in zip(setup.given, still, strict=True) if stands)
+        return (
+            f"{names} stood still: what shows only in motion of it is not told, and kept as given;"
+            " log a motion of all axes, fast and in many poses"
+        )
     worse = [d for d, h in heldout.items() if h.rms > _WORSE * h.noise_rms]
     if worse:
         return (
             f"on the held-out run the force of {', '.join(worse)} differs by more than the sensors"
             " explain: the model lacks something there; look for it with `hydrotele gap`"
         )
-    if not np.isfinite(told.condition) or told.condition > 1e6:
-        return "badly conditioned: log a motion that moves all axes, fast and in many poses"
     return "ok"

@@ -1,7 +1,7 @@
 """Motion of the joints from noisy positions: smoothed, differentiated, with its uncertainty."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ METHODS = ("optimal", "zero_phase", "periodic", "raw")
 _KEPT = 2.0  # times the resolved bandwidth: there the signal is a hundredth of the noise
 _BAND = 0.5  # of the bandwidth is compared: there accelerations still stand above their noise
 _CONTENT = 0.98  # of an acceleration's power, beyond which forces tell of other things than motion
+_LINES = 10.0  # of the record's own lines lie in the band at least
 _MOVES = 10.0  # standard deviations of the noise, from which a joint counts as moved
 _GAP = 0.1  # s without samples that a filter may bridge
 _WHERE = "signal processing"
@@ -59,11 +60,13 @@ class Resolution:
     Attributes:
         bandwidth: frequency [Hz] at which the optimal smoother keeps half of the signal, of the
             moving joint that is told least; at most 0.2 of the sample rate.
+        moves: (k,) whether a joint moves at all, by more than ten times the noise.
         content: frequency [Hz] below which 98 % of the accelerations' power lie.
         noise: (k,) standard deviation of one position [rad] or [m], stated or found.
     """
 
     bandwidth: float
+    moves: np.ndarray
     content: float
     noise: np.ndarray
 
@@ -95,10 +98,12 @@ def resolution(positions: np.ndarray, period: float, noise: np.ndarray) -> Resol
     limit = 0.2 / period
     power = np.cumsum(np.abs(np.fft.rfft(smoothed.acceleration[:, moves], axis=0)) ** 2, axis=0)
     rows = np.argmax(power >= _CONTENT * power[-1], axis=0)
-    content = np.fft.rfftfreq(len(positions), period)[rows]
+    lines = np.fft.rfftfreq(len(positions), period)
+    least = min(_LINES * lines[1], limit)
     return Resolution(
-        float(min([limit, *halves[moves]])), float(max(content, default=limit)), smoothed.noise
-    )
+        bandwidth=max(float(min([limit, *halves[moves]])), least / _BAND), moves=moves,
+        content=max([*lines[rows], least]) if moves.any() else limit, noise=smoothed.noise,
+    )  # fmt: skip
 
 
 def joint_motion(
@@ -123,7 +128,10 @@ def joint_motion(
         return smooth(positions, period, noise)
     if processing.method == "zero_phase":
         cutoff = min(_KEPT * found.bandwidth, 0.4 / period)
-        return zero_phase(positions, period, cutoff, noise, bridge=round(_GAP / period))
+        moving = zero_phase(positions, period, cutoff, noise, bridge=round(_GAP / period))
+        if found.moves.all():
+            return moving
+        return _rested(moving, smooth(positions, period, noise), found.moves)
     if processing.method == "periodic":
         assert processing.period is not None
         cycle = round(processing.period / period)
@@ -181,6 +189,14 @@ def rate_spread(found: Projection, given: list[int], rate_std: np.ndarray) -> np
     # share[n, d, v] = d q_v / d q_d for the drives d; with it d q_v / d q_g for the given joints g
     moves = np.linalg.solve(found.share[:, :, given], found.share)
     return np.sqrt(np.einsum("ngv,ng->nv", moves**2, rate_std**2))
+
+
+def _rested(moving: Smoothed, smoothed: Smoothed, moves: np.ndarray) -> Smoothed:
+    """Joints that do not move as the smoother has them: a filter makes motion of their noise."""
+    return Smoothed(*(
+        np.where(moves, getattr(moving, part.name), getattr(smoothed, part.name))
+        for part in fields(Smoothed)
+    ))  # fmt: skip
 
 
 def _known(noise: np.ndarray) -> np.ndarray | None:

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 
-from hydrotele.identify.identifiability import COMBINATION, FULL, UNIDENTIFIABLE
+from hydrotele.identify.identifiability import COMBINATION, FULL, UNIDENTIFIABLE, WEAK
 from hydrotele.identify.identification import Identification
 
-WEAK = "weak"
 STATUSES = (UNIDENTIFIABLE, COMBINATION, FULL, WEAK)
 MEANING = {
     UNIDENTIFIABLE: "has no effect on the measured forces in this motion",
@@ -55,7 +54,7 @@ def parameter_rows(found: Identification) -> list[ParameterRow]:
     given = found.told.combination @ found.nominal
     rows = []
     for m, name in enumerate(found.names):
-        status, unit, nominal = found.structure.status[m], found.units[m], float(found.nominal[m])
+        status, unit, nominal = found.told.status[m], found.units[m], float(found.nominal[m])
         if m in told:
             k = told[m]
             low, high = found.estimate.ci95[k]
@@ -67,8 +66,6 @@ def parameter_rows(found: Identification) -> list[ParameterRow]:
             continue
         part_of = [found.names[b] for b, row in zip(found.told.base, found.told.combination,
                                                     strict=True) if row[m] != 0.0]  # fmt: skip
-        if m in found.structure.base or (status != UNIDENTIFIABLE and not part_of):
-            status = WEAK
         text = f"in {', '.join(part_of)}" if part_of else ""
         rows.append(ParameterRow(name, unit, nominal, None, None, None, status, text))
     return rows

@@ -5,15 +5,16 @@ import numpy as np
 from hydrotele.identify.regressor import BODY_PARAMETERS, Regressor
 from hydrotele.identify.setup import Setup
 
-_SPEED = 0.1  # m/s or rad/s, at which viscous friction may be as large as the whole force
+_PART = 0.05  # of a drive's force that friction or an offset may be where none is given
+_SPEED = 0.1  # m/s or rad/s, at which viscous friction may be as large
 _LEVER = 0.1  # m: friction of a pin acts on its radius, that of a drive on a lever ten times longer
 
 
 def reference_sizes(table: Regressor, setup: Setup, forces: np.ndarray) -> np.ndarray:
     """Sizes of all parameters.
 
-    A body's are its given mass and radius of gyration; friction is as large as the force of its
-    drive.
+    A body's are its given mass and radius of gyration; friction's are as given, and at least a
+    share of its drive's force.
 
     Args:
         table: the parameters.
@@ -27,15 +28,15 @@ def reference_sizes(table: Regressor, setup: Setup, forces: np.ndarray) -> np.nd
     known = {d: float(f) for d, f in zip(table.drives, forces, strict=False)}
     usual = float(np.max(forces)) if len(forces) else 1.0
     sizes = []
-    for name in table.names:
+    for name, given in zip(table.names, table.nominal, strict=True):
         kind, _, place = name.partition(".")
         if kind in BODY_PARAMETERS:
             sizes.append(_body_size(chain.inertia, chain.bodies.index(place), kind))
         elif kind == "drive_inertia":
             sizes.append(max(float(chain.armature[chain.index(place)]), usual))
         else:
-            size = known.get(place, _LEVER * usual)
-            sizes.append(size / _SPEED if kind.startswith("viscous") else size)
+            size = _PART * known.get(place, _LEVER * usual)
+            sizes.append(max(abs(given), size / _SPEED if kind.startswith("viscous") else size))
     return np.maximum(sizes, 1e-12)
 
 

@@ -1,0 +1,197 @@
+"""Identification from logs: independent data, real data, and data that tell little."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hydrotele.commands.identifying import closed_chain
+from hydrotele.dataset.load import load_dataset
+from hydrotele.errors import InputError
+from hydrotele.identify.friction_shape import identify_with_shapes
+from hydrotele.identify.identifiability import FULL, WEAK
+from hydrotele.identify.identification import identify
+from hydrotele.identify.motion import Processing
+from hydrotele.identify.parameter_rows import counts, parameter_rows
+from hydrotele.identify.record import records
+from hydrotele.identify.setup import machine_setup
+from hydrotele.machine_file import load_machine
+
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+MEASURED, REAL = SHARED / "measured", SHARED / "real"
+needs_measured = pytest.mark.skipif(not MEASURED.is_dir(), reason="no ../shared/measured here")
+needs_real = pytest.mark.skipif(not REAL.is_dir(), reason="no ../shared/real here")
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """The unchanged machine, recorded by an independent simulator."""
+    machine = load_machine("cat215")
+    fit, heldout, _ = records(load_dataset(MEASURED / "open_04", machine))
+    return fit, heldout, machine_setup(machine, closed_chain(machine))
+
+
+@pytest.fixture(scope="module")
+def found(clean):
+    return identify(*clean)
+
+
+@needs_measured
+def test_intervals_hold_the_parameters_of_the_machine_that_was_recorded(found):
+    truth = found.told.combination @ found.nominal
+    away = np.abs(found.estimate.value - truth) / found.estimate.std
+    # of 29 numbers 1.5 lie outside by chance, more than 4 in 2 % of all cases
+    assert np.sum(away > 1.96) <= 4
+    # chi^2 of 29 degrees of freedom exceeds 49.6 in 1 % of all cases
+    assert len(away) > 25 and found.estimate.ellipsoid(truth) < 49.6
+
+
+@needs_measured
+def test_held_out_forces_differ_by_noise(found):
+    for drive, judged in found.heldout.items():
+        # what the exact parameters leave, which 3 identified ones in 100 equations may raise by 3 %
+        assert judged.rms < 1.05 * judged.nominal_rms, drive
+        # the bound leaves out friction of drives that stick, up to 14 % in the pauses of this run
+        assert judged.rms < 1.2 * judged.noise_rms, drive
+        assert judged.noise_rms < 0.02 * np.nanmax(np.abs(found.forces.measured)), drive
+    assert found.status == "ok"
+
+
+@needs_measured
+def test_a_wrong_machine_is_found_out_and_mended(clean, found):
+    fit, heldout, setup = clean
+    wrong = dataclasses.replace(setup.chain, inertia=setup.chain.inertia * 0.8)
+    rubbing = tuple(
+        dataclasses.replace(r, nominal={k: 0.5 * v for k, v in r.nominal.items()})
+        for r in setup.rubbing
+    )
+    again = identify(fit, heldout, dataclasses.replace(setup, chain=wrong, rubbing=rubbing))
+    for drive, judged in again.heldout.items():
+        assert judged.rms < 0.4 * judged.nominal_rms, drive
+        assert judged.rms < 1.1 * found.heldout[drive].rms, drive  # weak ones stay wrong
+
+
+@needs_measured
+def test_the_complete_model_is_at_least_as_good_as_the_reduced_one(clean, found):
+    """As Khoshzaban's cross-validation: 3720, 5860, 8700 against 4720, 5500, 11900."""
+    fit, heldout, setup = clean
+    links = tuple(b for b in setup.bodies if not b.endswith(("_tube", "_rod")))
+    reduced = identify(fit, heldout, dataclasses.replace(setup, bodies=links))
+    better = [found.heldout[d].rms / reduced.heldout[d].rms for d in found.heldout]
+    # the links take most of the bars over; the held-out run's 80 periods know a ratio to 8 %
+    assert max(better) < 1.08
+
+
+@needs_measured
+def test_with_perfect_sensors_tubes_and_rods_show():
+    machine = load_machine("cat215")
+    fit, heldout, _ = records(load_dataset([MEASURED / "nominal_truth"], machine, "ideal"))
+    chain = closed_chain(machine)
+    complete, reduced = (
+        identify(fit, heldout, machine_setup(machine, chain, model)).heldout
+        for model in ("complete", "reduced")
+    )
+    for drive in complete:
+        assert complete[drive].rms < reduced[drive].rms, drive
+        # differentiating samples of 50 Hz leaves 0.1 to 0.5 %, friction near reversals most
+        assert complete[drive].relative < 0.006, drive
+
+
+@needs_measured
+def test_without_pressures_of_one_side_the_others_are_still_told(clean):
+    fit, heldout, setup = clean
+
+    def without(record):
+        force = record.force.copy()
+        force[:, 1] = np.nan
+        return dataclasses.replace(record, force=force)
+
+    found = identify([without(r) for r in fit], without(heldout), setup)
+    rows = {row.name: row for row in parameter_rows(found)}
+    assert set(found.heldout) == {"swing", "stick_rod"}
+    assert rows["coulomb.boom_rod"].value is None and rows["offset.boom_rod"].value is None
+    assert rows["coulomb.stick_rod"].value == pytest.approx(2000, abs=4 * 60)
+
+
+@needs_measured
+def test_a_drive_that_rests_has_no_friction_to_tell(clean):
+    fit, heldout, setup = clean
+
+    def resting(record):
+        position = record.position.copy()
+        noise = np.random.default_rng(0).normal(0.0, record.position_noise[1], len(position))
+        position[:, 1] = 0.45 + noise
+        return dataclasses.replace(record, position=position)
+
+    found = identify([resting(r) for r in fit], resting(heldout), setup)
+    assert "boom stood still" in found.status
+    rows = {row.name: row for row in parameter_rows(found)}
+    assert all(rows[f"{kind}.boom_rod"].value is None for kind in ("coulomb", "viscous"))
+
+
+@needs_measured
+def test_missing_samples_are_bridged(clean, found):
+    fit, heldout, setup = clean
+    rng = np.random.default_rng(1)
+
+    def dropped(record):
+        lost = rng.random(len(record.force)) < 0.01
+        position, force = record.position.copy(), record.force.copy()
+        position[lost], force[lost] = np.nan, np.nan
+        return dataclasses.replace(record, position=position, force=force)
+
+    again = identify([dropped(r) for r in fit], dropped(heldout), setup)
+    for drive, judged in again.heldout.items():
+        assert judged.rms < 1.1 * found.heldout[drive].rms, drive
+
+
+@needs_measured
+def test_unknown_forces_everywhere_are_refused(clean):
+    fit, heldout, setup = clean
+    blind = [dataclasses.replace(r, force=np.full_like(r.force, np.nan)) for r in fit]
+    with pytest.raises(InputError, match="no drive has a known force"):
+        identify(blind, heldout, setup)
+
+
+@needs_real
+@pytest.mark.parametrize(("asymmetry", "error"), [(False, 0.041), (True, 0.032)])
+def test_emps_has_the_published_numbers(asymmetry, error):
+    """Janot, Gautier and Brunot: 95.11 kg, 203.5 N s/m, 20.39 N, -3.165 N, 4.08 and 3.11 %."""
+    machine = load_machine("emps")
+    fit, heldout, _ = records(load_dataset(REAL / "emps" / "main.parquet", machine))
+    setup = machine_setup(machine, closed_chain(machine), asymmetry=asymmetry)
+    found = identify_with_shapes(fit, heldout, setup)
+    rows = {row.name: row for row in parameter_rows(found)}
+    assert rows["mass.carriage"].value == pytest.approx(95.11, rel=0.01)
+    assert rows["viscous.slide"].value == pytest.approx(203.5, rel=0.02)
+    assert rows["coulomb.slide"].value == pytest.approx(20.39, rel=0.02)
+    assert found.heldout["slide"].relative < error
+    assert {row.status for row in rows.values() if row.value is not None} == {FULL}
+    if asymmetry:
+        low, high = rows["viscous_asymmetry.slide"].ci95
+        assert low < (166.7 - 240.4) / 2 < high
+    else:
+        assert rows["offset.slide"].value == pytest.approx(-3.165, rel=0.05)
+
+
+@needs_measured
+def test_rows_say_of_every_parameter_what_is_known(found):
+    rows = parameter_rows(found)
+    assert [row.name for row in rows] == list(found.names)
+    assert sum(counts(rows).values()) == len(rows)
+    for row in rows:
+        assert (row.value is None) == (row.std is None) == (row.ci95 is None)
+        if row.status == WEAK:
+            assert row.value is None
+        if row.ci95:
+            assert row.ci95[0] < row.value < row.ci95[1]
+
+
+def test_processing_refuses_nonsense():
+    with pytest.raises(InputError, match="not known"):
+        Processing("magic")  # pyright: ignore - that is the point
+    with pytest.raises(InputError, match="positive"):
+        Processing(band=-1.0)
+    with pytest.raises(InputError, match="number of harmonics"):
+        Processing("periodic")
