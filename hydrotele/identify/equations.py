@@ -16,7 +16,7 @@ from hydrotele.identify.motion import (
 )
 from hydrotele.identify.projection import project
 from hydrotele.identify.record import Record
-from hydrotele.identify.regressor import Regressor, regressor
+from hydrotele.identify.regressor import Regressor, regressor, sign_doubt
 from hydrotele.identify.setup import Setup
 
 _TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
@@ -38,6 +38,7 @@ class Equations:
         matrix: (n, k, m).
         force: (n, k) [N] or [N m]; NaN where unknown.
         time: (n,) [s] from the run's start.
+        doubt: (n, k) how uncertain the sign of the drives' dry friction is, 0 .. 1.
         force_noise: (k,) standard deviation that the force sensors' noise leaves; NaN if unknown.
         motion_noise: (k, p) draws of what the motion's errors leave per parameter; see
             `noise_of`. Empty where not asked for or not known.
@@ -47,6 +48,7 @@ class Equations:
     matrix: np.ndarray
     force: np.ndarray
     time: np.ndarray
+    doubt: np.ndarray
     force_noise: np.ndarray
     motion_noise: np.ndarray
 
@@ -88,18 +90,20 @@ def build_equations(
             record.name, f"{len(record.force)} rows are too few for a band of {band:g} Hz, which"
             f" needs {len(low)}",
         )  # fmt: skip
-    start, last, parts = None, None, []
+    start, last, parts, doubts = None, None, [], []
+    weights = np.abs(low) / np.abs(low).sum()
     errors, draws = [], ()
     if with_noise:
         draws = motion_errors(record.position, record.period, found, processing, _DRAWS)
     for first in range(0, count, per_chunk := max(1, _CHUNK // thin)):
         some = min(per_chunk, count - first)
         rows = slice(first * thin, (first + some - 1) * thin + len(low))
-        last, pose = _rows(setup, motions[:, rows], motion.rate_std[rows], start)
+        last, doubt, pose = _rows(setup, motions[:, rows], motion.rate_std[rows], start)
         parts.append(_thinned(last.matrix, low, thin))
+        doubts.append(_thinned(doubt, weights, thin))
         truth = _rows(setup, motions[:, rows], None, start)[0] if len(draws) else last
         for draw in draws:  # the motion found is taken for the true one, whose rates are certain
-            moved, _ = _rows(setup, motions[:, rows] + draw[:, rows], motion.rate_std[rows], start)
+            moved, *_ = _rows(setup, motions[:, rows] + draw[:, rows], motion.rate_std[rows], start)
             errors.append(_thinned(moved.matrix - truth.matrix, low, thin))
         start = pose
     assert last is not None
@@ -109,14 +113,20 @@ def build_equations(
         spread = sum(np.einsum("nkm,nkl->kml", e, e) for e in errors) / (count * _DRAWS)
     time = (np.arange(count) * thin + (len(low) - 1) / 2) * record.period
     made = Equations(
-        record.name, np.concatenate(parts), _forces(record.force, low, thin), time, noise, spread
+        record.name,
+        np.concatenate(parts),
+        _forces(record.force, low, thin),
+        time,
+        np.concatenate(doubts),
+        noise,
+        spread,
     )
     empty = Regressor(last.matrix[:0], last.drives, last.names, last.units, last.nominal)
     return made, empty
 
 
 def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start: np.ndarray | None):
-    """Regressor of some rows (3, n, k), and the pose (v,) of the last of them."""
+    """Regressor of some rows (3, n, k), doubt of the signs, and the pose (v,) of the last row."""
     chain = setup.chain
     found = project(chain, setup.given, *motions, start=start)
     given = [chain.index(name) for name in setup.given]
@@ -124,10 +134,14 @@ def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start:
     if rate_std is not None and np.isfinite(rate_std).all():
         spread = rate_spread(found, given, rate_std)
     table = regressor(
-        chain, found, bodies=setup.bodies, rubbing=setup.rubbing, offsets=setup.offsets,
+        chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
+        offsets=False if setup.offsets is None else setup.offsets,
         drive_inertia=setup.drive_inertia, rate_std=spread,
     )  # fmt: skip
-    return table, found.position[-1]
+    doubt = np.zeros((len(found.rate), len(table.drives)))
+    if spread is not None:
+        doubt = sign_doubt(chain, found, table.drives, setup.rubbing, spread)
+    return table, doubt, found.position[-1]
 
 
 def _low_pass(band: float, period: float) -> tuple[np.ndarray, int]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.optimize import nnls
 
 from hydrotele.errors import InputError
 from hydrotele.identify.equations import Equations, build_equations, stacked
@@ -141,15 +142,19 @@ def identify(
     matrix, force = matrix[:, drives], force[:, drives]
     there = np.isfinite(force).all(axis=1)
     matrix, force = matrix[there], force[there]
+    doubt = stacked(runs, lambda e: e.doubt)[there][:, drives]
     structure = identifiability(_flat(matrix), table.names, table.units)
     still = ~np.any([part.moves for part in resolved[:-1]], axis=0)
     resting = [d for d, stands in zip(table.drives, still, strict=True) if stands]
+    first = _fit(matrix, force, table, structure, 0.0, 0.0)
+    weight = _weights(first, doubt)
+    matrix, force = weight[:, :, None] * matrix, weight * force
     told = _told(matrix, force, table, structure, setup, resting)
     found = _fit(matrix, force, table, told, ridge, cut)
     value = table.nominal.copy()
     value[told.base] += found.value - told.combination @ table.nominal
     judged, _ = build_equations(heldout, setup, processing, resolved[-1], with_noise=True)
-    predicted = _judge(judged, table, value, drives)
+    predicted = _judge(judged, table, value, drives, setup)
     return Identification(
         names=table.names, units=table.units, nominal=table.nominal, value=value, told=told,
         structure=structure, estimate=found, heldout=predicted,
@@ -170,6 +175,21 @@ def _fit(matrix, force, table: Regressor, told: Identifiability, ridge: float, c
     given = told.combination @ table.nominal
     rest = force - matrix @ table.nominal + base @ given
     return estimate(base, rest, ridge=ridge, cut=cut, prior=given)
+
+
+def _weights(first: Estimate, doubt: np.ndarray) -> np.ndarray:
+    """Weights (n, k), 1 at most, of equations in which dry friction may have either sign.
+
+    How much larger their errors are is read off the residuals of a first estimate.
+    """
+    weights = np.ones_like(first.residual)
+    for k in range(doubt.shape[1]):
+        square = first.residual[:, k] ** 2
+        grows = np.column_stack([np.ones(len(square)), doubt[:, k] ** 2])
+        calm, more = nnls(grows * square.size**-0.5, square * square.size**-0.5)[0]
+        if calm > 0.0:
+            weights[:, k] = np.sqrt(calm / (grows @ (calm, more)))
+    return weights
 
 
 def _told(
@@ -203,7 +223,7 @@ def _long_run(residual: np.ndarray) -> np.ndarray:
     return np.maximum(spread, np.std(residual, axis=0))
 
 
-def _judge(judged: Equations, table: Regressor, value: np.ndarray, drives: list[int]):
+def _judge(judged: Equations, table: Regressor, value: np.ndarray, drives: list[int], setup: Setup):
     """Drive -> prediction of the held-out run."""
     noise = judged.noise_of(value)
     out = {}
@@ -217,8 +237,7 @@ def _judge(judged: Equations, table: Regressor, value: np.ndarray, drives: list[
             for p in (value, table.nominal)
         ]
         whole = float(np.sqrt(np.mean(force[known] ** 2)))
-        unit = next(u for n, u in zip(table.names, table.units, strict=True)
-                    if n == f"coulomb.{table.drives[k]}")  # fmt: skip
+        unit = "N" if setup.chain.tree.slides[setup.chain.index(table.drives[k])] else "N m"
         out[table.drives[k]] = HeldOut(
             sizes[0], unit, float(noise[k]), sizes[0] / max(whole, 1e-300), sizes[1]
         )

@@ -129,6 +129,34 @@ def regressor(
     return Regressor(matrix, drives, tuple(names), tuple(units), np.array(nominal))
 
 
+def sign_doubt(
+    chain: Chain, found: Projection, drives: Sequence[str], rubbing: Sequence[Rubbing],
+    rate_std: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """How uncertain it is on which side of zero the rates of the drives are.
+
+    Args:
+        chain: the chain.
+        found: its projection.
+        drives: names of the k drives.
+        rubbing: friction, place by place; that of the drives counts.
+        rate_std: (n, v) as of `regressor`.
+
+    Returns:
+        (n, k) standard deviation of the sign that dry friction has, 0 .. 1.
+    """
+    out, weights = np.zeros((len(found.rate), len(drives))), _WEIGHTS / _WEIGHTS.sum()
+    for one in rubbing:
+        if one.place not in drives:
+            continue
+        j = chain.index(one.place)
+        way = _shape(one, "coulomb", found.rate[:, j, None] + rate_std[:, j, None] * _NODES)
+        mean = way @ weights
+        spread = np.sqrt(np.maximum(way**2 @ weights - mean**2, 0.0))
+        out[:, list(drives).index(one.place)] = spread
+    return out
+
+
 def _rubbing(chain: Chain, found: Projection, one: Rubbing, rate_std: np.ndarray | None):
     """Parameter -> (column (n, k), unit)."""
     strange = [kind for kind in one.nominal if kind not in RUBBING]

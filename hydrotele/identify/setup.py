@@ -22,7 +22,7 @@ class Setup:
         given: the k joints whose motion is measured.
         bodies: those with columns.
         rubbing: friction, place by place.
-        offsets: constant forces of the drives as given [N] or [N m].
+        offsets: constant forces of the drives as given [N] or [N m]; None for no such columns.
         drive_inertia: joints whose drive has an inertia of its own.
     """
 
@@ -30,7 +30,7 @@ class Setup:
     given: tuple[str, ...]
     bodies: tuple[str, ...]
     rubbing: tuple[Rubbing, ...]
-    offsets: Mapping[str, float] = field(default_factory=dict)
+    offsets: Mapping[str, float] | None = field(default_factory=dict)
     drive_inertia: tuple[str, ...] = ()
 
 
