@@ -25,6 +25,7 @@ _SPARE = 1.25  # equations per second over twice the band
 _FINE = 4  # times more rows where forces are judged and shown
 _CHUNK = 8000  # rows at a time, so that long logs need little memory
 _MISSING = 0.1  # part of a low-pass' weight that may lie on missing forces
+_NOISY = 6000  # rows at most on which they are tried
 _DRAWS = 4  # of the motion's errors: an RMS over thousands of rows needs no more
 _WHERE = "equations"
 
@@ -92,37 +93,46 @@ def build_equations(
         )  # fmt: skip
     start, last, parts, doubts = None, None, [], []
     weights = np.abs(low) / np.abs(low).sum()
-    errors, draws = [], ()
-    if with_noise:
-        draws = motion_errors(record.position, record.period, found, processing, _DRAWS)
     for first in range(0, count, per_chunk := max(1, _CHUNK // thin)):
         some = min(per_chunk, count - first)
         rows = slice(first * thin, (first + some - 1) * thin + len(low))
         last, doubt, pose = _rows(setup, motions[:, rows], motion.rate_std[rows], start)
         parts.append(_thinned(last.matrix, low, thin))
         doubts.append(_thinned(doubt, weights, thin))
-        truth = _rows(setup, motions[:, rows], None, start)[0] if len(draws) else last
-        for draw in draws:  # the motion found is taken for the true one, whose rates are certain
-            moved, *_ = _rows(setup, motions[:, rows] + draw[:, rows], motion.rate_std[rows], start)
-            errors.append(_thinned(moved.matrix - truth.matrix, low, thin))
         start = pose
     assert last is not None
     noise = np.sqrt(np.sum(low**2)) * record.force_noise
     spread = np.zeros(0)
-    if errors:
-        spread = sum(np.einsum("nkm,nkl->kml", e, e) for e in errors) / (count * _DRAWS)
+    if with_noise:
+        spread = _motion_noise(
+            record, setup, processing, found, motions, motion.rate_std, low, thin
+        )
     time = (np.arange(count) * thin + (len(low) - 1) / 2) * record.period
     made = Equations(
-        record.name,
-        np.concatenate(parts),
-        _forces(record.force, low, thin),
-        time,
-        np.concatenate(doubts),
-        noise,
-        spread,
-    )
+        record.name, np.concatenate(parts), _forces(record.force, low, thin), time,
+        np.concatenate(doubts), noise, spread,
+    )  # fmt: skip
     empty = Regressor(last.matrix[:0], last.drives, last.names, last.units, last.nominal)
     return made, empty
+
+
+def _motion_noise(
+    record: Record, setup: Setup, processing: Processing, found: Resolution, motions: np.ndarray,
+    rate_std: np.ndarray, low: np.ndarray, thin: int,
+) -> np.ndarray:  # fmt: skip
+    """What the motion's errors leave in the drives' forces (k, m, m); see `Equations`.
+
+    The motion found is taken for the true one, whose rates are certain.
+    """
+    rows = slice(0, min(_NOISY, len(record.position)))
+    truth = _thinned(_rows(setup, motions[:, rows], None, None)[0].matrix, low, thin)
+    draws = motion_errors(record.position[rows], record.period, found, processing, _DRAWS)
+    total = np.zeros((truth.shape[1], truth.shape[2], truth.shape[2]))
+    for draw in draws:
+        moved, *_ = _rows(setup, motions[:, rows] + draw, rate_std[rows], None)
+        error = _thinned(moved.matrix, low, thin) - truth
+        total += np.einsum("nkm,nkl->kml", error, error)
+    return total / (len(truth) * _DRAWS)
 
 
 def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start: np.ndarray | None):

@@ -1,0 +1,261 @@
+"""Excitation: the periodic motion that tells a machine's parameters best within its limits."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from hydrotele.errors import InputError
+from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.identify.projection import Projection, project
+from hydrotele.identify.regressor import regressor
+from hydrotele.identify.setup import Setup
+from hydrotele.machine import Machine
+
+_ROWS = 12  # per period of the highest harmonic
+_MARGIN = 0.05  # of a range, stroke or limit that is left free
+_FLOW, _FORCE, _VALVE = 0.95, 0.8, 0.8  # of the pump, of the relief pressure, of a valve's rating
+_PRESS = (1e1, 1e3, 1e5)  # weights of violated limits, growing, so that the end lies inside them
+_WHERE = "excitation"
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """A periodic motion of k axes with H harmonics.
+
+    Attributes:
+        axes: the k axes.
+        period: [s].
+        mean: (k,) middle of the motion [rad] or [m].
+        sin: (k, H) amplitudes of the positions [rad] or [m].
+        cos: (k, H) amplitudes of the positions [rad] or [m].
+        criterion: ln det of the information per parameter.
+        worst: largest use of a limit, 1 at the limit.
+        parameters: number of base parameters that the criterion counts.
+    """
+
+    axes: tuple[str, ...]
+    period: float
+    mean: np.ndarray
+    sin: np.ndarray
+    cos: np.ndarray
+    criterion: float
+    worst: float
+    parameters: int
+
+    def motion(self, time: np.ndarray) -> np.ndarray:
+        """Positions, rates and accelerations (3, n, k) at times (n,) [s]."""
+        h = np.arange(1, self.sin.shape[1] + 1)
+        turn = 2.0 * math.pi * h / self.period
+        s, c = np.sin(np.outer(time, turn)), np.cos(np.outer(time, turn))
+        return np.stack([
+            self.mean + s @ self.sin.T + c @ self.cos.T,
+            (c * turn) @ self.sin.T - (s * turn) @ self.cos.T,
+            -(s * turn**2) @ self.sin.T - (c * turn**2) @ self.cos.T,
+        ])  # fmt: skip
+
+    def scenario(self, name: str, machine: Machine, cycles: float, **more: Any) -> dict[str, Any]:
+        """Scenario that runs it, as `hydrotele run` reads it.
+
+        Args:
+            name: of the scenario.
+            machine: the machine.
+            cycles: periods to run after the fade-in.
+            more: further keys, such as `sensors`.
+        """
+        fade = 0.25 * self.period
+        axes = {
+            axis: {"mean": float(m), "sin": [float(v) for v in s], "cos": [float(v) for v in c]}
+            for axis, m, s, c in zip(self.axes, self.mean, self.sin, self.cos, strict=True)
+        }
+        start = {machine.axes[a].joint: float(m) for a, m in zip(self.axes, self.mean, strict=True)}
+        return {
+            "name": name, "machine": machine.name, "tool": machine.tool,
+            "duration": float(fade + cycles * self.period), "control_rate": 50, "ground": False,
+            "start": {"joints": start},
+            "pilot": {"kind": "fourier", "period": float(self.period), "fade": fade, "axes": axes},
+            "servo": {"lead": 0.06}, **more,
+        }  # fmt: skip
+
+
+def information(
+    setup: Setup, motions: np.ndarray, noise: np.ndarray, base: Sequence[int] | np.ndarray,
+    sizes: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Information (p, p) per row that a motion holds of base parameters.
+
+    Args:
+        setup: of the regressor.
+        motions: (3, n, k) positions, rates and accelerations.
+        noise: (k,) standard deviation of the drives' force errors [N] or [N m].
+        base: places of the p base parameters.
+        sizes: (p,) to count the parameters in; 1 by default.
+    """
+    found = project(setup.chain, setup.given, *motions)
+    table = regressor(
+        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
+        offsets=False if setup.offsets is None else setup.offsets,
+    )  # fmt: skip
+    scaled = table.matrix[:, :, base] / noise[:, None]
+    if sizes is not None:
+        scaled = scaled * sizes
+    flat = scaled.reshape(-1, len(base))
+    return flat.T @ flat / len(found.rate)
+
+
+def design_excitation(
+    machine: Machine, setup: Setup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
+    period: float = 20.0, harmonics: int = 5, starts: int = 4, seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> Excitation:  # fmt: skip
+    """D-optimal Fourier motion within the machine's limits.
+
+    Maximises ln det of the information of the base parameters. Limits: joint ranges, strokes,
+    pump flow shared by all axes, valves' rated flows, and forces at the relief pressure.
+
+    Args:
+        machine: the machine.
+        setup: of the regressor; its given numbers tell the forces.
+        noise: (k,) standard deviation of the drives' force errors [N] or [N m].
+        base: places of the base parameters that count.
+        period: [s].
+        harmonics: number H of them.
+        starts: random motions from which to search.
+        seed: of these.
+        progress: told what is being done and how far, 0 .. 1.
+
+    Returns:
+        The best motion found.
+
+    Raises:
+        InputError: no start moves within the limits, or an axis has no range.
+
+    Source: Abdellatif 2008, section 4; Swevers et al. 1997.
+    """
+    limits = _Limits(machine, setup)
+    rows = max(60, _ROWS * harmonics)
+    time = np.arange(rows) * period / rows
+    k, rng, best = len(setup.given), np.random.default_rng(seed), None
+    sizes = _sizes(setup, base, limits.middle)
+
+    def excitation(x: np.ndarray) -> Excitation:
+        parts = x.reshape(k, 1 + 2 * harmonics)
+        turn = np.arange(1, harmonics + 1)
+        mean = limits.middle + limits.half * np.tanh(parts[:, 0])
+        wide = limits.half[:, None] * parts[:, 1:] / np.tile(turn, 2)
+        return Excitation(
+            limits.axes, period, mean, wide[:, :harmonics], wide[:, harmonics:], 0.0, 0.0, len(base)
+        )
+
+    def measure(x: np.ndarray) -> tuple[float, np.ndarray]:
+        motions = excitation(x).motion(time)
+        inside = np.clip(motions[0], limits.low, limits.high)
+        held = np.stack([inside, motions[1], motions[2]])
+        info = information(setup, held, noise, base, sizes)
+        value = np.linalg.slogdet(info + 1e-12 * np.eye(len(base)))[1] / len(base)
+        return float(value), limits.use(motions, held)
+
+    def cost(x: np.ndarray, press: float) -> float:
+        try:
+            value, use = measure(x)
+        except InputError:
+            return 1e6
+        return -value + press * float(np.mean(np.maximum(use - 1.0, 0.0) ** 2))
+
+    for start in range(starts):
+        x = rng.normal(0.0, 0.15, (k, 1 + 2 * harmonics)).ravel()
+        for step, press in enumerate(_PRESS):
+            if progress:
+                progress(f"start {start + 1}", (start + step / len(_PRESS)) / starts)
+            x = minimize(cost, x, (press,), method="L-BFGS-B", options={"maxiter": 150}).x
+        x = _inside(x, measure)
+        value, use = measure(x)
+        if best is None or value > best[0]:
+            best = (value, x, float(use.max()))
+    if best is None or best[2] > 1.0 + 1e-6:
+        raise InputError(_WHERE, "no motion within the limits was found: give more starts")
+    value, x, worst = best
+    made = excitation(x)
+    return Excitation(made.axes, period, made.mean, made.sin, made.cos, value, worst, len(base))
+
+
+def _inside(x: np.ndarray, measure: Callable) -> np.ndarray:
+    """A motion shrunk until it keeps all limits."""
+    for _ in range(60):
+        if measure(x)[1].max() <= 1.0:
+            return x
+        x = 0.97 * x
+    return x
+
+
+def _sizes(setup: Setup, base: Sequence[int] | np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Sizes of base parameters, so that a determinant is no matter of units: those given."""
+    still = np.zeros((1, len(middle)))
+    found = project(setup.chain, setup.given, middle[None], still, still)
+    table = regressor(
+        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
+        offsets=False if setup.offsets is None else setup.offsets,
+    )  # fmt: skip
+    return np.maximum(np.abs(table.nominal[np.asarray(base)]), 1.0)
+
+
+class _Limits:
+    """What the machine allows: ranges, strokes, flows and forces."""
+
+    def __init__(self, machine: Machine, setup: Setup):
+        self.machine, self.setup = machine, setup
+        self.axes = tuple(actuator_order(machine))
+        ranges = []
+        for axis in self.axes:
+            joint = machine.joints[machine.axes[axis].joint]
+            ranges.append(joint.range or (-0.5 * math.pi, 0.5 * math.pi))
+        low, high = np.array(ranges).T
+        self.low, self.high = low + _MARGIN * (high - low), high - _MARGIN * (high - low)
+        self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        self.drives = [setup.chain.index(d) for d in setup.chain.drives]
+
+    def use(self, motions: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Use of every limit at every row (n, l), 1 at the limit."""
+        parts = [
+            1.0 + (motions[0] - self.high) / self.half,
+            1.0 + (self.low - motions[0]) / self.half,
+        ]
+        found = project(self.setup.chain, self.setup.given, *held)
+        table = regressor(
+            self.setup.chain, found, bodies=self.setup.bodies, rubbing=self.setup.rubbing,
+            offsets=False,
+        )  # fmt: skip
+        forces = table.matrix @ table.nominal
+        flow = np.zeros(len(forces))
+        for i, axis in enumerate(self.axes):
+            parts.append(self._drive_use(axis, i, found, forces[:, i], flow)[:, None])
+        supply = self.machine.supply
+        if supply is not None:
+            parts.append(flow[:, None] / (_FLOW * supply.pump_flow))
+        return np.concatenate(parts, axis=1)
+
+    def _drive_use(
+        self, axis: str, i: int, found: Projection, force: np.ndarray, flow: np.ndarray
+    ) -> np.ndarray:
+        """Use (n,) of a drive's own limits; adds its flow (n,) [m^3/s]."""
+        facts, supply = self.machine.axes[axis], self.machine.supply
+        j = self.drives[i]
+        if facts.force:
+            limit = abs(facts.force.gain) * facts.force.command_limit
+            return np.abs(force) / (_FORCE * limit)
+        assert supply is not None and facts.valve is not None
+        head, rod = facts.hydraulic_drive.areas
+        speed = found.rate[:, j]
+        taken = np.where(speed > 0.0, head * speed, -rod * speed)
+        flow += taken
+        reach = np.where(force > 0.0, head, rod) * (supply.relief_pressure - supply.tank_pressure)
+        used = np.maximum(
+            np.abs(force) / (_FORCE * reach), taken / (_VALVE * facts.valve.rated_flow)
+        )
+        if facts.cylinder:
+            x, half = found.position[:, j], 0.5 * facts.cylinder.stroke
+            used = np.maximum(used, np.abs(x - half) / ((1.0 - _MARGIN) * half))
+        return used
