@@ -169,13 +169,13 @@ def identify(
         bool, typer.Option("--hydraulics", help="Identify valves, oil, leakage and supply, too.")
     ] = False,
     processing: Annotated[
-        str, typer.Option(help="zero_phase, optimal, periodic (needs period, harmonics) or raw.")
+        str, typer.Option(help="zero_phase, optimal, periodic (needs the period) or raw.")
     ] = "zero_phase",
     band: Annotated[
         float | None, typer.Option(help="Compare forces below this frequency [Hz].")
     ] = None,
     period: Annotated[float | None, typer.Option(help="Period of a repeated motion [s].")] = None,
-    harmonics: Annotated[int, typer.Option(help="Harmonics of it to keep.")] = 0,
+    harmonics: Annotated[int, typer.Option(help="Harmonics of it to keep; 0: enough.")] = 0,
     ridge: Annotated[float, typer.Option(help="Ridge, share of the largest singular value.")] = 0.0,
     truncate: Annotated[float, typer.Option(help="Leave out smaller singular values.")] = 0.0,
     force: Annotated[

@@ -108,8 +108,8 @@ def information(
 
 def design_excitation(
     machine: Machine, setup: Setup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
-    period: float = 20.0, harmonics: int = 5, starts: int = 4, seed: int = 0,
-    progress: Callable[[str, float], None] | None = None,
+    period: float = 20.0, harmonics: int = 8, starts: int = 2, iterations: int = 150,
+    seed: int = 0, progress: Callable[[str, float], None] | None = None,
 ) -> Excitation:  # fmt: skip
     """D-optimal Fourier motion within the machine's limits.
 
@@ -124,6 +124,7 @@ def design_excitation(
         period: [s].
         harmonics: number H of them.
         starts: random motions from which to search.
+        iterations: of each search, per weight of the limits.
         seed: of these.
         progress: told what is being done and how far, 0 .. 1.
 
@@ -170,7 +171,7 @@ def design_excitation(
         for step, press in enumerate(_PRESS):
             if progress:
                 progress(f"start {start + 1}", (start + step / len(_PRESS)) / starts)
-            x = minimize(cost, x, (press,), method="L-BFGS-B", options={"maxiter": 150}).x
+            x = minimize(cost, x, (press,), method="L-BFGS-B", options={"maxiter": iterations}).x
         x = _inside(x, measure)
         value, use = measure(x)
         if best is None or value > best[0]:

@@ -13,7 +13,7 @@ from hydrotele.identify.equations import Equations, build_equations, stacked
 from hydrotele.identify.estimators import Estimate, autoregression, estimate
 from hydrotele.identify.identifiability import Identifiability, identifiability, told_in_noise
 from hydrotele.identify.motion import Processing, resolution
-from hydrotele.identify.record import Record
+from hydrotele.identify.record import Record, whole_cycles
 from hydrotele.identify.reference_size import reference_sizes
 from hydrotele.identify.regressor import RUBBING, Regressor
 from hydrotele.identify.setup import Setup
@@ -112,7 +112,8 @@ def identify(
         heldout: record to judge on.
         setup: what the regressor is built of.
         processing: how positions are differentiated, and the band; each run as its own positions
-            allow by default.
+            allow by default. Where it is `periodic`, runs to fit are cut to their last whole
+            cycles, and the held-out run, which need not be periodic, is filtered.
         ridge: of the estimator, towards the given parameters.
         cut: of the estimator: truncation of small singular values.
         notes: to hand on.
@@ -127,9 +128,14 @@ def identify(
     """
     started = time.perf_counter()
     processing = processing or Processing()
+    judging = processing
+    if processing.method == "periodic":
+        assert processing.period
+        fit = [whole_cycles(record, processing.period) for record in fit]
+        judging = replace(processing, method="zero_phase")
     resolved = [resolution(r.position, r.period, r.position_noise) for r in (*fit, heldout)]
     band = processing.band or min(found.band for found in resolved[:-1])
-    processing = replace(processing, band=band)
+    processing, judging = replace(processing, band=band), replace(judging, band=band)
     made = [
         build_equations(record, setup, processing, found)
         for record, found in zip(fit, resolved, strict=False)
@@ -153,7 +159,7 @@ def identify(
     found = _fit(matrix, force, table, told, ridge, cut)
     value = table.nominal.copy()
     value[told.base] += found.value - told.combination @ table.nominal
-    judged, _ = build_equations(heldout, setup, processing, resolved[-1], with_noise=True)
+    judged, _ = build_equations(heldout, setup, judging, resolved[-1], with_noise=True)
     predicted = _judge(judged, table, value, drives, setup)
     return Identification(
         names=table.names, units=table.units, nominal=table.nominal, value=value, told=told,

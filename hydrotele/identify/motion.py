@@ -35,7 +35,8 @@ class Processing:
         band: low-pass that regressor and forces pass alike [Hz]; None to take half of what the
             positions resolve.
         period: of the motion [s], where it is repeated.
-        harmonics: of it that are kept in the frequency domain.
+        harmonics: of it that are kept in the frequency domain; 0 for those that a zero-phase
+            filter would keep.
     """
 
     method: Method = "zero_phase"
@@ -49,8 +50,8 @@ class Processing:
             raise InputError(_WHERE, f"{self.method!r} is not known: {', '.join(METHODS)}")
         if self.band is not None and not (math.isfinite(self.band) and self.band > 0):
             raise InputError(_WHERE, f"the band must be positive, got {self.band} Hz")
-        if self.method == "periodic" and not (self.period and self.harmonics):
-            raise InputError(_WHERE, "periodic needs the period [s] and the number of harmonics")
+        if self.method == "periodic" and not self.period:
+            raise InputError(_WHERE, "periodic needs the period of the motion [s]")
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,9 @@ def joint_motion(
     if processing.method == "periodic":
         assert processing.period is not None
         cycle = round(processing.period / period)
-        return periodic(positions, period, cycle, processing.harmonics, noise)
+        highest = round(_KEPT * found.bandwidth * processing.period)
+        harmonics = min(processing.harmonics or highest, (cycle - 1) // 2)
+        return periodic(positions, period, cycle, harmonics, noise)
     rate = np.gradient(positions, period, axis=0)
     acceleration = np.gradient(rate, period, axis=0)
     spread = np.broadcast_to(noise, positions.shape)

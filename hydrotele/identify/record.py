@@ -1,7 +1,7 @@
 """What logs tell of the drives: position of every joint and force of every drive, row by row."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,6 +75,32 @@ def records(dataset: Dataset) -> tuple[tuple[Record, ...], Record, tuple[str, ..
         )
     made = [_record(dataset, run, axes) for run in (*dataset.fit, dataset.heldout)]
     return tuple(made[:-1]), made[-1], tuple(notes)
+
+
+def whole_cycles(record: Record, period: float) -> Record:
+    """The last whole cycles of a record: those before may still hold its fade-in.
+
+    Args:
+        record: of a periodic motion.
+        period: of the motion [s].
+
+    Returns:
+        The cut record.
+
+    Raises:
+        InputError: it has no whole cycle, or a cycle is no whole number of rows.
+    """
+    rows = period / record.period
+    cycle = round(rows)
+    if abs(rows - cycle) > 1e-3 * max(rows, 1.0) or cycle < 3:
+        raise InputError(
+            record.name, f"a period of {period:g} s is no whole number of rows of"
+            f" {record.period:g} s",
+        )  # fmt: skip
+    count = len(record.force) // cycle * cycle
+    if count == 0:
+        raise InputError(record.name, f"is shorter than a period of {period:g} s")
+    return replace(record, position=record.position[-count:], force=record.force[-count:])
 
 
 def _record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> Record:

@@ -193,5 +193,5 @@ def test_processing_refuses_nonsense():
         Processing("magic")  # pyright: ignore - that is the point
     with pytest.raises(InputError, match="positive"):
         Processing(band=-1.0)
-    with pytest.raises(InputError, match="number of harmonics"):
+    with pytest.raises(InputError, match="needs the period"):
         Processing("periodic")
