@@ -197,6 +197,25 @@ def identify(
     )
 
 
+@app.command(epilog="Example:  hydrotele excite cat215 --out my_excitation.yaml")
+def excite(
+    machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Scenario to write (.yaml).")],
+    tool: ToolName = None,
+    sensors: Annotated[str | None, typer.Option(help="Sensors of the machine.")] = None,
+    period: Annotated[float, typer.Option(min=1.0, help="Of the motion [s].")] = 20.0,
+    harmonics: Annotated[int, typer.Option(min=1, max=30, help="Of the motion.")] = 8,
+    starts: Annotated[int, typer.Option(min=1, help="Searches from random motions.")] = 2,
+    seed: Annotated[int, typer.Option(help="Of these.")] = 0,
+    cycles: Annotated[float, typer.Option(min=1.0, help="Periods to run.")] = 3.0,
+    json: Json = False,
+) -> None:
+    """Design the motion that tells a machine's parameters best, within its limits."""
+    from hydrotele.commands.exciting import excite_to_file
+
+    excite_to_file(machine, tool, sensors, out, period, harmonics, starts, seed, cycles, json)
+
+
 @app.command(
     epilog="Examples:  hydrotele review runs/zhu_up   |   hydrotele review a.parquet b.parquet"
 )

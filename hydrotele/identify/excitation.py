@@ -10,7 +10,9 @@ from scipy.optimize import minimize
 
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.identify.identifiability import told_in_noise
 from hydrotele.identify.projection import Projection, project
+from hydrotele.identify.reference_size import reference_sizes
 from hydrotele.identify.regressor import regressor
 from hydrotele.identify.setup import Setup
 from hydrotele.machine import Machine
@@ -19,6 +21,8 @@ _ROWS = 12  # per period of the highest harmonic
 _MARGIN = 0.05  # of a range, stroke or limit that is left free
 _FLOW, _FORCE, _VALVE = 0.95, 0.8, 0.8  # of the pump, of the relief pressure, of a valve's rating
 _PRESS = (1e1, 1e3, 1e5)  # weights of violated limits, growing, so that the end lies inside them
+_READ = 0.02  # s between force readings of an ordinary log
+_DRAWN = 12  # random motions of which the best is where a search starts
 _WHERE = "excitation"
 
 
@@ -106,6 +110,40 @@ def information(
     return flat.T @ flat / len(found.rate)
 
 
+def informative_base(
+    machine: Machine, setup: Setup, noise: np.ndarray, period: float = 20.0, seed: int = 0
+) -> np.ndarray:
+    """Places of base parameters that an ordinary motion tells in spite of the noise.
+
+    Args:
+        machine: the machine.
+        setup: of the regressor.
+        noise: (k,) standard deviation of a force reading [N] or [N m].
+        period: of that motion [s].
+        seed: of its random harmonics.
+
+    Returns:
+        (p,) places in the regressor's parameters: worth designing a motion for.
+    """
+    limits, rng = _Limits(machine, setup), np.random.default_rng(seed)
+    time = np.arange(0.0, period, _READ)
+    phase = rng.uniform(0.0, 2.0 * math.pi, (len(limits.axes), 5))
+    wide = 0.15 * limits.half[:, None] / np.arange(1, 6) * 5.0 / np.sqrt(5.0)
+    motion = Excitation(
+        limits.axes, period, limits.middle, wide * np.cos(phase), wide * np.sin(phase), 0, 0, 0
+    ).motion(time)
+    motion[0] = np.clip(motion[0], limits.low, limits.high)
+    found = project(setup.chain, setup.given, *motion)
+    table = regressor(
+        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
+        offsets=False if setup.offsets is None else setup.offsets,
+    )  # fmt: skip
+    forces = np.sqrt(np.mean((table.matrix @ table.nominal) ** 2, axis=0))
+    flat = (table.matrix / noise[:, None]).reshape(-1, len(table.names))
+    asked = np.ones(len(table.names), bool)
+    return told_in_noise(flat, table.names, reference_sizes(table, setup, forces), asked).base
+
+
 def design_excitation(
     machine: Machine, setup: Setup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
     period: float = 20.0, harmonics: int = 8, starts: int = 2, iterations: int = 150,
@@ -167,7 +205,11 @@ def design_excitation(
         return -value + press * float(np.mean(np.maximum(use - 1.0, 0.0) ** 2))
 
     for start in range(starts):
-        x = rng.normal(0.0, 0.15, (k, 1 + 2 * harmonics)).ravel()
+        drawn = [
+            _inside(rng.normal(0.0, 0.3, (k, 1 + 2 * harmonics)).ravel(), measure)
+            for _ in range(_DRAWN)
+        ]
+        x = max(drawn, key=lambda one: measure(one)[0])
         for step, press in enumerate(_PRESS):
             if progress:
                 progress(f"start {start + 1}", (start + step / len(_PRESS)) / starts)

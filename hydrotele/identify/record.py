@@ -7,9 +7,11 @@ import numpy as np
 
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.errors import InputError
+from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import DriveLinkage, axis_linkage
 from hydrotele.kinematics.triangle import LoopOpen
 from hydrotele.machine import Machine
+from hydrotele.noise import noise_rms, sensor_set
 from hydrotele.sensors import SensorError
 
 _WHERE = "identification"
@@ -75,6 +77,33 @@ def records(dataset: Dataset) -> tuple[tuple[Record, ...], Record, tuple[str, ..
         )
     made = [_record(dataset, run, axes) for run in (*dataset.fit, dataset.heldout)]
     return tuple(made[:-1]), made[-1], tuple(notes)
+
+
+def force_noise(machine: Machine, sensors: str) -> np.ndarray:
+    """Noise of all drives' forces with the machine's sensors.
+
+    Args:
+        machine: the machine.
+        sensors: name of its sensors.
+
+    Returns:
+        (k,) standard deviation of a force reading, in actuator order [N] or [N m]; 0 of plain
+        drives.
+
+    Raises:
+        InputError: the machine has no such sensors.
+    """
+    known, out = sensor_set(machine, sensors), []
+    for axis in actuator_order(machine):
+        facts = machine.axes[axis]
+        if facts.force:
+            out.append(0.0)
+            continue
+        sides = zip(facts.hydraulic_drive.areas, ("head", "rod"), strict=True)
+        out.append(float(np.linalg.norm(
+            [area * noise_rms(machine, known, f"pressure_{side}.{axis}") for area, side in sides]
+        )))  # fmt: skip
+    return np.array(out)
 
 
 def whole_cycles(record: Record, period: float) -> Record:
