@@ -13,6 +13,7 @@ import hydrotele
 from hydrotele.datafile import suggest
 from hydrotele.effects import apply_effect
 from hydrotele.errors import InputError
+from hydrotele.feedforward import force_references
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.log import Log
 from hydrotele.machine import Machine
@@ -197,6 +198,7 @@ def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None):
     ticks, rows = scenario.ticks, scenario.rows
     numbers = servo_numbers(plant.machine, plant.axes, scenario.servo, dt)
     drives = drive_references(plant.machine, plan, scenario.servo)
+    forces = force_references(scenario_model(scenario), plan, scenario.servo)
     k = len(plant.axes)
     load, command, commands = np.zeros(k), np.zeros(k), np.empty((ticks, k))
     recorder, stepper = Recorder(plant, rows), Stepper(plant, data, steps)
@@ -208,13 +210,13 @@ def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None):
                 progress(tick * dt, scenario.duration)
         seen.update(tick, data, stepper.past)
         if tick == 0:
-            load[:] = numbers[:, 1] * seen.head - numbers[:, 2] * seen.rod
+            load[:] = numbers[:, 1] * seen.head - numbers[:, 2] * seen.rod - forces.force[0]
         command[:] = plan.command[tick]
         servo_step(
             numbers, plan.closed, drives.velocity[tick], drives.arm[tick],
             drives.volume_head[tick], drives.volume_rod[tick],
             plan.reference[tick - tick % seen.every], seen.joint, seen.rate, seen.head, seen.rod,
-            seen.supply, load, command,
+            seen.supply, load, forces.known, forces.force[tick], forces.rate[tick], command,
         )  # fmt: skip
         commands[tick] = command
         begin = begin if tick else clock.perf_counter()

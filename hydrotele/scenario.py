@@ -152,7 +152,9 @@ class Servo(Facts):
 
     position_gain [1/s], velocity_gain (force drives only) [N s/m] or [N m s/rad], feedforward and
     deadband_compensation as fractions, lead [s] that makes up for the spool's lag,
-    pressure_feedback [1/s] (damping) with load_time [s] of the slow mean force.
+    pressure_feedback [1/s] (damping) with load_time [s] of the slow mean force. With `force_model`
+    the force that is expected follows from inverse dynamics along the reference instead of that
+    mean: of the scenario's own machine (`nominal`), or of another (its name or folder).
     """
 
     position_gain: NonNegative = 4.0
@@ -162,6 +164,7 @@ class Servo(Facts):
     deadband_compensation: Annotated[float, Field(ge=0, le=1)] = 1.0
     load_time: Positive = 0.2
     pressure_feedback: NonNegative = 6.0
+    force_model: str | None = None
 
 
 class PlantedEffect(Facts):

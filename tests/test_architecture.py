@@ -31,15 +31,16 @@ FLOORS = (
     ("kinematics", "hydraulics", "dynamics"),
     ("dataset",),
     ("prediction",),
-    ("simulate", "operate"),
-    ("run", "replay", "summary"),
     ("identify",),
+    ("simulate", "operate"),
+    ("feedforward", "run", "replay", "summary"),
     ("calibrate", "gap"),
     ("show",),
     ("envs", "bench", "sweep", "commands"),
     ("cli",),
 )
 WALLED = {"simulate", "operate", "calibrate", "identify", "gap"}
+_PLAIN = set().union(*FLOORS[:3])
 _FACTS = set().union(*FLOORS[:5])
 # Rooms that see less than all the floors below.
 ONLY = {
@@ -47,6 +48,8 @@ ONLY = {
     "signals": set(),
     "kinematics": {"errors", "drives", "machine"},
     "identify": _FACTS,
+    "simulate": _PLAIN,
+    "operate": _PLAIN,
     "calibrate": {*_FACTS, "identify"},
     "gap": {*_FACTS, "identify"},
 }

@@ -3,8 +3,10 @@
 The wanted piston velocity becomes the valve opening that, at the pressures measured now, keeps the
 drive's force constant while the piston moves at that velocity. That holds through the compression
 of the oil when the direction changes, where a steady flow gain would be wrong by centimetres. Since
-it also takes away the damping that orifices give, the deviation of the force from its slow mean is
-fed back as a velocity.
+it also takes away the damping that orifices give, the deviation of the force from what is expected
+is fed back as a velocity. Expected is its slow mean, or, with computed forces, what inverse
+dynamics asks for along the reference; then the oil that the change of that force compresses is fed
+forward, too, and a plain drive gets the force itself.
 """
 
 import math
@@ -141,7 +143,7 @@ def wanted_opening(
 @compiled
 def servo_step(
     numbers, closed, velocity, arm, volume_head, volume_rod, reference, joint, rate, head, rod,
-    supply, load, out,
+    supply, load, computed, force_ahead, force_rate, out,
 ):  # fmt: skip
     """Commands of all axes for one control period.
 
@@ -159,6 +161,9 @@ def servo_step(
         rod: (k,) measured rod-side pressures [Pa].
         supply: measured supply pressure, scalar [Pa].
         load: (k,) slow mean of the drive force, updated [N] or [N m].
+        computed: whether forces were computed; scalar.
+        force_ahead: (k,) computed force of the drive, of now [N] or [N m].
+        force_rate: (k,) its rate of change, ahead as the velocity [N/s] or [N m/s].
         out: (k,) commands, written where closed [1] or in the drive's unit.
 
     Returns:
@@ -172,17 +177,22 @@ def servo_step(
         if numbers[i, 0] == _FORCE:
             if closed[i]:
                 force = rate_gain * (gain * error + velocity[i] - rate[i])
+                if computed:
+                    force += force_ahead[i]
                 limit = numbers[i, 6]
                 out[i] = min(limit, max(-limit, force / numbers[i, 7]))
             continue
         area_head, area_rod = numbers[i, 1], numbers[i, 2]
         force = area_head * head[i] - area_rod * rod[i]
-        load[i] += numbers[i, 11] * (force - load[i])
+        model = force_ahead[i] if computed else 0.0
+        load[i] += numbers[i, 11] * (force - model - load[i])
         if not closed[i]:
             continue
         stiffness = numbers[i, 12] * (area_head**2 / volume_head[i] + area_rod**2 / volume_rod[i])
         wanted = velocity[i] + gain * arm[i] * error
-        wanted -= numbers[i, 13] * (force - load[i]) / stiffness
+        wanted -= numbers[i, 13] * (force - model - load[i]) / stiffness
+        if computed:
+            wanted += force_rate[i] / stiffness
         opening = wanted_opening(
             wanted, head[i], rod[i], supply, numbers[i, 5], area_head, area_rod, volume_head[i],
             volume_rod[i], numbers[i, 3],

@@ -70,7 +70,7 @@ def one_step(axis, servo=None, error=0.0, velocity=0.0, arm=1.0, rate=0.0, load=
     servo_step(
         numbers, np.arange(4) == k, full(velocity), full(arm), full(0.02), full(0.02), reference,
         full(0.0), full(rate), head, rod, SUPPLY,
-        forces if load is None else load * forces, out,
+        forces if load is None else load * forces, False, full(0.0), full(0.0), out,
     )  # fmt: skip
     assert np.all(np.delete(out, k) == 0.123)  # what is not under feedback keeps its command
     return out[k]
