@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import firwin, upfirdn
+from scipy.signal import upfirdn
 
 from hydrotele.errors import InputError
 from hydrotele.identify.motion import (
@@ -159,8 +159,9 @@ def _low_pass(band: float, period: float) -> tuple[np.ndarray, int]:
     half = round(_TAPS / (band * period))
     if half < 1:
         return np.ones(1), 1
-    weights = firwin(2 * half + 1, band, fs=1.0 / period, window=("kaiser", _KAISER))
-    return weights, max(1, int(1.0 / (2.0 * _SPARE * band * period)))
+    reach = np.arange(-half, half + 1)
+    weights = np.sinc(2.0 * band * period * reach) * np.kaiser(len(reach), _KAISER)
+    return weights / weights.sum(), max(1, int(1.0 / (2.0 * _SPARE * band * period)))
 
 
 def _thinned(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
