@@ -123,10 +123,6 @@ def main() -> None:
             lines.append(f"| {minutes:g} | {seconds:.1f} | {whole:.1f} | {memory:.0f} |")
     lines += ["", "| regressor, 20 000 rows | us per row |", "| --- | ---: |"]
     lines += [f"| {name} | {value:.1f} |" for name, value in throughput(20_000)]
-    lines += [
-        "",
-        f"This process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB",
-    ]
     text = "\n".join(lines) + "\n"
     print(text)
     if asked.out:
