@@ -40,7 +40,7 @@ _NO_FLOOR = (
     " another effect."
 )
 SURE = 0.95  # probability below which an effect is called ambiguous
-DOUBTFUL = 0.5  # largest probability of an effect next to an unknown one
+DOUBTFUL = 0.1  # largest probability next to an unknown effect; 2 of 48 blind ones were true
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _NORMAL95 = 1.96
 Progress = Callable[[str, float], None]
