@@ -77,6 +77,7 @@ def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferen
         chain, found, bodies=setup.bodies, rubbing=setup.rubbing, offsets=setup.offsets or {}
     )
     force = table.matrix @ table.nominal
+    force += np.einsum("nkv,nv->nk", found.share, chain.damping * found.rate)
     ahead = np.minimum(plan.time + servo.lead, plan.time[-1])
     change = np.gradient(force, step, axis=0)
     rate = np.column_stack([np.interp(ahead, plan.time, column) for column in change.T])

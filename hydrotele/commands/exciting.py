@@ -1,5 +1,6 @@
 """`hydrotele excite`: a scenario whose motion tells a machine's parameters best."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hydrotele.errors import InputError
 from hydrotele.identify.excitation import design_excitation, informative_base
 from hydrotele.identify.record import force_noise
 from hydrotele.identify.setup import machine_setup
-from hydrotele.machine_file import load_machine
+from hydrotele.machine_file import load_machine, shipped_machines
 from hydrotele.output import replacing
 from hydrotele.scenario import load_scenario
 
@@ -44,6 +45,10 @@ def excite_to_file(
     named = sensors or next(iter(model.sensors), None)
     if named is None:
         raise InputError(machine, "has no sensors: their noise decides what a motion tells")
+    name = re.sub(r"[^a-z0-9_]", "_", target.stem.lower()).lstrip("_0123456789") or "excitation"
+    if target.suffix.lower() != ".yaml" or not target.parent.is_dir():
+        raise InputError(target, "must be a .yaml file in a folder that is there")
+    place = machine if machine in shipped_machines() else str(Path(machine).resolve())
     setup = machine_setup(model, closed_chain(model))
     noise = np.maximum(force_noise(model, named), 1e-9)
     base = informative_base(model, setup, noise, period, seed)
@@ -52,7 +57,7 @@ def excite_to_file(
             model, setup, noise, base, period=period, harmonics=harmonics, starts=starts,
             seed=seed, progress=progress,
         )  # fmt: skip
-    scenario = found.scenario(target.stem, model, cycles, sensors=named)
+    scenario = found.scenario(name, model, cycles, place, sensors=named)
     with replacing(target, ".yaml") as part:
         text = yaml.safe_dump(scenario, sort_keys=False, default_flow_style=None)
         part.write_text(text, encoding="utf-8")

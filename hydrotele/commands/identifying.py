@@ -180,7 +180,8 @@ def _print(
         out.print(rows)
         out.print(
             f"one-step prediction errors on {dataset.heldout.name}: {hydraulics.before:.3g} times"
-            f" noise as given, {hydraulics.after:.3g} identified; {hydraulics.status}"
+            f" noise with the given hydraulics, {hydraulics.after:.3g} identified;"
+            f" {hydraulics.status}"
         )
 
 

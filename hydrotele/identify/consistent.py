@@ -17,6 +17,7 @@ from hydrotele.identify.regressor import BODY_PARAMETERS, RUBBING
 
 _USUAL = 0.3  # deformation that counts as one standard deviation: masses to 60 %, sizes to 30 %
 _THIN = 1e-4  # of the largest second moment, that a body has at least in every direction
+_CERTAIN = 1e-10  # of the largest variance, below which truncation has left none
 _SIGNED = ("asymmetry",)  # friction that may have either sign
 
 
@@ -66,9 +67,13 @@ def consistent(found: Identification, freedom: Mapping[str, Freedom] | None = No
     pieces = [_Body(found, body, freedom.get(body, Freedom())) for body in bodies]
     taken = {k for piece in pieces for k in piece.places}
     others = np.array([k for k in range(len(found.names)) if k not in taken], int)
-    spread = np.linalg.cholesky(found.estimate.covariance)
-    base = np.linalg.solve(spread, found.told.combination)
-    wanted = np.linalg.solve(spread, found.estimate.value)
+    std = found.estimate.std
+    variances, ways = np.linalg.eigh(
+        found.estimate.covariance / np.outer(*[found.estimate.std] * 2)
+    )
+    whiten = (ways / np.sqrt(np.maximum(variances, _CERTAIN * variances[-1]))).T
+    whiten = whiten / std
+    base, wanted = whiten @ found.told.combination, whiten @ found.estimate.value
     sizes = _sizes(found, others)
     counts = [piece.size for piece in pieces]
     ends = np.cumsum([0, *counts])

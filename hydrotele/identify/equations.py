@@ -8,6 +8,7 @@ from scipy.signal import upfirdn
 
 from hydrotele.errors import InputError
 from hydrotele.identify.motion import (
+    GAP,
     Processing,
     Resolution,
     joint_motion,
@@ -27,7 +28,7 @@ _CHUNK = 8000  # rows at a time, so that long logs need little memory
 _MISSING = 0.1  # part of a low-pass' weight that may lie on missing forces
 _NOISY = 6000  # rows at most on which they are tried
 _DRAWS = 4  # of the motion's errors: an RMS over thousands of rows needs no more
-_WHERE = "equations"
+_NYQUIST = 0.4  # of the sample rate that a band may reach
 
 
 @dataclass(frozen=True)
@@ -37,12 +38,12 @@ class Equations:
     Attributes:
         name: the run's.
         matrix: (n, k, m).
-        force: (n, k) [N] or [N m]; NaN where unknown.
+        force: (n, k) less what the joints' stated damping takes [N] or [N m]; NaN where unknown.
         time: (n,) [s] from the run's start.
         doubt: (n, k) how uncertain the sign of the drives' dry friction is, 0 .. 1.
         force_noise: (k,) standard deviation that the force sensors' noise leaves; NaN if unknown.
-        motion_noise: (k, p) draws of what the motion's errors leave per parameter; see
-            `noise_of`. Empty where not asked for or not known.
+        motion_noise: (k, m, m) second moments of what the motion's errors leave per parameter;
+            see `noise_of`. Empty where not asked for.
     """
 
     name: str
@@ -86,17 +87,23 @@ def build_equations(
     low, thin = _low_pass(band, record.period)
     thin = max(1, thin // _FINE) if with_noise else thin
     count = (len(record.force) - len(low)) // thin + 1
+    if band > _NYQUIST / record.period:
+        raise InputError(
+            record.name, f"a band of {band:g} Hz is too wide for rows of {record.period:g} s: at"
+            f" most {_NYQUIST / record.period:g} Hz",
+        )  # fmt: skip
     if count < 1:
         raise InputError(
             record.name, f"{len(record.force)} rows are too few for a band of {band:g} Hz, which"
             f" needs {len(low)}",
         )  # fmt: skip
-    start, last, parts, doubts = None, None, [], []
+    start, last, parts, doubts, damped = None, None, [], [], []
     weights = np.abs(low) / np.abs(low).sum()
     for first in range(0, count, per_chunk := max(1, _CHUNK // thin)):
         some = min(per_chunk, count - first)
         rows = slice(first * thin, (first + some - 1) * thin + len(low))
-        last, doubt, pose = _rows(setup, motions[:, rows], motion.rate_std[rows], start)
+        last, doubt, damping, pose = _rows(setup, motions[:, rows], motion.rate_std[rows], start)
+        damped.append(_thinned(damping, low, thin))
         parts.append(_thinned(last.matrix, low, thin))
         doubts.append(_thinned(doubt, weights, thin))
         start = pose
@@ -105,11 +112,12 @@ def build_equations(
     spread = np.zeros(0)
     if with_noise:
         spread = _motion_noise(
-            record, setup, processing, found, motions, motion.rate_std, low, thin
+            record.period, setup, processing, found, motions, motion.rate_std, low, thin
         )
     time = (np.arange(count) * thin + (len(low) - 1) / 2) * record.period
     made = Equations(
-        record.name, np.concatenate(parts), _forces(record.force, low, thin), time,
+        record.name, np.concatenate(parts), 
+        _forces(record.force, record.period, low, thin) - np.concatenate(damped), time,
         np.concatenate(doubts), noise, spread,
     )  # fmt: skip
     empty = Regressor(last.matrix[:0], last.drives, last.names, last.units, last.nominal)
@@ -117,16 +125,16 @@ def build_equations(
 
 
 def _motion_noise(
-    record: Record, setup: Setup, processing: Processing, found: Resolution, motions: np.ndarray,
+    period: float, setup: Setup, processing: Processing, found: Resolution, motions: np.ndarray,
     rate_std: np.ndarray, low: np.ndarray, thin: int,
 ) -> np.ndarray:  # fmt: skip
     """What the motion's errors leave in the drives' forces (k, m, m); see `Equations`.
 
     The motion found is taken for the true one, whose rates are certain.
     """
-    rows = slice(0, min(_NOISY, len(record.position)))
+    rows = slice(0, max(_NOISY, 4 * len(low)))
     truth = _thinned(_rows(setup, motions[:, rows], None, None)[0].matrix, low, thin)
-    draws = motion_errors(record.position[rows], record.period, found, processing, _DRAWS)
+    draws = motion_errors(motions[0, rows], period, found, processing, _DRAWS)
     total = np.zeros((truth.shape[1], truth.shape[2], truth.shape[2]))
     for draw in draws:
         moved, *_ = _rows(setup, motions[:, rows] + draw, rate_std[rows], None)
@@ -136,7 +144,7 @@ def _motion_noise(
 
 
 def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start: np.ndarray | None):
-    """Regressor of some rows (3, n, k), doubt of the signs, and the pose (v,) of the last row."""
+    """Some rows (3, n, k): regressor, doubt of the signs, forces of damping, and the last pose."""
     chain = setup.chain
     found = project(chain, setup.given, *motions, start=start)
     given = [chain.index(name) for name in setup.given]
@@ -151,7 +159,8 @@ def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start:
     doubt = np.zeros((len(found.rate), len(table.drives)))
     if spread is not None:
         doubt = sign_doubt(chain, found, table.drives, setup.rubbing, spread)
-    return table, doubt, found.position[-1]
+    damping = np.einsum("nkv,nv->nk", found.share, chain.damping * found.rate)
+    return table, doubt, damping, found.position[-1]
 
 
 def _low_pass(band: float, period: float) -> tuple[np.ndarray, int]:
@@ -176,15 +185,23 @@ def _thinned(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
     return out[first : first + count].reshape(count, *values.shape[1:])
 
 
-def _forces(force: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
+def _forces(force: np.ndarray, period: float, low: np.ndarray, thin: int) -> np.ndarray:
     """Low-passed forces (n, k); short gaps are bridged, long ones leave NaN."""
     known = np.isfinite(force)
+    far = np.zeros_like(known)
     filled, rows = np.zeros_like(force), np.arange(len(force))
     for k in range(force.shape[1]):
-        if known[:, k].any():
+        if not known[:, k].any():
+            far[:, k] = True
+        else:
+            places = rows[known[:, k]]
+            after = np.searchsorted(places, rows).clip(0, len(places) - 1)
+            before = (after - 1).clip(0)
+            near = np.minimum(np.abs(places[after] - rows), np.abs(places[before] - rows))
+            far[:, k] = near * period > 0.5 * GAP
             filled[:, k] = np.interp(rows, rows[known[:, k]], force[known[:, k], k])
     out = _thinned(filled, low, thin)
-    missing = _thinned((~known).astype(float), np.abs(low) / np.abs(low).sum(), thin)
+    missing = _thinned(far.astype(float), np.abs(low) / np.abs(low).sum(), thin)
     out[missing > _MISSING] = np.nan
     return out
 

@@ -61,13 +61,16 @@ class Excitation:
             -(s * turn**2) @ self.sin.T - (c * turn**2) @ self.cos.T,
         ])  # fmt: skip
 
-    def scenario(self, name: str, machine: Machine, cycles: float, **more: Any) -> dict[str, Any]:
+    def scenario(
+        self, name: str, machine: Machine, cycles: float, found_at: str | None = None, **more: Any
+    ) -> dict[str, Any]:
         """Scenario that runs it, as `hydrotele run` reads it.
 
         Args:
             name: of the scenario.
             machine: the machine.
             cycles: periods to run after the fade-in.
+            found_at: its name or folder for the scenario; its name by default.
             more: further keys, such as `sensors`.
         """
         fade = 0.25 * self.period
@@ -77,7 +80,7 @@ class Excitation:
         }
         start = {machine.axes[a].joint: float(m) for a, m in zip(self.axes, self.mean, strict=True)}
         return {
-            "name": name, "machine": machine.name, "tool": machine.tool,
+            "name": name, "machine": found_at or machine.name, "tool": machine.tool,
             "duration": float(fade + cycles * self.period), "control_rate": 50, "ground": False,
             "start": {"joints": start},
             "pilot": {"kind": "fourier", "period": float(self.period), "fade": fade, "axes": axes},
@@ -170,10 +173,16 @@ def design_excitation(
         The best motion found.
 
     Raises:
-        InputError: no start moves within the limits, or an axis has no range.
+        InputError: no start moves within the limits, or the machine has plain drives, whose
+            feedback nobody has tuned.
 
     Source: Abdellatif 2008, section 4; Swevers et al. 1997.
     """
+    if plain := [name for name, axis in machine.axes.items() if axis.force]:
+        raise InputError(
+            _WHERE, f"{', '.join(plain)} has a plain drive, whose feedback depends on its use:"
+            " write a scenario with a `fourier` pilot and a `servo` of your own",
+        )  # fmt: skip
     limits = _Limits(machine, setup)
     rows = max(60, _ROWS * harmonics)
     time = np.arange(rows) * period / rows
@@ -216,9 +225,9 @@ def design_excitation(
             x = minimize(cost, x, (press,), method="L-BFGS-B", options={"maxiter": iterations}).x
         x = _inside(x, measure)
         value, use = measure(x)
-        if best is None or value > best[0]:
+        if use.max() <= 1.0 and (best is None or value > best[0]):
             best = (value, x, float(use.max()))
-    if best is None or best[2] > 1.0 + 1e-6:
+    if best is None:
         raise InputError(_WHERE, "no motion within the limits was found: give more starts")
     value, x, worst = best
     made = excitation(x)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hydrotele.identify.identification import Identification, identify
-from hydrotele.identify.record import Record
+from hydrotele.identify.record import Record, trimmed
 from hydrotele.identify.setup import Setup
 
 _TRIED = 600.0  # s of data that tell the shape
@@ -37,7 +37,7 @@ def identify_with_shapes(
         return identify(fit, heldout, setup, *args, **options)
     started = time.perf_counter()
     sharp = replace(setup, rubbing=tuple(replace(one, smoothing=0.0) for one in setup.rubbing))
-    some, judged = [_head(record, _TRIED / len(fit)) for record in fit], _head(heldout, _TRIED)
+    some, judged = _some(fit), _head(heldout)
     misfits = [_misfit(identify(some, judged, s, *args, **options)) for s in (setup, sharp)]
     found = identify(fit, heldout, setup if misfits[0] <= misfits[1] else sharp, *args, **options)
     found = replace(found, seconds=time.perf_counter() - started)
@@ -47,10 +47,21 @@ def identify_with_shapes(
     return replace(found, notes=(*found.notes, note))
 
 
-def _head(record: Record, seconds: float) -> Record:
-    """The first seconds of a record."""
-    rows = max(2, round(seconds / record.period))
-    return replace(record, position=record.position[:rows], force=record.force[:rows])
+def _some(fit: Sequence[Record]) -> list[Record]:
+    """The first runs, as many as last long enough; one that alone is longer is cut."""
+    some, seconds = [], 0.0
+    for record in fit:
+        some.append(_head(record))
+        seconds += len(record.force) * record.period
+        if seconds >= _TRIED:
+            break
+    return some
+
+
+def _head(record: Record) -> Record:
+    """The first part of a record."""
+    rows = round(_TRIED / record.period)
+    return trimmed(replace(record, position=record.position[:rows], force=record.force[:rows]))
 
 
 def _misfit(found: Identification) -> float:

@@ -76,7 +76,8 @@ class Hydraulics:
     Attributes:
         numbers: the identified numbers.
         machine: the machine that has those which the data tell.
-        before: RMS of the held-out run's whitened one-step prediction errors as given [1].
+        before: RMS of the held-out run's whitened one-step prediction errors with the machine that
+            the search started from [1]; where the sensors state no noise it is 1 by construction.
         after: the same with the identified machine.
         status: `ok`, or what is wrong and what to do about it.
         seconds: that it took.

@@ -19,6 +19,7 @@ from hydrotele.identify.regressor import RUBBING, Regressor
 from hydrotele.identify.setup import Setup
 
 Weighting = Literal["gauss_markov", "drives", "none"]
+_LEAST = 4.0  # periods of the band that a run must have: its low-pass takes three
 _WORSE = 1.5  # times the noise; beyond it the model lacks something
 _WHERE = "identification"
 
@@ -127,6 +128,8 @@ def identify(
     Source: Khoshzaban 1992, chapter 4; Abdellatif 2008, section 4.
     """
     started = time.perf_counter()
+    if ridge < 0.0 or not 0.0 <= cut < 1.0:
+        raise InputError(_WHERE, f"ridge must not be negative and cut below 1: {ridge}, {cut}")
     processing = processing or Processing()
     judging = processing
     if processing.method == "periodic":
@@ -136,10 +139,14 @@ def identify(
     resolved = [resolution(r.position, r.period, r.position_noise) for r in (*fit, heldout)]
     band = processing.band or min(found.band for found in resolved[:-1])
     processing, judging = replace(processing, band=band), replace(judging, band=band)
-    made = [
-        build_equations(record, setup, processing, found)
-        for record, found in zip(fit, resolved, strict=False)
-    ]
+    notes, made = list(notes), []
+    for record, found in zip(fit, resolved, strict=False):
+        if len(record.force) * record.period * band < _LEAST:
+            notes.append(f"{record.name} is too short for a band of {band:.3g} Hz; left out.")
+            continue
+        made.append(build_equations(record, setup, processing, found))
+    if not made:
+        raise InputError(_WHERE, f"all runs are too short for a band of {band:.3g} Hz: log longer")
     table, runs = made[0][1], [equations for equations, _ in made]
     matrix, force = stacked(runs, lambda e: e.matrix), stacked(runs, lambda e: e.force)
     drives = [k for k in range(force.shape[1]) if np.isfinite(force[:, k]).any()]
@@ -147,6 +154,13 @@ def identify(
         raise InputError(_WHERE, "no drive has a known force in any run: log both its pressures")
     matrix, force = matrix[:, drives], force[:, drives]
     there = np.isfinite(force).all(axis=1)
+    notes += [
+        f"{e.name} lacks the force of {', '.join(lost)} throughout; left out."
+        for e in runs
+        if (lost := [table.drives[k] for k in drives if np.isnan(e.force[:, k]).all()])
+    ]
+    if not there.any():
+        raise InputError(_WHERE, "no run has the forces of all drives that any run has")
     matrix, force = matrix[there], force[there]
     doubt = stacked(runs, lambda e: e.doubt)[there][:, drives]
     structure = identifiability(_flat(matrix), table.names, table.units)
@@ -155,7 +169,7 @@ def identify(
     first = _fit(matrix, force, table, structure, 0.0, 0.0)
     weight = _weights(first, doubt)
     matrix, force = weight[:, :, None] * matrix, weight * force
-    told = _told(matrix, force, table, structure, setup, resting)
+    told = _told(matrix, force, table, structure, setup, resting, [table.drives[k] for k in drives])
     found = _fit(matrix, force, table, told, ridge, cut)
     value = table.nominal.copy()
     value[told.base] += found.value - told.combination @ table.nominal
@@ -200,7 +214,7 @@ def _weights(first: Estimate, doubt: np.ndarray) -> np.ndarray:
 
 def _told(
     matrix: np.ndarray, force: np.ndarray, table: Regressor, structure: Identifiability,
-    setup: Setup, resting: Sequence[str],
+    setup: Setup, resting: Sequence[str], drives: Sequence[str],
 ) -> Identifiability:  # fmt: skip
     """What these data tell in spite of their noise.
 
@@ -210,7 +224,7 @@ def _told(
         raise InputError(_WHERE, "no parameter has an effect on the forces of this motion")
     first = _fit(matrix, force, table, structure, 0.0, 0.0)
     noise = _long_run(first.residual)
-    sizes = reference_sizes(table, setup, np.sqrt(np.mean(force**2, axis=0)))
+    sizes = reference_sizes(table, setup, np.sqrt(np.mean(force**2, axis=0)), drives)
     held = {f"{kind}.{drive}" for kind in RUBBING for drive in resting}
     asked = np.array([name not in held for name in table.names])
     told = told_in_noise(_flat(matrix / noise[:, None]), table.names, sizes, asked)
@@ -269,6 +283,8 @@ def _status(heldout: dict[str, HeldOut], still: np.ndarray, setup: Setup) -> str
             f"{names} stood still: what shows only in motion of it is not told, and kept as given;"
             " log a motion of all axes, fast and in many poses"
         )
+    if not heldout:
+        return "the held-out run has no known force: nothing was judged; hold out another one"
     worse = [d for d, h in heldout.items() if h.rms > _WORSE * h.noise_rms]
     if worse:
         return (

@@ -8,7 +8,7 @@ from hydrotele.identify.identification import Identification
 from hydrotele.machine import Machine
 from hydrotele.sensors import SensorError
 
-_SURE = 2.0  # standard deviations from which an offset is written
+_SURE = 2.0  # standard deviations by which an offset must differ to be written
 _FRICTION = {"coulomb": "coulomb", "stribeck": "stribeck_extra", "viscous": "viscous"}
 
 
@@ -112,7 +112,7 @@ def _with_offset(
         return machine
     k = found.names.index(name)
     spread = {int(b): s for b, s in zip(found.told.base, found.estimate.std, strict=True)}
-    if k not in spread or abs(numbers[name]) < _SURE * spread[k]:
+    if k not in spread or abs(numbers[name] - found.nominal[k]) < _SURE * spread[k]:
         return machine
     facts = machine.axes[axis]
     if facts.force:

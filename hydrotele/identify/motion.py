@@ -20,7 +20,7 @@ _BAND = 0.5  # of the bandwidth is compared: there accelerations still stand abo
 _CONTENT = 0.98  # of an acceleration's power, beyond which forces tell of other things than motion
 _LINES = 10.0  # of the record's own lines lie in the band at least
 _MOVES = 10.0  # standard deviations of the noise, from which a joint counts as moved
-_GAP = 0.1  # s without samples that a filter may bridge
+GAP = 0.1  # s without samples that a filter may bridge
 _WHERE = "signal processing"
 
 
@@ -50,6 +50,10 @@ class Processing:
             raise InputError(_WHERE, f"{self.method!r} is not known: {', '.join(METHODS)}")
         if self.band is not None and not (math.isfinite(self.band) and self.band > 0):
             raise InputError(_WHERE, f"the band must be positive, got {self.band} Hz")
+        if self.period is not None and not (math.isfinite(self.period) and self.period > 0):
+            raise InputError(_WHERE, f"the period must be positive, got {self.period} s")
+        if self.harmonics < 0:
+            raise InputError(_WHERE, f"harmonics must be 0 or more, got {self.harmonics}")
         if self.method == "periodic" and not self.period:
             raise InputError(_WHERE, "periodic needs the period of the motion [s]")
 
@@ -129,7 +133,7 @@ def joint_motion(
         return smooth(positions, period, noise)
     if processing.method == "zero_phase":
         cutoff = min(_KEPT * found.bandwidth, 0.4 / period)
-        moving = zero_phase(positions, period, cutoff, noise, bridge=round(_GAP / period))
+        moving = zero_phase(positions, period, cutoff, noise, bridge=round(GAP / period))
         if found.moves.all():
             return moving
         return _rested(moving, smooth(positions, period, noise), found.moves)

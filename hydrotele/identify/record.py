@@ -57,6 +57,12 @@ def records(dataset: Dataset) -> tuple[tuple[Record, ...], Record, tuple[str, ..
     Raises:
         InputError: no axis has both a position and a force.
     """
+    for axis, facts in dataset.machine.axes.items():
+        if facts.transmission:
+            raise InputError(
+                _WHERE, f"{axis} has a transmission (backlash or flexibility) between drive and"
+                " load: what is measured of one does not tell the other",
+            )  # fmt: skip
     axes = tuple(axis for axis in dataset.axes if _positions(dataset, axis))
     forced = [axis for axis in axes if _force_channels(dataset, axis) is not None]
     notes = [f"{a} has no position sensor: nothing is known of it." for a in dataset.axes
@@ -139,7 +145,30 @@ def _record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> Record:
     for k, axis in enumerate(axes):
         position[:, k], position_noise[k] = _position(dataset, run, axis)
         force[:, k], force_noise[k] = _force(dataset, run, axis)
-    return Record(run.name, run.period, tuple(axes), position, position_noise, force, force_noise)
+    return trimmed(
+        Record(run.name, run.period, tuple(axes), position, position_noise, force, force_noise)
+    )
+
+
+def trimmed(record: Record) -> Record:
+    """The rows from the first to the last at which every position was read.
+
+    Args:
+        record: the record.
+
+    Returns:
+        It without rows at its ends that filters could not bridge.
+
+    Raises:
+        InputError: a position is never read.
+    """
+    known = np.isfinite(record.position)
+    for axis, column in zip(record.axes, known.T, strict=True):
+        if not column.any():
+            raise InputError(record.name, f"has no good position of {axis}: leave this run out")
+    first = int(known.argmax(axis=0).max())
+    last = len(known) - int(known[::-1].argmax(axis=0).max())
+    return replace(record, position=record.position[first:last], force=record.force[first:last])
 
 
 def _positions(dataset: Dataset, axis: str) -> list[str]:
@@ -203,7 +232,9 @@ def _force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float
         return np.full(len(run.command), np.nan), float("nan")
     if facts.force:
         command = run.command[:, dataset.axes.index(axis)]
-        return np.where(run.command_known, facts.force.gain * command, np.nan), 0.0
+        rows = np.arange(len(command)) - facts.command_delay / run.period
+        late = np.maximum(np.floor(rows + 1e-9), 0.0).astype(int)
+        return np.where(run.command_known, facts.force.gain * command, np.nan)[late], 0.0
     (head, noise_head), (rod, noise_rod) = (_reading(dataset, run, c) for c in channels)
     area_head, area_rod = facts.hydraulic_drive.areas
     return area_head * head - area_rod * rod, float(

@@ -1,5 +1,7 @@
 """How large parameters are, to tell whether data say anything about them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hydrotele.identify.regressor import BODY_PARAMETERS, Regressor
@@ -10,7 +12,9 @@ _SPEED = 0.1  # m/s or rad/s, at which viscous friction may be as large
 _LEVER = 0.1  # m: friction of a pin acts on its radius, that of a drive on a lever ten times longer
 
 
-def reference_sizes(table: Regressor, setup: Setup, forces: np.ndarray) -> np.ndarray:
+def reference_sizes(
+    table: Regressor, setup: Setup, forces: np.ndarray, drives: Sequence[str] | None = None
+) -> np.ndarray:
     """Sizes of all parameters.
 
     A body's are its given mass and radius of gyration; friction's are as given, and at least a
@@ -19,13 +23,15 @@ def reference_sizes(table: Regressor, setup: Setup, forces: np.ndarray) -> np.nd
     Args:
         table: the parameters.
         setup: of the regressor.
-        forces: (k,) RMS of the drives' forces [N] or [N m].
+        forces: (k,) RMS of drives' forces [N] or [N m].
+        drives: names of these drives; the table's by default.
 
     Returns:
         (m,) positive, in the parameters' units.
     """
     chain = setup.chain
-    known = {d: float(f) for d, f in zip(table.drives, forces, strict=False)}
+    names = table.drives if drives is None else drives
+    known = {d: float(f) for d, f in zip(names, forces, strict=True)}
     usual = float(np.max(forces)) if len(forces) else 1.0
     sizes = []
     for name, given in zip(table.names, table.nominal, strict=True):

@@ -68,7 +68,7 @@ def _header(
             ("after", f"{100 * h.relative:.2f} %", f"{against}error of the {name}'s force")
         )
     if hydraulics:
-        said_of = f"one-step prediction errors ({hydraulics.before:.2f} as given)"
+        said_of = f"one-step prediction errors ({hydraulics.before:.2f} before)"
         cards.append(("after", f"{hydraulics.after:.2f} × noise", said_of))
     status = found.status if found else hydraulics.status if hydraulics else ""
     good = status == "ok" and (hydraulics is None or hydraulics.status == "ok")
