@@ -195,3 +195,42 @@ def test_processing_refuses_nonsense():
         Processing(band=-1.0)
     with pytest.raises(InputError, match="needs the period"):
         Processing("periodic")
+
+
+@needs_measured
+def test_pressures_that_are_read_half_as_often_are_enough(clean, found):
+    fit, heldout, setup = clean
+
+    def slower(record):
+        force = record.force.copy()
+        force[1::2] = np.nan
+        return dataclasses.replace(record, force=force)
+
+    again = identify([slower(r) for r in fit], slower(heldout), setup)
+    truth = again.told.combination @ again.nominal
+    away = np.abs(again.estimate.value - truth) / again.estimate.std
+    # as above; bridged samples carry twice the noise's variance
+    assert np.sum(away > 1.96) <= 4
+
+
+@needs_measured
+def test_a_short_run_is_left_out_with_a_note(clean):
+    fit, heldout, setup = clean
+    short = dataclasses.replace(
+        fit[0], name="blink", position=fit[0].position[:60], force=fit[0].force[:60]
+    )
+    found = identify([*fit[1:], short], heldout, setup)
+    assert any("blink is too short" in note for note in found.notes)
+
+
+@needs_measured
+@pytest.mark.parametrize("options", [{"ridge": -1.0}, {"cut": 1.0}, {"cut": -0.1}])
+def test_options_without_sense_are_refused(clean, options):
+    with pytest.raises(InputError, match="ridge"):
+        identify(*clean, **options)
+
+
+@needs_measured
+def test_a_band_beyond_the_samples_is_refused(clean):
+    with pytest.raises(InputError, match="too wide"):
+        identify(*clean, Processing(band=40.0))

@@ -98,3 +98,15 @@ def test_what_nothing_can_be_told_of_is_refused():
     pressures = [f"pressure_{side}.{axis}" for side in ("head", "rod") for axis in AXES]
     with pytest.raises(InputError, match="no force is known"):
         records(made_up(drop=pressures))
+
+
+def test_ends_without_a_position_are_cut():
+    data = made_up()
+    late = {"angle.swing": SensorError(delay=0.05)}
+    other = dataclasses.replace(
+        data, machine=data.machine.model_copy(update={"sensor_errors": late})
+    )
+    fit, _, _ = records(other)
+    # the last readings of a late sensor tell of earlier times: 2.5 rows
+    assert len(fit[0].position) == len(fit[0].force) == ROWS - 3
+    assert np.isfinite(fit[0].position).all()
