@@ -2,7 +2,7 @@
 
 Whitened errors of a perfect model are white noise of size 1 in every channel. The limits lie well
 above what integrators and linearisation leave on clean simulated machines, whose worst channels
-reach 1.03, 1.3 and 25 (`docs/results/gap_calibration.md`), and far below what an effect of some
+reach 1.02, 1.4 and 25 (`docs/results/gap_calibration.md`), and far below what an effect of some
 size leaves (3, 54 and 3100 on open_02).
 """
 

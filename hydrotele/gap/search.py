@@ -10,7 +10,7 @@ from hydrotele.prediction.evidence import Evidence, Fit, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
 from hydrotele.prediction.track import COARSE
 
-ENTER = 15.0  # twice the log evidence an effect must bring; thrice what 56 clean machines reach
+ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines stay below 14.7
 MOST = 3  # effects that one search names
 _ODDS = 6.0  # score by which a candidate too small to name must lead another, 20 to 1
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
