@@ -31,8 +31,14 @@ def hydrotele_process(*words, **facts) -> subprocess.Popen:
     env = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "COLUMNS": "200"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | facts
     return subprocess.Popen(
-        [sys.executable, "-m", "hydrotele.cli", *map(str, words)], env=env, **pipes
-    )
+        [sys.executable, "-m", "hydrotele.cli", *map(str, words)], env=env, **pipes,
+        preexec_fn=_heed_interrupts,
+    )  # fmt: skip
+
+
+def _heed_interrupts() -> None:
+    """A shell's job in the background ignores them, and so do all programs that it starts."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_for_work(process: subprocess.Popen, seconds: float) -> None:
