@@ -176,6 +176,15 @@ def identify(
     ] = None,
     period: Annotated[float | None, typer.Option(help="Period of a repeated motion [s].")] = None,
     harmonics: Annotated[int, typer.Option(help="Harmonics of it to keep; 0: enough.")] = 0,
+    estimator: Annotated[
+        str,
+        typer.Option(
+            help="weighted, gauss_markov, least_squares or instruments (needs the period)."
+        ),
+    ] = "weighted",
+    keep_bias: Annotated[
+        bool, typer.Option("--keep-bias", help="Leave in what the positions' noise does to it.")
+    ] = False,
     ridge: Annotated[float, typer.Option(help="Ridge, share of the largest singular value.")] = 0.0,
     truncate: Annotated[float, typer.Option(help="Leave out smaller singular values.")] = 0.0,
     force: Annotated[
@@ -185,12 +194,16 @@ def identify(
 ) -> None:
     """Identify masses, friction and hydraulics from measured logs; write the identified machine."""
     from hydrotele.commands.identifying import Choices, identify_to_folder
+    from hydrotele.identify.estimation import Estimator
     from hydrotele.identify.motion import Processing
 
     choices = Choices(
         model="reduced" if reduced else "complete", pins=pins, asymmetry=asymmetry,
         processing=Processing(processing, band, period, harmonics),  # pyright: ignore - checks itself
-        ridge=ridge, cut=truncate, hydraulics=hydraulics,
+        estimator=Estimator(
+            estimator, ridge, truncate, **({"pairs": 0} if keep_bias else {})  # pyright: ignore
+        ),
+        hydraulics=hydraulics,
     )  # fmt: skip
     identify_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, choices, force

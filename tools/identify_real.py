@@ -17,11 +17,11 @@ from hydrotele.commands.identifying import closed_chain
 from hydrotele.dataset.load import load_dataset
 from hydrotele.identify.chain import Chain, load_chain
 from hydrotele.identify.friction_shape import identify_with_shapes
-from hydrotele.identify.identification import Identification
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.parameter_rows import parameter_rows
 from hydrotele.identify.record import Record, records
 from hydrotele.identify.regressor import Rubbing
+from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.log import load_log
 from hydrotele.machine_file import load_machine

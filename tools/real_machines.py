@@ -76,11 +76,12 @@ def velocity_fit(machine: Machine, data: Dataset, cutoff: float) -> dict[str, fl
 
 
 def named(gap: Gap) -> str:
-    """What was named."""
+    """What was named, with its rivals and the probability that they leave."""
     return "; ".join(
         f"{e.name}({e.location}), "
         + ", ".join(f"{k} {p.value:.4g} [{p.low:.4g}, {p.high:.4g}] {p.unit}"
                     for k, p in e.parameters.items())
+        + "".join(f", {e.probability:.2f}, or {a.name}({a.location})" for a in e.alternatives)
         for e in gap.effects
     )  # fmt: skip
 

@@ -12,14 +12,15 @@ from hydrotele.commands.opening import data_name, machine_of
 from hydrotele.dataset.load import Dataset, load_dataset
 from hydrotele.errors import InputError
 from hydrotele.identify.chain import Chain, load_chain
+from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.friction_shape import identify_with_shapes
 from hydrotele.identify.hydraulic import Hydraulics, identify_hydraulics
-from hydrotele.identify.identification import Identification
 from hydrotele.identify.identified_machine import identified_machine
 from hydrotele.identify.identify_json import identify_document
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.parameter_rows import MEANING, counts, parameter_rows
 from hydrotele.identify.record import records
+from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import Model, cylinder_bars, machine_setup
 from hydrotele.machine import Machine
 from hydrotele.machine_file import MACHINE_FILE, save_machine
@@ -37,8 +38,7 @@ class Choices:
         pins: friction in joints and closures without drive.
         asymmetry: viscous friction that depends on the direction.
         processing: of the signals.
-        ridge: of the estimator.
-        cut: of the estimator.
+        estimator: of the parameters.
         hydraulics: whether valves, oil and supply are identified, too.
     """
 
@@ -46,8 +46,7 @@ class Choices:
     pins: bool = False
     asymmetry: bool = False
     processing: Processing = dataclasses.field(default_factory=Processing)
-    ridge: float = 0.0
-    cut: float = 0.0
+    estimator: Estimator = dataclasses.field(default_factory=Estimator)
     hydraulics: bool = False
 
 
@@ -124,8 +123,7 @@ def identify_mechanism(
         asymmetry=choices.asymmetry,
     )  # fmt: skip
     found = identify_with_shapes(
-        fit, heldout, setup, choices.processing, ridge=choices.ridge, cut=choices.cut,
-        notes=(*dataset.notes, *said),
+        fit, heldout, setup, choices.processing, choices.estimator, notes=(*dataset.notes, *said)
     )  # fmt: skip
     patched, _ = identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
     return found, patched, ""

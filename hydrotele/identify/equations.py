@@ -12,13 +12,13 @@ from hydrotele.identify.motion import (
     Processing,
     Resolution,
     joint_motion,
-    motion_errors,
     rate_spread,
 )
 from hydrotele.identify.projection import project
 from hydrotele.identify.record import Record
 from hydrotele.identify.regressor import Regressor, regressor, sign_doubt
 from hydrotele.identify.setup import Setup
+from hydrotele.identify.smoothing import error_draws, smooth
 
 _TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
 _KAISER = 5.0  # its ripple is 50 dB down
@@ -37,6 +37,7 @@ class Equations:
 
     Attributes:
         name: the run's.
+        band: of the low-pass [Hz].
         matrix: (n, k, m).
         force: (n, k) less what the joints' stated damping takes [N] or [N m]; NaN where unknown.
         time: (n,) [s] from the run's start.
@@ -47,6 +48,7 @@ class Equations:
     """
 
     name: str
+    band: float
     matrix: np.ndarray
     force: np.ndarray
     time: np.ndarray
@@ -84,7 +86,7 @@ def build_equations(
     band = processing.band or found.band
     motion = joint_motion(record.position, record.period, found, processing)
     motions = np.stack([motion.value, motion.rate, motion.acceleration])
-    low, thin = _low_pass(band, record.period)
+    low, thin = low_pass(band, record.period)
     thin = max(1, thin // _FINE) if with_noise else thin
     count = (len(record.force) - len(low)) // thin + 1
     if band > _NYQUIST / record.period:
@@ -111,12 +113,10 @@ def build_equations(
     noise = np.sqrt(np.sum(low**2)) * record.force_noise
     spread = np.zeros(0)
     if with_noise:
-        spread = _motion_noise(
-            record.period, setup, processing, found, motions, motion.rate_std, low, thin
-        )
+        spread = _motion_noise(record, setup, found, motions, motion.rate_std, low, thin)
     time = (np.arange(count) * thin + (len(low) - 1) / 2) * record.period
     made = Equations(
-        record.name, np.concatenate(parts), 
+        record.name, band, np.concatenate(parts), 
         _forces(record.force, record.period, low, thin) - np.concatenate(damped), time,
         np.concatenate(doubts), noise, spread,
     )  # fmt: skip
@@ -125,22 +125,46 @@ def build_equations(
 
 
 def _motion_noise(
-    period: float, setup: Setup, processing: Processing, found: Resolution, motions: np.ndarray,
+    record: Record, setup: Setup, found: Resolution, motions: np.ndarray,
     rate_std: np.ndarray, low: np.ndarray, thin: int,
 ) -> np.ndarray:  # fmt: skip
     """What the motion's errors leave in the drives' forces (k, m, m); see `Equations`.
 
-    The motion found is taken for the true one, whose rates are certain.
+    True motions that the positions allow are drawn about the optimal smoother's; their rates are
+    certain.
     """
     rows = slice(0, max(_NOISY, 4 * len(low)))
-    truth = _thinned(_rows(setup, motions[:, rows], None, None)[0].matrix, low, thin)
-    draws = motion_errors(motions[0, rows], period, found, processing, _DRAWS)
-    total = np.zeros((truth.shape[1], truth.shape[2], truth.shape[2]))
-    for draw in draws:
-        moved, *_ = _rows(setup, motions[:, rows] + draw, rate_std[rows], None)
-        error = _thinned(moved.matrix, low, thin) - truth
+    smoothed = smooth(record.position[rows], record.period, found.noise)
+    likely = np.stack([smoothed.value, smoothed.rate, smoothed.acceleration])
+    taken = _rows(setup, motions[:, rows], rate_std[rows], None)[0].matrix
+    total = np.zeros((taken.shape[1], taken.shape[2], taken.shape[2]))
+    for draw in error_draws(smoothed, _DRAWS):
+        error = _thinned(taken - _rows(setup, likely - draw, None, None)[0].matrix, low, thin)
         total += np.einsum("nkm,nkl->kml", error, error)
-    return total / (len(truth) * _DRAWS)
+    return total / (len(error) * _DRAWS)
+
+
+def row_forces(
+    setup: Setup, motions: np.ndarray, value: np.ndarray, rate_std: np.ndarray | None = None
+) -> np.ndarray:
+    """Drive forces along a motion.
+
+    Args:
+        setup: what the regressor is built of.
+        motions: (3, n, k) positions, rates and accelerations of the given joints.
+        value: (m,) parameters.
+        rate_std: (n, k) of the rates [rad/s] or [m/s]; None if they are certain.
+
+    Returns:
+        (n, k) [N] or [N m].
+    """
+    out, start = [], None
+    for first in range(0, motions.shape[1], _CHUNK):
+        rows = slice(first, first + _CHUNK)
+        spread = None if rate_std is None else rate_std[rows]
+        table, _, damping, start = _rows(setup, motions[:, rows], spread, start)
+        out.append(table.matrix @ value + damping)
+    return np.concatenate(out)
 
 
 def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start: np.ndarray | None):
@@ -163,8 +187,16 @@ def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start:
     return table, doubt, damping, found.position[-1]
 
 
-def _low_pass(band: float, period: float) -> tuple[np.ndarray, int]:
-    """Weights of a low-pass without lag, and how many rows make one equation."""
+def low_pass(band: float, period: float) -> tuple[np.ndarray, int]:
+    """Low-pass without lag.
+
+    Args:
+        band: of the equations [Hz].
+        period: between rows [s].
+
+    Returns:
+        Weights, their number odd, and how many rows make one equation.
+    """
     half = round(_TAPS / (band * period))
     if half < 1:
         return np.ones(1), 1

@@ -26,12 +26,14 @@ class Estimate:
         value: (p,) in the parameters' SI units.
         covariance: (p, p).
         residual: (n, k) measured less predicted force [N] or [N m].
+        gain: (p, n, k) of the forces: how the value follows from each; 0 for rows left out.
         condition: ratio of the singular values of the weighted, scaled equations.
     """
 
     value: np.ndarray
     covariance: np.ndarray
     residual: np.ndarray
+    gain: np.ndarray
     condition: float
 
     @property
@@ -102,7 +104,9 @@ def estimate(
     error = y - x @ value
     follow = autoregression(error, order)
     spread = _carried(inverse, error, follow) * y.size / (y.size - x.shape[2])
-    return Estimate(value, spread, forces - matrix @ value, condition)
+    gain = np.zeros((len(value), *forces.shape))
+    gain[:, there] = inverse @ white
+    return Estimate(value, spread, forces - matrix @ value, gain, condition)
 
 
 class _Shape(NamedTuple):

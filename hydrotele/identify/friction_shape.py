@@ -6,17 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.identify.identification import Identification, identify
-from hydrotele.identify.record import Record, trimmed
+from hydrotele.identify.estimation import Estimator
+from hydrotele.identify.identification import fit_runs, identify
+from hydrotele.identify.motion import Processing
+from hydrotele.identify.record import Record, beginning
+from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import Setup
 
 _TRIED = 600.0  # s of data that tell the shape
 
 
 def identify_with_shapes(
-    fit: Sequence[Record], heldout: Record, setup: Setup, *args, **options
-) -> Identification:
-    """Identify with friction as smooth as the machine states, and with a sharp sign.
+    fit: Sequence[Record], heldout: Record, setup: Setup,
+    processing: Processing | None = None, estimator: Estimator | None = None, *,
+    notes: Sequence[str] = (),
+) -> Identification:  # fmt: skip
+    """Identify with friction as smooth as the machine states, or with a sharp sign.
 
     A machine's smoothing velocity often only helps a simulator; sharp friction is Coulomb's own.
 
@@ -24,8 +29,9 @@ def identify_with_shapes(
         fit: as of `identify`.
         heldout: as of `identify`.
         setup: as of `identify`.
-        args: as of `identify`.
-        options: as of `identify`.
+        processing: as of `identify`.
+        estimator: as of `identify`.
+        notes: as of `identify`.
 
     Returns:
         The identification with the smaller residuals; a note says if it is the sharp one.
@@ -33,37 +39,34 @@ def identify_with_shapes(
     Raises:
         InputError: as `identify`.
     """
-    if not any(one.smoothing for one in setup.rubbing):
-        return identify(fit, heldout, setup, *args, **options)
     started = time.perf_counter()
-    sharp = replace(setup, rubbing=tuple(replace(one, smoothing=0.0) for one in setup.rubbing))
-    some, judged = _some(fit), _head(heldout)
-    misfits = [_misfit(identify(some, judged, s, *args, **options)) for s in (setup, sharp)]
-    found = identify(fit, heldout, setup if misfits[0] <= misfits[1] else sharp, *args, **options)
-    found = replace(found, seconds=time.perf_counter() - started)
-    if misfits[0] <= misfits[1]:
-        return found
-    note = "Dry friction changes sign at once in these data, more sharply than in the machine."
-    return replace(found, notes=(*found.notes, note))
+    processing, estimator = processing or Processing(), estimator or Estimator()
+    if any(one.smoothing for one in setup.rubbing):
+        sharp = replace(setup, rubbing=tuple(replace(one, smoothing=0.0) for one in setup.rubbing))
+        some = _some(fit, processing.period)
+        misfits = [_misfit(some, s, processing, estimator) for s in (setup, sharp)]
+        if misfits[1] < misfits[0]:
+            setup = sharp
+            said = "Dry friction changes sign at once in these data, more sharply than given."
+            notes = (*notes, said)
+    found = identify(fit, heldout, setup, processing, estimator, notes=notes)
+    return replace(found, seconds=time.perf_counter() - started)
 
 
-def _some(fit: Sequence[Record]) -> list[Record]:
+def _some(fit: Sequence[Record], period: float | None) -> list[Record]:
     """The first runs, as many as last long enough; one that alone is longer is cut."""
     some, seconds = [], 0.0
     for record in fit:
-        some.append(_head(record))
+        some.append(beginning(record, _TRIED, period))
         seconds += len(record.force) * record.period
         if seconds >= _TRIED:
             break
     return some
 
 
-def _head(record: Record) -> Record:
-    """The first part of a record."""
-    rows = round(_TRIED / record.period)
-    return trimmed(replace(record, position=record.position[:rows], force=record.force[:rows]))
-
-
-def _misfit(found: Identification) -> float:
+def _misfit(
+    fit: Sequence[Record], setup: Setup, processing: Processing, estimator: Estimator
+) -> float:
     """Sum over the drives of the logarithm of their residuals' RMS."""
-    return float(np.sum(np.log(np.mean(found.estimate.residual**2, axis=0))))
+    residual = fit_runs(fit, setup, processing, estimator).estimate.residual
+    return float(np.sum(np.log(np.mean(residual**2, axis=0))))

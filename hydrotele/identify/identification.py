@@ -3,107 +3,57 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
-from scipy.optimize import nnls
 
-from hydrotele.errors import InputError
-from hydrotele.identify.equations import Equations, build_equations, stacked
-from hydrotele.identify.estimators import Estimate, autoregression, estimate
-from hydrotele.identify.identifiability import Identifiability, identifiability, told_in_noise
+from hydrotele.identify.bias import motion_bias
+from hydrotele.identify.equations import Equations, build_equations
+from hydrotele.identify.estimation import Estimator, Weighted, told_by, weighted
+from hydrotele.identify.estimators import Estimate
+from hydrotele.identify.gathering import Gathered, gather
+from hydrotele.identify.identifiability import Identifiability, identifiability
+from hydrotele.identify.judging import heldout_errors, heldout_forces, status_of, whiteness
 from hydrotele.identify.motion import Processing, resolution
-from hydrotele.identify.record import Record, whole_cycles
-from hydrotele.identify.reference_size import reference_sizes
-from hydrotele.identify.regressor import RUBBING, Regressor
+from hydrotele.identify.propagation import propagated
+from hydrotele.identify.record import Record, beginning, whole_cycles
+from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import Setup
 
-Weighting = Literal["gauss_markov", "drives", "none"]
-_LEAST = 4.0  # periods of the band that a run must have: its low-pass takes three
-_WORSE = 1.5  # times the noise; beyond it the model lacks something
-_WHERE = "identification"
+_UNSURE = 0.2  # of a bias: the motion that it is found with is smoother than the true one
+_LONG = 600.0  # s of data; beyond it residuals alone tell the covariance
+_ENOUGH = 240.0  # s of data that tell the bias
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Force of one drive on the run that was not fitted, in the band of the equations.
+class Fitted:
+    """A fit to some runs, before its bias is taken off.
 
     Attributes:
-        rms: of measured less predicted force [N] or [N m].
-        unit: its unit.
-        noise_rms: what a perfect model would show with these sensors; NaN if not known.
-        relative: the error's norm over the force's [1].
-        nominal_rms: the same as rms, with the given parameters.
+        data: equations of the runs.
+        processing: with the band.
+        equations: weighted.
+        structure: base parameters that the motion would tell without noise.
+        told: those that the data tell.
+        estimate: of them.
+        still: (k,) whether a given joint stood still in all runs.
     """
 
-    rms: float
-    unit: str
-    noise_rms: float
-    relative: float
-    nominal_rms: float
-
-
-@dataclass(frozen=True)
-class Forces:
-    """Forces of the held-out run in the band of the equations; n rows, k drives [N] or [N m].
-
-    Attributes:
-        run: its name.
-        drives: the k drives.
-        time: (n,) [s] from its start.
-        measured: (n, k), NaN where unknown.
-        predicted: (n, k) with the identified parameters.
-        nominal: (n, k) with the given parameters.
-    """
-
-    run: str
-    drives: tuple[str, ...]
-    time: np.ndarray
-    measured: np.ndarray
-    predicted: np.ndarray
-    nominal: np.ndarray
-
-
-@dataclass(frozen=True)
-class Identification:
-    """Result; m parameters, r of them in the base.
-
-    Attributes:
-        names: the m parameters.
-        units: (m,) SI units.
-        nominal: (m,) as given.
-        value: (m,) identified; what the data do not tell stays as given.
-        structure: what this motion would tell without noise, and the base parameters.
-        told: what these data tell in spite of their noise.
-        estimate: of the base parameters, with covariance and residuals.
-        heldout: drive -> prediction of the held-out run.
-        forces: of the held-out run.
-        band: of the equations [Hz].
-        whiteness: (k,) correlation of a residual with the one before it.
-        status: `ok`, or what is wrong and what to do about it.
-        notes: one sentence each.
-        seconds: that it took.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    nominal: np.ndarray
-    value: np.ndarray
-    told: Identifiability
+    data: Gathered
+    processing: Processing
+    equations: Weighted
     structure: Identifiability
+    told: Identifiability
     estimate: Estimate
-    heldout: dict[str, HeldOut]
-    forces: Forces
-    band: float
-    whiteness: np.ndarray
-    status: str
-    notes: tuple[str, ...]
-    seconds: float
+    still: np.ndarray
+
+    def whole(self) -> np.ndarray:
+        """All parameters (m,): what the data do not tell stays as given."""
+        return _whole(self.told, self.data.table.nominal, self.estimate)
 
 
 def identify(
     fit: Sequence[Record], heldout: Record, setup: Setup,
-    processing: Processing | None = None, *, ridge: float = 0.0, cut: float = 0.0,
+    processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
 ) -> Identification:  # fmt: skip
     """Identify the parameters of a chain.
@@ -115,180 +65,130 @@ def identify(
         processing: how positions are differentiated, and the band; each run as its own positions
             allow by default. Where it is `periodic`, runs to fit are cut to their last whole
             cycles, and the held-out run, which need not be periodic, is filtered.
-        ridge: of the estimator, towards the given parameters.
-        cut: of the estimator: truncation of small singular values.
+        estimator: how base parameters are estimated. Where the sensors state their noise, its
+            bias is taken off, and the covariance is that of every reading's noise.
         notes: to hand on.
 
     Returns:
         The identification.
 
     Raises:
-        InputError: no drive has a force, or there are too few rows.
+        InputError: no drive has a force, there are too few rows, or the estimator needs a period.
 
     Source: Khoshzaban 1992, chapter 4; Abdellatif 2008, section 4.
     """
-    started = time.perf_counter()
-    if ridge < 0.0 or not 0.0 <= cut < 1.0:
-        raise InputError(_WHERE, f"ridge must not be negative and cut below 1: {ridge}, {cut}")
-    processing = processing or Processing()
-    judging = processing
+    started, estimator = time.perf_counter(), estimator or Estimator()
+    fitted = fit_runs(fit, setup, processing or Processing(), estimator)
+    data, told, found = fitted.data, fitted.told, fitted.estimate
+    bias = np.zeros(len(told.base))
+    if _noise_stated(data):
+        found = replace(found, covariance=_covariance(fitted, setup))
+        if estimator.pairs and estimator.method != "instruments":
+            bias = _bias(fitted, setup, estimator)
+            unsure = np.outer(_UNSURE * bias, _UNSURE * bias)
+            found = replace(found, value=found.value - bias, covariance=found.covariance + unsure)
+    table = data.table
+    value = _whole(told, table.nominal, found)
+    judging = fitted.processing
+    if judging.method == "periodic":
+        judging = replace(judging, method="zero_phase")
+    resolved = resolution(heldout.position, heldout.period, heldout.position_noise)
+    judged, _ = build_equations(heldout, setup, judging, resolved, with_noise=True)
+    predicted = heldout_errors(judged, table, value, data.columns, setup)
+    return Identification(
+        names=table.names, units=table.units, nominal=table.nominal, value=value, told=told,
+        structure=fitted.structure, estimate=found, bias=bias, heldout=predicted,
+        forces=heldout_forces(judged, table, value), band=judged.band,
+        whiteness=dict(zip(data.drives, whiteness(found.residual).tolist(), strict=True)),
+        status=status_of(predicted, fitted.still, setup), notes=(*notes, *data.notes),
+        seconds=time.perf_counter() - started,
+    )  # fmt: skip
+
+
+def fit_runs(
+    fit: Sequence[Record], setup: Setup, processing: Processing, estimator: Estimator
+) -> Fitted:
+    """Fit base parameters to runs, without care for bias or a run to judge on.
+
+    Args:
+        fit: records.
+        setup: what the regressor is built of.
+        processing: as of `identify`.
+        estimator: as of `identify`.
+
+    Returns:
+        The fit.
+
+    Raises:
+        InputError: as `identify`.
+    """
     if processing.method == "periodic":
         assert processing.period
         fit = [whole_cycles(record, processing.period) for record in fit]
-        judging = replace(processing, method="zero_phase")
-    resolved = [resolution(r.position, r.period, r.position_noise) for r in (*fit, heldout)]
-    band = processing.band or min(found.band for found in resolved[:-1])
-    processing, judging = replace(processing, band=band), replace(judging, band=band)
-    notes, made = list(notes), []
-    for record, found in zip(fit, resolved, strict=False):
-        if len(record.force) * record.period * band < _LEAST:
-            notes.append(f"{record.name} is too short for a band of {band:.3g} Hz; left out.")
-            continue
-        made.append(build_equations(record, setup, processing, found))
-    if not made:
-        raise InputError(_WHERE, f"all runs are too short for a band of {band:.3g} Hz: log longer")
-    table, runs = made[0][1], [equations for equations, _ in made]
-    matrix, force = stacked(runs, lambda e: e.matrix), stacked(runs, lambda e: e.force)
-    drives = [k for k in range(force.shape[1]) if np.isfinite(force[:, k]).any()]
-    if not drives:
-        raise InputError(_WHERE, "no drive has a known force in any run: log both its pressures")
-    matrix, force = matrix[:, drives], force[:, drives]
-    there = np.isfinite(force).all(axis=1)
-    notes += [
-        f"{e.name} lacks the force of {', '.join(lost)} throughout; left out."
-        for e in runs
-        if (lost := [table.drives[k] for k in drives if np.isnan(e.force[:, k]).all()])
+    resolved = [resolution(r.position, r.period, r.position_noise) for r in fit]
+    band = processing.band or min(found.band for found in resolved)
+    processing = replace(processing, band=band)
+    data = gather(list(zip(fit, resolved, strict=True)), setup, processing)
+    rows = data.matrix.reshape(-1, data.matrix.shape[2])
+    structure = identifiability(rows, data.table.names, data.table.units)
+    still = ~np.any([part.moves for part in resolved], axis=0)
+    resting = [d for d, stands in zip(data.table.drives, still, strict=True) if stands]
+    equations = weighted(data, structure, estimator.method, processing.period)
+    told = told_by(equations, structure, setup, resting, data.drives)
+    found = equations.fitted(told, estimator.ridge, estimator.cut)
+    return Fitted(data, processing, equations, structure, told, found, still)
+
+
+def _whole(told: Identifiability, nominal: np.ndarray, found: Estimate) -> np.ndarray:
+    value = nominal.copy()
+    value[told.base] += found.value - told.combination @ nominal
+    return value
+
+
+def _noise_stated(data: Gathered) -> bool:
+    """Whether sensors state the noise of all positions and of the forces that are used."""
+    return all(
+        np.all(record.position_noise > 0.0) and np.isfinite(record.force_noise[data.columns]).all()
+        for record, _ in data.runs
+    )
+
+
+def _covariance(fitted: Fitted, setup: Setup) -> np.ndarray:
+    """Covariance (r, r) by the sensors' noise, larger where residuals are.
+
+    Residuals alone tell it in long logs, and where a smoother adapts to the data.
+    """
+    data, found = fitted.data, fitted.estimate
+    seconds = sum(len(record.force) * record.period for record, _ in data.runs)
+    if seconds > _LONG or fitted.processing.method == "optimal":
+        return found.covariance
+    value, total = fitted.whole(), np.zeros_like(found.covariance)
+    for k, (record, resolved) in enumerate(data.runs):
+        gain = data.spread(fitted.equations.weight * found.gain, k)
+        total += propagated(record, resolved, gain, setup, fitted.processing, value)
+    ratio = np.trace(np.linalg.solve(total, found.covariance)) / len(total)
+    return total * max(1.0, ratio)
+
+
+def _bias(fitted: Fitted, setup: Setup, estimator: Estimator) -> np.ndarray:
+    """Bias (r,) of an estimate by noise of the positions, with its weights held fast."""
+    told, value, data = fitted.told, fitted.whole(), fitted.data
+    equations, sure = fitted.equations, fitted.equations.covariance
+    if sure is None:
+        sure = np.diag(np.mean(fitted.estimate.residual**2, axis=0))
+    runs = [
+        (beginning(record, _ENOUGH / len(data.runs), fitted.processing.period), resolved)
+        for record, resolved in data.runs
     ]
-    if not there.any():
-        raise InputError(_WHERE, "no run has the forces of all drives that any run has")
-    matrix, force = matrix[there], force[there]
-    doubt = stacked(runs, lambda e: e.doubt)[there][:, drives]
-    structure = identifiability(_flat(matrix), table.names, table.units)
-    still = ~np.any([part.moves for part in resolved[:-1]], axis=0)
-    resting = [d for d, stands in zip(table.drives, still, strict=True) if stands]
-    first = _fit(matrix, force, table, structure, 0.0, 0.0)
-    weight = _weights(first, doubt)
-    matrix, force = weight[:, :, None] * matrix, weight * force
-    told = _told(matrix, force, table, structure, setup, resting, [table.drives[k] for k in drives])
-    found = _fit(matrix, force, table, told, ridge, cut)
-    value = table.nominal.copy()
-    value[told.base] += found.value - told.combination @ table.nominal
-    judged, _ = build_equations(heldout, setup, judging, resolved[-1], with_noise=True)
-    predicted = _judge(judged, table, value, drives, setup)
-    return Identification(
-        names=table.names, units=table.units, nominal=table.nominal, value=value, told=told,
-        structure=structure, estimate=found, heldout=predicted,
-        forces=_forces(judged, table, value),
-        band=band,
-        whiteness=_whiteness(found.residual), status=_status(predicted, still, setup),
-        notes=tuple(notes), seconds=time.perf_counter() - started,
-    )  # fmt: skip
+    if any(len(a.force) < len(b.force) for (a, _), (b, _) in zip(runs, data.runs, strict=True)):
+        data = gather(runs, setup, fitted.processing)
+        equations = weighted(data, fitted.structure, estimator.method, fitted.processing.period)
 
+    def estimated(made: Sequence[Equations]) -> np.ndarray:
+        matrix, force = data.taken(made)
+        weight = equations.weight
+        again = Weighted(data.table, weight, weight[:, :, None] * matrix, weight * force, sure)
+        return again.fitted(told, estimator.ridge, estimator.cut, order=0).value
 
-def _flat(matrix: np.ndarray) -> np.ndarray:
-    return matrix.reshape(-1, matrix.shape[2])
-
-
-def _fit(matrix, force, table: Regressor, told: Identifiability, ridge: float, cut: float):
-    """Base parameters; what the data do not tell of the others stays as given."""
-    base = matrix[:, :, told.base]
-    given = told.combination @ table.nominal
-    rest = force - matrix @ table.nominal + base @ given
-    return estimate(base, rest, ridge=ridge, cut=cut, prior=given)
-
-
-def _weights(first: Estimate, doubt: np.ndarray) -> np.ndarray:
-    """Weights (n, k), 1 at most, of equations in which dry friction may have either sign.
-
-    How much larger their errors are is read off the residuals of a first estimate.
-    """
-    weights = np.ones_like(first.residual)
-    for k in range(doubt.shape[1]):
-        square = first.residual[:, k] ** 2
-        grows = np.column_stack([np.ones(len(square)), doubt[:, k] ** 2])
-        calm, more = nnls(grows * square.size**-0.5, square * square.size**-0.5)[0]
-        if calm > 0.0:
-            weights[:, k] = np.sqrt(calm / (grows @ (calm, more)))
-    return weights
-
-
-def _told(
-    matrix: np.ndarray, force: np.ndarray, table: Regressor, structure: Identifiability,
-    setup: Setup, resting: Sequence[str], drives: Sequence[str],
-) -> Identifiability:  # fmt: skip
-    """What these data tell in spite of their noise.
-
-    Friction of drives that rest is not asked for: whatever holds them is no sliding.
-    """
-    if not len(structure.base):
-        raise InputError(_WHERE, "no parameter has an effect on the forces of this motion")
-    first = _fit(matrix, force, table, structure, 0.0, 0.0)
-    noise = _long_run(first.residual)
-    sizes = reference_sizes(table, setup, np.sqrt(np.mean(force**2, axis=0)), drives)
-    held = {f"{kind}.{drive}" for kind in RUBBING for drive in resting}
-    asked = np.array([name not in held for name in table.names])
-    told = told_in_noise(_flat(matrix / noise[:, None]), table.names, sizes, asked)
-    if not len(told.base):
-        raise InputError(_WHERE, "these data tell no parameter: log a motion with larger forces")
-    return told
-
-
-def _long_run(residual: np.ndarray) -> np.ndarray:
-    """Standard deviations (k,) of independent errors that would tell slow changes as badly."""
-    follow = autoregression(residual)
-    fresh = residual.copy()
-    for q, weights in enumerate(follow, start=1):
-        fresh[q:] -= weights * residual[:-q]
-    spread = np.std(fresh[len(follow) :], axis=0) / np.abs(1.0 - follow.sum(axis=0))
-    return np.maximum(spread, np.std(residual, axis=0))
-
-
-def _judge(judged: Equations, table: Regressor, value: np.ndarray, drives: list[int], setup: Setup):
-    """Drive -> prediction of the held-out run."""
-    noise = judged.noise_of(value)
-    out = {}
-    for k in drives:
-        force = judged.force[:, k]
-        known = np.isfinite(force)
-        if not known.any():
-            continue
-        sizes = [
-            float(np.sqrt(np.mean((force - judged.matrix[:, k] @ p)[known] ** 2)))
-            for p in (value, table.nominal)
-        ]
-        whole = float(np.sqrt(np.mean(force[known] ** 2)))
-        unit = "N" if setup.chain.tree.slides[setup.chain.index(table.drives[k])] else "N m"
-        out[table.drives[k]] = HeldOut(
-            sizes[0], unit, float(noise[k]), sizes[0] / max(whole, 1e-300), sizes[1]
-        )
-    return out
-
-
-def _forces(judged: Equations, table: Regressor, value: np.ndarray) -> Forces:
-    return Forces(
-        judged.name, table.drives, judged.time, judged.force, judged.matrix @ value,
-        judged.matrix @ table.nominal,
-    )  # fmt: skip
-
-
-def _whiteness(residual: np.ndarray) -> np.ndarray:
-    error = residual - residual.mean(axis=0)
-    return np.sum(error[1:] * error[:-1], axis=0) / np.sum(error**2, axis=0)
-
-
-def _status(heldout: dict[str, HeldOut], still: np.ndarray, setup: Setup) -> str:
-    if still.any():
-        names = ", ".join(j for j, stands in zip(setup.given, still, strict=True) if stands)
-        return (
-            f"{names} stood still: what shows only in motion of it is not told, and kept as given;"
-            " log a motion of all axes, fast and in many poses"
-        )
-    if not heldout:
-        return "the held-out run has no known force: nothing was judged; hold out another one"
-    worse = [d for d, h in heldout.items() if h.rms > _WORSE * h.noise_rms]
-    if worse:
-        return (
-            f"on the held-out run the force of {', '.join(worse)} differs by more than the sensors"
-            " explain: the model lacks something there; look for it with `hydrotele gap`"
-        )
-    return "ok"
+    mean = motion_bias(data.runs, setup, fitted.processing, value, estimated, estimator.pairs)
+    return mean - told.combination @ value

@@ -4,7 +4,7 @@ import numpy as np
 
 from hydrotele.effects.effect import changed
 from hydrotele.identify.consistent import Consistent, Freedom, consistent
-from hydrotele.identify.identification import Identification
+from hydrotele.identify.result import Identification
 from hydrotele.machine import Machine
 from hydrotele.sensors import SensorError
 

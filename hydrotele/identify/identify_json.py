@@ -3,8 +3,8 @@
 from typing import Any
 
 from hydrotele.identify.hydraulic import Hydraulics
-from hydrotele.identify.identification import Identification
 from hydrotele.identify.parameter_rows import WEAK, counts, parameter_rows
+from hydrotele.identify.result import Identification
 
 
 def identify_document(

@@ -10,12 +10,12 @@ from hydrotele.errors import InputError
 from hydrotele.identify.periodic import periodic
 from hydrotele.identify.projection import Projection
 from hydrotele.identify.smoothed import Smoothed
-from hydrotele.identify.smoothing import OptimallySmoothed, error_draws, smooth
+from hydrotele.identify.smoothing import smooth
 from hydrotele.identify.zero_phase import zero_phase
 
 Method = Literal["optimal", "zero_phase", "periodic", "raw"]
 METHODS = ("optimal", "zero_phase", "periodic", "raw")
-_KEPT = 2.0  # times the resolved bandwidth: there the signal is a hundredth of the noise
+_KEPT = 2.5  # times the resolved bandwidth: there the signal is a thousandth of the noise
 _BAND = 0.5  # of the bandwidth is compared: there accelerations still stand above their noise
 _CONTENT = 0.98  # of an acceleration's power, beyond which forces tell of other things than motion
 _LINES = 10.0  # of the record's own lines lie in the band at least
@@ -128,15 +128,45 @@ def joint_motion(
     Raises:
         InputError: the positions do not suit the method.
     """
-    noise = found.noise
     if processing.method == "optimal":
-        return smooth(positions, period, noise)
+        return smooth(positions, period, found.noise)
+    moving = _filtered(positions, period, found, processing, found.noise)
+    if processing.method != "zero_phase" or found.moves.all():
+        return moving
+    return _rested(moving, smooth(positions, period, found.noise), found.moves)
+
+
+def adjoint(
+    gain: np.ndarray, period: float, found: Resolution, processing: Processing
+) -> np.ndarray:
+    """What single positions add to a sum over a motion; all but the optimal smoother.
+
+    The filters are symmetric in time, the first derivative antisymmetric.
+
+    Args:
+        gain: (3, p, n, k) of p sums for positions, rates and accelerations.
+        period: time between rows [s].
+        found: resolution of the positions.
+        processing: how they become a motion.
+
+    Returns:
+        (p, n, k) gains for positions; 0 for joints that rest.
+    """
+    _, p, rows, k = gain.shape
+    flat = np.where(found.moves, gain, 0.0).transpose(0, 2, 1, 3).reshape(3, rows, p * k)
+    parts = [_filtered(one, period, found, processing, None) for one in flat]
+    out = parts[0].value - parts[1].rate + parts[2].acceleration
+    return out.reshape(rows, p, k).transpose(1, 0, 2)
+
+
+def _filtered(
+    positions: np.ndarray, period: float, found: Resolution, processing: Processing,
+    noise: np.ndarray | None,
+) -> Smoothed:  # fmt: skip
+    """Linear filter and derivatives of any number of columns."""
     if processing.method == "zero_phase":
         cutoff = min(_KEPT * found.bandwidth, 0.4 / period)
-        moving = zero_phase(positions, period, cutoff, noise, bridge=round(GAP / period))
-        if found.moves.all():
-            return moving
-        return _rested(moving, smooth(positions, period, noise), found.moves)
+        return zero_phase(positions, period, cutoff, noise, bridge=round(GAP / period))
     if processing.method == "periodic":
         assert processing.period is not None
         cycle = round(processing.period / period)
@@ -145,41 +175,11 @@ def joint_motion(
         return periodic(positions, period, cycle, harmonics, noise)
     rate = np.gradient(positions, period, axis=0)
     acceleration = np.gradient(rate, period, axis=0)
-    spread = np.broadcast_to(noise, positions.shape)
+    spread = np.broadcast_to(np.nan if noise is None else noise, positions.shape)
     return Smoothed(
         positions, rate, acceleration, spread, spread / (math.sqrt(2.0) * period),
         spread * math.sqrt(6.0) / (4.0 * period**2),
     )  # fmt: skip
-
-
-def motion_errors(
-    positions: np.ndarray, period: float, found: Resolution, processing: Processing, count: int,
-    seed: int = 0,
-) -> np.ndarray:  # fmt: skip
-    """Random errors that the positions' noise leaves in a motion.
-
-    Args:
-        positions: (n, k) [rad] or [m].
-        period: time between rows [s].
-        found: their resolution.
-        processing: how they become a motion.
-        count: number of draws [1].
-        seed: of the random numbers [1].
-
-    Returns:
-        (count, 3, n, k) errors of position, rate and acceleration.
-    """
-    clean = joint_motion(positions, period, found, processing)
-    if isinstance(clean, OptimallySmoothed):
-        return error_draws(clean, count, seed)
-    generator, out = np.random.default_rng(seed), np.empty((count, 3, *positions.shape))
-    for draw in out:
-        noise = found.noise * generator.standard_normal(positions.shape)
-        moved = joint_motion(positions + noise, period, found, processing)
-        draw[0] = moved.value - clean.value
-        draw[1] = moved.rate - clean.rate
-        draw[2] = moved.acceleration - clean.acceleration
-    return out
 
 
 def rate_spread(found: Projection, given: list[int], rate_std: np.ndarray) -> np.ndarray:

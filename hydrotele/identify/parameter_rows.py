@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from hydrotele.identify.identifiability import COMBINATION, FULL, UNIDENTIFIABLE, WEAK
-from hydrotele.identify.identification import Identification
+from hydrotele.identify.result import Identification
 
 STATUSES = (UNIDENTIFIABLE, COMBINATION, FULL, WEAK)
 MEANING = {

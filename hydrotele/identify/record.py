@@ -138,6 +138,28 @@ def whole_cycles(record: Record, period: float) -> Record:
     return replace(record, position=record.position[-count:], force=record.force[-count:])
 
 
+def beginning(record: Record, seconds: float, period: float | None = None) -> Record:
+    """The first part of a record.
+
+    Args:
+        record: the record.
+        seconds: of it, at most [s].
+        period: of its motion [s], of which to keep whole ones; None for any length.
+
+    Returns:
+        The cut record.
+
+    Raises:
+        InputError: a position is never read in it.
+    """
+    if period:
+        seconds = max(1.0, seconds // period) * period
+    rows = round(seconds / record.period)
+    if rows >= len(record.force):
+        return record
+    return trimmed(replace(record, position=record.position[:rows], force=record.force[:rows]))
+
+
 def _record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> Record:
     rows = len(run.command)
     position, force = np.full((2, rows, len(axes)), np.nan)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.identify.identification import Forces, HeldOut
+from hydrotele.identify.result import Forces, HeldOut
 from hydrotele.show.report_figure import drawing, png
 
 MEASURED, NOMINAL, IDENTIFIED = "#262b33", "#e07b00", "#1769aa"

@@ -8,8 +8,8 @@ from hydrotele.dataset.load import Dataset
 from hydrotele.gap.customary import amount, said
 from hydrotele.gap.result import Estimate
 from hydrotele.identify.hydraulic import Hydraulics
-from hydrotele.identify.identification import Identification
 from hydrotele.identify.parameter_rows import MEANING, counts, parameter_rows
+from hydrotele.identify.result import Identification
 from hydrotele.show.identify_figures import draw_forces
 from hydrotele.show.report_html import Markup, interval, picture, table, tag, text
 from hydrotele.show.report_style import STYLE

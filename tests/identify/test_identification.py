@@ -9,6 +9,7 @@ import pytest
 from hydrotele.commands.identifying import closed_chain
 from hydrotele.dataset.load import load_dataset
 from hydrotele.errors import InputError
+from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.friction_shape import identify_with_shapes
 from hydrotele.identify.identifiability import FULL, WEAK
 from hydrotele.identify.identification import identify
@@ -52,8 +53,8 @@ def test_held_out_forces_differ_by_noise(found):
     for drive, judged in found.heldout.items():
         # what the exact parameters leave, which 3 identified ones in 100 equations may raise by 3 %
         assert judged.rms < 1.05 * judged.nominal_rms, drive
-        # the bound leaves out friction of drives that stick, up to 14 % in the pauses of this run
-        assert judged.rms < 1.2 * judged.noise_rms, drive
+        # the bound holds for motions as rough all the time; the exact parameters leave 1.16 here
+        assert judged.rms < 1.25 * judged.noise_rms, drive
         assert judged.noise_rms < 0.02 * np.nanmax(np.abs(found.forces.measured)), drive
     assert found.status == "ok"
 
@@ -223,11 +224,12 @@ def test_a_short_run_is_left_out_with_a_note(clean):
     assert any("blink is too short" in note for note in found.notes)
 
 
-@needs_measured
-@pytest.mark.parametrize("options", [{"ridge": -1.0}, {"cut": 1.0}, {"cut": -0.1}])
-def test_options_without_sense_are_refused(clean, options):
-    with pytest.raises(InputError, match="ridge"):
-        identify(*clean, **options)
+@pytest.mark.parametrize(
+    "options", [{"ridge": -1.0}, {"cut": 1.0}, {"cut": -0.1}, {"method": "magic"}, {"pairs": -1}]
+)
+def test_options_without_sense_are_refused(options):
+    with pytest.raises(InputError, match="estimator"):
+        Estimator(**options)
 
 
 @needs_measured

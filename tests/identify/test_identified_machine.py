@@ -10,10 +10,10 @@ from hydrotele.identify.chain import load_chain
 from hydrotele.identify.consistent import Freedom, consistent
 from hydrotele.identify.estimators import Estimate
 from hydrotele.identify.identifiability import identifiability
-from hydrotele.identify.identification import Forces, Identification
 from hydrotele.identify.identified_machine import identified_machine
 from hydrotele.identify.projection import project
 from hydrotele.identify.regressor import BODY_PARAMETERS, regressor
+from hydrotele.identify.result import Forces, Identification
 from hydrotele.identify.setup import cylinder_bars, machine_setup
 from hydrotele.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
@@ -45,11 +45,13 @@ def as_found(table, told, value, share=1e-3):
     """An identification that found certain base parameters, each known to a share of itself."""
     base = told.combination @ value
     spread = share * np.maximum(np.abs(base), 1.0)
-    estimate = Estimate(base, np.diag(spread**2), np.zeros((1, 1)), 1.0)
+    estimate = Estimate(
+        base, np.diag(spread**2), np.zeros((1, 1)), np.zeros((len(base), 1, 1)), 1.0
+    )
     nothing = Forces("", (), *(np.zeros((0,)) for _ in range(4)))
     return Identification(
-        table.names, table.units, table.nominal, value, told, told, estimate, {}, nothing, 1.0,
-        np.zeros(3), "ok", (), 0.0,
+        table.names, table.units, table.nominal, value, told, told, estimate,
+        np.zeros(len(base)), {}, nothing, 1.0, {}, "ok", (), 0.0,
     )  # fmt: skip
 
 
