@@ -12,6 +12,7 @@ from hydrotele.commands.opening import data_name, machine_of
 from hydrotele.dataset.load import Dataset, load_dataset
 from hydrotele.errors import InputError
 from hydrotele.identify.chain import Chain, load_chain
+from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.friction_shape import identify_with_shapes
 from hydrotele.identify.hydraulic import Hydraulics, identify_hydraulics
@@ -27,6 +28,23 @@ from hydrotele.machine_file import MACHINE_FILE, save_machine
 from hydrotele.output import check_target, whole_folder
 from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.plant import build_plant, rest_state
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """What was found of bodies, friction and offsets.
+
+    Attributes:
+        found: the identification, None where no force is known.
+        best: the nearest machine that can exist, None with it.
+        machine: the identified machine.
+        lacking: why there is none, or nothing.
+    """
+
+    found: Identification | None
+    best: Consistent | None
+    machine: Machine
+    lacking: str = ""
 
 
 @dataclass(frozen=True)
@@ -82,27 +100,23 @@ def identify_to_folder(
     with stages(f"identify {model.name}", as_json) as progress:
         say = progress or (lambda said, share: None)
         say("mechanism", 0.0)
-        found, patched, lacking = identify_mechanism(dataset, choices)
-        hydraulics = None
+        mechanism, hydraulics = identify_mechanism(dataset, choices), None
         if choices.hydraulics:
-            better = dataclasses.replace(dataset, machine=patched)
+            better = dataclasses.replace(dataset, machine=mechanism.machine)
             hydraulics = identify_hydraulics(better, progress=progress)
-            patched = hydraulics.machine
-    if found is None and hydraulics is None:
-        raise InputError(target, lacking)
+    if mechanism.found is None and hydraulics is None:
+        raise InputError(target, mechanism.lacking)
     with whole_folder(target, "identify") as folder:
-        _write(folder, dataset, found, hydraulics, patched, data, choices)
+        _write(folder, dataset, mechanism, hydraulics, data, choices)
     if as_json:
-        print_json(identify_document(found, hydraulics))
+        print_json(identify_document(mechanism.found, hydraulics, mechanism.best))
     else:
-        _print(found, hydraulics, dataset, lacking)
+        _print(mechanism, hydraulics, dataset)
         out.print(f"written to [bold]{target}[/]; open {target}/report.html")
     return target
 
 
-def identify_mechanism(
-    dataset: Dataset, choices: Choices
-) -> tuple[Identification | None, Machine, str]:
+def identify_mechanism(dataset: Dataset, choices: Choices) -> Mechanism:
     """Identify bodies, friction and offsets.
 
     Args:
@@ -110,14 +124,17 @@ def identify_mechanism(
         choices: what to identify, and how.
 
     Returns:
-        The identification, None where no force is known; the identified machine; and what lacks.
+        What was found.
+
+    Raises:
+        InputError: the logs do not tell it, and hydraulics were not asked for.
     """
     try:
         fit, heldout, said = records(dataset)
     except InputError as error:
         if not choices.hydraulics:
             raise
-        return None, dataset.machine, str(error)
+        return Mechanism(None, None, dataset.machine, str(error))
     setup = machine_setup(
         dataset.machine, closed_chain(dataset.machine), choices.model, pins=choices.pins,
         asymmetry=choices.asymmetry,
@@ -125,8 +142,8 @@ def identify_mechanism(
     found = identify_with_shapes(
         fit, heldout, setup, choices.processing, choices.estimator, notes=(*dataset.notes, *said)
     )  # fmt: skip
-    patched, _ = identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
-    return found, patched, ""
+    patched, best = identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
+    return Mechanism(found, best, patched)
 
 
 def closed_chain(machine: Machine) -> Chain:
@@ -136,10 +153,11 @@ def closed_chain(machine: Machine) -> Chain:
 
 
 def _write(
-    folder: Path, dataset: Dataset, found: Identification | None, hydraulics: Hydraulics | None,
-    patched: Machine, data: Sequence[Path], choices: Choices,
+    folder: Path, dataset: Dataset, mechanism: Mechanism, hydraulics: Hydraulics | None,
+    data: Sequence[Path], choices: Choices,
 ) -> None:  # fmt: skip
-    document = plain(identify_document(found, hydraulics))
+    found, patched = mechanism.found, hydraulics.machine if hydraulics else mechanism.machine
+    document = plain(identify_document(found, hydraulics, mechanism.best))
     text = json.dumps(document, indent=2, allow_nan=False)
     (folder / "identify.json").write_text(text + "\n", encoding="utf-8")
     made = folder / "identified"
@@ -149,7 +167,7 @@ def _write(
     from hydrotele.show.identify_report import write_identify_report
 
     notes.print("writing report.html ...", style="dim")
-    write_identify_report(dataset, found, hydraulics, folder / "report.html")
+    write_identify_report(dataset, found, hydraulics, mechanism.best, folder / "report.html")
     summary = {
         "kind": "identify",
         "machine": dataset.machine.name,
@@ -163,13 +181,11 @@ def _write(
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
-def _print(
-    found: Identification | None, hydraulics: Hydraulics | None, dataset: Dataset, lacking: str
-) -> None:
-    if found:
-        _print_mechanism(found, dataset)
-    elif lacking:
-        out.print(f"[yellow]note[/] {lacking}")
+def _print(mechanism: Mechanism, hydraulics: Hydraulics | None, dataset: Dataset) -> None:
+    if mechanism.found:
+        _print_mechanism(mechanism.found, dataset)
+    else:
+        out.print(f"[yellow]note[/] {mechanism.lacking}")
     if hydraulics:
         rows = table("hydraulics", "number", "given", "identified", "std", "unit")
         for n in hydraulics.numbers:
@@ -204,6 +220,11 @@ def _print_mechanism(found: Identification, dataset: Dataset) -> None:
         judged.add_row(drive, f"{h.nominal_rms:.4g}", f"{h.rms:.4g}", f"{h.noise_rms:.4g}", h.unit,
                        f"{100 * h.relative:.2f} %")  # fmt: skip
     out.print(judged)
+    distance, limit = found.distance(found.nominal)
+    out.print(
+        f"the given parameters lie {'in' if distance <= limit else 'out'}side the 95 % ellipsoid of"
+        f" all together: {distance:.3g}, limit {limit:.3g}"
+    )
     out.print(f"condition {found.estimate.condition:.3g}, {found.seconds:.1f} s")
     for note in found.notes:
         out.print(f"[yellow]note[/] {note}")

@@ -1,7 +1,7 @@
 """From the errors of the given model to named effects: screen, fit, add, prune, compare rivals."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,7 @@ _WORTH = 0.25  # of the best screened score: below it a candidate is not fitted
 Progress = Callable[[str, float], None]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Found:
     """What a search leaves.
 
@@ -84,43 +84,47 @@ def search(
             break
         tell(f"fit {best.guess.parts[-1][0].name}", 0.9 * (1.0 - 0.6 ** (depth + 0.7)) + 0.05)
         added = best.guess.parts[-1][0]
-        grown = _settled_better(evidence, guess, best.guess, best.charge + ENTER)
-        if grown is None:
+        grown, settled, gain = _settled_gain(evidence, guess, best.guess)
+        if gain < best.charge + ENTER:
+            evidence.set_base(guess)
             candidates = [c for c in candidates if c.key != added.key]
             continue
         seen[added.key] = ranked
-        guess, fit = grown
+        guess, fit = grown, settled
     guess, fit = _prune(evidence, guess, fit)
     tell("compare rivals", 0.92)
     rivals, scores = [], []
     for index in range(len(guess.parts)):
         ranked = seen.get(guess.parts[index][0].key, rankings[0])
         own, others = compare(evidence, guess, index, ranked)
-        best = others[0] if others else None
-        if best and best.score > own.score and worth_naming(best.guess, -1, best.score):
+        while others and others[0].score > own.score:
+            best = others[0]
+            if not worth_naming(best.guess, -1, best.score):
+                break
             other, asked = _exchanged(guess, index, best.guess), best.charge - own.charge
-            swapped = _settled_better(evidence, guess, other, asked)
-            if swapped:
-                guess, fit = swapped
+            grown, settled, gain = _settled_gain(evidence, guess, other)
+            if gain >= asked:
+                guess, fit = grown, settled
                 own, others = compare(evidence, guess, index, ranked)
+                break
+            evidence.set_base(guess)
+            # no better after all: by as much as likelihoods with their own gains differ
+            fair = replace(best, gain=own.gain + gain)
+            others = tuple(sorted((*others[1:], fair), key=lambda one: -one.score))
         scores.append(own.score)
         rivals.append(others)
     return Found(guess, fit, tuple(rankings[0]), tuple(rivals), tuple(scores), weak)
 
 
-def _settled_better(
-    evidence: Evidence, guess: Guess, other: Guess, asked: float
-) -> tuple[Guess, Fit] | None:
-    """Another guess settled, or None, and the base as it was, if that is no improvement.
+def _settled_gain(evidence: Evidence, guess: Guess, other: Guess) -> tuple[Guess, Fit, float]:
+    """Another guess settled, its fit, and by how much it is more likely; it is the base then.
 
     Kept gains can flatter a guess that moves far, so likelihoods with gains of their own decide.
     """
     before = evidence.base_loss + _prior(guess)
     grown, fit = settle(evidence, other)
-    if _strained(grown) or before - evidence.base_loss - _prior(grown) < asked:
-        evidence.set_base(guess)
-        return None
-    return grown, fit
+    gain = before - evidence.base_loss - _prior(grown)
+    return grown, fit, -np.inf if _strained(grown) else gain
 
 
 def _prior(guess: Guess) -> float:

@@ -1,7 +1,7 @@
 """From gathered equations to base parameters: weights, and what noisy data tell."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -33,8 +33,8 @@ class Estimator:
         ridge: added to the squares of singular values, as a share of the largest; towards the
             given parameters.
         cut: share of the largest singular value below which directions keep the given parameters.
-        pairs: of added noise by which the bias of the positions' noise is found and taken off;
-            0 to leave it, and always with instruments, which have none.
+        pairs: of added noise by which the bias of the positions' noise is found and taken off; 0 to
+            leave it. Instruments are free of it only where the regressor is linear in the noise.
     """
 
     method: Method = "weighted"
@@ -129,11 +129,12 @@ def weighted(
         error = found.fitted(structure, order=0).residual
         if period:  # what repeats is the model's error, the rest is noise, twice of it
             error = (error - data.cycle_on(error, period)) / np.sqrt(2.0)
+            error = error[np.isfinite(error).all(axis=1)]
         return Weighted(data.table, weight, matrix, force, error.T @ error / len(error))
     if method == "instruments":
         if not period:
             raise InputError("estimator", "instruments need the period of the motion [s]")
-        aside = weight[:, :, None] * data.cycle_on(data.matrix, period)
+        aside = weight[:, :, None] * np.nan_to_num(data.cycle_on(data.matrix, period))
         return Weighted(data.table, weight, matrix, force, None, aside)
     return found
 
@@ -161,7 +162,8 @@ def told_by(
     """
     if not len(structure.base):
         raise InputError(_WHERE, "no parameter has an effect on the forces of this motion")
-    noise = _long_run(data.fitted(structure, order=0).residual)
+    plain = replace(data, instruments=None)  # which tell badly what the data hardly tell
+    noise = _long_run(plain.fitted(structure, order=0).residual)
     table = data.table
     sizes = reference_sizes(table, setup, np.sqrt(np.mean(data.force**2, axis=0)), drives)
     held = {f"{kind}.{drive}" for kind in RUBBING for drive in resting}

@@ -73,29 +73,32 @@ class Gathered:
         return out[:, self.starts[run] : self.starts[run + 1]]
 
     def cycle_on(self, values: np.ndarray, period: float) -> np.ndarray:
-        """Values (n, ...) one period later, or earlier where the run ends before.
+        """Values one period later, or earlier where the run ends before.
 
         Args:
-            values: at every row.
+            values: (n, ...) at every row.
             period: of the repeated motion [s].
+
+        Returns:
+            (n, ...), NaN where there is neither.
 
         Raises:
             InputError: a run is shorter than two periods.
         """
-        out = np.empty_like(values)
+        out = np.empty(values.shape)  # in the order in which `reshape` yields a view
         flat, shifted = values.reshape(len(values), -1), out.reshape(len(values), -1)
         for k, (record, _) in enumerate(self.runs):
             own = self.run == k
             if not own.any():
                 continue
             time = self.time[own]
-            if time[-1] - time[0] < period:
+            if len(record.force) * record.period < 2.0 * period:
                 raise InputError(
                     record.name, f"does not repeat its motion: two periods of {period:g} s at least"
                 )
             other = np.where(time + period <= time[-1], time + period, time - period)
             for c in range(flat.shape[1]):
-                shifted[own, c] = np.interp(other, time, flat[own, c])
+                shifted[own, c] = np.interp(other, time, flat[own, c], np.nan, np.nan)
         return out
 
 

@@ -83,7 +83,7 @@ def identify(
     bias = np.zeros(len(told.base))
     if _noise_stated(data):
         found = replace(found, covariance=_covariance(fitted, setup))
-        if estimator.pairs and estimator.method != "instruments":
+        if estimator.pairs:
             bias = _bias(fitted, setup, estimator)
             unsure = np.outer(_UNSURE * bias, _UNSURE * bias)
             found = replace(found, value=found.value - bias, covariance=found.covariance + unsure)
@@ -187,7 +187,9 @@ def _bias(fitted: Fitted, setup: Setup, estimator: Estimator) -> np.ndarray:
     def estimated(made: Sequence[Equations]) -> np.ndarray:
         matrix, force = data.taken(made)
         weight = equations.weight
-        again = Weighted(data.table, weight, weight[:, :, None] * matrix, weight * force, sure)
+        again = replace(
+            equations, matrix=weight[:, :, None] * matrix, force=weight * force, covariance=sure
+        )
         return again.fitted(told, estimator.ridge, estimator.cut, order=0).value
 
     mean = motion_bias(data.runs, setup, fitted.processing, value, estimated, estimator.pairs)

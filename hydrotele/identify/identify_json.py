@@ -2,24 +2,28 @@
 
 from typing import Any
 
+from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.hydraulic import Hydraulics
 from hydrotele.identify.parameter_rows import WEAK, counts, parameter_rows
 from hydrotele.identify.result import Identification
 
 
 def identify_document(
-    found: Identification | None, hydraulics: Hydraulics | None = None
-) -> dict[str, Any]:
+    found: Identification | None, hydraulics: Hydraulics | None = None,
+    best: Consistent | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """The document; what is unknown is None or NaN.
 
     Args:
         found: identification of the mechanism, None where no force is known.
         hydraulics: identification of the hydraulics, None where not asked for.
+        best: the nearest machine that can exist.
 
     Returns:
         Keys `parameters`, `condition`, `heldout`, `counts`, `status`, `seconds`, `band_hz`,
-        `notes`; `hydraulics` where asked for.
+        `whiteness`, `given`, `consistent`, `notes`; `hydraulics` where asked for.
     """
+    distance, limit = found.distance(found.nominal) if found else (None, None)
     rows = parameter_rows(found) if found else []
     document: dict[str, Any] = {
         "parameters": [
@@ -42,6 +46,12 @@ def identify_document(
         "status": found.status if found else "no force is known",
         "seconds": found.seconds if found else 0.0,
         "band_hz": found.band if found else None,
+        "whiteness": found.whiteness if found else {},
+        "given": {"distance": distance, "limit95": limit},
+        "consistent": {
+            "distance": best.loss, "limit95": limit,
+            "parameters": dict(zip(found.names, best.value.tolist(), strict=True)),
+        } if found and best else None,
         "notes": list(found.notes) if found else [],
     }  # fmt: skip
     if hydraulics:

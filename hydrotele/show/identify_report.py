@@ -7,6 +7,7 @@ import hydrotele
 from hydrotele.dataset.load import Dataset
 from hydrotele.gap.customary import amount, said
 from hydrotele.gap.result import Estimate
+from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.hydraulic import Hydraulics
 from hydrotele.identify.parameter_rows import MEANING, counts, parameter_rows
 from hydrotele.identify.result import Identification
@@ -18,19 +19,21 @@ _MEMBERS = 6  # of a combination that are written out
 
 
 def write_identify_report(
-    dataset: Dataset, found: Identification | None, hydraulics: Hydraulics | None, path: str | Path
-) -> None:
+    dataset: Dataset, found: Identification | None, hydraulics: Hydraulics | None,
+    best: Consistent | None, path: str | Path,
+) -> None:  # fmt: skip
     """Write an identification as one self-contained HTML file.
 
     Args:
         dataset: what it learned from.
         found: the mechanism, None where no force is known.
         hydraulics: the hydraulics, None where not asked for.
+        best: the nearest machine that can exist, None without a mechanism.
         path: file to write.
     """
     sections = [_header(dataset, found, hydraulics)]
     if found:
-        sections += [_proof(found), _parameters(found), _others(found)]
+        sections += [_proof(found), _parameters(found), _tests(found, best), _others(found)]
     if hydraulics:
         sections.append(_hydraulics(hydraulics))
     notes = found.notes if found else dataset.notes
@@ -123,6 +126,24 @@ def _parameters(found: Identification) -> Markup:
         f" of the whole. Condition of the equations {found.estimate.condition:.3g}."
     )
     return _section("What the data tell", why, table(head, rows, numbers=" nnn"))
+
+
+def _tests(found: Identification, best: Consistent | None) -> Markup:
+    distance, limit = found.distance(found.nominal)
+    verdict = "could be the true ones" if distance <= limit else "are refuted"
+    rows = [("the given parameters, all together", f"{distance:.3g}", f"{limit:.3g}", verdict)]
+    if best:
+        verdict = "agrees with the estimate" if best.loss <= limit else "cannot have all of it"
+        rows.append(("a machine that can exist", f"{best.loss:.3g}", f"{limit:.3g}", verdict))
+    head = ("95 % ellipsoid", "squared distance", "limit", "verdict")
+    memory = ", ".join(f"{drive.replace('_', ' ')} {r:.2f}" for drive, r in found.whiteness.items())
+    why = (
+        "How far other parameters are from the estimate in standard deviations, and what 95 of 100"
+        " true ones stay below. Bodies that can exist have positive mass and the inertia of a mass"
+        f" distribution. Residuals correlate with those before them by: {memory}; the intervals"
+        " know of it."
+    )
+    return _section("Tests", why, table(head, rows, numbers=" nn"))
 
 
 def _others(found: Identification) -> Markup:
