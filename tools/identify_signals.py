@@ -5,9 +5,11 @@
 
 The CAT 215 repeats a Fourier motion with its sensors' noise. The same records are differentiated
 raw, by the optimal smoother, by the zero-phase filter, and in the frequency domain; everything else
-is the same. Judged is the force along a circle of 0.7 m in the plane of boom and stick, at rising
-speed, while the swing turns: RMS over one lap of the recorded machine's forces less those of the
-identified parameters, mean over the trials. No noise has a part in the judgement.
+is the same. The bias that the positions' noise leaves is what processing is to avoid; taking it
+off, as the identification does by default, stands below. Judged is the force along a circle of
+0.7 m in the plane of boom and stick, at rising speed, while the swing turns: RMS over one lap of
+the recorded machine's forces less those of the identified parameters, mean over the trials. No
+noise has a part in the judgement.
 """
 
 import argparse
@@ -19,6 +21,7 @@ import numpy as np
 from hydrotele.commands.identifying import closed_chain
 from hydrotele.dataset.files import RunFiles
 from hydrotele.dataset.load import make_dataset
+from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import identify
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.projection import project
@@ -35,10 +38,14 @@ from hydrotele.scenario import load_scenario
 PERIOD = 20.0  # s, of the scenario `excitation`
 RADIUS, REACH, HEIGHT, TURN = 0.7, 5.2, 0.8, 0.4  # m, m, m, rad
 LAPS = (12.0, 8.0, 5.0)  # s
-WAYS = {
-    "raw": "raw differences", "optimal": "time domain: optimal smoother",
-    "zero_phase": "time domain: zero-phase filter", "periodic": "frequency domain",
-}  # fmt: skip
+WAYS = {  # what is said -> method, pairs of noise to find the bias with
+    "raw differences": ("raw", 0),
+    "time domain: optimal smoother": ("optimal", 0),
+    "time domain: zero-phase filter": ("zero_phase", 0),
+    "frequency domain": ("periodic", 0),
+    "zero-phase filter, bias taken off": ("zero_phase", 4),
+    "frequency domain, bias taken off": ("periodic", 4),
+}
 
 
 def circle(machine: Machine, lap: float) -> np.ndarray:
@@ -76,9 +83,9 @@ def one_trial(seed: int, number: int, cycles: int) -> dict[str, list[list[float]
     setup = machine_setup(machine, closed_chain(machine))
     laps = [forces(setup, circle(machine, lap)) for lap in LAPS]
     out = {}
-    for way in WAYS:
-        how = Processing(way, period=PERIOD)
-        found = identify(fit, heldout, setup, how)
+    for way, (method, pairs) in WAYS.items():
+        how = Processing(method, period=PERIOD)
+        found = identify(fit, heldout, setup, how, Estimator(pairs=pairs))
         errors = [matrix @ (found.value - truth) for matrix, truth in laps]
         out[way] = [np.sqrt(np.mean(e**2, axis=0)).tolist() for e in errors]
     return out
@@ -94,11 +101,11 @@ def report(results: list[dict[str, list[list[float]]]]) -> str:
     table = {way: np.mean([r[way] for r in results], axis=0) for way in WAYS}
     for k, lap in enumerate(LAPS):
         best = np.min([table[way][k] for way in WAYS], axis=0)
-        for way, said in WAYS.items():
+        for way in WAYS:
             row = table[way][k]
             whole = float(np.exp(np.mean(np.log(row / best))))
             cells = " | ".join(f"{value:.0f}" for value in row)
-            lines.append(f"| {lap:g} | {said} | {cells} | {whole:.2f} |")
+            lines.append(f"| {lap:g} | {way} | {cells} | {whole:.2f} |")
     return "\n".join(lines) + "\n"
 
 

@@ -13,6 +13,7 @@ from hydrotele.noise import channel_sensor, converter
 from hydrotele.sensors import Sensor, SensorSet
 
 _KEPT = 0.1  # of its readings a channel must keep in a run to be of use there
+_NEAR = 3.0  # of its noise, within which a limit of a sensor cuts off some of it
 _CLIPPED = 0.02  # of a run; a starved chamber reads 0 now and then on any machine
 _RESOLVED = 1.0e-4  # of its span: what a sensor without a stated converter resolves, at worst
 _STARVED = 0.5e6  # [Pa] above tank, where a chamber on its make-up valve may rest
@@ -165,9 +166,15 @@ def _take_out_frozen(data: _Data, run: str, channel: str, parts) -> list[str]:
              for a, b in parts]  # fmt: skip
     listed = ", ".join(spans[:3]) + (f" and {len(spans) - 3} times more" if spans[3:] else "")
     value = np.nanmedian(reading[slice(*parts[0])])
+    said = f"{run}: {channel} is stuck at {value:.6g} {listed}; these readings were left out."
+    if stuck.saturated(reading, parts):
+        noise = float(data.noise[list(data.channels).index(channel)])
+        near = np.abs(reading - value) <= _NEAR * (noise if math.isfinite(noise) else 0.0)
+        reading[near] = np.nan
+        said = f"{run}: {channel} does not get beyond {value:.6g}, as {listed}; left out there."
     for part in parts:
         reading[slice(*part)] = np.nan
-    return [f"{run}: {channel} is stuck at {value:.6g} {listed}; these readings were left out."]
+    return [said]
 
 
 def _take_out_repeated_rows(data: _Data, run: str) -> list[str]:

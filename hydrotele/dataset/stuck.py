@@ -72,6 +72,22 @@ def repeats(reading: np.ndarray, shortest: int) -> list[Stretch]:
     ]
 
 
+def saturated(reading: np.ndarray, parts: Sequence[Stretch]) -> bool:
+    """Whether a channel comes to rest at one value again and again, and never beyond it.
+
+    >>> reading = np.array([1.0, 2.0, 2.0, 1.5, 2.0, 2.0, 1.0])
+    >>> saturated(reading, repeats(reading, 2))
+    True
+
+    Args:
+        reading: (n,) readings of one run, NaN where missing.
+        parts: where it repeats one value.
+    """
+    values = {float(np.nanmedian(reading[slice(*part)])) for part in parts}
+    ends = {float(np.nanmin(reading)), float(np.nanmax(reading))}
+    return len(parts) > 1 and len(values) == 1 and values <= ends
+
+
 def noise_floor(reading: np.ndarray) -> float:
     """Noise [channel's unit] where the channel is most at rest, NaN if it repeats all along.
 

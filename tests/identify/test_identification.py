@@ -17,6 +17,7 @@ from hydrotele.identify.motion import Processing
 from hydrotele.identify.parameter_rows import counts, parameter_rows
 from hydrotele.identify.record import records
 from hydrotele.identify.setup import machine_setup
+from hydrotele.log import load_log, save_log
 from hydrotele.machine_file import load_machine
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
@@ -145,6 +146,22 @@ def test_missing_samples_are_bridged(clean, found):
     again = identify([dropped(r) for r in fit], dropped(heldout), setup)
     for drive, judged in again.heldout.items():
         assert judged.rms < 1.1 * found.heldout[drive].rms, drive
+
+
+@needs_measured
+def test_readings_of_a_saturated_sensor_are_left_out(clean, tmp_path):
+    """A third of the time the pressure is above what its sensor can say."""
+    for file in sorted((MEASURED / "open_04").glob("*.parquet")):
+        log = load_log(file)
+        name, columns = "pressure_head.boom", dict(log.columns)
+        columns[name] = np.minimum(columns[name], np.quantile(columns[name], 0.67))
+        save_log(dataclasses.replace(log, columns=columns), tmp_path / file.name)
+    data = load_dataset(tmp_path, load_machine("cat215"))
+    assert any("pressure_head.boom does not get beyond" in note for note in data.notes)
+    fit, heldout, _ = records(data)
+    found = identify(fit, heldout, clean[2])
+    # chi^2 of 25 degrees of freedom exceeds 44.3 in 1 % of all cases
+    assert 20 < len(found.told.base) <= 25 and found.distance(found.nominal)[0] < 44.3
 
 
 @needs_measured
