@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from hydrotele.identify.equations import Equations, build_equations, row_forces
-from hydrotele.identify.motion import Processing, Resolution
+from hydrotele.identify.motion import Processing, Resolution, joint_motion
 from hydrotele.identify.record import Record
 from hydrotele.identify.setup import Setup
 from hydrotele.identify.smoothing import smooth
@@ -19,9 +19,10 @@ def motion_bias(
 ) -> np.ndarray:  # fmt: skip
     """Mean error of an estimate whose regressor comes from noisy positions.
 
-    The motion found is taken for the true one and the parameters found for the true ones. Forces
-    that follow from both are estimated from again, with the positions' noise added anew. Every
-    noise is used with both signs, so that only what does not average out remains.
+    The optimal smoother's motion, or the mean cycle, is taken for the true one and the parameters
+    found for the true ones. Forces that follow from both are estimated from again, with the
+    positions' noise added anew. Every noise is used with both signs, so that only what does not
+    average out remains.
 
     Args:
         runs: records and what their positions resolve.
@@ -40,7 +41,10 @@ def motion_bias(
     """
     generator, worlds = np.random.default_rng(seed), []
     for record, found in runs:
-        motion = smooth(record.position, record.period, found.noise)
+        if processing.method == "periodic":
+            motion = joint_motion(record.position, record.period, found, processing)
+        else:
+            motion = smooth(record.position, record.period, found.noise)
         motions = np.stack([motion.value, motion.rate, motion.acceleration])
         force = row_forces(setup, motions, value)
         force[~np.isfinite(record.force)] = np.nan

@@ -125,7 +125,9 @@ def fit_runs(
     if processing.method == "periodic":
         assert processing.period
         fit = [whole_cycles(record, processing.period) for record in fit]
-    resolved = [resolution(r.position, r.period, r.position_noise) for r in fit]
+    resolved = [
+        resolution(r.position, r.period, r.position_noise, _cycles(r, processing)) for r in fit
+    ]
     band = processing.band or min(found.band for found in resolved)
     processing = replace(processing, band=band)
     data = gather(list(zip(fit, resolved, strict=True)), setup, processing)
@@ -137,6 +139,13 @@ def fit_runs(
     told = told_by(equations, structure, setup, resting, data.drives)
     found = equations.fitted(told, estimator.ridge, estimator.cut)
     return Fitted(data, processing, equations, structure, told, found, still)
+
+
+def _cycles(record: Record, processing: Processing) -> int:
+    """How many cycles of a motion are taken the mean of."""
+    if processing.method != "periodic" or not processing.period:
+        return 1
+    return round(len(record.force) * record.period / processing.period)
 
 
 def _whole(told: Identifiability, nominal: np.ndarray, found: Estimate) -> np.ndarray:

@@ -81,15 +81,19 @@ class Resolution:
         return min(_BAND * self.bandwidth, self.content)
 
 
-def resolution(positions: np.ndarray, period: float, noise: np.ndarray) -> Resolution:
+def resolution(
+    positions: np.ndarray, period: float, noise: np.ndarray, cycles: int = 1
+) -> Resolution:
     """Bandwidth and noise of positions.
 
-    The optimal smoother's gain is `1 / (1 + (f/f_h)^(2 order))`.
+    The optimal smoother's gain is `1 / (1 + (f/f_h)^(2 order))`; the mean of many cycles has less
+    noise and resolves more.
 
     Args:
         positions: (n, k) [rad] or [m], NaN where missing.
         period: time between rows [s].
         noise: (k,) standard deviation of a position, NaN where to be found.
+        cycles: of a repeated motion, of which the mean will be taken [1].
 
     Returns:
         The resolution; joints at rest are left out of the bandwidth.
@@ -97,7 +101,7 @@ def resolution(positions: np.ndarray, period: float, noise: np.ndarray) -> Resol
     Source: Wiener filter of an integrator chain in white noise.
     """
     smoothed = smooth(positions, period, _known(noise))
-    ratio = smoothed.input_std / smoothed.noise
+    ratio = math.sqrt(cycles) * smoothed.input_std / smoothed.noise
     halves = ratio ** (1.0 / smoothed.order) / (2.0 * math.pi)
     moves = np.nanstd(smoothed.value, axis=0) > _MOVES * smoothed.noise
     limit = 0.2 / period
