@@ -96,24 +96,41 @@ def search(
     rivals, scores = [], []
     for index in range(len(guess.parts)):
         ranked = seen.get(guess.parts[index][0].key, rankings[0])
-        own, others = compare(evidence, guess, index, ranked)
-        while others and others[0].score > own.score:
-            best = others[0]
-            if not worth_naming(best.guess, -1, best.score):
-                break
-            other, asked = _exchanged(guess, index, best.guess), best.charge - own.charge
-            grown, settled, gain = _settled_gain(evidence, guess, other)
-            if gain >= asked:
-                guess, fit = grown, settled
-                own, others = compare(evidence, guess, index, ranked)
-                break
-            evidence.set_base(guess)
-            # no better after all: by as much as likelihoods with their own gains differ
-            fair = replace(best, gain=own.gain + gain)
-            others = tuple(sorted((*others[1:], fair), key=lambda one: -one.score))
+        guess, fit, own, others = _weighed(evidence, guess, fit, index, ranked)
         scores.append(own.score)
         rivals.append(others)
     return Found(guess, fit, tuple(rankings[0]), tuple(rivals), tuple(scores), weak)
+
+
+def _weighed(
+    evidence: Evidence, guess: Guess, fit: Fit | None, index: int, ranked: Sequence[Screened]
+) -> tuple[Guess, Fit | None, Fit, tuple[Fit, ...]]:
+    """A guess in which an effect has given way to a better rival, if there is one.
+
+    Args:
+        evidence: with the guess as base.
+        guess: all effects.
+        fit: of it.
+        index: of the effect.
+        ranked: the screening in which it was found.
+
+    Returns:
+        The guess, its fit, and the fits of the effect and of its rivals as of `compare`; a rival
+        that settles for less than it seemed counts by that.
+    """
+    own, others = compare(evidence, guess, index, ranked)
+    while others and others[0].score > own.score:
+        best = others[0]
+        if not worth_naming(best.guess, -1, best.score):
+            break
+        other, asked = _exchanged(guess, index, best.guess), best.charge - own.charge
+        grown, settled, gain = _settled_gain(evidence, guess, other)
+        if gain >= asked:
+            return grown, settled, *compare(evidence, grown, index, ranked)
+        evidence.set_base(guess)
+        fair = replace(best, gain=own.gain + gain)
+        others = tuple(sorted((*others[1:], fair), key=lambda one: -one.score))
+    return guess, fit, own, others
 
 
 def _settled_gain(evidence: Evidence, guess: Guess, other: Guess) -> tuple[Guess, Fit, float]:
