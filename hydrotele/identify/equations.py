@@ -18,6 +18,7 @@ from hydrotele.identify.projection import project
 from hydrotele.identify.record import Record
 from hydrotele.identify.regressor import Regressor, regressor, sign_doubt
 from hydrotele.identify.setup import Setup
+from hydrotele.identify.smoothed import Smoothed
 from hydrotele.identify.smoothing import error_draws, smooth
 
 _TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
@@ -41,6 +42,7 @@ class Equations:
         matrix: (n, k, m).
         force: (n, k) less what the joints' stated damping takes [N] or [N m]; NaN where unknown.
         time: (n,) [s] from the run's start.
+        spacing: between equations [s]; a whole part of a repeated motion's period.
         doubt: (n, k) how uncertain the sign of the drives' dry friction is, 0 .. 1.
         force_noise: (k,) standard deviation that the force sensors' noise leaves; NaN if unknown.
         motion_noise: (k, m, m) second moments of what the motion's errors leave per parameter;
@@ -52,6 +54,7 @@ class Equations:
     matrix: np.ndarray
     force: np.ndarray
     time: np.ndarray
+    spacing: float
     doubt: np.ndarray
     force_noise: np.ndarray
     motion_noise: np.ndarray
@@ -84,9 +87,9 @@ def build_equations(
         InputError: the run is too short for the band, or cannot be followed by the chain.
     """
     band = processing.band or found.band
-    motion = joint_motion(record.position, record.period, found, processing)
+    motion = _motion(record, found, processing)
     motions = np.stack([motion.value, motion.rate, motion.acceleration])
-    low, thin = low_pass(band, record.period)
+    low, thin = low_pass(band, record.period, processing.period)
     thin = max(1, thin // _FINE) if with_noise else thin
     count = (len(record.force) - len(low)) // thin + 1
     if band > _NYQUIST / record.period:
@@ -118,10 +121,28 @@ def build_equations(
     made = Equations(
         record.name, band, np.concatenate(parts), 
         _forces(record.force, record.period, low, thin) - np.concatenate(damped), time,
-        np.concatenate(doubts), noise, spread,
+        thin * record.period, np.concatenate(doubts), noise, spread,
     )  # fmt: skip
     empty = Regressor(last.matrix[:0], last.drives, last.names, last.units, last.nominal)
     return made, empty
+
+
+def _motion(record: Record, found: Resolution, processing: Processing) -> Smoothed:
+    """Motion of the joints, refused with a remedy where a filter cannot bridge a gap."""
+    known = np.isfinite(record.position)
+    if processing.method in ("raw", "zero_phase"):
+        bridge = round(GAP / record.period) if processing.method == "zero_phase" else 0
+        for axis, column in zip(record.axes, known.T, strict=True):
+            rows = np.flatnonzero(column)
+            missing = np.diff(rows, prepend=-1, append=len(column)) - 1
+            if len(rows) and missing.max() > bridge:
+                at = int(np.insert(rows, 0, 0)[missing.argmax()])
+                raise InputError(
+                    record.name, f"lacks the position of {axis} for"
+                    f" {missing.max() * record.period:.3g} s from {at * record.period:.3g} s on:"
+                    " take --processing optimal, which needs no filter, or cut the run there",
+                )  # fmt: skip
+    return joint_motion(record.position, record.period, found, processing)
 
 
 def _motion_noise(
@@ -187,22 +208,27 @@ def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start:
     return table, doubt, damping, found.position[-1]
 
 
-def low_pass(band: float, period: float) -> tuple[np.ndarray, int]:
+def low_pass(band: float, period: float, cycle: float | None = None) -> tuple[np.ndarray, int]:
     """Low-pass without lag.
 
     Args:
         band: of the equations [Hz].
         period: between rows [s].
+        cycle: period of a repeated motion [s].
 
     Returns:
-        Weights, their number odd, and how many rows make one equation.
+        Weights, their number odd, and how many rows make one equation: a part of a cycle's rows
+        where they have a suitable one.
     """
     half = round(_TAPS / (band * period))
     if half < 1:
         return np.ones(1), 1
     reach = np.arange(-half, half + 1)
     weights = np.sinc(2.0 * band * period * reach) * np.kaiser(len(reach), _KAISER)
-    return weights / weights.sum(), max(1, int(1.0 / (2.0 * _SPARE * band * period)))
+    thin = max(1, int(1.0 / (2.0 * _SPARE * band * period)))
+    rows = round(cycle / period) if cycle else 0
+    parts = [part for part in range(thin, thin // 2, -1) if rows % part == 0]
+    return weights / weights.sum(), (parts or [thin])[0]
 
 
 def _thinned(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:

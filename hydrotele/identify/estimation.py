@@ -46,11 +46,13 @@ class Estimator:
         """Refuse what is not known or makes no sense."""
         if self.method not in METHODS:
             raise InputError("estimator", f"{self.method!r} is not known: {', '.join(METHODS)}")
-        if self.ridge < 0.0 or not 0.0 <= self.cut < 1.0:
+        if not (0.0 <= self.ridge < np.inf and 0.0 <= self.cut < 1.0):
             raise InputError(
                 "estimator",
                 f"ridge must not be negative and cut below 1: {self.ridge}, {self.cut}",
             )
+        if self.method == "instruments" and (self.ridge or self.cut):
+            raise InputError("estimator", "instruments know no ridge and no truncation")
         if self.pairs < 0:
             raise InputError("estimator", f"pairs of noise must be 0 or more, got {self.pairs}")
 
@@ -62,6 +64,7 @@ class Weighted:
     Attributes:
         table: names, units and nominal values of the parameters.
         weight: (n, k) of the equations.
+        doubtful: (k, 2) variance of a drive's errors, and what doubt of a sign adds to it.
         matrix: (n, k, m), weighted.
         force: (n, k), weighted [N] or [N m].
         covariance: (k, k) of the weighted forces' errors; None to count drives by residuals.
@@ -70,6 +73,7 @@ class Weighted:
 
     table: Regressor
     weight: np.ndarray
+    doubtful: np.ndarray
     matrix: np.ndarray
     force: np.ndarray
     covariance: np.ndarray | None = None
@@ -117,25 +121,25 @@ def weighted(
     Raises:
         InputError: instruments without a period, or with runs of one period.
     """
-    ones = np.ones_like(data.force)
+    ones, drives = np.ones_like(data.force), data.force.shape[1]
+    alike = np.tile([1.0, 0.0], (drives, 1))
     if method == "least_squares":
-        alike = np.eye(data.force.shape[1])
-        return Weighted(data.table, ones, data.matrix, data.force, alike)
-    plain = Weighted(data.table, ones, data.matrix, data.force)
-    weight = _weights(plain.fitted(structure, order=0).residual, data.doubt)
+        return Weighted(data.table, ones, alike, data.matrix, data.force, np.eye(drives))
+    plain = Weighted(data.table, ones, alike, data.matrix, data.force)
+    doubtful = _doubtful(plain.fitted(structure, order=0).residual, data.doubt)
+    weight = weights(doubtful, data.doubt)
     matrix, force = weight[:, :, None] * data.matrix, weight * data.force
-    found = Weighted(data.table, weight, matrix, force)
+    found = Weighted(data.table, weight, doubtful, matrix, force)
     if method == "gauss_markov":
         error = found.fitted(structure, order=0).residual
         if period:  # what repeats is the model's error, the rest is noise, twice of it
             error = (error - data.cycle_on(error, period)) / np.sqrt(2.0)
             error = error[np.isfinite(error).all(axis=1)]
-        return Weighted(data.table, weight, matrix, force, error.T @ error / len(error))
+        return replace(found, covariance=error.T @ error / len(error))
     if method == "instruments":
-        if not period:
-            raise InputError("estimator", "instruments need the period of the motion [s]")
+        assert period
         aside = weight[:, :, None] * np.nan_to_num(data.cycle_on(data.matrix, period))
-        return Weighted(data.table, weight, matrix, force, None, aside)
+        return replace(found, instruments=aside)
     return found
 
 
@@ -175,19 +179,29 @@ def told_by(
     return told
 
 
-def _weights(residual: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-    """Weights (n, k), 1 at most, of equations in which dry friction may have either sign.
+def weights(doubtful: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+    """Weights of equations in which dry friction may have either sign.
 
-    How much larger their errors are is read off the residuals of a first estimate.
+    Args:
+        doubtful: (k, 2) as of `Weighted`.
+        doubt: (n, k) of the signs.
+
+    Returns:
+        (n, k), 1 at most.
     """
-    weights = np.ones_like(residual)
+    return np.sqrt(doubtful[:, 0] / (doubtful[:, 0] + doubtful[:, 1] * doubt**2))
+
+
+def _doubtful(residual: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+    """How much larger doubtful errors are (k, 2), read off the residuals of a first estimate."""
+    out = np.tile([1.0, 0.0], (doubt.shape[1], 1))
     for k in range(doubt.shape[1]):
         square = residual[:, k] ** 2
         grows = np.column_stack([np.ones(len(square)), doubt[:, k] ** 2])
         calm, more = nnls(grows * square.size**-0.5, square * square.size**-0.5)[0]
         if calm > 0.0:
-            weights[:, k] = np.sqrt(calm / (grows @ (calm, more)))
-    return weights
+            out[k] = calm, more
+    return out
 
 
 def _long_run(residual: np.ndarray) -> np.ndarray:

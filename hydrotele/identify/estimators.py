@@ -28,6 +28,10 @@ class Estimate:
         residual: (n, k) measured less predicted force [N] or [N m].
         gain: (p, n, k) of the forces: how the value follows from each; 0 for rows left out.
         condition: ratio of the singular values of the weighted, scaled equations.
+        white: (k, k) by which the equations were weighted.
+        normal: (p, p) inverse of the weighted normal equations: for weighted Y (or Z) and F the
+            value is the prior and `normal Y' (F - Y prior)`.
+        rank: number of directions that truncation left.
     """
 
     value: np.ndarray
@@ -35,6 +39,9 @@ class Estimate:
     residual: np.ndarray
     gain: np.ndarray
     condition: float
+    white: np.ndarray
+    normal: np.ndarray
+    rank: int
 
     @property
     def std(self) -> np.ndarray:
@@ -48,9 +55,14 @@ class Estimate:
         return np.column_stack([self.value - reach, self.value + reach])
 
     def ellipsoid(self, truth: np.ndarray) -> float:
-        """Squared distance of other parameters (p,) in standard deviations: chi^2 of p degrees."""
-        away = np.asarray(truth) - self.value
-        return float(away @ np.linalg.solve(self.covariance, away))
+        """Squared distance of other parameters (p,) in standard deviations: chi^2 of rank degrees.
+
+        Directions that truncation has fixed do not count.
+        """
+        away = (np.asarray(truth) - self.value) / self.std
+        values, ways = np.linalg.eigh(self.covariance / np.outer(self.std, self.std))
+        kept = slice(len(values) - self.rank, None)
+        return float(np.sum((away @ ways[:, kept]) ** 2 / values[kept]))
 
 
 def estimate(
@@ -100,13 +112,16 @@ def estimate(
         raise InputError(_WHERE, f"column {int(np.argmin(size))} has no effect: leave it out")
     start = np.zeros(x.shape[2]) if prior is None else np.asarray(prior, float)
     shape = _Shape(start, ridge, cut, covariance is None)
-    value, inverse, condition = _solve(x, y, z, shape)
+    value, inverse, solved, scale = _solve(x, y, z, shape)
     error = y - x @ value
     follow = autoregression(error, order)
     spread = _carried(inverse, error, follow) * y.size / (y.size - x.shape[2])
     gain = np.zeros((len(value), *forces.shape))
     gain[:, there] = inverse @ white
-    return Estimate(value, spread, forces - matrix @ value, gain, condition)
+    return Estimate(
+        value, spread, forces - matrix @ value, gain, solved.condition, white / scale[:, None],
+        solved.normal, solved.rank,
+    )  # fmt: skip
 
 
 class _Shape(NamedTuple):
@@ -118,16 +133,25 @@ class _Shape(NamedTuple):
     weigh: bool
 
 
-def _solve(x, y, z, shape: _Shape) -> tuple[np.ndarray, np.ndarray, float]:
-    """Value (p,), how it follows from the forces (p, n, k), and the condition."""
-    value, inverse, condition = _solve_once(x, y, z, shape)
+class _Solved(NamedTuple):
+    """Of scaled equations: their condition, inverse of their normal equations, and rank."""
+
+    condition: float
+    normal: np.ndarray
+    rank: int
+
+
+def _solve(x, y, z, shape: _Shape) -> tuple[np.ndarray, np.ndarray, _Solved, np.ndarray]:
+    """Value (p,), how it follows from the forces (p, n, k), the rest, and the drives' scales."""
+    value, inverse, solved = _solve_once(x, y, z, shape)
+    ones = np.ones(y.shape[1])
     if shape.weigh and y.shape[1] > 1:
         scale = np.sqrt(np.mean((y - x @ value) ** 2, axis=0))
         if (scale > _SILENT * np.sqrt(np.mean(y**2, axis=0))).all():
             x, y, z = x / scale[:, None], y / scale, None if z is None else z / scale[:, None]
-            value, inverse, condition = _solve_once(x, y, z, shape)
-            inverse = inverse / scale
-    return value, inverse, condition
+            value, inverse, solved = _solve_once(x, y, z, shape)
+            return value, inverse / scale, solved, scale
+    return value, inverse, solved, ones
 
 
 def _solve_once(x, y, z, shape: _Shape):
@@ -135,12 +159,14 @@ def _solve_once(x, y, z, shape: _Shape):
     size = np.sqrt(np.einsum("nkp,nkp->p", x, x))
     flat, rest = (x / size).reshape(-1, p), (y - x @ shape.prior).ravel()
     if z is None:
-        inverse, condition = _pseudo_inverse(flat, shape.ridge, shape.cut)
+        inverse, solved = _pseudo_inverse(flat, shape.ridge, shape.cut)
+        solved = solved._replace(normal=solved.normal / np.outer(size, size))
     else:
-        scaled = z / np.sqrt(np.einsum("nkp,nkp->p", z, z))
-        inverse, condition = _by_instruments(scaled.reshape(-1, p), flat)
+        length = np.sqrt(np.einsum("nkp,nkp->p", z, z))
+        inverse, solved = _by_instruments((z / length).reshape(-1, p), flat)
+        solved = solved._replace(normal=solved.normal / np.outer(size, length))
     inverse = inverse / size[:, None]
-    return shape.prior + inverse @ rest, inverse.reshape(p, n, k), condition
+    return shape.prior + inverse @ rest, inverse.reshape(p, n, k), solved
 
 
 def _carried(inverse: np.ndarray, error: np.ndarray, follow: np.ndarray) -> np.ndarray:
@@ -191,15 +217,18 @@ def autoregression(error: np.ndarray, order: int | None = None) -> np.ndarray:
     return out
 
 
-def _pseudo_inverse(x: np.ndarray, ridge: float, cut: float) -> tuple[np.ndarray, float]:
-    """(p, N) with columns of length 1, and the condition."""
+def _pseudo_inverse(x: np.ndarray, ridge: float, cut: float) -> tuple[np.ndarray, _Solved]:
+    """(p, N) with columns of length 1, and the rest."""
     u, s, v = np.linalg.svd(x, full_matrices=False)
-    gains = np.where(s > max(cut, 1e-14) * s[0], s / (s**2 + ridge * s[0] ** 2), 0.0)
-    return (v.T * gains) @ u.T, float(s[0] / s[-1])
+    kept = s > max(cut, 1e-14) * s[0]
+    squares = np.where(kept, 1.0 / (s**2 + ridge * s[0] ** 2), 0.0)
+    solved = _Solved(float(s[0] / s[-1]), (v.T * squares) @ v, int(kept.sum()))
+    return (v.T * (s * squares)) @ u.T, solved
 
 
-def _by_instruments(z: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, float]:
-    return np.linalg.solve(z.T @ x, z.T), float(np.linalg.cond(x))
+def _by_instruments(z: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, _Solved]:
+    normal = np.linalg.inv(z.T @ x)
+    return normal @ z.T, _Solved(float(np.linalg.cond(x)), normal, x.shape[1])
 
 
 def _whitener(covariance: np.ndarray) -> np.ndarray:

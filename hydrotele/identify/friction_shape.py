@@ -67,6 +67,8 @@ def _some(fit: Sequence[Record], period: float | None) -> list[Record]:
 def _misfit(
     fit: Sequence[Record], setup: Setup, processing: Processing, estimator: Estimator
 ) -> float:
-    """Sum over the drives of the logarithm of their residuals' RMS."""
-    residual = fit_runs(fit, setup, processing, estimator).estimate.residual
-    return float(np.sum(np.log(np.mean(residual**2, axis=0))))
+    """What the residuals' likelihood asks to be small."""
+    found = fit_runs(fit, setup, processing, estimator)
+    # weights count as the inverse of standard deviations, or the shape that doubts most would win
+    doubted = np.sum(np.mean(np.log(found.equations.weight**2), axis=0))
+    return float(np.sum(np.log(np.mean(found.estimate.residual**2, axis=0))) - doubted)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hydrotele.errors import InputError
-from hydrotele.identify.equations import Equations, build_equations, stacked
+from hydrotele.identify.equations import build_equations, stacked
 from hydrotele.identify.motion import Processing, Resolution
 from hydrotele.identify.record import Record
 from hydrotele.identify.regressor import Regressor
@@ -26,8 +26,7 @@ class Gathered:
         columns: places of the k drives among the table's.
         rows: which of the runs' stacked equations are the n.
         starts: at which of the stacked equations every run starts, and their number.
-        time: (n,) [s], every run's by itself.
-        run: (n,) places of their runs.
+        spacing: between the equations of every run [s].
         matrix: (n, k, m).
         force: (n, k) [N] or [N m].
         doubt: (n, k) of the signs of dry friction.
@@ -39,8 +38,7 @@ class Gathered:
     columns: list[int]
     rows: np.ndarray
     starts: np.ndarray
-    time: np.ndarray
-    run: np.ndarray
+    spacing: tuple[float, ...]
     matrix: np.ndarray
     force: np.ndarray
     doubt: np.ndarray
@@ -50,11 +48,6 @@ class Gathered:
     def drives(self) -> tuple[str, ...]:
         """The k drives whose forces are known."""
         return tuple(self.table.drives[k] for k in self.columns)
-
-    def taken(self, made: Sequence[Equations]) -> tuple[np.ndarray, np.ndarray]:
-        """The same rows and drives (n, k, m), (n, k) of equations that the runs were made anew."""
-        matrix, force = stacked(made, lambda e: e.matrix), stacked(made, lambda e: e.force)
-        return matrix[self.rows][:, self.columns], force[self.rows][:, self.columns]
 
     def spread(self, values: np.ndarray, run: int) -> np.ndarray:
         """Values (p, n, k) of the equations of one run, with 0 for rows and drives not used.
@@ -85,21 +78,23 @@ class Gathered:
         Raises:
             InputError: a run is shorter than two periods.
         """
-        out = np.empty(values.shape)  # in the order in which `reshape` yields a view
-        flat, shifted = values.reshape(len(values), -1), out.reshape(len(values), -1)
+        whole = np.full((len(self.rows), *values.shape[1:]), np.nan)
+        whole[self.rows] = values
         for k, (record, _) in enumerate(self.runs):
-            own = self.run == k
-            if not own.any():
-                continue
-            time = self.time[own]
             if len(record.force) * record.period < 2.0 * period:
                 raise InputError(
                     record.name, f"does not repeat its motion: two periods of {period:g} s at least"
                 )
-            other = np.where(time + period <= time[-1], time + period, time - period)
-            for c in range(flat.shape[1]):
-                shifted[own, c] = np.interp(other, time, flat[own, c], np.nan, np.nan)
-        return out
+            own = slice(self.starts[k], self.starts[k + 1])
+            whole[own] = cycle_on(whole[own], round(period / self.spacing[k]))
+        return whole[self.rows]
+
+
+def cycle_on(values: np.ndarray, step: int) -> np.ndarray:
+    """Values (n, ...) `step` rows later, or earlier where there are none; NaN without both."""
+    later, earlier = np.full((2, *values.shape), np.nan)
+    later[:-step], earlier[step:] = values[step:], values[:-step]
+    return np.where(np.isnan(later), earlier, later)
 
 
 def gather(
@@ -142,11 +137,10 @@ def gather(
     ]
     if not rows.any():
         raise InputError(_WHERE, "no run has the forces of all drives that any run has")
-    places = np.concatenate([np.full(len(e.time), k) for k, e in enumerate(equations)])
+    spacing = tuple(e.spacing for e in equations)
     starts = np.cumsum([0, *(len(e.time) for e in equations)])
     return Gathered(
-        tuple(kept), table, columns, rows, starts, stacked(equations, lambda e: e.time)[rows],
-        places[rows],
+        tuple(kept), table, columns, rows, starts, spacing,
         stacked(equations, lambda e: e.matrix)[rows][:, columns], force[rows][:, columns],
         stacked(equations, lambda e: e.doubt)[rows][:, columns], tuple(notes),
     )  # fmt: skip

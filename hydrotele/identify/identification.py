@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hydrotele.errors import InputError
 from hydrotele.identify.bias import motion_bias
-from hydrotele.identify.equations import Equations, build_equations
+from hydrotele.identify.equations import build_equations
 from hydrotele.identify.estimation import Estimator, Weighted, told_by, weighted
 from hydrotele.identify.estimators import Estimate
 from hydrotele.identify.gathering import Gathered, gather
@@ -15,13 +16,12 @@ from hydrotele.identify.identifiability import Identifiability, identifiability
 from hydrotele.identify.judging import heldout_errors, heldout_forces, status_of, whiteness
 from hydrotele.identify.motion import Processing, resolution
 from hydrotele.identify.propagation import propagated
-from hydrotele.identify.record import Record, beginning, whole_cycles
+from hydrotele.identify.record import Record, whole_cycles
 from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import Setup
 
 _UNSURE = 0.2  # of a bias: the motion that it is found with is smoother than the true one
-_LONG = 600.0  # s of data; beyond it residuals alone tell the covariance
-_ENOUGH = 240.0  # s of data that tell the bias
+_MANY = 2e7  # ways of readings into parameters; beyond it residuals alone tell the covariance
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,16 @@ def identify(
     if _noise_stated(data):
         found = replace(found, covariance=_covariance(fitted, setup))
         if estimator.pairs:
-            bias = _bias(fitted, setup, estimator)
+            bias = motion_bias(
+                data, fitted.equations, told.base, found, fitted.whole(), setup, fitted.processing,
+                estimator.pairs,
+            )  # fmt: skip
             unsure = np.outer(_UNSURE * bias, _UNSURE * bias)
-            found = replace(found, value=found.value - bias, covariance=found.covariance + unsure)
+            residual = found.residual + fitted.equations.matrix[:, :, told.base] @ bias
+            found = replace(
+                found, value=found.value - bias, covariance=found.covariance + unsure,
+                residual=residual,
+            )  # fmt: skip
     table = data.table
     value = _whole(told, table.nominal, found)
     judging = fitted.processing
@@ -100,7 +107,8 @@ def identify(
         structure=fitted.structure, estimate=found, bias=bias, heldout=predicted,
         forces=heldout_forces(judged, table, value), band=judged.band,
         whiteness=dict(zip(data.drives, whiteness(found.residual).tolist(), strict=True)),
-        status=status_of(predicted, fitted.still, setup), notes=(*notes, *data.notes),
+        status=status_of(predicted, _residual_sizes(fitted), fitted.still, setup),
+        notes=(*notes, *data.notes),
         seconds=time.perf_counter() - started,
     )  # fmt: skip
 
@@ -122,6 +130,14 @@ def fit_runs(
     Raises:
         InputError: as `identify`.
     """
+    if estimator.method == "instruments":
+        if not processing.period:
+            raise InputError("estimator", "instruments need the period of the motion [s]")
+        if processing.method == "periodic":
+            raise InputError(
+                "estimator", "instruments need cycles of their own, `periodic` takes their mean:"
+                " take zero_phase",
+            )  # fmt: skip
     if processing.method == "periodic":
         assert processing.period
         fit = [whole_cycles(record, processing.period) for record in fit]
@@ -154,6 +170,14 @@ def _whole(told: Identifiability, nominal: np.ndarray, found: Estimate) -> np.nd
     return value
 
 
+def _residual_sizes(fitted: Fitted) -> dict[str, float]:
+    """Drive -> RMS of its residuals, as if all equations counted alike [N] or [N m]."""
+    residual = fitted.estimate.residual / fitted.equations.weight
+    return dict(
+        zip(fitted.data.drives, np.sqrt(np.mean(residual**2, axis=0)).tolist(), strict=True)
+    )
+
+
 def _noise_stated(data: Gathered) -> bool:
     """Whether sensors state the noise of all positions and of the forces that are used."""
     return all(
@@ -168,38 +192,15 @@ def _covariance(fitted: Fitted, setup: Setup) -> np.ndarray:
     Residuals alone tell it in long logs, and where a smoother adapts to the data.
     """
     data, found = fitted.data, fitted.estimate
-    seconds = sum(len(record.force) * record.period for record, _ in data.runs)
-    if seconds > _LONG or fitted.processing.method == "optimal":
+    readings = sum(record.force.size + record.position.size for record, _ in data.runs)
+    many = len(found.value) * readings > _MANY and fitted.processing.method != "periodic"
+    if many or fitted.processing.method == "optimal":
         return found.covariance
     value, total = fitted.whole(), np.zeros_like(found.covariance)
     for k, (record, resolved) in enumerate(data.runs):
         gain = data.spread(fitted.equations.weight * found.gain, k)
         total += propagated(record, resolved, gain, setup, fitted.processing, value)
-    ratio = np.trace(np.linalg.solve(total, found.covariance)) / len(total)
+    size = np.outer(found.std, found.std)
+    inverse = np.linalg.pinv(total / size, rcond=1e-10, hermitian=True)
+    ratio = np.trace(inverse @ (found.covariance / size)) / found.rank
     return total * max(1.0, ratio)
-
-
-def _bias(fitted: Fitted, setup: Setup, estimator: Estimator) -> np.ndarray:
-    """Bias (r,) of an estimate by noise of the positions, with its weights held fast."""
-    told, value, data = fitted.told, fitted.whole(), fitted.data
-    equations, sure = fitted.equations, fitted.equations.covariance
-    if sure is None:
-        sure = np.diag(np.mean(fitted.estimate.residual**2, axis=0))
-    runs = [
-        (beginning(record, _ENOUGH / len(data.runs), fitted.processing.period), resolved)
-        for record, resolved in data.runs
-    ]
-    if any(len(a.force) < len(b.force) for (a, _), (b, _) in zip(runs, data.runs, strict=True)):
-        data = gather(runs, setup, fitted.processing)
-        equations = weighted(data, fitted.structure, estimator.method, fitted.processing.period)
-
-    def estimated(made: Sequence[Equations]) -> np.ndarray:
-        matrix, force = data.taken(made)
-        weight = equations.weight
-        again = replace(
-            equations, matrix=weight[:, :, None] * matrix, force=weight * force, covariance=sure
-        )
-        return again.fitted(told, estimator.ridge, estimator.cut, order=0).value
-
-    mean = motion_bias(data.runs, setup, fitted.processing, value, estimated, estimator.pairs)
-    return mean - told.combination @ value

@@ -31,6 +31,7 @@ def identify_document(
                 "name": row.name, "value": row.value, "std": row.std,
                 "ci95": None if row.ci95 is None else list(row.ci95), "status": row.status,
                 "unit": row.unit, "nominal": row.nominal, "combination": row.combination,
+                "bias": row.bias,
             }
             for row in rows
         ],
@@ -60,7 +61,7 @@ def identify_document(
                 "name": n.name, "value": n.value if n.told else None,
                 "std": n.std if n.told else None, "ci95": list(n.ci95) if n.told else None,
                 "status": "full" if n.told else WEAK, "unit": n.unit, "nominal": n.nominal,
-                "combination": "", "parameter": n.parameter,
+                "combination": "", "bias": None, "parameter": n.parameter,
             }
             for n in hydraulics.numbers
         ]  # fmt: skip

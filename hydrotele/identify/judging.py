@@ -8,6 +8,7 @@ from hydrotele.identify.result import Forces, HeldOut
 from hydrotele.identify.setup import Setup
 
 _WORSE = 1.5  # times the noise; beyond it the model lacks something
+_FOREIGN = 3.0  # times the fitted runs' residuals; beyond it they tell too little
 
 
 def heldout_errors(
@@ -47,11 +48,14 @@ def whiteness(residual: np.ndarray) -> np.ndarray:
     return np.sum(error[1:] * error[:-1], axis=0) / np.sum(error**2, axis=0)
 
 
-def status_of(heldout: dict[str, HeldOut], still: np.ndarray, setup: Setup) -> str:
+def status_of(
+    heldout: dict[str, HeldOut], fitted: dict[str, float], still: np.ndarray, setup: Setup
+) -> str:
     """`ok`, or what is wrong and what to do about it.
 
     Args:
         heldout: prediction of the held-out run.
+        fitted: drive -> RMS of the residuals of the runs to fit [N] or [N m].
         still: (k,) whether a given joint stood still in all runs to fit.
         setup: of the regressor.
 
@@ -71,5 +75,12 @@ def status_of(heldout: dict[str, HeldOut], still: np.ndarray, setup: Setup) -> s
         return (
             f"on the held-out run the force of {', '.join(worse)} differs by more than the sensors"
             " explain: the model lacks something there; look for it with `hydrotele gap`"
+        )
+    worse = [d for d, h in heldout.items() if h.rms > _FOREIGN * fitted[d]]
+    if worse:
+        return (
+            f"on the held-out run the force of {', '.join(worse)} differs by more than"
+            f" {_FOREIGN:g} times as much as on the fitted ones: they do not tell what happens"
+            " there; fit runs like it, too"
         )
     return "ok"

@@ -135,7 +135,7 @@ def joint_motion(
     if processing.method == "optimal":
         return smooth(positions, period, found.noise)
     moving = _filtered(positions, period, found, processing, found.noise)
-    if processing.method != "zero_phase" or found.moves.all():
+    if found.moves.all():
         return moving
     return _rested(moving, smooth(positions, period, found.noise), found.moves)
 

@@ -29,6 +29,7 @@ class ParameterRow:
         status: see `MEANING`.
         combination: the combination that stands behind this name, or those that the parameter is
             part of; empty where there is none.
+        bias: that noise of the positions would have left in the value, taken off; or None.
     """
 
     name: str
@@ -39,6 +40,7 @@ class ParameterRow:
     ci95: tuple[float, float] | None
     status: str
     combination: str
+    bias: float | None = None
 
 
 def parameter_rows(found: Identification) -> list[ParameterRow]:
@@ -62,6 +64,7 @@ def parameter_rows(found: Identification) -> list[ParameterRow]:
             rows.append(ParameterRow(
                 name, unit, float(given[k]), float(found.estimate.value[k]),
                 float(found.estimate.std[k]), (float(low), float(high)), status, text,
+                float(found.bias[k]),
             ))  # fmt: skip
             continue
         part_of = [found.names[b] for b, row in zip(found.told.base, found.told.combination,

@@ -12,6 +12,9 @@ from hydrotele.identify.equations import low_pass, row_forces
 from hydrotele.identify.motion import Processing, Resolution, adjoint, joint_motion
 from hydrotele.identify.record import Record
 from hydrotele.identify.setup import Setup
+from hydrotele.identify.smoothed import Smoothed
+
+_BLOCK = 4  # parameters at a time, so that long logs need little memory
 
 
 def propagated(
@@ -35,7 +38,7 @@ def propagated(
     """
     p, _, k = gain.shape
     assert processing.band
-    low, thin = low_pass(processing.band, record.period)
+    low, thin = low_pass(processing.band, record.period, processing.period)
     rows = len(record.force)
     spaced = np.zeros((p, rows, k))
     middle = (len(low) - 1) // 2
@@ -43,27 +46,33 @@ def propagated(
     on_force = fftconvolve(spaced, low[None, :, None], mode="same", axes=1)
     noise = np.where(np.isfinite(record.force_noise), record.force_noise, 0.0)
     out = np.einsum("pnk,k,qnk->pq", on_force, noise**2, on_force, optimize=True)
-    slopes = _slopes(record, found, setup, processing, value)
-    # an equation's error is measured less modelled force: the sign does not matter in a square
-    on_motion = np.einsum("pnk,xnkj->xpnj", on_force, slopes)
-    on_position = adjoint(on_motion, record.period, found, processing)
-    stated = found.noise**2
+    motion = joint_motion(record.position, record.period, found, processing)
+    cycles = 1
+    if processing.method == "periodic":  # every cycle has the same slopes and is read alike
+        assert processing.period
+        cycles = round(rows * record.period / processing.period)
+    slopes = _slopes(motion, slice(0, rows // cycles), setup, value)
+    parts = []
+    for first in range(0, p, _BLOCK):
+        folded = on_force[first : first + _BLOCK].reshape(-1, cycles, rows // cycles, k)
+        # an equation's error is measured less modelled force: the sign does not matter in a square
+        on_motion = np.einsum("pcnk,xnkj->xpnj", folded, slopes, optimize=True)
+        parts.append(adjoint(on_motion, record.period, found, processing))
+    on_position, stated = np.concatenate(parts), found.noise**2 / cycles
     return out + np.einsum("pnj,j,qnj->pq", on_position, stated, on_position, optimize=True)
 
 
-def _slopes(
-    record: Record, found: Resolution, setup: Setup, processing: Processing, value: np.ndarray
-) -> np.ndarray:
+def _slopes(motion: Smoothed, rows: slice, setup: Setup, value: np.ndarray) -> np.ndarray:
     """Slopes (3, n, k, j) of drive forces over positions, rates and accelerations of the joints."""
-    motion = joint_motion(record.position, record.period, found, processing)
-    motions = np.stack([motion.value, motion.rate, motion.acceleration])
-    steps = (motion.value_std, motion.rate_std, motion.acceleration_std)
-    middle = row_forces(setup, motions, value, motion.rate_std)
+    motions = np.stack([motion.value, motion.rate, motion.acceleration])[:, rows]
+    rate_std = motion.rate_std[rows]
+    steps = (motion.value_std[rows], rate_std, motion.acceleration_std[rows])
+    middle = row_forces(setup, motions, value, rate_std)
     out = np.empty((3, *middle.shape, motions.shape[2]))
     for x, step in enumerate(steps):
         for j in range(motions.shape[2]):
             moved = motions.copy()
             moved[x, :, j] += step[:, j]
-            force = row_forces(setup, moved, value, motion.rate_std)
+            force = row_forces(setup, moved, value, rate_std)
             out[x, :, :, j] = (force - middle) / np.maximum(step[:, j], 1e-300)[:, None]
     return out

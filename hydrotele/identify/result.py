@@ -96,5 +96,5 @@ class Identification:
         Returns:
             Squared distance in standard deviations, and what 95 % of right ones stay below.
         """
-        limit = float(chi2.ppf(0.95, len(self.told.base)))
+        limit = float(chi2.ppf(0.95, self.estimate.rank))
         return self.estimate.ellipsoid(self.told.combination @ value), limit

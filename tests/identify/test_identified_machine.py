@@ -46,7 +46,14 @@ def as_found(table, told, value, share=1e-3):
     base = told.combination @ value
     spread = share * np.maximum(np.abs(base), 1.0)
     estimate = Estimate(
-        base, np.diag(spread**2), np.zeros((1, 1)), np.zeros((len(base), 1, 1)), 1.0
+        base,
+        np.diag(spread**2),
+        np.zeros((1, 1)),
+        np.zeros((len(base), 1, 1)),
+        1.0,
+        np.eye(1),
+        np.eye(len(base)),
+        len(base),
     )
     nothing = Forces("", (), *(np.zeros((0,)) for _ in range(4)))
     return Identification(
