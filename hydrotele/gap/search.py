@@ -119,17 +119,24 @@ def _weighed(
         that settles for less than it seemed counts by that.
     """
     own, others = compare(evidence, guess, index, ranked)
-    while others and others[0].score > own.score:
+    for _ in range(2 * _RIVALS):
+        if not others or others[0].score <= own.score:
+            break
         best = others[0]
         if not worth_naming(best.guess, -1, best.score):
             break
         other, asked = _exchanged(guess, index, best.guess), best.charge - own.charge
         grown, settled, gain = _settled_gain(evidence, guess, other)
         if gain >= asked:
-            return grown, settled, *compare(evidence, grown, index, ranked)
-        evidence.set_base(guess)
-        fair = replace(best, gain=own.gain + gain)
-        others = tuple(sorted((*others[1:], fair), key=lambda one: -one.score))
+            beaten = guess.parts[index][0].key
+            guess, fit = grown, settled
+            own, others = compare(evidence, guess, index, ranked)
+            fair = [replace(one, gain=own.gain - gain) if one.guess.parts[-1][0].key == beaten
+                    else one for one in others]  # fmt: skip
+        else:
+            evidence.set_base(guess)
+            fair = [*others[1:], replace(best, gain=own.gain + gain)]
+        others = tuple(sorted(fair, key=lambda one: -one.score))
     return guess, fit, own, others
 
 
