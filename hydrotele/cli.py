@@ -25,6 +25,17 @@ MachineName = Annotated[
     typer.Option("--machine", "-m", help="Shipped machine, or a folder with machine.yaml."),
 ]
 ToolName = Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")]
+Logs = Annotated[
+    list[Path], typer.Option("--data", "-d", help="Folder of logs, log file or run folder.")
+]
+MoreLogs = Annotated[list[Path] | None, typer.Argument(help="More of them.")]
+HeldOut = Annotated[
+    str | None, typer.Option(help="Run to judge on, not fitted; default test*, or the last.")
+]
+Sensors = Annotated[str | None, typer.Option(help="Sensors of the machine.")]
+Force = Annotated[
+    bool, typer.Option("--force", help="Accept logs that name another machine or tool.")
+]
 
 
 def _overrides(items: list[str]) -> dict[str, str]:
@@ -106,16 +117,12 @@ def replay(
     "hydrotele gap --data runs/a runs/b --heldout b"
 )
 def gap(
-    data: Annotated[
-        list[Path], typer.Option("--data", "-d", help="Folder of logs, log file or run folder.")
-    ],
-    more: Annotated[list[Path] | None, typer.Argument(help="More of them.")] = None,
+    data: Logs,
+    more: MoreLogs = None,
     machine: MachineName = None,
     tool: ToolName = None,
-    heldout: Annotated[
-        str | None, typer.Option(help="Run to judge on, not fitted; default test*, or the last.")
-    ] = None,
-    sensors: Annotated[str | None, typer.Option(help="Sensors of the machine.")] = None,
+    heldout: HeldOut = None,
+    sensors: Sensors = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder to write; default gap_DATA.")
     ] = None,
@@ -123,9 +130,7 @@ def gap(
         list[str] | None, typer.Option("--effect", help="Try only this effect; may be repeated.")
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Accept logs that name another machine or tool.")
-    ] = False,
+    force: Force = False,
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
     json: Json = False,
 ) -> None:
@@ -143,16 +148,12 @@ def gap(
     "hydrotele identify --machine emps --data main.parquet --asymmetry"
 )
 def identify(
-    data: Annotated[
-        list[Path], typer.Option("--data", "-d", help="Folder of logs, log file or run folder.")
-    ],
-    more: Annotated[list[Path] | None, typer.Argument(help="More of them.")] = None,
+    data: Logs,
+    more: MoreLogs = None,
     machine: MachineName = None,
     tool: ToolName = None,
-    heldout: Annotated[
-        str | None, typer.Option(help="Run to judge on, not fitted; default test*, or the last.")
-    ] = None,
-    sensors: Annotated[str | None, typer.Option(help="Sensors of the machine.")] = None,
+    heldout: HeldOut = None,
+    sensors: Sensors = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder to write; default identify_DATA.")
     ] = None,
@@ -174,7 +175,9 @@ def identify(
     band: Annotated[
         float | None, typer.Option(help="Compare forces below this frequency [Hz].")
     ] = None,
-    period: Annotated[float | None, typer.Option(help="Period of a repeated motion [s].")] = None,
+    period: Annotated[
+        float | None, typer.Option(help="Period of a repeated motion, in seconds.")
+    ] = None,
     harmonics: Annotated[int, typer.Option(help="Harmonics of it to keep; 0: enough.")] = 0,
     estimator: Annotated[
         str,
@@ -187,9 +190,7 @@ def identify(
     ] = False,
     ridge: Annotated[float, typer.Option(help="Ridge, share of the largest singular value.")] = 0.0,
     truncate: Annotated[float, typer.Option(help="Leave out smaller singular values.")] = 0.0,
-    force: Annotated[
-        bool, typer.Option("--force", help="Accept logs that name another machine or tool.")
-    ] = False,
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Identify masses, friction and hydraulics from measured logs; write the identified machine."""
@@ -215,8 +216,8 @@ def excite(
     machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Scenario to write (.yaml).")],
     tool: ToolName = None,
-    sensors: Annotated[str | None, typer.Option(help="Sensors of the machine.")] = None,
-    period: Annotated[float, typer.Option(min=1.0, help="Of the motion [s].")] = 20.0,
+    sensors: Sensors = None,
+    period: Annotated[float, typer.Option(min=1.0, help="Of the motion, in seconds.")] = 20.0,
     harmonics: Annotated[int, typer.Option(min=1, max=30, help="Of the motion.")] = 8,
     starts: Annotated[int, typer.Option(min=1, help="Searches from random motions.")] = 2,
     seed: Annotated[int, typer.Option(help="Of these.")] = 0,

@@ -1,6 +1,6 @@
 """The designed excitation against one of Khoshzaban's style: determinant and intervals.
 
-    python tools/excitation_study.py [--harmonics 8] [--starts 2] [--seed 0] [--trials 5]
+    python tools/excitation_study.py [--harmonics 10] [--starts 4] [--seed 0] [--trials 5]
         [--out docs/results/excitation.md]
 
 Both motions repeat after 20 s and are run for 60 s by the simulator, with the CAT 215's sensors.
@@ -9,7 +9,6 @@ ordinary motion tells; the intervals are those that the identification states, f
 logs, for parameters that it tells from either.
 """
 
-import argparse
 import tempfile
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from hydrotele.identify.setup import machine_setup
 from hydrotele.machine_file import load_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario, load_scenario
+from tools.study import options, publish
 
 SENSORS, OLD, HELD_OUT = "khoshzaban1992", "excitation", "excitation_fast"
 
@@ -70,15 +70,7 @@ def spreads(scenario: Scenario, trials: int) -> dict[str, float]:
 
 def main() -> None:
     """Design, compare, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--harmonics", type=int, default=8)
-    parser.add_argument("--starts", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--trials", type=int, default=5)
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+    asked = options(__doc__, harmonics=10, starts=4, seed=0, trials=5)
     machine = load_machine("cat215")
     setup = machine_setup(machine, closed_chain(machine))
     noise = force_noise(machine, SENSORS)
@@ -117,12 +109,8 @@ def main() -> None:
         *(f"| {n} | {stds[0][n]:.3g} | {stds[1][n]:.3g} | {r:.2f} |" for n, r in ratios.items()),
         "",
     ])  # fmt: skip
-    print(text)
     print(tracked.get("tracking"))
-    if asked.out:
-        command = f"python tools/excitation_study.py --harmonics {asked.harmonics}"
-        command += f" --starts {asked.starts} --seed {asked.seed} --trials {asked.trials}"
-        asked.out.write_text(f"# Designed excitation\n\n`{command}`\n\n{text}")
+    publish(text, "Designed excitation", asked)
 
 
 if __name__ == "__main__":

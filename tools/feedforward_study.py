@@ -9,7 +9,6 @@ model comes from its own log of an excitation with its usual sensors, through `h
 functions. Figures are RMS distances of the tip from its reference, after the start.
 """
 
-import argparse
 import tempfile
 from pathlib import Path
 
@@ -31,6 +30,7 @@ from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine, save_machine
 from hydrotele.run import Run, run_scenario
 from hydrotele.scenario import Scenario, load_scenario
+from tools.study import options, publish
 
 SENSORS = "khoshzaban1992"
 AXES = ("swing", "boom", "stick")
@@ -140,12 +140,7 @@ def excited(folder: Path, seed: int) -> Run:
 
 def main() -> None:
     """Drive, identify, drive again, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+    asked = options(__doc__, seed=1)
     given = direct_machine()
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
@@ -177,10 +172,7 @@ def main() -> None:
                 lines.append(f"| {shape} | {lap:g} | {cells} |")
                 print(lines[-1], flush=True)
     text = "\n".join(lines) + "\n"
-    print(text)
-    if asked.out:
-        command = f"python tools/feedforward_study.py --seed {asked.seed}"
-        asked.out.write_text(f"# Computed-force feedforward\n\n`{command}`\n\n{text}")
+    publish(text, "Computed-force feedforward", asked)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,6 @@ deleted parameters. One counts as fully identifiable here if no more than a stat
 in the null space.
 """
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 
 from hydrotele.commands.identifying import closed_chain
@@ -22,6 +19,7 @@ from hydrotele.identify.machine_friction import pin_friction
 from hydrotele.identify.projection import project
 from hydrotele.identify.regressor import Regressor, Rubbing, regressor
 from hydrotele.machine_file import load_machine
+from tools.study import options, publish
 
 TABLE_13 = (31, 24, 27)
 PARTS = (1e-5, 0.01, 0.05)
@@ -113,13 +111,6 @@ def _values(flat: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+    asked = options(__doc__)
     text = report()
-    print(text)
-    if asked.out:
-        head = "# Identifiability of the complete model\n\n`python tools/identifiability_study.py`"
-        asked.out.write_text(f"{head}\n\n{text}")
+    publish(text, "Identifiability of the complete model", asked)

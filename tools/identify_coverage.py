@@ -10,10 +10,7 @@ parameters that it gives a number for: the combination as the identification wro
 recorded machine's numbers. The ellipsoid is that of all of them together.
 """
 
-import argparse
 import dataclasses
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,6 +25,7 @@ from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.machine_file import load_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
+from tools.study import options, publish, side_by_side
 
 FIT, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"
 OFF = 0.15
@@ -72,18 +70,6 @@ def one_trial(seed: int, number: int, sensors: str) -> dict[str, Any]:
     }
 
 
-def study(trials: int, seed: int, jobs: int, sensors: str) -> list[dict[str, Any]]:
-    """All trials, with a line for every tenth."""
-    numbers, results = range(trials), []
-    with ProcessPoolExecutor(jobs) as pool:
-        found = pool.map(one_trial, [seed] * trials, numbers, [sensors] * trials)
-        for k, result in enumerate(found, start=1):
-            results.append(result)
-            if k % 10 == 0:
-                print(f"{k} of {trials}", flush=True)
-    return results
-
-
 def report(results: list[dict[str, Any]]) -> str:
     """A table in Markdown."""
     away = np.array([z for r in results for z in r["away"].values()])
@@ -114,17 +100,6 @@ def report(results: list[dict[str, Any]]) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--trials", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--sensors", default="khoshzaban1992")
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
-    text = report(study(asked.trials, asked.seed, asked.jobs, asked.sensors))
-    print(text)
-    if asked.out:
-        command = f"python tools/identify_coverage.py --trials {asked.trials} --seed {asked.seed}"
-        asked.out.write_text(f"# Coverage of identified parameters\n\n`{command}`\n\n{text}")
+    asked = options(__doc__, trials=300, seed=1, sensors="khoshzaban1992", jobs=2)
+    found = side_by_side(one_trial, asked, asked.sensors)
+    publish(report(found), "Coverage of identified parameters", asked)

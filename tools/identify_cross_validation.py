@@ -10,13 +10,10 @@ MEASURED is the folder of the independent simulator's logs: there the same is do
 data, each run held out in turn.
 """
 
-import argparse
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from identify_coverage import wrong_setup
 
 from hydrotele.commands.identifying import closed_chain
 from hydrotele.dataset.files import RunFiles
@@ -29,6 +26,8 @@ from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
+from tools.identify_coverage import wrong_setup
+from tools.study import options, publish, side_by_side
 
 MOTIONS, SENSORS, CLEAN = ("excitation", "excitation_fast"), "khoshzaban1992", "open_04"
 THESIS = {  # Khoshzaban 1992, cross-validation of the CAT 215's models
@@ -94,34 +93,21 @@ def rows(results: Sequence[Errors]) -> list[str]:
     return lines
 
 
-def main() -> None:
-    """Run all, print and write the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("measured", type=Path)
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
-    many = asked.trials
-    with ProcessPoolExecutor(asked.jobs) as pool:
-        found = list(pool.map(one_trial, [asked.seed] * many, range(many)))
-    text = "\n".join([
+def report(trials: Sequence[list[Errors]], measured: Sequence[Errors]) -> str:
+    """All tables in Markdown."""
+    return "\n".join([
         "N m for the swing, N for the cylinders.", "",
-        f"Simulated here, {many} trials:", "", *rows([e for trial in found for e in trial]), "",
-        f"The independent simulator's clean logs ({CLEAN}), each run held out in turn:", "",
-        *rows(independent(asked.measured / CLEAN, asked.seed)), "",
+        f"Simulated here, {len(trials)} trials:", "", *rows([e for found in trials for e in found]),
+        "", f"The independent simulator's clean logs ({CLEAN}), each run held out in turn:", "",
+        *rows(measured), "",
         "The thesis' excavator (all frequencies, its own noise and nominal model):", "",
         "| force of | complete | reduced | nominal |", "| --- | ---: | ---: | ---: |",
         *(f"| {d} | {c:.0f} | {r:.0f} | {n:.0f} |" for d, (c, r, n) in THESIS.items()), "",
     ])  # fmt: skip
-    print(text)
-    if asked.out:
-        command = f"python tools/identify_cross_validation.py ../shared/measured --trials {many}"
-        asked.out.write_text(f"# Cross-validation\n\n`{command} --seed {asked.seed}`\n\n{text}")
 
 
 if __name__ == "__main__":
-    main()
+    asked = options(__doc__, "measured", trials=10, seed=1, jobs=2)
+    found = side_by_side(one_trial, asked)
+    text = report(found, independent(asked.measured / CLEAN, asked.seed))
+    publish(text, "Cross-validation", asked)

@@ -12,10 +12,6 @@ the recorded machine's forces less those of the identified parameters, mean over
 noise has a part in the judgement.
 """
 
-import argparse
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
-
 import numpy as np
 
 from hydrotele.commands.identifying import closed_chain
@@ -34,6 +30,7 @@ from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
+from tools.study import options, publish, side_by_side
 
 PERIOD = 20.0  # s, of the scenario `excitation`
 RADIUS, REACH, HEIGHT, TURN = 0.7, 5.2, 0.8, 0.4  # m, m, m, rad
@@ -110,22 +107,6 @@ def report(results: list[dict[str, list[list[float]]]]) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--cycles", type=int, default=5)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
-    many = asked.trials
-    with ProcessPoolExecutor(asked.jobs) as pool:
-        numbers = range(many)
-        found = list(pool.map(one_trial, [asked.seed] * many, numbers, [asked.cycles] * many))
-    text = report(found)
-    print(text)
-    if asked.out:
-        command = f"python tools/identify_signals.py --trials {many} --seed {asked.seed}"
-        command += f" --cycles {asked.cycles}"
-        asked.out.write_text(f"# Signal processing and what it predicts\n\n`{command}`\n\n{text}")
+    asked = options(__doc__, trials=10, seed=1, cycles=5, jobs=2)
+    found = side_by_side(one_trial, asked, asked.cycles)
+    publish(report(found), "Signal processing and what it predicts", asked)

@@ -8,7 +8,6 @@ one process with a Python loop over Pinocchio's regressor of the same spanning t
 that one yields the tree's columns only, without projection on the drives and without friction.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from hydrotele.log import Log, save_log
 from hydrotele.machine_file import load_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
+from tools.study import options, publish
 
 CHILD = """
 import resource, sys, time
@@ -109,12 +109,7 @@ def throughput(rows: int) -> list[tuple[str, float]]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+    asked = options(__doc__, minutes=60.0)
     log = run_scenario(load_scenario("excitation", {"duration": str(60 * asked.minutes)})).measured
     lines = ["| log [min] | identification [s] | process in all [s] | largest memory [MB] |",
              "| ---: | ---: | ---: | ---: |"]  # fmt: skip
@@ -124,10 +119,7 @@ def main() -> None:
     lines += ["", "| regressor, 20 000 rows | us per row |", "| --- | ---: |"]
     lines += [f"| {name} | {value:.1f} |" for name, value in throughput(20_000)]
     text = "\n".join(lines) + "\n"
-    print(text)
-    if asked.out:
-        command = f"python tools/identify_speed.py --minutes {asked.minutes:g}"
-        asked.out.write_text(f"# Speed of identification\n\n`{command}`\n\n{text}")
+    publish(text, "Speed of identification", asked)
 
 
 if __name__ == "__main__":

@@ -11,10 +11,7 @@ are differentiated as the identification does it; beside that stands the simulat
 with which the pressures' errors are the only ones.
 """
 
-import argparse
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -34,6 +31,7 @@ from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
 from hydrotele.run import Run, run_scenario
 from hydrotele.scenario import load_scenario
+from tools.study import options, publish, side_by_side
 
 RUNS, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"
 PSI = 6894.757
@@ -154,19 +152,5 @@ def report(results: list[dict[tuple[str, str, str], dict[str, float]]]) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
-    many = asked.trials
-    with ProcessPoolExecutor(asked.jobs) as pool:
-        found = list(pool.map(one_trial, [asked.seed] * many, range(many)))
-    text = report(found)
-    print(text)
-    if asked.out:
-        command = f"python tools/sensor_study.py --trials {many} --seed {asked.seed}"
-        asked.out.write_text(f"# What better sensors are worth\n\n`{command}`\n\n{text}")
+    asked = options(__doc__, trials=10, seed=1, jobs=2)
+    publish(report(side_by_side(one_trial, asked)), "What better sensors are worth", asked)

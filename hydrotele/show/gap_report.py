@@ -22,7 +22,7 @@ from hydrotele.gap.words import (
 from hydrotele.show.gap_figures import draw_heat_map, draw_overlay
 from hydrotele.show.gap_tables import channel_table, law_table, ranking_table, test_table
 from hydrotele.show.gap_windows import most_changed
-from hydrotele.show.report_html import Markup, interval, picture, table, tag, text
+from hydrotele.show.report_html import Markup, interval, page, picture, section, table, tag, text
 from hydrotele.show.report_style import STYLE
 
 _CHANNELS = 4
@@ -54,17 +54,7 @@ def write_report(gap: Gap, path: str | Path) -> None:
         _notes(gap),
         _use(gap),
     ]
-    page = (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"{tag('title', title)}<style>{STYLE}</style></head>\n"
-        f"<body><main>{''.join(sections)}</main></body></html>\n"
-    )
-    Path(path).write_text(page, encoding="utf-8")
-
-
-def _section(heading: str, why: str, *inside: Markup) -> Markup:
-    return tag("section", tag("h2", heading), tag("p", why, class_="why"), *inside)
+    Path(path).write_text(page(title, STYLE, sections), encoding="utf-8")
 
 
 def _header(gap: Gap) -> Markup:
@@ -107,7 +97,7 @@ def _found(gap: Gap) -> Markup:
     head = ("effect", "parameter", "model had", "found", "95 % interval", "unit",
             "model and found, to scale", "probability")  # fmt: skip
     why = "Values that the fit runs ask for. The interval holds the true value in 95 of 100 cases."
-    return _section("What was found", why, table(head, rows, numbers="  nnn  n"))
+    return section("What was found", why, table(head, rows, numbers="  nnn  n"))
 
 
 def _unknown(gap: Gap) -> Markup:
@@ -124,7 +114,7 @@ def _unknown(gap: Gap) -> Markup:
     ]
     why = "None of the known effects removes this; here is what can be said of it."
     rows = [(tag("b", name), value) for name, value in facts]
-    return _section(
+    return section(
         "What is not explained", why, tag("p", unknown.description), table(("", ""), rows)
     )
 
@@ -142,7 +132,7 @@ def _proof(gap: Gap) -> Markup:
         for name in most_changed(before, after, _CHANNELS)
     ]
     which = "that changed most" if patched else "that are off most"
-    return _section(
+    return section(
         "Proof on data that were not fitted" if patched else "Predictions on data not fitted", why,
         channel_table(before, after if patched else None),
         tag("h3", f"Readings and predictions of the channels {which}"), *pictures,
@@ -161,7 +151,7 @@ def _where(gap: Gap) -> Markup:
     )  # fmt: skip
     why = f"Which law of the model fails, and in which channel and when, on {gap.before[0].run}."
     laws = law_table(gap.laws, gap.law_units, changed) if gap.laws else Markup("")
-    return _section("Where the model is off", why, laws, heat)
+    return section("Where the model is off", why, laws, heat)
 
 
 def _ranking(gap: Gap) -> Markup:
@@ -172,14 +162,14 @@ def _ranking(gap: Gap) -> Markup:
         " likelihood over the fit runs, less the charge for its parameters; below 0 an effect is"
         " not worth naming."
     )
-    return _section("Ranking of single effects", why, ranking_table(gap))
+    return section("Ranking of single effects", why, ranking_table(gap))
 
 
 def _rest(gap: Gap) -> Markup:
     if not gap.tests:
         return Markup("")
     why = "What is left after the last model must look like sensor noise in every respect."
-    return _section("Is anything left?", why, test_table(gap.tests))
+    return section("Is anything left?", why, test_table(gap.tests))
 
 
 def _next(gap: Gap) -> Markup:
@@ -201,14 +191,14 @@ def _next(gap: Gap) -> Markup:
     if not parts:
         return Markup("")
     why = "What these data leave open, and what would settle it."
-    return _section("Alternatives and the next experiment", why, *parts)
+    return section("Alternatives and the next experiment", why, *parts)
 
 
 def _notes(gap: Gap) -> Markup:
     if not gap.notes:
         return Markup("")
     items = tag("ul", *(tag("li", note) for note in gap.notes))
-    return _section("Notes on the data", "What was left out or mended before the search.", items)
+    return section("Notes on the data", "What was left out or mended before the search.", items)
 
 
 def _use(gap: Gap) -> Markup:

@@ -12,7 +12,7 @@ from hydrotele.identify.hydraulic import Hydraulics
 from hydrotele.identify.parameter_rows import MEANING, counts, parameter_rows
 from hydrotele.identify.result import Identification
 from hydrotele.show.identify_figures import draw_forces
-from hydrotele.show.report_html import Markup, interval, picture, table, tag, text
+from hydrotele.show.report_html import Markup, interval, page, picture, section, table, tag, text
 from hydrotele.show.report_style import STYLE
 
 _MEMBERS = 6  # of a combination that are written out
@@ -39,20 +39,10 @@ def write_identify_report(
     notes = found.notes if found else dataset.notes
     if notes:
         items = tag("ul", *(tag("li", note) for note in notes))
-        sections.append(_section("Notes", "On the data and on what was left out.", items))
+        sections.append(section("Notes", "On the data and on what was left out.", items))
     sections.append(_use(found, hydraulics))
     title = f"{dataset.machine.name}: identification"
-    page = (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"{tag('title', title)}<style>{STYLE}</style></head>\n"
-        f"<body><main>{''.join(sections)}</main></body></html>\n"
-    )
-    Path(path).write_text(page, encoding="utf-8")
-
-
-def _section(heading: str, why: str, *inside: Markup) -> Markup:
-    return tag("section", tag("h2", heading), tag("p", why, class_="why"), *inside)
+    Path(path).write_text(page(title, STYLE, sections), encoding="utf-8")
 
 
 def _header(
@@ -104,7 +94,7 @@ def _proof(found: Identification) -> Markup:
         " where the positions tell accelerations. Noise alone is what a perfect model would show"
         " with these sensors; the grey band is twice that."
     )
-    return _section("Forces on data that were not fitted", why,
+    return section("Forces on data that were not fitted", why,
                     table(head, rows, numbers=" nnnn"), *pictures)  # fmt: skip
 
 
@@ -125,7 +115,7 @@ def _parameters(found: Identification) -> Markup:
         "A combination stands under the name of its first member; all numbers in its row are those"
         f" of the whole. Condition of the equations {found.estimate.condition:.3g}."
     )
-    return _section("What the data tell", why, table(head, rows, numbers=" nnn"))
+    return section("What the data tell", why, table(head, rows, numbers=" nnn"))
 
 
 def _tests(found: Identification, best: Consistent | None) -> Markup:
@@ -143,7 +133,7 @@ def _tests(found: Identification, best: Consistent | None) -> Markup:
         f" distribution. Residuals correlate with those before them by: {memory}; the intervals"
         " know of it."
     )
-    return _section("Tests", why, table(head, rows, numbers=" nn"))
+    return section("Tests", why, table(head, rows, numbers=" nn"))
 
 
 def _others(found: Identification) -> Markup:
@@ -154,7 +144,7 @@ def _others(found: Identification) -> Markup:
         parts.append((tag("b", status), str(number), MEANING[status], ", ".join(names) or "-"))
     head = ("status", "number", "meaning", "those without a number of their own")
     why = "Why some parameters have no number: the data do not hold one."
-    return _section("Identifiability", why, table(head, parts, numbers=" n"))
+    return section("Identifiability", why, table(head, parts, numbers=" n"))
 
 
 def _short(combination: str) -> str:
@@ -181,7 +171,7 @@ def _hydraulics(found: Hydraulics) -> Markup:
         "All fitted together to one-step prediction errors of commands, pressures and motion,"
         f" which fall from {found.before:.2f} to {found.after:.2f} times noise on the held-out run."
     )
-    return _section("Valves, oil and supply", why, table(head, rows, numbers="  nnn"))
+    return section("Valves, oil and supply", why, table(head, rows, numbers="  nnn"))
 
 
 def _use(found: Identification | None, hydraulics: Hydraulics | None) -> Markup:

@@ -114,3 +114,27 @@ def _svg(class_: str, width: int, height: int, parts: list[str]) -> Markup:
     size = f'width="{width}" height="{height}" viewBox="0 0 {width} {height}"'
     head = f'<svg class="{class_}" {size} role="img">'
     return Markup(f"{head}{''.join(parts)}</svg>")
+
+
+def section(heading: str, why: str, *inside: Markup) -> Markup:
+    """A section with a heading and a sentence on what it is for."""
+    return tag("section", tag("h2", heading), tag("p", why, class_="why"), *inside)
+
+
+def page(title: str, style: str, sections: Iterable[Markup]) -> str:
+    """A whole document that needs nothing else.
+
+    Args:
+        title: for the browser.
+        style: CSS.
+        sections: its content.
+
+    Returns:
+        HTML.
+    """
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"{tag('title', title)}<style>{style}</style></head>\n"
+        f"<body><main>{''.join(sections)}</main></body></html>\n"
+    )

@@ -16,7 +16,7 @@ from hydrotele.identify.setup import machine_setup
 from hydrotele.machine_file import load_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
-from tools.identify_coverage import study
+from tools.identify_coverage import one_trial
 
 PERIOD = 20.0  # s, of the scenario `excitation`
 
@@ -81,7 +81,7 @@ def test_instruments_ask_for_a_repeated_motion(repeated):
 
 def test_intervals_of_repeated_experiments_cover_the_truth():
     """Six of the three hundred of `tools/identify_coverage.py`."""
-    results = study(6, 2026, 1, "khoshzaban1992")
+    results = [one_trial(2026, number, "khoshzaban1992") for number in range(6)]
     away = np.array([z for r in results for z in r["away"].values()])
     # of some 140 intervals, 95 % each, fewer than 88 % cover in one of a thousand studies
     assert len(away) > 120 and np.mean(np.abs(away) <= 1.959964) > 0.88
