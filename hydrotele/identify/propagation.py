@@ -14,6 +14,7 @@ from hydrotele.identify.record import Record
 from hydrotele.identify.setup import Setup
 from hydrotele.identify.smoothed import Smoothed
 
+_SLOPES = 8000  # rows of a run that are asked for the forces' slopes
 _BLOCK = 4  # parameters at a time, so that long logs need little memory
 
 
@@ -51,7 +52,7 @@ def propagated(
     if processing.method == "periodic":  # every cycle has the same slopes and is read alike
         assert processing.period
         cycles = round(rows * record.period / processing.period)
-    slopes = _slopes(motion, slice(0, rows // cycles), setup, value)
+    slopes = _slopes(motion, rows // cycles, setup, value)
     parts = []
     for first in range(0, p, _BLOCK):
         folded = on_force[first : first + _BLOCK].reshape(-1, cycles, rows // cycles, k)
@@ -62,8 +63,12 @@ def propagated(
     return out + np.einsum("pnj,j,qnj->pq", on_position, stated, on_position, optimize=True)
 
 
-def _slopes(motion: Smoothed, rows: slice, setup: Setup, value: np.ndarray) -> np.ndarray:
-    """Slopes (3, n, k, j) of drive forces over positions, rates and accelerations of the joints."""
+def _slopes(motion: Smoothed, count: int, setup: Setup, value: np.ndarray) -> np.ndarray:
+    """Slopes (3, n, k, j) of drive forces over positions, rates and accelerations of the joints.
+
+    They change as slowly as the motion: in long runs those of every few rows tell the others.
+    """
+    rows = np.arange(0, count, max(1, count // _SLOPES))
     motions = np.stack([motion.value, motion.rate, motion.acceleration])[:, rows]
     rate_std = motion.rate_std[rows]
     steps = (motion.value_std[rows], rate_std, motion.acceleration_std[rows])
@@ -75,4 +80,8 @@ def _slopes(motion: Smoothed, rows: slice, setup: Setup, value: np.ndarray) -> n
             moved[x, :, j] += step[:, j]
             force = row_forces(setup, moved, value, rate_std)
             out[x, :, :, j] = (force - middle) / np.maximum(step[:, j], 1e-300)[:, None]
-    return out
+    if len(rows) == count:
+        return out
+    before = np.clip(np.searchsorted(rows, np.arange(count), side="right") - 1, 0, len(rows) - 2)
+    part = ((np.arange(count) - rows[before]) / np.diff(rows)[before])[None, :, None, None]
+    return (1.0 - part) * out[:, before] + part * out[:, before + 1]
