@@ -10,9 +10,13 @@ from hydrotele.effects.effect import changed
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.laws import friction
 from hydrotele.identify.chain import load_chain
+from hydrotele.identify.estimators import estimate
+from hydrotele.identify.identifiability import identifiability
 from hydrotele.identify.machine_friction import drive_friction, pin_friction
 from hydrotele.identify.projection import project
+from hydrotele.identify.reference_size import reference_sizes
 from hydrotele.identify.regressor import Rubbing, regressor
+from hydrotele.identify.setup import machine_setup
 from hydrotele.machine_file import load_machine
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
@@ -87,6 +91,30 @@ def test_regressor_times_parameters_is_the_inverse_dynamics_of_mujoco(tool):
         # MuJoCo's side knows the basis' rate to 1e-10 by differences; forces are 1e4 .. 1e5 N
         error = found.matrix[k] @ found.nominal - expected
         assert np.abs(error).max() < 1e-8 * np.abs(expected).max()
+
+
+def test_noise_free_forces_of_mujoco_tell_every_combination_exactly():
+    """Complete model: forces by MuJoCo's inverse dynamics, not by our own regressor."""
+    machine, rng, rows = load_machine("cat215"), np.random.default_rng(5), 120
+    plant = build_plant(machine)
+    low, high = np.array([-1.0, -0.4, -2.4]), np.array([1.0, 0.9, -0.7])
+    poses, rates = rng.uniform(low, high, (rows, 3)), rng.uniform(-0.6, 0.6, (rows, 3))
+    accelerations = rng.uniform(-2, 2, (rows, 3))
+    found = of_machine(machine, poses, rates, accelerations)
+    forces = []
+    for pose, rate, acceleration in zip(poses, rates, accelerations, strict=True):
+        force, velocities = mujoco_forces(plant, pose, rate, acceleration)
+        forces.append(force + friction_of(machine, velocities))
+    flat = found.matrix.reshape(-1, found.matrix.shape[2])
+    told = identifiability(flat, found.names, found.units)
+    assert len(told.base) > 40
+    base = estimate(found.matrix[:, :, told.base], np.array(forces), order=0)
+    truth = told.combination @ found.nominal
+    # relative to the body's own mass, radius and inertia: many of the true numbers are 0
+    setup = machine_setup(machine, closed_chain(machine)[0])
+    size = reference_sizes(found, setup, np.sqrt(np.mean(np.square(forces), axis=0)))[told.base]
+    error = np.abs(base.value - truth)
+    assert error.max() > 0.0 and np.all(error <= 1e-6 * np.maximum(np.abs(truth), size))
 
 
 def test_columns_are_named_with_their_units_and_values():
