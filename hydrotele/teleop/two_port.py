@@ -1,0 +1,270 @@
+"""A bilateral teleoperator as a linear two-port: what is felt, whether it is passive and stable.
+
+Master and slave are masses, `Z = M s`, with controllers `C = B + K/s`; four channels join them:
+velocity forward C1, force back C2, force forward C3, velocity back C4. In and out go the hand's
+force and velocity and the environment's.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.errors import InputError
+
+Block = Callable[[np.ndarray], np.ndarray]  # transfer function of the complex frequency [rad/s]
+_RATE = ("rate_position", "rate_force", "four_channel_rate")
+_DIRECT = ("position_position", "position_force", "four_channel_position")
+STRUCTURES = (*_DIRECT, *_RATE)
+_WHERE = "two-port"
+
+
+@dataclass(frozen=True)
+class Impedance:
+    """Force over velocity of a mass, a damper and a spring, `M s + B + K/s`.
+
+    Attributes:
+        mass: M [kg].
+        damping: B [N s/m].
+        stiffness: K [N/m].
+    """
+
+    mass: float = 0.0
+    damping: float = 0.0
+    stiffness: float = 0.0
+
+    def __call__(self, s: np.ndarray) -> np.ndarray:
+        """Impedance [N s/m] at complex frequencies [rad/s]."""
+        return self.mass * s + self.damping + self.stiffness / s
+
+
+@dataclass(frozen=True)
+class TwoPort:
+    """A teleoperator.
+
+    Attributes:
+        master: impedance of the master.
+        slave: impedance of the slave.
+        master_control: C_m, what the master's controller makes of its own velocity.
+        slave_control: C_s.
+        velocity_forward: C1.
+        force_back: C2.
+        force_forward: C3.
+        velocity_back: C4.
+        delay_forward: from the master to the slave [s].
+        delay_back: from the slave to the master [s].
+    """
+
+    master: Impedance
+    slave: Impedance
+    master_control: Block
+    slave_control: Block
+    velocity_forward: Block
+    force_back: Block
+    force_forward: Block
+    velocity_back: Block
+    delay_forward: float = 0.0
+    delay_back: float = 0.0
+
+    def channels(self, s: np.ndarray) -> tuple[np.ndarray, ...]:
+        """C1 .. C4 at complex frequencies, with their delays."""
+        late, back = np.exp(-s * self.delay_forward), np.exp(-s * self.delay_back)
+        return (
+            self.velocity_forward(s) * late, self.force_back(s) * back,
+            self.force_forward(s) * late, self.velocity_back(s) * back,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Gains of a structure.
+
+    Attributes:
+        position: of the slave's position over the master's [1].
+        velocity: of the slave's velocity over the master's position, k_v [1/s].
+        force: of the force that comes back over the environment's [1].
+    """
+
+    position: float = 1.0
+    velocity: float = 1.0
+    force: float = 1.0
+
+
+def two_port(
+    structure: str, master: Impedance, slave: Impedance, master_control: Impedance,
+    slave_control: Impedance, gains: Gains | None = None, *, delay_forward: float = 0.0,
+    delay_back: float = 0.0, jerk: bool = False,
+) -> TwoPort:  # fmt: skip
+    """A teleoperator of a known structure.
+
+    Args:
+        structure: `position_position` (coordinating force), `position_force` (direct force),
+            `four_channel_position` (transparent), and the same under rate control:
+            `rate_position`, `rate_force`, `four_channel_rate`.
+        master: its mass and what rubs on it.
+        slave: the same of the slave.
+        master_control: damper and spring of the master's controller.
+        slave_control: damper and spring of the slave's controller.
+        gains: of the channels; those that a structure has not do not matter.
+        delay_forward: from the master to the slave [s].
+        delay_back: from the slave to the master [s].
+        jerk: whether the four-channel structure under rate control uses the master's jerk, which
+            makes it fully transparent and cannot be measured. Without, both sides' inertia is left
+            out of the channels, and of equal sides the master itself is felt, too.
+
+    Returns:
+        The two-port.
+
+    Raises:
+        InputError: the structure is not known, a gain or a delay makes no sense.
+
+    Source: Lawrence 1992; Zhu 1994, 3.9-3.62.
+
+    >>> heavy, firm = Impedance(1.0), Impedance(0.0, 40.0, 400.0)
+    >>> clear = two_port("four_channel_position", heavy, heavy, firm, firm)
+    >>> bool(np.allclose(hybrid(clear, 3j), [[0, 1], [-1, 0]]))
+    True
+    """
+    gains = gains or Gains()
+    if structure not in STRUCTURES:
+        raise InputError(_WHERE, f"{structure!r} is not known: {', '.join(STRUCTURES)}")
+    if min(delay_forward, delay_back) < 0.0:
+        raise InputError(_WHERE, f"delays must not be negative: {delay_forward}, {delay_back} s")
+    if structure in _RATE and not gains.velocity > 0.0:
+        raise InputError(_WHERE, f"the velocity gain must be positive, got {gains.velocity} 1/s")
+    k = gains.velocity
+
+    def nothing(s: np.ndarray) -> np.ndarray:
+        return np.zeros_like(s)
+
+    def rated(block: Block) -> Block:
+        return lambda s: block(s) * k / s
+
+    forward = _scaled(slave_control, gains.position)
+    own: Block = master_control
+    back, ahead, feel = nothing, nothing, nothing
+    if structure in ("position_position", "rate_position"):
+        feel = _scaled(master_control, -1.0)
+    if structure in ("position_force", "rate_force"):
+        back = lambda s: gains.force * np.ones_like(s)  # noqa: E731 - a constant block
+    if structure == "four_channel_position":
+        forward = lambda s: slave(s) + slave_control(s)  # noqa: E731
+        back, ahead = np.ones_like, np.ones_like
+        feel = lambda s: -(master(s) + master_control(s))  # noqa: E731
+    if structure in ("rate_position", "rate_force"):
+        forward = rated(slave_control)
+    if structure in ("rate_position", "four_channel_rate"):
+        own = rated(master_control)
+    if structure == "four_channel_rate":
+        forward = rated(lambda s: slave(s) * jerk + slave_control(s))
+        back, ahead = (lambda s: s / k), (lambda s: k / s)
+        feel = lambda s: -(master(s) * s / k * jerk + master_control(s))  # noqa: E731
+    return TwoPort(
+        master, slave, own, slave_control, forward, back, ahead, feel, delay_forward, delay_back
+    )
+
+
+def hybrid(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
+    """Hybrid matrix H of `[F_h, -V_e] = H [V_h, F_e]`.
+
+    Args:
+        port: the two-port.
+        s: (...) complex frequencies [rad/s].
+
+    Returns:
+        (..., 2, 2).
+
+    Source: Zhu 1994, 3.10-3.11.
+    """
+    s = np.asarray(s, complex)
+    c1, c2, c3, c4 = port.channels(s)
+    a, b = port.master(s) + port.master_control(s), port.slave(s) + port.slave_control(s)
+    rows = [[a * b + c1 * c4, c2 * b - c4], [-(c3 * a + c1), 1.0 - c2 * c3]]
+    return np.moveaxis(np.array(rows) / (b - c3 * c4), (0, 1), (-2, -1))
+
+
+def transmitted(port: TwoPort, s: np.ndarray | complex, environment: Block) -> np.ndarray:
+    """Impedance that the operator feels.
+
+    Args:
+        port: the two-port.
+        s: (...) complex frequencies [rad/s].
+        environment: impedance of the task.
+
+    Returns:
+        (...) [N s/m].
+
+    Source: Zhu 1994, 3.12.
+    """
+    s = np.asarray(s, complex)
+    h, task = hybrid(port, s), environment(s)
+    return h[..., 0, 0] - h[..., 0, 1] * h[..., 1, 0] * task / (1.0 + h[..., 1, 1] * task)
+
+
+def scattering_norm(port: TwoPort, s: np.ndarray | complex, unit: float = 1.0) -> np.ndarray:
+    """Largest singular value of the scattering matrix; passive where it stays at or below 1.
+
+    Args:
+        port: the two-port.
+        s: (...) points of the imaginary axis [rad/s].
+        unit: impedance by which forces are counted as velocities [N s/m]; passivity does not
+            depend on it.
+
+    Returns:
+        (...).
+
+    Source: Anderson and Spong 1989; Zhu 1994, chapter 3.
+    """
+    h = hybrid(port, s) * np.array([[1.0 / unit, 1.0], [1.0, unit]])
+    one = np.eye(2)
+    scatter = np.diag([1.0, -1.0]) @ (h - one) @ np.linalg.inv(h + one)
+    return np.linalg.svd(scatter, compute_uv=False)[..., 0]
+
+
+def characteristic(
+    port: TwoPort, s: np.ndarray | complex, hand: Block, environment: Block
+) -> np.ndarray:
+    """What is 0 at the poles of the whole loop: hand, teleoperator and task.
+
+    Args:
+        port: the two-port.
+        s: (...) complex frequencies [rad/s].
+        hand: impedance of the operator's hand.
+        environment: impedance of the task.
+
+    Returns:
+        (...) `(Z_m + C_m + Z_h)(Z_s + C_s + Z_e) + (C2 Z_e + C4)(C1 - C3 Z_h)` [(N s/m)^2].
+
+    Source: Zhu 1994, 3.13.
+    """
+    s = np.asarray(s, complex)
+    c1, c2, c3, c4 = port.channels(s)
+    near = port.master(s) + port.master_control(s) + hand(s)
+    far = port.slave(s) + port.slave_control(s) + environment(s)
+    return near * far + (c2 * environment(s) + c4) * (c1 - c3 * hand(s))
+
+
+def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
+    """Margin of the theorem of stiffness feedback, `B^2 - 4 M K_max`; stable if positive.
+
+    `M x'' + B x' + K(t) x = 0` with a stiffness that stays between bounds is then uniformly
+    asymptotically stable, however fast it changes, and whatever delay or task changes it.
+
+    Args:
+        mass: of joystick and hand, M [kg] or [kg m^2].
+        damping: of both, B [N s/m] or [N m s/rad].
+        stiffest: K_max [N/m] or [N m/rad].
+
+    Returns:
+        The margin.
+
+    Source: Zhu 1994, 4.2.
+
+    >>> stiffness_margin(1.0, 30.0, 200.0)
+    100.0
+    """
+    return damping**2 - 4.0 * mass * stiffest
+
+
+def _scaled(block: Block, factor: float) -> Block:
+    return lambda s: factor * block(s)

@@ -1,0 +1,182 @@
+"""Teleoperators as two-ports: published closed forms, passivity, and stability in simulation."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from hydrotele.errors import InputError
+from hydrotele.teleop.stability import stable, unstable_poles
+from hydrotele.teleop.two_port import (
+    STRUCTURES,
+    Gains,
+    Impedance,
+    characteristic,
+    hybrid,
+    scattering_norm,
+    stiffness_margin,
+    transmitted,
+    two_port,
+)
+
+MASTER, SLAVE = Impedance(0.8, 0.5), Impedance(2.0, 3.0)
+CM, CS = Impedance(0.0, 12.0, 150.0), Impedance(0.0, 60.0, 900.0)
+HAND, TASK = Impedance(0.6, 8.0, 250.0), Impedance(0.0, 20.0, 3000.0)
+S = 1j * np.geomspace(0.05, 200.0, 60)
+
+
+def test_transparent_under_position_control():
+    port = two_port("four_channel_position", MASTER, SLAVE, CM, CS)
+    assert np.allclose(hybrid(port, S), [[0.0, 1.0], [-1.0, 0.0]])
+    assert np.allclose(transmitted(port, S, TASK), TASK(S))
+
+
+def test_transparent_under_rate_control_needs_jerk():
+    kv = 1.7
+    port = two_port("four_channel_rate", SLAVE, SLAVE, CS, CS, Gains(velocity=kv), jerk=True)
+    found = hybrid(port, S)
+    assert np.allclose(found[:, 0, 1], S / kv) and np.allclose(found[:, 1, 0], -kv / S)
+    assert np.allclose(found[:, [0, 1], [0, 1]], 0.0, atol=1e-6)
+    assert np.allclose(transmitted(port, S, TASK), TASK(S))
+    # the form without jerk leaves the master itself (Zhu 1994, 3.61)
+    port = two_port("four_channel_rate", SLAVE, SLAVE, CS, CS, Gains(velocity=kv))
+    assert np.allclose(transmitted(port, S, TASK), SLAVE(S) + TASK(S))
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_the_transmitted_impedance_is_that_of_the_thesis(structure):
+    port = two_port(
+        structure, MASTER, SLAVE, CM, CS, Gains(0.8, 1.3, 0.6), delay_forward=0.03, delay_back=0.07
+    )
+    c1, c2, c3, c4 = port.channels(S)
+    near, far, task = MASTER(S) + port.master_control(S), SLAVE(S) + CS(S), TASK(S)
+    over = near * far + c1 * c4 + task * (near + c1 * c2)
+    assert np.allclose(transmitted(port, S, TASK), over / (far - c3 * c4 + task * (1.0 - c2 * c3)))
+    # the loop's poles are where hand and transmitted impedance cancel
+    whole = (HAND(S) + transmitted(port, S, TASK)) * (far - c3 * c4 + task * (1.0 - c2 * c3))
+    assert np.allclose(characteristic(port, S, HAND, TASK), whole)
+
+
+def test_passivity_is_lost_by_delay_and_by_rate_control():
+    """Position-position with equal controllers is a spring and damper between two masses."""
+    slow = 1j * np.geomspace(0.05, 50.0, 80)
+    passive = two_port("position_position", MASTER, SLAVE, CS, CS)
+    assert scattering_norm(passive, slow).max() < 1.0 + 1e-9
+    for changed in (
+        two_port("position_position", MASTER, SLAVE, CS, CS, delay_forward=0.1, delay_back=0.1),
+        two_port("rate_position", MASTER, SLAVE, CS, CS),
+        two_port("position_force", MASTER, SLAVE, CM, CS),
+    ):
+        assert scattering_norm(changed, slow).max() > 1.001
+    # whether a norm is above 1 does not depend on the unit
+    both = [scattering_norm(passive, slow, unit).max() for unit in (1e-2, 1e3)]
+    assert max(both) < 1.0 + 1e-9
+
+
+def test_poles_are_those_of_a_polynomial():
+    """Position-force without delay: a polynomial whose roots numpy finds."""
+    for force in (0.1, 1.0, 3.0, 10.0, 40.0):
+        port = two_port("position_force", MASTER, SLAVE, CM, CS, Gains(force=force))
+        near = np.array([MASTER.mass + HAND.mass, MASTER.damping + CM.damping + HAND.damping,
+                         CM.stiffness + HAND.stiffness])  # fmt: skip
+        far = np.array([SLAVE.mass, SLAVE.damping + CS.damping + TASK.damping,
+                        CS.stiffness + TASK.stiffness])  # fmt: skip
+        cross = force * np.polymul([TASK.damping, TASK.stiffness], [CS.damping, CS.stiffness])
+        roots = np.roots(np.polyadd(np.polymul(near, far), cross))
+        assert unstable_poles(port, HAND, TASK) == int(np.sum(roots.real > 0))
+
+
+def grows(structure, gains, delays, seconds=20.0, step=1e-3):
+    """Whether a kick of the hand grows, for many gains and delays at once."""
+    many, rows = len(delays), round(seconds / step)
+    late = np.round(delays / step).astype(int)
+    keep = int(late.max()) + 1
+    past = np.zeros((6, keep, many))  # x_h, v_h, integral of x_h, x_e, v_e, F_e
+    now, which = np.zeros((6, many)), np.arange(many)
+    now[1] = 0.1
+    near, far = MASTER.mass + HAND.mass, SLAVE.mass
+    size = np.zeros((rows, many))
+    for n in range(rows):
+        past[:, n % keep] = now
+        xh, vh, ih, xe, ve, fe = past[:, (n - late) % keep, which] * (n >= late)
+        x, v, i, y, w, _ = now
+        force = np.zeros(many)
+        if structure == "position_position":
+            felt = CM.damping * (v - ve) + CM.stiffness * (x - xe)
+            push = CS.damping * vh + CS.stiffness * xh
+        elif structure == "rate_position":
+            k = gains
+            felt = k * (CM.damping * x + CM.stiffness * i) - CM.damping * ve - CM.stiffness * xe
+            push = k * (CS.damping * xh + CS.stiffness * ih)
+        else:
+            felt = CM.damping * v + CM.stiffness * x
+            if structure == "position_force":
+                push, force = CS.damping * vh + CS.stiffness * xh, gains * fe
+            else:
+                push, force = gains * (CS.damping * xh + CS.stiffness * ih), fe
+        task = TASK.damping * w + TASK.stiffness * y
+        own = (MASTER.damping + HAND.damping) * v + HAND.stiffness * x
+        a = -(own + felt + force) / near
+        b = (push - SLAVE.damping * w - CS.damping * w - CS.stiffness * y - task) / far
+        v, w = v + step * a, w + step * b
+        now = np.array([x + step * v, v, i + step * x, y + step * w, w, task])
+        now = np.where(np.abs(now) < 1e100, now, 1e100 * np.sign(now))
+        size[n] = np.abs(x) + np.abs(y)
+    fifth = rows // 5
+    with np.errstate(divide="ignore"):
+        return np.log(size[-fifth:].max(axis=0)) > np.log(size[fifth : 2 * fifth].max(axis=0))
+
+
+@pytest.mark.parametrize(
+    "structure, gains",
+    [
+        ("position_position", (1.0,)),
+        ("position_force", (0.05, 0.15, 0.4, 1.0, 3.0, 8.0)),
+        ("rate_position", (0.3, 1.0, 3.0, 12.0, 40.0, 100.0)),
+        ("rate_force", (0.1, 0.3, 1.0, 3.0, 6.0, 12.0)),
+    ],
+)
+def test_predicted_stability_is_that_of_a_simulation(structure, gains):
+    delays = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
+    grid = np.array(list(itertools.product(gains, delays)))
+    seen = grows(structure, grid[:, 0], grid[:, 1])
+    predicted = []
+    for gain, delay in grid:
+        own = Gains(velocity=gain) if structure.startswith("rate") else Gains(force=gain)
+        port = two_port(
+            structure, MASTER, SLAVE, CM, CS, own, delay_forward=delay, delay_back=delay
+        )
+        predicted.append(not stable(port, HAND, TASK))
+    agree = np.mean(np.array(predicted) == seen)
+    assert agree >= 0.95, (agree, grid[np.array(predicted) != seen])
+    if structure != "position_position":
+        assert 0.1 < np.mean(seen) < 0.9  # both kinds are there
+
+
+def test_the_theorem_of_stiffness_feedback_holds_where_stiffness_jumps():
+    """Inside the margin no switching of the stiffness makes it grow; far outside one does."""
+    step, mass, stiffest = 1e-3, 1.0, 400.0
+
+    def worst(damping):
+        x, v, sizes = 0.01, 0.0, []
+        for _ in range(20_000):  # soft outwards, stiff inwards feeds most
+            k = stiffest if x * v < 0.0 else 0.05 * stiffest
+            v += step * (-(damping * v + k * x) / mass)
+            x += step * v
+            sizes.append(abs(x))
+        return max(sizes[-5000:]) / max(sizes[:5000])
+
+    assert stiffness_margin(mass, 41.0, stiffest) > 0.0 and worst(41.0) < 1e-3
+    assert stiffness_margin(mass, 2.0, stiffest) < 0.0 and worst(2.0) > 10.0
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(InputError, match="not known"):
+        two_port("telepathy", MASTER, SLAVE, CM, CS)
+    with pytest.raises(InputError, match="delays"):
+        two_port("rate_force", MASTER, SLAVE, CM, CS, delay_back=-0.1)
+    with pytest.raises(InputError, match="velocity gain"):
+        two_port("rate_force", MASTER, SLAVE, CM, CS, Gains(velocity=0.0))
+    light = Impedance(0.0, 1.0, 1.0)
+    with pytest.raises(InputError, match="masses"):
+        stable(two_port("position_position", light, light, CM, CS), light, light)
