@@ -86,45 +86,93 @@ def test_poles_are_those_of_a_polynomial():
         assert unstable_poles(port, HAND, TASK) == int(np.sum(roots.real > 0))
 
 
-def grows(structure, gains, delays, seconds=20.0, step=1e-3):
-    """Whether a kick of the hand grows, for many gains and delays at once."""
+def controls(structure, gains, now, past):
+    """Force that the master's controller takes, and that pushes the slave.
+
+    Both states hold the master's position, velocity and integral of its position, the slave's
+    position and velocity, and the task's force; the second one as it was a delay ago.
+    """
+    x, v, i, y, w, _ = now
+    xh, vh, ih, xe, ve, fe = past
+    if structure == "position_position":
+        felt = CM.damping * (v - ve) + CM.stiffness * (x - xe)
+        push = CS.damping * vh + CS.stiffness * xh
+    elif structure == "rate_position":
+        felt = gains * (CM.damping * x + CM.stiffness * i) - CM.damping * ve - CM.stiffness * xe
+        push = gains * (CS.damping * xh + CS.stiffness * ih)
+    elif structure == "position_force":
+        felt = CM.damping * v + CM.stiffness * x + gains * fe
+        push = CS.damping * vh + CS.stiffness * xh
+    else:
+        felt = CM.damping * v + CM.stiffness * x + fe
+        push = gains * (CS.damping * xh + CS.stiffness * ih)
+    return felt, push - CS.damping * w - CS.stiffness * y
+
+
+def simulated(structure, gains, delays, seconds, step, imposed=None):
+    """States (rows, 6, cases) after a kick of the hand, or with the master's motion imposed.
+
+    With an imposed motion, of `imposed(time) -> x, v, i, a`, also the force (rows, cases) that it
+    takes.
+    """
     many, rows = len(delays), round(seconds / step)
     late = np.round(delays / step).astype(int)
-    keep = int(late.max()) + 1
-    past = np.zeros((6, keep, many))  # x_h, v_h, integral of x_h, x_e, v_e, F_e
+    states, forces = np.zeros((rows, 6, many)), np.zeros((rows, many))
     now, which = np.zeros((6, many)), np.arange(many)
     now[1] = 0.1
-    near, far = MASTER.mass + HAND.mass, SLAVE.mass
-    size = np.zeros((rows, many))
     for n in range(rows):
-        past[:, n % keep] = now
-        xh, vh, ih, xe, ve, fe = past[:, (n - late) % keep, which] * (n >= late)
-        x, v, i, y, w, _ = now
-        force = np.zeros(many)
-        if structure == "position_position":
-            felt = CM.damping * (v - ve) + CM.stiffness * (x - xe)
-            push = CS.damping * vh + CS.stiffness * xh
-        elif structure == "rate_position":
-            k = gains
-            felt = k * (CM.damping * x + CM.stiffness * i) - CM.damping * ve - CM.stiffness * xe
-            push = k * (CS.damping * xh + CS.stiffness * ih)
+        if imposed:
+            now[:3] = np.array(imposed(n * step)[:3])[:, None]
+        states[n] = now
+        past = np.where(n >= late, states[np.maximum(n - late, 0), :, which].T, 0.0)
+        felt, push = controls(structure, gains, now, past)
+        x, v, i, y, w, task = now
+        if imposed:
+            a = imposed(n * step)[3]
+            forces[n] = MASTER.mass * a + MASTER.damping * v + felt
         else:
-            felt = CM.damping * v + CM.stiffness * x
-            if structure == "position_force":
-                push, force = CS.damping * vh + CS.stiffness * xh, gains * fe
-            else:
-                push, force = gains * (CS.damping * xh + CS.stiffness * ih), fe
+            a = -((MASTER.damping + HAND.damping) * v + HAND.stiffness * x + felt) / (
+                MASTER.mass + HAND.mass
+            )
+        w = w + step * (push - SLAVE.damping * w - task) / SLAVE.mass
+        y, v = y + step * w, v + step * a
+        x = x + step * v
         task = TASK.damping * w + TASK.stiffness * y
-        own = (MASTER.damping + HAND.damping) * v + HAND.stiffness * x
-        a = -(own + felt + force) / near
-        b = (push - SLAVE.damping * w - CS.damping * w - CS.stiffness * y - task) / far
-        v, w = v + step * a, w + step * b
-        now = np.array([x + step * v, v, i + step * x, y + step * w, w, task])
-        now = np.where(np.abs(now) < 1e100, now, 1e100 * np.sign(now))
-        size[n] = np.abs(x) + np.abs(y)
-    fifth = rows // 5
-    with np.errstate(divide="ignore"):
-        return np.log(size[-fifth:].max(axis=0)) > np.log(size[fifth : 2 * fifth].max(axis=0))
+        now = np.clip([x, v, i + step * x, y, w, task], -1e100, 1e100)
+    return states, forces
+
+
+def grows(structure, gains, delays):
+    """Whether a kick of the hand grows, for many gains and delays at once."""
+    states, _ = simulated(structure, gains, delays, 20.0, 1e-3)
+    size = np.abs(states[:, 0]) + np.abs(states[:, 3])
+    fifth = len(size) // 5
+    return size[-fifth:].max(axis=0) > size[fifth : 2 * fifth].max(axis=0)
+
+
+@pytest.mark.parametrize(
+    "structure", ["position_position", "position_force", "rate_position", "rate_force"]
+)
+@pytest.mark.parametrize("turns", [0.3, 1.0, 4.0])
+def test_what_is_felt_in_a_sine_sweep(structure, turns):
+    """Force over velocity of an imposed sine of some turns a second, within 3 %."""
+    w, delays = 2.0 * np.pi * turns, np.array([0.0, 0.05])
+
+    def sine(t):
+        return np.sin(w * t), w * np.cos(w * t), -np.cos(w * t) / w, -(w**2) * np.sin(w * t)
+
+    step, seconds = 5e-4, 8.0 + 4.0 / turns
+    states, forces = simulated(structure, np.array([0.4, 0.4]), delays, seconds, step, sine)
+    rows = np.arange(round(seconds / step))[-round(4.0 / turns / step) :]
+    wave = np.exp(-1j * w * rows * step)[:, None]
+    measured = (forces[rows] * wave).sum(axis=0) / (states[rows, 1] * wave).sum(axis=0)
+    for k, delay in enumerate(delays):
+        own = Gains(velocity=0.4) if structure.startswith("rate") else Gains(force=0.4)
+        port = two_port(
+            structure, MASTER, SLAVE, CM, CS, own, delay_forward=delay, delay_back=delay
+        )
+        expected = transmitted(port, 1j * w, TASK)
+        assert abs(measured[k] - expected) < 0.03 * abs(expected)
 
 
 @pytest.mark.parametrize(
