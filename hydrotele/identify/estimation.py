@@ -17,6 +17,7 @@ from hydrotele.identify.setup import Setup
 
 Method = Literal["weighted", "gauss_markov", "least_squares", "instruments"]
 METHODS = ("weighted", "gauss_markov", "least_squares", "instruments")
+REPEATED = ("gauss_markov", "instruments")  # that compare the periods of a repeated motion
 _WHERE = "identification"
 
 

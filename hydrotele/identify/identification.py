@@ -9,14 +9,14 @@ import numpy as np
 from hydrotele.errors import InputError
 from hydrotele.identify.bias import motion_bias
 from hydrotele.identify.equations import build_equations
-from hydrotele.identify.estimation import Estimator, Weighted, told_by, weighted
+from hydrotele.identify.estimation import REPEATED, Estimator, Weighted, told_by, weighted
 from hydrotele.identify.estimators import Estimate
 from hydrotele.identify.gathering import Gathered, gather
 from hydrotele.identify.identifiability import Identifiability, identifiability
 from hydrotele.identify.judging import heldout_errors, heldout_forces, status_of, whiteness
 from hydrotele.identify.motion import Processing, resolution
 from hydrotele.identify.propagation import propagated
-from hydrotele.identify.record import Record, whole_cycles
+from hydrotele.identify.record import Record, check_repeats, whole_cycles
 from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import Setup
 
@@ -144,6 +144,9 @@ def fit_runs(
     resolved = [
         resolution(r.position, r.period, r.position_noise, _cycles(r, processing)) for r in fit
     ]
+    if processing.period and (processing.method == "periodic" or estimator.method in REPEATED):
+        for record, found in zip(fit, resolved, strict=True):
+            check_repeats(record, processing.period, found.noise)
     band = processing.band or min(found.band for found in resolved)
     processing = replace(processing, band=band)
     data = gather(list(zip(fit, resolved, strict=True)), setup, processing)

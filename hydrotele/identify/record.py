@@ -15,6 +15,9 @@ from hydrotele.noise import noise_rms, sensor_set
 from hydrotele.sensors import SensorError
 
 _WHERE = "identification"
+_DRIFT = 0.5  # rows by which a cycle may move away from the rows over a whole record
+_MEDIAN = 0.6745  # of a standard deviation is the median of a normal error's size
+_UNLIKE = 8.0  # times noise: servos answer to noise, and no cycle is quite like the one before
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,8 @@ def whole_cycles(record: Record, period: float) -> Record:
     """
     rows = period / record.period
     cycle = round(rows)
-    if abs(rows - cycle) > 1e-3 * max(rows, 1.0) or cycle < 3:
+    drift = abs(rows - cycle) * len(record.force) / max(cycle, 1)
+    if drift > _DRIFT or cycle < 3:
         raise InputError(
             record.name, f"a period of {period:g} s is no whole number of rows of"
             f" {record.period:g} s",
@@ -136,6 +140,30 @@ def whole_cycles(record: Record, period: float) -> Record:
     if count == 0:
         raise InputError(record.name, f"is shorter than a period of {period:g} s")
     return replace(record, position=record.position[-count:], force=record.force[-count:])
+
+
+def check_repeats(record: Record, period: float, noise: np.ndarray) -> None:
+    """Refuse a record whose motion does not repeat.
+
+    Args:
+        record: the record.
+        period: that its motion is said to have [s].
+        noise: (k,) of its positions [rad] or [m].
+
+    Raises:
+        InputError: positions differ from those a period before by far more than noise.
+    """
+    step = round(period / record.period)
+    if step < 1 or len(record.force) <= step:
+        return
+    change = record.position[step:] - record.position[:-step]
+    size = np.sqrt(np.nanmedian(change**2, axis=0)) / (_MEDIAN * np.sqrt(2.0) * noise)
+    for axis, times in zip(record.axes, size, strict=True):
+        if times > _UNLIKE:
+            raise InputError(
+                record.name, f"the motion of {axis} does not repeat after {period:g} s: it differs"
+                f" by {times:.0f} times its noise",
+            )  # fmt: skip
 
 
 def beginning(record: Record, seconds: float, period: float | None = None) -> Record:

@@ -79,6 +79,15 @@ def test_instruments_ask_for_a_repeated_motion(repeated):
         identify(once, heldout, setup, Processing(period=PERIOD), Estimator("instruments"))
 
 
+@pytest.mark.parametrize("method", ["gauss_markov", "instruments"])
+def test_a_motion_with_another_period_is_refused(repeated, method):
+    fit, heldout, setup = repeated
+    with pytest.raises(InputError, match="does not repeat after 13 s"):
+        identify(fit, heldout, setup, Processing(period=13.0), Estimator(method))
+    with pytest.raises(InputError, match="does not repeat after 13 s"):
+        identify(fit, heldout, setup, Processing("periodic", period=13.0))
+
+
 def test_intervals_of_repeated_experiments_cover_the_truth():
     """Six of the three hundred of `tools/identify_coverage.py`."""
     results = [one_trial(2026, number, "khoshzaban1992") for number in range(6)]
