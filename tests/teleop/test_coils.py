@@ -1,0 +1,63 @@
+"""The coils' map against MuJoCo, and what saturation does."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hydrotele.errors import InputError
+from hydrotele.teleop.coils import Coils, three_stations
+
+COILS = three_stations(0.05, 8.0, 4.0)
+WRENCH = st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6)
+
+
+def test_the_map_is_what_mujoco_makes_of_forces_at_the_coils():
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body name='flotor'><freejoint/>"
+        "<inertial pos='0 0 0' mass='0.85' diaginertia='0.0012 0.0012 0.0015'/>"
+        "</body></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    currents, total = np.array([1.0, -0.5, 0.3, 2.0, -1.5, 0.7]), np.zeros(6)
+    for place, way, current in zip(COILS.position, COILS.direction, currents, strict=True):
+        mujoco.mj_applyFT(model, data, 8.0 * current * way, np.zeros(3), place, 1, total)
+    assert COILS.wrench(currents) == pytest.approx(total, abs=1e-12)
+
+
+@given(WRENCH)
+def test_currents_make_the_wrench_or_a_smaller_one_of_its_direction(wrench):
+    wanted = np.array(wrench) * [1, 1, 1, 0.05, 0.05, 0.05]
+    found = COILS.currents(wanted)
+    assert np.abs(found.value).max() <= 4.0 * (1 + 1e-12)
+    made = COILS.wrench(found.value)
+    if not found.limited:
+        assert np.allclose(made, wanted, atol=1e-9)
+    else:
+        assert np.allclose(made * np.linalg.norm(wanted), wanted * np.linalg.norm(made), atol=1e-6)
+        assert np.linalg.norm(made) <= np.linalg.norm(wanted) * (1 + 1e-12)
+
+
+def test_the_weight_of_the_flotor_takes_a_tenth_of_the_current():
+    found = COILS.currents(np.array([0.0, 0.0, 0.85 * 9.81, 0.0, 0.0, 0.0]))
+    assert not found.limited and np.abs(found.value).max() == pytest.approx(0.3474, abs=1e-3)
+
+
+def test_a_wrench_that_is_no_number_gets_no_current():
+    found = COILS.currents(np.array([1.0, np.nan, 0.0, 0.0, 0.0, 0.0]))
+    assert found.limited and not found.value.any()
+
+
+def test_coils_that_cannot_make_every_wrench_are_refused():
+    up = np.tile([0.0, 0.0, 1.0], (6, 1))
+    place = np.random.default_rng(0).uniform(-0.05, 0.05, (6, 3))
+    with pytest.raises(InputError, match="every force"):
+        Coils(place, up, 8.0, 4.0)
+    with pytest.raises(InputError, match="length 1"):
+        Coils(place, 2.0 * up, 8.0, 4.0)
+    with pytest.raises(InputError, match="six positions"):
+        Coils(place[:3], up[:3], 8.0, 4.0)
+    with pytest.raises(InputError, match="positive"):
+        three_stations(0.05, 0.0, 4.0)
