@@ -5,11 +5,11 @@
 
 The CAT 215 repeats a Fourier motion with its sensors' noise. The same records are differentiated
 raw, by the optimal smoother, by the zero-phase filter, and in the frequency domain; everything else
-is the same. The bias that the positions' noise leaves is what processing is to avoid; taking it
-off, as the identification does by default, stands below. Judged is the force along a circle of
-0.7 m in the plane of boom and stick, at rising speed, while the swing turns: RMS over one lap of
-the recorded machine's forces less those of the identified parameters, mean over the trials. No
-noise has a part in the judgement.
+is the same, the given machine too, which is off by up to 15 %. The bias that the positions' noise
+leaves is what processing is to avoid; taking it off, as the identification does by default, stands
+below. Judged is the force along a circle of 0.7 m in the plane of boom and stick, at rising speed,
+while the swing turns: RMS over one lap of the recorded machine's forces less those of the
+identified parameters, mean over the trials. No noise has a part in the judgement.
 """
 
 import numpy as np
@@ -30,6 +30,7 @@ from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
+from tools.identify_coverage import wrong_setup
 from tools.study import options, publish, side_by_side
 
 PERIOD = 20.0  # s, of the scenario `excitation`
@@ -79,10 +80,11 @@ def one_trial(seed: int, number: int, cycles: int) -> dict[str, list[list[float]
     fit, heldout, _ = records(dataset)
     setup = machine_setup(machine, closed_chain(machine))
     laps = [forces(setup, circle(machine, lap)) for lap in LAPS]
+    wrong = wrong_setup(setup, rng)  # what a way does not tell is not kept at the truth
     out = {}
     for way, (method, pairs) in WAYS.items():
         how = Processing(method, period=PERIOD)
-        found = identify(fit, heldout, setup, how, Estimator(pairs=pairs))
+        found = identify(fit, heldout, wrong, how, Estimator(pairs=pairs))
         errors = [matrix @ (found.value - truth) for matrix, truth in laps]
         out[way] = [np.sqrt(np.mean(e**2, axis=0)).tolist() for e in errors]
     return out

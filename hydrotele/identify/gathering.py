@@ -76,7 +76,7 @@ class Gathered:
             (n, ...), NaN where there is neither.
 
         Raises:
-            InputError: a run is shorter than two periods.
+            InputError: a run is shorter than two periods, or a period than two equations.
         """
         whole = np.full((len(self.rows), *values.shape[1:]), np.nan)
         whole[self.rows] = values
@@ -85,8 +85,13 @@ class Gathered:
                 raise InputError(
                     record.name, f"does not repeat its motion: two periods of {period:g} s at least"
                 )
+            if (step := round(period / self.spacing[k])) < 1:
+                raise InputError(
+                    record.name, f"a period of {period:g} s is shorter than the time between"
+                    f" equations, {self.spacing[k]:.3g} s: no motion of this band repeats so fast",
+                )  # fmt: skip
             own = slice(self.starts[k], self.starts[k + 1])
-            whole[own] = cycle_on(whole[own], round(period / self.spacing[k]))
+            whole[own] = cycle_on(whole[own], step)
         return whole[self.rows]
 
 

@@ -74,6 +74,8 @@ def test_instruments_ask_for_a_repeated_motion(repeated):
     fit, heldout, setup = repeated
     with pytest.raises(InputError, match="need the period"):
         identify(fit, heldout, setup, Processing(), Estimator("instruments"))
+    with pytest.raises(InputError, match="repeat"):
+        identify(fit, heldout, setup, Processing(period=0.1), Estimator("instruments"))
     once = [beginning(fit[0], 25.0)]
     with pytest.raises(InputError, match="does not repeat"):
         identify(once, heldout, setup, Processing(period=PERIOD), Estimator("instruments"))

@@ -54,8 +54,9 @@ def test_held_out_forces_differ_by_noise(found):
     for drive, judged in found.heldout.items():
         # what the exact parameters leave, which 3 identified ones in 100 equations may raise by 3 %
         assert judged.rms < 1.05 * judged.nominal_rms, drive
-        # the bound holds for motions as rough all the time; the exact parameters leave 1.16 here
-        assert judged.rms < 1.25 * judged.noise_rms, drive
+        # the bound holds for motions as rough all the time; the exact parameters leave 1.16 here,
+        # which the estimate may raise by 5 %
+        assert judged.rms < 1.22 * judged.noise_rms, drive
         assert judged.noise_rms < 0.02 * np.nanmax(np.abs(found.forces.measured)), drive
     assert found.status == "ok"
 
