@@ -114,13 +114,13 @@ def weighted(
         data: equations.
         structure: base parameters of their motion.
         method: of the estimator.
-        period: of a repeated motion [s].
+        period: of a repeated motion [s]; instruments need it.
 
     Returns:
         The weighted equations.
 
     Raises:
-        InputError: instruments without a period, or with runs of one period.
+        InputError: a method that compares periods gets runs of one.
     """
     ones, drives = np.ones_like(data.force), data.force.shape[1]
     alike = np.tile([1.0, 0.0], (drives, 1))
@@ -209,7 +209,7 @@ def _long_run(residual: np.ndarray) -> np.ndarray:
     """Standard deviations (k,) of independent errors that would tell slow changes as badly."""
     follow = autoregression(residual)
     fresh = residual.copy()
-    for q, weights in enumerate(follow, start=1):
-        fresh[q:] -= weights * residual[:-q]
+    for q, kept in enumerate(follow, start=1):
+        fresh[q:] -= kept * residual[:-q]
     spread = np.std(fresh[len(follow) :], axis=0) / np.abs(1.0 - follow.sum(axis=0))
     return np.maximum(spread, np.std(residual, axis=0))
