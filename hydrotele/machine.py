@@ -79,13 +79,24 @@ class Supply(Facts):
 
 
 class Arm(Facts):
-    """Names of the joints of a swing-boom-stick(-tool) arm and the point it moves."""
+    """Names of the joints of a swing-boom-stick(-tool(-head)) arm and the point it moves.
+
+    `tool` moves in the arm's plane as a bucket or a feller-buncher's tilt does; `head` turns on it
+    about an axis in that plane, perpendicular to it.
+    """
 
     swing: Name
     boom: Name
     stick: Name
     tool: Name | None = None
+    head: Name | None = None
     tip: Pin
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.head and not self.tool:
+            raise ValueError("a head turns on a tool joint: give arm.tool, such as the tilt")
+        return self
 
 
 class Machine(Facts):
@@ -164,7 +175,7 @@ class Machine(Facts):
                     f"home.{joint}: {self.home[joint]:g} is outside its range {low:g} .. {high:g}"
                 )
         if self.arm:
-            for part in ("swing", "boom", "stick", "tool"):
+            for part in ("swing", "boom", "stick", "tool", "head"):
                 joint = getattr(self.arm, part)
                 if joint is not None:
                     _expect(joint, joints, f"arm.{part}")

@@ -27,12 +27,13 @@ from hydrotele.signals import parse_channel
 
 
 class Pose(Facts):
-    """The arm's tip: r from the swing axis, z above ground [m], theta and attitude [rad]."""
+    """The arm's tip: r from the swing axis, z above ground [m], theta, attitude, head [rad]."""
 
     r: Positive
     z: float
     theta: float = 0.0
     attitude: float | None = None
+    head: float | None = None
 
 
 class Start(Facts):
@@ -99,12 +100,13 @@ class FourierPilot(Facts):
 
 
 class Move(Facts):
-    """A straight move of the tip: signed distances of r, z [m], theta, attitude [rad]."""
+    """A straight move of the tip: signed distances of r, z [m], theta, attitude, head [rad]."""
 
     r: float = 0.0
     z: float = 0.0
     theta: float = 0.0
     attitude: float = 0.0
+    head: float = 0.0
     speed: Annotated[float, Field(ge=1e-4, le=100)] = 0.5
     pause: NonNegative = 0.5
 

@@ -1,6 +1,7 @@
 """Closed-form geometry of a Machine: its arm, and the linkage between each drive and its joint."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,10 +10,13 @@ import numpy as np
 from hydrotele.drives import Axis
 from hydrotele.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry
+from hydrotele.kinematics.five_dof import FellerGeometry
+from hydrotele.kinematics.five_dof import FellerGeometry
 from hydrotele.kinematics.linkage import FourBar, TwoBar, two_bar_from_points
 from hydrotele.machine import Machine
 
 _PLAY = 2.0e-3  # m: joint ranges are given in whole degrees
+_EXACT = 1.0e-9  # m or 1, by which pins may miss the arm's plane: the closed form has no place for it
 
 
 @dataclass(frozen=True)
@@ -171,11 +175,18 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
         The geometry of `kinematics.arm`.
 
     Raises:
-        InputError: the machine has no arm.
+        InputError: the machine has no arm, or one with a head, which is that of
+            `feller_geometry`.
     """
     arm = machine.arm
     if arm is None:
         raise InputError(f"machine {machine.name}", "has no arm: give arm.swing, boom, stick, tip")
+    if arm.head:
+        raise InputError(
+            f"machine {machine.name}",
+            f"has a head ({arm.head}) on its tool: its arm of five joints is that of"
+            " kinematics.five_dof, see feller_geometry",
+        )
     joints = (arm.swing, arm.boom, arm.stick)
     swing, boom, stick = (machine.links[machine.link_of(j)] for j in joints)
     if arm.tool:
@@ -193,3 +204,85 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
         tool_offset=offset,
         tool_joint=arm.tool is not None,
     )
+
+
+def feller_geometry(machine: Machine) -> FellerGeometry:
+    """Dimensions of a feller-buncher's arm, heights counted from the ground.
+
+    Args:
+        machine: a machine whose arm has a head, in the plane of its swing axis.
+
+    Returns:
+        The geometry of `kinematics.five_dof`.
+
+    Raises:
+        InputError: the machine has no arm with a head, or its arm lies beside the swing axis.
+    """
+    arm = machine.arm
+    where = f"machine {machine.name}"
+    if arm is None or arm.tool is None or arm.head is None:
+        raise InputError(where, "has no arm with a head: give arm.tool and arm.head")
+    joints = (arm.swing, arm.boom, arm.stick, arm.tool, arm.head)
+    swing, boom, stick, tilt, head = (machine.links[machine.link_of(j)] for j in joints)
+    base = np.add(swing.position, boom.position)
+    aside = [base[1], stick.position[1], tilt.position[1], head.position[1], arm.tip.position[1]]
+    if np.abs(aside).max() > 1e-9:
+        raise InputError(where, "a feller-buncher's arm must lie in the plane of the swing axis")
+    return FellerGeometry(
+        base_radius=float(base[0]),
+        base_height=float(base[2]),
+        boom_length=math.hypot(*_plane(stick.position)),
+        stick_length=math.hypot(*_plane(tilt.position)),
+        tilt_length=float(head.position[0]),
+        head_radius=float(arm.tip.position[0]),
+        head_depth=-float(arm.tip.position[2] + head.position[2]),
+    )
+
+
+def feller_geometry(machine: Machine) -> FellerGeometry:
+    """Dimensions of a feller-buncher's arm, heights counted from the ground.
+
+    Args:
+        machine: a machine with an `arm` that has a head.
+
+    Returns:
+        The geometry of `kinematics.five_dof`.
+
+    Raises:
+        InputError: the arm has no head, or its joints are not those of `kinematics.five_dof`: all
+            pins in one plane through the swing axis, the links along x, the head's axis along -z
+            of the tilt link.
+    """
+    arm = machine.arm
+    if arm is None or arm.head is None or arm.tool is None:
+        raise InputError(f"machine {machine.name}", "has no head joint: give arm.tool and arm.head")
+    joints = (arm.swing, arm.boom, arm.stick, arm.tool, arm.head)
+    swing, boom, stick, tilt, head = (machine.links[machine.link_of(j)] for j in joints)
+    base, tip = np.add(swing.position, boom.position), arm.tip.position
+    _expect_feller(machine, joints, (base[1], *stick.position[1:], *tilt.position[1:], tip[1],
+                                     *head.position[1:]))  # fmt: skip
+    return FellerGeometry(
+        base_radius=float(base[0]),
+        base_height=float(base[2]),
+        boom_length=stick.position[0],
+        stick_length=tilt.position[0],
+        tilt_length=head.position[0],
+        head_radius=tip[0],
+        head_depth=-tip[2],
+    )
+
+
+def _expect_feller(machine: Machine, joints: Sequence[str], aside: Sequence[float]) -> None:
+    """Refuse an arm whose pins or axes `kinematics.five_dof` has no numbers for."""
+    where = f"machine {machine.name}: arm"
+    axes = ((0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1))
+    for name, axis in zip(joints, axes, strict=True):
+        if np.abs(np.subtract(machine.joints[name].axis, axis)).max() > _EXACT:
+            raise InputError(where, f"{name} must turn about {axis} of its link")
+    chain = [machine.links[machine.link_of(name)].parent for name in joints[1:]]
+    if chain != [machine.link_of(name) for name in joints[:-1]]:
+        raise InputError(where, "each joint must carry the next: swing, boom, stick, tool, head")
+    if machine.arm and machine.arm.tip.link != machine.link_of(joints[-1]):
+        raise InputError(where, f"its tip must be on the head, not on {machine.arm.tip.link}")
+    if np.abs(aside).max() > _EXACT:
+        raise InputError(where, "its pins must be in the plane y = 0, each on the x axis before it")

@@ -11,8 +11,6 @@ import numpy as np
 
 from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
-from hydrotele.kinematics.arm import forward
-from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.machine import Machine
 from hydrotele.operate.limits import check_command, check_reference, cut_short
 from hydrotele.operate.resolved_motion import ResolvedMotion, arm_axes, pose_to_joints
@@ -33,14 +31,14 @@ class Plan:
     """What is asked of every axis at every control tick.
 
     Attributes:
-        time: (n,) [s].
-        axes: axis names, in the order of the columns.
-        command: (n, k) open-loop commands [1] (or in the drive's unit).
-        reference: (n, k) joint references [rad] or [m].
-        rate: (n, k) their rates [rad/s] or [m/s].
-        closed: (k,) whether the axis follows its reference.
-        pose: (n, 4) desired r, theta, z, attitude of the tip, or None.
-        notes: what was clamped or could not be followed.
+            time: (n,) [s].
+            axes: axis names, in the order of the columns.
+            command: (n, k) open-loop commands [1] (or in the drive's unit).
+            reference: (n, k) joint references [rad] or [m].
+            rate: (n, k) their rates [rad/s] or [m/s].
+            closed: (k,) whether the axis follows its reference.
+    X
+            notes: what was clamped or could not be followed.
     """
 
     time: np.ndarray
@@ -179,8 +177,9 @@ def _lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
     motion = ResolvedMotion.begin(machine, dict(zip(plan.axes, plan.reference[0], strict=True)))
     rates = _rate_commands(plan.time, pilot)
     dt = np.diff(plan.time, prepend=plan.time[0])
-    pose = np.empty((len(plan.time), 4))
-    wanted = np.cumsum(rates * dt[:, None], axis=0) + np.array(motion.pose)
+    pose = np.empty((len(plan.time), len(motion.pose)))
+    wanted = np.cumsum(rates * dt[:, None], axis=0)
+    wanted[:, : len(motion.pose)] += motion.pose
     blocked = 0
     for row in range(len(plan.time)):
         if pilot.mode == "rate":
@@ -202,10 +201,10 @@ def _lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
 
 
 def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
-    rates = np.zeros((len(time), 4))
+    rates = np.zeros((len(time), 5))
     begin = pilot.settle
     for move in pilot.moves:
-        way = np.array([move.r, move.theta, move.z, move.attitude])
+        way = np.array([move.r, move.theta, move.z, move.attitude, move.head])
         size = float(np.hypot(move.r, move.z)) or float(np.abs(way).max())
         if size == 0.0:
             begin += move.pause
@@ -225,7 +224,7 @@ def lines_duration(pilot: LinesPilot) -> float:
 
 
 def _move_duration(move: Move, acceleration: float) -> float:
-    size = math.hypot(move.r, move.z) or max(abs(move.theta), abs(move.attitude))
+    size = math.hypot(move.r, move.z) or max(abs(move.theta), abs(move.attitude), abs(move.head))
     return _trapezoid(np.zeros(1), size, move.speed, acceleration)[1] if size else 0.0
 
 
@@ -264,9 +263,9 @@ def _waypoint_joints(machine, axes, here: dict, point: Waypoint, where: str) -> 
 
 
 def _pose_path(machine, axes, here, target, s, ds, where: str) -> tuple[np.ndarray, np.ndarray]:
-    geometry, order = arm_geometry(machine), arm_axes(machine)
-    first = np.array(forward(geometry, [here[a] for a in order]))
-    last = np.array(forward(geometry, [target[a] for a in order]))
+    order = arm_axes(machine)
+    first = np.array(ResolvedMotion.begin(machine, here).pose)
+    last = np.array(ResolvedMotion.begin(machine, target).pose)
     path = np.tile([here[a] for a in axes], (len(s), 1))
     speeds = np.zeros_like(path)
     for a in axes:
