@@ -31,14 +31,14 @@ class Plan:
     """What is asked of every axis at every control tick.
 
     Attributes:
-            time: (n,) [s].
-            axes: axis names, in the order of the columns.
-            command: (n, k) open-loop commands [1] (or in the drive's unit).
-            reference: (n, k) joint references [rad] or [m].
-            rate: (n, k) their rates [rad/s] or [m/s].
-            closed: (k,) whether the axis follows its reference.
-    X
-            notes: what was clamped or could not be followed.
+        time: (n,) [s].
+        axes: axis names, in the order of the columns.
+        command: (n, k) open-loop commands [1] (or in the drive's unit).
+        reference: (n, k) joint references [rad] or [m].
+        rate: (n, k) their rates [rad/s] or [m/s].
+        closed: (k,) whether the axis follows its reference.
+        pose: (n, 4 or 5) desired r, theta, z, attitude and head angle of the tip, or None.
+        notes: what was clamped or could not be followed.
     """
 
     time: np.ndarray
