@@ -1,0 +1,169 @@
+"""Static model of an arm: the torque of its weight, linear in a few parameters."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.errors import InputError
+from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.log import Log
+from hydrotele.machine import Machine
+from hydrotele.operate.arm_tables import arm_joints, arm_tables, gravity_size
+from hydrotele.operate.tip_balance import dynamic_balance, static_torque
+from hydrotele.teleop.recursive import RecursiveLeastSquares
+
+_NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
+_GRID = 9  # poses per joint to which the masses' torques are fitted
+_SPREAD = 3.0e5  # N m: nothing is known of the parameters before
+_PERIOD = 0.2  # s between equations: nearer ones share their friction
+_START = 50  # equations whose parameters are no estimate yet (Zhu 1994, 6.1.3)
+_NORMAL = 1.96
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Parameters of the static model.
+
+    Attributes:
+        names: (p,) what every parameter multiplies: C2, S2, C23, S23, C234, S234, C5.
+        value: (p,) parameters [N m].
+        interval: (p,) half the width of their 95 % interval [N m]; 0 where they were computed.
+        history: (r, p) parameters after every equation [N m]; empty where they were computed.
+        residual: (m - 1,) RMS of the torques that are left, from the boom outwards [N m].
+    """
+
+    names: tuple[str, ...]
+    value: np.ndarray
+    interval: np.ndarray
+    history: np.ndarray
+    residual: np.ndarray
+
+
+def gravity_rows(q: np.ndarray) -> np.ndarray:
+    """Rows Y of the static model `tau = Y(q) P`.
+
+    Args:
+        q: (m,) joint angles of the arm, swing first [rad].
+
+    Returns:
+        (m, p) [1].
+
+    Source: Zhu 1994, 6.8 and 6.9.
+    """
+    joint, size = np.arange(len(q)), gravity_size(len(q))
+    units = np.eye(size)
+    return np.array(
+        [[static_torque(q, joint, units[p], i) for p in range(size)] for i in range(len(q))]
+    )
+
+
+def gravity_from_masses(machine: Machine) -> Gravity:
+    """The static model that comes nearest to the torques of all a machine's masses.
+
+    Fitted to the complete model at rest over the joints' ranges. The links' own weight is of the
+    form of the model; that of cylinders and linkages is not, which leaves `residual`.
+
+    Args:
+        machine: with an arm whose joints are driven by valves.
+
+    Returns:
+        The parameters.
+
+    Raises:
+        InputError: the arm's joints are not all driven.
+    """
+    arm = arm_tables(machine, tuple(machine.axes), f"gravity of {machine.name}")
+    joints = arm_joints(machine)
+    ranges = [machine.joints[j].range or (-math.pi, math.pi) for j in joints[1:]]
+    grid = np.meshgrid(*(np.linspace(low, high, _GRID) for low, high in ranges), indexing="ij")
+    poses = np.column_stack([np.zeros(grid[0].size), *(axis.ravel() for axis in grid)])
+    torque = np.zeros((len(poses), len(joints)))
+    _weights(arm, poses, torque)
+    rows = np.array([gravity_rows(q)[1:] for q in poses])
+    value = np.linalg.lstsq(rows.reshape(-1, rows.shape[2]), torque[:, 1:].ravel(), rcond=None)[0]
+    left = torque[:, 1:] - rows @ value
+    size = len(value)
+    return Gravity(
+        _NAMES[:size], value, np.zeros(size), np.zeros((0, size)), np.sqrt(np.mean(left**2, axis=0))
+    )
+
+
+@compiled
+def _weights(arm, poses, torque):
+    """Torques (r, m) of gravity on the arm's joints in poses (r, m)."""
+    n = len(arm.outside)
+    arm.z[n:] = 0.0
+    arm.acceleration[:] = 0.0
+    arm.push[:] = 0.0
+    for row in range(len(poses)):
+        for i in range(len(arm.joint)):
+            arm.z[arm.joint[i]] = poses[row, i]
+        dynamic_balance(arm)
+        for i in range(len(arm.joint)):
+            torque[row, i] = arm.outside[arm.joint[i]]
+
+
+def drive_torques(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Joint angles (n, m) [rad] and torques (n, m) [N m] of the arm's drives in a log.
+
+    Args:
+        machine: the machine.
+        log: measured angles and pressures.
+
+    Returns:
+        (angles, torques by virtual work through the two-bar and four-bar linkages).
+
+    Raises:
+        InputError: a channel is missing, or a joint is not driven by a valve.
+
+    Source: Zhu 1994, 6.12 and 6.13.
+    """
+    arm_tables(machine, tuple(machine.axes), f"torques of {machine.name}")
+    driver = {axis.joint: name for name, axis in machine.axes.items()}
+    angles, torques = [], []
+    for name in (driver[joint] for joint in arm_joints(machine)):
+        head, rod = machine.axes[name].hydraulic_drive.areas
+        angle = log[f"angle.{name}"]
+        force = head * log[f"pressure_head.{name}"] - rod * log[f"pressure_rod.{name}"]
+        angles.append(angle)
+        torques.append(force * axis_linkage(machine, name).rate(angle))
+    return np.column_stack(angles), np.column_stack(torques)
+
+
+def identify_gravity(machine: Machine, log: Log) -> Gravity:
+    """Static model of a machine from a log of slow moves, by recursive least squares.
+
+    Args:
+        machine: the machine; its masses are not used.
+        log: measured angles and pressures of joints that move slowly to and fro over their ranges.
+
+    Returns:
+        The parameters with their history.
+
+    Raises:
+        InputError: a channel is missing or the log is too short.
+
+    Source: Zhu 1994, 6.1.3.
+    """
+    angles, torques = drive_torques(machine, log)
+    every = max(1, round(_PERIOD * log.rate))
+    angles, torques = angles[::every], torques[::every]
+    size = gravity_size(angles.shape[1])
+    if len(angles) < _START:
+        raise InputError(log.source, f"{_START * _PERIOD:g} s of slow moves are needed at least")
+    rows = np.array([gravity_rows(q)[1:] for q in angles])
+    found = RecursiveLeastSquares(np.zeros(size), np.full(size, _SPREAD))
+    history = []
+    for table, torque in zip(rows, torques[:, 1:], strict=True):
+        for row, one in zip(table, torque, strict=True):
+            found.update(row, one)
+        history.append(found.value)
+    left = torques[:, 1:] - rows @ found.value
+    freedom = left.size - size
+    spread = math.sqrt(float(np.sum(left**2)) / freedom)
+    return Gravity(
+        _NAMES[:size], found.value, _NORMAL * spread * np.sqrt(np.diag(found.covariance)),
+        np.array(history), np.sqrt(np.mean(left**2, axis=0)),
+    )  # fmt: skip

@@ -1,0 +1,95 @@
+"""State-variable filter: a signal's low-pass with its first two derivatives, causal.
+
+All signals that a balance needs go through the same filter, so that they are equally late: a sum of
+signals and derivatives that is zero stays zero. Between two readings a signal is taken as a
+straight line, which is exact for what ramps, and finite for one that is held.
+"""
+
+import math
+
+import numpy as np
+from scipy.linalg import expm
+
+from hydrotele.compiled import lean
+
+LOW, RATE, CHANGE, LAST = range(4)  # columns of a filter's state
+_REAL, _SQUARE, _CUBE = 2.0, 2.0, 1.0  # Butterworth's polynomial of third order
+
+
+def filter_table(bandwidth: float, period: float) -> np.ndarray:
+    """One step of the filter as a table.
+
+    `y''' = w^3 (u - y) - 2 w^2 y' - 2 w y''` (Butterworth), solved exactly for u that runs straight
+    from the last reading to the new one.
+
+    Args:
+        bandwidth: w / (2 pi), scalar [Hz], > 0.
+        period: time between two calls, scalar [s], > 0.
+
+    Returns:
+        (3, 5): new y, y', y'' from the old three, the last and the new reading.
+
+    Source: Butterworth's filter; Franklin, Powell and Workman 1998, Digital control, section 6.3
+    (triangle hold).
+
+    >>> filter_table(1.0, 0.01)[:, 3:].sum(axis=1).round(4) + 0.0  # a step of both readings
+    array([0.    , 0.0121, 2.3303])
+    """
+    w = 2.0 * math.pi * bandwidth
+    block = np.zeros((5, 5))
+    block[0, 1] = block[1, 2] = block[3, 4] = 1.0
+    block[2] = -_CUBE * w**3, -_SQUARE * w**2, -_REAL * w, _CUBE * w**3, 0.0
+    scale = np.diag([1.0, w, w**2, 1.0, 1.0])  # or the exponential would lose digits
+    block[3, 4] = 1.0 / period
+    step = scale @ expm(np.linalg.inv(scale) @ block @ scale * period) @ np.linalg.inv(scale)
+    table = step[:3].copy()
+    table[:, 3] -= step[:3, 4]
+    return table
+
+
+def noise_gains(bandwidth: float, period: float) -> np.ndarray:
+    """Standard deviations (3,) of y, y', y'' for white readings of standard deviation 1.
+
+    Args:
+        bandwidth: scalar [Hz].
+        period: time between two readings, scalar [s].
+
+    Returns:
+        [1], [1/s], [1/s^2].
+
+    Source: response to a single reading.
+    """
+    table = filter_table(bandwidth, period)
+    state, total, last = np.zeros(3), np.zeros(3), 0.0
+    for row in range(math.ceil(6.0 / (bandwidth * period))):
+        now = 1.0 if row == 0 else 0.0
+        state = table @ (*state, last, now)
+        last = now
+        total += state**2
+    return np.sqrt(total)
+
+
+@lean
+def filter_step(table, state, reading):
+    """Take in the next reading of one signal.
+
+    Args:
+        table: (3, 5) of `filter_table`.
+        state: (4,) of the signal: LOW, RATE, CHANGE, LAST reading; updated.
+        reading: u, scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `filter_table`.
+    """
+    low, rate, change, last = state[LOW], state[RATE], state[CHANGE], state[LAST]
+    for i in range(3):
+        state[i] = (
+            table[i, 0] * low
+            + table[i, 1] * rate
+            + table[i, 2] * change
+            + table[i, 3] * last
+            + table[i, 4] * reading
+        )
+    state[LAST] = reading
