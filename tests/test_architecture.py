@@ -47,7 +47,7 @@ ONLY = {
     "errors": set(),
     "signals": set(),
     "kinematics": {"errors", "drives", "machine"},
-    "teleop": {"errors"},
+    "teleop": {"errors", "compiled"},
     "identify": _FACTS,
     "simulate": _PLAIN,
     "operate": _PLAIN,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hydrotele.compiled import compiled
 from hydrotele.errors import InputError
 
 _WHERE = "compliance"
@@ -73,6 +74,82 @@ class Motion:
     rate: np.ndarray
 
 
+@compiled
+def turn_matrix(q, out):
+    """Rotation matrix of a unit quaternion.
+
+    Args:
+        q: (4,) scalar first.
+        out: (3, 3) written.
+
+    Returns:
+        Nothing.
+
+    Source: definition.
+    """
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    out[0, 0], out[0, 1], out[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    out[1, 0], out[1, 1], out[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    out[2, 0], out[2, 1], out[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+
+
+@compiled
+def driving_wrench(mass, arm, inertia, below, wanted, about, turn, rate, gravity, out):
+    """Wrench of the coils that gives the handle's point and the flotor chosen accelerations.
+
+    Args:
+        mass: of the flotor, scalar [kg].
+        arm: (3,) centre of mass from the handle's point, flotor axes [m].
+        inertia: (3, 3) about the centre of mass [kg m^2].
+        below: (3,) centre of mass from the coils' frame, flotor axes [m].
+        wanted: (3,) acceleration of the handle's point, world axes [m/s^2].
+        about: (3,) angular acceleration, flotor axes [rad/s^2].
+        turn: (3, 3) flotor to world.
+        rate: (3,) angular velocity, flotor axes [rad/s].
+        gravity: (3,) world axes [m/s^2].
+        out: (6,) written: force [N] and torque about the coils' frame [N m], flotor axes.
+
+    Returns:
+        Nothing.
+
+    Source: Newton and Euler; Zhu 1994, 5.1.3 (moved from the handle over the centre of mass).
+    """
+    w0, w1, w2 = rate[0], rate[1], rate[2]
+    # centripetal and tangential acceleration of the centre of mass against the handle's point
+    s0, s1, s2 = w1 * arm[2] - w2 * arm[1], w2 * arm[0] - w0 * arm[2], w0 * arm[1] - w1 * arm[0]
+    d0 = about[1] * arm[2] - about[2] * arm[1] + w1 * s2 - w2 * s1
+    d1 = about[2] * arm[0] - about[0] * arm[2] + w2 * s0 - w0 * s2
+    d2 = about[0] * arm[1] - about[1] * arm[0] + w0 * s1 - w1 * s0
+    for i in range(3):
+        own = d0 if i == 0 else (d1 if i == 1 else d2)
+        drawn = 0.0
+        for j in range(3):
+            drawn += turn[j, i] * (wanted[j] - gravity[j])
+        out[i] = mass * (drawn + own)
+    m0 = inertia[0, 0] * w0 + inertia[0, 1] * w1 + inertia[0, 2] * w2
+    m1 = inertia[1, 0] * w0 + inertia[1, 1] * w1 + inertia[1, 2] * w2
+    m2 = inertia[2, 0] * w0 + inertia[2, 1] * w1 + inertia[2, 2] * w2
+    for i in range(3):
+        out[3 + i] = 0.0
+        for j in range(3):
+            out[3 + i] += inertia[i, j] * about[j]
+    out[3] += w1 * m2 - w2 * m1 + below[1] * out[2] - below[2] * out[1]
+    out[4] += w2 * m0 - w0 * m2 + below[2] * out[0] - below[0] * out[2]
+    out[5] += w0 * m1 - w1 * m0 + below[0] * out[1] - below[1] * out[0]
+
+
 def compliance_wrench(
     flotor: Flotor, axes: Axes, centre: np.ndarray, motion: Motion, target: np.ndarray,
     turned: np.ndarray, gravity: Sequence[float] = GRAVITY,
@@ -94,7 +171,8 @@ def compliance_wrench(
     Source: Zhu 1994, 5.1.3 (Euler quaternions, forces moved from T over the centre of mass to F).
     """
     spring, damper = axes.frequency**2, 2.0 * axes.ratio * axes.frequency
-    turn, w = _matrix(motion.quaternion), motion.rate
+    turn, w, out = np.empty((3, 3)), motion.rate, np.empty(6)
+    turn_matrix(motion.quaternion, turn)
     place = motion.position + turn @ centre
     speed = motion.velocity + turn @ np.cross(w, centre)
     wanted = spring[:3] * (target - place) - damper[:3] * speed
@@ -104,16 +182,12 @@ def compliance_wrench(
     swing = -spring[3:] * vector - damper[3:] * vector_rate
     swing -= 0.5 * (scalar_rate * w + np.cross(vector_rate, w))
     about = np.linalg.solve(0.5 * (scalar * np.eye(3) + _cross(vector)), swing)
-    arm = flotor.centre_of_mass - centre
-    drawn = wanted + turn @ (np.cross(about, arm) + np.cross(w, np.cross(w, arm)))
-    force = turn.T @ (flotor.mass * (drawn - np.asarray(gravity)))
-    torque = flotor.inertia @ about + np.cross(w, flotor.inertia @ w)
-    return np.concatenate([force, torque + np.cross(flotor.centre_of_mass, force)])
-
-
-def _matrix(q: np.ndarray) -> np.ndarray:
-    w, v = q[0], np.asarray(q[1:])
-    return np.eye(3) + 2.0 * (w * _cross(v) + _cross(v) @ _cross(v))
+    below = np.asarray(flotor.centre_of_mass, float)
+    driving_wrench(
+        flotor.mass, below - centre, np.asarray(flotor.inertia, float), below, wanted, about, turn,
+        w, np.asarray(gravity, float), out,
+    )  # fmt: skip
+    return out
 
 
 def _cross(v: np.ndarray) -> np.ndarray:

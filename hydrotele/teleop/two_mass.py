@@ -1,0 +1,260 @@
+"""Two masses in time: master and slave with their channels, as differential equations with delay.
+
+A case is written as signals and coefficients. The signals are the master's position, its integral
+and derivatives, the hand's force and its integral, and the slave's position and its derivatives:
+
+`q = [int x, x, v, a, int F_h, F_h, y, w, w', w'']`
+
+so that a derivative moves coefficients one place. Accelerations, the hand's force and the slave's
+jerk follow from the others and from delayed signals by four linear equations, which also solves the
+algebraic loops of a structure without delay. Independent of `stability`, which it confirms.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.teleop.case import Case
+from hydrotele.teleop.two_port import Impedance
+
+INT, X, V, A, IMPULSE, FORCE, Y, W, W1, W2 = range(10)
+_KNOWN = np.array([INT, X, V, IMPULSE, Y, W])
+_SOLVED = np.array([A, FORCE, W1, W2])
+_PER_RATE = 0.2  # steps over the time constant of the fastest rate, a tenth of Adams' limit of 1
+_LARGEST = 5e-4  # s
+_BLOCKS = 20  # of a run, whose largest speeds are compared
+_GROWN, _GONE = 1e9, 1e-9  # of the kick, beyond which nothing changes any more
+_KICK = 0.1  # m/s
+
+
+class Law(NamedTuple):
+    """Coefficients on the signals (10,).
+
+    Attributes:
+        own: force of the master's own controller.
+        forward: force on the slave, C1 and C3, of signals as they were a delay ago.
+        back: force on the master, C2 and C4, the same.
+    """
+
+    own: np.ndarray
+    forward: np.ndarray
+    back: np.ndarray
+
+
+class Run(NamedTuple):
+    """A simulated run.
+
+    Attributes:
+        largest: (20,) of master's and slave's speed together, in twentieths of the run [m/s].
+        felt: force over velocity of an imposed motion at its frequency [N s/m], else 0.
+    """
+
+    largest: np.ndarray
+    felt: complex
+
+
+def law_of(case: Case, structure: str, reflected: float = 1.0) -> Law:
+    """The control law of a structure in time.
+
+    Args:
+        case: the teleoperator.
+        structure: its name, one of `STRUCTURES`.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        The law.
+
+    Source: Zhu 1994, 3.9-3.62, written in time.
+    """
+    kv, gains = case.gains.velocity, case.gains
+    rate = structure in ("rate_position", "rate_force", "four_channel_rate")
+    forward = on_motion(case.slave_control, INT if rate else X) * (kv if rate else gains.position)
+    own, back = on_motion(case.master_control, X), np.zeros(10)
+    if structure in ("rate_position", "four_channel_rate"):
+        own = kv * on_motion(case.master_control, INT)
+    if structure in ("position_position", "rate_position", "four_channel_rate"):
+        back = -on_motion(case.master_control, Y)
+    if structure in ("position_force", "rate_force"):
+        back = gains.force * on_motion(case.task, Y)
+    if structure == "four_channel_position":
+        forward = on_motion(case.slave, X) + on_motion(case.slave_control, X)
+        forward[FORCE] = 1.0
+        back = on_motion(case.task, Y) - on_motion(case.master, Y)
+        back -= on_motion(case.master_control, Y)
+    if structure == "four_channel_rate":
+        forward[IMPULSE] = kv
+        back = back + on_motion(case.task, W) / kv
+    return Law(own, forward, reflected * back)
+
+
+def on_motion(impedance: Impedance, position: int) -> np.ndarray:
+    """Coefficients (10,) of an impedance on a position and its two derivatives."""
+    made = np.zeros(10)
+    made[position : position + 3] = impedance.stiffness, impedance.damping, impedance.mass
+    return made
+
+
+def step_of(case: Case) -> float:
+    """Step that resolves the fastest rate that the masses can have together [s]."""
+    parts = (case.master, case.slave, case.master_control, case.slave_control, case.hand, case.task)
+    lightest = min(part.mass for part in parts if part.mass)
+    rates = (
+        sum(part.damping for part in parts) / lightest,
+        math.sqrt(sum(part.stiffness for part in parts) / lightest),
+        1.0 / _LARGEST * _PER_RATE,
+    )
+    return _PER_RATE / max(rates)
+
+
+def kicked(case: Case, structure: str, reflected: float = 1.0, seconds: float = 40.0) -> Run:
+    """Simulate a kick of the hand, with hand and task in place.
+
+    Args:
+        case: the teleoperator with hand and task.
+        structure: its name.
+        reflected: factor on what comes back [1].
+        seconds: to simulate; it ends sooner where motion has died out or has grown without bound.
+
+    Returns:
+        The run.
+    """
+    return _simulated(case, law_of(case, structure, reflected), seconds, 0.0, 0.0)
+
+
+def grows(run: Run) -> bool:
+    """Whether a kick grows: speeds late in the run are larger than early ones."""
+    reached = run.largest[run.largest > 0.0]
+    if len(reached) < _BLOCKS:
+        return bool(reached[-1] > _KICK)
+    return bool(run.largest[-4:].max() > run.largest[4:8].max())
+
+
+def swept(case: Case, structure: str, frequency: float, settle: float = 20.0) -> complex:
+    """Impedance felt where the master's motion is an imposed sine.
+
+    Args:
+        case: the teleoperator with its task.
+        structure: its name.
+        frequency: [rad/s].
+        settle: time before measuring [s]; measured are five periods.
+
+    Returns:
+        Force over velocity [N s/m].
+    """
+    period = 2.0 * math.pi / frequency
+    seconds = (math.ceil(settle / period) + 5.0) * period
+    return _simulated(case, law_of(case, structure), seconds, frequency, 5.0 * period).felt
+
+
+def _simulated(case: Case, law: Law, seconds: float, frequency: float, measured: float) -> Run:
+    step = step_of(case)
+    if frequency:  # a whole number of steps in a period, so that the sine's mean is 0
+        step = 2.0 * math.pi / frequency / math.ceil(2.0 * math.pi / frequency / step)
+    lags = round(case.delay_forward / step), round(case.delay_back / step)
+    now, delayed = _equations(case, law, lags, bool(frequency))
+    inverse = np.linalg.inv(now[:, _SOLVED])
+    largest, sums = _march(
+        inverse, inverse @ now[:, _KNOWN], inverse @ delayed, np.array(lags), step,
+        round(seconds / step), round(measured / step), frequency,
+    )  # fmt: skip
+    return Run(largest, complex(sums[0] / sums[1]) if frequency else 0.0)
+
+
+def _equations(
+    case: Case, law: Law, lags: tuple[int, int], imposed: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (4, 10) on signals now, and on delayed ones (4, 20): forward, then back.
+
+    Rows: master, hand, slave, derivative of the slave's. The last is needed where the slave's jerk
+    is, and is otherwise `w'' = 0`.
+    """
+    own = on_motion(case.master, X) + law.own
+    own[FORCE] -= 1.0
+    hand = on_motion(case.hand, X)
+    hand[FORCE] = 1.0
+    if imposed:
+        hand = np.eye(10)[A]
+    slave = on_motion(case.slave, Y) + on_motion(case.slave_control, Y) + on_motion(case.task, Y)
+    jerk, still = np.eye(10)[W2], np.zeros(10)
+    if law.back[W2]:
+        jerk, still = np.roll(slave, 1), np.roll(law.forward, 1)
+    now = np.array([own, hand, slave, jerk])
+    there, here = np.array([still, still, law.forward, still]), np.zeros((4, 10))
+    there[:2] = 0.0
+    here[0] = -law.back
+    there, here = _if_late(there, here, now, lags)
+    return now, np.hstack([there, here])
+
+
+def _if_late(
+    there: np.ndarray, here: np.ndarray, now: np.ndarray, lags: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Delayed coefficients; those without delay are moved to the signals of now."""
+    found = []
+    for part, lag in zip((there, here), lags, strict=True):
+        if lag == 0:
+            now -= part
+            part = np.zeros_like(part)
+        found.append(part)
+    return found[0], found[1]
+
+
+@compiled
+def _march(inverse, known, delayed, lags, step, rows, measured, frequency):
+    """Largest speeds (20,), and sums of force and velocity times the measured wave (2,)."""
+    kept = max(lags[0], lags[1]) + 1
+    past = np.zeros((kept, 10))
+    largest, sums = np.zeros(_BLOCKS), np.zeros(2, np.complex128)
+    q, before, solved, late = np.zeros(10), np.zeros(10), np.zeros(4), np.zeros(20)
+    if frequency == 0.0:
+        q[V] = _KICK
+    for n in range(rows):
+        if frequency != 0.0:
+            angle = frequency * step * n
+            q[INT], q[X] = -math.cos(angle) / frequency, math.sin(angle)
+            q[V] = frequency * math.cos(angle)
+        for side in range(2):
+            if lags[side] > 0 and n >= lags[side]:
+                late[10 * side : 10 * side + 10] = past[(n - lags[side]) % kept]
+        for i in range(4):
+            total = 0.0
+            for j in range(20):
+                total += delayed[i, j] * late[j]
+            total -= (
+                known[i, 0] * q[INT] + known[i, 1] * q[X] + known[i, 2] * q[V]
+                + known[i, 3] * q[IMPULSE] + known[i, 4] * q[Y] + known[i, 5] * q[W]
+            )  # fmt: skip
+            if frequency != 0.0:
+                total -= inverse[i, 1] * frequency**2 * q[X]
+            solved[i] = total
+        q[A], q[FORCE], q[W1], q[W2] = solved
+        past[n % kept] = q
+        speed = abs(q[V]) + abs(q[W])
+        block = n * _BLOCKS // rows
+        largest[block] = max(largest[block], speed)
+        if frequency != 0.0 and n >= rows - measured:
+            wave = complex(math.cos(angle), -math.sin(angle))
+            sums[0] += q[FORCE] * wave
+            sums[1] += q[V] * wave
+        if frequency == 0.0 and n * _BLOCKS % rows < _BLOCKS and block > 0:
+            if largest[block - 1] < _GONE * _KICK or not largest[block - 1] < _GROWN * _KICK:
+                break
+        _advance(q, before, step, n == 0)
+    return largest, sums
+
+
+@compiled
+def _advance(q, before, step, first):
+    """Second order: Adams-Bashforth for speeds and impulse, the trapezoid for what they move."""
+    if first:
+        before[:] = q
+    x, v, w = q[X], q[V], q[W]
+    q[V] += step * (1.5 * q[A] - 0.5 * before[A])
+    q[W] += step * (1.5 * q[W1] - 0.5 * before[W1])
+    q[IMPULSE] += step * (1.5 * q[FORCE] - 0.5 * before[FORCE])
+    before[A], before[W1], before[FORCE] = q[A], q[W1], q[FORCE]
+    q[X] += 0.5 * step * (v + q[V])
+    q[Y] += 0.5 * step * (w + q[W])
+    q[INT] += 0.5 * step * (x + q[X])
