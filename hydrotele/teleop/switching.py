@@ -1,0 +1,147 @@
+"""Stiffness feedback at its worst: a spring that is soft on the way out and stiff on the way back.
+
+Where a spring's stiffness may change at any time between two bounds, no change feeds the motion
+more than this one, because at every point of the phase plane it turns the path outwards most. A
+joystick that survives it survives every contact, delay and operator.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.errors import InputError
+from hydrotele.teleop.two_port import Impedance, stiffness_margin
+
+_PER_RATE = 0.01  # steps over the time constant of the fastest rate
+_DEAD = 1e-9  # of speed or displacement at the start of a half, below which it does not arrive
+_MOST_STEPS = 10_000_000
+
+
+@dataclass(frozen=True)
+class Spring:
+    """A joystick axis whose stiffness follows a force.
+
+    Attributes:
+        mass: M [kg].
+        damping: B [N s/m].
+        nominal: stiffness without contact [N/m].
+        least: K_min [N/m].
+        most: K_max [N/m].
+    """
+
+    mass: float
+    damping: float
+    nominal: float
+    least: float
+    most: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is no spring and mass."""
+        if not (self.mass > 0.0 and self.damping >= 0.0):
+            raise InputError("stiffness", "mass must be positive, damping not negative")
+        if not 0.0 <= self.least <= self.nominal <= self.most:
+            raise InputError(
+                "stiffness", "must be ordered, 0 <= least <= nominal <= most:"
+                f" {self.least:g}, {self.nominal:g}, {self.most:g}",
+            )  # fmt: skip
+
+    def held(self, hand: Impedance) -> "Spring":
+        """The same in an operator's hand, whose mass, damper and spring add to its own."""
+        stiff = hand.stiffness
+        return Spring(
+            self.mass + hand.mass, self.damping + hand.damping, self.nominal + stiff,
+            self.least + stiff, self.most + stiff,
+        )  # fmt: skip
+
+    @property
+    def margin(self) -> float:
+        """`B^2 - 4 M K_max` [(N s/m)^2]; stable whatever happens, if positive (Zhu 1994, 4.14)."""
+        return stiffness_margin(self.mass, self.damping, self.most)
+
+    @property
+    def growth(self) -> float:
+        """Speed after half a swing over that before, by `worst_growth`."""
+        return worst_growth(self.mass, self.damping, self.least, self.most)
+
+    @property
+    def enough_damping(self) -> float:
+        """Damping for which the theorem holds [N s/m]."""
+        return 2.0 * math.sqrt(self.mass * self.most)
+
+
+def worst_growth(mass: float, damping: float, least: float, most: float) -> float:
+    """Simulate half a swing with the worst switching of the stiffness.
+
+    The motion is linear between switches, so that every half swing grows by the same factor: below
+    1 the axis comes to rest, however the stiffness changes.
+
+    Args:
+        mass: M [kg].
+        damping: B [N s/m].
+        least: stiffness outwards, K_min [N/m].
+        most: stiffness inwards, K_max [N/m].
+
+    Returns:
+        Speed through the centre over that half a swing before [1]; 0 where it does not come back to
+        the centre, infinite where it never turns.
+
+    Source: Zhu 1994, 4.2 (the switching that drives a spring unstable).
+
+    >>> round(worst_growth(1.0, 0.0, 100.0, 400.0), 3)
+    2.0
+    >>> worst_growth(1.0, 41.0, 20.0, 400.0)
+    0.0
+    """
+    if least == 0.0 and damping == 0.0:
+        return math.inf
+    rate = max(damping / mass, math.sqrt(most / mass))
+    return float(_half_swing(damping / mass, least / mass, most / mass, _PER_RATE / rate))
+
+
+def growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.ndarray) -> np.ndarray:
+    """Growth of half a swing over damping and K_max.
+
+    Args:
+        mass: M [kg].
+        least: K_min [N/m].
+        dampings: (n,) B [N s/m].
+        stiffest: (m,) K_max [N/m], none below K_min.
+
+    Returns:
+        (m, n) as of `worst_growth`.
+    """
+    return np.array([[worst_growth(mass, b, least, k) for b in dampings] for k in stiffest])
+
+
+@compiled
+def _half_swing(damping, least, most, step):
+    x, v = 0.0, 1.0
+    for _ in range(_MOST_STEPS):
+        if v <= _DEAD:
+            break
+        x, v = _runge_kutta(x, v, damping, least, step)
+    peak, v = x, min(v, 0.0)
+    for _ in range(_MOST_STEPS):
+        if x <= 0.0:
+            return -v
+        if x < _DEAD * peak:
+            break
+        x, v = _runge_kutta(x, v, damping, most, step)
+    return 0.0
+
+
+@compiled
+def _runge_kutta(x, v, damping, stiffness, step):
+    a = -damping * v - stiffness * x
+    x2, v2 = x + 0.5 * step * v, v + 0.5 * step * a
+    a2 = -damping * v2 - stiffness * x2
+    x3, v3 = x + 0.5 * step * v2, v + 0.5 * step * a2
+    a3 = -damping * v3 - stiffness * x3
+    x4, v4 = x + step * v3, v + step * a3
+    a4 = -damping * v4 - stiffness * x4
+    return (
+        x + step / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4),
+        v + step / 6.0 * (a + 2.0 * a2 + 2.0 * a3 + a4),
+    )
