@@ -19,6 +19,9 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+analyse_app = typer.Typer(help="Analyse by formula what others simulate.", no_args_is_help=True)
+app.add_typer(analyse_app, name="analyse")
+
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 MachineName = Annotated[
     str | None,
@@ -228,6 +231,44 @@ def excite(
     from hydrotele.commands.exciting import excite_to_file
 
     excite_to_file(machine, tool, sensors, out, period, harmonics, starts, seed, cycles, json)
+
+
+@analyse_app.command(
+    "teleop",
+    epilog="Examples:  hydrotele analyse teleop   |   "
+    "hydrotele analyse teleop my_case.yaml --structure rate_force --delay 0.1 --confirm",
+)
+def analyse_teleop(
+    file: Annotated[
+        Path | None, typer.Argument(help="Case (.yaml); default an axis of the CAT 215.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Folder to write; default runs/analyse_NAME, with --json none."
+        ),
+    ] = None,
+    structure: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--structure",
+            help="position_position, position_force, four_channel_position, rate_position, "
+            "rate_force or four_channel_rate; may be repeated; default the case's.",
+        ),
+    ] = None,
+    delay: Annotated[
+        float | None, typer.Option(help="Delay each way in seconds, instead of the case's.")
+    ] = None,
+    confirm: Annotated[
+        bool,
+        typer.Option("--confirm", help="Simulate sine sweeps and every cell of the map, too."),
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Two-port of a teleoperator: what is felt, passivity, stability with delay, margins."""
+    from hydrotele.commands.analysing import analyse_teleop_to_folder
+
+    analyse_teleop_to_folder(file, out, structure or [], delay, confirm, json)
 
 
 @app.command(

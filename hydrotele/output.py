@@ -22,6 +22,7 @@ OURS = {
         "patched/machine.*", "patched/effects.yaml",
     ),
     "identify": ("identify.json", "report.html", "identified/machine.*"),
+    "analyse": ("analysis.json", "report.html"),
 }  # fmt: skip
 """Kind of folder -> files that it holds beside `summary.json`, which states the kind."""
 

@@ -17,7 +17,7 @@ from hydrotele.teleop.two_port import (
     transmitted,
 )
 
-FREQUENCIES = np.geomspace(0.1, 1e3, 600)  # rad/s, from slow motions to the flotor's bandwidth
+FREQUENCIES = np.geomspace(0.1, 1e3, 1601)  # rad/s, from slow motions to the flotor's bandwidth
 _FREE = Impedance()
 _PASSIVE = 1.0 + 1e-6  # rounding in the inverse of a lossless port's matrix stays below
 _STEPS = 61  # tried before a margin is refined
