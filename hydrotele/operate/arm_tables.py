@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from hydrotele.dynamics.mechanism import HOME, body_names, coordinate_names
+from hydrotele.dynamics.mechanism import HOME, coordinate_names
 from hydrotele.dynamics.model import model_space, reduced_model, state_size
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
+from hydrotele.operate.resolved_motion import arm_facts
 from hydrotele.operate.tip_balance import Arm, Body, Work
 
 
@@ -18,8 +19,7 @@ def arm_joints(machine: Machine) -> tuple[str, ...]:
     arm = machine.arm
     if arm is None:
         raise InputError(f"machine {machine.name}", "has no arm, so there is no tip to feel with")
-    joints = (arm.swing, arm.boom, arm.stick, arm.tool, getattr(arm, "head", None))
-    return tuple(j for j in joints if j)
+    return tuple(j for j in (arm.swing, arm.boom, arm.stick, arm.tool, arm.head) if j)
 
 
 def gravity_size(joints: int) -> int:
@@ -27,47 +27,60 @@ def gravity_size(joints: int) -> int:
     return 7 if joints == 5 else 2 * (joints - 1)
 
 
-def arm_tables(machine: Machine, axes: tuple[str, ...], where: str) -> Arm:
-    """Tables of an arm.
+def free_axes(machine: Machine, where: str) -> tuple[str, ...]:
+    """Axes of the independent coordinates, all of which must be driven, those of the arm by valves.
 
     Args:
         machine: the machine.
-        axes: axes whose readings there are.
         where: who asks, for messages.
 
     Returns:
-        The tables, standing at home.
+        Axis names in the order of the coordinates.
 
     Raises:
-        InputError: a joint is not driven, not by a valve, or not measured.
+        InputError: names the joints that cannot be felt.
     """
-    joints, model = arm_joints(machine), reduced_model(machine, ())
     names, driver = coordinate_names(machine), {a.joint: n for n, a in machine.axes.items()}
-    free = [names[i] for i in model.mech.free]
-    if loose := [j for j in free if j not in driver]:
+    free = [names[i] for i in reduced_model(machine, ()).mech.free]
+    if loose := [joint for joint in free if joint not in driver]:
         raise InputError(where, f"no drive holds {', '.join(loose)}: their motion is not measured")
-    if plain := [j for j in joints if driver[j] not in machine.hydraulic_axes]:
+    joints = arm_joints(machine)
+    if plain := [joint for joint in joints if driver[joint] not in machine.hydraulic_axes]:
         raise InputError(where, f"no valve drives {', '.join(plain)}: their torque is not measured")
-    if missing := [driver[j] for j in free if driver[j] not in axes]:
-        raise InputError(where, f"readings of {', '.join(missing)} are missing")
-    assert machine.arm
-    bodies, n, m = body_names(machine), len(free), len(joints)
-    space, z = model_space(model), np.zeros(state_size(model))
+    return tuple(driver[joint] for joint in free)
+
+
+def arm_tables(machine: Machine, where: str) -> Arm:
+    """Tables of an arm, whose transmissions are taken as rigid and without inertia.
+
+    Args:
+        machine: the machine.
+        where: who asks, for messages.
+
+    Returns:
+        The tables, standing at home without pressures.
+
+    Raises:
+        InputError: a joint is not driven, or a joint of the arm not by a valve.
+    """
+    free = free_axes(machine, where)
+    rigid = {n: a.model_copy(update={"transmission": None}) for n, a in machine.axes.items()}
+    model = reduced_model(machine.model_copy(update={"axes": rigid}), ())
+    space, z, (task, axes, _) = model_space(model), np.zeros(state_size(model)), arm_facts(machine)
+    n, m = len(free), len(axes)
     z[:n] = model.mech.joint[HOME][model.mech.free]
     return Arm(
-        model=Body(model.mech, model.user, model.gear, model.transmission),
-        space=Work(space.motion, space.drive, space.row),
-        z=z,
-        joint=np.array([free.index(j) for j in joints]),
-        bends=np.array([float(1 <= i <= 3) for i in range(m)]),
-        tip=np.array(machine.arm.tip.position, float),
-        links=np.array(
-            [bodies.index(k) for k in (machine.arm.tip.link, machine.link_of(joints[0]))]
+        model=Body(
+            model.mech, model.user, model.hydraulic, model.gain, model.gear, model.transmission
         ),
+        space=Work(space.motion, space.drive, space.row, space.mass, space.force),
+        z=z,
+        joint=np.array([free.index(name) for name in axes]),
+        task=task,
         gravity=np.zeros(gravity_size(m)),
         acceleration=np.zeros(n),
-        push=np.zeros(model.hydraulic),
-        rate_noise=np.zeros(n),
-        outside=np.zeros(n),
+        read=np.zeros(n),
+        angle=np.zeros(m),
         table=np.zeros((m, m)),
+        work=np.zeros(n),
     )

@@ -1,9 +1,8 @@
 """Force at the tip of an arm, felt through the pressures of its drives.
 
 The static estimate takes the torque of gravity, linear in a few identified parameters, off that of
-the drives (Zhu 1994, 6.1). The dynamic one takes off all that the motion needs: inertia, Coriolis
-forces, friction, and the closed chains with their cylinders. Positions and forces pass the same
-filter, so that both sides of the balance are equally late.
+the drives (Zhu 1994, 6.1). The dynamic one lets the complete model run along: inertia, Coriolis
+forces, friction, and the closed chains with their cylinders. Both have the same bandwidth.
 """
 
 import math
@@ -13,63 +12,58 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from hydrotele.compiled import lean
-from hydrotele.dynamics.mechanism import coordinate_names
-from hydrotele.dynamics.model import reduced_model
 from hydrotele.errors import InputError
-from hydrotele.hydraulics.circuit import Slot
-from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
+from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.log import Log
 from hydrotele.machine import Machine
-from hydrotele.operate.arm_tables import arm_tables
+from hydrotele.operate.arm_tables import arm_tables, free_axes
+from hydrotele.operate.force_observer import observe, observer_gains
 from hydrotele.operate.gravity_model import Gravity, gravity_from_masses
-from hydrotele.operate.state_filter import (
-    CHANGE,
-    LAST,
-    LOW,
-    RATE,
-    filter_step,
-    filter_table,
-    noise_gains,
-)
+from hydrotele.operate.state_filter import LAST, LOW, filter_step, filter_table
 from hydrotele.operate.tip_balance import dynamic_balance, static_balance, tip_force
 
 Kind = Literal["static", "dynamic"]
-BANDWIDTH = 2.0  # Hz
+BANDWIDTH = 1.0  # Hz
 _TASK = ("r", "theta", "z", "attitude", "head")
 _WAITING, _GOOD, _BAD, _SINGULAR = range(4)
+_JOINT, _HEAD, _ROD = range(3)  # rows of `Readings.last`
 
 
 class Readings(NamedTuple):
-    """How readings become filtered states; n independent coordinates, h valves.
+    """What is kept of the readings; n independent coordinates, h valves, k axes.
 
     Attributes:
-        table: (3, 5) of the filter.
-        position: (n,) column of every coordinate's joint among the readings.
+        period: between two readings of the sensors [s].
+        table: (3, 5) of the static estimate's filter.
+        gains: (3,) of the dynamic estimate's observer.
+        position: (n,) column of every coordinate's axis.
         valve: (h,) column of every valve's axis.
-        area: (h, 2) areas of head and rod side [m^2] or [m^3/rad].
-        state: (n + h, 4) of the filters: positions, then forces.
+        state: (n + 2 h, 4) of the filters: positions, head and rod pressures.
+        outside: (n,) forces on the coordinates from outside [N m] or [N].
         last: (3, k) last good readings of joint, head and rod; NaN before the first.
-        still: (3, k) calls since a reading changed.
+        still: (3, k) readings since one changed.
     """
 
+    period: float
     table: np.ndarray
+    gains: np.ndarray
     position: np.ndarray
     valve: np.ndarray
-    area: np.ndarray
     state: np.ndarray
+    outside: np.ndarray
     last: np.ndarray
     still: np.ndarray
 
 
 @lean
 def endpoint_force_step(arm, readings, dynamic, begun, joint, head, rod, out):
-    """Take in the readings of one moment; force at the tip.
+    """Take in new readings; force at the tip.
 
     Args:
         arm: Arm.
         readings: Readings.
         dynamic: whether the complete model is used, or gravity alone; scalar.
-        begun: whether there was a moment before; scalar.
+        begun: whether there were readings before; scalar.
         joint: (k,) measured joint positions [rad] or [m].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
@@ -81,36 +75,45 @@ def endpoint_force_step(arm, readings, dynamic, begun, joint, head, rod, out):
 
     Source: Zhu 1994, 6.1.
     """
-    good = _take(readings.last[0], readings.still[0], readings.position, joint)
-    good = _take(readings.last[1], readings.still[1], readings.valve, head) and good
-    good = _take(readings.last[2], readings.still[2], readings.valve, rod) and good
-    if not _known(readings):
+    r, n = readings, len(readings.position)
+    good = _take(r.last[_JOINT], r.still[_JOINT], r.position, joint)
+    good = _take(r.last[_HEAD], r.still[_HEAD], r.valve, head) and good
+    good = _take(r.last[_ROD], r.still[_ROD], r.valve, rod) and good
+    if not _known(r):
         return _WAITING
-    n, h, state = len(readings.position), len(readings.valve), readings.state
-    first = n + len(arm.model.transmission)
-    for c in range(n + h):
-        if c < n:
-            value = readings.last[0, readings.position[c]]
-        else:
-            i = c - n
-            value = readings.area[i, 0] * readings.last[1, readings.valve[i]]
-            value -= readings.area[i, 1] * readings.last[2, readings.valve[i]]
+    for c in range(len(r.state)):
+        place, value = _reading(r, c)
         if not begun:
-            state[c, LOW], state[c, RATE], state[c, CHANGE], state[c, LAST] = value, 0.0, 0.0, value
-        filter_step(readings.table, state[c], value)
-        if c < n:
-            arm.z[c] = state[c, LOW]
-            arm.z[first + c] = state[c, RATE] if dynamic else 0.0
-            arm.acceleration[c] = state[c, CHANGE]
+            for i in range(4):
+                r.state[c, i] = value if i == LOW or i == LAST else 0.0
+            arm.z[place] = value
+        if dynamic and c >= n:  # the mean over the period that has passed
+            arm.z[place] = 0.5 * (value + r.state[c, LAST])
+            r.state[c, LAST] = value
+        elif dynamic:
+            arm.read[c] = value
         else:
-            arm.push[c - n] = state[c, LOW]
-    if dynamic:
-        dynamic_balance(arm)
+            filter_step(r.table, r.state[c], value)
+            arm.z[place] = r.state[c, LOW]
+    if not dynamic:
+        static_balance(arm, r.outside)
+    elif begun:
+        observe(arm, r.gains, r.period, r.outside)
     else:
-        static_balance(arm)
-    if not tip_force(arm, out):
+        dynamic_balance(arm, r.outside)
+    if not tip_force(arm, r.outside, out):
         return _SINGULAR
     return _GOOD if good else _BAD
+
+
+@lean
+def _reading(r, c):
+    """Place in the arm's state and last good value of a signal: positions, then pressures."""
+    n = len(r.position)
+    if c < n:
+        return c, r.last[_JOINT, r.position[c]]
+    i, side = (c - n) // 2, (c - n) % 2
+    return 2 * n + 4 * i + 2 + side, r.last[_HEAD + side, r.valve[i]]
 
 
 @lean
@@ -134,10 +137,10 @@ def _take(last, still, used, values):
 def _known(readings):
     """Whether all channels that are used have read once."""
     for i in readings.position:
-        if math.isnan(readings.last[0, i]):
+        if math.isnan(readings.last[_JOINT, i]):
             return False
     for i in readings.valve:
-        if math.isnan(readings.last[1, i]) or math.isnan(readings.last[2, i]):
+        if math.isnan(readings.last[_HEAD, i]) or math.isnan(readings.last[_ROD, i]):
             return False
     return True
 
@@ -148,15 +151,15 @@ class EndpointForce:
     Attributes:
         axes: axes of the readings.
         task: what the force acts along: r [N], theta [N m], z [N], attitude, head [N m].
-        bandwidth: of the filter [Hz].
+        bandwidth: of the estimate [Hz].
         force: (m,) last estimate; 0 until every channel has read once.
-        healthy: whether all readings of the last update were finite and the arm was not singular.
+        healthy: whether the last readings were finite and the arm was not singular.
     """
 
     def __init__(
         self, machine: Machine, axes: Sequence[str], kind: Kind = "dynamic",
-        period: float = 0.005, *, gravity: Gravity | None = None, bandwidth: float = BANDWIDTH,
-        angle_noise: float = 0.0,
+        period: float = 0.005, *, every: int = 1, gravity: Gravity | None = None,
+        bandwidth: float = BANDWIDTH,
     ):  # fmt: skip
         """Lay out what every update needs.
 
@@ -165,10 +168,10 @@ class EndpointForce:
             axes: order of the readings, as `Feedback.joint`.
             kind: `static` knows gravity only, `dynamic` the complete model.
             period: time between two updates [s].
+            every: updates per sample of the sensors, as `Feedback.every`: the first brings a new
+                sample, the following ones hold it and change nothing.
             gravity: parameters of the static model; those of the machine's masses if None.
-            bandwidth: of the filter [Hz].
-            angle_noise: standard deviation of the joint readings [rad] or [m], by which the sign
-                of a slow motion, and with it friction, is uncertain.
+            bandwidth: of the estimate [Hz].
 
         Raises:
             InputError: a joint is not driven, not by a valve, or not measured; a number makes no
@@ -177,21 +180,22 @@ class EndpointForce:
         where = f"end-point force of {machine.name}"
         if kind not in ("static", "dynamic"):
             raise InputError(where, f"kind must be static or dynamic, got {kind!r}")
-        if not (period > 0.0 and 0.0 < bandwidth < 0.5 / period):
-            raise InputError(where, f"{bandwidth} Hz must lie below half of 1/{period} Hz")
-        self.axes, self.bandwidth, self.healthy = tuple(axes), bandwidth, True
-        self._dynamic, self._begun, self._period = kind == "dynamic", False, period
-        self._arm = arm_tables(machine, self.axes, where)
-        joints = len(self._arm.joint)
+        if not (period > 0.0 and every >= 1 and 0.0 < bandwidth < 0.25 / (period * every)):
+            rate = 1.0 / (period * every) if period > 0.0 and every >= 1 else float("nan")
+            raise InputError(
+                where, f"{bandwidth:g} Hz must be less than a quarter of the sensors' {rate:g} Hz"
+            )
+        self.axes, self.bandwidth, self.healthy = tuple(axes), bandwidth, False
+        self._dynamic, self._begun, self._every, self._tick = kind == "dynamic", False, every, 0
+        self._arm = arm_tables(machine, where)
         if not self._dynamic:
             found = gravity or gravity_from_masses(machine)
             if len(found.value) != len(self._arm.gravity):
                 raise InputError(where, f"gravity needs {len(self._arm.gravity)} parameters")
             self._arm.gravity[:] = found.value
-        noise = noise_gains(bandwidth, period)[1] * angle_noise
-        self._arm.rate_noise[:] = noise
-        self._readings = _readings(machine, self.axes, filter_table(bandwidth, period))
-        self.task, self.force = _TASK[:joints], np.zeros(joints)
+        self._readings = _readings(machine, self.axes, period * every, bandwidth, where)
+        self.task = _TASK[: len(self._arm.joint)]
+        self.force = np.zeros(len(self.task))
 
     def update(self, joint: np.ndarray, head: np.ndarray, rod: np.ndarray) -> np.ndarray:
         """Take in the readings of one moment.
@@ -207,6 +211,9 @@ class EndpointForce:
         Returns:
             (m,) force of the environment on the machine along `task`; the same array every time.
         """
+        held, self._tick = self._tick % self._every, self._tick + 1
+        if held:
+            return self.force
         status = endpoint_force_step(
             self._arm, self._readings, self._dynamic, self._begun, joint, head, rod, self.force
         )
@@ -222,9 +229,9 @@ class EndpointForce:
                 of a machine at rest do.
 
         Returns:
-            Names such as `angle.boom`, `pressure_head.boom`.
+            Names such as `joint.boom`, `pressure_head.boom`.
         """
-        r, calls = self._readings, duration / self._period
+        r, calls = self._readings, duration / self._readings.period
         kinds = (("joint", r.position), ("pressure_head", r.valve), ("pressure_rod", r.valve))
         return tuple(
             f"{kind}.{self.axes[i]}"
@@ -234,19 +241,22 @@ class EndpointForce:
         )
 
 
-def _readings(machine: Machine, axes: tuple[str, ...], table: np.ndarray) -> Readings:
-    """Where the readings are and the filters they go through."""
-    names, model = coordinate_names(machine), reduced_model(machine, ())
-    driver = {axis.joint: name for name, axis in machine.axes.items()}
-    valves = actuator_order(machine)[: model.hydraulic]
-    numbers = actuator_numbers(machine)
-    k, n = len(axes), len(model.mech.free)
+def _readings(
+    machine: Machine, axes: tuple[str, ...], period: float, bandwidth: float, where: str
+) -> Readings:
+    """Where the readings are and what they go through."""
+    free, valves = free_axes(machine, where), actuator_order(machine)[: len(machine.hydraulic_axes)]
+    if missing := [name for name in free if name not in axes]:
+        raise InputError(where, f"readings of {', '.join(missing)} are missing")
+    n, h, k = len(free), len(valves), len(axes)
     return Readings(
-        table=table,
-        position=np.array([axes.index(driver[names[i]]) for i in model.mech.free]),
+        period=period,
+        table=filter_table(bandwidth, period),
+        gains=observer_gains(bandwidth, period),
+        position=np.array([axes.index(name) for name in free]),
         valve=np.array([axes.index(name) for name in valves]),
-        area=np.array([numbers[v][[Slot.AREA_HEAD, Slot.AREA_ROD]] for v in valves]),
-        state=np.zeros((n + len(valves), 4)),
+        state=np.zeros((n + 2 * h, 4)),
+        outside=np.zeros(n),
         last=np.full((3, k), np.nan),
         still=np.zeros((3, k), int),
     )

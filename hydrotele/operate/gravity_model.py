@@ -10,7 +10,7 @@ from hydrotele.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.log import Log
 from hydrotele.machine import Machine
-from hydrotele.operate.arm_tables import arm_joints, arm_tables, gravity_size
+from hydrotele.operate.arm_tables import arm_joints, arm_tables, free_axes, gravity_size
 from hydrotele.operate.tip_balance import dynamic_balance, static_torque
 from hydrotele.teleop.recursive import RecursiveLeastSquares
 
@@ -74,7 +74,7 @@ def gravity_from_masses(machine: Machine) -> Gravity:
     Raises:
         InputError: the arm's joints are not all driven.
     """
-    arm = arm_tables(machine, tuple(machine.axes), f"gravity of {machine.name}")
+    arm = arm_tables(machine, f"gravity of {machine.name}")
     joints = arm_joints(machine)
     ranges = [machine.joints[j].range or (-math.pi, math.pi) for j in joints[1:]]
     grid = np.meshgrid(*(np.linspace(low, high, _GRID) for low, high in ranges), indexing="ij")
@@ -93,16 +93,13 @@ def gravity_from_masses(machine: Machine) -> Gravity:
 @compiled
 def _weights(arm, poses, torque):
     """Torques (r, m) of gravity on the arm's joints in poses (r, m)."""
-    n = len(arm.outside)
-    arm.z[n:] = 0.0
-    arm.acceleration[:] = 0.0
-    arm.push[:] = 0.0
+    outside = np.zeros(len(arm.work))
     for row in range(len(poses)):
         for i in range(len(arm.joint)):
             arm.z[arm.joint[i]] = poses[row, i]
-        dynamic_balance(arm)
+        dynamic_balance(arm, outside)
         for i in range(len(arm.joint)):
-            torque[row, i] = arm.outside[arm.joint[i]]
+            torque[row, i] = outside[arm.joint[i]]
 
 
 def drive_torques(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarray]:
@@ -120,7 +117,7 @@ def drive_torques(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarray]:
 
     Source: Zhu 1994, 6.12 and 6.13.
     """
-    arm_tables(machine, tuple(machine.axes), f"torques of {machine.name}")
+    free_axes(machine, f"torques of {machine.name}")
     driver = {axis.joint: name for name, axis in machine.axes.items()}
     angles, torques = [], []
     for name in (driver[joint] for joint in arm_joints(machine)):

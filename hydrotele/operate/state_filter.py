@@ -33,7 +33,7 @@ def filter_table(bandwidth: float, period: float) -> np.ndarray:
     (triangle hold).
 
     >>> filter_table(1.0, 0.01)[:, 3:].sum(axis=1).round(4) + 0.0  # a step of both readings
-    array([0.    , 0.0121, 2.3303])
+    array([0.    , 0.0119, 2.3279])
     """
     w = 2.0 * math.pi * bandwidth
     block = np.zeros((5, 5))
@@ -45,28 +45,6 @@ def filter_table(bandwidth: float, period: float) -> np.ndarray:
     table = step[:3].copy()
     table[:, 3] -= step[:3, 4]
     return table
-
-
-def noise_gains(bandwidth: float, period: float) -> np.ndarray:
-    """Standard deviations (3,) of y, y', y'' for white readings of standard deviation 1.
-
-    Args:
-        bandwidth: scalar [Hz].
-        period: time between two readings, scalar [s].
-
-    Returns:
-        [1], [1/s], [1/s^2].
-
-    Source: response to a single reading.
-    """
-    table = filter_table(bandwidth, period)
-    state, total, last = np.zeros(3), np.zeros(3), 0.0
-    for row in range(math.ceil(6.0 / (bandwidth * period))):
-        now = 1.0 if row == 0 else 0.0
-        state = table @ (*state, last, now)
-        last = now
-        total += state**2
-    return np.sqrt(total)
 
 
 @lean

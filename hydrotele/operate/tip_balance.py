@@ -9,90 +9,90 @@ from hydrotele.compiled import lean
 from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.integrate import place
 from hydrotele.dynamics.mechanism import DAMPING, Mechanism
-from hydrotele.dynamics.model import GEAR_INERTIA
-from hydrotele.dynamics.motion import BIAS, DRIFT, ORIGIN, RATE, Motion, cross, turned
-from hydrotele.hydraulics.circuit import SLOTS, actuator_friction
+from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Motion
+from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
+from hydrotele.kinematics.task import task_jacobian
 
-_SINGULAR = 1.0e-6  # pivot against the largest entry; the last force is kept below it
-_AXIS = 1.0e-3  # m: closer to the swing axis the tip has no azimuth
-# Gauss's rule of three points for a normal distribution: its outer nodes and their weights
-_NODE, _OUTER = math.sqrt(3.0), 1.0 / 6.0
+_AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
+_SINGULAR = 1.0e-6  # pivot against the largest entry
 
 
 class Body(NamedTuple):
-    """What a balance needs of `dynamics.model.Model`, whose attributes these are.
+    """What is needed of `dynamics.model.Model`, whose attributes these are.
 
     Every array that Python hands over costs a tenth of a microsecond.
     """
 
     mech: Mechanism
     user: np.ndarray
+    hydraulic: int
+    gain: np.ndarray
     gear: np.ndarray
     transmission: np.ndarray
 
 
 class Work(NamedTuple):
-    """What a balance needs of `dynamics.model.Space`, whose attributes these are."""
+    """What is needed of `dynamics.model.Space`, whose attributes these are."""
 
     motion: Motion
     drive: np.ndarray
     row: np.ndarray
+    mass: np.ndarray
+    force: np.ndarray
 
 
 class Arm(NamedTuple):
-    """An arm in its machine: m joints, n independent coordinates, h valves.
+    """An arm in its machine, without transmissions: m joints, n independent coordinates.
 
     Attributes:
         model: the machine.
         space: its work space.
-        z: state of the model that is asked for; its first n and its rates are used.
+        z: (2 n + 4 h,) state of the model: positions, rates, and four numbers per valve, of which
+            the last two are its pressures [Pa].
         joint: (m,) independent coordinate of every joint, swing first.
-        bends: (m,) 1 where a joint changes the attitude of the tool, else 0.
-        tip: (3,) tip in its link's frame [m].
-        links: (2,) frames of the tip's link and of the swing.
+        task: (9,) of `kinematics.task.task_numbers`.
         gravity: (p,) parameters of the static model [N m].
         acceleration: (n,) of the independent coordinates.
-        push: (h,) forces of the drives from their pressures [N] or [N m].
-        rate_noise: (n,) standard deviations of the independent rates.
-        outside: (n,) forces on the independent coordinates from outside [N m] or [N].
-        table: (m, m) transposed Jacobian of the tip, destroyed.
+        read: (n,) measured positions of the independent coordinates [rad] or [m].
+        angle: (m,) work space.
+        table: (m, m) work space.
+        work: (n,) work space.
     """
 
     model: Body
     space: Work
     z: np.ndarray
     joint: np.ndarray
-    bends: np.ndarray
-    tip: np.ndarray
-    links: np.ndarray
+    task: np.ndarray
     gravity: np.ndarray
     acceleration: np.ndarray
-    push: np.ndarray
-    rate_noise: np.ndarray
-    outside: np.ndarray
+    read: np.ndarray
+    angle: np.ndarray
     table: np.ndarray
+    work: np.ndarray
 
 
 @lean
-def dynamic_balance(arm):
+def dynamic_balance(arm, outside):
     """Forces from outside by the complete model: inertia, gravity, friction, closed chains.
 
-    `tau = B' (M (B q'' + d) + h + D q') - sum r_i (F_i - E f_i(v_i))`
+    `tau = B' (M (B q'' + d) + h + D q') - sum r_i (F_i - f_i(v_i))`
 
     Args:
-        arm: Arm; z, acceleration and push are read, outside is written.
+        arm: Arm; z and acceleration are read.
+        outside: (n,) written: forces on the independent coordinates [N m] or [N].
 
     Returns:
         Nothing.
 
     Source: Zhu 1994, 6.2, with the projection of `dynamics.integrate`.
     """
-    model, sp, m, out = arm.model, arm.space, arm.space.motion, arm.outside
-    n, nt = len(out), m.joint.shape[1]
-    place(model, sp, arm.z)
+    model, m = arm.model, arm.space.motion
+    n, nt = len(outside), m.joint.shape[1]
+    place(model, arm.space, arm.z)
     gather_forces(model.mech, m)
     for f in range(n):
-        out[f] = 0.0
+        outside[f] = 0.0
     for j in range(nt):
         need = m.joint[BIAS, j] + model.mech.joint[DAMPING, j] * m.joint[RATE, j]
         for k in range(nt):
@@ -101,18 +101,20 @@ def dynamic_balance(arm):
                 way += m.basis[k, f] * arm.acceleration[f]
             need += m.mass[j, k] * way
         for f in range(n):
-            out[f] += m.basis[j, f] * need
-    _subtract_drives(arm, True)
+            outside[f] += m.basis[j, f] * need
+    _subtract_drives(arm, True, outside)
 
 
 @lean
-def static_balance(arm):
+def static_balance(arm, outside):
     """Forces from outside by the static model of gravity alone.
 
     `tau = Y(q) P - sum r_i F_i`
 
     Args:
-        arm: Arm; z (whose rates must be 0), gravity and push are read, outside is written.
+        arm: Arm; z and gravity are read.
+        outside: (n,) written: forces on the independent coordinates [N m]; those of joints that
+            are not the arm's without gravity.
 
     Returns:
         Nothing.
@@ -120,11 +122,27 @@ def static_balance(arm):
     Source: Zhu 1994, 6.6.
     """
     place(arm.model, arm.space, arm.z)
-    for f in range(len(arm.outside)):
-        arm.outside[f] = 0.0
+    for f in range(len(outside)):
+        outside[f] = 0.0
     for i in range(len(arm.joint)):
-        arm.outside[arm.joint[i]] = static_torque(arm.z, arm.joint, arm.gravity, i)
-    _subtract_drives(arm, False)
+        outside[arm.joint[i]] = static_torque(arm.z, arm.joint, arm.gravity, i)
+    _subtract_drives(arm, False, outside)
+
+
+@lean
+def _subtract_drives(arm, rubbing, outside):
+    """Take what the drives give off the forces outside."""
+    model, sp, n = arm.model, arm.space, len(outside)
+    for i in range(model.hydraulic):
+        u, a = i * SLOTS, 2 * n + 4 * i
+        give = model.user[u + _AH] * arm.z[a + 2] - model.user[u + _AR] * arm.z[a + 3]
+        if rubbing:
+            v = 0.0
+            for f in range(n):
+                v += sp.row[i, f] * arm.z[n + f]
+            give -= actuator_friction(model.user, u, v)
+        for f in range(n):
+            outside[f] -= sp.row[i, f] * give
 
 
 @lean
@@ -162,35 +180,12 @@ def static_torque(q, joint, gravity, i):
 
 
 @lean
-def _subtract_drives(arm, rubbing):
-    """Take what the drives give off the forces outside, friction as expected from noisy rates."""
-    model, sp, out = arm.model, arm.space, arm.outside
-    n = len(out)
-    for i in range(len(arm.push)):
-        give, inertia = arm.push[i], 0.0
-        if rubbing:
-            v, noise, first = 0.0, 0.0, n + len(model.transmission)
-            for f in range(n):
-                v += sp.row[i, f] * arm.z[first + f]
-                noise += (sp.row[i, f] * arm.rate_noise[f]) ** 2
-                inertia += sp.row[i, f] * arm.acceleration[f]
-            away, u = _NODE * math.sqrt(noise), i * SLOTS
-            give -= (1.0 - 2.0 * _OUTER) * actuator_friction(model.user, u, v)
-            give -= _OUTER * actuator_friction(model.user, u, v - away)
-            give -= _OUTER * actuator_friction(model.user, u, v + away)
-            gear = model.gear[i]
-            if gear >= 0:
-                give -= model.transmission[gear, GEAR_INERTIA] * inertia
-        for f in range(n):
-            out[f] -= sp.row[i, f] * give
-
-
-@lean
-def tip_force(arm, out):
+def tip_force(arm, outside, out):
     """Force at the tip that gives the forces outside.
 
     Args:
-        arm: Arm after a balance; `table` is destroyed.
+        arm: Arm; z is read, table and work are destroyed.
+        outside: (n,) forces on the independent coordinates from outside [N m] or [N].
         out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m]; left alone
             where the Jacobian is singular.
 
@@ -199,21 +194,32 @@ def tip_force(arm, out):
 
     Source: Zhu 1994, 6.6: `F = J^-T tau`.
     """
-    if not _transposed_jacobian(arm):
-        return False
-    table, m = arm.table, len(out)
-    most = 0.0
+    m, most = len(out), 0.0
     for i in range(m):
-        arm.acceleration[i] = arm.outside[arm.joint[i]]  # not needed any more: the right-hand side
+        arm.angle[i] = arm.z[arm.joint[i]]
+    task_jacobian(arm.task, arm.angle, arm.table)
+    for i in range(m):
+        arm.work[i] = outside[arm.joint[i]]
+        for j in range(i):
+            arm.table[i, j], arm.table[j, i] = arm.table[j, i], arm.table[i, j]
         for j in range(m):
-            most = max(most, abs(table[i, j]))
-    right = arm.acceleration
+            most = max(most, abs(arm.table[i, j]))
+    if not _eliminated(arm.table, arm.work, m, _SINGULAR * most):
+        return False
+    for i in range(m):
+        out[i] = arm.work[i]
+    return True
+
+
+@lean
+def _eliminated(table, right, m, least):
+    """Solve by elimination, in place; False where a pivot is less than the least."""
     for i in range(m):
         best = i
         for r in range(i + 1, m):
             if abs(table[r, i]) > abs(table[best, i]):
                 best = r
-        if not abs(table[best, i]) > _SINGULAR * most:
+        if not abs(table[best, i]) > least:
             return False
         for j in range(m):
             table[i, j], table[best, j] = table[best, j], table[i, j]
@@ -227,38 +233,4 @@ def tip_force(arm, out):
         for j in range(i + 1, m):
             right[i] -= table[i, j] * right[j]
         right[i] /= table[i, i]
-    for i in range(m):
-        out[i] = right[i]
-    return True
-
-
-@lean
-def _transposed_jacobian(arm):
-    """Derivatives of (r, theta, z, attitude, head) by the arm's joints; False on the swing axis."""
-    m, frame, link, table = arm.space.motion, arm.space.motion.frame, arm.links[0], arm.table
-    x, y, z = turned(frame, link, arm.tip[0], arm.tip[1], arm.tip[2])
-    px = frame[link, ORIGIN] + x - frame[arm.links[1], ORIGIN]
-    py = frame[link, ORIGIN + 1] + y - frame[arm.links[1], ORIGIN + 1]
-    r = math.sqrt(px * px + py * py)
-    if r < _AXIS:
-        return False
-    nt = m.joint.shape[1]
-    for i in range(len(arm.joint)):
-        vx, vy, vz = 0.0, 0.0, 0.0
-        for k in range(nt):
-            part = m.basis[k, arm.joint[i]]
-            if part == 0.0:
-                continue
-            jac = m.jacobian[link, k]
-            cx, cy, cz = cross(jac[3], jac[4], jac[5], x, y, z)
-            vx += part * (jac[0] + cx)
-            vy += part * (jac[1] + cy)
-            vz += part * (jac[2] + cz)
-        table[i, 0] = (px * vx + py * vy) / r
-        table[i, 1] = (px * vy - py * vx) / (r * r)
-        table[i, 2] = vz
-        if len(arm.joint) > 3:
-            table[i, 3] = arm.bends[i]
-        if len(arm.joint) > 4:
-            table[i, 4] = 1.0 if i == 4 else 0.0
     return True
