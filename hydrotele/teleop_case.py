@@ -16,6 +16,10 @@ from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance
 SHIPPED = Path(__file__).resolve().parent / "teleop" / "cat215_axis.yaml"
 
 
+LONGEST = 10.0  # s
+Delay = Annotated[float, Field(ge=0, le=LONGEST)]
+
+
 class Side(Facts):
     """A body, the hand or the task: mass [kg], damping [N s/m], stiffness [N/m]."""
 
@@ -28,10 +32,16 @@ class Side(Facts):
         return Impedance(self.mass, self.damping, self.stiffness)
 
 
-class Body(Side):
-    """Master or slave, which have a mass."""
+class Body(Facts):
+    """Master or slave, which have a mass [kg], and perhaps damping [N s/m], stiffness [N/m]."""
 
     mass: Positive
+    damping: NonNegative = 0.0
+    stiffness: NonNegative = 0.0
+
+    def impedance(self) -> Impedance:
+        """The same as a function of frequency."""
+        return Impedance(self.mass, self.damping, self.stiffness)
 
 
 class Controller(Facts):
@@ -56,8 +66,8 @@ class ChannelGains(Facts):
 class Delays(Facts):
     """Delays [s] from the master to the slave and back."""
 
-    forward: NonNegative = 0.0
-    back: NonNegative = 0.0
+    forward: Delay = 0.0
+    back: Delay = 0.0
 
 
 class VaryingSpring(Facts):
@@ -86,7 +96,7 @@ class VaryingSpring(Facts):
 class MapRange(Facts):
     """Range of the map of stability: delay each way [s], factor on what comes back [1]."""
 
-    longest_delay: Positive = 0.5
+    longest_delay: Annotated[float, Field(gt=0, le=LONGEST)] = 0.5
     least_factor: Positive = 0.01
     most_factor: Positive = 100.0
     points: Annotated[int, Field(ge=3, le=200)] = 25

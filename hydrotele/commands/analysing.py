@@ -1,7 +1,6 @@
 """`hydrotele analyse teleop`: a teleoperator as a two-port, with hand, task and delays."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,12 +10,22 @@ import hydrotele
 from hydrotele.commands.console import notes, out, plain, print_json, stages, table
 from hydrotele.errors import InputError
 from hydrotele.output import check_target, whole_folder
-from hydrotele.teleop.findings import Findings, find, findings_document
-from hydrotele.teleop_case import TeleopCase, known_structures, load_teleop_case
+from hydrotele.teleop.findings import (
+    Findings,
+    find,
+    findings_document,
+    said_delay,
+    said_error,
+    said_factor,
+    why_unstable,
+)
+from hydrotele.teleop_case import LONGEST, TeleopCase, known_structures, load_teleop_case
 
 _LEGEND = (
-    "gain margin: factor on what comes back (force, or the slave's motion) up to which it stays"
-    " stable; below 1 it has to be made that much smaller"
+    "margin: factor on what comes back (force, or the slave's motion) up to which it stays stable;"
+    " below 1 it has to be made that much smaller\n"
+    "delay: each way, up to which it stays stable; none: none found up to a factor of 1000, 10 s\n"
+    "norm: largest of the scattering matrix; passive only if it is nowhere above 1"
 )
 
 
@@ -81,8 +90,8 @@ def analyse_case(
         raise InputError("--structure", str(error)) from None
     case = facts.case()
     if delay is not None:
-        if not 0.0 <= delay < math.inf:
-            raise InputError("--delay", f"must be a time of 0 s or more, got {delay:g}")
+        if not 0.0 <= delay <= LONGEST:
+            raise InputError("--delay", f"must be from 0 to {LONGEST:g} s, got {delay:g}")
         case = case.with_delay(delay)
     reach = facts.map
     delays = max(reach.longest_delay, case.delay) * np.linspace(0.0, 1.0, reach.points) ** 2
@@ -105,13 +114,13 @@ def _write(folder: Path, found: Findings, document: dict) -> None:
 
 def _print(found: Findings) -> None:
     case = found.case
-    title = f"{found.name}, delay {1e3 * case.delay_forward:g} ms forward, {1e3 * case.delay_back:g} ms back"  # fmt: skip  # noqa: E501 - one title
-    rows = table(title, "structure", "stable", "unstable poles", "free", "gain margin",
-                 "largest delay", "scattering", "passive")  # fmt: skip
+    delays = f"{1e3 * case.delay_forward:g} ms forward, {1e3 * case.delay_back:g} ms back"
+    title = f"{found.name}, delay {delays}"
+    rows = table(title, "structure", "stable", "margin", "delay", "norm", "passive")  # fmt: skip
     for one in found.analyses:
         rows.add_row(
-            one.structure, "yes" if one.stable else "[red]no[/]", str(one.unstable_poles),
-            str(one.unstable_free), _factor(one.gain_margin), _delay(one.largest_delay),
+            one.structure, "yes" if one.stable else f"[red]{why_unstable(one)}[/]",
+            said_factor(one.gain_margin), said_delay(one.largest_delay),
             f"{one.scattering.max():.3g}", "yes" if one.passive else "no",
         )  # fmt: skip
     out.print(rows)
@@ -124,31 +133,20 @@ def _print(found: Findings) -> None:
 
 def _print_springs(found: Findings) -> None:
     assert found.spring
-    rows = table("stiffness feedback", "joystick", "B [N s/m]", "K_max [N/m]", "B^2 - 4 M K_max",
-                 "B asked for", "worst growth of half a swing")  # fmt: skip
+    rows = table("stiffness feedback: B^2 - 4 M K_max, and the worst switching", "joystick", "B",
+                 "K_max", "margin", "B asked for", "growth")  # fmt: skip
     for name, one in (("held", found.spring.held(found.case.hand)), ("let go", found.spring)):
-        rows.add_row(name, f"{one.damping:g}", f"{one.most:g}", f"{one.margin:.4g}",
+        rows.add_row(name, f"{one.damping:g} N s/m", f"{one.most:g} N/m", f"{one.margin:.4g}",
                      f"{one.enough_damping:.4g}", f"{one.growth:.3g}")  # fmt: skip
     out.print(rows)
+    out.print("growth: of half a swing, stable below 1; the theorem asks for more", style="dim")
 
 
 def _print_confirmed(found: Findings) -> None:
     rows = table("confirmed in simulation", "structure", "sweep, no delay",
                  "sweep, with delay", "map agrees")  # fmt: skip
     for one in found.agreements:
-        errors = [_error(s.error) for s in found.sweeps if s.structure == one.structure]
+        errors = [said_error(s.error) for s in found.sweeps if s.structure == one.structure]
         rows.add_row(one.structure, *[*errors, "-"][:2], f"{100.0 * one.share:.1f} %")
     out.print(rows)
     out.print("sweep: largest error of the felt impedance; map: share of its cells", style="dim")
-
-
-def _factor(margin: float) -> str:
-    return "none found" if math.isinf(margin) else f"{margin:.3g}"
-
-
-def _delay(delay: float) -> str:
-    return "none found" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
-
-
-def _error(error: float | None) -> str:
-    return "not measurable" if error is None else f"{100.0 * error:.2g} %"

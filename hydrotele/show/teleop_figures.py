@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from hydrotele.show.report_figure import drawing, png
-from hydrotele.teleop.findings import Findings
+from hydrotele.teleop.findings import Findings, why_unstable
 from hydrotele.teleop.switching import Spring, growth_map
 
 _INK, _SOFT = "#262b33", "#8a94a0"
@@ -108,14 +108,13 @@ def draw_nyquist(found: Findings) -> bytes:
                 (one.loop, {"color": colour, "lw": 1.4}, "with the task"),
                 (one.loop_free, {"color": _SOFT, "lw": 1.1}, "free"),
             ):
-                panel.plot(curve.real, curve.imag, label=name, **look)
-                panel.plot(curve.real, -curve.imag, **(look | {"alpha": 0.35}))
+                panel.plot(np.real(curve), np.imag(curve), label=name, **look)
+                panel.plot(np.real(curve), -np.imag(curve), **(look | {"alpha": 0.35}))
             panel.plot(-1.0, 0.0, "+", color="#b5281c", ms=10, mew=2)
             panel.axis(_NYQUIST)
             panel.set_aspect("equal")
             panel.set(xlabel="real part [1]", ylabel="imaginary part [1]")
-            many = one.unstable_poles
-            said = "stable" if many == 0 else f"{many} unstable pole{'s' * (many != 1)}"
+            said = "stable" if one.stable else why_unstable(one).removeprefix("no, ")
             panel.set_title(f"{plain_name(one.structure)}: {said}")
             panel.legend(loc="upper right", fontsize=8, frameon=False)
         return png(figure)

@@ -1,6 +1,5 @@
 """`report.html` of a teleoperator's analysis: one page that needs nothing else."""
 
-import math
 from pathlib import Path
 
 import hydrotele
@@ -15,8 +14,13 @@ from hydrotele.show.teleop_figures import (
     draw_stiffness,
     plain_name,
 )
-from hydrotele.teleop.analysis import Analysis
-from hydrotele.teleop.findings import Findings
+from hydrotele.teleop.findings import (
+    Findings,
+    said_delay,
+    said_error,
+    said_factor,
+    why_unstable,
+)
 from hydrotele.teleop.switching import Spring
 from hydrotele.teleop.two_port import Impedance
 
@@ -74,19 +78,18 @@ def _header(found: Findings) -> Markup:
 
 
 def _verdicts(found: Findings) -> Markup:
-    rows = [
-        (
-            Markup(tag("b", plain_name(one.structure)) + tag("small", _CHANNELS[one.structure])),
-            _yes(one.stable, _poles(one)), _margin(one.gain_margin), _delay(one.largest_delay),
-            f"{one.scattering.max():.3g}", _yes(one.passive, "no"),
-        )
-        for one in found.analyses
-    ]  # fmt: skip
+    rows = []
+    for one in found.analyses:
+        name = Markup(tag("b", plain_name(one.structure)) + tag("small", _CHANNELS[one.structure]))
+        margin, delay = said_factor(one.gain_margin), said_delay(one.largest_delay)
+        rows.append((name, _yes(one.stable, why_unstable(one)), margin, delay,
+                     f"{one.scattering.max():.3g}", _yes(one.passive, "no")))  # fmt: skip
     head = ("structure", "stable", "gain margin", "largest delay", "scattering norm", "passive")
     why = (
         "Gain margin: factor on what comes back to the hand up to which the loop stays stable;"
         " below 1, what comes back has to be made that much smaller. Largest delay: each way, with"
-        " the gains as they are. A passive two-port, whose scattering norm nowhere exceeds 1, is"
+        " the gains as they are. None: no factor up to 1000 and no delay up to 10 s"
+        " hurts. A passive two-port, whose scattering norm nowhere exceeds 1, is"
         " stable with every passive hand and task; without passivity it depends on them."
     )
     parts = [table(head, rows, numbers="  nnn")]
@@ -98,11 +101,7 @@ def _verdicts(found: Findings) -> Markup:
 def _confirmed(found: Findings) -> Markup:
     rows = []
     for one in found.agreements:
-        errors = [
-            "not measurable" if s.error is None else f"{100 * s.error:.2g} %"
-            for s in found.sweeps
-            if s.structure == one.structure
-        ]
+        errors = [said_error(s.error) for s in found.sweeps if s.structure == one.structure]
         cells = f"{int((one.predicted == one.seen).sum())} of {one.seen.size}"
         rows.append((tag("b", plain_name(one.structure)), *[*errors, "-"][:2], cells))
     head = ("in simulation", "felt, no delay", "felt, with delay", "cells of the map that agree")
@@ -219,16 +218,3 @@ def _figure(png: bytes, alt: str) -> Markup:
 
 def _yes(good: bool, otherwise: str) -> Cell:
     return Cell("yes" if good else otherwise, "yes" if good else "no")
-
-
-def _poles(one: Analysis) -> str:
-    many = one.unstable_poles or one.unstable_free
-    return f"no, {many} pole{'s' * (many != 1)}{'' if one.unstable_poles else ' when free'}"
-
-
-def _margin(value: float) -> str:
-    return "none found" if math.isinf(value) else f"× {value:.3g}"
-
-
-def _delay(value: float) -> str:
-    return "none found" if math.isinf(value) else f"{1e3 * value:.3g} ms"

@@ -39,8 +39,8 @@ class Analysis:
         scattering: (n,) largest singular value of the scattering matrix [1].
         loop: (n,) gain of the loop through hand and task [1].
         loop_free: (n,) the same without a task [1].
-        unstable_poles: with the task.
-        unstable_free: poles without a task.
+        unstable_poles: with the task; None where poles lie on the axis.
+        unstable_free: the same without a task.
         gain_margin: factor on what comes back up to which the loop stays stable; below 1 where the
             case is unstable, 0 where no factor helps, infinite where none was found that hurts.
         largest_delay: each way, up to which it stays stable [s]; 0 where it is unstable without.
@@ -55,8 +55,8 @@ class Analysis:
     scattering: np.ndarray
     loop: np.ndarray
     loop_free: np.ndarray
-    unstable_poles: int
-    unstable_free: int
+    unstable_poles: int | None
+    unstable_free: int | None
     gain_margin: float
     largest_delay: float
     passive: bool
@@ -88,8 +88,8 @@ def analyse(case: Case, structure: str, frequencies: np.ndarray = FREQUENCIES) -
     return Analysis(
         structure, frequencies, hybrid(port, s), transmitted(port, s, case.task), case.task(s),
         scattering_norm(port, s, unit), loop_gain(port, s, case.hand, case.task),
-        loop_gain(port, s, case.hand, _FREE), unstable_poles(port, case.hand, case.task),
-        unstable_poles(port, case.hand, _FREE), gain_margin(case, structure),
+        loop_gain(port, s, case.hand, _FREE), _counted(port, case.hand, case.task),
+        _counted(port, case.hand, _FREE), gain_margin(case, structure),
         largest_delay(case, structure), is_passive(port, unit),
     )  # fmt: skip
 
@@ -148,6 +148,13 @@ def holds(port: TwoPort, hand: Block, environment: Block) -> bool:
         return stable(port, hand, environment)
     except OnTheAxis:
         return False
+
+
+def _counted(port: TwoPort, hand: Block, environment: Block) -> int | None:
+    try:
+        return unstable_poles(port, hand, environment)
+    except OnTheAxis:
+        return None
 
 
 def gain_margin(case: Case, structure: str) -> float:

@@ -1,5 +1,6 @@
 """Everything that an analysis of a teleoperator finds, and the same as JSON."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -81,6 +82,44 @@ def find(
     )
 
 
+def why_unstable(one: Analysis) -> str:
+    """What makes a structure unstable, in a few words."""
+    free = "" if one.unstable_poles != 0 else " when free"
+    many = one.unstable_poles if not free else one.unstable_free
+    if many is None:
+        return f"no, poles on the axis{free}"
+    return f"no, {many} pole{'s' * (many != 1)}{free}"
+
+
+def said_factor(margin: float) -> str:
+    """A gain margin.
+
+    >>> said_factor(0.17), said_factor(math.inf)
+    ('x 0.17', 'none')
+    """
+    return "none" if math.isinf(margin) else f"x {margin:.3g}"
+
+
+def said_delay(delay: float) -> str:
+    """A delay.
+
+    >>> said_delay(0.12345)
+    '123 ms'
+    """
+    return "none" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
+
+
+def said_error(error: float | None) -> str:
+    """A relative error.
+
+    >>> said_error(0.0016), said_error(1e-7)
+    ('0.16 %', '< 0.01 %')
+    """
+    if error is None:
+        return "not measurable"
+    return "< 0.01 %" if error < 1e-4 else f"{100.0 * error:.2g} %"
+
+
 def findings_document(found: Findings) -> dict:
     """What was found as plain data; infinite where nothing within reach changes stability.
 
@@ -133,7 +172,7 @@ def _analysis(one: Analysis) -> dict:
 
 
 def _pairs(values: np.ndarray) -> list:
-    return np.stack([values.real, values.imag], axis=-1).tolist()
+    return np.stack([np.real(values), np.imag(values)], axis=-1).tolist()
 
 
 def _spring(one: Spring) -> dict:

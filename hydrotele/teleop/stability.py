@@ -111,5 +111,7 @@ def _order(function: Block, highest: float, least: int) -> int:
     sizes = np.abs(function(far))
     order = round(float(np.log10(sizes[1] / sizes[0])))
     if order < least:
-        raise InputError(_WHERE, "master and slave need masses")
+        raise InputError(
+            _WHERE, "master and slave need masses, a transparent one hand or task, too"
+        )
     return order

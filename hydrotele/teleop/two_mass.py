@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.compiled import compiled
+from hydrotele.errors import InputError
 from hydrotele.teleop.case import Case
 from hydrotele.teleop.two_port import Impedance
 
@@ -27,6 +28,8 @@ _LARGEST = 5e-4  # s
 _BLOCKS = 20  # of a run, whose largest speeds are compared
 _GROWN, _GONE = 1e9, 1e-9  # of the kick, beyond which nothing changes any more
 _KICK = 0.1  # m/s
+_TRIPS = 40  # there and back that a run lasts at least
+_FINEST = 2e-6  # s, a step below which a run takes minutes
 
 
 class Law(NamedTuple):
@@ -97,7 +100,11 @@ def on_motion(impedance: Impedance, position: int) -> np.ndarray:
 
 
 def step_of(case: Case) -> float:
-    """Step that resolves the fastest rate that the masses can have together [s]."""
+    """Step that resolves the fastest rate that the masses can have together [s].
+
+    Raises:
+        InputError: that would take too long.
+    """
     parts = (case.master, case.slave, case.master_control, case.slave_control, case.hand, case.task)
     lightest = min(part.mass for part in parts if part.mass)
     rates = (
@@ -105,7 +112,13 @@ def step_of(case: Case) -> float:
         math.sqrt(sum(part.stiffness for part in parts) / lightest),
         1.0 / _LARGEST * _PER_RATE,
     )
-    return _PER_RATE / max(rates)
+    step = _PER_RATE / max(rates)
+    if step < _FINEST:
+        raise InputError(
+            "teleoperator", f"too fast to be simulated, with rates of {max(rates):.3g} 1/s: the"
+            f" lightest mass is {lightest:g} kg; leave --confirm out or give hand and sides mass",
+        )  # fmt: skip
+    return step
 
 
 def kicked(case: Case, structure: str, reflected: float = 1.0, seconds: float = 40.0) -> Run:
@@ -115,11 +128,13 @@ def kicked(case: Case, structure: str, reflected: float = 1.0, seconds: float = 
         case: the teleoperator with hand and task.
         structure: its name.
         reflected: factor on what comes back [1].
-        seconds: to simulate; it ends sooner where motion has died out or has grown without bound.
+        seconds: to simulate, and at least forty delays; it ends sooner where motion has died out
+            or has grown without bound.
 
     Returns:
         The run.
     """
+    seconds = max(seconds, _TRIPS * 2.0 * case.delay)
     return _simulated(case, law_of(case, structure, reflected), seconds, 0.0, 0.0)
 
 
