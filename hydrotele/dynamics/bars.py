@@ -3,7 +3,7 @@
 import math
 
 from hydrotele.compiled import lean
-from hydrotele.dynamics.mechanism import PARENT, REACH
+from hydrotele.dynamics.mechanism import AXIS, PARENT, REACH
 from hydrotele.dynamics.motion import (
     ACCELERATION,
     LENGTH,
@@ -47,7 +47,10 @@ def place_bars(tree, shape, first, frame, jacobian, bar):
         dz = frame[rod, ORIGIN + 2] - frame[tube, ORIGIN + 2]
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         ex, ey, ez = dx / length, dy / length, dz / length
-        nx, ny, nz = -frame[base, 1], -frame[base, 4], -frame[base, 7]
+        px, py, pz = shape[tube, AXIS], shape[tube, AXIS + 1], shape[tube, AXIS + 2]
+        nx = px * frame[base, 0] + py * frame[base, 1] + pz * frame[base, 2]
+        ny = px * frame[base, 3] + py * frame[base, 4] + pz * frame[base, 5]
+        nz = px * frame[base, 6] + py * frame[base, 7] + pz * frame[base, 8]
         ux, uy, uz = cross(nx, ny, nz, ex, ey, ez)
         bar[b, LENGTH] = length
         for i in (tube, rod):

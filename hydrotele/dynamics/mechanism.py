@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.kinematics.from_machine import pin_axis
 from hydrotele.kinematics.loops import following_joints
 from hydrotele.machine import Machine
 
@@ -25,8 +26,9 @@ class Mechanism(NamedTuple):
             at its rod pin), KIND, tree COORDINATE of its joint (-1 without one), REACH (only tree
             coordinates below it move the frame).
         shape: (f, SHAPE) of every frame: POSITION in its parent's [m] (of tube and rod: their
-            pins), AXIS of its joint, COM [m] and INERTIA about it [kg m^2] in its own axes, MASS
-            [kg], CLOSED (of a tube) pin-to-pin length at piston displacement 0 [m].
+            pins), AXIS of its joint (of tube and rod: of their pins, in the axes of the tube's
+            parent), COM [m] and INERTIA about it [kg m^2] in its own axes, MASS [kg], CLOSED (of a
+            tube) pin-to-pin length at piston displacement 0 [m].
         links: l, number of links.
         bars: number of bars.
         joint: (2, N) of every tree coordinate: DAMPING [N m s/rad] or [N s/m], HOME [rad] or [m].
@@ -69,7 +71,7 @@ def mechanism(machine: Machine) -> Mechanism:
     """Tables of a machine's mechanism.
 
     Args:
-        machine: the machine. The pins of a cylinder are normal to its base link's x-z plane, as in
+        machine: the machine. The pins of a cylinder are parallel to the joint that it turns, as in
             the MuJoCo plant.
 
     Returns:
@@ -87,12 +89,13 @@ def mechanism(machine: Machine) -> Mechanism:
         shape.append(_row(link.position, axis, link.com, link.inertia, link.mass))
     drives = actuator_order(machine)
     bars = [name for name in drives if machine.axes[name].cylinder]
-    for c in (machine.axes[name].cylinder for name in bars):
+    for name in bars:
+        c, pins = machine.axes[name].cylinder, pin_axis(machine, name)
         assert c
         ends = (TUBE, c.base_pin, c.tube, c.tube.com), (ROD, c.rod_pin, c.rod, -c.rod.com)
         for kind, pin, bar, com in ends:
             tree.append((index[pin.link], kind, -1))
-            row = _row(pin.position, com=(com, 0, 0), inertia=bar.inertia, mass=bar.mass)
+            row = _row(pin.position, pins, (com, 0, 0), bar.inertia, bar.mass)
             shape.append(row)
         shape[-2][CLOSED] = c.closed_length
     for pin in (pin for closure in machine.closures.values() for pin in (closure.a, closure.b)):

@@ -6,8 +6,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+from hydrotele.kinematics import five_dof
 from hydrotele.kinematics.arm import forward
-from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage
+from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry
 from hydrotele.machine import Machine
 
 _MARGIN = 0.06  # of a joint's range that is left at each end, for overshoot
@@ -130,12 +131,17 @@ def _height(machine: Machine, pose: Mapping[str, float]) -> float:
     if arm is None:
         return math.inf
     of_joint = {axis.joint: pose[name] for name, axis in machine.axes.items()}
-    joints = [j for j in (arm.swing, arm.boom, arm.stick, arm.tool) if j is not None]
+    joints = [j for j in (arm.swing, arm.boom, arm.stick, arm.tool, arm.head) if j is not None]
     if not all(joint in of_joint for joint in joints):
         return math.inf
+    q = [of_joint[joint] for joint in joints]
+    if arm.head:
+        feller = feller_geometry(machine)
+        elbow = feller.base_height + feller.boom_length * math.sin(of_joint[arm.boom])
+        return min(elbow, five_dof.forward(feller, q).z)
     geometry = arm_geometry(machine)
     elbow = geometry.boom_pin_height + geometry.boom_length * math.sin(of_joint[arm.boom])
-    return min(elbow, forward(geometry, [of_joint[joint] for joint in joints])[2])
+    return min(elbow, forward(geometry, q)[2])
 
 
 def steps(s: Stage, axes: Sequence[str]) -> Iterator[Leg]:

@@ -11,12 +11,11 @@ from hydrotele.drives import Axis
 from hydrotele.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry
 from hydrotele.kinematics.five_dof import FellerGeometry
-from hydrotele.kinematics.five_dof import FellerGeometry
 from hydrotele.kinematics.linkage import FourBar, TwoBar, two_bar_from_points
 from hydrotele.machine import Machine
 
 _PLAY = 2.0e-3  # m: joint ranges are given in whole degrees
-_EXACT = 1.0e-9  # m or 1, by which pins may miss the arm's plane: the closed form has no place for it
+_EXACT = 1.0e-9  # m or 1, by which the closed form of a feller-buncher's arm may be missed
 
 
 @dataclass(frozen=True)
@@ -141,6 +140,20 @@ def _plane(point) -> tuple[float, float]:
     return point[0], point[2]
 
 
+def pin_axis(machine: Machine, name: str) -> tuple[float, float, float]:
+    """Direction of a cylinder's pins in the frame of the link at its base pin.
+
+    Args:
+        machine: the machine.
+        name: axis name.
+
+    Returns:
+        Unit vector (3,): the axis of the joint that the cylinder turns; -y for a slide.
+    """
+    joint = machine.joints[machine.axes[name].joint]
+    return joint.axis if joint.type == "hinge" else (0.0, -1.0, 0.0)
+
+
 def check_strokes(machine: Machine) -> None:
     """Refuse a cylinder whose stroke does not span the range of its joint.
 
@@ -210,39 +223,6 @@ def feller_geometry(machine: Machine) -> FellerGeometry:
     """Dimensions of a feller-buncher's arm, heights counted from the ground.
 
     Args:
-        machine: a machine whose arm has a head, in the plane of its swing axis.
-
-    Returns:
-        The geometry of `kinematics.five_dof`.
-
-    Raises:
-        InputError: the machine has no arm with a head, or its arm lies beside the swing axis.
-    """
-    arm = machine.arm
-    where = f"machine {machine.name}"
-    if arm is None or arm.tool is None or arm.head is None:
-        raise InputError(where, "has no arm with a head: give arm.tool and arm.head")
-    joints = (arm.swing, arm.boom, arm.stick, arm.tool, arm.head)
-    swing, boom, stick, tilt, head = (machine.links[machine.link_of(j)] for j in joints)
-    base = np.add(swing.position, boom.position)
-    aside = [base[1], stick.position[1], tilt.position[1], head.position[1], arm.tip.position[1]]
-    if np.abs(aside).max() > 1e-9:
-        raise InputError(where, "a feller-buncher's arm must lie in the plane of the swing axis")
-    return FellerGeometry(
-        base_radius=float(base[0]),
-        base_height=float(base[2]),
-        boom_length=math.hypot(*_plane(stick.position)),
-        stick_length=math.hypot(*_plane(tilt.position)),
-        tilt_length=float(head.position[0]),
-        head_radius=float(arm.tip.position[0]),
-        head_depth=-float(arm.tip.position[2] + head.position[2]),
-    )
-
-
-def feller_geometry(machine: Machine) -> FellerGeometry:
-    """Dimensions of a feller-buncher's arm, heights counted from the ground.
-
-    Args:
         machine: a machine with an `arm` that has a head.
 
     Returns:
@@ -255,12 +235,12 @@ def feller_geometry(machine: Machine) -> FellerGeometry:
     """
     arm = machine.arm
     if arm is None or arm.head is None or arm.tool is None:
-        raise InputError(f"machine {machine.name}", "has no head joint: give arm.tool and arm.head")
+        raise InputError(f"machine {machine.name}", "has no arm with a head: give arm.head")
     joints = (arm.swing, arm.boom, arm.stick, arm.tool, arm.head)
     swing, boom, stick, tilt, head = (machine.links[machine.link_of(j)] for j in joints)
     base, tip = np.add(swing.position, boom.position), arm.tip.position
-    _expect_feller(machine, joints, (base[1], *stick.position[1:], *tilt.position[1:], tip[1],
-                                     *head.position[1:]))  # fmt: skip
+    aside = [base[1], tip[1], *(v for link in (stick, tilt, head) for v in link.position[1:])]
+    _expect_feller(machine, joints, aside)
     return FellerGeometry(
         base_radius=float(base[0]),
         base_height=float(base[2]),

@@ -148,9 +148,11 @@ def _aim_cylinders(machine, model, data) -> None:
             tube, rod_pin = model.body(f"{name}_tube").id, model.site(f"{name}_pin_b").id
             way = data.site_xpos[rod_pin] - data.xpos[tube]
             parent = data.xmat[model.body_parentid[tube]].reshape(3, 3)
+            hinge = model.joint(f"{name}_tube")
+            along = np.array([1.0, 0.0, 0.0])  # the tube at angle 0
+            across = np.cross(hinge.axis, along)
             local = parent.T @ way
-            angle = np.arctan2(local[2], local[0])
-            data.qpos[model.joint(f"{name}_tube").qposadr[0]] = angle
+            data.qpos[hinge.qposadr[0]] = np.arctan2(local @ across, local @ along)
             reach = np.linalg.norm(way) - axis.cylinder.closed_length
             data.qpos[model.joint(f"{name}_rod").qposadr[0]] = reach
 

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from hydrotele.datafile import Vector
 from hydrotele.drives import Axis, Cylinder, Pin
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS
 from hydrotele.hydraulics.parameters import actuator_numbers
+from hydrotele.kinematics.from_machine import pin_axis
 from hydrotele.machine import Link, Machine
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, write_drive_side
 from hydrotele.simulate.looks import name_geoms, without_looks
@@ -58,7 +60,7 @@ def assemble(
         _write_link(root, name, link)
     for name, axis in machine.axes.items():
         if axis.cylinder:
-            _write_cylinder(root, name, axis.cylinder, timestep)
+            _write_cylinder(root, name, axis.cylinder, pin_axis(machine, name), timestep)
     for name in flexible_axes(machine):
         write_drive_side(root, machine, name)
     for name, closure in machine.closures.items():
@@ -164,12 +166,12 @@ def _set_inertial(body, mass, com, inertia) -> None:
     body.add("inertial", mass=mass, pos=com, diaginertia=inertia)
 
 
-def _write_cylinder(root, name: str, cylinder: Cylinder, timestep: float) -> None:
+def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep: float) -> None:
     tube = root.find("body", f"{name}_tube")
     if tube is None:
         base = _body(root, cylinder.base_pin.link)
         tube = base.add("body", name=f"{name}_tube")
-        tube.add("joint", name=f"{name}_tube", type="hinge", axis=(0, -1, 0))
+        tube.add("joint", name=f"{name}_tube", type="hinge", axis=pins)
     tube.pos = cylinder.base_pin.position
     _set_inertial(tube, cylinder.tube.mass, (cylinder.tube.com, 0, 0), cylinder.tube.inertia)
     rod = root.find("body", f"{name}_rod")
