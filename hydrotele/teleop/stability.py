@@ -20,8 +20,9 @@ class OnTheAxis(InputError):
 
 
 def unstable_poles(
-    port: TwoPort, hand: Block, environment: Block, *, lowest: float = 1e-3, highest: float = 1e4
-) -> int:
+    port: TwoPort, hand: Block, environment: Block, *, lowest: float = 1e-3, highest: float = 1e4,
+    masses: int = 2,
+) -> int:  # fmt: skip
     """Number of poles right of the imaginary axis.
 
     The characteristic function has no poles but those at 0, so that the turns of its phase along
@@ -33,6 +34,7 @@ def unstable_poles(
         environment: impedance of the task.
         lowest: frequency below which nothing is expected [rad/s].
         highest: frequency above which masses rule [rad/s].
+        masses: that the loop must have, as the power of the frequency with which it grows.
 
     Returns:
         The number; for a loop whose delayed part is as strong as its masses, such as a four-channel
@@ -43,7 +45,7 @@ def unstable_poles(
 
     Source: argument principle; Zhu 1994, 3.13 (loop transfer functions LG1 and LG2).
     """
-    return _zeros(lambda s: characteristic(port, s, hand, environment), lowest, highest)
+    return _zeros(lambda s: characteristic(port, s, hand, environment), lowest, highest, masses)
 
 
 def unstable_held(
@@ -77,7 +79,7 @@ def stable(port: TwoPort, hand: Block, environment: Block) -> bool:
     return unstable_poles(port, hand, environment) == 0
 
 
-def _zeros(function: Block, lowest: float, highest: float, least_order: int = 2) -> int:
+def _zeros(function: Block, lowest: float, highest: float, least_order: int) -> int:
     """Zeros right of the axis of a function that has no poles but at 0."""
     shift = _ASIDE * lowest
     order = _order(function, highest, least_order)

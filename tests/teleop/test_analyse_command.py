@@ -1,0 +1,110 @@
+"""`hydrotele analyse teleop`: what it writes, prints and refuses."""
+
+import json
+import re
+
+import pytest
+from typer.testing import CliRunner
+
+from hydrotele import cli
+from hydrotele.errors import InputError
+from hydrotele.teleop.two_port import STRUCTURES
+from hydrotele.teleop_case import SHIPPED, load_teleop_case
+
+SMALL = "map: {points: 3}\n"  # nine cells
+
+
+def invoke(*words):
+    """Exit status, stdout, and stderr or the user's error."""
+    result = CliRunner().invoke(cli.app, ["analyse", "teleop", *map(str, words)])
+    if isinstance(result.exception, InputError):
+        return 2, result.stdout, str(result.exception)
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.fixture
+def case(tmp_path):
+    """A copy of the shipped case with a small map."""
+    path = tmp_path / "case.yaml"
+    path.write_text(SHIPPED.read_text("utf-8") + SMALL, "utf-8")
+    return path
+
+
+def test_help_has_an_example_and_every_structure():
+    code, out, _ = invoke("--help")
+    said = "".join(out.split())  # a terminal wraps
+    assert code == 0 and "hydroteleanalyseteleop" in said
+    assert all(option in said for option in ("--delay", "--confirm", "--json", "--out"))
+
+
+def test_it_writes_report_and_json(case, tmp_path):
+    target = tmp_path / "out"
+    code, out, _ = invoke(case, "--out", target, "--confirm")
+    assert code == 0 and "rate_force" in out and "confirmed in simulation" in out
+    assert {p.name for p in target.iterdir()} == {"analysis.json", "report.html", "summary.json"}
+    document = json.loads((target / "analysis.json").read_text())
+    assert set(document["structures"]) == set(STRUCTURES)
+    assert min(document["confirmed"]["agreement"].values()) >= 0.95  # what was asked for
+    assert all(s["error"] < 0.03 for s in document["confirmed"]["sweeps"])  # the same
+    page = (target / "report.html").read_text("utf-8")
+    assert page.count("data:image/png;base64,") == 6
+    assert 'src="http' not in page and "href=" not in page  # it needs nothing else
+    code, _, err = invoke(case, "--out", case.parent)
+    assert code == 2 and "was not written by a" in err
+
+
+def test_json_is_all_that_is_printed_and_nothing_is_written(case, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = invoke(case, "--json", "--structure", "rate_force", "--delay", "0.3")
+    document = json.loads(out)
+    assert code == 0 and list(document["structures"]) == ["rate_force"]
+    assert document["delay"] == {"forward": 0.3, "back": 0.3}
+    found = document["structures"]["rate_force"]
+    assert not found["stable"] and found["unstable_poles"] > 0 and found["gain_margin"] < 1.0
+    assert 0.1 < found["largest_delay"] < 0.15  # 123 ms
+    assert [p.name for p in tmp_path.iterdir()] == ["case.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("line", "new", "message"),
+    [
+        ("master: {mass: 0.85}", "master: {mass: -1}", r"master\.mass.*greater than 0"),
+        ("slave: {mass: 15.7}", "slave: {}", r"slave\.mass.*required"),
+        ("task: {damping: 451,", "task: {dampling: 451,", "did you mean 'damping'"),
+        ("velocity: 1,", "velocity: 0,", r"gains\.velocity.*greater than 0"),
+        ("force: 1}", "force: -2}", r"gains\.force.*greater than or equal to 0"),
+        ("forward: 0.02", "forward: 99", r"delays\.forward.*less than or equal to 10"),
+        ("least: 300", "least: 700", "least <= nominal <= most: 700, 600, 4000"),
+        ("name: cat215_axis", "structures: [rate_farce]\nname: x", "did you mean 'rate_force'"),
+        ("master_control: {damping", "master_control: {mass: 1, damping", "unknown key 'mass'"),
+    ],
+)
+def test_a_case_that_makes_no_sense(case, line, new, message):
+    text = case.read_text("utf-8")
+    assert line in text
+    case.write_text(text.replace(line, new), "utf-8")
+    code, out, err = invoke(case, "--json")
+    assert code == 2 and out == "" and re.search(message, err) and "case.yaml:" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.yaml"], "none.yaml: cannot be read"),
+        (["--structure", "rate_farce"], "--structure: no structure .*did you mean 'rate_force'"),
+        (["--delay", "-1"], "--delay: must be from 0 to 10 s"),
+        (["--delay", "nan"], "--delay: must be from 0 to 10 s"),
+    ],
+)
+def test_wrong_words(words, message):
+    code, out, err = invoke(*words, "--json")
+    assert code == 2 and out == "" and re.search(message, err)
+
+
+def test_the_shipped_case_has_its_joystick_from_the_thesis():
+    facts = load_teleop_case()
+    assert facts.stiffness and facts.master_control.stiffness == facts.stiffness.nominal
+    assert facts.structures == STRUCTURES
+    assert facts.stiffness.mass == facts.master.mass
