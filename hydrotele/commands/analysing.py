@@ -104,10 +104,13 @@ def analyse_case(
 def _write(folder: Path, found: Findings, document: dict) -> None:
     text = json.dumps(document, indent=2, allow_nan=False)
     (folder / "analysis.json").write_text(text + "\n", encoding="utf-8")
+    from hydrotele.show.teleop_figures import draw_maps
     from hydrotele.show.teleop_report import write_teleop_report
 
     notes.print("writing report.html ...", style="dim")
-    write_teleop_report(found, folder / "report.html")
+    maps = draw_maps(found)
+    write_teleop_report(found, maps, folder / "report.html")
+    (folder / "stability.png").write_bytes(maps)
     summary = {"kind": "analyse", "name": found.name, "hydrotele": hydrotele.__version__}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 

@@ -8,7 +8,6 @@ from hydrotele.show.report_style import STYLE
 from hydrotele.show.teleop_figures import (
     draw_felt,
     draw_hybrid,
-    draw_maps,
     draw_nyquist,
     draw_scattering,
     draw_stiffness,
@@ -34,14 +33,15 @@ _CHANNELS = {
 }
 
 
-def write_teleop_report(found: Findings, path: str | Path) -> None:
+def write_teleop_report(found: Findings, maps: bytes, path: str | Path) -> None:
     """Write an analysis as one self-contained HTML file.
 
     Args:
         found: what was found.
+        maps: the picture of its maps of stability, a PNG.
         path: file to write.
     """
-    sections = [_header(found), _verdicts(found), _maps(found), _nyquist(found), _felt(found)]
+    sections = [_header(found), _verdicts(found), _maps(found, maps), _nyquist(found), _felt(found)]
     sections += [_passivity(found), _hybrid(found)]
     if found.spring:
         sections.append(_stiffness(found.spring, found.spring.held(found.case.hand)))
@@ -112,17 +112,15 @@ def _confirmed(found: Findings) -> Markup:
     )  # fmt: skip
 
 
-def _maps(found: Findings) -> Markup:
+def _maps(found: Findings, maps: bytes) -> Markup:
     why = (
         "Blue is stable with the task. Upwards, more comes back to the hand (force, or the slave's"
         " motion); 1 is the case's own gain. The point is this case. Only the sum of both delays"
-        " matters. A red cross marks a cell in which a simulation says otherwise."
-        if found.agreements
-        else "Blue is stable with the task. Upwards, more comes back to the hand (force, or the"
-        " slave's motion); 1 is the case's own gain. The point is this case. Only the sum of both"
-        " delays matters."
+        " matters."
     )
-    return section("Stability over delay and gain", why, _figure(draw_maps(found), "maps"))
+    if found.agreements:
+        why += " A red cross marks a cell in which a simulation says otherwise."
+    return section("Stability over delay and gain", why, _figure(maps, "maps"))
 
 
 def _nyquist(found: Findings) -> Markup:

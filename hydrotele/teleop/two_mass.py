@@ -28,6 +28,7 @@ _LARGEST = 5e-4  # s
 _BLOCKS = 20  # of a run, whose largest speeds are compared
 _GROWN, _GONE = 1e9, 1e-9  # of the kick, beyond which nothing changes any more
 _KICK = 0.1  # m/s
+_PERIODS = 2  # of a sine that are measured
 _TRIPS = 40  # there and back that a run lasts at least
 _FINEST = 2e-6  # s, a step below which a run takes minutes
 
@@ -153,14 +154,14 @@ def swept(case: Case, structure: str, frequency: float, settle: float = 20.0) ->
         case: the teleoperator with its task.
         structure: its name.
         frequency: [rad/s].
-        settle: time before measuring [s]; measured are five periods.
+        settle: time before measuring [s]; measured are two periods.
 
     Returns:
         Force over velocity [N s/m].
     """
     period = 2.0 * math.pi / frequency
-    seconds = (math.ceil(settle / period) + 5.0) * period
-    return _simulated(case, law_of(case, structure), seconds, frequency, 5.0 * period).felt
+    seconds = (math.ceil(settle / period) + _PERIODS) * period
+    return _simulated(case, law_of(case, structure), seconds, frequency, _PERIODS * period).felt
 
 
 def _simulated(case: Case, law: Law, seconds: float, frequency: float, measured: float) -> Run:

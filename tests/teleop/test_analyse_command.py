@@ -43,7 +43,9 @@ def test_it_writes_report_and_json(case, tmp_path):
     target = tmp_path / "out"
     code, out, _ = invoke(case, "--out", target, "--confirm")
     assert code == 0 and "rate_force" in out and "confirmed in simulation" in out
-    assert {p.name for p in target.iterdir()} == {"analysis.json", "report.html", "summary.json"}
+    assert {p.name for p in target.iterdir()} == {
+        "analysis.json", "report.html", "stability.png", "summary.json",
+    }  # fmt: skip
     document = json.loads((target / "analysis.json").read_text())
     assert set(document["structures"]) == set(STRUCTURES)
     assert min(document["confirmed"]["agreement"].values()) >= 0.95  # what was asked for
