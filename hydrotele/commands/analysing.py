@@ -24,8 +24,8 @@ from hydrotele.teleop_case import LONGEST, TeleopCase, known_structures, load_te
 _LEGEND = (
     "margin: factor on what comes back (force, or the slave's motion) up to which it stays stable;"
     " below 1 it has to be made that much smaller\n"
-    "delay: each way, up to which it stays stable; none: none found up to a factor of 1000, 10 s\n"
-    "norm: largest of the scattering matrix; passive only if it is nowhere above 1"
+    "delay: each way, up to which it stays stable; any: up to a factor of 1000 and 10 s, at least\n"
+    "norm: of the scattering matrix, largest that is drawn; passive only if it is nowhere above 1"
 )
 
 

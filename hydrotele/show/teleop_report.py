@@ -88,7 +88,7 @@ def _verdicts(found: Findings) -> Markup:
     why = (
         "Gain margin: factor on what comes back to the hand up to which the loop stays stable;"
         " below 1, what comes back has to be made that much smaller. Largest delay: each way, with"
-        " the gains as they are. None: no factor up to 1000 and no delay up to 10 s"
+        " the gains as they are. Any: no factor up to 1000 and no delay up to 10 s"
         " hurts. A passive two-port, whose scattering norm nowhere exceeds 1, is"
         " stable with every passive hand and task; without passivity it depends on them."
     )

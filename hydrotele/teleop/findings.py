@@ -95,9 +95,9 @@ def said_factor(margin: float) -> str:
     """A gain margin.
 
     >>> said_factor(0.17), said_factor(math.inf)
-    ('x 0.17', 'none')
+    ('x 0.17', 'any')
     """
-    return "none" if math.isinf(margin) else f"x {margin:.3g}"
+    return "any" if math.isinf(margin) else f"x {margin:.3g}"
 
 
 def said_delay(delay: float) -> str:
@@ -106,7 +106,7 @@ def said_delay(delay: float) -> str:
     >>> said_delay(0.12345)
     '123 ms'
     """
-    return "none" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
+    return "any" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
 
 
 def said_error(error: float | None) -> str:
