@@ -12,7 +12,7 @@ from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Q
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 
-MACHINES = ("cat215/none", "cat215/bucket", "cat215/grapple", "ec20", "rig", "emps")
+MACHINES = ("cat215/none", "cat215/bucket", "cat215/grapple", "cat325", "ec20", "rig", "emps")
 DIFFERENCE = 1e-5  # [s] of central differences: truncation 1e-10, cancellation 1e-11
 
 

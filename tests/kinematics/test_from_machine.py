@@ -19,7 +19,7 @@ PLANTS = {
     for tool in load_machine(name).tools
 }
 DRIVES = [(p, axis) for p, plant in PLANTS.items() for axis in plant.machine.axes]
-ARMS = [p for p, plant in PLANTS.items() if plant.machine.arm]
+ARMS = [p for p, plant in PLANTS.items() if (arm := plant.machine.arm) and not arm.head]
 
 
 def poses(plant, axis, count=9):
