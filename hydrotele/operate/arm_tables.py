@@ -79,7 +79,7 @@ def arm_tables(machine: Machine, where: str) -> Arm:
         task=task,
         gravity=np.zeros(gravity_size(m)),
         acceleration=np.zeros(n),
-        read=np.zeros(n),
+        rate_noise=np.zeros(n),
         angle=np.zeros(m),
         table=np.zeros((m, m)),
         work=np.zeros(n),

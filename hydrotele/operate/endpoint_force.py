@@ -1,8 +1,13 @@
 """Force at the tip of an arm, felt through the pressures of its drives.
 
 The static estimate takes the torque of gravity, linear in a few identified parameters, off that of
-the drives (Zhu 1994, 6.1). The dynamic one lets the complete model run along: inertia, Coriolis
-forces, friction, and the closed chains with their cylinders. Both have the same bandwidth.
+the drives (Zhu 1994, 6.1). The dynamic one takes off all that the complete model needs: inertia, Coriolis
+forces, friction, and the closed chains with their cylinders.
+
+Everything passes two filters. A fast one gives positions, rates, accelerations and pressures that
+are equally late, so that their balance holds, and friction is that of the rate of its time. The
+force that is left passes a slow one, since what noise of the angles makes of accelerations grows
+with the fifth power of the frequency.
 """
 
 import math
@@ -16,14 +21,24 @@ from hydrotele.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.log import Log
 from hydrotele.machine import Machine
-from hydrotele.operate.arm_tables import arm_tables, free_axes
-from hydrotele.operate.force_observer import observe, observer_gains
+from hydrotele.noise import noise_rms
+from hydrotele.operate.arm_tables import arm_joints, arm_tables, free_axes
 from hydrotele.operate.gravity_model import Gravity, gravity_from_masses
-from hydrotele.operate.state_filter import LAST, LOW, filter_step, filter_table
+from hydrotele.operate.state_filter import (
+    CHANGE,
+    LAST,
+    LOW,
+    RATE,
+    filter_step,
+    filter_table,
+    noise_gains,
+)
 from hydrotele.operate.tip_balance import dynamic_balance, static_balance, tip_force
+from hydrotele.sensors import SensorSet
 
 Kind = Literal["static", "dynamic"]
 BANDWIDTH = 1.0  # Hz
+FAST = 3.0  # Hz
 _TASK = ("r", "theta", "z", "attitude", "head")
 _WAITING, _GOOD, _BAD, _SINGULAR = range(4)
 _JOINT, _HEAD, _ROD = range(3)  # rows of `Readings.last`
@@ -34,22 +49,24 @@ class Readings(NamedTuple):
 
     Attributes:
         period: between two readings of the sensors [s].
-        table: (3, 5) of the static estimate's filter.
-        gains: (3,) of the dynamic estimate's observer.
+        motion: (3, 5) table of the readings' filter.
+        table: (3, 5) table of the force's filter.
         position: (n,) column of every coordinate's axis.
         valve: (h,) column of every valve's axis.
         state: (n + 2 h, 4) of the filters: positions, head and rod pressures.
+        force: (m, 4) of the filters of the force.
         outside: (n,) forces on the coordinates from outside [N m] or [N].
         last: (3, k) last good readings of joint, head and rod; NaN before the first.
         still: (3, k) readings since one changed.
     """
 
     period: float
+    motion: np.ndarray
     table: np.ndarray
-    gains: np.ndarray
     position: np.ndarray
     valve: np.ndarray
     state: np.ndarray
+    force: np.ndarray
     outside: np.ndarray
     last: np.ndarray
     still: np.ndarray
@@ -84,26 +101,30 @@ def endpoint_force_step(arm, readings, dynamic, begun, joint, head, rod, out):
     for c in range(len(r.state)):
         place, value = _reading(r, c)
         if not begun:
-            for i in range(4):
-                r.state[c, i] = value if i == LOW or i == LAST else 0.0
-            arm.z[place] = value
-        if dynamic and c >= n:  # the mean over the period that has passed
-            arm.z[place] = 0.5 * (value + r.state[c, LAST])
-            r.state[c, LAST] = value
-        elif dynamic:
-            arm.read[c] = value
-        else:
-            filter_step(r.table, r.state[c], value)
-            arm.z[place] = r.state[c, LOW]
-    if not dynamic:
-        static_balance(arm, r.outside)
-    elif begun:
-        observe(arm, r.gains, r.period, r.outside)
-    else:
+            _start(r.state[c], value)
+        filter_step(r.motion, r.state[c], value)
+        arm.z[place] = r.state[c, LOW]
+        if c < n:
+            arm.z[n + c] = r.state[c, RATE]
+            arm.acceleration[c] = r.state[c, CHANGE]
+    if dynamic:
         dynamic_balance(arm, r.outside)
+    else:
+        static_balance(arm, r.outside)
     if not tip_force(arm, r.outside, out):
         return _SINGULAR
+    for i in range(len(out)):
+        if not begun:
+            _start(r.force[i], out[i])
+        filter_step(r.table, r.force[i], out[i])
+        out[i] = r.force[i, LOW]
     return _GOOD if good else _BAD
+
+
+@lean
+def _start(state, value):
+    """Let a filter stand at a value."""
+    state[LOW], state[RATE], state[CHANGE], state[LAST] = value, 0.0, 0.0, value
 
 
 @lean
@@ -158,8 +179,8 @@ class EndpointForce:
 
     def __init__(
         self, machine: Machine, axes: Sequence[str], kind: Kind = "dynamic",
-        period: float = 0.005, *, every: int = 1, gravity: Gravity | None = None,
-        bandwidth: float = BANDWIDTH,
+        period: float = 0.005, *, every: int = 1, sensors: SensorSet | None = None,
+        gravity: Gravity | None = None, bandwidth: float = BANDWIDTH, fast: float = FAST,
     ):  # fmt: skip
         """Lay out what every update needs.
 
@@ -170,8 +191,10 @@ class EndpointForce:
             period: time between two updates [s].
             every: updates per sample of the sensors, as `Feedback.every`: the first brings a new
                 sample, the following ones hold it and change nothing.
+            sensors: of the machine, whose noise the dynamic estimate weighs; None for ideal ones.
             gravity: parameters of the static model; those of the machine's masses if None.
             bandwidth: of the estimate [Hz].
+            fast: bandwidth of the motion that friction and inertia are computed of [Hz].
 
         Raises:
             InputError: a joint is not driven, not by a valve, or not measured; a number makes no
@@ -193,7 +216,11 @@ class EndpointForce:
             if len(found.value) != len(self._arm.gravity):
                 raise InputError(where, f"gravity needs {len(self._arm.gravity)} parameters")
             self._arm.gravity[:] = found.value
-        self._readings = _readings(machine, self.axes, period * every, bandwidth, where)
+        self._readings = _readings(machine, self.axes, period * every, bandwidth, fast, where)
+        noise = noise_gains(self._readings.motion)[1]
+        for i, name in enumerate(free_axes(machine, where)):
+            channel = f"{machine.position_kind(name)}.{name}"
+            self._arm.rate_noise[i] = noise * noise_rms(machine, sensors, channel)
         self.task = _TASK[: len(self._arm.joint)]
         self.force = np.zeros(len(self.task))
 
@@ -242,7 +269,12 @@ class EndpointForce:
 
 
 def _readings(
-    machine: Machine, axes: tuple[str, ...], period: float, bandwidth: float, where: str
+    machine: Machine,
+    axes: tuple[str, ...],
+    period: float,
+    bandwidth: float,
+    fast: float,
+    where: str,
 ) -> Readings:
     """Where the readings are and what they go through."""
     free, valves = free_axes(machine, where), actuator_order(machine)[: len(machine.hydraulic_axes)]
@@ -251,11 +283,12 @@ def _readings(
     n, h, k = len(free), len(valves), len(axes)
     return Readings(
         period=period,
+        motion=filter_table(fast, period),
         table=filter_table(bandwidth, period),
-        gains=observer_gains(bandwidth, period),
         position=np.array([axes.index(name) for name in free]),
         valve=np.array([axes.index(name) for name in valves]),
         state=np.zeros((n + 2 * h, 4)),
+        force=np.zeros((len(arm_joints(machine)), 4)),
         outside=np.zeros(n),
         last=np.full((3, k), np.nan),
         still=np.zeros((3, k), int),
@@ -264,7 +297,7 @@ def _readings(
 
 def endpoint_force_of_log(
     machine: Machine, log: Log, kind: Kind = "dynamic", gravity: Gravity | None = None,
-    bandwidth: float = BANDWIDTH,
+    bandwidth: float = BANDWIDTH, fast: float = FAST, sensors: SensorSet | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """The online estimate over a log, one update per row.
 
@@ -274,6 +307,8 @@ def endpoint_force_of_log(
         kind: see `EndpointForce`.
         gravity: see `EndpointForce`.
         bandwidth: see `EndpointForce`.
+        fast: see `EndpointForce`.
+        sensors: see `EndpointForce`.
 
     Returns:
         `r` [N], `theta` [N m], `z` [N], `attitude` [N m] ... and `healthy` [1], (n,) each.
@@ -287,7 +322,16 @@ def endpoint_force_of_log(
     for i, name in enumerate(axes):
         if name in machine.hydraulic_axes:
             head[:, i], rod[:, i] = log[f"pressure_head.{name}"], log[f"pressure_rod.{name}"]
-    felt = EndpointForce(machine, axes, kind, 1.0 / log.rate, gravity=gravity, bandwidth=bandwidth)
+    felt = EndpointForce(
+        machine,
+        axes,
+        kind,
+        1.0 / log.rate,
+        sensors=sensors,
+        gravity=gravity,
+        bandwidth=bandwidth,
+        fast=fast,
+    )
     out, healthy = np.empty((len(log), len(felt.task))), np.empty(len(log))
     for row in range(len(log)):
         out[row] = felt.update(joint[row], head[row], rod[row])

@@ -13,6 +13,7 @@ from scipy.linalg import expm
 from hydrotele.compiled import lean
 
 LOW, RATE, CHANGE, LAST = range(4)  # columns of a filter's state
+_NEGLIGIBLE = 1.0e-12
 _REAL, _SQUARE, _CUBE = 2.0, 2.0, 1.0  # Butterworth's polynomial of third order
 
 
@@ -45,6 +46,25 @@ def filter_table(bandwidth: float, period: float) -> np.ndarray:
     table = step[:3].copy()
     table[:, 3] -= step[:3, 4]
     return table
+
+
+def noise_gains(table: np.ndarray) -> np.ndarray:
+    """Standard deviations of y, y', y'' for white readings of standard deviation 1.
+
+    Args:
+        table: (3, 5) of `filter_table`.
+
+    Returns:
+        (3,) [1], [1/s], [1/s^2].
+
+    Source: response to a single reading.
+    """
+    state, last, total = np.zeros(3), 1.0, table[:, 4] ** 2
+    state += table[:, 4]
+    while np.any(state**2 > _NEGLIGIBLE * total):
+        state = table @ (*state, last, 0.0)
+        total, last = total + state**2, 0.0
+    return np.sqrt(total)
 
 
 @lean

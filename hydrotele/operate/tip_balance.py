@@ -14,6 +14,7 @@ from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
 from hydrotele.kinematics.task import task_jacobian
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
+_ODDS = 20.0
 _SINGULAR = 1.0e-6  # pivot against the largest entry
 
 
@@ -53,7 +54,7 @@ class Arm(NamedTuple):
         task: (9,) of `kinematics.task.task_numbers`.
         gravity: (p,) parameters of the static model [N m].
         acceleration: (n,) of the independent coordinates.
-        read: (n,) measured positions of the independent coordinates [rad] or [m].
+        rate_noise: (n,) standard deviation of the independent coordinates' rates.
         angle: (m,) work space.
         table: (m, m) work space.
         work: (n,) work space.
@@ -66,7 +67,7 @@ class Arm(NamedTuple):
     task: np.ndarray
     gravity: np.ndarray
     acceleration: np.ndarray
-    read: np.ndarray
+    rate_noise: np.ndarray
     angle: np.ndarray
     table: np.ndarray
     work: np.ndarray
@@ -130,6 +131,30 @@ def static_balance(arm, outside):
 
 
 @lean
+def moving(velocity, variance):
+    """Probability that a drive moves, given what is read of its velocity.
+
+    Standing and moving are equally likely beforehand, and a moving drive has any velocity of a
+    range that is ODDS sqrt(2 pi) times as wide as the noise.
+
+    Args:
+        velocity: scalar [m/s] or [rad/s].
+        variance: of its noise, scalar [m^2/s^2] or [rad^2/s^2]; 0 where it is known.
+
+    Returns:
+        Probability, scalar [1].
+
+    Source: Bayes' rule.
+
+    >>> moving(0.0, 1.0) < 0.05 and moving(5.0, 1.0) > 0.99 and moving(0.0, 0.0) == 1.0
+    True
+    """
+    if not variance > 0.0:
+        return 1.0
+    return 1.0 / (1.0 + _ODDS * math.exp(-0.5 * velocity * velocity / variance))
+
+
+@lean
 def _subtract_drives(arm, rubbing, outside):
     """Take what the drives give off the forces outside."""
     model, sp, n = arm.model, arm.space, len(outside)
@@ -137,10 +162,11 @@ def _subtract_drives(arm, rubbing, outside):
         u, a = i * SLOTS, 2 * n + 4 * i
         give = model.user[u + _AH] * arm.z[a + 2] - model.user[u + _AR] * arm.z[a + 3]
         if rubbing:
-            v = 0.0
+            v, noise = 0.0, 0.0
             for f in range(n):
                 v += sp.row[i, f] * arm.z[n + f]
-            give -= actuator_friction(model.user, u, v)
+                noise += (sp.row[i, f] * arm.rate_noise[f]) ** 2
+            give -= moving(v, noise) * actuator_friction(model.user, u, v)
         for f in range(n):
             outside[f] -= sp.row[i, f] * give
 
