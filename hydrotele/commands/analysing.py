@@ -17,6 +17,7 @@ from hydrotele.teleop.findings import (
     said_delay,
     said_error,
     said_factor,
+    said_size,
     why_unstable,
 )
 from hydrotele.teleop_case import LONGEST, TeleopCase, known_structures, load_teleop_case
@@ -139,7 +140,7 @@ def _print_springs(found: Findings) -> None:
     rows = table("stiffness feedback: B^2 - 4 M K_max, and the worst switching", "joystick", "B",
                  "K_max", "margin", "B asked for", "growth")  # fmt: skip
     for name, one in (("held", found.spring.held(found.case.hand)), ("let go", found.spring)):
-        rows.add_row(name, f"{one.damping:g} N s/m", f"{one.most:g} N/m", f"{one.margin:.4g}",
+        rows.add_row(name, f"{one.damping:g} N s/m", f"{one.most:g} N/m", said_size(one.margin),
                      f"{one.enough_damping:.4g}", f"{one.growth:.3g}")  # fmt: skip
     out.print(rows)
     out.print("growth: of half a swing, stable below 1; the theorem asks for more", style="dim")

@@ -138,6 +138,7 @@ def draw_maps(found: Findings) -> bytes:
             panel.set_xlabel("delay each way [ms]")
             panel.set_ylabel("reflected, times nominal")
             panel.grid(False)
+        _key(figure)
         return png(figure)
 
 
@@ -219,6 +220,18 @@ def _logarithmic(panel: Any, least: float, most: float) -> None:
 def _legend(figure: Any, panel: Any) -> None:
     handles, labels = panel.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=8.5)
+
+
+def _key(figure: Any) -> None:
+    """What the maps' colours and the point mean."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    point = Line2D([], [], color=_INK, marker="o", ls="")
+    figure.legend(
+        [Patch(color=_SURE), Patch(color=_BAD), point], ["stable", "unstable", "this case"],
+        loc="outside upper left", ncols=3, frameon=False, fontsize=8.5,
+    )  # fmt: skip
 
 
 def _rows(found: Findings) -> int:

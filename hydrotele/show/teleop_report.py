@@ -18,6 +18,7 @@ from hydrotele.teleop.findings import (
     said_delay,
     said_error,
     said_factor,
+    said_size,
     why_unstable,
 )
 from hydrotele.teleop.switching import Spring
@@ -160,7 +161,7 @@ def _hybrid(found: Findings) -> Markup:
 def _stiffness(spring: Spring, held: Spring) -> Markup:
     rows = [
         (tag("b", name), f"{one.mass:.3g}", f"{one.damping:.4g}", f"{one.least:g} to {one.most:g}",
-         f"{one.margin:.4g}", f"{one.enough_damping:.4g}", f"{one.growth:.3g}")
+         said_size(one.margin), f"{one.enough_damping:.4g}", f"{one.growth:.3g}")
         for name, one in (("held", held), ("let go", spring))
     ]  # fmt: skip
     head = ("joystick", "M [kg]", "B [N s/m]", "K [N/m]", "B² - 4 M K_max", "B that it asks for",

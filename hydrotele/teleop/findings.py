@@ -109,6 +109,15 @@ def said_delay(delay: float) -> str:
     return "any" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
 
 
+def said_size(value: float) -> str:
+    """A number with four digits, without an exponent.
+
+    >>> said_size(-20026.0), said_size(0.0123456)
+    ('-20030', '0.01235')
+    """
+    return np.format_float_positional(value, precision=4, fractional=False, trim="-")
+
+
 def said_error(error: float | None) -> str:
     """A relative error.
 
