@@ -22,7 +22,7 @@ OURS = {
         "patched/machine.*", "patched/effects.yaml",
     ),
     "identify": ("identify.json", "report.html", "identified/machine.*"),
-    "analyse": ("analysis.json", "report.html", "stability.png"),
+    "two-port analysis": ("analysis.json", "report.html", "stability.png"),
 }  # fmt: skip
 """Kind of folder -> files that it holds beside `summary.json`, which states the kind."""
 

@@ -53,11 +53,11 @@ def analyse_teleop_to_folder(
     facts = load_teleop_case(file)
     target = target or (None if as_json else Path("runs") / f"analyse_{facts.name}")
     if target:
-        check_target(target, "analyse")
+        check_target(target, "two-port analysis")
     found = analyse_case(facts, structures, delay, confirm, as_json)
     document = plain(findings_document(found))
     if target:
-        with whole_folder(target, "analyse") as folder:
+        with whole_folder(target, "two-port analysis") as folder:
             _write(folder, found, document)
     if as_json:
         print_json(document)
@@ -112,7 +112,7 @@ def _write(folder: Path, found: Findings, document: dict) -> None:
     maps = draw_maps(found)
     write_teleop_report(found, maps, folder / "report.html")
     (folder / "stability.png").write_bytes(maps)
-    summary = {"kind": "analyse", "name": found.name, "hydrotele": hydrotele.__version__}
+    summary = {"kind": "two-port analysis", "name": found.name, "hydrotele": hydrotele.__version__}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 

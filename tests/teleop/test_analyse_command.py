@@ -41,20 +41,22 @@ def test_help_has_an_example_and_every_structure():
 
 def test_it_writes_report_and_json(case, tmp_path):
     target = tmp_path / "out"
-    code, out, _ = invoke(case, "--out", target, "--confirm")
+    chosen = ("rate_force", "four_channel_position")
+    words = [word for name in chosen for word in ("--structure", name)]
+    code, out, _ = invoke(case, "--out", target, "--confirm", *words)
     assert code == 0 and "rate_force" in out and "confirmed in simulation" in out
     assert {p.name for p in target.iterdir()} == {
         "analysis.json", "report.html", "stability.png", "summary.json",
     }  # fmt: skip
     document = json.loads((target / "analysis.json").read_text())
-    assert set(document["structures"]) == set(STRUCTURES)
+    assert set(document["structures"]) == set(chosen)
     assert min(document["confirmed"]["agreement"].values()) >= 0.95  # what was asked for
     assert all(s["error"] < 0.03 for s in document["confirmed"]["sweeps"])  # the same
     page = (target / "report.html").read_text("utf-8")
     assert page.count("data:image/png;base64,") == 6
     assert 'src="http' not in page and "href=" not in page  # it needs nothing else
     code, _, err = invoke(case, "--out", case.parent)
-    assert code == 2 and "was not written by a" in err
+    assert code == 2 and "not written by a two-port analysis" in err
 
 
 def test_json_is_all_that_is_printed_and_nothing_is_written(case, tmp_path, monkeypatch):
