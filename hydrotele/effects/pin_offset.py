@@ -1,5 +1,7 @@
 """A cylinder whose base pin sits elsewhere than in the model."""
 
+import numpy as np
+
 from hydrotele.effects._sizes import cylinders
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
 from hydrotele.machine import Machine
@@ -11,15 +13,22 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     assert cylinder
     size = cylinder.closed_length
     offset = Parameter("m", 0.0, -0.05 * size, 0.05 * size, 0.005 * size, 0.001 * size)
-    return {"x": offset, "z": offset}
+    return dict.fromkeys(_across(machine, location), offset)
+
+
+def _across(machine: Machine, location: str) -> str:
+    """The two directions across the pin, along which its linkage still closes."""
+    joint = machine.joints[machine.axes[location].joint]
+    axis = joint.axis if joint.type == "hinge" else (0.0, 1.0, 0.0)
+    return "xyz".replace("xyz"[int(np.argmax(np.abs(axis)))], "")
 
 
 def _apply(machine: Machine, location: str, values: Values) -> Machine:
     """The base pin moves in its link's frame; the closed length, hence x at a length, stays."""
     cylinder = machine.axes[location].cylinder
     assert cylinder
-    x, y, z = cylinder.base_pin.position
-    position = (x + values["x"], y, z + values["z"])
+    way = zip("xyz", cylinder.base_pin.position, strict=True)
+    position = tuple(place + values.get(name, 0.0) for name, place in way)
     return changed(machine, f"axes.{location}.cylinder.base_pin.position", position)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 
+from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.errors import InputError
 from hydrotele.kinematics import five_dof
 from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry
@@ -292,3 +293,17 @@ def test_a_head_needs_a_joint_that_is_there():
     ):
         with pytest.raises(ValueError, match=message):
             type(CAT).model_validate({**facts, "arm": arm})
+
+
+@pytest.mark.parametrize(("axis", "ways"), [("boom", "xz"), ("tilt", "xz"), ("head", "xy")])
+def test_a_pin_that_sits_elsewhere_is_moved_across_itself(axis, ways):
+    """Along itself its loop would not close."""
+    assert list(EFFECTS["pin_offset"].parameters(CAT, axis)) == list(ways)
+    moved = apply_effect(CAT, "pin_offset", axis, dict.fromkeys(ways, 0.01))
+    plant = build_plant(moved, ground=False)
+    data = rest_state(plant)
+    mujoco.mj_kinematics(plant.model, data)
+    assert pin_opening(plant.model, data) < 1e-9  # loops are closed to 1e-12 m
+    found = data.body(f"{axis}_tube").xpos - data.body(CAT.axes[axis].cylinder.base_pin.link).xpos
+    nominal = CAT.axes[axis].cylinder.base_pin.position
+    assert abs(np.linalg.norm(found) - np.linalg.norm(nominal)) > 1e-3
