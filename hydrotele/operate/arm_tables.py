@@ -70,10 +70,8 @@ def arm_tables(machine: Machine, where: str) -> Arm:
     n, m = len(free), len(axes)
     z[:n] = model.mech.joint[HOME][model.mech.free]
     return Arm(
-        model=Body(
-            model.mech, model.user, model.hydraulic, model.gain, model.gear, model.transmission
-        ),
-        space=Work(space.motion, space.drive, space.row, space.mass, space.force),
+        model=Body(model.mech, model.user, model.hydraulic, model.gear, model.transmission),
+        space=Work(space.motion, space.drive, space.row),
         z=z,
         joint=np.array([free.index(name) for name in axes]),
         task=task,

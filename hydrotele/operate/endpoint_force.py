@@ -1,8 +1,8 @@
 """Force at the tip of an arm, felt through the pressures of its drives.
 
 The static estimate takes the torque of gravity, linear in a few identified parameters, off that of
-the drives (Zhu 1994, 6.1). The dynamic one takes off all that the complete model needs: inertia, Coriolis
-forces, friction, and the closed chains with their cylinders.
+the drives (Zhu 1994, 6.1). The dynamic one takes off all that the complete model needs: inertia,
+Coriolis forces, friction, and the closed chains with their cylinders.
 
 Everything passes two filters. A fast one gives positions, rates, accelerations and pressures that
 are equally late, so that their balance holds, and friction is that of the rate of its time. The
@@ -37,8 +37,9 @@ from hydrotele.operate.tip_balance import dynamic_balance, static_balance, tip_f
 from hydrotele.sensors import SensorSet
 
 Kind = Literal["static", "dynamic"]
-BANDWIDTH = 1.0  # Hz
-FAST = 3.0  # Hz
+BANDWIDTH = 0.9  # Hz
+FAST = 2.5  # Hz
+_SETTLE = 0.5  # periods of the fast filter
 _TASK = ("r", "theta", "z", "attitude", "head")
 _WAITING, _GOOD, _BAD, _SINGULAR = range(4)
 _JOINT, _HEAD, _ROD = range(3)  # rows of `Readings.last`
@@ -49,38 +50,37 @@ class Readings(NamedTuple):
 
     Attributes:
         period: between two readings of the sensors [s].
-        motion: (3, 5) table of the readings' filter.
-        table: (3, 5) table of the force's filter.
+        settle: number of readings that are averaged at first.
+        tables: (2, 3, 5) of the readings' filter and of the force's.
         position: (n,) column of every coordinate's axis.
         valve: (h,) column of every valve's axis.
-        state: (n + 2 h, 4) of the filters: positions, head and rod pressures.
-        force: (m, 4) of the filters of the force.
+        state: (n + 2 h + m, 4) of the filters: positions, pressures, force at the tip.
         outside: (n,) forces on the coordinates from outside [N m] or [N].
         last: (3, k) last good readings of joint, head and rod; NaN before the first.
         still: (3, k) readings since one changed.
     """
 
     period: float
-    motion: np.ndarray
-    table: np.ndarray
+    settle: int
+    tables: np.ndarray
     position: np.ndarray
     valve: np.ndarray
     state: np.ndarray
-    force: np.ndarray
     outside: np.ndarray
     last: np.ndarray
     still: np.ndarray
 
 
 @lean
-def endpoint_force_step(arm, readings, dynamic, begun, joint, head, rod, out):
+def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
     """Take in new readings; force at the tip.
 
     Args:
         arm: Arm.
         readings: Readings.
         dynamic: whether the complete model is used, or gravity alone; scalar.
-        begun: whether there were readings before; scalar.
+        count: number of readings before; scalar. The first ones are averaged, as of a machine at
+            rest.
         joint: (k,) measured joint positions [rad] or [m].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
@@ -98,11 +98,16 @@ def endpoint_force_step(arm, readings, dynamic, begun, joint, head, rod, out):
     good = _take(r.last[_ROD], r.still[_ROD], r.valve, rod) and good
     if not _known(r):
         return _WAITING
-    for c in range(len(r.state)):
+    places = n + 2 * len(r.valve)
+    for c in range(places):
         place, value = _reading(r, c)
-        if not begun:
-            _start(r.state[c], value)
-        filter_step(r.motion, r.state[c], value)
+        if count < r.settle:
+            mean = (
+                value if count == 0 else r.state[c, LOW] + (value - r.state[c, LOW]) / (count + 1)
+            )
+            _stand(r.state[c], mean)
+        else:
+            filter_step(r.tables[0], r.state[c], value)
         arm.z[place] = r.state[c, LOW]
         if c < n:
             arm.z[n + c] = r.state[c, RATE]
@@ -114,15 +119,16 @@ def endpoint_force_step(arm, readings, dynamic, begun, joint, head, rod, out):
     if not tip_force(arm, r.outside, out):
         return _SINGULAR
     for i in range(len(out)):
-        if not begun:
-            _start(r.force[i], out[i])
-        filter_step(r.table, r.force[i], out[i])
-        out[i] = r.force[i, LOW]
+        if count < r.settle:
+            _stand(r.state[places + i], out[i])
+        else:
+            filter_step(r.tables[1], r.state[places + i], out[i])
+        out[i] = r.state[places + i, LOW]
     return _GOOD if good else _BAD
 
 
 @lean
-def _start(state, value):
+def _stand(state, value):
     """Let a filter stand at a value."""
     state[LOW], state[RATE], state[CHANGE], state[LAST] = value, 0.0, 0.0, value
 
@@ -209,7 +215,7 @@ class EndpointForce:
                 where, f"{bandwidth:g} Hz must be less than a quarter of the sensors' {rate:g} Hz"
             )
         self.axes, self.bandwidth, self.healthy = tuple(axes), bandwidth, False
-        self._dynamic, self._begun, self._every, self._tick = kind == "dynamic", False, every, 0
+        self._dynamic, self._count, self._every, self._tick = kind == "dynamic", 0, every, 0
         self._arm = arm_tables(machine, where)
         if not self._dynamic:
             found = gravity or gravity_from_masses(machine)
@@ -217,7 +223,7 @@ class EndpointForce:
                 raise InputError(where, f"gravity needs {len(self._arm.gravity)} parameters")
             self._arm.gravity[:] = found.value
         self._readings = _readings(machine, self.axes, period * every, bandwidth, fast, where)
-        noise = noise_gains(self._readings.motion)[1]
+        noise = noise_gains(self._readings.tables[0])[1]
         for i, name in enumerate(free_axes(machine, where)):
             channel = f"{machine.position_kind(name)}.{name}"
             self._arm.rate_noise[i] = noise * noise_rms(machine, sensors, channel)
@@ -242,9 +248,9 @@ class EndpointForce:
         if held:
             return self.force
         status = endpoint_force_step(
-            self._arm, self._readings, self._dynamic, self._begun, joint, head, rod, self.force
+            self._arm, self._readings, self._dynamic, self._count, joint, head, rod, self.force
         )
-        self._begun = self._begun or status != _WAITING
+        self._count += status != _WAITING
         self.healthy = status == _GOOD
         return self.force
 
@@ -283,12 +289,11 @@ def _readings(
     n, h, k = len(free), len(valves), len(axes)
     return Readings(
         period=period,
-        motion=filter_table(fast, period),
-        table=filter_table(bandwidth, period),
+        settle=max(1, round(_SETTLE / (fast * period))),
+        tables=np.array([filter_table(fast, period), filter_table(bandwidth, period)]),
         position=np.array([axes.index(name) for name in free]),
         valve=np.array([axes.index(name) for name in valves]),
-        state=np.zeros((n + 2 * h, 4)),
-        force=np.zeros((len(arm_joints(machine)), 4)),
+        state=np.zeros((n + 2 * h + len(arm_joints(machine)), 4)),
         outside=np.zeros(n),
         last=np.full((3, k), np.nan),
         still=np.zeros((3, k), int),

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,13 +12,17 @@ from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.operate.arm_tables import arm_joints, arm_tables, free_axes, gravity_size
+from hydrotele.operate.state_filter import LOW, RATE, filter_table, filtered
 from hydrotele.operate.tip_balance import dynamic_balance, static_torque
 from hydrotele.teleop.recursive import RecursiveLeastSquares
 
 _NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
 _GRID = 9  # poses per joint to which the masses' torques are fitted
 _SPREAD = 3.0e5  # N m: nothing is known of the parameters before
-_PERIOD = 0.2  # s between equations: nearer ones share their friction
+_RUBBING = 3.0e4  # N: nor of friction
+_PERIOD = 0.2  # s between equations
+_SMOOTH = 1.0  # Hz
+_CREEP = 5.0e-3  # m/s or rad/s: slower drives may stand, and are asked nothing about friction
 _START = 50  # equations whose parameters are no estimate yet (Zhu 1994, 6.1.3)
 _NORMAL = 1.96
 
@@ -102,15 +107,29 @@ def _weights(arm, poses, torque):
             torque[row, i] = outside[arm.joint[i]]
 
 
-def drive_torques(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarray]:
-    """Joint angles (n, m) [rad] and torques (n, m) [N m] of the arm's drives in a log.
+class SlowMoves(NamedTuple):
+    """What slow moves tell of an arm with m joints, r rows; all passed the same filter.
+
+    Attributes:
+        angle: (r, m) [rad].
+        torque: (r, m) of the drives [N m].
+        rubbing: (r, m) torque of a newton of dry friction of the drive; 0 where it may stand [m].
+    """
+
+    angle: np.ndarray
+    torque: np.ndarray
+    rubbing: np.ndarray
+
+
+def slow_moves(machine: Machine, log: Log) -> SlowMoves:
+    """Angles and torques of an arm's drives in a log, by virtual work through their linkages.
 
     Args:
         machine: the machine.
         log: measured angles and pressures.
 
     Returns:
-        (angles, torques by virtual work through the two-bar and four-bar linkages).
+        One row for every period between equations.
 
     Raises:
         InputError: a channel is missing, or a joint is not driven by a valve.
@@ -119,22 +138,27 @@ def drive_torques(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarray]:
     """
     free_axes(machine, f"torques of {machine.name}")
     driver = {axis.joint: name for name, axis in machine.axes.items()}
-    angles, torques = [], []
+    table, every = filter_table(_SMOOTH, 1.0 / log.rate), max(1, round(_PERIOD * log.rate))
+    columns = []
     for name in (driver[joint] for joint in arm_joints(machine)):
         head, rod = machine.axes[name].hydraulic_drive.areas
-        angle = log[f"angle.{name}"]
         force = head * log[f"pressure_head.{name}"] - rod * log[f"pressure_rod.{name}"]
-        angles.append(angle)
-        torques.append(force * axis_linkage(machine, name).rate(angle))
-    return np.column_stack(angles), np.column_stack(torques)
+        moved, pushed = (filtered(table, x)[::every] for x in (log[f"angle.{name}"], force))
+        lever = axis_linkage(machine, name).rate(moved[:, LOW])
+        speed = np.abs(lever * moved[:, RATE])
+        way = np.where(speed > _CREEP, np.sign(moved[:, RATE]), 0.0)
+        columns.append((moved[:, LOW], lever * pushed[:, LOW], np.abs(lever) * way))
+    return SlowMoves(*(np.column_stack(part) for part in zip(*columns, strict=True)))
 
 
-def identify_gravity(machine: Machine, log: Log) -> Gravity:
+def identify_gravity(machine: Machine, log: Log, friction: bool = True) -> Gravity:
     """Static model of a machine from a log of slow moves, by recursive least squares.
 
     Args:
         machine: the machine; its masses are not used.
         log: measured angles and pressures of joints that move slowly to and fro over their ranges.
+        friction: whether a dry friction of every drive is estimated along with it, or left in the
+            torques as by Zhu, to average out.
 
     Returns:
         The parameters with their history.
@@ -144,23 +168,26 @@ def identify_gravity(machine: Machine, log: Log) -> Gravity:
 
     Source: Zhu 1994, 6.1.3.
     """
-    angles, torques = drive_torques(machine, log)
-    every = max(1, round(_PERIOD * log.rate))
-    angles, torques = angles[::every], torques[::every]
-    size = gravity_size(angles.shape[1])
-    if len(angles) < _START:
+    moves = slow_moves(machine, log)
+    size, joints = gravity_size(moves.angle.shape[1]), moves.angle.shape[1]
+    if len(moves.angle) < _START:
         raise InputError(log.source, f"{_START * _PERIOD:g} s of slow moves are needed at least")
-    rows = np.array([gravity_rows(q)[1:] for q in angles])
-    found = RecursiveLeastSquares(np.zeros(size), np.full(size, _SPREAD))
-    history = []
-    for table, torque in zip(rows, torques[:, 1:], strict=True):
+    rows = np.array([gravity_rows(q)[1:] for q in moves.angle])
+    if friction:
+        rubbing = moves.rubbing[:, 1:, None] * np.eye(joints - 1)
+        rows = np.concatenate([rows, rubbing], axis=2)
+    spread = np.append(np.full(size, _SPREAD), np.full(rows.shape[2] - size, _RUBBING))
+    found, history = RecursiveLeastSquares(np.zeros(rows.shape[2]), spread), []
+    for table, torque in zip(rows, moves.torque[:, 1:], strict=True):
         for row, one in zip(table, torque, strict=True):
             found.update(row, one)
-        history.append(found.value)
-    left = torques[:, 1:] - rows @ found.value
-    freedom = left.size - size
-    spread = math.sqrt(float(np.sum(left**2)) / freedom)
+        history.append(found.value[:size])
+    left = moves.torque[:, 1:] - rows @ found.value
+    usual = math.sqrt(float(np.sum(left**2)) / (left.size - rows.shape[2]))
     return Gravity(
-        _NAMES[:size], found.value, _NORMAL * spread * np.sqrt(np.diag(found.covariance)),
-        np.array(history), np.sqrt(np.mean(left**2, axis=0)),
-    )  # fmt: skip
+        _NAMES[:size],
+        found.value[:size],
+        _NORMAL * usual * np.sqrt(np.diag(found.covariance)[:size]),
+        np.array(history),
+        np.sqrt(np.mean(left**2, axis=0)),
+    )

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from scipy.linalg import expm
 
-from hydrotele.compiled import lean
+from hydrotele.compiled import compiled, lean
 
 LOW, RATE, CHANGE, LAST = range(4)  # columns of a filter's state
 _NEGLIGIBLE = 1.0e-12
@@ -91,3 +91,24 @@ def filter_step(table, state, reading):
             + table[i, 4] * reading
         )
     state[LAST] = reading
+
+
+@compiled
+def filtered(table, readings):
+    """A whole signal through the filter, which stands at the first reading.
+
+    Args:
+        table: (3, 5) of `filter_table`.
+        readings: (r,) signal.
+
+    Returns:
+        (r, 3) low-pass LOW, its RATE and its CHANGE.
+
+    Source: `filter_table`.
+    """
+    state, out = np.zeros(4), np.zeros((len(readings), 3))
+    state[LOW] = state[LAST] = readings[0]
+    for row in range(len(readings)):
+        filter_step(table, state, readings[row])
+        out[row] = state[:3]
+    return out

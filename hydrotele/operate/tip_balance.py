@@ -14,7 +14,7 @@ from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
 from hydrotele.kinematics.task import task_jacobian
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
-_ODDS = 20.0
+_ODDS = 8.0
 _SINGULAR = 1.0e-6  # pivot against the largest entry
 
 
@@ -27,7 +27,6 @@ class Body(NamedTuple):
     mech: Mechanism
     user: np.ndarray
     hydraulic: int
-    gain: np.ndarray
     gear: np.ndarray
     transmission: np.ndarray
 
@@ -38,8 +37,6 @@ class Work(NamedTuple):
     motion: Motion
     drive: np.ndarray
     row: np.ndarray
-    mass: np.ndarray
-    force: np.ndarray
 
 
 class Arm(NamedTuple):
