@@ -29,6 +29,7 @@ from hydrotele.operate.state_filter import (
     LAST,
     LOW,
     RATE,
+    filter_delay,
     filter_step,
     filter_table,
     noise_gains,
@@ -179,6 +180,7 @@ class EndpointForce:
         axes: axes of the readings.
         task: what the force acts along: r [N], theta [N m], z [N], attitude, head [N m].
         bandwidth: of the estimate [Hz].
+        delay: by which it is late, for slow changes [s].
         force: (m,) last estimate; 0 until every channel has read once.
         healthy: whether the last readings were finite and the arm was not singular.
     """
@@ -227,6 +229,7 @@ class EndpointForce:
         for i, name in enumerate(free_axes(machine, where)):
             channel = f"{machine.position_kind(name)}.{name}"
             self._arm.rate_noise[i] = noise * noise_rms(machine, sensors, channel)
+        self.delay = filter_delay(fast) + filter_delay(bandwidth)
         self.task = _TASK[: len(self._arm.joint)]
         self.force = np.zeros(len(self.task))
 

@@ -48,6 +48,11 @@ def filter_table(bandwidth: float, period: float) -> np.ndarray:
     return table
 
 
+def filter_delay(bandwidth: float) -> float:
+    """Delay [s] that the filter gives slow changes, for its bandwidth [Hz]: 2 / w."""
+    return _SQUARE / (2.0 * math.pi * bandwidth)
+
+
 def noise_gains(table: np.ndarray) -> np.ndarray:
     """Standard deviations of y, y', y'' for white readings of standard deviation 1.
 
