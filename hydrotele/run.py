@@ -32,7 +32,11 @@ from hydrotele.simulate.readout import late_channels, true_channels
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
 from hydrotele.simulate.sensors import measure
 from hydrotele.simulate.stepping import DelayLine, Stepper
+from hydrotele.simulate.surroundings import Surroundings
+from hydrotele.station import Station
+from hydrotele.station_log import StationLog
 from hydrotele.summary import summarise
+from hydrotele.teleoperation import TeleopPilot
 
 AUDIT_SECONDS = 5.0
 _DEEPEST_START = 0.05  # m: contact is soft, so a tool may rest a little in the ground
@@ -50,6 +54,7 @@ class Run:
         measured: what the sensors say.
         truth: what was true, with `initial_state` in its metadata.
         summary: versions, speed, pins, balances, tracking.
+        station: the operator's, of a teleoperated run.
     """
 
     scenario: Scenario
@@ -58,6 +63,7 @@ class Run:
     measured: Log
     truth: Log
     summary: dict[str, Any]
+    station: Station | None = None
 
 
 def scenario_model(scenario: Scenario) -> Machine:
@@ -98,7 +104,7 @@ def prepare(scenario: Scenario) -> Prepared:
     """
     machine = scenario_machine(scenario)
     sensors = sensor_set(machine, scenario.sensors)
-    plant = build_plant(machine, scenario.timestep, scenario.ground)
+    plant = build_plant(machine, scenario.timestep, scenario.ground, scenario.surroundings)
     data, start = _start(plant, scenario)
     times = np.arange(scenario.ticks) / scenario.control_rate
     plan = make_plan(machine, plant.axes, scenario.pilot, start, times)
@@ -127,14 +133,29 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
     plant, data, plan, seen = prepared
     begin_leapfrog(plant.model, data)
     begin, line = full_state(plant.model, data), DelayLine(plant, data.ctrl)
-    record, commands, pins, wall = _loop(prepared, scenario, progress)
+    looped = _loop(prepared, scenario, progress)
+    record = looped.record
     truth, measured = _logs(plant, scenario, record, seen)
-    summary = summarise(plant, scenario, plan, record, pins, wall)
+    summary = summarise(plant, scenario, plan, record, looped.pins, looped.wall)
+    if looped.station:
+        measured = _with_station(measured, looped.station.log, scenario)
+        summary["teleoperation"] = looped.station.summary()
+        summary["notes"] += looped.station.notes
+    summary["notes"] += [f"{said} at {time:.2f} s" for time, said in looped.events]
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
-    window = commands[: round(AUDIT_SECONDS * scenario.control_rate)]
+    window = looped.commands[: round(AUDIT_SECONDS * scenario.control_rate)]
     controls = np.concatenate([line.controls(command, steps) for command in window])
     summary["balance"] = audit(plant, begin, controls)
-    return Run(scenario, plant, plan, measured, truth, summary)
+    return Run(scenario, plant, plan, measured, truth, summary, looped.station)
+
+
+def _with_station(measured: Log, station: StationLog, scenario: Scenario) -> Log:
+    """The measured log with what the operator's station measured."""
+    every = round(scenario.control_rate / scenario.log_rate)
+    columns, units = station.channels(every, scenario.rows)
+    return dataclasses.replace(
+        measured, columns={**measured.columns, **columns}, units={**measured.units, **units}
+    )
 
 
 def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> tuple[Log, Log]:
@@ -184,13 +205,28 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
     return data, joints
 
 
-def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None):
-    """Step through the run.
+class Looped(NamedTuple):
+    """What the loop leaves.
 
-    Returns:
-        (record, commands (n, nu), largest pin opening [m], wall time [s] from the second control
-        tick on, since the first one loads compiled code).
+    Attributes:
+        record: states at the log's rows.
+        commands: (n, nu) by control tick.
+        pins: largest pin opening [m].
+        wall: time [s] from the second control tick on, since the first one loads compiled code.
+        station: the operator's, of a teleoperated run.
+        events: (time [s], what happened around the machine).
     """
+
+    record: Record
+    commands: np.ndarray
+    pins: float
+    wall: float
+    station: Station | None
+    events: tuple[tuple[float, str], ...]
+
+
+def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None) -> Looped:
+    """Step through the run."""
     plant, data, plan, seen = prepared
     model, dt = plant.model, 1.0 / scenario.control_rate
     steps = round(dt / scenario.timestep)
@@ -202,6 +238,8 @@ def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None):
     k = len(plant.axes)
     load, command, commands = np.zeros(k), np.zeros(k), np.empty((ticks, k))
     recorder, stepper = Recorder(plant, rows), Stepper(plant, data, steps)
+    station = _station(plant, scenario, plan, drives, seen)
+    around = Surroundings(plant.machine, model, scenario.surroundings)
     worst, begin = 0.0, 0.0
     for tick in range(ticks):
         if tick % every == 0 and tick // every < rows:
@@ -212,20 +250,34 @@ def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None):
         if tick == 0:
             load[:] = numbers[:, 1] * seen.head - numbers[:, 2] * seen.rod - forces.force[0]
         command[:] = plan.command[tick]
+        tripped = station is not None and station.tick(tick, data, seen)
         servo_step(
             numbers, plan.closed, drives.velocity[tick], drives.arm[tick],
             drives.volume_head[tick], drives.volume_rod[tick],
             plan.reference[tick - tick % seen.every], seen.joint, seen.rate, seen.head, seen.rod,
             seen.supply, load, forces.known, forces.force[tick], forces.rate[tick], command,
         )  # fmt: skip
+        if tripped:
+            command[:] = 0.0
         commands[tick] = command
         begin = begin if tick else clock.perf_counter()
         stepper.advance(command)
+        if scenario.surroundings:
+            around.update(tick * dt, data, dt)
         worst = max(worst, pin_opening(model, data))
     recorder.command[:] = commands[: rows * every].reshape(rows, every, k).mean(axis=1)
     if progress:
         progress(scenario.duration, scenario.duration)
-    return recorder.record(), commands, worst, clock.perf_counter() - begin
+    around.restore()
+    wall = clock.perf_counter() - begin
+    return Looped(recorder.record(), commands, worst, wall, station, tuple(around.events))
+
+
+def _station(plant: Plant, scenario: Scenario, plan: Plan, drives, seen: Feedback):
+    """The operator's station of a teleoperated scenario, none of another."""
+    if not isinstance(scenario.pilot, TeleopPilot):
+        return None
+    return Station(plant, scenario, plan, drives, seen)
 
 
 def _log(scenario, machine, time, values, units, sensors: str) -> Log:

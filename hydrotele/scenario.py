@@ -24,6 +24,8 @@ from hydrotele.errors import InputError
 from hydrotele.log import load_log
 from hydrotele.resources import scenarios_folder
 from hydrotele.signals import parse_channel
+from hydrotele.surroundings import Thing
+from hydrotele.teleoperation import TeleopPilot
 
 
 class Pose(Facts):
@@ -144,7 +146,7 @@ class WaypointsPilot(Facts):
 
 
 Pilot = Annotated[
-    ConstantPilot | TablePilot | FourierPilot | LinesPilot | WaypointsPilot,
+    ConstantPilot | TablePilot | FourierPilot | LinesPilot | WaypointsPilot | TeleopPilot,
     Field(discriminator="kind"),
 ]
 
@@ -191,6 +193,7 @@ class Scenario(Facts):
     log_rate: Positive = 50.0
     sensors: str = "ideal"
     ground: bool = True
+    surroundings: tuple[Thing, ...] = ()
     start: Start = Start()
     pilot: Pilot
     servo: Servo = Servo()

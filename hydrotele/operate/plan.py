@@ -24,6 +24,7 @@ from hydrotele.scenario import (
     Waypoint,
     WaypointsPilot,
 )
+from hydrotele.teleoperation import TeleopPilot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +101,21 @@ def _plan(
             return _lines(plan, machine, pilot)
         case WaypointsPilot():
             return _waypoints(plan, machine, pilot)
+        case TeleopPilot():
+            return _teleoperated(plan, machine, pilot)
+
+
+def _teleoperated(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
+    """References that are written while it runs; buttons command the axes that they name."""
+    closed = np.array([machine.axes[a].force is None for a in plan.axes])
+    for button in pilot.buttons:
+        column = _column(plan.axes, button.axis, "pilot.buttons")
+        if button.axis in arm_axes(machine):
+            raise InputError("pilot.buttons", f"{button.axis} is moved by the joystick")
+        plan.command[plan.time >= button.at, column] = button.command
+        closed[column] = False
+    pose = np.zeros((len(plan.time), max(4, len(arm_axes(machine)))))
+    return dataclasses.replace(plan, closed=closed, pose=pose)
 
 
 def _column(axes: tuple[str, ...], name: str, where: str) -> int:

@@ -10,6 +10,7 @@ from mujoco import rollout
 
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import port_flow
+from hydrotele.simulate.closure import pin_count
 from hydrotele.simulate.drive_side import drive_and_load_dofs
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import drive_motion, state_flows
@@ -110,7 +111,7 @@ def _energy_balance(plant, qpos, qvel, work, dt):
         data.qpos[:], data.qvel[:] = qpos[row], qvel[row]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
-        if data.ncon or data.nefc > 3 * model.neq:
+        if data.ncon or data.nefc > 3 * pin_count(model):
             return None
         if row in (0, last):
             mujoco.mj_energyPos(model, data)

@@ -3,11 +3,13 @@
 Loops are closed on the MuJoCo model itself, so that any tree with `connect` constraints works.
 """
 
+import math
 from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 
+from hydrotele.compiled import compiled
 from hydrotele.errors import InputError
 from hydrotele.kinematics import loops
 from hydrotele.machine import Machine
@@ -15,6 +17,7 @@ from hydrotele.simulate.drive_side import drive_and_load_dofs, lock_drives
 
 _STEP = 0.2  # largest move of an independent joint between two Newton solutions [rad] or [m]
 _CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
+_CONNECT = int(mujoco.mjtEq.mjEQ_CONNECT)
 _FOLLOWED = 1.0e-9  # the same where only looks depend on it
 
 
@@ -28,19 +31,22 @@ def following_joints(machine: Machine) -> tuple[str, ...]:
 def closure_error(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
     """Openings of all `connect` pins and their Jacobian, in the current configuration.
 
+    Pins come before any other equality.
+
     Args:
         model: the model; its connects are defined by sites.
         data: the data; kinematics are updated here.
 
     Returns:
-        (errors (3 neq,) [m], Jacobian (3 neq, nv)).
+        (errors (3 pins,) [m], Jacobian (3 pins, nv)).
     """
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    errors = np.zeros(3 * model.neq)
-    jacobian = np.zeros((3 * model.neq, model.nv))
+    pins = pin_count(model)
+    errors = np.zeros(3 * pins)
+    jacobian = np.zeros((3 * pins, model.nv))
     ja, jb = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-    for k in range(model.neq):
+    for k in range(pins):
         a, b = model.eq_obj1id[k], model.eq_obj2id[k]
         errors[3 * k : 3 * k + 3] = data.site_xpos[a] - data.site_xpos[b]
         mujoco.mj_jacSite(model, data, ja, None, a)
@@ -49,12 +55,29 @@ def closure_error(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarra
     return errors, jacobian
 
 
+def pin_count(model: mujoco.MjModel) -> int:
+    """Number of `connect` pins; other equalities, of what stands around, come after them."""
+    return int(np.count_nonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT))
+
+
 def pin_opening(model: mujoco.MjModel, data: mujoco.MjData) -> float:
     """Largest distance between the two halves of a pin, with `site_xpos` as it stands [m]."""
-    if model.neq == 0:
-        return 0.0
-    gap = data.site_xpos[model.eq_obj1id] - data.site_xpos[model.eq_obj2id]
-    return float(np.sqrt((gap * gap).sum(axis=1).max()))
+    return math.sqrt(
+        _widest(data.site_xpos, model.eq_type, model.eq_obj1id, model.eq_obj2id, _CONNECT)
+    )
+
+
+@compiled
+def _widest(places, kinds, one, two, connect):
+    """Square of the largest distance between the sites of connects."""
+    widest = 0.0
+    for k in range(len(kinds)):
+        if kinds[k] == connect:
+            gap = 0.0
+            for i in range(3):
+                gap += (places[one[k], i] - places[two[k], i]) ** 2
+            widest = max(widest, gap)
+    return widest
 
 
 def close_loops(

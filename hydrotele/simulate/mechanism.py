@@ -20,6 +20,8 @@ from hydrotele.kinematics.from_machine import pin_axis
 from hydrotele.machine import Link, Machine
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, write_drive_side
 from hydrotele.simulate.looks import name_geoms, without_looks
+from hydrotele.simulate.surroundings import write_surroundings
+from hydrotele.surroundings import Thing
 
 with warnings.catch_warnings():  # glfw warns when there is no screen, which nobody needs here
     warnings.simplefilter("ignore")
@@ -33,7 +35,11 @@ _SOIL_FRICTION = (0.3, 0.02, 0.001)  # steel sliding on loam: friction angle of 
 
 
 def assemble(
-    machine: Machine, timestep: float = 1.0e-3, ground: bool = True, looks: bool = True
+    machine: Machine,
+    timestep: float = 1.0e-3,
+    ground: bool = True,
+    looks: bool = True,
+    surroundings: tuple[Thing, ...] = (),
 ) -> mjcf.RootElement:
     """Build the MJCF of a machine, with scene, closures and actuators.
 
@@ -42,6 +48,7 @@ def assemble(
         timestep: physics step [s].
         ground: whether there is a ground to touch.
         looks: whether to keep what only a picture needs.
+        surroundings: what stands around the machine.
 
     Returns:
         The MJCF document. `mjcf_text` writes it out.
@@ -71,6 +78,7 @@ def assemble(
         add_element(body, "site", name="tip", pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
     _write_scene(root, ground, looks)
+    write_surroundings(root, machine, surroundings)
     return root
 
 

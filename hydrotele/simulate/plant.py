@@ -20,6 +20,7 @@ from hydrotele.simulate.closure import (
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, wind_up
 from hydrotele.simulate.mechanism import add_element, assemble, mjcf_text
 from hydrotele.simulate.native import install_hydraulics
+from hydrotele.surroundings import Thing
 
 REST_PRESSURE = 2.0e6  # Pa, in the chamber that carries no load when a machine stands
 
@@ -32,6 +33,7 @@ class Plant:
         machine: the machine.
         model: its MuJoCo model; steps with `mj_step`, `mujoco.rollout` and `mujoco.batch`.
         ground: whether there is a ground to touch.
+        surroundings: what stands around it.
         axes: axis names in actuator order.
         qpos: (nu,) place of each axis' joint in `qpos`.
         dof: (nu,) place of each axis' joint in `qvel`.
@@ -45,6 +47,7 @@ class Plant:
     machine: Machine
     model: mujoco.MjModel
     ground: bool
+    surroundings: tuple[Thing, ...]
     axes: tuple[str, ...]
     qpos: np.ndarray
     dof: np.ndarray
@@ -56,7 +59,9 @@ class Plant:
     @functools.cached_property
     def mjcf(self) -> str:
         """The complete MJCF as text, with looks and the `home` keyframe, made when asked for."""
-        root = assemble(self.machine, self.model.opt.timestep, self.ground)
+        root = assemble(
+            self.machine, self.model.opt.timestep, self.ground, surroundings=self.surroundings
+        )
         home = rest_state(self)
         pressures = {"act": home.act} if self.model.na else {}
         add_element(root.keyframe, "key", name="home", qpos=home.qpos, **pressures)
@@ -71,13 +76,17 @@ class Plant:
         return mjcf_text(root).replace(">", f">\n  <!-- {note} -->", 1)
 
 
-def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True) -> Plant:
+def build_plant(
+    machine: Machine, timestep: float = 1.0e-3, ground: bool = True,
+    surroundings: tuple[Thing, ...] = (),
+) -> Plant:  # fmt: skip
     """Compile a machine.
 
     Args:
         machine: the machine.
         timestep: physics step [s].
         ground: whether there is a ground to touch.
+        surroundings: what stands around it.
 
     Returns:
         The plant; the native hydraulics are installed in this process.
@@ -87,7 +96,8 @@ def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True)
         RuntimeError: the native hydraulics cannot run with this MuJoCo.
     """
     install_hydraulics()
-    text = mjcf_text(assemble(machine, timestep, ground, looks=False))
+    root = assemble(machine, timestep, ground, looks=False, surroundings=surroundings)
+    text = mjcf_text(root)
     try:
         model = mujoco.MjModel.from_xml_string(text)
     except ValueError as error:
@@ -101,6 +111,7 @@ def build_plant(machine: Machine, timestep: float = 1.0e-3, ground: bool = True)
         machine=machine,
         model=model,
         ground=ground,
+        surroundings=surroundings,
         axes=axes,
         qpos=np.array([j.qposadr[0] for j in joints], dtype=int),
         dof=np.array([j.dofadr[0] for j in joints], dtype=int),

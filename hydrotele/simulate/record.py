@@ -34,7 +34,7 @@ class Record:
         qacc: (n, nv).
         act: (n, na).
         command: (n, nu) mean command over the row's interval.
-        contact: (n, 3) sum of the ground's forces on the machine, world frame [N].
+        contact: (n, 3) sum of the forces on the machine of ground and things, world frame [N].
         tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
         late: sensor delay [s] -> (qpos (n, nq), act (n, na)) that long before each row.
     """
@@ -65,8 +65,16 @@ def begin_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Positions (nq,) at the time of the activations; joints are hinges and slides."""
-    return data.qpos - model.opt.timestep * data.qvel
+    """Positions (nq,) at the time of the activations.
+
+    A felled tree's ball joint and what comes after it stay as they are.
+    """
+    if model.nq == model.nv:
+        return data.qpos - model.opt.timestep * data.qvel
+    plain = int(np.argmax(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL))
+    positions = data.qpos.copy()
+    positions[:plain] -= model.opt.timestep * data.qvel[:plain]
+    return positions
 
 
 def split_delay(delay: float, timestep: float) -> tuple[int, float]:
@@ -122,6 +130,7 @@ class Recorder:
         model = plant.model
         self.model = model
         self.tip_site = model.site("tip").id if plant.machine.arm else -1
+        self.around = surrounding_bodies(plant)
         self.time = np.zeros(rows)
         self.qpos, self.qvel = np.zeros((rows, model.nq)), np.zeros((rows, model.nv))
         self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
@@ -155,7 +164,7 @@ class Recorder:
         if self.tip_site >= 0:
             self.tip[row] = data.site_xpos[self.tip_site]
         if data.ncon:
-            self.contact[row] = _contact_force(self.model, data)
+            self.contact[row] = contact_force(self.model, data, self.around)
         if not np.isfinite(self.qacc[row]).all() or data.warning.number.any():
             raise SimulationFailed(self._story(row))
 
@@ -174,14 +183,27 @@ class Recorder:
         )  # fmt: skip
 
 
-def _contact_force(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Sum of all contact forces of the ground on the machine, (3,) [N] in the world frame."""
+def surrounding_bodies(plant: Plant) -> np.ndarray:
+    """Whether each body (nbody,) is the ground, fixed to it or one of the things around."""
+    model = plant.model
+    named = [model.body(b).name.startswith(("plate_", "tree_")) for b in range(model.nbody)]
+    return (model.body_weldid == 0) | (np.array(named) & bool(plant.surroundings))
+
+
+def contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
+    """Sum of all contact forces on the machine, (3,) [N] in the world frame.
+
+    Args:
+        model: the model.
+        data: with contacts and their forces.
+        around: (nbody,) of `surrounding_bodies`.
+    """
     total, wrench = np.zeros(3), np.zeros(6)
     for k in range(data.ncon):
         contact = data.contact[k]
         mujoco.mj_contactForce(model, data, k, wrench)
         force = contact.frame.reshape(3, 3).T @ wrench[:3]
-        grounded = model.body_weldid[model.geom_bodyid[contact.geom]] == 0
+        grounded = around[model.geom_bodyid[contact.geom]]
         if grounded[0] != grounded[1]:  # the machine touching itself is no ground force
             total += force if grounded[0] else -force
     return total

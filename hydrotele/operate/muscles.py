@@ -1,0 +1,66 @@
+"""Muscles of the simulated operator: from a wanted displacement to forces on the handle."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+
+_FINE, _FINE_TURN = 4e-4, 4e-3  # m, rad: a larger gap is a way to go, nothing to learn from
+
+
+class Muscles(NamedTuple):
+    """Numbers and state of the muscles.
+
+    Attributes:
+        wanted: (6,) displacement of the handle [m], [rad].
+        spring: (6,) what the joystick is expected to push back with [N/m], [N m/rad].
+        correction: (6,) what was learnt to be missing [N], [N m].
+        force: (6,) on the handle [N], [N m].
+        arm: (6,) stiffness of arm and hand [N/m], [N m/rad].
+        most: (6,) largest force [N], [N m].
+        weight: (6,) of the hand, which they carry [N], [N m].
+        gain: (1,) of the correction [1/s].
+        past: (reflex + 1, 6) displacements of the last periods.
+        tremor: (n, 6) of the run [N], [N m].
+    """
+
+    wanted: np.ndarray
+    spring: np.ndarray
+    correction: np.ndarray
+    force: np.ndarray
+    arm: np.ndarray
+    most: np.ndarray
+    weight: np.ndarray
+    gain: np.ndarray
+    past: np.ndarray
+    tremor: np.ndarray
+
+
+@compiled
+def pull(muscles, handle, tick, period):
+    """Forces of one period: the arm's rest moves with what is wanted, the rest is corrected late.
+
+    Args:
+        muscles: Muscles; `correction`, `force` and `past` are written.
+        handle: (6,) displacement of now [m], [rad].
+        tick: number of the period, scalar.
+        period: scalar [s].
+
+    Returns:
+        Nothing.
+
+    Source: equilibrium-point control with a late integral; Feldman 1986.
+    """
+    rows = len(muscles.past)
+    noise = tick % len(muscles.tremor)
+    for i in range(6):
+        muscles.past[tick % rows, i] = handle[i]
+        late = muscles.past[(tick + 1) % rows, i]
+        firm, most = muscles.arm[i] + muscles.spring[i], muscles.most[i]
+        fine = _FINE if i < 3 else _FINE_TURN
+        gap = min(fine, max(-fine, muscles.wanted[i] - late))
+        more = muscles.gain[0] * period * firm * gap
+        muscles.correction[i] = min(most, max(-most, muscles.correction[i] + more))
+        force = firm * muscles.wanted[i] + muscles.correction[i] + muscles.tremor[noise, i]
+        muscles.force[i] = min(most, max(-most, force)) + muscles.weight[i]

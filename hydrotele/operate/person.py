@@ -1,0 +1,262 @@
+"""The simulated operator: what he sees and feels, and what he wants the handle to do.
+
+He never knows the contact force: he feels what the handle does, sees the tip and whether it
+touches, and in `track` a graph of the force that he is to make. He decides fifty times a second;
+`operate.muscles` does the rest.
+"""
+
+import math
+from typing import Protocol
+
+import numpy as np
+
+from hydrotele.joystick import AXES, Joystick
+from hydrotele.operate.master import (
+    COORDINATE,
+    DEADBAND,
+    GAIN,
+    LEAST,
+    NOMINAL,
+    RATIO,
+    REACH,
+    SIGN,
+    SLOPE,
+    Master,
+)
+from hydrotele.operate.muscles import Muscles
+from hydrotele.operate.resolved_motion import COORDINATES
+from hydrotele.teleoperation import Follow, ForceTarget, Regulate, Steer, TeleopPilot, Track
+
+DECISIONS = 50.0  # Hz
+_REFLEX = 0.05  # s, from where the hand is to what the muscles do: stretch reflex and cortex
+_HOLD = 0.8  # of the dead band: where a hand rests that feels without moving
+_CLOSE = 0.05  # of the largest target: a force error that a person leaves alone
+_PUSH = 0.4  # s of a correcting push
+_LEAST_WAY = 3e-4  # m: a stiffness cannot be felt from a smaller displacement
+_LEANING = 0.3  # s in which a hand builds up a force
+_TREMOR_BAND = 2.0 * math.pi * 8.0  # rad/s of a physiological tremor
+_SLOW = 2.0 * math.pi * 0.5  # rad/s of drifting judgement
+_LEVER = 0.1  # m: forces of the hand into torques
+_ROUND = 2**14  # periods of tremor before it comes again
+
+
+class Seen(Protocol):
+    """What there was to see and feel, by tick (`StationLog`)."""
+
+    touching: np.ndarray
+
+    def master(self, name: str) -> np.ndarray:
+        """(n, ...) of a field of MasterState."""
+        ...
+
+    def slave(self, name: str) -> np.ndarray:
+        """(n, ...) of a field of SlaveState."""
+        ...
+
+
+class Person:
+    """An operator in one run.
+
+    Attributes:
+        muscles: what he wants, and his arm.
+        believed: contact force that he believes to have [N]; NaN where he does not care.
+        displayed: force that he is shown [N]; NaN without.
+    """
+
+    def __init__(
+        self, pilot: TeleopPilot, joystick: Joystick, numbers: Master, ticks: int, period: float,
+        seed: int,
+    ) -> None:  # fmt: skip
+        """Sit down.
+
+        Args:
+            pilot: the scenario's.
+            joystick: the joystick, with the hand's numbers.
+            numbers: of the master's control, which he has learnt.
+            ticks: number of control periods.
+            period: of the control [s].
+            seed: of the run.
+        """
+        self._pilot, self._behaviour, self._habits = pilot, pilot.operator, pilot.perception
+        self._numbers, self._period = numbers, period
+        self.every = max(1, round(1.0 / (DECISIONS * period)))
+        self._step = self.every * period
+        p, rng = pilot.perception, np.random.default_rng([seed, 1994])
+        self.muscles = _muscles(pilot, joystick, numbers, period, rng)
+        count = ticks // self.every + 1
+        self._judgement = p.force_noise * _coloured(rng.standard_normal(count), _SLOW, self._step)
+        sight = _coloured(rng.standard_normal(count), 4.0 * _SLOW, self._step)
+        self._sight = p.sight_noise * sight
+        self._imagined_gain = math.exp(p.imagination * rng.standard_normal())
+        self._look = max(1, round(p.reaction / period))
+        self._touch = max(1, round(p.touch / period))
+        self._reflex = max(1, round(_REFLEX / period))
+        self.believed = self.displayed = math.nan
+        self._imagined, self._errors = 0.0, []
+        self._pushing, self._until = True, 0.0
+        self._paths = _paths(pilot.operator, count, self._step)
+
+    def decide(self, tick: int, seen: Seen) -> None:
+        """Choose what the handle should do until the next decision; `muscles` is written.
+
+        Args:
+            tick: the control tick, a multiple of `every`.
+            seen: what there was to see and feel before it.
+        """
+        match self._behaviour:
+            case Follow():
+                self.muscles.wanted[:] = self._paths[tick // self.every]
+            case Regulate() | Track() as pressing:
+                self._press(tick, pressing.target, pressing.approach, seen)
+            case Steer():
+                self._steer(tick, seen)
+
+    def _axis_of(self, coordinate: int) -> int:
+        return int(np.flatnonzero(self._numbers.axis[:, COORDINATE] == coordinate)[0])
+
+    def _press(self, tick: int, target: ForceTarget, approach: float, seen: Seen) -> None:
+        """Bring a contact force to its target, by feel if there is any, else by imagination."""
+        c = COORDINATES.index(target.coordinate)
+        axis, shown = self._axis_of(c), isinstance(self._behaviour, Track)
+        row, wanted = self._numbers.axis[axis], self.muscles.wanted
+        time = max(0, tick - (self._look if shown else 0)) * self._period
+        goal = float(np.interp(time, target.time, target.force))
+        largest = max(abs(f) for f in target.force) or 1.0
+        if shown:
+            self.displayed = float(np.interp(tick * self._period, target.time, target.force))
+            goal += largest * self._sight[tick // self.every]
+        side = math.copysign(1.0, next((f for f in target.force if f), 1.0))
+        way = -side * row[SIGN]  # of the handle, to press harder
+        felt, looked = max(0, tick - self._touch), max(0, tick - self._look)
+        touching = bool(seen.touching[looked])
+        self.believed = side * self._judge(tick, axis, way, seen, felt, touching)
+        if not touching and abs(self.believed) < _CLOSE * largest:
+            wanted[axis] = way * (row[DEADBAND] + approach * (row[REACH] - row[DEADBAND]))
+        elif self._pilot.reflection == "direct_force":
+            self._lean(axis, way, row, abs(goal), seen, max(0, tick - self._reflex))
+        else:
+            error = side * (goal - self.believed)
+            self._pulse_or_feel(tick, axis, way, error, _CLOSE * largest)
+
+    def _pulse_or_feel(self, tick: int, axis: int, way: float, error: float, close: float) -> None:
+        """Rest inside the dead band where contact is felt; correct by short pushes beyond it."""
+        row, now, wanted = self._numbers.axis[axis], tick * self._period, self.muscles.wanted
+        self._errors.append(error)
+        if now >= self._until:
+            late = self._errors[len(self._errors) // 2 :]
+            mean = sum(late) / len(late)
+            self._errors.clear()
+            if self._pushing:
+                self._pushing, self._until = False, now + self._habits.dwell
+                wanted[axis] = way * _HOLD * row[DEADBAND]
+            elif abs(mean) < close:
+                self._until = now + 0.5 * self._habits.dwell
+            else:
+                speed = self._habits.skill * mean / (self._habits.task_stiffness * row[GAIN])
+                most = 0.5 * (row[REACH] - row[DEADBAND])
+                step = min(most, max(-most, speed))
+                wanted[axis] = way * (math.copysign(row[DEADBAND], step) + step)
+                self._pushing, self._until = True, now + _PUSH
+        if self._pilot.reflection == "stiffness":
+            stiff = row[NOMINAL] + row[SLOPE] * abs(self.believed)
+            self.muscles.spring[axis] = stiff if way * wanted[axis] >= 0.0 else row[LEAST]
+
+    def _judge(
+        self, tick: int, axis: int, way: float, seen: Seen, felt: int, touching: bool
+    ) -> float:
+        """Contact force that he believes to have, at least 0 [N]."""
+        row, reflection = self._numbers.axis[axis], self._pilot.reflection
+        if reflection == "none":
+            wanted = self.muscles.wanted[axis]
+            beyond = math.copysign(max(0.0, abs(wanted) - row[DEADBAND]), way * wanted)
+            if touching:
+                change = beyond * row[GAIN] * self._habits.task_stiffness * self._imagined_gain
+                self._imagined = max(0.0, self._imagined + self._step * change)
+            return self._imagined
+        x = seen.master("handle")[felt, axis]
+        force = seen.master("hand")[felt, axis] * (1.0 + self._judgement[tick // self.every])
+        if reflection in ("stiffness", "impedance"):
+            if way * x > _LEAST_WAY:
+                self._imagined = max(0.0, (force / x - row[NOMINAL]) / row[SLOPE])
+            return self._imagined
+        return max(0.0, (way * force - row[NOMINAL] * way * x) / max(row[RATIO], 1e-12))
+
+    def _lean(
+        self, axis: int, way: float, row: np.ndarray, goal: float, seen: Seen, reflex: int
+    ) -> None:
+        """Push with the force that the target would push back with, and let the handle go."""
+        share = 1.0 - math.exp(-self._step / _LEANING)
+        wish = way * row[RATIO] * goal
+        self.muscles.correction[axis] += share * (wish - self.muscles.correction[axis])
+        self.muscles.spring[axis] = 0.0
+        self.muscles.wanted[axis] = seen.master("handle")[reflex, axis]  # a force, not a place
+
+    def _steer(self, tick: int, seen: Seen) -> None:
+        """Move the tip to where it should be, by sight."""
+        pose = seen.slave("measured")[max(0, tick - self._look), 0]
+        for c, goals in self._paths.items():
+            axis = self._axis_of(c)
+            row, wanted = self._numbers.axis[axis], self.muscles.wanted
+            error = row[SIGN] * (goals[tick // self.every] - pose[c])
+            if self._pilot.mode == "position":
+                step = self._habits.skill * self._step * error / row[GAIN]
+                wanted[axis] = min(row[REACH], max(-row[REACH], wanted[axis] + step))
+                continue
+            most = 0.95 * (row[REACH] - row[DEADBAND])
+            step = min(most, max(-most, self._habits.skill * error / row[GAIN]))
+            close = abs(error) < self._habits.sight
+            wanted[axis] = 0.0 if close else math.copysign(row[DEADBAND], step) + step
+
+
+def _muscles(
+    pilot: TeleopPilot, joystick: Joystick, numbers: Master, period: float, rng
+) -> Muscles:
+    """His arm at rest."""
+    hand, p = joystick.hand, pilot.perception
+    levers = np.array([1.0] * 3 + [_LEVER] * 3)
+    white = rng.standard_normal((_ROUND, 6)) * levers
+    free = pilot.mode == "position" and pilot.reflection not in ("none", "stiffness", "impedance")
+    return Muscles(
+        wanted=np.zeros(6),
+        spring=np.zeros(6) if free else numbers.axis[:, NOMINAL].copy(),
+        correction=np.zeros(6),
+        force=np.zeros(6),
+        arm=np.array([hand.stiffness] * 3 + [hand.rotation_stiffness] * 3),
+        most=p.largest_force * levers,
+        weight=np.array([0.0, 0.0, 9.81 * hand.mass, 0.0, 0.0, 0.0]),
+        gain=np.array([p.muscle]),
+        past=np.zeros((1 + max(1, round(_REFLEX / period)), 6)),
+        tremor=p.tremor * _coloured(white, _TREMOR_BAND, period),
+    )
+
+
+def _coloured(white: np.ndarray, band: float, period: float) -> np.ndarray:
+    """White noise (n, ...) through a first-order low-pass, of unit standard deviation."""
+    from scipy.signal import lfilter
+
+    share = 1.0 - math.exp(-band * period)
+    scale = math.sqrt((2.0 - share) / share)
+    return scale * lfilter([share], [1.0, share - 1.0], white, axis=0)
+
+
+def _paths(behaviour, count: int, step: float):
+    """Wanted displacements (n, 6) of `follow`, or coordinate -> (n,) of `steer`."""
+    time = step * np.arange(count)
+    if isinstance(behaviour, Follow):
+        paths = np.zeros((count, 6))
+        for name, values in behaviour.path.items():
+            paths[:, AXES.index(name)] = _at(time, behaviour.time, values, behaviour.interpolate)
+        return paths
+    if isinstance(behaviour, Steer):
+        return {
+            COORDINATES.index(name): _at(time, behaviour.time, values, "hold")
+            for name, values in behaviour.points.items()
+        }
+    return {}
+
+
+def _at(time: np.ndarray, times, values, how: str) -> np.ndarray:
+    if how == "linear":
+        return np.interp(time, times, values)
+    row = np.searchsorted(times, time + 1e-9, side="right") - 1
+    return np.asarray(values, float)[np.clip(row, 0, len(values) - 1)]

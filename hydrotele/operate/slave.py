@@ -1,0 +1,303 @@
+"""The slave's side of teleoperation: packets of the master into joint references, safely.
+
+Under rate control the handle beyond its dead band asks for a rate of the task coordinates, under
+position control for their place. With four channels a virtual mass stands between, which the hand's
+and the task's force move, because a valve-controlled machine does not yield by itself.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.kinematics.task import task_forward
+from hydrotele.machine import Machine
+from hydrotele.operate.master import LEVER, Master, flat_state
+from hydrotele.operate.resolved_motion import arm_facts, follow_pose
+from hydrotele.teleoperation import TeleopPilot
+
+_SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
+_BLEND = 30.0  # rad/s, of measured task rates from held angles
+BLOCKED, SILENT, TRIPPED, AGE = range(4)  # of `SlaveState.flags`
+# rows of a command packet
+HANDLE, HANDLE_SPEED, HAND = range(3)
+
+
+class Slave(NamedTuple):
+    """Numbers of the slave's side; k joints and task coordinates.
+
+    Attributes:
+        arm: (9,) of `kinematics.task.task_numbers`.
+        ranges: (k, 2) joint ranges [rad].
+        start: (5,) pose at the start: r [m], theta [rad], z [m], attitude [rad], head [rad].
+        table: (k, 9) of every coordinate: joystick axis (-1 without), sign, gain, dead band, reach,
+            coupling, its damping, hand per machine force, lever of the virtual mass [1] or [m^2].
+        limits: (4,) silence [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
+            mass [kg].
+        kind: (2,) structure and mode.
+    """
+
+    arm: np.ndarray
+    ranges: np.ndarray
+    start: np.ndarray
+    table: np.ndarray
+    limits: np.ndarray
+    kind: np.ndarray
+
+
+class SlaveState(NamedTuple):
+    """What the slave's side knows and asks for.
+
+    Attributes:
+        pose: (5,) of the references [m], [rad].
+        rate: (5,) of it.
+        joint: (k,) joint references [rad].
+        joint_rate: (k,) [rad/s].
+        filtered: (2, 5) of commands under position control: place and rate; of the virtual mass.
+        measured: (2, 5) pose of the measured joints and its filtered rate.
+        command: (3, 6) last packet: handle, its rate, hand's force.
+        force_integral: (5,) of the hand's force, for four channels under rate control.
+        ahead: (5,) integral of the rate that the handle asks for, for the same.
+        flags: (4,) whether it is held at the edge, the line silent, the valves closed for good; age
+            of the last packet [s].
+    """
+
+    pose: np.ndarray
+    rate: np.ndarray
+    joint: np.ndarray
+    joint_rate: np.ndarray
+    filtered: np.ndarray
+    measured: np.ndarray
+    command: np.ndarray
+    force_integral: np.ndarray
+    ahead: np.ndarray
+    flags: np.ndarray
+
+
+def slave(
+    machine: Machine, pilot: TeleopPilot, numbers: Master, joints: np.ndarray
+) -> tuple[Slave, SlaveState]:
+    """Numbers and first state of the slave's side.
+
+    Args:
+        machine: the machine, with an arm.
+        pilot: the scenario's.
+        numbers: of the master.
+        joints: (k,) where its arm stands, from swing outwards [rad].
+
+    Returns:
+        Both.
+
+    Raises:
+        InputError: the machine has no arm.
+    """
+    arm, _, ranges = arm_facts(machine)
+    k, pose = len(joints), np.zeros(5)
+    task_forward(arm, joints, pose)
+    table = np.zeros((k, 9))
+    table[:, 0] = -1.0
+    for axis, row in enumerate(numbers.axis):
+        if row[10] >= 0.0:
+            lever = 1.0 if axis < 3 else LEVER**2
+            table[int(row[10])] = (
+                axis, row[11], row[12], row[6], row[9], row[14], row[15], row[13], lever
+            )  # fmt: skip
+    safety = pilot.safety
+    limits = np.array(
+        [safety.silence, safety.following_error, pilot.acceleration, pilot.virtual_mass]
+    )
+    state = flat_state(
+        SlaveState, [(5,), (5,), (k,), (k,), (2, 5), (2, 5), (3, 6), (5,), (5,), (4,)]
+    )
+    state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
+    return Slave(arm, ranges, pose.copy(), table, limits, numbers.kind), state
+
+
+@compiled
+def measure_task(numbers, joint, fresh, elapsed, s):
+    """Pose and rate of the tip from measured joint angles.
+
+    Args:
+        numbers: Slave.
+        joint: (k,) measured [rad].
+        fresh: whether there is a new sample, scalar.
+        elapsed: since the last one, scalar [s].
+        s: SlaveState; `measured` is written.
+
+    Returns:
+        Nothing.
+
+    Source: `kinematics.task`; first-order filter.
+    """
+    if not fresh:
+        return
+    pose = np.empty(5)
+    task_forward(numbers.arm, joint, pose)
+    share = min(1.0, _BLEND * elapsed)
+    for i in range(5):
+        if elapsed > 0.0:
+            s.measured[1, i] += share * ((pose[i] - s.measured[0, i]) / elapsed - s.measured[1, i])
+        s.measured[0, i] = pose[i]
+
+
+@compiled
+def ask(numbers, packet, arrived, force, period, s):
+    """Joint references of this period from what the master says.
+
+    Args:
+        numbers: Slave.
+        packet: (3, 6) handle's displacement [m], [rad], its rate, the hand's force [N], [N m].
+        arrived: whether a packet came this period, scalar.
+        force: (k,) of the environment on the tip, task coordinates [N], [N m].
+        period: scalar [s].
+        s: SlaveState; references and flags are written.
+
+    Returns:
+        Nothing.
+
+    Source: Zhu 1994, chapters 2 and 3; see this module's docstring.
+    """
+    k = len(s.joint)
+    if arrived:
+        for r in range(3):
+            for i in range(6):
+                s.command[r, i] = packet[r, i] if np.isfinite(packet[r, i]) else 0.0
+        s.flags[3] = 0.0
+    else:
+        s.flags[3] += period
+    s.flags[1] = 1.0 if s.flags[3] > numbers.limits[0] else 0.0
+    wanted, rate = np.zeros(5), np.zeros(5)
+    for c in range(5):
+        wanted[c] = s.pose[c]
+        if c >= k or (c == 3 and k < 4):
+            continue
+        row = numbers.table[c]
+        x, v, hand = 0.0, 0.0, 0.0
+        if row[0] >= 0.0 and s.flags[1] == 0.0:
+            i = int(row[0])
+            x, v, hand = (
+                row[1] * s.command[0, i],
+                row[1] * s.command[1, i],
+                row[1] * s.command[2, i],
+            )
+        beyond = abs(x) - row[3]
+        x_live = 0.0 if beyond <= 0.0 else (beyond if x > 0.0 else -beyond)
+        if numbers.kind[0] == 4:
+            rate[c] = _virtual_rate(numbers, row, c, x, v, hand, force[c], period, s)
+        elif numbers.kind[1] == 0:
+            most = max(row[4] - row[3], 0.0)
+            rate[c] = row[2] * min(most, max(-most, x_live))
+        elif s.flags[1] == 0.0:
+            rate[c] = _placed_rate(numbers, row, c, x, period, s)
+        if numbers.kind[1] == 0 or s.flags[1] > 0.0:
+            change = numbers.limits[2] * period
+            rate[c] = min(s.rate[c] + change, max(s.rate[c] - change, rate[c]))
+        wanted[c] += period * rate[c]
+    held = follow_pose(
+        numbers.arm, numbers.ranges, wanted, rate, s.flags[0] > 0.0, s.pose, s.joint, s.joint_rate
+    )
+    s.flags[0] = 1.0 if held else 0.0
+    for c in range(5):
+        s.rate[c] = 0.0 if held else rate[c]
+        if held:
+            s.filtered[0, c], s.filtered[1, c] = s.pose[c] - numbers.start[c], 0.0
+            s.ahead[c], s.force_integral[c] = s.filtered[0, c], 0.0
+
+
+@compiled
+def _placed_rate(numbers, row, c, x, period, s):
+    """Rate of a coordinate under position control: a critically damped filter of the handle."""
+    place, speed = s.filtered[0, c], s.filtered[1, c]
+    push = _SMOOTH * _SMOOTH * (row[2] * x - place) - 2.0 * _SMOOTH * speed
+    speed += period * push
+    s.filtered[0, c], s.filtered[1, c] = place + period * speed, speed
+    return speed
+
+
+@compiled
+def _virtual_rate(numbers, row, c, x, v, hand, force, period, s):
+    """Rate of the virtual slave of four channels, which hand, task and the master's place move.
+
+    Under position control `M z'' = hand + ratio F + K (x - z) + B (x' - z')` with z = y / scale,
+    under rate control `M y'' = k_v int hand + ratio F + K (k_v int x - y) + B (k_v x - y')`.
+    """
+    gain, spring, damper = row[2], row[5], row[6]
+    mass = numbers.limits[3] * row[8]
+    scale = gain if numbers.kind[1] == 1 else 1.0
+    place, speed = s.filtered[0, c] / scale, s.filtered[1, c] / scale
+    ahead, ahead_speed, push = x, v, hand
+    if numbers.kind[1] == 0:
+        s.force_integral[c] += period * gain * hand
+        s.ahead[c] += period * gain * x
+        ahead, ahead_speed, push = s.ahead[c], gain * x, s.force_integral[c]
+    push += row[7] * force + spring * (ahead - place) + damper * (ahead_speed - speed)
+    speed += period * push / mass
+    s.filtered[0, c], s.filtered[1, c] = scale * (place + period * speed), scale * speed
+    return scale * speed
+
+
+@compiled
+def watch(numbers, joint, s):
+    """Close the valves for good where a joint does not follow its reference.
+
+    Args:
+        numbers: Slave.
+        joint: (k,) measured [rad]; one that is not finite trips, too.
+        s: SlaveState; `flags` is written.
+
+    Returns:
+        Nothing.
+
+    Source: following-error monitor, as drives have it.
+    """
+    for i in range(len(joint)):
+        if not abs(joint[i] - s.joint[i]) <= numbers.limits[1]:
+            s.flags[2] = 1.0
+
+
+@compiled
+def report(numbers, force, s, packet):
+    """What the master is told: force, places and speeds against the start.
+
+    Args:
+        numbers: Slave.
+        force: (k,) at the tip, task coordinates [N], [N m].
+        s: SlaveState.
+        packet: (7, k) written, all but the last two rows.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    for c in range(len(force)):
+        packet[0, c] = force[c]
+        packet[1, c] = s.measured[0, c] - numbers.start[c]
+        packet[2, c] = s.measured[1, c]
+        packet[3, c] = s.pose[c] - numbers.start[c]
+        packet[4, c] = s.rate[c]
+    if numbers.kind[0] == 4:
+        for c in range(len(force)):
+            packet[1, c], packet[2, c] = s.filtered[0, c], s.filtered[1, c]
+
+
+@compiled
+def slave_step(numbers, packet, arrived, force, joint, period, s):
+    """One period of the slave's side: references of the joints, and whether they are followed.
+
+    Args:
+        numbers: Slave.
+        packet: (3, 6) see `ask`.
+        arrived: see `ask`, scalar.
+        force: (k,) see `ask`.
+        joint: (k,) measured [rad].
+        period: scalar [s].
+        s: SlaveState, written.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    ask(numbers, packet, arrived, force, period, s)
+    watch(numbers, joint, s)

@@ -1,0 +1,168 @@
+"""The joystick's flotor in MuJoCo: coils push it, stops hold it, a hand or a cab may shake it.
+
+The cab's frame is not inertial: its acceleration counts against gravity, and its turning acts on
+the flotor as force and torque.
+"""
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.errors import InputError
+from hydrotele.joystick import Joystick
+
+GRAVITY = -9.81
+_STEPS = 2  # physics steps per control period of 5 ms: its stiffest spring turns over in 30 ms
+
+
+class Flotor:
+    """The simulated joystick.
+
+    Attributes:
+        model: its MuJoCo model; coils are its actuators [A].
+        data: its state; `qpos` (7,) handle [m] and quaternion, `qvel` (6,) [m/s] in the stator's
+            axes and [rad/s] in the flotor's.
+        hand: whether a hand holds the handle.
+    """
+
+    def __init__(self, facts: Joystick, *, hand: bool = True, period: float | None = None) -> None:
+        """Compile the joystick.
+
+        Args:
+            facts: the joystick.
+            hand: whether a hand holds it.
+            period: of the control [s]; the joystick's own by default.
+
+        Raises:
+            InputError: its MJCF cannot be read or lacks a part.
+        """
+        self.facts, self.hand = facts, hand
+        self.period = period or 1.0 / facts.control_rate
+        self.steps = max(_STEPS, math.ceil(_STEPS * self.period * facts.control_rate - 1e-9))
+        spec = joystick_spec(facts, hand)
+        spec.compiler.discardvisual = True
+        spec.compiler.fusestatic = True
+        spec.option.timestep = self.period / self.steps
+        self.model = spec.compile()
+        self.model.opt.disableflags |= int(
+            mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_EQUALITY
+        )
+        self.data = mujoco.MjData(self.model)
+        body = self.model.body("flotor")
+        self._mass, self._com = float(body.mass[0]), body.ipos.copy()
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, body.iquat)
+        turn = turn.reshape(3, 3)
+        self._inertia = turn @ np.diag(body.inertia) @ turn.T
+        self._inertia += self._mass * (self._com @ self._com * np.eye(3))
+        self._inertia -= self._mass * np.outer(self._com, self._com)
+        self.model.opt.gravity[:] = (0.0, 0.0, GRAVITY)
+
+    def step(self, currents: np.ndarray, muscles: np.ndarray) -> None:
+        """Go on by one control period with held currents (6,) [A] and muscle forces (6,) [N, N m].
+
+        Muscles act on the handle: force along the stator's axes, torque about them.
+        """
+        data = self.data
+        data.ctrl[:] = currents
+        data.qfrc_applied[:] = muscles
+        mujoco.mj_step(self.model, data, nstep=self.steps)
+
+    def shaken_step(
+        self, currents: np.ndarray, muscles: np.ndarray, mount: np.ndarray, spin: float,
+        spin_rate: float,
+    ) -> None:  # fmt: skip
+        """Like `step`, in a cab that turns about a vertical axis.
+
+        Args:
+            currents: (6,) [A].
+            muscles: (6,) [N, N m].
+            mount: (3,) where the joystick stands, from the cab's axis [m].
+            spin: turning of the cab [rad/s].
+            spin_rate: its rate [rad/s^2].
+        """
+        _shake(
+            self._mass, self._com, self._inertia, mount, spin, spin_rate, muscles,
+            self.model.opt.gravity, self.data.qfrc_applied,
+        )  # fmt: skip
+        self.data.ctrl[:] = currents
+        mujoco.mj_step(self.model, self.data, nstep=self.steps)
+
+    def place(self, pose: np.ndarray) -> None:
+        """Put the handle to a pose at rest, (6,) displacement [m] and rotation vector [rad]."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:3] = pose[:3]
+        angle = float(np.linalg.norm(pose[3:]))
+        way = pose[3:] / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
+        mujoco.mju_axisAngle2Quat(self.data.qpos[3:7], way, angle)
+
+
+@compiled
+def _shake(mass, com, inertia, mount, w, a, muscles, gravity, out):
+    """Gravity as it is felt at the mount, and the forces on a body in a frame that turns."""
+    gravity[0] = w * w * mount[0] + a * mount[1]
+    gravity[1] = w * w * mount[1] - a * mount[0]
+    gravity[2] = GRAVITY
+    out[0] = muscles[0] + mass * (a * com[1] + w * w * com[0])
+    out[1] = muscles[1] + mass * (-a * com[0] + w * w * com[1])
+    out[2] = muscles[2]
+    out[3] = muscles[3] - inertia[0, 2] * a + w * w * inertia[1, 2]
+    out[4] = muscles[4] - inertia[1, 2] * a - w * w * inertia[0, 2]
+    out[5] = muscles[5] - inertia[2, 2] * a
+
+
+def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
+    """The joystick's MJCF with the numbers of its facts.
+
+    Args:
+        facts: the joystick.
+        hand: whether a hand holds it: its mass on the handle, its spring and damper to the centre.
+
+    Returns:
+        The spec, looks included.
+
+    Raises:
+        InputError: the MJCF cannot be read or lacks a part.
+    """
+    path = Path(facts.folder, facts.mjcf)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"cannot be read: {error}") from None
+    flotor, grip = spec.body("flotor"), spec.body("hand")
+    coils, joints = spec.body("coils"), {j.name: j for j in spec.joints}
+    if not (flotor and grip and coils and {"x", "y", "z", "turn"} <= set(joints)):
+        raise InputError(path, "needs bodies flotor, hand and coils, joints x, y, z and turn")
+    facts_flotor = facts.flotor
+    flotor.mass, flotor.inertia = facts_flotor.mass, facts_flotor.inertia
+    flotor.ipos = np.subtract(facts_flotor.com, facts_flotor.handle)
+    coils.pos = np.negative(facts_flotor.handle)
+    degrees = 180.0 / math.pi if spec.compiler.degree else 1.0
+    far = facts.workspace.translation
+    for name in ("x", "y", "z"):
+        joints[name].range = (-far, far)
+    joints["turn"].range = (0.0, degrees * facts.workspace.rotation)
+    for actuator in spec.actuators:
+        actuator.ctrlrange = (-facts.coils.max_current, facts.coils.max_current)
+        actuator.gear = np.sign(actuator.gear) * facts.coils.force_per_ampere
+    for k in range(6):
+        place, turn = spec.site(f"coil_{k + 1}"), 2.0 * math.pi * (k % 3) / 3.0
+        place.pos = facts.coils.radius * np.array([math.cos(turn), math.sin(turn), 0.0])
+    if hand and facts.hand.mass > 0.0:
+        grip.mass = facts.hand.mass
+    else:
+        spec.delete(grip)
+    if hand:
+        _hold(joints, facts)
+    return spec
+
+
+def _hold(joints, facts: Joystick) -> None:
+    for name in ("x", "y", "z", "turn"):
+        turns = name == "turn"
+        stiffness = facts.hand.rotation_stiffness if turns else facts.hand.stiffness
+        damping = facts.hand.rotation_damping if turns else facts.hand.damping
+        joints[name].stiffness[0], joints[name].damping[0] = stiffness, damping
