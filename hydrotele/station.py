@@ -76,6 +76,7 @@ class Station:
         self._slave, self._s = slave(machine, pilot, self._master, start)
         self._line = _line(pilot, scenario, len(axes))
         self._flotor = Flotor(joystick, period=self._period)
+        self._qpos = self._flotor.data.qpos
         self._mount = np.array(joystick.mount)
         self._swing = int(plant.dof[self.columns[0]]) if pilot.mount == "cab" else -1
         self._grid, self._table = drive_tables(machine, plan.axes)
@@ -85,10 +86,10 @@ class Station:
         self._task = TaskImpedance(len(axes)) if pilot.reflection == "impedance" else None
         self._force = np.zeros(len(axes))
         self._elapsed = 0.0
-        self.person = Person(
-            pilot, joystick, self._master, scenario.ticks, self._period, scenario.seed
-        )
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
+        self.person = Person(
+            pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed
+        )
         self.notes: list[str] = []
         self._said: set[str] = set()
         self.tripped = False
@@ -116,16 +117,15 @@ class Station:
                 self._m.handle, self._m.extra,
             )  # fmt: skip
         if tick % self.person.every == 0:
-            self.person.decide(tick, self.log)
-            self.log.displayed[tick:] = self.person.displayed
-            self.log.believed[tick:] = self.person.believed
+            self.person.decide(tick)
+        hand = self.person.muscles
         to_the_hand(
             tick, fresh, self._elapsed, self.tripped, joint, self._force, self._slave, self._s,
-            self._line, self._master, self._m, self._flotor.data.qpos, self.person.muscles,
+            self._line, self._master, self._m, self._qpos, hand,
         )  # fmt: skip
         self._elapsed = seen.period
         self._move_flotor(data)
-        self.log.take(tick, self._force, self.person.muscles.force, data.ncon > 0)
+        self.log.take(tick, self._force, hand.force, data.ncon > 0)
         self._ask(tick, joint)
         self._check(tick, seen)
         return self.tripped

@@ -21,8 +21,6 @@ class StationLog:
         force: (n, k) at the tip as it is felt, task coordinates [N], [N m].
         muscles: (n, 6) forces of the operator on the handle [N], [N m].
         touching: (n,) whether the machine touches something.
-        displayed: (n,) force that the operator is shown [N].
-        believed: (n,) force that he believes to have [N].
     """
 
     def __init__(
@@ -42,7 +40,6 @@ class StationLog:
         self._slave = np.zeros((ticks, len(self._two)))
         self.force, self.muscles = np.zeros((ticks, len(coordinates))), np.zeros((ticks, 6))
         self.touching = np.zeros(ticks, bool)
-        self.displayed, self.believed = np.full(ticks, np.nan), np.full(ticks, np.nan)
 
     def take(self, tick: int, force: np.ndarray, muscles: np.ndarray, touching: bool) -> None:
         """Keep what stands after the operator's half of a tick."""

@@ -6,7 +6,7 @@ touches, and in `track` a graph of the force that he is to make. He decides fift
 """
 
 import math
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -59,13 +59,14 @@ class Person:
 
     Attributes:
         muscles: what he wants, and his arm.
-        believed: contact force that he believes to have [N]; NaN where he does not care.
-        displayed: force that he is shown [N]; NaN without.
+        every: control ticks per decision.
+        believed: (decisions,) contact force that he believes to have [N]; NaN where he does not
+            care.
     """
 
     def __init__(
-        self, pilot: TeleopPilot, joystick: Joystick, numbers: Master, ticks: int, period: float,
-        seed: int,
+        self, pilot: TeleopPilot, joystick: Joystick, numbers: Master, seen: Seen, ticks: int,
+        period: float, seed: int,
     ) -> None:  # fmt: skip
         """Sit down.
 
@@ -73,6 +74,7 @@ class Person:
             pilot: the scenario's.
             joystick: the joystick, with the hand's numbers.
             numbers: of the master's control, which he has learnt.
+            seen: what there will be to see and feel, filled tick by tick.
             ticks: number of control periods.
             period: of the control [s].
             seed: of the run.
@@ -91,56 +93,53 @@ class Person:
         self._look = max(1, round(p.reaction / period))
         self._touch = max(1, round(p.touch / period))
         self._reflex = max(1, round(_REFLEX / period))
-        self.believed = self.displayed = math.nan
+        self.believed = np.full(count, np.nan)
         self._imagined, self._errors = 0.0, []
+        self._handle, self._hand = seen.master("handle"), seen.master("hand")
+        self._pose, self._touching = seen.slave("measured"), seen.touching
+        if isinstance(pilot.operator, Regulate | Track):
+            time, shown = self._step * np.arange(count), isinstance(pilot.operator, Track)
+            self._target = _prepared(
+                pilot.operator.target, shown, numbers, time, p.reaction, self._sight
+            )
         self._pushing, self._until = True, 0.0
         self._paths = _paths(pilot.operator, count, self._step)
 
-    def decide(self, tick: int, seen: Seen) -> None:
+    def decide(self, tick: int) -> None:
         """Choose what the handle should do until the next decision; `muscles` is written.
 
         Args:
             tick: the control tick, a multiple of `every`.
-            seen: what there was to see and feel before it.
         """
         match self._behaviour:
             case Follow():
                 self.muscles.wanted[:] = self._paths[tick // self.every]
             case Regulate() | Track() as pressing:
-                self._press(tick, pressing.target, pressing.approach, seen)
+                self._press(tick, pressing.approach)
             case Steer():
-                self._steer(tick, seen)
+                self._steer(tick)
 
-    def _axis_of(self, coordinate: int) -> int:
-        return int(np.flatnonzero(self._numbers.axis[:, COORDINATE] == coordinate)[0])
-
-    def _press(self, tick: int, target: ForceTarget, approach: float, seen: Seen) -> None:
+    def _press(self, tick: int, approach: float) -> None:
         """Bring a contact force to its target, by feel if there is any, else by imagination."""
-        c = COORDINATES.index(target.coordinate)
-        axis, shown = self._axis_of(c), isinstance(self._behaviour, Track)
-        row, wanted = self._numbers.axis[axis], self.muscles.wanted
-        time = max(0, tick - (self._look if shown else 0)) * self._period
-        goal = float(np.interp(time, target.time, target.force))
-        largest = max(abs(f) for f in target.force) or 1.0
-        if shown:
-            self.displayed = float(np.interp(tick * self._period, target.time, target.force))
-            goal += largest * self._sight[tick // self.every]
-        side = math.copysign(1.0, next((f for f in target.force if f), 1.0))
-        way = -side * row[SIGN]  # of the handle, to press harder
+        press, number = self._target, tick // self.every
+        axis, row, wanted = press.axis, press.row, self.muscles.wanted
+        goal = press.goal[number]
         felt, looked = max(0, tick - self._touch), max(0, tick - self._look)
-        touching = bool(seen.touching[looked])
-        self.believed = side * self._judge(tick, axis, way, seen, felt, touching)
-        if not touching and abs(self.believed) < _CLOSE * largest:
-            wanted[axis] = way * (row[DEADBAND] + approach * (row[REACH] - row[DEADBAND]))
+        touching = bool(self._touching[looked])
+        believed = self._judge(tick, axis, press.way, felt, touching)
+        self.believed[number] = press.side * believed
+        if not touching and believed < press.close:
+            reach = row[DEADBAND] + approach * (row[REACH] - row[DEADBAND])
+            wanted[axis] = press.way * reach
         elif self._pilot.reflection == "direct_force":
-            self._lean(axis, way, row, abs(goal), seen, max(0, tick - self._reflex))
+            self._lean(axis, press.way, row, abs(goal), max(0, tick - self._reflex))
         else:
-            error = side * (goal - self.believed)
-            self._pulse_or_feel(tick, axis, way, error, _CLOSE * largest)
+            error = press.side * goal - believed
+            self._pulse_or_feel(tick, axis, press.way, error, press.close)
 
     def _pulse_or_feel(self, tick: int, axis: int, way: float, error: float, close: float) -> None:
         """Rest inside the dead band where contact is felt; correct by short pushes beyond it."""
-        row, now, wanted = self._numbers.axis[axis], tick * self._period, self.muscles.wanted
+        row, now, wanted = self._target.row, tick * self._period, self.muscles.wanted
         self._errors.append(error)
         if now >= self._until:
             late = self._errors[len(self._errors) // 2 :]
@@ -158,14 +157,12 @@ class Person:
                 wanted[axis] = way * (math.copysign(row[DEADBAND], step) + step)
                 self._pushing, self._until = True, now + _PUSH
         if self._pilot.reflection == "stiffness":
-            stiff = row[NOMINAL] + row[SLOPE] * abs(self.believed)
+            stiff = row[NOMINAL] + row[SLOPE] * self._imagined
             self.muscles.spring[axis] = stiff if way * wanted[axis] >= 0.0 else row[LEAST]
 
-    def _judge(
-        self, tick: int, axis: int, way: float, seen: Seen, felt: int, touching: bool
-    ) -> float:
+    def _judge(self, tick: int, axis: int, way: float, felt: int, touching: bool) -> float:
         """Contact force that he believes to have, at least 0 [N]."""
-        row, reflection = self._numbers.axis[axis], self._pilot.reflection
+        row, reflection = self._target.row, self._pilot.reflection
         if reflection == "none":
             wanted = self.muscles.wanted[axis]
             beyond = math.copysign(max(0.0, abs(wanted) - row[DEADBAND]), way * wanted)
@@ -173,29 +170,27 @@ class Person:
                 change = beyond * row[GAIN] * self._habits.task_stiffness * self._imagined_gain
                 self._imagined = max(0.0, self._imagined + self._step * change)
             return self._imagined
-        x = seen.master("handle")[felt, axis]
-        force = seen.master("hand")[felt, axis] * (1.0 + self._judgement[tick // self.every])
+        x = float(self._handle[felt, axis])
+        force = float(self._hand[felt, axis]) * (1.0 + self._judgement[tick // self.every])
         if reflection in ("stiffness", "impedance"):
             if way * x > _LEAST_WAY:
                 self._imagined = max(0.0, (force / x - row[NOMINAL]) / row[SLOPE])
             return self._imagined
         return max(0.0, (way * force - row[NOMINAL] * way * x) / max(row[RATIO], 1e-12))
 
-    def _lean(
-        self, axis: int, way: float, row: np.ndarray, goal: float, seen: Seen, reflex: int
-    ) -> None:
+    def _lean(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
         """Push with the force that the target would push back with, and let the handle go."""
         share = 1.0 - math.exp(-self._step / _LEANING)
         wish = way * row[RATIO] * goal
         self.muscles.correction[axis] += share * (wish - self.muscles.correction[axis])
         self.muscles.spring[axis] = 0.0
-        self.muscles.wanted[axis] = seen.master("handle")[reflex, axis]  # a force, not a place
+        self.muscles.wanted[axis] = self._handle[reflex, axis]  # a force, not a place
 
-    def _steer(self, tick: int, seen: Seen) -> None:
+    def _steer(self, tick: int) -> None:
         """Move the tip to where it should be, by sight."""
-        pose = seen.slave("measured")[max(0, tick - self._look), 0]
+        pose = self._pose[max(0, tick - self._look), 0]
         for c, goals in self._paths.items():
-            axis = self._axis_of(c)
+            axis = _axis_of(self._numbers, c)
             row, wanted = self._numbers.axis[axis], self.muscles.wanted
             error = row[SIGN] * (goals[tick // self.every] - pose[c])
             if self._pilot.mode == "position":
@@ -206,6 +201,46 @@ class Person:
             step = min(most, max(-most, self._habits.skill * error / row[GAIN]))
             close = abs(error) < self._habits.sight
             wanted[axis] = 0.0 if close else math.copysign(row[DEADBAND], step) + step
+
+
+class _Target(NamedTuple):
+    """A force to make, as he has prepared for it.
+
+    Attributes:
+        axis: of the joystick.
+        row: its numbers.
+        side: sign of the force.
+        way: of the handle, to press harder.
+        goal: (decisions,) what he aims at, as late and as rough as he sees it [N].
+        displayed: (decisions,) what he is shown [N]; NaN without.
+        close: error that he leaves alone [N].
+    """
+
+    axis: int
+    row: list[float]
+    side: float
+    way: float
+    goal: list[float]
+    displayed: np.ndarray
+    close: float
+
+
+def _prepared(
+    target: ForceTarget, shown: bool, numbers: Master, time: np.ndarray, late: float,
+    sight: np.ndarray,
+) -> _Target:  # fmt: skip
+    axis = _axis_of(numbers, COORDINATES.index(target.coordinate))
+    largest = max(abs(f) for f in target.force) or 1.0
+    side = math.copysign(1.0, next((f for f in target.force if f), 1.0))
+    goal = np.interp(np.maximum(time - late * shown, 0.0), target.time, target.force)
+    displayed = np.interp(time, target.time, target.force) if shown else np.full(len(time), np.nan)
+    goal = goal + shown * largest * sight
+    row = numbers.axis[axis].tolist()
+    return _Target(axis, row, side, -side * row[SIGN], goal.tolist(), displayed, _CLOSE * largest)
+
+
+def _axis_of(numbers: Master, coordinate: int) -> int:
+    return int(np.flatnonzero(numbers.axis[:, COORDINATE] == coordinate)[0])
 
 
 def _muscles(
