@@ -38,7 +38,7 @@ from hydrotele.operate.tip_balance import dynamic_balance, static_balance, tip_f
 from hydrotele.sensors import SensorSet
 
 Kind = Literal["static", "dynamic"]
-BANDWIDTH = 0.9  # Hz
+BANDWIDTH = 0.7  # Hz
 FAST = 2.5  # Hz
 _SETTLE = 0.5  # periods of the fast filter
 _TASK = ("r", "theta", "z", "attitude", "head")
