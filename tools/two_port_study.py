@@ -95,8 +95,7 @@ def main() -> None:
         "", "## The shipped case", "", *shipped, "",
         f"## {asked.trials} random cases", "",
         "Every mass, damper, spring and gain of the shipped case times 10^u, u uniform within",
-        f"{SPREAD} either way; sweeps without delay and with one of up to {1e3 * SWEPT:g} ms each",
-        "way.",
+        f"{SPREAD} either way; sweeps without delay, and with one of up to {1e3 * SWEPT:g} ms.",
         "Not measurable: the slave is unstable while the handle is held, nothing settles.",
         "", *drawn, "",
     ])  # fmt: skip

@@ -28,7 +28,10 @@ _LARGEST = 5e-4  # s
 _BLOCKS = 20  # of a run, whose largest speeds are compared
 _GROWN, _GONE = 1e9, 1e-9  # of the kick, beyond which nothing changes any more
 _KICK = 0.1  # m/s
+_WHOLE = 1e-6  # of a step, what a quotient of delay and step rounds by
 _PERIODS = 2  # of a sine that are measured
+_SETTLE = (20.0, 40.0, 80.0, 160.0, 320.0)  # s before a sine is measured
+_SETTLED = 1e-3  # change of what is measured, small against the 3 % that are asked for
 _TRIPS = 40  # there and back that a run lasts at least
 _FINEST = 2e-6  # s, a step below which a run takes minutes
 
@@ -147,32 +150,43 @@ def grows(run: Run) -> bool:
     return bool(run.largest[-4:].max() > run.largest[4:8].max())
 
 
-def swept(case: Case, structure: str, frequency: float, settle: float = 20.0) -> complex:
+def swept(case: Case, structure: str, frequency: float) -> complex:
     """Impedance felt where the master's motion is an imposed sine.
+
+    Transients are given more and more time, until that changes nothing.
 
     Args:
         case: the teleoperator with its task.
         structure: its name.
         frequency: [rad/s].
-        settle: time before measuring [s]; measured are two periods.
 
     Returns:
-        Force over velocity [N s/m].
+        Force over velocity, of two periods [N s/m].
     """
-    period = 2.0 * math.pi / frequency
-    seconds = (math.ceil(settle / period) + _PERIODS) * period
-    return _simulated(case, law_of(case, structure), seconds, frequency, _PERIODS * period).felt
+    law, period = law_of(case, structure), 2.0 * math.pi / frequency
+    felt = 0.0
+    for settle in _SETTLE:
+        before, seconds = felt, (math.ceil(settle / period) + _PERIODS) * period
+        felt = _simulated(case, law, seconds, frequency, _PERIODS * period).felt
+        if abs(felt - before) < _SETTLED * abs(felt):
+            break
+    return felt
 
 
 def _simulated(case: Case, law: Law, seconds: float, frequency: float, measured: float) -> Run:
     step = step_of(case)
     if frequency:  # a whole number of steps in a period, so that the sine's mean is 0
         step = 2.0 * math.pi / frequency / math.ceil(2.0 * math.pi / frequency / step)
-    lags = round(case.delay_forward / step), round(case.delay_back / step)
+    elif case.delay_forward >= step:  # a whole number in the delay
+        step = case.delay_forward / math.ceil(case.delay_forward / step)
+    late = np.array([case.delay_forward, case.delay_back]) / step
+    late = np.where(np.abs(late - np.round(late)) < _WHOLE, np.round(late), late)
+    late[late < 1.0] = 0.0  # less than a step counts as none
+    lags = int(late[0]), int(late[1])
     now, delayed = _equations(case, law, lags, bool(frequency))
     inverse = np.linalg.inv(now[:, _SOLVED])
     largest, sums = _march(
-        inverse, inverse @ now[:, _KNOWN], inverse @ delayed, np.array(lags), step,
+        inverse, inverse @ now[:, _KNOWN], inverse @ delayed, np.array(lags), late - lags, step,
         round(seconds / step), round(measured / step), frequency,
     )  # fmt: skip
     return Run(largest, complex(sums[0] / sums[1]) if frequency else 0.0)
@@ -218,38 +232,23 @@ def _if_late(
 
 
 @compiled
-def _march(inverse, known, delayed, lags, step, rows, measured, frequency):
+def _march(inverse, known, delayed, lags, beyond, step, rows, measured, frequency):
     """Largest speeds (20,), and sums of force and velocity times the measured wave (2,)."""
-    kept = max(lags[0], lags[1]) + 1
-    past = np.zeros((kept, 10))
+    past = np.zeros((max(lags[0], lags[1]) + 2, 10))
     largest, sums = np.zeros(_BLOCKS), np.zeros(2, np.complex128)
-    q, before, solved, late = np.zeros(10), np.zeros(10), np.zeros(4), np.zeros(20)
+    q, before, late = np.zeros(10), np.zeros(10), np.zeros(20)
     if frequency == 0.0:
         q[V] = _KICK
     for n in range(rows):
+        angle = frequency * step * n
         if frequency != 0.0:
-            angle = frequency * step * n
             q[INT], q[X] = -math.cos(angle) / frequency, math.sin(angle)
             q[V] = frequency * math.cos(angle)
-        for side in range(2):
-            if lags[side] > 0 and n >= lags[side]:
-                late[10 * side : 10 * side + 10] = past[(n - lags[side]) % kept]
-        for i in range(4):
-            total = 0.0
-            for j in range(20):
-                total += delayed[i, j] * late[j]
-            total -= (
-                known[i, 0] * q[INT] + known[i, 1] * q[X] + known[i, 2] * q[V]
-                + known[i, 3] * q[IMPULSE] + known[i, 4] * q[Y] + known[i, 5] * q[W]
-            )  # fmt: skip
-            if frequency != 0.0:
-                total -= inverse[i, 1] * frequency**2 * q[X]
-            solved[i] = total
-        q[A], q[FORCE], q[W1], q[W2] = solved
-        past[n % kept] = q
-        speed = abs(q[V]) + abs(q[W])
+        _recall(past, n, lags, beyond, late)
+        _solve(q, late, inverse, known, delayed, frequency)
+        past[n % len(past)] = q
         block = n * _BLOCKS // rows
-        largest[block] = max(largest[block], speed)
+        largest[block] = max(largest[block], abs(q[V]) + abs(q[W]))
         if frequency != 0.0 and n >= rows - measured:
             wave = complex(math.cos(angle), -math.sin(angle))
             sums[0] += q[FORCE] * wave
@@ -259,6 +258,31 @@ def _march(inverse, known, delayed, lags, step, rows, measured, frequency):
                 break
         _advance(q, before, step, n == 0)
     return largest, sums
+
+
+@compiled
+def _recall(past, n, lags, beyond, late):
+    """Signals as they were a delay ago, between two steps where it is no whole number of them."""
+    for side in range(2):
+        if lags[side] > 0 and n > lags[side]:
+            row, share = n - lags[side], beyond[side]
+            for j in range(10):
+                newer, older = past[row % len(past), j], past[(row - 1) % len(past), j]
+                late[10 * side + j] = newer + share * (older - newer)
+
+
+@compiled
+def _solve(q, late, inverse, known, delayed, frequency):
+    """Accelerations, the hand's force and the slave's jerk."""
+    for i in range(4):
+        total = 0.0
+        for j in range(20):
+            total += delayed[i, j] * late[j]
+        for j in range(6):
+            total -= known[i, j] * q[_KNOWN[j]]
+        if frequency != 0.0:
+            total -= inverse[i, 1] * frequency**2 * q[X]
+        q[_SOLVED[i]] = total  # none of the known ones
 
 
 @compiled

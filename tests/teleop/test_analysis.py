@@ -17,10 +17,10 @@ from hydrotele.teleop.analysis import (
 )
 from hydrotele.teleop.case import Case
 from hydrotele.teleop.findings import find, findings_document, why_unstable
-from hydrotele.teleop.stability import stable
+from hydrotele.teleop.stability import stable, unstable_held
 from hydrotele.teleop.switching import Spring, worst_growth
 from hydrotele.teleop.two_mass import grows, kicked, step_of, swept
-from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance, characteristic
+from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance, characteristic, transmitted
 from hydrotele.teleop_case import load_teleop_case
 
 CASE = Case(
@@ -169,8 +169,6 @@ def test_different_delays_there_and_back():
     """What is felt depends on both, stability on their sum only."""
     uneven = Case(**{**vars(CASE), "delay_forward": 0.08, "delay_back": 0.0})
     w = 6.0
-    from hydrotele.teleop.two_port import transmitted
-
     expected = transmitted(uneven.port("rate_force"), 1j * w, uneven.task)
     # 3 % are asked for; the delay is rounded to steps
     assert abs(swept(uneven, "rate_force", w) / expected - 1.0) < 0.01
@@ -190,3 +188,22 @@ def test_the_document_of_the_shipped_case_is_complete():
     assert document["confirmed"]["agreement"] == {"rate_force": 1.0}
     assert [s["error"] < 0.03 for s in document["confirmed"]["sweeps"]] == [True, True]
     assert document["stiffness_feedback"]["held"]["margin"] < 0.0
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_tasks_with_mass_and_sides_with_springs(structure):
+    """A task with a mass needs the slave's jerk under rate control with all four channels."""
+    heavy = Case(
+        Impedance(0.8, 0.5, 30.0), Impedance(2.0, 3.0, 40.0), CASE.master_control,
+        CASE.slave_control, CASE.hand, Impedance(0.5, 20.0, 3000.0), Gains(1.0, 0.4, 0.5),
+    )  # fmt: skip
+    w = 9.0
+    for delay in (0.0, 0.0207):  # no whole number of steps
+        case = heavy.with_delay(delay)
+        if unstable_held(case.port(structure), case.task):
+            continue  # nothing settles
+        expected = transmitted(case.port(structure), 1j * w, case.task)
+        # second order in steps of at most 0.5 ms: (w h)^2 is 2e-5; settled to 1e-3
+        assert abs(swept(case, structure, w) / expected - 1.0) < 2e-3
+        kick = kicked(case, structure)
+        assert grows(kick) != stable(case.port(structure), case.hand, case.task)
