@@ -14,7 +14,7 @@ from hydrotele.compiled import compiled
 from hydrotele.errors import InputError
 from hydrotele.joystick import AXES, Joystick
 from hydrotele.teleop.coils import three_stations
-from hydrotele.teleop.compliance import GRAVITY, driving_wrench, turn_matrix
+from hydrotele.teleop.compliance import GRAVITY, holding_wrench, turn_matrix
 from hydrotele.teleop.handle import StiffnessFeedback
 from hydrotele.teleoperation import Coupling, TeleopPilot
 
@@ -38,9 +38,8 @@ class Master(NamedTuple):
             displacement beyond the dead band [1/s], or its place per displacement.
         mass: (1,) of the flotor [kg].
         turning: (3,) its moments about the handle [kg m^2].
-        arm: (3,) its centre of mass from the handle [m].
         below: (3,) its centre of mass from the coils' frame [m].
-        inertia: (3, 3) about the centre of mass [kg m^2].
+        handle: (3,) the handle's point from the coils' frame [m].
         gravity: (3,) [m/s^2].
         to_currents: (6, 6) inverse of the coils' map [A/N], [A/(N m)].
         most: (1,) largest current [A].
@@ -51,9 +50,8 @@ class Master(NamedTuple):
     axis: np.ndarray
     mass: np.ndarray
     turning: np.ndarray
-    arm: np.ndarray
     below: np.ndarray
-    inertia: np.ndarray
+    handle: np.ndarray
     gravity: np.ndarray
     to_currents: np.ndarray
     most: np.ndarray
@@ -119,9 +117,8 @@ def master(
         axis=_axis_table(joystick, pilot, coordinates),
         mass=np.array([f.mass]),
         turning=turning,
-        arm=arm,
         below=com,
-        inertia=inertia,
+        handle=handle,
         gravity=np.array(GRAVITY),
         to_currents=np.linalg.inv(lorentz.wrench_map),
         most=np.array([coils.max_current]),
@@ -312,7 +309,7 @@ def _four_channels(row, mode, x, v, force, sign, packet, c, period, s, i):
 
 @compiled
 def drive_coils(numbers, quaternion, period, s):
-    """Coil currents that put `push` on the handle, weight and couplings taken away; hand's force.
+    """Coil currents that put `push` on the handle, the flotor's weight taken off; hand's force.
 
     Currents beyond the largest make the whole wrench smaller, in its direction.
 
@@ -329,15 +326,9 @@ def drive_coils(numbers, quaternion, period, s):
     """
     turn, wrench = np.empty((3, 3)), np.empty(6)
     turn_matrix(quaternion, turn)
-    wanted, about, rate = np.empty(3), np.empty(3), np.empty(3)
-    for i in range(3):
-        wanted[i] = s.push[i] / numbers.mass[0]
-        about[i] = s.push[3 + i] / numbers.turning[i]
-        rate[i] = s.speed[3 + i]
-    driving_wrench(
-        numbers.mass[0], numbers.arm, numbers.inertia, numbers.below, wanted, about, turn, rate,
-        numbers.gravity, wrench,
-    )  # fmt: skip
+    holding_wrench(
+        numbers.mass[0], numbers.below, numbers.handle, s.push, turn, numbers.gravity, wrench
+    )
     largest = numbers.most[0]
     for i in range(6):
         s.currents[i] = 0.0

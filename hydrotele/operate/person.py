@@ -111,9 +111,11 @@ class Person:
         Args:
             tick: the control tick, a multiple of `every`.
         """
+        if isinstance(self._behaviour, Follow):
+            self.muscles.wanted[:] = self._paths[tick // self.every]
+        if tick == 0:
+            return  # nothing seen yet
         match self._behaviour:
-            case Follow():
-                self.muscles.wanted[:] = self._paths[tick // self.every]
             case Regulate() | Track() as pressing:
                 self._press(tick, pressing.approach)
             case Steer():

@@ -114,3 +114,5 @@ def to_the_machine(
     for i in range(len(columns)):
         reference[columns[i]], rate[columns[i]] = s.joint[i], s.joint_rate[i]
     drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod)
+    for i in range(len(columns)):
+        velocity[columns[i]] = scale * arm[columns[i]] * s.ahead[i]

@@ -17,6 +17,7 @@ from hydrotele.operate.resolved_motion import arm_facts, follow_pose
 from hydrotele.teleoperation import TeleopPilot
 
 _SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
+_AHEAD = 0.02  # s over which the change of a rate is averaged before it is looked ahead
 _BLEND = 30.0  # rad/s, of measured task rates from held angles
 BLOCKED, SILENT, TRIPPED, AGE = range(4)  # of `SlaveState.flags`
 # rows of a command packet
@@ -32,8 +33,8 @@ class Slave(NamedTuple):
         start: (5,) pose at the start: r [m], theta [rad], z [m], attitude [rad], head [rad].
         table: (k, 9) of every coordinate: joystick axis (-1 without), sign, gain, dead band, reach,
             coupling, its damping, hand per machine force, lever of the virtual mass [1] or [m^2].
-        limits: (4,) silence [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
-            mass [kg].
+        limits: (5,) silence [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
+            mass [kg], lead of the drives [s].
         kind: (2,) structure and mode.
     """
 
@@ -53,11 +54,12 @@ class SlaveState(NamedTuple):
         rate: (5,) of it.
         joint: (k,) joint references [rad].
         joint_rate: (k,) [rad/s].
+        ahead: (k,) rates as they will be by the time the valves have moved [rad/s].
         filtered: (2, 5) of commands under position control: place and rate; of the virtual mass.
         measured: (2, 5) pose of the measured joints and its filtered rate.
         command: (3, 6) last packet: handle, its rate, hand's force.
         force_integral: (5,) of the hand's force, for four channels under rate control.
-        ahead: (5,) integral of the rate that the handle asks for, for the same.
+        asked: (5,) integral of the rate that the handle asks for, for the same.
         flags: (4,) whether it is held at the edge, the line silent, the valves closed for good; age
             of the last packet [s].
     """
@@ -66,16 +68,17 @@ class SlaveState(NamedTuple):
     rate: np.ndarray
     joint: np.ndarray
     joint_rate: np.ndarray
+    ahead: np.ndarray
     filtered: np.ndarray
     measured: np.ndarray
     command: np.ndarray
     force_integral: np.ndarray
-    ahead: np.ndarray
+    asked: np.ndarray
     flags: np.ndarray
 
 
 def slave(
-    machine: Machine, pilot: TeleopPilot, numbers: Master, joints: np.ndarray
+    machine: Machine, pilot: TeleopPilot, numbers: Master, joints: np.ndarray, lead: float = 0.0
 ) -> tuple[Slave, SlaveState]:
     """Numbers and first state of the slave's side.
 
@@ -84,6 +87,7 @@ def slave(
         pilot: the scenario's.
         numbers: of the master.
         joints: (k,) where its arm stands, from swing outwards [rad].
+        lead: by which the drives' velocities are asked for earlier [s].
 
     Returns:
         Both.
@@ -104,10 +108,10 @@ def slave(
             )  # fmt: skip
     safety = pilot.safety
     limits = np.array(
-        [safety.silence, safety.following_error, pilot.acceleration, pilot.virtual_mass]
+        [safety.silence, safety.following_error, pilot.acceleration, pilot.virtual_mass, lead]
     )
     state = flat_state(
-        SlaveState, [(5,), (5,), (k,), (k,), (2, 5), (2, 5), (3, 6), (5,), (5,), (4,)]
+        SlaveState, [(5,), (5,), (k,), (k,), (k,), (2, 5), (2, 5), (3, 6), (5,), (5,), (4,)]
     )
     state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
     return Slave(arm, ranges, pose.copy(), table, limits, numbers.kind), state
@@ -193,15 +197,22 @@ def ask(numbers, packet, arrived, force, period, s):
             change = numbers.limits[2] * period
             rate[c] = min(s.rate[c] + change, max(s.rate[c] - change, rate[c]))
         wanted[c] += period * rate[c]
+    before = s.joint_rate.copy()
     held = follow_pose(
         numbers.arm, numbers.ranges, wanted, rate, s.flags[0] > 0.0, s.pose, s.joint, s.joint_rate
     )
+    lead = numbers.limits[4]
+    for i in range(k):
+        share = min(1.0, period / _AHEAD)
+        change = (s.joint_rate[i] - before[i]) / period
+        late = s.ahead[i] - before[i]
+        s.ahead[i] = s.joint_rate[i] + late + share * (lead * change - late)
     s.flags[0] = 1.0 if held else 0.0
     for c in range(5):
         s.rate[c] = 0.0 if held else rate[c]
         if held:
             s.filtered[0, c], s.filtered[1, c] = s.pose[c] - numbers.start[c], 0.0
-            s.ahead[c], s.force_integral[c] = s.filtered[0, c], 0.0
+            s.asked[c], s.force_integral[c] = s.filtered[0, c], 0.0
 
 
 @compiled
@@ -228,8 +239,8 @@ def _virtual_rate(numbers, row, c, x, v, hand, force, period, s):
     ahead, ahead_speed, push = x, v, hand
     if numbers.kind[1] == 0:
         s.force_integral[c] += period * gain * hand
-        s.ahead[c] += period * gain * x
-        ahead, ahead_speed, push = s.ahead[c], gain * x, s.force_integral[c]
+        s.asked[c] += period * gain * x
+        ahead, ahead_speed, push = s.asked[c], gain * x, s.force_integral[c]
     push += row[7] * force + spring * (ahead - place) + damper * (ahead_speed - speed)
     speed += period * push / mass
     s.filtered[0, c], s.filtered[1, c] = scale * (place + period * speed), scale * speed

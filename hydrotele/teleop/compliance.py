@@ -150,6 +150,40 @@ def driving_wrench(mass, arm, inertia, below, wanted, about, turn, rate, gravity
     out[5] += w0 * m1 - w1 * m0 + below[0] * out[1] - below[1] * out[0]
 
 
+@compiled
+def holding_wrench(mass, below, handle, push, turn, gravity, out):
+    """Wrench of the coils that acts as a force at the handle and carries the flotor's weight.
+
+    For a hand on the handle: a spring made so turns nothing that the hand pushes straight, while
+    one that moves the flotor as if it were free (`driving_wrench`) acts through the centre of mass.
+
+    Args:
+        mass: of the flotor, scalar [kg].
+        below: (3,) centre of mass from the coils' frame, flotor axes [m].
+        handle: (3,) handle's point from the coils' frame, flotor axes [m].
+        push: (6,) force at the handle, world axes [N], and torque, flotor axes [N m].
+        turn: (3, 3) flotor to world.
+        gravity: (3,) world axes [m/s^2].
+        out: (6,) written: force [N] and torque about the coils' frame [N m], flotor axes.
+
+    Returns:
+        Nothing.
+
+    Source: statics; Zhu 1994, 5.1.3 (forces moved to the coils' frame).
+    """
+    lift, own = np.empty(3), np.empty(3)
+    for i in range(3):
+        lift[i], own[i] = 0.0, 0.0
+        for j in range(3):
+            lift[i] -= mass * turn[j, i] * gravity[j]
+            own[i] += turn[j, i] * push[j]
+        out[i] = lift[i] + own[i]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[3 + i] = push[3 + i] + below[j] * lift[k] - below[k] * lift[j]
+        out[3 + i] += handle[j] * own[k] - handle[k] * own[j]
+
+
 def compliance_wrench(
     flotor: Flotor, axes: Axes, centre: np.ndarray, motion: Motion, target: np.ndarray,
     turned: np.ndarray, gravity: Sequence[float] = GRAVITY,
