@@ -154,14 +154,16 @@ Pilot = Annotated[
 class Servo(Facts):
     """Joint servo.
 
-    position_gain [1/s], velocity_gain (force drives only) [N s/m] or [N m s/rad], feedforward and
-    deadband_compensation as fractions, lead [s] that makes up for the spool's lag,
-    pressure_feedback [1/s] (damping) with load_time [s] of the slow mean force. With `force_model`
-    the force that is expected follows from inverse dynamics along the reference instead of that
-    mean: of the scenario's own machine (`nominal`), or of another (its name or folder).
+    position_gain [1/s], axis_gains for axes that need another one (a slewing house), velocity_gain
+    (force drives only) [N s/m] or [N m s/rad], feedforward and deadband_compensation as fractions,
+    lead [s] that makes up for the spool's lag, pressure_feedback [1/s] (damping) with load_time [s]
+    of the slow mean force. With `force_model` the force that is expected follows from inverse
+    dynamics along the reference instead of that mean: of the scenario's own machine (`nominal`), or
+    of another (its name or folder).
     """
 
     position_gain: NonNegative = 4.0
+    axis_gains: dict[Name, NonNegative] = {}
     velocity_gain: NonNegative = 0.0
     feedforward: Annotated[float, Field(ge=0, le=1.5)] = 1.0
     lead: Annotated[float, Field(ge=0, le=0.3)] = 0.05

@@ -27,6 +27,7 @@ from hydrotele.operate.slave import BLOCKED, SILENT, TRIPPED, slave
 from hydrotele.operate.task_impedance import TaskImpedance
 from hydrotele.operate.tip_over import push_back
 from hydrotele.scenario import Scenario
+from hydrotele.sensors import SensorSet
 from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.joystick import Flotor
 from hydrotele.simulate.plant import Plant
@@ -73,7 +74,7 @@ class Station:
         self.coordinates = COORDINATES[: len(axes)]
         self._master, self._m = master(joystick, pilot, self.coordinates)
         start = plan.reference[0, self.columns]
-        self._slave, self._s = slave(machine, pilot, self._master, start)
+        self._slave, self._s = slave(machine, pilot, self._master, start, scenario.servo.lead)
         self._line = _line(pilot, scenario, len(axes))
         self._flotor = Flotor(joystick, period=self._period)
         self._qpos = self._flotor.data.qpos
@@ -81,7 +82,7 @@ class Station:
         self._swing = int(plant.dof[self.columns[0]]) if pilot.mount == "cab" else -1
         self._grid, self._table = drive_tables(machine, plan.axes)
         self._sensors = sensor_set(machine, scenario.sensors)
-        self._feel = _estimator(machine, plan.axes, pilot, seen, self._period)
+        self._feel = _estimator(machine, plan.axes, pilot, seen, self._period, self._sensors)
         self._around = surrounding_bodies(plant)
         self._task = TaskImpedance(len(axes)) if pilot.reflection == "impedance" else None
         self._force = np.zeros(len(axes))
@@ -236,12 +237,20 @@ class _Fault:
 
 
 def _estimator(
-    machine: Machine, axes: tuple[str, ...], pilot: TeleopPilot, seen: Feedback, period: float
+    machine: Machine,
+    axes: tuple[str, ...],
+    pilot: TeleopPilot,
+    seen: Feedback,
+    period: float,
+    sensors: SensorSet | None,
 ) -> EndpointForce | None:
     """What tells the force at the tip; none where the simulator's own is asked for."""
     if pilot.force == "true":
         return None
-    return EndpointForce(machine, axes, pilot.force, period * seen.every)
+    return EndpointForce(
+        machine, axes, pilot.force, period * seen.every, sensors=sensors,
+        bandwidth=pilot.bandwidth, fast=2.0 * pilot.bandwidth,
+    )  # fmt: skip
 
 
 def _beside(scenario: Scenario, name: str) -> str:

@@ -197,7 +197,8 @@ class TeleopPilot(Facts):
     forces: hand per machine force [N/N]; `coupling` [N/m] is the spring between handle and slave of
     coordinating force and four channels, with `coupling_damping` [N s/m]; `virtual_mass` [kg] is
     the slave's of four channels. `force` chooses where the contact force comes from: the pressures
-    with the static or the dynamic model, or the simulator's own (`true`).
+    with the static or the dynamic model, through a filter of a `bandwidth` [Hz], or the simulator's
+    own (`true`).
     """
 
     kind: Literal["teleop"]
@@ -213,6 +214,7 @@ class TeleopPilot(Facts):
     coupling_damping: NonNegative = 40.0
     virtual_mass: Positive = 2.0
     force: Literal["static", "dynamic", "true"] = "dynamic"
+    bandwidth: Annotated[float, Field(gt=0, le=5)] = 1.5
     acceleration: Positive = 1.0
     coordinates: dict[Coordinate, Coupling] = {}
     stiffness: dict[JoystickAxis, dict[str, float]] = {}

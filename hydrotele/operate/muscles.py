@@ -15,6 +15,8 @@ class Muscles(NamedTuple):
     Attributes:
         wanted: (6,) displacement of the handle [m], [rad].
         spring: (6,) what the joystick is expected to push back with [N/m], [N m/rad].
+        notch: (3, 6) of its detents: edge [m], [rad], drop [N], [N m], slope outside [N/m], < 0
+            without a detent.
         correction: (6,) what was learnt to be missing [N], [N m].
         force: (6,) on the handle [N], [N m].
         arm: (6,) stiffness of arm and hand [N/m], [N m/rad].
@@ -27,6 +29,7 @@ class Muscles(NamedTuple):
 
     wanted: np.ndarray
     spring: np.ndarray
+    notch: np.ndarray
     correction: np.ndarray
     force: np.ndarray
     arm: np.ndarray
@@ -57,10 +60,17 @@ def pull(muscles, handle, tick, period):
     for i in range(6):
         muscles.past[tick % rows, i] = handle[i]
         late = muscles.past[(tick + 1) % rows, i]
-        firm, most = muscles.arm[i] + muscles.spring[i], muscles.most[i]
+        wanted, spring, most = muscles.wanted[i], muscles.spring[i], muscles.most[i]
+        firm = muscles.arm[i] + spring
+        known = firm * wanted
+        beyond = abs(wanted) - muscles.notch[0, i]
+        if muscles.notch[2, i] >= 0.0 and beyond > 0.0:
+            firm = muscles.arm[i] + muscles.notch[2, i]
+            back = spring * muscles.notch[0, i] - muscles.notch[1, i] + muscles.notch[2, i] * beyond
+            known = muscles.arm[i] * wanted + (back if wanted > 0.0 else -back)
         fine = _FINE if i < 3 else _FINE_TURN
-        gap = min(fine, max(-fine, muscles.wanted[i] - late))
+        gap = min(fine, max(-fine, wanted - late))
         more = muscles.gain[0] * period * firm * gap
         muscles.correction[i] = min(most, max(-most, muscles.correction[i] + more))
-        force = firm * muscles.wanted[i] + muscles.correction[i] + muscles.tremor[noise, i]
+        force = known + muscles.correction[i] + muscles.tremor[noise, i]
         muscles.force[i] = min(most, max(-most, force)) + muscles.weight[i]

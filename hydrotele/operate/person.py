@@ -14,9 +14,11 @@ from hydrotele.joystick import AXES, Joystick
 from hydrotele.operate.master import (
     COORDINATE,
     DEADBAND,
+    DROP,
     GAIN,
     LEAST,
     NOMINAL,
+    OUTSIDE,
     RATIO,
     REACH,
     SIGN,
@@ -256,6 +258,7 @@ def _muscles(
     return Muscles(
         wanted=np.zeros(6),
         spring=np.zeros(6) if free else numbers.axis[:, NOMINAL].copy(),
+        notch=numbers.axis[:, [DEADBAND, DROP, OUTSIDE]].T.copy(),
         correction=np.zeros(6),
         force=np.zeros(6),
         arm=np.array([hand.stiffness] * 3 + [hand.rotation_stiffness] * 3),

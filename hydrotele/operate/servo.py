@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.compiled import compiled
+from hydrotele.datafile import suggest
+from hydrotele.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.machine import Machine
 from hydrotele.operate.plan import Plan
@@ -38,12 +40,19 @@ def servo_numbers(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: flo
         (k, 14): hydraulic, area_head, area_rod, flow gain [m^3/(s sqrt(Pa))], dead band, tank [Pa],
         command limit, drive gain, position gain [1/s], velocity gain, dead-band compensation,
         load filter coefficient, bulk modulus [Pa], pressure feedback [1/s].
+
+    Raises:
+        InputError: a gain is given for an axis that there is not.
     """
     rows = []
+    if strange := set(servo.axis_gains) - set(axes):
+        message = f"{sorted(strange)[0]!r} is no axis of the machine; {suggest('', axes)}"
+        raise InputError("servo.axis_gains", message)
     for name in axes:
         axis = machine.axes[name]
         filtered = 1.0 - math.exp(-dt / servo.load_time)
-        gains = [servo.position_gain, servo.velocity_gain, servo.deadband_compensation, filtered]
+        position_gain = servo.axis_gains.get(name, servo.position_gain)
+        gains = [position_gain, servo.velocity_gain, servo.deadband_compensation, filtered]
         gains += [machine.supply.bulk_modulus if machine.supply else 0.0, servo.pressure_feedback]
         if axis.valve and machine.supply:
             head, rod = axis.hydraulic_drive.areas

@@ -14,6 +14,7 @@ from hydrotele.simulate.closure import pin_count
 from hydrotele.simulate.drive_side import drive_and_load_dofs
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import drive_motion, state_flows
+from hydrotele.simulate.record import align_positions
 
 _LOOK_EVERY = 10  # steps, to see whether the machine touches something: a hit lasts longer
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -49,7 +50,7 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
     at = np.cumsum([1, model.nq, model.nv, model.na])
     qpos, qvel, act = states[:, 1 : at[1]], states[:, at[1] : at[2]], states[:, at[2] : at[3]]
     dt = model.opt.timestep
-    qpos = qpos[1:] - dt * qvel[1:]  # states at equal times, see record.py
+    qpos = align_positions(model, qpos[1:], qvel[1:])  # states at equal times, see record.py
     qvel, act = 0.5 * (qvel[1:] + qvel[:-1]), act[1:]
     work, flow = _hydraulic_balance(plant, qpos, qvel, act, dt)
     return {

@@ -69,11 +69,16 @@ def aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
     A felled tree's ball joint and what comes after it stay as they are.
     """
+    return align_positions(model, data.qpos, data.qvel)
+
+
+def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """Staggered positions (..., nq) a step back along velocities (..., nv); see `Record`."""
     if model.nq == model.nv:
-        return data.qpos - model.opt.timestep * data.qvel
+        return qpos - model.opt.timestep * qvel
     plain = int(np.argmax(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL))
-    positions = data.qpos.copy()
-    positions[:plain] -= model.opt.timestep * data.qvel[:plain]
+    positions = qpos.copy()
+    positions[..., :plain] -= model.opt.timestep * qvel[..., :plain]
     return positions
 
 

@@ -155,6 +155,7 @@ class _Standing:
         self._spin = model.joint(machine.axes[tree.saw].joint).dofadr[0]
         self._close = model.joint(machine.axes[tree.grab].joint).qposadr[0]
         self._body, self._weld = model.body(name).id, model.equality(f"{name}_held").id
+        self._stem = model.geom(name).id
         disc = [g for g in range(model.ngeom) if model.geom_bodyid[g] == self._saw
                 and model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CYLINDER]  # fmt: skip
         solid = [g for g in disc if model.geom_contype[g]] or disc
@@ -174,6 +175,7 @@ class _Standing:
         self._model.jnt_stiffness[self._joints] = self._stiffness
         self._model.dof_damping[self._dofs] = self._damping
         self._touch(True)
+        self._model.geom_contype[self._stem] = self._model.geom_conaffinity[self._stem] = 3
 
     def _touch(self, on: bool) -> None:
         model = self._model
@@ -256,4 +258,6 @@ class _Standing:
         row[6:10] = relative
         row[10] = 1.0
         data.eq_active[self._weld] = 1
+        self._model.geom_contype[self._stem] = 2  # the ground only: head and stem are one
+        self._model.geom_conaffinity[self._stem] = 1
         self.held = True
