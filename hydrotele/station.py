@@ -17,11 +17,12 @@ from hydrotele.machine import Machine
 from hydrotele.noise import sensor_set
 from hydrotele.operate.drive_rows import drive_tables
 from hydrotele.operate.endpoint_force import EndpointForce
+from hydrotele.operate.flat import flat_view
 from hydrotele.operate.master import TASK_DAMPING, TASK_STIFFNESS, master
 from hydrotele.operate.person import Person
 from hydrotele.operate.plan import Plan
 from hydrotele.operate.resolved_motion import COORDINATES, arm_facts
-from hydrotele.operate.round_trip import Line, to_the_hand, to_the_machine
+from hydrotele.operate.round_trip import to_the_hand, to_the_machine
 from hydrotele.operate.servo import DriveReferences
 from hydrotele.operate.slave import BLOCKED, SILENT, TRIPPED, slave
 from hydrotele.operate.task_impedance import TaskImpedance
@@ -75,7 +76,7 @@ class Station:
         self._master, self._m = master(joystick, pilot, self.coordinates)
         start = plan.reference[0, self.columns]
         self._slave, self._s = slave(machine, pilot, self._master, start, scenario.servo.lead)
-        self._line = _line(pilot, scenario, len(axes))
+        self._line = _Line(pilot, scenario, len(axes))
         self._flotor = Flotor(joystick, period=self._period)
         self._qpos = self._flotor.data.qpos
         self._mount = np.array(joystick.mount)
@@ -91,6 +92,9 @@ class Station:
         self.person = Person(
             pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed
         )
+        self._master_flat, self._m_flat = flat_view(self._master), flat_view(self._m)
+        self._slave_flat, self._s_flat = flat_view(self._slave), flat_view(self._s)
+        self._hand_flat = flat_view(self.person.muscles)
         self.notes: list[str] = []
         self._said: set[str] = set()
         self.tripped = False
@@ -110,7 +114,6 @@ class Station:
         for fault in self._faults:
             fault.freeze(tick * self._period, seen)
         fresh = tick % seen.every == 0
-        joint = seen.joint[self.columns]
         self._felt(data, seen, fresh)
         if self._pilot.tip_over:
             push_back(
@@ -119,15 +122,17 @@ class Station:
             )  # fmt: skip
         if tick % self.person.every == 0:
             self.person.decide(tick)
-        hand = self.person.muscles
+        person, line = self.person, self._line
         to_the_hand(
-            tick, fresh, self._elapsed, self.tripped, joint, self._force, self._slave, self._s,
-            self._line, self._master, self._m, self._qpos, hand,
+            tick, fresh, self._elapsed, self.tripped, seen.joint, self._force, self.columns,
+            self._slave_flat, self._s_flat, line.back, line.packet, line.lost, line.state,
+            self._master_flat, self._m_flat, self._qpos, self._hand_flat, person.past,
+            person.tremor, line.forward,
         )  # fmt: skip
         self._elapsed = seen.period
         self._move_flotor(data)
-        self.log.take(tick, self._force, hand.force, data.ncon > 0)
-        self._ask(tick, joint)
+        self.log.take(tick, self._force, person.muscles.force, data.ncon > 0)
+        self._ask(tick, seen)
         self._check(tick, seen)
         return self.tripped
 
@@ -152,14 +157,14 @@ class Station:
         w, a = float(data.qvel[self._swing]), float(data.qacc[self._swing])
         self._flotor.shaken_step(currents, muscles, self._mount, w, a)
 
-    def _ask(self, tick: int, joint: np.ndarray) -> None:
+    def _ask(self, tick: int, seen: Feedback) -> None:
         """Turn the packet that arrives into references."""
-        plan, drives = self._plan, self._drives
+        plan, drives, line = self._plan, self._drives, self._line
         to_the_machine(
-            tick, joint, self._force, self.columns, self._slave, self._s, self._line, self._grid,
-            self._table, self._scale, plan.reference[tick], plan.rate[tick],
-            drives.velocity[tick], drives.arm[tick], drives.volume_head[tick],
-            drives.volume_rod[tick],
+            tick, seen.joint, self._force, self.columns, self._slave_flat, self._s_flat,
+            line.forward, line.lost, line.state, self._grid, self._table, self._scale,
+            plan.reference[tick], plan.rate[tick], drives.velocity[tick], drives.arm[tick],
+            drives.volume_head[tick], drives.volume_rod[tick],
         )  # fmt: skip
         if plan.pose is not None:
             plan.pose[tick] = self._s.pose[: plan.pose.shape[1]]
@@ -259,16 +264,15 @@ def _beside(scenario: Scenario, name: str) -> str:
     return str(path) if name != "joystick" and path.is_file() else name
 
 
-def _line(pilot: TeleopPilot, scenario: Scenario, k: int) -> Line:
+class _Line:
     """Delay lines, and the packets that will be lost."""
-    channel, period = pilot.channel, 1.0 / scenario.control_rate
-    lost = np.random.default_rng([scenario.seed, 404]).random((scenario.ticks, 2)) < channel.lost
-    lost[: round(channel.lost_from / period)] = False
-    return Line(
-        forward=np.zeros((1 + round(channel.delay_forward / period), 3, 6)),
-        back=np.zeros((1 + round(channel.delay_back / period), 7, k)),
-        packet=np.zeros((7, k)),
-        lost=lost,
-        state=np.array([0.0, 1.0]),
-        times=np.array([period, pilot.safety.silence, _FADE]),
-    )
+
+    def __init__(self, pilot: TeleopPilot, scenario: Scenario, k: int) -> None:
+        channel, period = pilot.channel, 1.0 / scenario.control_rate
+        rng = np.random.default_rng([scenario.seed, 404])
+        self.lost = rng.random((scenario.ticks, 2)) < channel.lost
+        self.lost[: round(channel.lost_from / period)] = False
+        self.forward = np.zeros((1 + round(channel.delay_forward / period), 3, 6))
+        self.back = np.zeros((1 + round(channel.delay_back / period), 7, k))
+        self.packet = np.zeros((7, k))
+        self.state = np.array([0.0, 1.0, period, pilot.safety.silence, _FADE])

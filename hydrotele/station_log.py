@@ -3,7 +3,8 @@
 import numpy as np
 
 from hydrotele.joystick import AXES
-from hydrotele.operate.master import MasterState, flat_view
+from hydrotele.operate.flat import flat_view
+from hydrotele.operate.master import MasterState
 from hydrotele.operate.slave import SlaveState
 
 _LENGTHS = ("m", "m", "m", "rad", "rad", "rad")

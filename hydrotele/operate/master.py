@@ -13,6 +13,7 @@ import numpy as np
 from hydrotele.compiled import compiled
 from hydrotele.errors import InputError
 from hydrotele.joystick import AXES, Joystick
+from hydrotele.operate.flat import flat_state, flattened
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.compliance import GRAVITY, holding_wrench, turn_matrix
 from hydrotele.teleop.handle import StiffnessFeedback
@@ -127,33 +128,43 @@ def master(
     )
     state = flat_state(MasterState, [(6,)] * 10 + [(1,), (2,)])
     state.limited[:] = 1.0
-    return numbers, state
+    return flattened(numbers), state
 
 
-def flat_state(kind, shapes):
-    """A state whose arrays lie one after the other in memory, so that it can be kept in one go.
+@compiled
+def unpack_master(flat):
+    """The parts of `flat_view(Master)`.
 
     Args:
-        kind: a NamedTuple type of arrays.
-        shapes: theirs, in order.
+        flat: (160,) array.
 
     Returns:
-        The state, all zero; `flat_view` shows it as one array.
+        Master, views of it.
+
+    Source: order and shapes of Master.
     """
-    sizes = [int(np.prod(shape)) for shape in shapes]
-    whole = np.zeros(sum(sizes))
-    ends = np.cumsum(sizes)
-    parts = [
-        whole[end - size : end].reshape(shape)
-        for end, size, shape in zip(ends, sizes, shapes, strict=True)
-    ]
-    return kind(*parts)
+    return Master(
+        flat[0:102].reshape(6, 17), flat[102:103], flat[103:106], flat[106:109], flat[109:112],
+        flat[112:115], flat[115:151].reshape(6, 6), flat[151:152], flat[152:158], flat[158:160],
+    )  # fmt: skip
 
 
-def flat_view(state) -> np.ndarray:
-    """The memory of a `flat_state` as one array."""
-    base = state[0].base
-    return base if base.ndim == 1 else base.base
+@compiled
+def unpack_master_state(flat):
+    """The parts of `flat_view(MasterState)`.
+
+    Args:
+        flat: (63,) array.
+
+    Returns:
+        MasterState, views of it.
+
+    Source: order and shapes of MasterState.
+    """
+    return MasterState(
+        flat[0:6], flat[6:12], flat[12:18], flat[18:24], flat[24:30], flat[30:36], flat[36:42],
+        flat[42:48], flat[48:54], flat[54:60], flat[60:61], flat[61:63],
+    )  # fmt: skip
 
 
 def _axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates) -> np.ndarray:

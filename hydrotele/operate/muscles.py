@@ -23,8 +23,6 @@ class Muscles(NamedTuple):
         most: (6,) largest force [N], [N m].
         weight: (6,) of the hand, which they carry [N], [N m].
         gain: (1,) of the correction [1/s].
-        past: (reflex + 1, 6) displacements of the last periods.
-        tremor: (n, 6) of the run [N], [N m].
     """
 
     wanted: np.ndarray
@@ -36,16 +34,34 @@ class Muscles(NamedTuple):
     most: np.ndarray
     weight: np.ndarray
     gain: np.ndarray
-    past: np.ndarray
-    tremor: np.ndarray
 
 
 @compiled
-def pull(muscles, handle, tick, period):
+def unpack_muscles(flat):
+    """The parts of `flat_view(Muscles)`.
+
+    Args:
+        flat: (61,) array.
+
+    Returns:
+        Muscles, views of it.
+
+    Source: order and shapes of Muscles.
+    """
+    return Muscles(
+        flat[0:6], flat[6:12], flat[12:30].reshape(3, 6), flat[30:36], flat[36:42], flat[42:48],
+        flat[48:54], flat[54:60], flat[60:61],
+    )  # fmt: skip
+
+
+@compiled
+def pull(muscles, past, tremor, handle, tick, period):
     """Forces of one period: the arm's rest moves with what is wanted, the rest is corrected late.
 
     Args:
-        muscles: Muscles; `correction`, `force` and `past` are written.
+        muscles: Muscles; `correction` and `force` are written.
+        past: (reflex + 1, 6) displacements of the last periods, written [m], [rad].
+        tremor: (n, 6) of the run [N], [N m].
         handle: (6,) displacement of now [m], [rad].
         tick: number of the period, scalar.
         period: scalar [s].
@@ -55,11 +71,11 @@ def pull(muscles, handle, tick, period):
 
     Source: equilibrium-point control with a late integral; Feldman 1986.
     """
-    rows = len(muscles.past)
-    noise = tick % len(muscles.tremor)
+    rows = len(past)
+    noise = tick % len(tremor)
     for i in range(6):
-        muscles.past[tick % rows, i] = handle[i]
-        late = muscles.past[(tick + 1) % rows, i]
+        past[tick % rows, i] = handle[i]
+        late = past[(tick + 1) % rows, i]
         wanted, spring, most = muscles.wanted[i], muscles.spring[i], muscles.most[i]
         firm = muscles.arm[i] + spring
         known = firm * wanted
@@ -72,5 +88,5 @@ def pull(muscles, handle, tick, period):
         gap = min(fine, max(-fine, wanted - late))
         more = muscles.gain[0] * period * firm * gap
         muscles.correction[i] = min(most, max(-most, muscles.correction[i] + more))
-        force = known + muscles.correction[i] + muscles.tremor[noise, i]
+        force = known + muscles.correction[i] + tremor[noise, i]
         muscles.force[i] = min(most, max(-most, force)) + muscles.weight[i]

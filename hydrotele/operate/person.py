@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from hydrotele.joystick import AXES, Joystick
+from hydrotele.operate.flat import flattened
 from hydrotele.operate.master import (
     COORDINATE,
     DEADBAND,
@@ -38,7 +39,7 @@ _LEAST_WAY = 3e-4  # m: a stiffness cannot be felt from a smaller displacement
 _LEANING = 0.3  # s in which a hand builds up a force
 _TREMOR_BAND = 2.0 * math.pi * 8.0  # rad/s of a physiological tremor
 _SLOW = 2.0 * math.pi * 0.5  # rad/s of drifting judgement
-_LEVER = 0.1  # m: forces of the hand into torques
+_LEVERS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m: forces of the hand into torques
 _ROUND = 2**14  # periods of tremor before it comes again
 
 
@@ -61,6 +62,8 @@ class Person:
 
     Attributes:
         muscles: what he wants, and his arm.
+        tremor: (n, 6) of his forces [N], [N m].
+        past: (reflex + 1, 6) where the handle has just been [m], [rad].
         every: control ticks per decision.
         believed: (decisions,) contact force that he believes to have [N]; NaN where he does not
             care.
@@ -86,7 +89,10 @@ class Person:
         self.every = max(1, round(1.0 / (DECISIONS * period)))
         self._step = self.every * period
         p, rng = pilot.perception, np.random.default_rng([seed, 1994])
-        self.muscles = _muscles(pilot, joystick, numbers, period, rng)
+        self.muscles = _muscles(pilot, joystick, numbers)
+        white = rng.standard_normal((_ROUND, 6)) * _LEVERS
+        self.tremor = p.tremor * _coloured(white, _TREMOR_BAND, period)
+        self.past = np.zeros((1 + max(1, round(_REFLEX / period)), 6))
         count = ticks // self.every + 1
         self._judgement = p.force_noise * _coloured(rng.standard_normal(count), _SLOW, self._step)
         sight = _coloured(rng.standard_normal(count), 4.0 * _SLOW, self._step)
@@ -247,27 +253,22 @@ def _axis_of(numbers: Master, coordinate: int) -> int:
     return int(np.flatnonzero(numbers.axis[:, COORDINATE] == coordinate)[0])
 
 
-def _muscles(
-    pilot: TeleopPilot, joystick: Joystick, numbers: Master, period: float, rng
-) -> Muscles:
+def _muscles(pilot: TeleopPilot, joystick: Joystick, numbers: Master) -> Muscles:
     """His arm at rest."""
     hand, p = joystick.hand, pilot.perception
-    levers = np.array([1.0] * 3 + [_LEVER] * 3)
-    white = rng.standard_normal((_ROUND, 6)) * levers
     free = pilot.mode == "position" and pilot.reflection not in ("none", "stiffness", "impedance")
-    return Muscles(
+    at_rest = Muscles(
         wanted=np.zeros(6),
         spring=np.zeros(6) if free else numbers.axis[:, NOMINAL].copy(),
         notch=numbers.axis[:, [DEADBAND, DROP, OUTSIDE]].T.copy(),
         correction=np.zeros(6),
         force=np.zeros(6),
         arm=np.array([hand.stiffness] * 3 + [hand.rotation_stiffness] * 3),
-        most=p.largest_force * levers,
+        most=p.largest_force * _LEVERS,
         weight=np.array([0.0, 0.0, 9.81 * hand.mass, 0.0, 0.0, 0.0]),
         gain=np.array([p.muscle]),
-        past=np.zeros((1 + max(1, round(_REFLEX / period)), 6)),
-        tremor=p.tremor * _coloured(white, _TREMOR_BAND, period),
     )
+    return flattened(at_rest)
 
 
 def _coloured(white: np.ndarray, band: float, period: float) -> np.ndarray:

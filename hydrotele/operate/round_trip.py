@@ -3,41 +3,28 @@
 Delay lines are rings: what is written at a tick is read as many ticks later as the ring is long.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from hydrotele.compiled import compiled
 from hydrotele.operate.drive_rows import drive_row
-from hydrotele.operate.master import master_step
-from hydrotele.operate.muscles import pull
-from hydrotele.operate.slave import measure_task, report, slave_step
+from hydrotele.operate.master import master_step, unpack_master, unpack_master_state
+from hydrotele.operate.muscles import pull, unpack_muscles
+from hydrotele.operate.slave import (
+    measure_task,
+    report,
+    slave_step,
+    unpack_slave,
+    unpack_slave_state,
+)
 
-QUIET, SHARE = range(2)
-
-
-class Line(NamedTuple):
-    """The line between the two sides.
-
-    Attributes:
-        forward: (n, 3, 6) packets of the master on their way.
-        back: (n, 7, k) packets of the machine on their way.
-        packet: (7, k) the last one that the master got.
-        lost: (ticks, 2) whether the packet that arrives then is lost: forward, back.
-        state: (2,) since when none came back [s]; share of the reflected force that counts.
-        times: (3,) of the control period, of silence that is borne, of fading [s].
-    """
-
-    forward: np.ndarray
-    back: np.ndarray
-    packet: np.ndarray
-    lost: np.ndarray
-    state: np.ndarray
-    times: np.ndarray
+QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
 
 
 @compiled
-def to_the_hand(tick, fresh, elapsed, tripped, joint, force, slave, s, line, master, m, qpos, hand):
+def to_the_hand(
+    tick, fresh, elapsed, tripped, joint, force, columns, slave_flat, state_flat, back, packet,
+    lost, line, master_flat, master_state, qpos, hand_flat, past, tremor, forward,
+):  # fmt: skip
     """Report the machine to the master, reflect, pull: ends in coil currents and muscle forces.
 
     Args:
@@ -45,53 +32,68 @@ def to_the_hand(tick, fresh, elapsed, tripped, joint, force, slave, s, line, mas
         fresh: whether the sensors have a new sample, scalar.
         elapsed: since the last one, scalar [s].
         tripped: whether the machine has been stopped for good, scalar.
-        joint: (k,) measured [rad].
+        joint: (nu,) measured [rad] or [m].
         force: (k,) at the tip, task coordinates [N], [N m].
-        slave: Slave.
-        s: SlaveState, written.
-        line: Line, written.
-        master: Master.
-        m: MasterState, written.
+        columns: (k,) places of the arm's joints among the axes.
+        slave_flat: (21 + 11 k,) Slave.
+        state_flat: (62 + 3 k,) SlaveState, written.
+        back: (n, 7, k) packets of the machine on their way, written.
+        packet: (7, k) the last one that the master got, written.
+        lost: (ticks, 2) whether the packet that arrives then is lost: forward, back.
+        line: (5,) QUIET, SHARE, written, PERIOD, SILENCE, FADING [s].
+        master_flat: (160,) Master.
+        master_state: (63,) MasterState, written.
         qpos: (7,) of the flotor: position [m] and quaternion.
-        hand: Muscles, written.
+        hand_flat: (61,) Muscles, written.
+        past: (reflex + 1, 6) see `pull`.
+        tremor: (n, 6) see `pull`.
+        forward: (n, 3, 6) packets of the master on their way, written.
 
     Returns:
         Nothing.
 
     Source: `operate.master`, `operate.slave`, `operate.muscles`.
     """
-    period = line.times[0]
-    measure_task(slave, joint, fresh, elapsed, s)
-    rows = len(line.back)
-    report(slave, force, s, line.back[tick % rows])
-    if line.lost[tick % len(line.lost), 1]:
-        line.state[0] += period
+    k = len(columns)
+    slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
+    m, hand = unpack_master_state(master_state), unpack_muscles(hand_flat)
+    period, rows = line[2], len(back)
+    arm = np.empty(k)
+    for i in range(k):
+        arm[i] = joint[columns[i]]
+    measure_task(slave, arm, fresh, elapsed, s)
+    report(slave, force, s, back[tick % rows])
+    if lost[tick % len(lost), 1]:
+        line[0] += period
     else:
-        line.state[0] = 0.0
-        line.packet[:] = line.back[(tick + 1) % rows]
-    goal = 0.0 if tripped or line.state[0] > line.times[1] else 1.0
-    line.state[1] += (goal - line.state[1]) * min(1.0, period / line.times[2])
-    master_step(master, qpos, line.packet, line.state[1], period if tick else 0.0, m)
-    pull(hand, m.handle, tick, period)
-    ahead = line.forward[tick % len(line.forward)]
-    ahead[0], ahead[1], ahead[2] = m.handle, m.speed, m.hand
+        line[0] = 0.0
+        packet[:] = back[(tick + 1) % rows]
+    goal = 0.0 if tripped or line[0] > line[3] else 1.0
+    line[1] += (goal - line[1]) * min(1.0, period / line[4])
+    master_step(unpack_master(master_flat), qpos, packet, line[1], period if tick else 0.0, m)
+    pull(hand, past, tremor, m.handle, tick, period)
+    ahead = forward[tick % len(forward)]
+    for i in range(6):
+        ahead[0, i], ahead[1, i], ahead[2, i] = m.handle[i], m.speed[i], m.hand[i]
 
 
 @compiled
 def to_the_machine(
-    tick, joint, force, columns, slave, s, line, grid, table, scale, reference, rate, velocity, arm,
-    volume_head, volume_rod,
+    tick, joint, force, columns, slave_flat, state_flat, forward, lost, line, grid, table, scale,
+    reference, rate, velocity, arm, volume_head, volume_rod,
 ):  # fmt: skip
     """Take the packet that arrives, and write the references of joints and drives.
 
     Args:
         tick: scalar.
-        joint: (k,) measured [rad].
+        joint: (nu,) measured [rad] or [m].
         force: (k,) at the tip, task coordinates [N], [N m].
         columns: (k,) places of the arm's joints among the axes.
-        slave: Slave.
-        s: SlaveState, written.
-        line: Line.
+        slave_flat: (21 + 11 k,) Slave.
+        state_flat: (62 + 3 k,) SlaveState, written.
+        forward: (n, 3, 6) packets of the master on their way.
+        lost: (ticks, 2) whether the packet that arrives then is lost: forward, back.
+        line: (5,) see `to_the_hand`.
         grid: (nu, 2) of `drive_tables`.
         table: (nu, POINTS, 3) of `drive_tables`.
         scale: of drive velocities, scalar.
@@ -107,12 +109,15 @@ def to_the_machine(
 
     Source: `operate.slave`, `operate.drive_rows`.
     """
-    rows = len(line.forward)
-    coming = tick >= rows - 1 and line.lost[tick % len(line.lost), 0]
-    packet = line.forward[(tick + 1) % rows]
-    slave_step(slave, packet, not coming, force, joint, line.times[0], s)
-    for i in range(len(columns)):
+    k, rows = len(columns), len(forward)
+    slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
+    measured = np.empty(k)
+    for i in range(k):
+        measured[i] = joint[columns[i]]
+    coming = tick >= rows - 1 and lost[tick % len(lost), 0]
+    slave_step(slave, forward[(tick + 1) % rows], not coming, force, measured, line[2], s)
+    for i in range(k):
         reference[columns[i]], rate[columns[i]] = s.joint[i], s.joint_rate[i]
     drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod)
-    for i in range(len(columns)):
+    for i in range(k):
         velocity[columns[i]] = scale * arm[columns[i]] * s.ahead[i]

@@ -12,7 +12,8 @@ import numpy as np
 from hydrotele.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine import Machine
-from hydrotele.operate.master import LEVER, Master, flat_state
+from hydrotele.operate.flat import flat_state, flattened
+from hydrotele.operate.master import LEVER, Master
 from hydrotele.operate.resolved_motion import arm_facts, follow_pose
 from hydrotele.teleoperation import TeleopPilot
 
@@ -114,7 +115,51 @@ def slave(
         SlaveState, [(5,), (5,), (k,), (k,), (k,), (2, 5), (2, 5), (3, 6), (5,), (5,), (4,)]
     )
     state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
-    return Slave(arm, ranges, pose.copy(), table, limits, numbers.kind), state
+    return flattened(Slave(arm, ranges, pose, table, limits, numbers.kind)), state
+
+
+@compiled
+def unpack_slave(flat, k):
+    """The parts of `flat_view(Slave)`.
+
+    Args:
+        flat: (21 + 11 k,) array.
+        k: number of joints, scalar.
+
+    Returns:
+        Slave, views of it.
+
+    Source: order and shapes of Slave.
+    """
+    a = 9 + 2 * k
+    b = a + 5
+    c = b + 9 * k
+    return Slave(
+        flat[0:9], flat[9:a].reshape(k, 2), flat[a:b], flat[b:c].reshape(k, 9), flat[c : c + 5],
+        flat[c + 5 : c + 7],
+    )  # fmt: skip
+
+
+@compiled
+def unpack_slave_state(flat, k):
+    """The parts of `flat_view(SlaveState)`.
+
+    Args:
+        flat: (62 + 3 k,) array.
+        k: number of joints, scalar.
+
+    Returns:
+        SlaveState, views of it.
+
+    Source: order and shapes of SlaveState.
+    """
+    a = 10 + 3 * k
+    return SlaveState(
+        flat[0:5], flat[5:10], flat[10 : 10 + k], flat[10 + k : 10 + 2 * k], flat[10 + 2 * k : a],
+        flat[a : a + 10].reshape(2, 5), flat[a + 10 : a + 20].reshape(2, 5),
+        flat[a + 20 : a + 38].reshape(3, 6), flat[a + 38 : a + 43], flat[a + 43 : a + 48],
+        flat[a + 48 : a + 52],
+    )  # fmt: skip
 
 
 @compiled
