@@ -118,7 +118,7 @@ class Station:
         if self._pilot.tip_over:
             push_back(
                 self._pilot.tip_over, self._master, self._line.packet, self._slave.start,
-                self._m.handle, self._m.extra,
+                self._m.handle, self._m.speed, self._m.extra,
             )  # fmt: skip
         if tick % self.person.every == 0:
             self.person.decide(tick)

@@ -68,15 +68,17 @@ class Safety(Facts):
 class TipOver(Facts):
     """Tip-over protection: beyond `share` of the tipping moment the stick is pushed back.
 
-    The machine of `mass` [kg] with its centre of mass `behind` [m] the swing axis tips about an
-    edge of its tracks at `edge` [m] ahead of the axis.
+    The machine of `mass` [kg] with its centre of mass `behind` [m] the swing axis tips about the
+    edge of its tracks, `edge` [m] ahead of the axis or behind it. What
+    pushes back is a spring and a damper of `stiffness` [N/m] and `damping` [N s/m].
     """
 
     mass: Positive
     behind: float = 0.0
     edge: Positive = 1.6
     share: Annotated[float, Field(gt=0, lt=1)] = 0.7
-    ratio: Positive = 1.0e-3
+    stiffness: Positive = 8.0e3
+    damping: NonNegative = 100.0
 
 
 class Fault(Facts):

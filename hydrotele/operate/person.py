@@ -18,6 +18,7 @@ from hydrotele.operate.master import (
     DROP,
     GAIN,
     LEAST,
+    LIMIT,
     NOMINAL,
     OUTSIDE,
     RATIO,
@@ -184,7 +185,8 @@ class Person:
         force = float(self._hand[felt, axis]) * (1.0 + self._judgement[tick // self.every])
         if reflection in ("stiffness", "impedance"):
             if way * x > _LEAST_WAY:
-                self._imagined = max(0.0, (force / x - row[NOMINAL]) / row[SLOPE])
+                stiffer = max(0.0, force / x - row[NOMINAL])
+                self._imagined = min(row[LIMIT], stiffer / row[SLOPE])
             return self._imagined
         return max(0.0, (way * force - row[NOMINAL] * way * x) / max(row[RATIO], 1e-12))
 

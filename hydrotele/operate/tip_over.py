@@ -1,13 +1,14 @@
 """Tip-over protection: a machine about to tip pushes the hand back into the dead band."""
 
+import math
+
 import numpy as np
 
-from hydrotele.operate.master import COORDINATE, DEADBAND, FORCE, PLACE, SIGN, Master
+from hydrotele.operate.master import COORDINATE, FORCE, PLACE, SIGN, Master
 from hydrotele.teleoperation import TipOver
 
 _GRAVITY = 9.81
-_SOFT = 5e-4  # m beyond the dead band in which the push builds up: a wall that does not chatter
-_PUSH = 40.0  # N at full tipping moment: more than a hand wants to hold against
+_FULL = 0.1  # of the tipping moment, beyond the allowed share, over which the spring builds up
 
 
 def tipping_share(facts: TipOver, radius: float, force: float) -> float:
@@ -34,12 +35,12 @@ def tipping_share(facts: TipOver, radius: float, force: float) -> float:
 
 def push_back(
     facts: TipOver, numbers: Master, packet: np.ndarray, start: np.ndarray, handle: np.ndarray,
-    extra: np.ndarray,
+    speed: np.ndarray, extra: np.ndarray,
 ) -> None:  # fmt: skip
     """Force on the handle's vertical axis that keeps the machine from tipping.
 
-    It acts only on a handle beyond its dead band in the direction that would make it worse, so that
-    it never commands a motion by itself.
+    A further spring to the centre, with a damper that 200 Hz needs to hold it, on the side that
+    would make it worse: the hand is back inside the dead band, and no motion is ever commanded.
 
     Args:
         facts: of the machine.
@@ -47,21 +48,19 @@ def push_back(
         packet: (7, k) what came from the machine.
         start: (5,) pose at the start.
         handle: (6,) measured displacement [m], [rad].
+        speed: (6,) its rate [m/s], [rad/s].
         extra: (6,) written [N], [N m].
 
     Source: Zhu 1994, chapter 6 (tip-over of an excavator that presses too hard).
     """
     extra[:] = 0.0
     force, radius = float(packet[FORCE, 2]), float(packet[PLACE, 0] + start[0])
-    share = tipping_share(facts, radius, force)
-    if not share > facts.share:
+    danger = min(1.0, (tipping_share(facts, radius, force) - facts.share) / _FULL)
+    if not danger > 0.0:
         return
     for axis in range(6):
         row = numbers.axis[axis]
-        if row[COORDINATE] != 2.0:
-            continue
-        worse = -np.sign(force) * row[SIGN]  # pressing on makes the force that pushes up larger
-        beyond = worse * handle[axis] - row[DEADBAND]
-        if beyond > 0.0:
-            size = _PUSH * min(1.0, (share - facts.share) / (1.0 - facts.share) + 0.3)
-            extra[axis] = -worse * size * min(1.0, beyond / _SOFT)
+        worse = -math.copysign(1.0, force) * row[SIGN]  # pressing on makes what pushes up larger
+        if row[COORDINATE] == 2.0 and worse * handle[axis] > 0.0:
+            push = facts.stiffness * handle[axis] + facts.damping * speed[axis]
+            extra[axis] = -danger * push
