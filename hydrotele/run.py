@@ -2,9 +2,8 @@
 
 import dataclasses
 import json
-import time as clock
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -13,32 +12,29 @@ import hydrotele
 from hydrotele.datafile import suggest
 from hydrotele.effects import apply_effect
 from hydrotele.errors import InputError
-from hydrotele.feedforward import force_references
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
 from hydrotele.noise import sensor_set
+from hydrotele.operate.person import Hand
 from hydrotele.operate.plan import Plan, make_plan
 from hydrotele.operate.resolved_motion import pose_to_joints
-from hydrotele.operate.servo import drive_references, servo_numbers, servo_step
 from hydrotele.scenario import Scenario, own_machine
-from hydrotele.simulate.audit import audit, full_state
-from hydrotele.simulate.closure import pin_opening
+from hydrotele.session import Prepared, Session
+from hydrotele.simulate.audit import audit
 from hydrotele.simulate.drive_side import flexible_axes
 from hydrotele.simulate.feedback import Feedback, feedback
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.readout import late_channels, true_channels
-from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
+from hydrotele.simulate.record import Record
 from hydrotele.simulate.sensors import measure
-from hydrotele.simulate.stepping import DelayLine, Stepper
-from hydrotele.simulate.surroundings import Surroundings
 from hydrotele.station import Station
 from hydrotele.station_log import StationLog
 from hydrotele.summary import summarise
-from hydrotele.teleoperation import TeleopPilot
 
 AUDIT_SECONDS = 5.0
+_PROGRESS_ROWS = 50
 _DEEPEST_START = 0.05  # m: contact is soft, so a tool may rest a little in the ground
 Progress = Callable[[float, float], None]
 
@@ -87,15 +83,6 @@ def scenario_machine(scenario: Scenario) -> Machine:
     return machine
 
 
-class Prepared(NamedTuple):
-    """A scenario before its first step."""
-
-    plant: Plant
-    data: mujoco.MjData
-    plan: Plan
-    seen: Feedback
-
-
 def prepare(scenario: Scenario) -> Prepared:
     """Compile the machine of a scenario, put it at its start and plan the run.
 
@@ -129,13 +116,43 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
         InputError: the scenario asks for what the machine has not.
         SimulationFailed: states became infinite or not a number.
     """
-    prepared = prepare(scenario)
-    plant, data, plan, seen = prepared
-    begin_leapfrog(plant.model, data)
-    begin, line = full_state(plant.model, data), DelayLine(plant, data.ctrl)
-    looped = _loop(prepared, scenario, progress)
-    record = looped.record
-    truth, measured = _logs(plant, scenario, record, seen)
+    session = begin(scenario)
+    stride = _PROGRESS_ROWS * session.every
+    while session.tick < scenario.ticks:
+        if progress and session.tick % stride == 0:
+            progress(session.time, scenario.duration)
+        session.advance()
+    if progress:
+        progress(scenario.duration, scenario.duration)
+    return finished(session, scenario)
+
+
+def begin(scenario: Scenario, hand: Hand | None = None) -> Session:
+    """Everything of a run before its first tick.
+
+    Args:
+        scenario: what is asked.
+        hand: where a live operator wants the handle.
+
+    Raises:
+        InputError: the scenario asks for what the machine has not.
+    """
+    return Session(prepare(scenario), scenario, scenario_model(scenario), hand)
+
+
+def finished(session: Session, scenario: Scenario) -> Run:
+    """The run of a session that has gone far enough.
+
+    Args:
+        session: after its last tick.
+        scenario: what was asked, of the duration that it went.
+
+    Raises:
+        InputError: it is too short for a log.
+    """
+    looped, plant = session.finish(), session.plant
+    plan, record = looped.plan, looped.record
+    truth, measured = _logs(plant, scenario, record, session.seen)
     summary = summarise(plant, scenario, plan, record, looped.pins, looped.wall)
     if looped.station:
         measured = _with_station(measured, looped.station.log, scenario)
@@ -144,8 +161,8 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
     summary["notes"] += [f"{said} at {time:.2f} s" for time, said in looped.events]
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
     window = looped.commands[: round(AUDIT_SECONDS * scenario.control_rate)]
-    controls = np.concatenate([line.controls(command, steps) for command in window])
-    summary["balance"] = audit(plant, begin, controls)
+    controls = np.concatenate([session.line.controls(command, steps) for command in window])
+    summary["balance"] = audit(plant, session.start, controls)
     return Run(scenario, plant, plan, measured, truth, summary, looped.station)
 
 
@@ -203,81 +220,6 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
     if depth > _DEEPEST_START:
         raise InputError("start", f"the machine would stand {depth:.2f} m deep in the ground")
     return data, joints
-
-
-class Looped(NamedTuple):
-    """What the loop leaves.
-
-    Attributes:
-        record: states at the log's rows.
-        commands: (n, nu) by control tick.
-        pins: largest pin opening [m].
-        wall: time [s] from the second control tick on, since the first one loads compiled code.
-        station: the operator's, of a teleoperated run.
-        events: (time [s], what happened around the machine).
-    """
-
-    record: Record
-    commands: np.ndarray
-    pins: float
-    wall: float
-    station: Station | None
-    events: tuple[tuple[float, str], ...]
-
-
-def _loop(prepared: Prepared, scenario: Scenario, progress: Progress | None) -> Looped:
-    """Step through the run."""
-    plant, data, plan, seen = prepared
-    model, dt = plant.model, 1.0 / scenario.control_rate
-    steps = round(dt / scenario.timestep)
-    every = round(scenario.control_rate / scenario.log_rate)
-    ticks, rows = scenario.ticks, scenario.rows
-    numbers = servo_numbers(plant.machine, plant.axes, scenario.servo, dt)
-    drives = drive_references(plant.machine, plan, scenario.servo)
-    forces = force_references(scenario_model(scenario), plan, scenario.servo)
-    k = len(plant.axes)
-    load, command, commands = np.zeros(k), np.zeros(k), np.empty((ticks, k))
-    recorder, stepper = Recorder(plant, rows), Stepper(plant, data, steps)
-    station = _station(plant, scenario, plan, drives, seen)
-    around = Surroundings(plant.machine, model, scenario.surroundings)
-    worst, begin = 0.0, 0.0
-    for tick in range(ticks):
-        if tick % every == 0 and tick // every < rows:
-            recorder.take(tick // every, tick * dt, data, stepper.past)
-            if progress and tick % (every * 50) == 0:
-                progress(tick * dt, scenario.duration)
-        seen.update(tick, data, stepper.past)
-        if tick == 0:
-            load[:] = numbers[:, 1] * seen.head - numbers[:, 2] * seen.rod - forces.force[0]
-        command[:] = plan.command[tick]
-        tripped = station is not None and station.tick(tick, data, seen)
-        servo_step(
-            numbers, plan.closed, drives.velocity[tick], drives.arm[tick],
-            drives.volume_head[tick], drives.volume_rod[tick],
-            plan.reference[tick - tick % seen.every], seen.joint, seen.rate, seen.head, seen.rod,
-            seen.supply, load, forces.known, forces.force[tick], forces.rate[tick], command,
-        )  # fmt: skip
-        if tripped:
-            command[:] = 0.0
-        commands[tick] = command
-        begin = begin if tick else clock.perf_counter()
-        stepper.advance(command)
-        if scenario.surroundings:
-            around.update(tick * dt, data, dt)
-        worst = max(worst, pin_opening(model, data))
-    recorder.command[:] = commands[: rows * every].reshape(rows, every, k).mean(axis=1)
-    if progress:
-        progress(scenario.duration, scenario.duration)
-    around.restore()
-    wall = clock.perf_counter() - begin
-    return Looped(recorder.record(), commands, worst, wall, station, tuple(around.events))
-
-
-def _station(plant: Plant, scenario: Scenario, plan: Plan, drives, seen: Feedback):
-    """The operator's station of a teleoperated scenario, none of another."""
-    if not isinstance(scenario.pilot, TeleopPilot):
-        return None
-    return Station(plant, scenario, plan, drives, seen)
 
 
 def _log(scenario, machine, time, values, units, sensors: str) -> Log:

@@ -19,7 +19,7 @@ from hydrotele.operate.drive_rows import drive_tables
 from hydrotele.operate.endpoint_force import EndpointForce
 from hydrotele.operate.flat import flat_view
 from hydrotele.operate.master import TASK_DAMPING, TASK_STIFFNESS, master
-from hydrotele.operate.person import Person
+from hydrotele.operate.person import Hand, Person
 from hydrotele.operate.plan import Plan
 from hydrotele.operate.resolved_motion import COORDINATES, arm_facts
 from hydrotele.operate.round_trip import to_the_hand, to_the_machine
@@ -50,8 +50,9 @@ class Station:
     """
 
     def __init__(
-        self, plant: Plant, scenario: Scenario, plan: Plan, drives: DriveReferences, seen: Feedback
-    ) -> None:
+        self, plant: Plant, scenario: Scenario, plan: Plan, drives: DriveReferences,
+        seen: Feedback, hand: Hand | None = None,
+    ) -> None:  # fmt: skip
         """Put everything in place.
 
         Args:
@@ -60,9 +61,10 @@ class Station:
             plan: references of the run, written tick by tick.
             drives: those of the drives, written tick by tick.
             seen: what the machine's sensors say.
+            hand: where a live operator wants the handle.
 
         Raises:
-            InputError: joystick, gains or arm do not fit each other.
+            InputError: joystick, gains or arm do not fit each other, a live operator without hand.
         """
         pilot = scenario.pilot
         assert isinstance(pilot, TeleopPilot)
@@ -90,8 +92,9 @@ class Station:
         self._elapsed = 0.0
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
         self.person = Person(
-            pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed
-        )
+            pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed,
+            hand,
+        )  # fmt: skip
         self._master_flat, self._m_flat = flat_view(self._master), flat_view(self._m)
         self._slave_flat, self._s_flat = flat_view(self._slave), flat_view(self._s)
         self._hand_flat = flat_view(self.person.muscles)

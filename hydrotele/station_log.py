@@ -47,6 +47,12 @@ class StationLog:
         self._master[tick], self._slave[tick] = self._one, self._two
         self.force[tick], self.muscles[tick], self.touching[tick] = force, muscles, touching
 
+    def cut(self, ticks: int) -> None:
+        """Keep the first ticks only."""
+        self._master, self._slave = self._master[:ticks], self._slave[:ticks]
+        self.force, self.muscles = self.force[:ticks], self.muscles[:ticks]
+        self.touching = self.touching[:ticks]
+
     def master(self, name: str) -> np.ndarray:
         """(n, ...) of a field of MasterState, as `handle`."""
         return _field(self._master, self._m, name)

@@ -163,6 +163,12 @@ class Steer(Facts):
     points: dict[Coordinate, list[float]]
 
 
+class Live(Facts):
+    """A person moves the handle by a device (`hydrotele drive`)."""
+
+    kind: Literal["live"]
+
+
 class Perception(Facts):
     """What a person's senses and muscles can do; sources in models/joystick/README.md.
 
@@ -188,7 +194,7 @@ class Perception(Facts):
     largest_force: Positive = 30.0
 
 
-Behaviour = Annotated[Follow | Regulate | Track | Steer, Field(discriminator="kind")]
+Behaviour = Annotated[Follow | Regulate | Track | Steer | Live, Field(discriminator="kind")]
 
 
 class TeleopPilot(Facts):

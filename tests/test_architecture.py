@@ -36,7 +36,7 @@ FLOORS = (
     ("prediction",),
     ("identify",),
     ("simulate", "operate"),
-    ("station_log", "station", "feedforward", "run", "replay", "summary"),
+    ("station_log", "station", "feedforward", "session", "run", "replay", "summary"),
     ("calibrate", "gap"),
     ("show",),
     ("envs", "bench", "sweep", "commands"),

@@ -6,10 +6,12 @@ touches, and in `track` a graph of the force that he is to make. He decides fift
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from hydrotele.errors import InputError
 from hydrotele.joystick import AXES, Joystick
 from hydrotele.operate.flat import flattened
 from hydrotele.operate.master import (
@@ -29,7 +31,15 @@ from hydrotele.operate.master import (
 )
 from hydrotele.operate.muscles import Muscles
 from hydrotele.operate.resolved_motion import COORDINATES
-from hydrotele.teleoperation import Follow, ForceTarget, Regulate, Steer, TeleopPilot, Track
+from hydrotele.teleoperation import (
+    Follow,
+    ForceTarget,
+    Live,
+    Regulate,
+    Steer,
+    TeleopPilot,
+    Track,
+)
 
 DECISIONS = 50.0  # Hz
 _REFLEX = 0.05  # s, from where the hand is to what the muscles do: stretch reflex and cortex
@@ -42,6 +52,10 @@ _TREMOR_BAND = 2.0 * math.pi * 8.0  # rad/s of a physiological tremor
 _SLOW = 2.0 * math.pi * 0.5  # rad/s of drifting judgement
 _LEVERS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m: forces of the hand into torques
 _ROUND = 2**14  # periods of tremor before it comes again
+
+
+Hand = Callable[[], np.ndarray]
+"""Where a live operator wants the handle now, (6,) [m], [rad]."""
 
 
 class Seen(Protocol):
@@ -72,7 +86,7 @@ class Person:
 
     def __init__(
         self, pilot: TeleopPilot, joystick: Joystick, numbers: Master, seen: Seen, ticks: int,
-        period: float, seed: int,
+        period: float, seed: int, hand: Hand | None = None,
     ) -> None:  # fmt: skip
         """Sit down.
 
@@ -84,7 +98,15 @@ class Person:
             ticks: number of control periods.
             period: of the control [s].
             seed: of the run.
+            hand: of a live operator.
+
+        Raises:
+            InputError: a live operator without a hand.
         """
+        if isinstance(pilot.operator, Live) and hand is None:
+            message = "a live operator has to be there: hydrotele drive SCENARIO"
+            raise InputError("pilot.operator", message)
+        self._live = hand
         self._pilot, self._behaviour, self._habits = pilot, pilot.operator, pilot.perception
         self._numbers, self._period = numbers, period
         self.every = max(1, round(1.0 / (DECISIONS * period)))
@@ -122,6 +144,8 @@ class Person:
         """
         if isinstance(self._behaviour, Follow):
             self.muscles.wanted[:] = self._paths[tick // self.every]
+        if self._live:
+            self.muscles.wanted[:] = self._live()
         if tick == 0:
             return  # nothing seen yet
         match self._behaviour:

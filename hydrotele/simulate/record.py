@@ -180,11 +180,12 @@ class Recorder:
             lines += [f"  t={self.time[r]:.3f} qpos={qpos}", f"    spools and pressures={act}"]
         return "\n".join(lines)
 
-    def record(self) -> Record:
-        """All rows as a Record."""
+    def record(self, rows: int | None = None) -> Record:
+        """All rows as a Record, or the first ones."""
+        late = {lag: (qpos[:rows], act[:rows]) for lag, (qpos, act) in self.late.items()}
         return Record(
-            self.time, self.qpos, self.qvel, self.qacc, self.act, self.command, self.contact,
-            self.tip, self.late,
+            self.time[:rows], self.qpos[:rows], self.qvel[:rows], self.qacc[:rows],
+            self.act[:rows], self.command[:rows], self.contact[:rows], self.tip[:rows], late,
         )  # fmt: skip
 
 
