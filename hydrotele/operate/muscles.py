@@ -6,6 +6,7 @@ import numpy as np
 
 from hydrotele.compiled import compiled
 
+_THROUGH = 1.15  # times the force at a notch's edge, to get over it
 _FINE, _FINE_TURN = 4e-4, 4e-3  # m, rad: a larger gap is a way to go, nothing to learn from
 
 
@@ -83,6 +84,8 @@ def pull(muscles, past, tremor, handle, tick, period):
         if muscles.notch[2, i] >= 0.0 and beyond > 0.0:
             firm = muscles.arm[i] + muscles.notch[2, i]
             back = spring * muscles.notch[0, i] - muscles.notch[1, i] + muscles.notch[2, i] * beyond
+            if (late if wanted > 0.0 else -late) < muscles.notch[0, i]:
+                back = _THROUGH * spring * muscles.notch[0, i]  # first over the notch's edge
             known = muscles.arm[i] * wanted + (back if wanted > 0.0 else -back)
         fine = _FINE if i < 3 else _FINE_TURN
         gap = min(fine, max(-fine, wanted - late))

@@ -1,0 +1,70 @@
+"""What an experiment found: a sentence from the source beside a sentence with figures of ours."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.run import Run, run_scenario
+from hydrotele.scenario import Scenario, load_scenario
+
+
+class Panel(NamedTuple):
+    """Curves over time that belong together.
+
+    Attributes:
+        title: with its unit.
+        time: (n,) [s].
+        curves: label -> (n,) in the title's unit.
+    """
+
+    title: str
+    time: np.ndarray
+    curves: Mapping[str, np.ndarray]
+
+
+class Finding(NamedTuple):
+    """A claim of the source, checked.
+
+    Attributes:
+        name: short, such as `lines: up`.
+        source: where it is published.
+        published: what was seen.
+        simulated: what is seen here, with figures.
+        ok: whether that is the same.
+        panels: curves to look at.
+    """
+
+    name: str
+    source: str
+    published: str
+    simulated: str
+    ok: bool
+    panels: tuple[Panel, ...] = ()
+
+    def row(self) -> dict[str, str | bool]:
+        """Name, published, simulated and ok, as `--json` prints them."""
+        return {"name": self.name, "published": self.published, "simulated": self.simulated,
+                "ok": bool(self.ok)}  # fmt: skip
+
+
+def perform(name: str, overrides: Mapping[str, str] | None = None) -> tuple[Scenario, Run]:
+    """Run a shipped scenario with some of its values changed."""
+    scenario = load_scenario(name, dict(overrides or {}))
+    return scenario, run_scenario(scenario)
+
+
+def truth(run: Run, channel: str) -> np.ndarray:
+    """(n,) of a true channel; zeros where nothing of the kind happened."""
+    return run.truth.columns.get(channel, np.zeros(len(run.truth.time)))
+
+
+def cylindrical(run: Run) -> dict[str, np.ndarray]:
+    """True pose of the tip: r, z [m], theta, attitude [rad], (n,) each."""
+    x, y, z = (truth(run, f"truth.tip.{c}") for c in "xyz")
+    arm = run.plant.machine.arm
+    assert arm is not None
+    axes = {axis.joint: name for name, axis in run.plant.machine.axes.items()}
+    bends = [truth(run, f"angle.{axes[j]}") for j in (arm.boom, arm.stick, arm.tool) if j]
+    return {"r": np.hypot(x, y), "theta": np.unwrap(np.arctan2(y, x)), "z": z,
+            "attitude": np.sum(bends, axis=0)}  # fmt: skip
