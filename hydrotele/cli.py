@@ -337,6 +337,23 @@ def export(
     export_machine(machine, tool, out, picture, camera)
 
 
+@app.command(epilog="Example:  hydrotele experiments zhu1994 --json")
+def experiments(
+    name: Annotated[str, typer.Argument(help="Series of experiments: zhu1994.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder to write; default runs/NAME, with --json none."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Operators of repeated experiments.")] = 20,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
+    json: Json = False,
+) -> None:
+    """Repeat published machine experiments with a simulated operator; print both beside each other."""
+    from hydrotele.commands.experimenting import experiments_to_folder
+
+    experiments_to_folder(name, out, seeds, jobs, json)
+
+
 @app.command(
     epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json"
 )

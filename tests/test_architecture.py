@@ -38,6 +38,7 @@ FLOORS = (
     ("simulate", "operate"),
     ("station_log", "station", "feedforward", "session", "run", "replay", "summary"),
     ("calibrate", "gap"),
+    ("experiments",),
     ("show",),
     ("envs", "bench", "sweep", "commands"),
     ("cli",),
