@@ -218,7 +218,8 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
     mujoco.mj_fwdPosition(plant.model, data)
     depth = -min((data.contact[k].dist for k in range(data.ncon)), default=0.0)
     if depth > _DEEPEST_START:
-        raise InputError("start", f"the machine would stand {depth:.2f} m deep in the ground")
+        things = "the ground or what stands around" if plant.surroundings else "the ground"
+        raise InputError("start", f"the machine would stand {depth:.2f} m deep in {things}")
     return data, joints
 
 

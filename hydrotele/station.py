@@ -88,9 +88,11 @@ class Station:
         self._feel = _estimator(machine, plan.axes, pilot, seen, self._period, self._sensors)
         self._around = surrounding_bodies(plant)
         self._task = TaskImpedance(len(axes)) if pilot.reflection == "impedance" else None
+        self._late = round(self._feel.delay / self._period) if self._feel else 0
         self._force = np.zeros(len(axes))
         self._elapsed = 0.0
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
+        self._seen = self.log.slave("measured")
         self.person = Person(
             pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed,
             hand,
@@ -117,7 +119,7 @@ class Station:
         for fault in self._faults:
             fault.freeze(tick * self._period, seen)
         fresh = tick % seen.every == 0
-        self._felt(data, seen, fresh)
+        self._felt(tick, data, seen, fresh)
         if self._pilot.tip_over:
             push_back(
                 self._pilot.tip_over, self._master, self._line.packet, self._slave.start,
@@ -139,15 +141,18 @@ class Station:
         self._check(tick, seen)
         return self.tripped
 
-    def _felt(self, data: mujoco.MjData, seen: Feedback, fresh: bool) -> None:
-        """Force at the tip, and what the task is like if that is reflected."""
+    def _felt(self, tick: int, data: mujoco.MjData, seen: Feedback, fresh: bool) -> None:
+        """Force at the tip, and what the task is like if that is reflected.
+
+        The task is identified from a pose that is as old as the filtered force.
+        """
         if self._feel is None:
             self._force = self._true_force(data)
         elif fresh:
             self._force = self._feel.update(seen.joint, seen.head, seen.rod)
         if self._task:
             if fresh:
-                self._task.update(self._force, self._s.measured)
+                self._task.update(self._force, self._seen[max(0, tick - 1 - self._late)])
             self._line.back[:, TASK_STIFFNESS] = self._task.stiffness
             self._line.back[:, TASK_DAMPING] = self._task.damping
 
@@ -242,6 +247,8 @@ class _Fault:
         if self._value is None:
             self._value = float(readings[self._column])
         readings[self._column] = self._value
+        if self._name == "joint":
+            seen.rate[self._column] = 0.0
 
 
 def _estimator(
@@ -272,6 +279,10 @@ class _Line:
 
     def __init__(self, pilot: TeleopPilot, scenario: Scenario, k: int) -> None:
         channel, period = pilot.channel, 1.0 / scenario.control_rate
+        for name in ("delay_forward", "delay_back"):
+            if (delay := getattr(channel, name)) >= scenario.duration:
+                message = f"{delay:g} s is as long as the run ({scenario.duration:g} s)"
+                raise InputError(f"pilot.channel.{name}", message)
         rng = np.random.default_rng([scenario.seed, 404])
         self.lost = rng.random((scenario.ticks, 2)) < channel.lost
         self.lost[: round(channel.lost_from / period)] = False

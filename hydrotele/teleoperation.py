@@ -26,7 +26,8 @@ class Coupling(Facts):
 
     Under rate control the handle at its stop asks for `speed` [m/s] or [rad/s]; under position
     control the coordinate moves `scale` times as far as the handle ([m/m], [rad/rad]; theta by
-    translation [rad/m]). `axis` and `sign` say which way of the joystick moves it.
+    translation [rad/m]), no faster than `speed`. `axis` and `sign` say which way of the joystick
+    moves it.
     """
 
     axis: JoystickAxis | None = None
@@ -43,7 +44,8 @@ class Coupling(Facts):
 class Channel(Facts):
     """The line between operator and machine: delays [s] either way, share of packets lost.
 
-    Packets are lost from `lost_from` [s] on: each with the probability `lost`.
+    Delays are rounded to whole control periods. Packets are lost from `lost_from` [s] on: each with
+    the probability `lost`.
     """
 
     delay_forward: Annotated[float, Field(ge=0, le=2)] = 0.0
@@ -96,6 +98,12 @@ class Button(Facts):
     command: float
 
 
+def _check_time(time: list[float]) -> None:
+    rises = all(a < b for a, b in zip(time, time[1:], strict=False))
+    if not time or time[0] != 0.0 or not rises:
+        raise ValueError("time must start at 0 and rise")
+
+
 class Follow(Facts):
     """The operator moves the handle along a path, `time` [s] and displacements [m] or [rad]."""
 
@@ -106,10 +114,7 @@ class Follow(Facts):
 
     @model_validator(mode="after")
     def _check(self):
-        if not self.time or self.time[0] != 0.0 or any(
-            b <= a for a, b in zip(self.time, self.time[1:], strict=False)
-        ):  # fmt: skip
-            raise ValueError("time must start at 0 and rise")
+        _check_time(self.time)
         for name, values in self.path.items():
             if len(values) != len(self.time):
                 raise ValueError(f"path.{name} has {len(values)} values, time has {len(self.time)}")
@@ -128,8 +133,9 @@ class ForceTarget(Facts):
 
     @model_validator(mode="after")
     def _check(self):
-        if len(self.time) != len(self.force) or not self.time or self.time[0] != 0.0:
-            raise ValueError("time must start at 0 and have as many values as force")
+        _check_time(self.time)
+        if len(self.time) != len(self.force):
+            raise ValueError(f"force has {len(self.force)} values, time has {len(self.time)}")
         return self
 
 
@@ -160,7 +166,17 @@ class Steer(Facts):
 
     kind: Literal["steer"]
     time: list[NonNegative]
-    points: dict[Coordinate, list[float]]
+    points: Annotated[dict[Coordinate, list[float]], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _check(self):
+        _check_time(self.time)
+        for name, values in self.points.items():
+            if len(values) != len(self.time):
+                raise ValueError(
+                    f"points.{name} has {len(values)} values, time has {len(self.time)}"
+                )
+        return self
 
 
 class Live(Facts):
@@ -202,11 +218,24 @@ class TeleopPilot(Facts):
 
     `mount: cab` shakes the joystick with the link that swings, `mount: table` leaves it alone.
     `reflection` is the structure, under `mode` rate or position control. `ratio` scales reflected
-    forces: hand per machine force [N/N]; `coupling` [N/m] is the spring between handle and slave of
-    coordinating force and four channels, with `coupling_damping` [N s/m]; `virtual_mass` [kg] is
-    the slave's of four channels. `force` chooses where the contact force comes from: the pressures
-    with the static or the dynamic model, through a filter of a `bandwidth` [Hz], or the simulator's
-    own (`true`).
+    forces: hand per machine force [N/N], up to the `force_limit` [N] of the machine's force.
+    `coupling` [N/m] is the spring between handle and slave of coordinating force and four channels:
+    per metre of the handle under position control (400 if not given), of the machine under rate
+    control (40); `coupling_damping` [N s/m] is a tenth of it. `virtual_mass` [kg] is the slave's of
+    four channels. References speed up by `acceleration` [m/s^2] or [rad/s^2]. `force` chooses where
+    the contact force comes from: the pressures with the static or the dynamic model, through a
+    filter of a `bandwidth` [Hz], or the simulator's own (`true`).
+
+    What structures can do: stiffness feedback is stable with every task and delay. Direct force
+    bounces where `ratio` times the task's stiffness (and `scale`) is more than hand and joystick
+    hold. Coordinating force tells of the machine's lag; a stiff servo hides the task from it, and
+    under rate control it needs less coupling with delay. Four channels under position control give
+    hand = ratio x force and place = scale x handle in the mean; on a valve-controlled machine they
+    bounce unless ratio x scale x task stiffness is below the coupling, some 400 N/m. Four channels
+    under rate control leave a constant contact force unfelt, by design (F_h = s/k_v F_e); they have
+    no dead band. `impedance` adds ratio x gain of the coordinate (its scale, or under rate control
+    its rate per displacement, for one second) x the task's identified stiffness to the joystick's,
+    within its bounds, and its damping, at most as much as the joystick's own.
     """
 
     kind: Literal["teleop"]
@@ -218,8 +247,8 @@ class TeleopPilot(Facts):
     detent: bool = False
     ratio: NonNegative = 2.0e-4
     force_limit: Positive | None = None
-    coupling: NonNegative = 400.0
-    coupling_damping: NonNegative = 40.0
+    coupling: NonNegative | None = None
+    coupling_damping: NonNegative | None = None
     virtual_mass: Positive = 2.0
     force: Literal["static", "dynamic", "true"] = "dynamic"
     bandwidth: Annotated[float, Field(gt=0, le=5)] = 1.5

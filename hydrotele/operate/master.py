@@ -11,24 +11,21 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.compiled import compiled
-from hydrotele.errors import InputError
-from hydrotele.joystick import AXES, Joystick
+from hydrotele.joystick import Joystick
+from hydrotele.operate.axis_table import axis_table
 from hydrotele.operate.flat import flat_state, flattened
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.compliance import GRAVITY, holding_wrench, turn_matrix
-from hydrotele.teleop.handle import StiffnessFeedback
-from hydrotele.teleoperation import Coupling, TeleopPilot
+from hydrotele.teleoperation import TeleopPilot
 
 NONE, STIFFNESS, DIRECT, COORDINATING, FOUR_CHANNEL, IMPEDANCE = range(6)
 KINDS = ("none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance")
 RATE, POSITION = range(2)
-# columns of `Master.axis`
-(NOMINAL, LEAST, MOST, SLOPE, DAMPING, LIMIT, DEADBAND, DROP, OUTSIDE, REACH, COORDINATE, SIGN,
- GAIN, RATIO, COUPLING, COUPLING_DAMPING, REFLECTED_MOST) = range(17)  # fmt: skip
 # rows of `Packet`
 FORCE, PLACE, SPEED, WANTED, WANTED_SPEED, TASK_STIFFNESS, TASK_DAMPING = range(7)
 _OBSERVER = 60.0  # rad/s of the hand force's estimate: a third of what 200 Hz samples
-LEVER = 0.1  # m, a hand's: makes rotational gains of translational ones
+_CHANGE = 20.0  # rad/s up to which a force is differentiated: sensors are slower than the joystick
+WINDUP = 0.1  # m or rad at the machine by which four channels under rate control may be apart
 
 
 class Master(NamedTuple):
@@ -70,8 +67,8 @@ class MasterState(NamedTuple):
         stiffness: (6,) of every axis [N/m], [N m/rad].
         hand: (6,) estimated force of the hand [N], [N m].
         momentum: (6,) of the estimate.
-        integral: (6,) of the displacement, for four channels under rate control.
-        before: (6,) force of the last period from the machine, for its rate of change.
+        integral: (6,) of the rate asked for, for four channels under rate control [m], [rad].
+        before: (6,) slow force from the machine, for its rate of change [N], [N m].
         currents: (6,) [A].
         extra: (6,) further force on the handle, such as that of tip-over protection [N], [N m].
         limited: (1,) share by which the currents had to be made smaller; 1 if not.
@@ -115,7 +112,7 @@ def master(
     turning = np.diag(inertia) + f.mass * (arm @ arm - arm**2)
     lorentz = three_stations(coils.radius, coils.force_per_ampere, coils.max_current)
     numbers = Master(
-        axis=_axis_table(joystick, pilot, coordinates),
+        axis=axis_table(joystick, pilot, coordinates),
         mass=np.array([f.mass]),
         turning=turning,
         below=com,
@@ -165,60 +162,6 @@ def unpack_master_state(flat):
         flat[0:6], flat[6:12], flat[12:18], flat[18:24], flat[24:30], flat[30:36], flat[36:42],
         flat[42:48], flat[48:54], flat[54:60], flat[60:61], flat[61:63],
     )  # fmt: skip
-
-
-def _axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates) -> np.ndarray:
-    where = "pilot"
-    if pilot.gains not in joystick.gains:
-        raise InputError(f"{where}.gains", f"{pilot.gains!r}; valid: {', '.join(joystick.gains)}")
-    table = np.zeros((6, 17))
-    table[:, COORDINATE] = -1.0
-    for number, name in enumerate(AXES):
-        gains = joystick.gains[pilot.gains][name].model_dump()
-        if unknown := set(pilot.stiffness.get(name, {})) - set(gains):
-            raise InputError(f"{where}.stiffness.{name}", f"no {', '.join(sorted(unknown))}")
-        gains |= pilot.stiffness.get(name, {})
-        reach = joystick.workspace.translation if number < 3 else joystick.workspace.rotation
-        slope = (gains["most"] - gains["nominal"]) / gains["force_limit"]
-        law = StiffnessFeedback(
-            gains["nominal"], gains["least"], gains["most"], slope, gains["damping"],
-            gains["force_limit"], gains["deadband"],
-        )  # fmt: skip
-        detent = gains["detent"] if pilot.detent and gains["detent"] else None
-        table[number, : COORDINATE] = (
-            law.nominal, law.least, law.most, law.ratio, law.damping, law.force_limit,
-            law.deadband, detent["drop"] if detent else 0.0,
-            detent["outside"] if detent else -1.0, reach,
-        )  # fmt: skip
-        lever = 1.0 if number < 3 else LEVER
-        table[number, RATIO:] = (
-            lever * pilot.ratio, lever**2 * pilot.coupling, lever**2 * pilot.coupling_damping,
-            pilot.force_limit or law.force_limit,
-        )  # fmt: skip
-    for number, coordinate in enumerate(coordinates):
-        axis, sign, gain = _placed(pilot, coordinate)
-        row = table[AXES.index(axis)]
-        if row[COORDINATE] >= 0.0:
-            raise InputError(f"{where}.coordinates", f"joystick axis {axis} moves two of them")
-        if row[DEADBAND] >= row[REACH] and coordinate in pilot.coordinates:
-            message = f"the dead band of {axis} reaches beyond its stop: {coordinate} cannot move"
-            raise InputError(f"{where}.coordinates.{coordinate}", message)
-        if pilot.mode == "rate":
-            gain /= max(row[REACH] - row[DEADBAND], 1e-9)
-        row[[COORDINATE, SIGN, GAIN]] = number, sign, gain
-    if strange := set(pilot.coordinates) - set(coordinates):
-        raise InputError(
-            f"{where}.coordinates", f"{', '.join(sorted(strange))}: the arm has"
-            f" {', '.join(coordinates)}",
-        )  # fmt: skip
-    return table
-
-
-def _placed(pilot: TeleopPilot, coordinate: str) -> tuple[str, float, float]:
-    """Joystick axis, its sign and its gain: speed at the stop, or scale."""
-    coupling = pilot.coordinates.get(coordinate, Coupling())  # pyright: ignore - checked above
-    axis, sign = coupling.placed(coordinate)
-    return axis, sign, coupling.speed if pilot.mode == "rate" else coupling.scale
 
 
 @compiled
@@ -290,32 +233,38 @@ def reflect(numbers, packet, fresh, period, s):
                 slower = share * (packet[4, c] - packet[2, c])
                 push -= fresh * (row[14] * behind + row[15] * slower)
             elif kind == 4:
-                push += _four_channels(row, mode, x, v, kept, sign, packet, c, period, s, i)
+                push += _four_channels(row, mode, x, v, kept, sign, packet, c, fresh, period, s, i)
             elif kind == 5:
-                stiff = min(row[2], max(row[1], stiff + fresh * row[13] * gain * packet[5, c]))
-                rub += fresh * row[13] * gain * packet[6, c]
+                felt = fresh * row[13] * gain
+                stiff = min(row[2], max(row[1], stiff + felt * packet[5, c]))
+                rub += min(rub, felt * packet[6, c])  # more makes a sampled flotor shake
         s.stiffness[i] = stiff
         beyond = abs(x) - row[6]
         if row[8] >= 0.0 and beyond > 0.0:
             stiff_out = row[8] + max(stiff - row[0], 0.0)
-            push -= way * (stiff * row[6] - row[7] + stiff_out * beyond)
+            push -= way * (max(stiff * row[6] - row[7], 0.0) + stiff_out * beyond)
         else:
             push -= stiff * x
         s.push[i] = push - rub * v + fresh * s.extra[i]
 
 
 @compiled
-def _four_channels(row, mode, x, v, force, sign, packet, c, period, s, i):
-    """Force back and velocity back of the four-channel structures, and the master's own part."""
+def _four_channels(row, mode, x, v, force, sign, packet, c, fresh, period, s, i):
+    """Force back and velocity back of the four-channel structures, and the master's own part.
+
+    Under rate control `C2 = s / k_v` differentiates the force, below 20 rad/s.
+    """
     gain, spring, damper = row[12], row[14], row[15]
     place, speed = sign * packet[1, c], sign * packet[2, c]
     reflected = row[13] * force
     if mode == 1:
-        return reflected - spring * (x - place / gain) - damper * (v - speed / gain)
-    s.integral[i] += period * x
-    change = (reflected - s.before[i]) / (period * gain)
-    s.before[i] = reflected
-    return change - spring * (gain * s.integral[i] - place) - damper * (gain * x - speed)
+        return reflected - fresh * (spring * (x - place / gain) + damper * (v - speed / gain))
+    asked = s.integral[i] + period * gain * x
+    s.integral[i] = min(place + WINDUP, max(place - WINDUP, asked))
+    change = _CHANGE * (reflected - s.before[i])
+    s.before[i] += period * change
+    apart = spring * (s.integral[i] - place) + damper * (gain * x - speed)
+    return change / gain - fresh * apart
 
 
 @compiled
@@ -353,15 +302,18 @@ def drive_coils(numbers, quaternion, period, s):
     for i in range(6):
         s.currents[i] *= s.limited[0]
         own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
+        given = s.limited[0] * s.push[i]
+        if i < 3:  # what is missing of the flotor's weight
+            given += (1.0 - s.limited[0]) * numbers.mass[0] * numbers.gravity[i]
         s.hand[i] = _OBSERVER * (own * s.speed[i] - s.momentum[i])
-        s.momentum[i] += period * (s.push[i] + s.hand[i])
+        s.momentum[i] += period * (given + s.hand[i])
         power += s.hand[i] * s.speed[i]
     s.energy[0] += period * power
     s.energy[1] = min(s.energy[1], s.energy[0])
 
 
 @compiled
-def master_step(numbers, qpos, packet, fresh, period, s):
+def master_step(numbers, qpos, packet, fresh, period, first, s):
     """One period of the master: read the handle, reflect, drive the coils.
 
     Args:
@@ -369,7 +321,8 @@ def master_step(numbers, qpos, packet, fresh, period, s):
         qpos: (7,) of the flotor: position [m] and quaternion.
         packet: (7, k) see `reflect`.
         fresh: see `reflect`, scalar.
-        period: scalar [s]; 0 for the first one.
+        period: scalar [s].
+        first: whether it is the first one, scalar.
         s: MasterState, written.
 
     Returns:
@@ -377,6 +330,6 @@ def master_step(numbers, qpos, packet, fresh, period, s):
 
     Source: this module.
     """
-    read_handle(numbers, qpos, period, s)
-    reflect(numbers, packet, fresh, max(period, 1e-9), s)
+    read_handle(numbers, qpos, 0.0 if first else period, s)
+    reflect(numbers, packet, fresh, period, s)
     drive_coils(numbers, qpos[3:7], period, s)

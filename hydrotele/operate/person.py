@@ -13,8 +13,7 @@ import numpy as np
 
 from hydrotele.errors import InputError
 from hydrotele.joystick import AXES, Joystick
-from hydrotele.operate.flat import flattened
-from hydrotele.operate.master import (
+from hydrotele.operate.axis_table import (
     COORDINATE,
     DEADBAND,
     DROP,
@@ -27,8 +26,9 @@ from hydrotele.operate.master import (
     REACH,
     SIGN,
     SLOPE,
-    Master,
 )
+from hydrotele.operate.flat import flattened
+from hydrotele.operate.master import Master
 from hydrotele.operate.muscles import Muscles
 from hydrotele.operate.resolved_motion import COORDINATES
 from hydrotele.teleoperation import (

@@ -108,7 +108,7 @@ def _plan(
 def _teleoperated(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
     """References that are written while it runs; buttons command the axes that they name."""
     closed = np.array([machine.axes[a].force is None for a in plan.axes])
-    for button in pilot.buttons:
+    for button in sorted(pilot.buttons, key=lambda button: button.at):
         column = _column(plan.axes, button.axis, "pilot.buttons")
         if button.axis in arm_axes(machine):
             raise InputError("pilot.buttons", f"{button.axis} is moved by the joystick")

@@ -35,8 +35,8 @@ def to_the_hand(
         joint: (nu,) measured [rad] or [m].
         force: (k,) at the tip, task coordinates [N], [N m].
         columns: (k,) places of the arm's joints among the axes.
-        slave_flat: (21 + 11 k,) Slave.
-        state_flat: (62 + 3 k,) SlaveState, written.
+        slave_flat: (21 + 13 k,) Slave.
+        state_flat: (52 + 3 k,) SlaveState, written.
         back: (n, 7, k) packets of the machine on their way, written.
         packet: (7, k) the last one that the master got, written.
         lost: (ticks, 2) whether the packet that arrives then is lost: forward, back.
@@ -47,7 +47,8 @@ def to_the_hand(
         hand_flat: (61,) Muscles, written.
         past: (reflex + 1, 6) see `pull`.
         tremor: (n, 6) see `pull`.
-        forward: (n, 3, 6) packets of the master on their way, written.
+        forward: (n, 3, 6) packets of the master on their way, written: displacement and rate of the
+            handle, what is left of the hand's force beyond the joystick's own spring and damper.
 
     Returns:
         Nothing.
@@ -67,14 +68,19 @@ def to_the_hand(
         line[0] += period
     else:
         line[0] = 0.0
-        packet[:] = back[(tick + 1) % rows]
+        for row in range(7):
+            for i in range(k):  # a number that is none does not count
+                if np.isfinite(back[(tick + 1) % rows, row, i]):
+                    packet[row, i] = back[(tick + 1) % rows, row, i]
     goal = 0.0 if tripped or line[0] > line[3] else 1.0
     line[1] += (goal - line[1]) * min(1.0, period / line[4])
-    master_step(unpack_master(master_flat), qpos, packet, line[1], period if tick else 0.0, m)
+    numbers = unpack_master(master_flat)
+    master_step(numbers, qpos, packet, line[1], period, tick == 0, m)
     pull(hand, past, tremor, m.handle, tick, period)
     ahead = forward[tick % len(forward)]
     for i in range(6):
-        ahead[0, i], ahead[1, i], ahead[2, i] = m.handle[i], m.speed[i], m.hand[i]
+        own = m.stiffness[i] * m.handle[i] + numbers.axis[i, 4] * m.speed[i]
+        ahead[0, i], ahead[1, i], ahead[2, i] = m.handle[i], m.speed[i], m.hand[i] - own
 
 
 @compiled
@@ -89,8 +95,8 @@ def to_the_machine(
         joint: (nu,) measured [rad] or [m].
         force: (k,) at the tip, task coordinates [N], [N m].
         columns: (k,) places of the arm's joints among the axes.
-        slave_flat: (21 + 11 k,) Slave.
-        state_flat: (62 + 3 k,) SlaveState, written.
+        slave_flat: (21 + 13 k,) Slave.
+        state_flat: (52 + 3 k,) SlaveState, written.
         forward: (n, 3, 6) packets of the master on their way.
         lost: (ticks, 2) whether the packet that arrives then is lost: forward, back.
         line: (5,) see `to_the_hand`.

@@ -1,8 +1,9 @@
 """The slave's side of teleoperation: packets of the master into joint references, safely.
 
 Under rate control the handle beyond its dead band asks for a rate of the task coordinates, under
-position control for their place. With four channels a virtual mass stands between, which the hand's
-and the task's force move, because a valve-controlled machine does not yield by itself.
+position control for their place; bounds of speed and acceleration keep the references continuous.
+With four channels a virtual mass stands between, which the hand's and the task's force move,
+because a valve-controlled machine does not yield by itself.
 """
 
 from typing import NamedTuple
@@ -12,12 +13,14 @@ import numpy as np
 from hydrotele.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine import Machine
+from hydrotele.operate.axis_table import LEVER
 from hydrotele.operate.flat import flat_state, flattened
-from hydrotele.operate.master import LEVER, Master
-from hydrotele.operate.resolved_motion import arm_facts, follow_pose
-from hydrotele.teleoperation import TeleopPilot
+from hydrotele.operate.master import WINDUP, Master
+from hydrotele.operate.resolved_motion import COORDINATES, arm_facts, follow_pose
+from hydrotele.teleoperation import Coupling, TeleopPilot
 
 _SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
+_BRAKE = 0.8  # of the acceleration: the rest makes up for the filter's lag
 _AHEAD = 0.02  # s over which the change of a rate is averaged before it is looked ahead
 _BLEND = 30.0  # rad/s, of measured task rates from held angles
 BLOCKED, SILENT, TRIPPED, AGE = range(4)  # of `SlaveState.flags`
@@ -32,8 +35,9 @@ class Slave(NamedTuple):
         arm: (9,) of `kinematics.task.task_numbers`.
         ranges: (k, 2) joint ranges [rad].
         start: (5,) pose at the start: r [m], theta [rad], z [m], attitude [rad], head [rad].
-        table: (k, 9) of every coordinate: joystick axis (-1 without), sign, gain, dead band, reach,
-            coupling, its damping, hand per machine force, lever of the virtual mass [1] or [m^2].
+        table: (k, 11) of every coordinate: joystick axis (-1 without), sign, gain, dead band,
+            reach, coupling, its damping, hand per machine force, lever of the virtual mass [1] or
+            [m^2], largest speed [m/s] or [rad/s], largest force that counts [N] or [N m].
         limits: (5,) silence [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
             mass [kg], lead of the drives [s].
         kind: (2,) structure and mode.
@@ -56,11 +60,10 @@ class SlaveState(NamedTuple):
         joint: (k,) joint references [rad].
         joint_rate: (k,) [rad/s].
         ahead: (k,) rates as they will be by the time the valves have moved [rad/s].
-        filtered: (2, 5) of commands under position control: place and rate; of the virtual mass.
         measured: (2, 5) pose of the measured joints and its filtered rate.
         command: (3, 6) last packet: handle, its rate, hand's force.
         force_integral: (5,) of the hand's force, for four channels under rate control.
-        asked: (5,) integral of the rate that the handle asks for, for the same.
+        asked: (5,) integral of the rate that the handle asks for, for the same [m], [rad].
         flags: (4,) whether it is held at the edge, the line silent, the valves closed for good; age
             of the last packet [s].
     """
@@ -70,7 +73,6 @@ class SlaveState(NamedTuple):
     joint: np.ndarray
     joint_rate: np.ndarray
     ahead: np.ndarray
-    filtered: np.ndarray
     measured: np.ndarray
     command: np.ndarray
     force_integral: np.ndarray
@@ -99,21 +101,22 @@ def slave(
     arm, _, ranges = arm_facts(machine)
     k, pose = len(joints), np.zeros(5)
     task_forward(arm, joints, pose)
-    table = np.zeros((k, 9))
+    table = np.zeros((k, 11))
     table[:, 0] = -1.0
     for axis, row in enumerate(numbers.axis):
         if row[10] >= 0.0:
             lever = 1.0 if axis < 3 else LEVER**2
+            name = COORDINATES[int(row[10])]
+            speed = pilot.coordinates.get(name, Coupling()).speed  # pyright: ignore - a Coordinate
             table[int(row[10])] = (
-                axis, row[11], row[12], row[6], row[9], row[14], row[15], row[13], lever
+                axis, row[11], row[12], row[6], row[9], row[14], row[15], row[13], lever, speed,
+                row[16],
             )  # fmt: skip
     safety = pilot.safety
     limits = np.array(
         [safety.silence, safety.following_error, pilot.acceleration, pilot.virtual_mass, lead]
     )
-    state = flat_state(
-        SlaveState, [(5,), (5,), (k,), (k,), (k,), (2, 5), (2, 5), (3, 6), (5,), (5,), (4,)]
-    )
+    state = flat_state(SlaveState, [(5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,)])
     state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
     return flattened(Slave(arm, ranges, pose, table, limits, numbers.kind)), state
 
@@ -123,7 +126,7 @@ def unpack_slave(flat, k):
     """The parts of `flat_view(Slave)`.
 
     Args:
-        flat: (21 + 11 k,) array.
+        flat: (21 + 13 k,) array.
         k: number of joints, scalar.
 
     Returns:
@@ -133,9 +136,9 @@ def unpack_slave(flat, k):
     """
     a = 9 + 2 * k
     b = a + 5
-    c = b + 9 * k
+    c = b + 11 * k
     return Slave(
-        flat[0:9], flat[9:a].reshape(k, 2), flat[a:b], flat[b:c].reshape(k, 9), flat[c : c + 5],
+        flat[0:9], flat[9:a].reshape(k, 2), flat[a:b], flat[b:c].reshape(k, 11), flat[c : c + 5],
         flat[c + 5 : c + 7],
     )  # fmt: skip
 
@@ -145,7 +148,7 @@ def unpack_slave_state(flat, k):
     """The parts of `flat_view(SlaveState)`.
 
     Args:
-        flat: (62 + 3 k,) array.
+        flat: (52 + 3 k,) array.
         k: number of joints, scalar.
 
     Returns:
@@ -156,9 +159,8 @@ def unpack_slave_state(flat, k):
     a = 10 + 3 * k
     return SlaveState(
         flat[0:5], flat[5:10], flat[10 : 10 + k], flat[10 + k : 10 + 2 * k], flat[10 + 2 * k : a],
-        flat[a : a + 10].reshape(2, 5), flat[a + 10 : a + 20].reshape(2, 5),
-        flat[a + 20 : a + 38].reshape(3, 6), flat[a + 38 : a + 43], flat[a + 43 : a + 48],
-        flat[a + 48 : a + 52],
+        flat[a : a + 10].reshape(2, 5), flat[a + 10 : a + 28].reshape(3, 6),
+        flat[a + 28 : a + 33], flat[a + 33 : a + 38], flat[a + 38 : a + 42],
     )  # fmt: skip
 
 
@@ -182,6 +184,9 @@ def measure_task(numbers, joint, fresh, elapsed, s):
         return
     pose = np.empty(5)
     task_forward(numbers.arm, joint, pose)
+    for i in range(5):
+        if not np.isfinite(pose[i]):
+            return
     share = min(1.0, _BLEND * elapsed)
     for i in range(5):
         if elapsed > 0.0:
@@ -221,26 +226,18 @@ def ask(numbers, packet, arrived, force, period, s):
         if c >= k or (c == 3 and k < 4):
             continue
         row = numbers.table[c]
-        x, v, hand = 0.0, 0.0, 0.0
+        goal = 0.0
         if row[0] >= 0.0 and s.flags[1] == 0.0:
             i = int(row[0])
-            x, v, hand = (
-                row[1] * s.command[0, i],
-                row[1] * s.command[1, i],
-                row[1] * s.command[2, i],
+            x, v, hand = s.command[0, i], s.command[1, i], s.command[2, i]
+            goal = _wanted_rate(
+                numbers, row, c, row[1] * x, row[1] * v, row[1] * hand, force[c], period, s
             )
-        beyond = abs(x) - row[3]
-        x_live = 0.0 if beyond <= 0.0 else (beyond if x > 0.0 else -beyond)
-        if numbers.kind[0] == 4:
-            rate[c] = _virtual_rate(numbers, row, c, x, v, hand, force[c], period, s)
-        elif numbers.kind[1] == 0:
-            most = max(row[4] - row[3], 0.0)
-            rate[c] = row[2] * min(most, max(-most, x_live))
-        elif s.flags[1] == 0.0:
-            rate[c] = _placed_rate(numbers, row, c, x, period, s)
-        if numbers.kind[1] == 0 or s.flags[1] > 0.0:
-            change = numbers.limits[2] * period
-            rate[c] = min(s.rate[c] + change, max(s.rate[c] - change, rate[c]))
+        else:
+            s.asked[c], s.force_integral[c] = s.pose[c] - numbers.start[c], 0.0
+        goal = min(row[9], max(-row[9], goal))
+        change = numbers.limits[2] * period
+        rate[c] = min(s.rate[c] + change, max(s.rate[c] - change, goal))
         wanted[c] += period * rate[c]
     before = s.joint_rate.copy()
     held = follow_pose(
@@ -256,18 +253,33 @@ def ask(numbers, packet, arrived, force, period, s):
     for c in range(5):
         s.rate[c] = 0.0 if held else rate[c]
         if held:
-            s.filtered[0, c], s.filtered[1, c] = s.pose[c] - numbers.start[c], 0.0
-            s.asked[c], s.force_integral[c] = s.filtered[0, c], 0.0
+            s.asked[c], s.force_integral[c] = s.pose[c] - numbers.start[c], 0.0
+
+
+@compiled
+def _wanted_rate(numbers, row, c, x, v, hand, force, period, s):
+    """Rate that the handle asks a coordinate for."""
+    if numbers.kind[0] == 4:
+        return _virtual_rate(numbers, row, c, x, v, hand, force, period, s)
+    if numbers.kind[1] == 1:
+        return _placed_rate(numbers, row, c, x, period, s)
+    beyond = min(row[4], abs(x)) - row[3]
+    if beyond <= 0.0:
+        return 0.0
+    return row[2] * beyond if x > 0.0 else -row[2] * beyond
 
 
 @compiled
 def _placed_rate(numbers, row, c, x, period, s):
-    """Rate of a coordinate under position control: a critically damped filter of the handle."""
-    place, speed = s.filtered[0, c], s.filtered[1, c]
-    push = _SMOOTH * _SMOOTH * (row[2] * x - place) - 2.0 * _SMOOTH * speed
-    speed += period * push
-    s.filtered[0, c], s.filtered[1, c] = place + period * speed, speed
-    return speed
+    """Rate of a coordinate under position control: a critically damped filter of the handle.
+
+    A long way is gone at the largest speed, and braked as the acceleration allows.
+    """
+    gap = row[2] * x - (s.pose[c] - numbers.start[c])
+    size = abs(gap)
+    speed = min(row[9], 0.5 * _SMOOTH * size, np.sqrt(2.0 * _BRAKE * numbers.limits[2] * size))
+    speed = speed if gap > 0.0 else -speed
+    return s.rate[c] + 2.0 * _SMOOTH * period * (speed - s.rate[c])
 
 
 @compiled
@@ -280,16 +292,18 @@ def _virtual_rate(numbers, row, c, x, v, hand, force, period, s):
     gain, spring, damper = row[2], row[5], row[6]
     mass = numbers.limits[3] * row[8]
     scale = gain if numbers.kind[1] == 1 else 1.0
-    place, speed = s.filtered[0, c] / scale, s.filtered[1, c] / scale
+    place, speed = (s.pose[c] - numbers.start[c]) / scale, s.rate[c] / scale
+    felt = row[7] * min(row[10], max(-row[10], force)) if np.isfinite(force) else 0.0
     ahead, ahead_speed, push = x, v, hand
     if numbers.kind[1] == 0:
-        s.force_integral[c] += period * gain * hand
-        s.asked[c] += period * gain * x
+        most = row[7] * row[10] + mass * numbers.limits[2]
+        total = s.force_integral[c] + period * gain * hand
+        s.force_integral[c] = min(most, max(-most, total))
+        asked = s.asked[c] + period * gain * x
+        s.asked[c] = min(place + WINDUP, max(place - WINDUP, asked))
         ahead, ahead_speed, push = s.asked[c], gain * x, s.force_integral[c]
-    push += row[7] * force + spring * (ahead - place) + damper * (ahead_speed - speed)
-    speed += period * push / mass
-    s.filtered[0, c], s.filtered[1, c] = scale * (place + period * speed), scale * speed
-    return scale * speed
+    push += felt + spring * (ahead - place) + damper * (ahead_speed - speed)
+    return scale * (speed + period * push / mass)
 
 
 @compiled
@@ -334,7 +348,7 @@ def report(numbers, force, s, packet):
         packet[4, c] = s.rate[c]
     if numbers.kind[0] == 4:
         for c in range(len(force)):
-            packet[1, c], packet[2, c] = s.filtered[0, c], s.filtered[1, c]
+            packet[1, c], packet[2, c] = packet[3, c], packet[4, c]
 
 
 @compiled

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from hydrotele.operate.master import COORDINATE, FORCE, PLACE, SIGN, Master
+from hydrotele.operate.axis_table import COORDINATE, SIGN
+from hydrotele.operate.master import FORCE, PLACE, Master
 from hydrotele.teleoperation import TipOver
 
 _GRAVITY = 9.81
