@@ -23,6 +23,7 @@ from hydrotele.simulate.plant import Plant, build_plant, rest_state
 
 STEPS = 1000
 SIMULATIONS = 256
+TELEOPERATED = ("joystick_up", "press_stiffness", "feller_steps")
 COMMAND = (0.2, 0.1, -0.1)
 _SHORT_RUN = ("run", "excitation", "--set", "duration=1.0", "--no-review")
 
@@ -59,8 +60,8 @@ def measure(repeats: int) -> dict:
         repeats: number of turns.
 
     Returns:
-        mechanism_us, hydraulics_us, ratio, scenario_realtime_factor, batch_steps_per_s by thread
-        count, batch_scaling, help_s, run_s.
+        mechanism_us, hydraulics_us, ratio, scenario_realtime_factor, teleoperation_realtime_factor
+        by scenario, batch_steps_per_s by thread count, batch_scaling, help_s, run_s.
     """
     stop_profiling_clock()
     notes.print("mechanism with and without hydraulics ...", style="dim")
@@ -68,6 +69,12 @@ def measure(repeats: int) -> dict:
     bare, full = best_of(repeats, [_bare_stepper(plant), _full_stepper(plant)])
     notes.print("whole scenario ...", style="dim")
     factor = max(_scenario_factor() for _ in range(max(2, repeats // 2)))
+    notes.print("teleoperation ...", style="dim")
+    turns = max(2, repeats // 2)
+    teleoperated = {
+        name: round(max(_teleoperation_factor(name) for _ in range(turns)), 1)
+        for name in TELEOPERATED
+    }
     notes.print("batches ...", style="dim")
     one, two = best_of(max(3, repeats), [_batch_stepper(plant, n) for n in (1, 2)])
     notes.print("start-up ...", style="dim")
@@ -77,6 +84,7 @@ def measure(repeats: int) -> dict:
         "hydraulics_us": round(full / STEPS * 1e6, 3),
         "ratio": round(full / bare, 4),
         "scenario_realtime_factor": round(factor, 1),
+        "teleoperation_realtime_factor": teleoperated,
         "batch_steps_per_s": {"1": round(steps / one), "2": round(steps / two)},
         "batch_scaling": round(one / two, 3),
         "help_s": round(min(_start("--help") for _ in range(3)), 3),
@@ -146,6 +154,11 @@ def _scenario_factor() -> float:
     begin = time.perf_counter()
     run_scenario(scenario)
     return scenario.duration / (time.perf_counter() - begin)
+
+
+def _teleoperation_factor(name: str) -> float:
+    """Real-time factor of the loop: machine, joystick, hand, line, control, sensors."""
+    return run_scenario(load_scenario(name)).summary["realtime_factor"]
 
 
 def _start(*arguments: str) -> float:

@@ -181,7 +181,9 @@ def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> t
     values, units = true_channels(plant, record)
     truth = _log(scenario, machine, record.time, values, units, "ideal")
     state = json.dumps(_initial_state(plant, record))
-    truth = dataclasses.replace(truth, metadata={**truth.metadata, "initial_state": state})
+    things = json.dumps([thing.model_dump() for thing in scenario.surroundings])
+    known = {"initial_state": state} | ({"surroundings": things} if scenario.surroundings else {})
+    truth = dataclasses.replace(truth, metadata={**truth.metadata, **known})
     per_row = round(scenario.control_rate / scenario.log_rate) // seen.every
     errors = {name: e[::per_row][: scenario.rows] for name, e in seen.errors.items()}
     visible = {c: v for c, v in values.items() if not c.startswith(("truth.", "command."))}

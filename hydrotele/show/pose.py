@@ -5,11 +5,16 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from pydantic import TypeAdapter
 
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.simulate.closure import follow_loops, following_joints
 from hydrotele.simulate.mechanism import assemble
+from hydrotele.simulate.surroundings import thing_joints
+from hydrotele.surroundings import Thing
+
+_THINGS = TypeAdapter(list[Thing])
 
 
 class Poses(NamedTuple):
@@ -26,13 +31,20 @@ class Poses(NamedTuple):
     quaternion: np.ndarray
 
 
-def model_with_looks(machine: Machine) -> mujoco.MjModel:
+def model_with_looks(
+    machine: Machine, ground: bool = True, surroundings: tuple[Thing, ...] = ()
+) -> mujoco.MjModel:
     """Compile a machine with all that a picture needs; a plant leaves that out for speed.
+
+    Args:
+        machine: the machine.
+        ground: whether there is a ground.
+        surroundings: what stands around it.
 
     Raises:
         InputError: the MJCF cannot be assembled.
     """
-    root = assemble(machine)
+    root = assemble(machine, ground=ground, surroundings=surroundings)
     return mujoco.MjModel.from_xml_string(root.to_xml_string(precision=17), root.get_assets())
 
 
@@ -66,13 +78,36 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
     return found
 
 
-def body_poses(machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray]) -> Poses:
+def logged_surroundings(log: Log) -> tuple[Thing, ...]:
+    """Plates and trees that a log of truth knows of."""
+    return tuple(_THINGS.validate_json(log.metadata.get("surroundings", "[]")))
+
+
+def _place_things(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
+    """Put plates and trees where a log of truth has them; `rows` (n, nq) is written."""
+    for joint, place in thing_joints(model):
+        name = model.joint(joint).name
+        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_BALL:
+            rows[:, place] = log[f"truth.position.{name}"]
+            continue
+        tree = name.removesuffix("_turn")
+        turns = np.column_stack([log[f"truth.angle.{tree}_r{c}"] for c in "xyz"])
+        for row, turn in zip(rows, turns, strict=True):
+            row[place : place + 4] = (1.0, 0.0, 0.0, 0.0)
+            mujoco.mju_quatIntegrate(row[place : place + 4], turn, 1.0)
+
+
+def body_poses(
+    machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray],
+    log: Log | None = None,
+) -> Poses:  # fmt: skip
     """Place every body, with tubes, rods, rockers and couplers where the pins put them.
 
     Args:
         machine: the machine.
         model: its model, as `model_with_looks` gives it.
         joints: joint name -> (n,) angles [rad] or positions [m]; others stay at home.
+        log: of truth, with what stands around the machine; needed if the model has that.
 
     Returns:
         The poses, n rows; one row where no joint is given.
@@ -82,6 +117,8 @@ def body_poses(machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.
     """
     data = mujoco.MjData(model)
     rows = follow_loops(machine, model, data, joints)
+    if log is not None:
+        _place_things(model, log, rows)
     position = np.empty((len(rows), model.nbody, 3))
     quaternion = np.empty((len(rows), model.nbody, 4))
     for row, qpos in enumerate(rows):

@@ -23,6 +23,7 @@ from hydrotele.show.pose import (
     Poses,
     body_poses,
     logged_joints,
+    logged_surroundings,
     model_with_looks,
     points_on_body,
 )
@@ -114,11 +115,12 @@ def _application_id(machine: Machine, entries: Mapping) -> str:
 def _log_machines(stream, entries) -> Scene:
     contents, trails, models, scene = [], [], {}, None
     for name, (machine, log) in entries.items():
-        key = machine.model_dump_json()
+        things = logged_surroundings(log)
+        key = machine.model_dump_json() + log.metadata.get("surroundings", "")
         if key not in models:
-            models[key] = model_with_looks(machine)
+            models[key] = model_with_looks(machine, surroundings=things)
         model = models[key]
-        poses = body_poses(machine, model, logged_joints(machine, log))
+        poses = body_poses(machine, model, logged_joints(machine, log), log)
         clock, tip = time_column(log.time), _tip(machine, log, poses)
         log_machine(stream, f"/{name}/machine", model, poses, clock, ghost=scene is not None)
         log_tip(stream, f"/{name}/tip_path", tip, clock, scene is not None)

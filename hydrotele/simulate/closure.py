@@ -28,6 +28,17 @@ def following_joints(machine: Machine) -> tuple[str, ...]:
     return (*bars, *loops.following_joints(machine))
 
 
+def shaping_joints(machine: Machine) -> list[str]:
+    """Names of the independent joints that a loop depends on; others, as a saw's, turn freely."""
+    following = following_joints(machine)
+    joints = [axis.joint for axis in machine.axes.values() if axis.cylinder]
+    for closure in machine.closures.values():
+        for link in loops.links_of_loop(machine, closure.a.link, closure.b.link):
+            joint = machine.links[link].joint
+            joints += [joint.name] if joint else []
+    return [name for name in dict.fromkeys(joints) if name not in following]
+
+
 def closure_error(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
     """Openings of all `connect` pins and their Jacobian, in the current configuration.
 
@@ -105,7 +116,8 @@ def close_loops(
     data.qpos[:] = model.qpos0
     for name in following:
         data.qpos[model.joint(name).qposadr[0]] = machine.home.get(name, 0.0)
-    parts = 1 + int(np.max(np.abs(goal - home), initial=0.0) / _STEP)
+    shaping = np.isin(names, shaping_joints(machine))
+    parts = 1 + int(np.max(np.abs(goal - home)[shaping], initial=0.0) / _STEP)
     for part in range(parts + 1):
         data.qpos[places] = home + (goal - home) * part / parts
         if part == 0:
@@ -148,9 +160,11 @@ def follow_loops(
         close_loops(machine, model, data, {})
         return np.tile(data.qpos, (0 if joints else 1, 1))
     places = [model.joint(n).qposadr[0] for n in joints]
+    shaping = np.isin(list(joints), shaping_joints(machine))
     poses = np.empty((len(values), model.nq))
     for row, target in enumerate(values):
-        near = row > 0 and np.abs(target - values[row - 1]).max() <= _STEP
+        moved = np.abs(target - values[row - 1])[shaping]
+        near = row > 0 and moved.max(initial=0.0) <= _STEP
         data.qpos[places] = target
         if not (near and _newton(model, data, following, _FOLLOWED)):
             try:

@@ -1,5 +1,6 @@
 """What a run shows: true channels from recorded states."""
 
+import mujoco
 import numpy as np
 
 from hydrotele.compiled import compiled
@@ -15,6 +16,7 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record
+from hydrotele.simulate.surroundings import thing_joints
 
 _D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 
@@ -150,6 +152,7 @@ def _hidden(plant: Plant, record: Record):
         if name not in driven and name not in following_joints(machine):
             kind, unit = ("angle", "rad") if joint.type == "hinge" else ("position", "m")
             put(f"truth.{kind}.{name}", record.qpos[:, model.joint(name).qposadr[0]], unit)
+    _put_things(plant, record, put)
     _put_hydraulics(plant, record, put)
     for k, letter in enumerate("xyz"):
         if np.any(record.contact):
@@ -157,6 +160,21 @@ def _hidden(plant: Plant, record: Record):
         if record.tip.shape[1]:
             put(f"truth.tip.{letter}", record.tip[:, k], "m")
     return values, units
+
+
+def _put_things(plant: Plant, record: Record, put) -> None:
+    """Where plates and trees are; a tree's turning as a rotation vector."""
+    for joint, place in thing_joints(plant.model):
+        if plant.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
+            tree = plant.model.joint(joint).name.removesuffix("_turn")
+            vectors = np.empty((len(record.time), 3))
+            for row, quaternion in enumerate(record.qpos[:, place : place + 4]):
+                mujoco.mju_quat2Vel(vectors[row], quaternion, 1.0)
+            for letter, column in zip("xyz", vectors.T, strict=True):
+                put(f"truth.angle.{tree}_r{letter}", column, "rad")
+        else:
+            name = plant.model.joint(joint).name
+            put(f"truth.position.{name}", record.qpos[:, place], "m")
 
 
 def _put_hydraulics(plant: Plant, record: Record, put) -> None:

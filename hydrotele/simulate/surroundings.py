@@ -104,6 +104,15 @@ def _write_tree(root, name: str, tree: Tree, machine: Machine, where: str, degre
     )  # fmt: skip
 
 
+def thing_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """(joint, its place in `qpos`) of plates and trees."""
+    return [
+        (j, int(model.jnt_qposadr[j]))
+        for j in range(model.njnt)
+        if model.joint(j).name.startswith(("plate_", "tree_"))
+    ]
+
+
 class Surroundings:
     """Trees of a run while they are cut, held and laid down; plates need nothing.
 
