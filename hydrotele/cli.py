@@ -298,11 +298,11 @@ def review(
 @app.command("list", epilog="Example:  hydrotele list scenarios --json")
 def list_(
     what: Annotated[
-        str, typer.Argument(help="machines, scenarios, effects, or nothing for all.")
+        str, typer.Argument(help="machines, joysticks, scenarios, effects, or nothing for all.")
     ] = "all",
     json: Json = False,
 ) -> None:
-    """List what is shipped: machines with their tools, scenarios, effects."""
+    """List what is shipped: machines with their tools, joysticks, scenarios, effects."""
     from hydrotele.commands.catalogue import list_things
 
     list_things(what, json)
@@ -310,10 +310,10 @@ def list_(
 
 @app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
 def validate(
-    files: Annotated[list[Path], typer.Argument(help="Machines, scenarios or logs.")],
+    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios or logs.")],
     json: Json = False,
 ) -> None:
-    """Check a machine, a scenario or a log; say what is wrong and where."""
+    """Check a machine, a joystick, a scenario or a log; say what is wrong and where."""
     from hydrotele.commands.catalogue import validate_files
 
     validate_files(files, json)
@@ -321,17 +321,17 @@ def validate(
 
 @app.command(epilog="Example:  hydrotele export cat215 --tool bucket --out scene.xml")
 def export(
-    machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
+    machine: Annotated[str, typer.Argument(help="Shipped machine or joystick, or a folder.")],
     tool: ToolName = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="MJCF file; default stdout.")
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", help="Write a PNG of the machine instead.")
+        Path | None, typer.Option("--picture", help="Write a PNG of it instead.")
     ] = None,
     camera: Annotated[str, typer.Option(help="Camera of the picture.")] = "overview",
 ) -> None:
-    """Write the complete MJCF of a machine, or a picture of it."""
+    """Write the complete MJCF of a machine or joystick, or a picture of it."""
     from hydrotele.commands.catalogue import export_machine
 
     export_machine(machine, tool, out, picture, camera)

@@ -4,13 +4,15 @@
 """
 
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from hydrotele.datafile import Facts, Name, NonNegative, Positive, Vector, parse, read_yaml
+from hydrotele.datafile import Facts, Name, NonNegative, Positive, Vector, parse, read_yaml, suggest
 from hydrotele.errors import InputError
 from hydrotele.resources import models_folder
 
+JOYSTICK_FILE = "joystick.yaml"
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -43,6 +45,20 @@ class CoilFacts(Facts):
     radius: Positive
     force_per_ampere: Positive
     max_current: Positive
+
+
+class DiodeFacts(Facts):
+    """The position-sensing diodes: distance from the coils' centre [m], step of a reading [m]."""
+
+    distance: Positive
+    step: NonNegative
+
+
+class AloneFacts(Facts):
+    """Second-order systems of the axes x, y, z, rx, ry, rz without a hand: [rad/s], ratio [1]."""
+
+    frequency: Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
+    ratio: Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
 
 
 class HandFacts(Facts):
@@ -101,9 +117,11 @@ class Joystick(Facts):
     folder: str = ""
     workspace: Workspace
     sensing: OpticalSensing
+    diodes: DiodeFacts
     control_rate: Positive
     flotor: FlotorFacts
     coils: CoilFacts
+    alone: AloneFacts
     hand: HandFacts
     mount: Vector
     gains: dict[Name, dict[Name, AxisGains]] = Field(min_length=1)
@@ -116,11 +134,16 @@ class Joystick(Facts):
         return self
 
 
+def shipped_joysticks() -> list[str]:
+    """Names of the joysticks that come with the package."""
+    return sorted(p.parent.name for p in models_folder().glob(f"*/{JOYSTICK_FILE}"))
+
+
 def load_joystick(name_or_path: str | Path = "joystick") -> Joystick:
     """Read a joystick.
 
     Args:
-        name_or_path: `joystick` for the shipped one, or a YAML file.
+        name_or_path: `joystick` for the shipped one, a YAML file, or a folder with joystick.yaml.
 
     Returns:
         The validated facts.
@@ -129,9 +152,12 @@ def load_joystick(name_or_path: str | Path = "joystick") -> Joystick:
         InputError: there is no such file, or names file, line and key of what is wrong.
     """
     path = Path(name_or_path)
-    if str(name_or_path) == "joystick":
-        path = models_folder() / "joystick" / "joystick.yaml"
+    if str(name_or_path) in shipped_joysticks():
+        path = models_folder() / path / JOYSTICK_FILE
+    elif path.is_dir():
+        path = path / JOYSTICK_FILE
     if not path.is_file():
-        raise InputError(f"joystick {str(name_or_path)!r}", "no such file; 'joystick' is shipped")
+        known = suggest(str(name_or_path), shipped_joysticks())
+        raise InputError(f"joystick {str(name_or_path)!r}", f"no such file; {known}")
     data, lines = read_yaml(path)
     return parse(Joystick, data | {"folder": str(path.parent.resolve())}, str(path), lines)

@@ -36,6 +36,7 @@ FLOORS = (
     ("prediction",),
     ("identify",),
     ("simulate", "operate"),
+    ("levitation",),
     ("station_log", "station", "feedforward", "session", "run", "replay", "summary"),
     ("calibrate", "gap"),
     ("experiments",),

@@ -380,15 +380,35 @@ def test_validate_reports_every_file(tmp_path):
     assert code == 2 and [entry["valid"] for entry in found] == [False, True] and "bad.yaml" in err
 
 
-@pytest.mark.parametrize("what", ["machines", "scenarios", "effects"])
+@pytest.mark.parametrize("what", ["machines", "joysticks", "scenarios", "effects"])
 def test_list(what):
     code, out, _ = invoke("list", what, "--json")
     rows = json.loads(out)
-    assert code == 0 and len(rows) >= 4
+    assert code == 0 and len(rows) >= (1 if what == "joysticks" else 4)
     whole = json.loads(invoke("list", "--json")[1])
-    assert whole[what] == rows and whole.keys() == {"machines", "scenarios", "effects"}
+    assert whole[what] == rows and list(whole) == ["machines", "joysticks", "scenarios", "effects"]
     code, text, _ = invoke("list", what)
     assert code == 0 and all(row["name"][:6] in text for row in rows)
+
+
+def test_a_joystick_is_validated_and_exported(tmp_path):
+    import mujoco
+
+    from hydrotele.resources import models_folder
+
+    for name in ("joystick.yaml", "joystick.xml"):
+        shutil.copy(models_folder() / "joystick" / name, tmp_path / name)
+    own = tmp_path / "joystick.yaml"
+    code, out, _ = invoke("validate", "joystick", tmp_path, own)
+    assert code == 0 and out.count("valid joystick") == 3 and "hovers with 0.35 of 4 A" in out
+    own.write_text(own.read_text().replace("mass: 0.85", "mass: 85.0"))
+    code, _, err = invoke("validate", own)
+    assert code == 2 and "does not hover" in err
+    code, out, _ = invoke("export", "joystick")
+    assert code == 0 and mujoco.MjModel.from_xml_string(out).nu == 6
+    assert invoke("export", "joystick", "--tool", "bucket")[0] == 2
+    code, _, err = invoke("validate", "joystik")
+    assert code == 2 and "did you mean 'joystick'" in err
 
 
 def test_validate_takes_everything(finished, tmp_path):

@@ -63,7 +63,11 @@ def test_wheel_has_the_package_machines_and_scenarios_and_nothing_else(wheel):
 def test_every_machine_folder_has_its_numbers():
     folders = {path.name for path in (ROOT / "models").iterdir() if path.is_dir()}
     assert folders
-    assert {path.parent.name for path in (ROOT / "models").glob("*/machine.yaml")} == folders
+    numbers = [
+        *(ROOT / "models").glob("*/machine.yaml"),
+        *(ROOT / "models").glob("*/joystick.yaml"),
+    ]
+    assert sorted(path.parent.name for path in numbers) == sorted(folders)
 
 
 def test_installed_wheel_finds_its_machines_from_any_folder(wheel, tmp_path):

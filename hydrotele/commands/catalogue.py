@@ -7,13 +7,14 @@ from rich.markup import escape
 from hydrotele.commands.console import notes, out, print_json, table
 from hydrotele.datafile import read_yaml, suggest
 from hydrotele.errors import InputError
+from hydrotele.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
 from hydrotele.machine_file import load_machine, machine_path, shipped_machines
 
-_KINDS = ("machines", "scenarios", "effects")
+_KINDS = ("machines", "joysticks", "scenarios", "effects")
 
 
 def list_things(what: str, as_json: bool) -> None:
-    """List machines, scenarios, effects, or all of them.
+    """List machines, joysticks, scenarios, effects, or all of them.
 
     Raises:
         InputError: there is no such list.
@@ -21,7 +22,10 @@ def list_things(what: str, as_json: bool) -> None:
     if what not in (*_KINDS, "all"):
         raise InputError(f"list {what}", suggest(what, [*_KINDS, "all"]))
     wanted = _KINDS if what == "all" else (what,)
-    tables = {"machines": _machines, "scenarios": _scenarios, "effects": _effects}
+    tables = {
+        "machines": _machines, "joysticks": _joysticks, "scenarios": _scenarios,
+        "effects": _effects,
+    }  # fmt: skip
     data = {kind: tables[kind]() for kind in wanted}
     if as_json:
         print_json(data if what == "all" else data[what])
@@ -58,6 +62,11 @@ def _machines() -> list[dict]:
     return rows
 
 
+def _joysticks() -> list[dict]:
+    found = map(load_joystick, shipped_joysticks())
+    return [{"name": j.name, "gains": list(j.gains), "description": j.description} for j in found]
+
+
 def _scenarios() -> list[dict]:
     from hydrotele.scenario import scenario_path, shipped_scenarios
 
@@ -92,7 +101,7 @@ def _effects() -> list[dict]:
 
 
 def validate_files(paths: list[Path], as_json: bool) -> None:
-    """Check machines (with all their tools), scenarios and logs, and say of each what it is.
+    """Check machines with all their tools, joysticks, scenarios and logs; say of each what it is.
 
     Raises:
         InputError: something is wrong; all files have been reported by then.
@@ -127,14 +136,37 @@ def _validate(path: Path) -> tuple[str, str]:
     from hydrotele.scenario import load_scenario, shipped_scenarios
 
     name = str(path)
+    if _is_joystick(path):
+        return "joystick", _check_joystick(path)
     if path.is_dir() or name in shipped_machines():
         return "machine", _check_machine(path)
     if name in shipped_scenarios() or (path.is_file() and "pilot" in read_yaml(path)[0]):
         return "scenario", _check_scenario(load_scenario(path))
     if path.is_file():
         return "machine", _check_machine(path)
-    names = [*shipped_machines(), *shipped_scenarios()]
-    raise InputError(path, f"is no file, machine or scenario; {suggest(name, names)}")
+    names = [*shipped_machines(), *shipped_joysticks(), *shipped_scenarios()]
+    raise InputError(path, f"is no file, machine, joystick or scenario; {suggest(name, names)}")
+
+
+def _is_joystick(path: Path) -> bool:
+    """Whether a name, folder or file is that of a joystick."""
+    if str(path) in shipped_joysticks() or (path / JOYSTICK_FILE).is_file():
+        return True
+    return path.suffix in (".yaml", ".yml") and path.is_file() and "flotor" in read_yaml(path)[0]
+
+
+def _check_joystick(path: Path) -> str:
+    import numpy as np
+
+    from hydrotele.levitation import fly
+
+    joystick = load_joystick(path)
+    flight = fly(joystick, np.zeros((round(joystick.control_rate), 6)))
+    far = np.abs(flight.pose[:, :3]).max()
+    if far > 0.1 * joystick.workspace.translation:
+        raise InputError(path, f"its flotor does not hover: it moves by {1e3 * far:.1f} mm in 1 s")
+    current, most = np.abs(flight.currents[-1]).max(), joystick.coils.max_current
+    return f"hovers with {current:.2f} of {most:g} A; gains {', '.join(joystick.gains)}"
 
 
 def _check_machine(path: Path) -> str:
@@ -167,11 +199,16 @@ def _check_scenario(scenario) -> str:
 def export_machine(
     name: str, tool: str | None, target: Path | None, picture: Path | None, camera: str
 ) -> None:
-    """Write a machine's complete MJCF (default: to stdout), or a picture of it at home.
+    """Write a machine's or joystick's complete MJCF (default: to stdout), or a picture of it.
 
     Raises:
-        InputError: the machine is not usable, or pictures cannot be rendered here.
+        InputError: it is not usable, or pictures cannot be rendered here.
     """
+    if _is_joystick(Path(name)):
+        if tool:
+            raise InputError("--tool", f"the joystick {name} has no tools")
+        _export_joystick(name, target, picture, camera)
+        return
     machine = load_machine(name, tool)
     if picture:
         from hydrotele.show.picture import render_picture
@@ -179,10 +216,30 @@ def export_machine(
         render_picture(machine, picture, camera=camera)
         notes.print(f"written to {picture}")
         return
-    from hydrotele.output import replacing
     from hydrotele.simulate.plant import build_plant
 
-    text = build_plant(machine).mjcf
+    _write(build_plant(machine).mjcf, target)
+
+
+def _export_joystick(name: str, target: Path | None, picture: Path | None, camera: str) -> None:
+    import mujoco
+
+    from hydrotele.simulate.joystick import joystick_spec
+
+    spec = joystick_spec(load_joystick(name), hand=False)
+    model = spec.compile()
+    if not picture:
+        _write(spec.to_xml(), target)
+        return
+    from hydrotele.show.picture import render_model
+
+    render_model(model, mujoco.MjData(model), picture, camera)
+    notes.print(f"written to {picture}")
+
+
+def _write(text: str, target: Path | None) -> None:
+    from hydrotele.output import replacing
+
     if target:
         with replacing(target, ".xml") as part:
             part.write_text(text)

@@ -71,7 +71,8 @@ class MasterState(NamedTuple):
         before: (6,) slow force from the machine, for its rate of change [N], [N m].
         currents: (6,) [A].
         extra: (6,) further force on the handle, such as that of tip-over protection [N], [N m].
-        limited: (1,) share by which the currents had to be made smaller; 1 if not.
+        limited: (1,) share by which the currents had to be made smaller; 1 if not, 0 where they
+            are off because the reading is no number.
         energy: (2,) gone into the handle from the hand [J]: now, and its least so far.
     """
 
@@ -245,7 +246,8 @@ def reflect(numbers, packet, fresh, period, s):
             push -= way * (max(stiff * row[6] - row[7], 0.0) + stiff_out * beyond)
         else:
             push -= stiff * x
-        s.push[i] = push - rub * v + fresh * s.extra[i]
+        total = push - rub * v + fresh * s.extra[i]
+        s.push[i] = total if np.isfinite(total) else -row[0] * x - row[4] * v  # the plain spring
 
 
 @compiled
@@ -313,8 +315,19 @@ def drive_coils(numbers, quaternion, period, s):
 
 
 @compiled
+def _blind(s):
+    """No currents, no command, nothing learnt; the next good reading starts from rest."""
+    for i in range(6):
+        s.handle[i], s.speed[i], s.push[i] = 0.0, 0.0, 0.0
+        s.hand[i], s.momentum[i], s.currents[i] = 0.0, 0.0, 0.0
+    s.limited[0] = 0.0
+
+
+@compiled
 def master_step(numbers, qpos, packet, fresh, period, first, s):
     """One period of the master: read the handle, reflect, drive the coils.
+
+    A reading that is no number switches the coils off and leaves the machine without a command.
 
     Args:
         numbers: Master.
@@ -330,6 +343,9 @@ def master_step(numbers, qpos, packet, fresh, period, first, s):
 
     Source: this module.
     """
-    read_handle(numbers, qpos, 0.0 if first else period, s)
+    if not np.isfinite(qpos).all():
+        _blind(s)
+        return
+    read_handle(numbers, qpos, 0.0 if first or s.limited[0] == 0.0 else period, s)
     reflect(numbers, packet, fresh, period, s)
     drive_coils(numbers, qpos[3:7], period, s)

@@ -52,6 +52,19 @@ def render_picture(
     model = model_with_looks(machine)
     data = mujoco.MjData(model)
     close_loops(machine, model, data, dict(joints or {}))
+    render_model(model, data, path, camera, size)
+
+
+def render_model(
+    model: mujoco.MjModel, data: mujoco.MjData, path: str | os.PathLike, camera: str = _OVERVIEW,
+    size: tuple[int, int] = (1600, 1000),
+) -> None:  # fmt: skip
+    """Draw a compiled model as it stands into a PNG file; arguments as of `render_picture`.
+
+    Raises:
+        InputError: there is no such camera, OpenGL cannot draw without a screen (says what to
+            install), or the file cannot be written.
+    """
     mujoco.mj_fwdPosition(model, data)
     cameras = [model.camera(i).name for i in range(model.ncam)]
     if camera == _OVERVIEW and _OVERVIEW not in cameras:

@@ -28,20 +28,24 @@ class Flotor:
         hand: whether a hand holds the handle.
     """
 
-    def __init__(self, facts: Joystick, *, hand: bool = True, period: float | None = None) -> None:
+    def __init__(
+        self, facts: Joystick, *, hand: bool = True, period: float | None = None, fine: int = 1
+    ) -> None:
         """Compile the joystick.
 
         Args:
             facts: the joystick.
             hand: whether a hand holds it.
             period: of the control [s]; the joystick's own by default.
+            fine: how many times as many physics steps as for runs with a machine.
 
         Raises:
             InputError: its MJCF cannot be read or lacks a part.
         """
         self.facts, self.hand = facts, hand
         self.period = period or 1.0 / facts.control_rate
-        self.steps = max(_STEPS, math.ceil(_STEPS * self.period * facts.control_rate - 1e-9))
+        steps = max(_STEPS, math.ceil(_STEPS * self.period * facts.control_rate - 1e-9))
+        self.steps = fine * steps
         spec = joystick_spec(facts, hand)
         spec.compiler.discardvisual = True
         spec.compiler.fusestatic = True

@@ -210,7 +210,7 @@ def compliance_wrench(
     place = motion.position + turn @ centre
     speed = motion.velocity + turn @ np.cross(w, centre)
     wanted = spring[:3] * (target - place) - damper[:3] * speed
-    scalar, vector = _apart(turned, motion.quaternion)
+    scalar, vector = rotation_between(turned, motion.quaternion)
     vector_rate = 0.5 * (scalar * w + np.cross(vector, w))
     scalar_rate = -0.5 * vector @ w
     swing = -spring[3:] * vector - damper[3:] * vector_rate
@@ -228,9 +228,19 @@ def _cross(v: np.ndarray) -> np.ndarray:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-def _apart(target: np.ndarray, now: np.ndarray) -> tuple[float, np.ndarray]:
-    """Scalar and vector part of the rotation from the target to now, the shorter way."""
-    a, b = np.asarray(target, float), np.asarray(now, float)
+def rotation_between(first: np.ndarray, then: np.ndarray) -> tuple[float, np.ndarray]:
+    """Rotation from one orientation to another, the shorter way.
+
+    Args:
+        first: quaternion (4,), scalar first.
+        then: quaternion (4,).
+
+    Returns:
+        Scalar part, at least 0, and vector part (3,), in the axes of either.
+
+    Source: Zhu 1994, 5.1.3 (Euler quaternions).
+    """
+    a, b = np.asarray(first, float), np.asarray(then, float)
     scalar = float(a @ b)
     vector = a[0] * b[1:] - b[0] * a[1:] - np.cross(a[1:], b[1:])
     return (scalar, vector) if scalar >= 0.0 else (-scalar, -vector)

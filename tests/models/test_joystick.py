@@ -1,0 +1,87 @@
+"""The shipped joystick: Zhu's numbers in SI, its MJCF, what a user's own file may say."""
+
+import shutil
+
+import mujoco
+import numpy as np
+import pytest
+
+from hydrotele.errors import InputError
+from hydrotele.joystick import AXES, load_joystick, shipped_joysticks
+from hydrotele.resources import models_folder
+from hydrotele.simulate.joystick import joystick_spec
+
+JOYSTICK = load_joystick()
+# Zhu 1994, Tables 6.7, 6.9 and 6.11 as printed: N/mm, N/(mm/s), 100 N m/rad, mm, 1e-4 rad
+EXCAVATOR = {
+    **dict.fromkeys(("x", "y", "z"), (4.0, 0.6, 0.3, 0.06, 1.5)),
+    "rx": (0.1, 0.06, 0.01, 0.03, 2000.0),
+    "ry": (0.1, 0.06, 0.01, 0.03, 50.0),
+    "rz": (0.1, 0.06, 0.01, 0.03, 2000.0),
+}
+FELLER = {
+    "x": (8.0, 4.0, 3.0, 0.06, 1.5),
+    "y": (4.0, 3.0, 2.0, 0.06, 1.5),
+    "z": (9.0, 4.0, 3.0, 0.06, 1.5),
+    "rx": (0.8, 0.45, 0.30, 0.04, 350.0),
+    "ry": (0.8, 0.45, 0.30, 0.04, 350.0),
+    "rz": (0.26, 0.25, 0.24, 0.04, 2000.0),
+}
+DETENT = {"x": (2.0, 0.3), "y": (2.0, 0.3), "z": (2.0, 0.4), "rx": (0.8, 0.03), "ry": (0.8, 0.03)}
+
+
+@pytest.mark.parametrize("name, table", [("excavator", EXCAVATOR), ("feller", FELLER)])
+def test_gains_are_those_of_the_tables(name, table):
+    for number, axis in enumerate(AXES):
+        found, (most, nominal, least, damping, band) = JOYSTICK.gains[name][axis], table[axis]
+        turns = number >= 3
+        unit = 100.0 if turns else 1e3
+        assert (found.most, found.nominal, found.least) == pytest.approx(
+            (unit * most, unit * nominal, unit * least)
+        )
+        assert found.deadband == pytest.approx(band * (1e-4 if turns else 1e-3))
+        # rotational damping is ours: the printed one shakes this flotor at 200 Hz (see README)
+        assert found.damping == pytest.approx(0.25 if turns else 1e3 * damping)
+        if name == "feller" and axis in DETENT:
+            drop, outside = DETENT[axis]
+            assert (found.detent.drop, found.detent.outside) == pytest.approx(
+                (drop, unit * outside)
+            )
+
+
+def test_the_mjcf_alone_has_the_numbers_of_the_yaml():
+    """It can be opened without this package; what is written over it changes nothing."""
+    folder = models_folder() / "joystick"
+    alone = mujoco.MjModel.from_xml_path(str(folder / "joystick.xml"))
+    made = joystick_spec(JOYSTICK).compile()
+    for name in ("body_mass", "body_ipos", "jnt_range", "actuator_gear", "site_pos"):
+        np.testing.assert_allclose(
+            getattr(alone, name), getattr(made, name), atol=1e-9, err_msg=name
+        )
+    turn = np.empty(9)
+    for model in (alone, made):
+        body = model.body("flotor")
+        mujoco.mju_quat2Mat(turn, body.iquat)
+        inertia = turn.reshape(3, 3) @ np.diag(body.inertia) @ turn.reshape(3, 3).T
+        np.testing.assert_allclose(inertia, np.diag(JOYSTICK.flotor.inertia), atol=1e-12)
+    assert alone.nu == 6 and (alone.actuator_ctrlrange == [-4.0, 4.0]).all()
+
+
+def test_nothing_of_its_looks_has_mass_or_touches():
+    model = joystick_spec(JOYSTICK, hand=False).compile()
+    assert not model.geom_contype.any() and not model.geom_conaffinity.any()
+    assert model.body_mass.sum() == pytest.approx(JOYSTICK.flotor.mass)
+
+
+def test_a_users_joystick_is_a_file_or_a_folder(tmp_path):
+    for name in ("joystick.yaml", "joystick.xml"):
+        shutil.copy(models_folder() / "joystick" / name, tmp_path / name)
+    assert load_joystick(tmp_path) == load_joystick(tmp_path / "joystick.yaml")
+    assert load_joystick(tmp_path).flotor == JOYSTICK.flotor
+    own = tmp_path / "joystick.yaml"
+    own.write_text(own.read_text().replace("mass: 0.85", "mass: -1"))
+    with pytest.raises(InputError, match="joystick.yaml.*mass"):
+        load_joystick(own)
+    with pytest.raises(InputError, match="valid: joystick"):
+        load_joystick("gamepad")
+    assert shipped_joysticks() == ["joystick"]

@@ -1,0 +1,117 @@
+"""The flotor in MuJoCo: coils, stops, nothing blows up, and what a turning cab does to it."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from hydrotele.joystick import load_joystick
+from hydrotele.levitation import rotation_vector
+from hydrotele.simulate.joystick import Flotor, joystick_spec
+from hydrotele.teleop.coils import three_stations
+
+JOYSTICK = load_joystick()
+REST = np.zeros(6)
+
+
+def lifting(flotor):
+    """Currents that carry the flotor's weight and leave it without torque about its handle."""
+    f, c = JOYSTICK.flotor, JOYSTICK.coils
+    weight = np.array([0.0, 0.0, 9.81 * f.mass, 0.0, 0.0, 0.0])
+    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
+    assert flotor.model.nu == 6
+    return coils.currents(weight).value
+
+
+def test_coils_push_as_their_map_says():
+    flotor = Flotor(JOYSTICK, hand=False)
+    f, c = JOYSTICK.flotor, JOYSTICK.coils
+    made = np.empty((6, 6))
+    for k in range(6):
+        flotor.data.ctrl[:] = np.eye(6)[k]
+        mujoco.mj_forward(flotor.model, flotor.data)
+        made[:, k] = flotor.data.qfrc_actuator
+    expected = three_stations(c.radius, c.force_per_ampere, c.max_current).wrench_map
+    expected[3:] -= np.cross(f.handle, expected[:3], axis=0)  # about the handle, as MuJoCo counts
+    np.testing.assert_allclose(made, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.3])
+def test_a_hand_does_not_push_it_through_a_stop(speed):
+    """A hit at the speed of a hand goes half as deep as the stop's 5 ms at that speed."""
+    flotor = Flotor(JOYSTICK)
+    flotor.data.qvel[0], deepest = speed, 0.0
+    for _ in range(40):
+        flotor.step(lifting(flotor), REST)
+        deepest = max(deepest, flotor.data.qpos[0])
+    assert deepest < 5e-3 + 0.5 * 5e-3 * speed, deepest
+
+
+def test_random_currents_break_nothing():
+    """10 s of currents anywhere within their limits, with and without a hand: no warning.
+
+    Nobody drives it so: all coils upwards throw 0.85 kg with 96 N through 10 mm, and it meets a
+    stop at 1.5 m/s, 3.8 mm per step of 2.5 ms. Two such steps make a stop of
+    5 ms.
+    """
+    rng = np.random.default_rng(6)
+    for hand in (False, True):
+        flotor = Flotor(JOYSTICK, hand=hand)
+        data, most = flotor.data, np.zeros(2)
+        for _ in range(2000):
+            flotor.step(rng.uniform(-4.0, 4.0, 6), REST)
+            turned = np.linalg.norm(rotation_vector(data.qpos[3:7]))
+            most = np.maximum(most, [np.abs(data.qpos[:3]).max(), turned])
+        assert not np.any(data.warning.number) and np.isfinite(data.qpos).all()
+        assert 5e-3 < most[0] < 13e-3 and np.deg2rad(7.0) < most[1] < np.deg2rad(11.0), most
+
+
+@pytest.mark.parametrize("axis", range(6))
+@pytest.mark.parametrize("way", [-1.0, 1.0])
+def test_stops_hold_20_newton(axis, way):
+    """At rest they give way by 0.08 mm and 0.05 deg: 20 N, or what 20 N turn at 0.1 m.
+
+    A stop takes 95 to 99 % of a push at once and the rest over its depth (solimp).
+    """
+    flotor, push = Flotor(JOYSTICK, hand=False), np.zeros(6)
+    push[axis] = way * (20.0 if axis < 3 else 2.0)
+    currents = lifting(flotor)
+    flotor.model.dof_damping[:] = [20.0] * 3 + [0.2] * 3  # so that it comes to rest
+    for _ in range(600):
+        flotor.step(currents, push)
+    found = np.concatenate([flotor.data.qpos[:3], rotation_vector(flotor.data.qpos[3:7])])
+    if axis < 3:
+        assert 5.0e-3 < way * found[axis] < 5.08e-3, found
+    else:
+        assert np.deg2rad(7.0) < way * found[axis] < np.deg2rad(7.05), np.rad2deg(found)
+
+
+def test_a_turning_cab_does_what_it_does_in_a_whole_model():
+    """0.1 s of free float in a cab that spins up, against MuJoCo with a cab of 1e9 kg m^2.
+
+    What the flotor's own motion adds is left out: Coriolis at 0.05 m/s on average and 0.7 rad/s is
+    0.07 of the 1.2 m/s^2 that push it aside, 6 %.
+    """
+    spin, rate, mount = 0.6, 1.5, np.array(JOYSTICK.mount)
+    flotor = Flotor(JOYSTICK, hand=False, fine=8)
+    currents = lifting(flotor)
+    inside = joystick_spec(JOYSTICK, hand=False)
+    world, inside.option = mujoco.MjSpec(), mujoco.MjSpec().option
+    inside.visual.map.znear = world.visual.map.znear
+    cab = world.worldbody.add_body(name="cab", mass=1.0, inertia=[1e9] * 3)
+    cab.add_joint(name="swing", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
+    world.attach(inside, frame=cab.add_frame(pos=mount))
+    world.option.timestep, world.option.gravity = flotor.model.opt.timestep, [0, 0, -9.81]
+    model = world.compile()
+    data = mujoco.MjData(model)
+    data.qvel[0], data.qfrc_applied[0], data.ctrl[:] = spin, 1e9 * rate, currents
+    for _ in range(40):
+        flotor.shaken_step(currents, REST, mount, data.qvel[0], rate)
+        mujoco.mj_step(model, data, nstep=flotor.steps)
+        if np.abs(data.qpos[1:4]).max() > 4e-3:
+            break
+    whole, own = data.qpos[1:], flotor.data.qpos
+    far = np.abs(whole[:3]).max()
+    assert far > 2e-3  # it was shaken
+    assert np.abs(own[:3] - whole[:3]).max() < 0.06 * far, (own, whole)
+    turned = rotation_vector(whole[3:])
+    assert np.abs(rotation_vector(own[3:]) - turned).max() < 0.06 * np.abs(turned).max()
