@@ -1,113 +1,248 @@
-"""The master's control on the simulated joystick: faults, detent, too large demands."""
+"""The master's control: its kernels are the plain laws, statics hold, bad numbers do no harm."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from hydrotele.joystick import load_joystick
-from hydrotele.operate.master import master, master_step
+from hydrotele.errors import InputError
+from hydrotele.joystick import AXES, load_joystick
+from hydrotele.operate.axis_table import COORDINATE, DEADBAND, SIGN, axis_table
+from hydrotele.operate.flat import flat_view
+from hydrotele.operate.master import (
+    drive_coils,
+    master,
+    master_step,
+    reflect,
+    unpack_master,
+    unpack_master_state,
+)
 from hydrotele.simulate.joystick import Flotor
 from hydrotele.teleop.coils import three_stations
-from hydrotele.teleop.compliance import holding_wrench
-from hydrotele.teleop.handle import Detent
+from hydrotele.teleop.handle import Detent, StiffnessFeedback
 from hydrotele.teleoperation import TeleopPilot
 
-JOYSTICK = load_joystick()
-COORDINATES = ("r", "theta", "z")
-PERIOD, QUIET = 5e-3, np.zeros((7, 3))
+STICK = load_joystick()
+NAMES = ("r", "theta", "z", "attitude")
+PERIOD = 0.005
+STILL = {"kind": "follow"}
 
 
-def at(x=0.0, y=0.0, z=0.0):
-    return np.array([x, y, z, 1.0, 0.0, 0.0, 0.0])
+def pilot(**changed) -> TeleopPilot:
+    return TeleopPilot.model_validate({"kind": "teleop", "operator": STILL, **changed})
 
 
-def seated(**keys):
-    """Numbers and state of a master."""
-    pilot = TeleopPilot.model_validate(
-        {"kind": "teleop", "operator": {"kind": "follow"}, "reflection": "none", **keys}
+def built(**changed):
+    return master(STICK, pilot(**changed), NAMES)
+
+
+def pushed(numbers, s, packet=None, fresh=1.0):
+    reflect(numbers, np.zeros((7, 4)) if packet is None else packet, fresh, PERIOD, s)
+    return s.push
+
+
+@given(
+    number=st.sampled_from([0, 1, 2, 4]),
+    x=st.floats(-5e-3, 5e-3),
+    v=st.floats(-0.1, 0.1),
+    force=st.floats(-2e5, 2e5) | st.just(np.nan),
+)
+def test_stiffness_feedback_is_the_plain_law(number, x, v, force):
+    """1e-12 of its largest force: the same sums in another order."""
+    numbers, s = built(reflection="stiffness")
+    row, gains = numbers.axis[number], STICK.gains["excavator"][AXES[number]]
+    law = StiffnessFeedback(
+        gains.nominal, gains.least, gains.most,
+        (gains.most - gains.nominal) / gains.force_limit, gains.damping, gains.force_limit,
+        gains.deadband,
+    )  # fmt: skip
+    packet = np.zeros((7, 4))
+    packet[0, int(row[COORDINATE])] = force
+    s.handle[number], s.speed[number] = x, v
+    contact = -row[SIGN] * force  # against a positive command
+    wanted = law.force(x, v, contact)
+    assert pushed(numbers, s, packet)[number] == pytest.approx(wanted, abs=1e-12 * 4000)
+    assert s.stiffness[number] == pytest.approx(law.stiffness(x, contact), rel=1e-12)
+
+
+@given(number=st.integers(0, 4), x=st.floats(-5e-3, 5e-3))
+def test_detent_is_the_plain_law(number, x):
+    """1e-9 N: the same sums in another order."""
+    numbers, s = built(reflection="none", gains="feller", detent=True)
+    gains = STICK.gains["feller"][AXES[number]]
+    law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
+    s.handle[number] = x * (1.0 if number < 3 else 20.0)
+    assert pushed(numbers, s)[number] == pytest.approx(law.force(s.handle[number]), abs=1e-9)
+
+
+def test_detent_never_pushes_outwards_and_needs_rate_control():
+    """A task that softens the spring below what the drop takes leaves no force, not a push out."""
+    numbers, s = built(gains="feller", detent=True, stiffness={"z": {"least": 0.0}})
+    packet = np.zeros((7, 4))
+    packet[0, 2] = 1e6
+    s.handle[2] = 1.6e-3
+    assert pushed(numbers, s, packet)[2] <= 0.0
+    numbers, s = built(gains="feller", detent=True, mode="position", reflection="direct_force")
+    s.handle[2] = 1.6e-3
+    assert pushed(numbers, s)[2] == 0.0
+
+
+def turned(rng) -> np.ndarray:
+    q = np.array([1.0, *rng.uniform(-0.06, 0.06, 3)])
+    return q / np.linalg.norm(q)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_coils_put_the_push_on_the_handle_and_carry_the_weight(seed):
+    """All forces on the flotor together are the push at the handle; 1e-9 N is rounding."""
+    rng = np.random.default_rng(seed)
+    numbers, s = built()
+    s.push[:] = rng.uniform(-3, 3, 6) * np.array([1, 1, 1, 0.1, 0.1, 0.1])
+    quaternion = turned(rng)
+    drive_coils(numbers, quaternion, PERIOD, s)
+    w, v = quaternion[0], quaternion[1:]
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    coils = three_stations(
+        STICK.coils.radius, STICK.coils.force_per_ampere, STICK.coils.max_current
     )
-    return master(JOYSTICK, pilot, COORDINATES)
+    made = coils.wrench_map @ s.currents
+    weight = turn.T @ np.array([0, 0, -9.81 * STICK.flotor.mass])
+    handle, com = np.array(STICK.flotor.handle), np.array(STICK.flotor.com)
+    np.testing.assert_allclose(turn @ (made[:3] + weight), s.push[:3], atol=1e-9)
+    about_handle = made[3:] - np.cross(handle, made[:3]) + np.cross(com - handle, weight)
+    np.testing.assert_allclose(about_handle, s.push[3:], atol=1e-9)
+    assert s.limited[0] == 1.0
 
 
-def test_a_reading_that_is_no_number_switches_the_coils_off():
-    numbers, s = seated(reflection="four_channel")
-    master_step(numbers, at(3e-3), QUIET, 1.0, PERIOD, True, s)
-    master_step(numbers, at(3e-3), QUIET, 1.0, PERIOD, False, s)
-    assert np.abs(s.currents).max() > 0.1 and s.limited[0] == 1.0
-    master_step(numbers, at(np.nan), QUIET, 1.0, PERIOD, False, s)
-    assert not s.currents.any() and not s.handle.any() and s.limited[0] == 0.0
-    for _ in range(3):
-        master_step(numbers, at(3e-3), QUIET, 1.0, PERIOD, False, s)
-        assert all(np.isfinite(part).all() for part in s)
-    # from rest: there was no jump from the centre to 3 mm in 5 ms
-    assert not s.speed.any() and s.limited[0] == 1.0
+def test_currents_are_limited_as_a_whole():
+    """The wrench keeps its direction and the hand's estimate knows what was given."""
+    numbers, s = built()
+    s.push[0] = 1000.0
+    drive_coils(numbers, np.array([1.0, 0, 0, 0]), PERIOD, s)
+    assert np.abs(s.currents).max() == pytest.approx(STICK.coils.max_current)
+    assert 0.0 < s.limited[0] < 1.0
+    assert s.momentum[0] == pytest.approx(PERIOD * 1000.0 * s.limited[0])
+
+
+def levitated(push, seconds=1.5, **changed):
+    """The joystick in a hand, its control, and what muscles (6,) do beyond carrying the hand."""
+    numbers, s = built(**changed)
+    flotor, packet = Flotor(STICK), np.zeros((7, 4))
+    muscles = np.asarray(push, float) + np.array([0, 0, 9.81 * STICK.hand.mass, 0, 0, 0])
+    for tick in range(round(seconds / PERIOD)):
+        master_step(numbers, flotor.data.qpos, packet, 1.0, PERIOD, tick == 0, s)
+        flotor.step(s.currents, muscles)
+    return numbers, s, flotor
+
+
+def test_handle_stands_still_without_a_push():
+    """In MuJoCo: 2 um is the sensing's step either way, 1 N/m of a spring would let 8 N sag."""
+    _, s, flotor = levitated(np.zeros(6))
+    assert np.abs(flotor.data.qpos[:3]).max() < 2e-6
+    assert np.abs(flotor.data.qpos[4:7]).max() < 2e-5
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_straight_push_moves_the_handle_straight(axis):
+    """F / K along the axis, nothing across and no turning; steps of the sensing are 1 um, 17 urad.
+
+    The joystick's spring and that of the hand share the push, and what the hand puts on the handle
+    is what is estimated: 0.01 N is some steps of the sensing times 600 N/m.
+    """
+    push = np.zeros(6)
+    push[axis] = 1.2
+    numbers, s, flotor = levitated(push)
+    away = flotor.data.qpos[:3].copy()
+    both = numbers.axis[axis, 0] + STICK.hand.stiffness
+    assert away[axis] == pytest.approx(1.2 / both, abs=3e-6)
+    assert np.abs(np.delete(away, axis)).max() < 3e-6
+    assert np.abs(2 * flotor.data.qpos[4:7]).max() < 1e-4
+    np.testing.assert_allclose(s.hand, push * (1.0 - STICK.hand.stiffness / both), atol=0.01)
+
+
+def test_flat_arrays_show_the_parts():
+    rng = np.random.default_rng(0)
+    numbers, s = built()
+    for whole, parts, unpack in (
+        (flat_view(numbers), numbers, unpack_master), (flat_view(s), s, unpack_master_state),
+    ):  # fmt: skip
+        whole[:] = rng.standard_normal(len(whole))
+        for shown, part in zip(unpack(whole), parts, strict=True):
+            np.testing.assert_array_equal(shown, part)
+            assert np.shares_memory(shown, part)
+
+
+@pytest.mark.parametrize("mode", ["rate", "position"])
+@pytest.mark.parametrize(
+    "kind",
+    ["none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance"],
+)
+def test_a_huge_force_and_none_at_all_leave_the_push_bounded(kind, mode):
+    """1 kN is beyond any coil; silence takes away all that came from the machine."""
+    numbers, s = built(reflection=kind, mode=mode)
+    packet = np.full((7, 4), 1e6)
+    packet[1:5] = 0.5
+    s.handle[:3] = 2e-3
+    for _ in range(400):
+        push = pushed(numbers, s, packet)
+    assert np.isfinite(push).all() and np.abs(push).max() < 1e3
+    for _ in range(400):
+        push = pushed(numbers, s, packet, fresh=0.0)
+    still, alone = built(reflection=kind, mode=mode)
+    alone.handle[:3] = 2e-3
+    if kind != "four_channel" or mode == "position":
+        np.testing.assert_allclose(push, pushed(still, alone, fresh=0.0), atol=1e-9)
+
+
+def test_identified_damping_stays_below_what_a_sampled_flotor_bears():
+    """At most the joystick's own once more: the handle comes to rest instead of shaking."""
+    numbers, s = built(reflection="impedance")
+    packet = np.zeros((7, 4))
+    packet[5:] = 1e9
+    flotor = Flotor(STICK)
+    muscles = np.array([0, 0, 9.81 * STICK.hand.mass, 0, 0, 0])
+    flotor.place(np.array([0.0, 0.0, 2e-3, 0.0, 0.0, 0.0]))
+    for tick in range(200):
+        master_step(numbers, flotor.data.qpos, packet, 1.0, PERIOD, tick == 0, s)
+        flotor.step(s.currents, muscles)
+    assert np.abs(s.currents).max() < 0.5 * STICK.coils.max_current
+    assert abs(flotor.data.qpos[2]) < 1e-4
 
 
 @pytest.mark.parametrize(
-    "kind", ["stiffness", "direct_force", "coordinating_force", "four_channel", "impedance"]
-)
-def test_a_packet_that_is_no_number_leaves_the_spring(kind):
-    numbers, s = seated(reflection=kind)
-    for _ in range(3):
-        master_step(numbers, at(3e-3), np.full((7, 3), np.nan), 1.0, PERIOD, False, s)
-    assert np.isfinite(s.currents).all() and np.abs(s.currents).max() < 4.0
-    # 600 N/m; between K_min and K_max where the stiffness itself was no number
-    assert -4000.0 * 3e-3 <= s.push[0] <= -300.0 * 3e-3
-    master_step(numbers, at(3e-3), QUIET, 1.0, PERIOD, False, s)
-    assert all(np.isfinite(part).all() for part in s)
+    ("changed", "where"),
+    [
+        ({"gains": "digger"}, "pilot.gains"),
+        ({"stiffness": {"z": {"least": 700.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"least": -1.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"most": 10.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"force_limit": 0.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"damping": -1.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"stifness": 1.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"detent": 1.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"deadband_mm": 6.0}}, "coordinates": {"z": {}}}, "coordinates.z"),
+        ({"coordinates": {"head": {}}}, "pilot.coordinates"),
+        ({"coordinates": {"z": {"axis": "x"}}}, "pilot.coordinates"),
+        ({"operator": {"kind": "steer", "time": [0], "points": {"head": [0]}}}, "points.head"),
+        (
+            {"operator": {"kind": "track",
+                          "target": {"coordinate": "head", "time": [0], "force": [1]}}},
+            "target.coordinate",
+        ),
+        (
+            {"coordinates": {}, "stiffness": {"z": {"deadband": 0.01}},
+             "operator": {"kind": "regulate", "target": {"time": [0], "force": [1]}}},
+            "target.coordinate",
+        ),
+    ],
+)  # fmt: skip
+def test_impossible_gains_are_refused_by_name(changed, where):
+    with pytest.raises(InputError) as error:
+        built(**changed)
+    assert where in error.value.where
 
 
-def test_a_frozen_reading_pushes_as_before_and_no_harder():
-    """Frozen at 3 mm: the coils keep the 1.8 N of there; a hand of 250 N/m is held at 7 mm of it.
-
-    So the handle stays within its stops and the currents as they were. The master cannot know: a
-    hand may rest. What stands alone knows by its noise (`operate.levitate`).
-    """
-    numbers, s = seated()
-    flotor, muscles = Flotor(JOYSTICK), np.zeros(6)
-    muscles[2] = 9.81 * JOYSTICK.hand.mass
-    for k in range(400):
-        master_step(numbers, at(3e-3), QUIET, 1.0, PERIOD, k == 0, s)
-        flotor.step(s.currents, muscles)
-    assert s.push[0] == pytest.approx(-1.8) and np.abs(s.currents).max() < 1.0
-    assert np.abs(flotor.data.qpos[:3]).max() < 5.1e-3
-    assert not np.any(flotor.data.warning.number)
-
-
-def test_a_demand_beyond_the_coils_keeps_its_direction():
-    numbers, s = seated()
-    s.extra[:] = [300.0, -200.0, 100.0, 5.0, 0.0, -8.0]
-    master_step(numbers, at(), QUIET, 1.0, PERIOD, True, s)
-    assert np.abs(s.currents).max() == pytest.approx(4.0) and 0.0 < s.limited[0] < 1.0
-    c, wanted = JOYSTICK.coils, np.empty(6)
-    holding_wrench(
-        numbers.mass[0], numbers.below, numbers.handle, s.push, np.eye(3), numbers.gravity, wanted
-    )
-    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
-    np.testing.assert_allclose(coils.wrench(s.currents), s.limited[0] * wanted, rtol=1e-9)
-
-
-@pytest.mark.parametrize("axis, far", [(0, 3e-3), (3, 0.07)])
-def test_the_detent_is_felt_as_it_was_designed(axis, far):
-    """The handle is led through its notch by a clamp; the clamp's force is that of the law.
-
-    A step of the reading, 1 um or 0.001 deg, is 4 mN or 0.8 mN m of the spring and, within 5 ms,
-    12 mN or 0.9 mN m of the damping.
-    """
-    numbers, s = seated(gains="feller", detent=True)
-    gains = JOYSTICK.gains["feller"]["x" if axis == 0 else "rx"]
-    law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
-    flotor, joint = Flotor(JOYSTICK, hand=False), 0 if axis == 0 else 3
-    flotor.model.jnt_stiffness[:] = [2e4] * 3 + [200.0]
-    flotor.model.dof_damping[:] = [100.0] * 3 + [2.0] * 3
-    fine = 16e-3 if axis == 0 else 1.7e-3
-    for place in np.linspace(-far, far, 13) * 1.01:  # away from the very edge
-        spring = flotor.model.qpos_spring
-        spring[:7] = (
-            at(place) if axis == 0 else [0, 0, 0, np.cos(place / 2), np.sin(place / 2), 0, 0]
-        )
-        for k in range(120):
-            master_step(numbers, flotor.data.qpos, QUIET, 1.0, PERIOD, k == 0, s)
-            flotor.step(s.currents, np.zeros(6))
-        clamp = flotor.data.qfrc_passive[joint]
-        now = flotor.data.qpos[0] if axis == 0 else 2.0 * np.arcsin(flotor.data.qpos[4])
-        assert clamp == pytest.approx(-law.force(now), abs=fine), place
+def test_gains_of_the_scenario_may_carry_units():
+    table = axis_table(STICK, pilot(stiffness={"z": {"deadband_mm": 2.0}}), NAMES)
+    assert table[2, DEADBAND] == pytest.approx(2e-3)
