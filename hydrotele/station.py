@@ -13,6 +13,7 @@ import numpy as np
 
 from hydrotele.errors import InputError
 from hydrotele.joystick import load_joystick
+from hydrotele.kinematics.task import task_forward
 from hydrotele.machine import Machine
 from hydrotele.noise import sensor_set
 from hydrotele.operate.drive_rows import drive_tables
@@ -87,12 +88,10 @@ class Station:
         self._sensors = sensor_set(machine, scenario.sensors)
         self._feel = _estimator(machine, plan.axes, pilot, seen, self._period, self._sensors)
         self._around = surrounding_bodies(plant)
-        self._task = TaskImpedance(len(axes)) if pilot.reflection == "impedance" else None
-        self._late = round(self._feel.delay / self._period) if self._feel else 0
+        self._task, self._pose = _task(pilot, seen, self._period, len(axes)), np.zeros(5)
         self._force = np.zeros(len(axes))
         self._elapsed = 0.0
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
-        self._seen = self.log.slave("measured")
         self.person = Person(
             pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed,
             hand,
@@ -119,7 +118,7 @@ class Station:
         for fault in self._faults:
             fault.freeze(tick * self._period, seen)
         fresh = tick % seen.every == 0
-        self._felt(tick, data, seen, fresh)
+        self._felt(data, seen, fresh)
         if self._pilot.tip_over:
             push_back(
                 self._pilot.tip_over, self._master, self._line.packet, self._slave.start,
@@ -141,18 +140,16 @@ class Station:
         self._check(tick, seen)
         return self.tripped
 
-    def _felt(self, tick: int, data: mujoco.MjData, seen: Feedback, fresh: bool) -> None:
-        """Force at the tip, and what the task is like if that is reflected.
-
-        The task is identified from a pose that is as old as the filtered force.
-        """
+    def _felt(self, data: mujoco.MjData, seen: Feedback, fresh: bool) -> None:
+        """Force at the tip, and what the task is like if that is reflected."""
         if self._feel is None:
             self._force = self._true_force(data)
         elif fresh:
             self._force = self._feel.update(seen.joint, seen.head, seen.rod)
         if self._task:
             if fresh:
-                self._task.update(self._force, self._seen[max(0, tick - 1 - self._late)])
+                task_forward(self._slave.arm, seen.joint[self.columns], self._pose)
+                self._task.update(self._force, self._pose[: len(self._force)])
             self._line.back[:, TASK_STIFFNESS] = self._task.stiffness
             self._line.back[:, TASK_DAMPING] = self._task.damping
 
@@ -266,6 +263,14 @@ def _estimator(
         machine, axes, pilot.force, period * seen.every, sensors=sensors,
         bandwidth=pilot.bandwidth, fast=2.0 * pilot.bandwidth,
     )  # fmt: skip
+
+
+def _task(pilot: TeleopPilot, seen: Feedback, period: float, k: int) -> TaskImpedance | None:
+    """What identifies the task where that is reflected."""
+    if pilot.reflection != "impedance":
+        return None
+    bands = (2.0 * pilot.bandwidth, pilot.bandwidth)
+    return TaskImpedance(k, period * seen.every, bands, late=pilot.force != "true")
 
 
 def _beside(scenario: Scenario, name: str) -> str:

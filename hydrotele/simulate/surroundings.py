@@ -3,7 +3,7 @@
 A tree stands on stiff springs in its own joints, which are cut with it. The saw cuts while it
 spins: then it passes through wood, which costs it torque and the head a little feed force. A grab
 that has closed around the stem holds it by a weld, since friction of wood on steel is not the point
-here.
+here; from then on the stem touches the ground only.
 """
 
 import math
@@ -11,12 +11,14 @@ import math
 import mujoco
 import numpy as np
 
+from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.surroundings import Plate, Thing, Tree
 
 _PLATE_SOLREF = (0.01, 1.0)  # s, 1: firm steel on steel, stiffer than any plate's spring
 _GAP = 0.02  # m, the kerf
+_GRAVITY = 9.81
 _ROOT, _ROOT_TURN = 4.0e6, 6.0e5  # N/m, N m/rad of a root
 _CUTTING = 30.0  # rad/s: slower, a saw does not cut
 _HIGH = 0.15  # m by which the saw may miss the height of the kerf
@@ -65,7 +67,9 @@ def _write_plate(root, name: str, plate: Plate) -> None:
 def _write_tree(root, name: str, tree: Tree, machine: Machine, where: str, degrees) -> None:
     for part in ("saw", "grab"):
         if getattr(tree, part) not in machine.axes:
-            raise InputError(f"{where}.{part}", f"the machine has no axis {getattr(tree, part)!r}")
+            axis = getattr(tree, part)
+            message = f"the machine has no axis {axis!r}; {suggest(axis, machine.axes)}"
+            raise InputError(f"{where}.{part}", message)
     x, y = tree.position
     radius, half = tree.diameter / 2.0, tree.height / 2.0
     mass = tree.density * math.pi * radius**2 * tree.height
@@ -80,9 +84,10 @@ def _write_tree(root, name: str, tree: Tree, machine: Machine, where: str, degre
         "inertial", mass=mass, pos=(0, 0, half), diaginertia=(across, across, mass * radius**2 / 2)
     )
     for axis, way in zip("xyz", np.eye(3), strict=True):
+        sag = mass * _GRAVITY / _ROOT if axis == "z" else 0.0  # its root holds it where it stands
         body.add(
             "joint", name=f"{name}_{axis}", type="slide", axis=way, stiffness=_ROOT,
-            damping=0.05 * _ROOT, limited="false",
+            damping=0.05 * _ROOT, limited="false", springref=sag,
         )  # fmt: skip
     body.add(
         "joint", name=f"{name}_turn", type="ball", stiffness=_ROOT_TURN, damping=0.05 * _ROOT_TURN,
