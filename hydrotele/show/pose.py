@@ -97,6 +97,27 @@ def _place_things(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
             mujoco.mju_quatIntegrate(row[place : place + 4], turn, 1.0)
 
 
+def logged_positions(
+    machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray],
+    log: Log | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Positions (n, nq) of all joints, those that follow from the pins too.
+
+    Args:
+        machine: the machine.
+        model: its model, as `model_with_looks` gives it.
+        joints: joint name -> (n,) angles [rad] or positions [m]; others stay at home.
+        log: of truth, with what stands around the machine; needed if the model has that.
+
+    Raises:
+        InputError: a linkage cannot be closed in some row.
+    """
+    rows = follow_loops(machine, model, mujoco.MjData(model), joints)
+    if log is not None:
+        _place_things(model, log, rows)
+    return rows
+
+
 def body_poses(
     machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray],
     log: Log | None = None,
@@ -116,9 +137,7 @@ def body_poses(
         InputError: a linkage cannot be closed in some row.
     """
     data = mujoco.MjData(model)
-    rows = follow_loops(machine, model, data, joints)
-    if log is not None:
-        _place_things(model, log, rows)
+    rows = logged_positions(machine, model, joints, log)
     position = np.empty((len(rows), model.nbody, 3))
     quaternion = np.empty((len(rows), model.nbody, 4))
     for row, qpos in enumerate(rows):
