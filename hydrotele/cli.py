@@ -2,12 +2,12 @@
 
 import signal
 import sys
-from json import dumps as json_text
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from hydrotele.commands import drive_command
 from hydrotele.errors import InputError
 
 app = typer.Typer(
@@ -41,29 +41,6 @@ Force = Annotated[
 ]
 
 
-def _overrides(items: list[str]) -> dict[str, str]:
-    pairs = {}
-    for item in items:
-        key, sign, value = item.partition("=")
-        if not sign or not key:
-            raise InputError(f"--set {item}", "must be key=value, for example servo.lead=0.04")
-        pairs[key] = value
-    return pairs
-
-
-def _chosen(machine: str | None, tool: str | None) -> dict[str, str]:
-    """Overrides of a scenario's machine; a path counts from here, not from the scenario's file."""
-    from hydrotele.machine_file import shipped_machines
-
-    pairs = {}
-    if machine is not None:
-        named = machine in shipped_machines()
-        pairs["machine"] = json_text(machine if named else str(Path(machine).resolve()))
-    if tool is not None:
-        pairs["tool"] = json_text(tool)
-    return pairs
-
-
 @app.command(
     epilog="Examples:  hydrotele run zhu_up   |   hydrotele run my.yaml --out runs/a --set seed=7"
 )
@@ -87,8 +64,12 @@ def run(
 ) -> None:
     """Simulate a scenario; write both logs, the rerun recording, the summary and the MJCF."""
     from hydrotele.commands.running import run_to_folder
+    from hydrotele.commands.words import chosen, overrides_of
 
-    run_to_folder(scenario, out, _overrides(set_ or []) | _chosen(machine, tool), review, json)
+    run_to_folder(scenario, out, overrides_of(set_ or []) | chosen(machine, tool), review, json)
+
+
+app.command(epilog=drive_command.EPILOG)(drive_command.drive)
 
 
 @app.command(
@@ -348,7 +329,7 @@ def experiments(
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
     json: Json = False,
 ) -> None:
-    """Repeat published machine experiments with a simulated operator; print both beside each other."""
+    """Repeat published machine experiments with a simulated operator, beside what was published."""
     from hydrotele.commands.experimenting import experiments_to_folder
 
     experiments_to_folder(name, out, seeds, jobs, json)

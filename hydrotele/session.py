@@ -156,6 +156,10 @@ class Session:
         """
         self._plan.command[self.tick :, self.plant.axes.index(axis)] = value
 
+    def command_of(self, tick: int) -> np.ndarray:
+        """Commands (nu,) of a tick that is over [1], or in the drives' units."""
+        return self._commands[tick]
+
     @property
     def events(self) -> list[tuple[float, str]]:
         """What has happened around the machine: (time [s], sentence)."""

@@ -16,6 +16,7 @@ from hydrotele.joystick import load_joystick
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine import Machine
 from hydrotele.noise import sensor_set
+from hydrotele.operate.axis_table import DEADBAND, REACH
 from hydrotele.operate.drive_rows import drive_tables
 from hydrotele.operate.endpoint_force import EndpointForce
 from hydrotele.operate.flat import flat_view
@@ -103,6 +104,11 @@ class Station:
         self._said: set[str] = set()
         self.tripped = False
         self._faults = [_Fault(fault, plan.axes) for fault in pilot.faults]
+
+    @property
+    def span(self) -> np.ndarray:
+        """(2, 6) edge of the dead band and stop of every axis of the joystick [m], [rad]."""
+        return self._master.axis[:, [DEADBAND, REACH]].T
 
     def tick(self, tick: int, data: mujoco.MjData, seen: Feedback) -> bool:
         """Go once around; references and drive references of this tick are written.

@@ -50,7 +50,7 @@ def run_to_folder(
     if as_json:
         print_json({**result.summary, "folder": str(target)})
     else:
-        _print_summary(result.summary)
+        print_summary(result.summary)
         out.print(f"written to [bold]{target}[/]")
     return target
 
@@ -74,7 +74,8 @@ def write_run(result: Run, folder: Path, review: bool = True) -> None:
     (folder / "summary.json").write_text(json.dumps(plain(result.summary), indent=2) + "\n")
 
 
-def _print_summary(summary: dict[str, Any]) -> None:
+def print_summary(summary: dict[str, Any]) -> None:
+    """Print the figures of a run as a table, and its notes."""
     rows = table(f"{summary['scenario']} ({summary['machine']}, tool {summary['tool']})", "", "")
     rows.show_header = False
     rows.add_row("simulated", f"{summary['simulated_seconds']:g} s")

@@ -1,0 +1,1 @@
+"""What a person drives with: keyboard, gamepad, SpaceMouse, or a script in their place."""

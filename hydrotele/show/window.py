@@ -1,0 +1,101 @@
+"""MuJoCo's window with the machine in it while it is driven."""
+
+import os
+import sys
+import threading
+from collections.abc import Callable, Sequence
+
+import mujoco
+import numpy as np
+
+from hydrotele.errors import InputError
+from hydrotele.show.pose import model_with_looks
+from hydrotele.simulate.plant import Plant
+
+_PATIENCE = 5.0  # s that the last picture may take
+_DISTANCE, _AZIMUTH, _ELEVATION = 14.0, 120.0, -18.0  # m, deg, deg of the camera at first
+
+
+class Window:
+    """A passive viewer of a plant, with its looks; open until closed by either side."""
+
+    def __init__(self, plant: Plant, pressed: Callable[[int], None] | None = None) -> None:
+        """Open it.
+
+        Args:
+            plant: what is simulated.
+            pressed: told the GLFW code of every key that goes down, by another thread.
+
+        Raises:
+            InputError: there is no screen, or OpenGL does not work on it.
+        """
+        check_screen()
+        from mujoco import viewer
+
+        self._model = model_with_looks(plant.machine, plant.ground, plant.surroundings)
+        assert self._model.nq == plant.model.nq
+        self._data = mujoco.MjData(self._model)
+        self._handle = viewer.launch_passive(
+            self._model, self._data, key_callback=pressed, show_left_ui=False, show_right_ui=False
+        )
+        with self._handle.lock():
+            camera = self._handle.cam
+            camera.lookat[:] = 4.0, 0.0, 1.5
+            camera.distance, camera.azimuth, camera.elevation = _DISTANCE, _AZIMUTH, _ELEVATION
+
+        self._newest: tuple[np.ndarray, Sequence[tuple[str, str]]] | None = None
+        self._fresh, self._over = threading.Event(), False
+        self._painter = threading.Thread(target=self._paint, daemon=True)
+        self._painter.start()
+
+    def show(self, qpos: np.ndarray, rows: Sequence[tuple[str, str]]) -> bool:
+        """Show positions (nq,) and a table as soon as may be; False if the user has closed it."""
+        if not self._handle.is_running():
+            return False
+        self._newest = qpos.copy(), rows
+        self._fresh.set()
+        return True
+
+    def _paint(self) -> None:
+        """Hand the newest state over, by a thread of its own: a slow screen holds up nobody."""
+        while self._fresh.wait() and not self._over:
+            self._fresh.clear()
+            assert self._newest
+            qpos, rows = self._newest
+            with self._handle.lock():
+                self._data.qpos[:] = qpos
+                mujoco.mj_kinematics(self._model, self._data)
+                mujoco.mj_comPos(self._model, self._data)
+                mujoco.mj_camlight(self._model, self._data)
+            names, values = ("\n".join(column) for column in zip(*rows, strict=True))
+            self._handle.set_texts((None, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT, names, values))
+            self._handle.sync()
+
+    def close(self) -> None:
+        """Close it."""
+        self._over = True
+        self._fresh.set()
+        self._painter.join(_PATIENCE)
+        self._handle.close()
+
+
+def check_screen() -> None:
+    """Find out whether a window can be opened, since MuJoCo's viewer hangs where none can.
+
+    Raises:
+        InputError: it cannot.
+    """
+    advice = "add --no-viewer and choose --device gamepad, spacemouse or scripted:FILE"
+    seen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    if sys.platform.startswith("linux") and not seen:
+        raise InputError("viewer", f"there is no screen (DISPLAY is not set); {advice}")
+    import glfw
+
+    if not glfw.init():
+        raise InputError("viewer", f"the screen cannot be used; {advice}")
+    glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
+    window = glfw.create_window(8, 8, "", None, None)
+    glfw.default_window_hints()
+    if not window:
+        raise InputError("viewer", f"OpenGL does not work on this screen; {advice}")
+    glfw.destroy_window(window)
