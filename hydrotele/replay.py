@@ -81,8 +81,8 @@ def replay_log(
         The replay.
 
     Raises:
-        InputError: a command or position column is missing, samples are missing, or the start
-            cannot be assembled.
+        InputError: a command or position column is missing, samples are missing, something stood
+            around the machine, or the start cannot be assembled.
         SimulationFailed: states became infinite or not a number.
     """
     if not 1e-6 <= timestep < math.inf:
@@ -90,6 +90,9 @@ def replay_log(
     if len(log.gaps):
         where = f"{log.source}, row {log.gaps[0]}"
         raise InputError(where, "samples are missing: cut the log there")
+    if things := log.metadata.get("things"):
+        message = f"the machine worked beside a {things}, and a replay has nothing around it"
+        raise InputError(log.source, message)
     period = float(log.time[-1] - log.time[0]) / (len(log) - 1)
     steps = max(1, math.ceil(period / timestep - 1e-6))
     plant = build_plant(machine, period / steps, ground=log.metadata.get("ground") == "yes")

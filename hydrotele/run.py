@@ -237,6 +237,8 @@ def _log(scenario, machine, time, values, units, sensors: str) -> Log:
         "hydrotele": hydrotele.__version__,
         "command": "held" if scenario.control_rate == scenario.log_rate else "mean over the row",
     }
+    if scenario.surroundings:
+        metadata["things"] = ", ".join(thing.kind for thing in scenario.surroundings)
     return Log(time=time, columns=values, units=units, metadata=metadata, source=scenario.name)
 
 

@@ -148,10 +148,10 @@ class Station:
 
     def _felt(self, data: mujoco.MjData, seen: Feedback, fresh: bool) -> None:
         """Force at the tip, and what the task is like if that is reflected."""
-        if self._feel is None:
-            self._force = self._true_force(data)
-        elif fresh:
+        if self._feel and fresh:
             self._force = self._feel.update(seen.joint, seen.head, seen.rod)
+        if self._pilot.force == "true":
+            self._force = self._true_force(data)
         if self._task:
             if fresh:
                 task_forward(self._slave.arm, seen.joint[self.columns], self._pose)
@@ -262,11 +262,12 @@ def _estimator(
     period: float,
     sensors: SensorSet | None,
 ) -> EndpointForce | None:
-    """What tells the force at the tip; none where the simulator's own is asked for."""
-    if pilot.force == "true":
+    """What tells the force at the tip, and that a sensor is frozen; none where neither is asked."""
+    if pilot.force == "true" and sensors is None:
         return None
+    kind = "static" if pilot.force == "true" else pilot.force
     return EndpointForce(
-        machine, axes, pilot.force, period * seen.every, sensors=sensors,
+        machine, axes, kind, period * seen.every, sensors=sensors,
         bandwidth=pilot.bandwidth, fast=2.0 * pilot.bandwidth,
     )  # fmt: skip
 
