@@ -5,7 +5,7 @@ What the device asked for is written down, so that the run's own scenario repeat
 
 import math
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -82,11 +82,11 @@ class LiveHand:
             from the one to the other.
     """
 
-    def __init__(self, further: tuple[str, ...]) -> None:
+    def __init__(self, further: dict[str, float]) -> None:
         """Begin at the centre.
 
         Args:
-            further: axes that the joystick does not move.
+            further: axes that the joystick does not move, with their largest commands.
         """
         self.span = np.zeros((2, 6))
         self._further, self._wanted = further, np.zeros(6)
@@ -105,12 +105,11 @@ class LiveHand:
             dead = np.where(dead < stop, dead, 0.0)
             self._wanted = np.sign(part) * dead + part * (stop - dead)
             self._note(session.time, self._wanted)
-        for name, old, new in zip(
-            self._further, self._before.commands, reading.commands, strict=True
-        ):
+        news = zip(self._further.items(), self._before.commands, reading.commands, strict=True)
+        for (name, most), old, new in news:
             if new != old:
-                session.set_command(name, new)
-                self._buttons.append(Button(at=session.time, axis=name, command=new))
+                session.set_command(name, most * new)
+                self._buttons.append(Button(at=session.time, axis=name, command=most * new))
         self._before = reading
 
     def _note(self, time: float, wanted: np.ndarray) -> None:
@@ -170,13 +169,17 @@ Watch = Callable[[Session, Callable[[], Status], float], bool]
 """Called after every tick with session, status and wall clock [s]; False ends the drive."""
 
 
-def further_axes(machine: Machine, axes: tuple[str, ...]) -> tuple[str, ...]:
-    """Axes of a machine, in the order given, that the joystick does not move."""
+def further_axes(machine: Machine) -> dict[str, float]:
+    """Axes of a machine that the joystick does not move -> largest command."""
     moved = arm_axes(machine)
-    return tuple(a for a in axes if a not in moved and machine.axes[a].force is None)
+    return {
+        name: axis.force.command_limit if axis.force else 1.0
+        for name, axis in machine.axes.items()
+        if name not in moved
+    }
 
 
-def live(scenario: Scenario, further: tuple[str, ...]) -> Scenario:
+def live(scenario: Scenario, further: Iterable[str]) -> Scenario:
     """The scenario with a live operator instead of its own.
 
     Args:
@@ -216,7 +219,7 @@ def drive(
         InputError: the scenario asks for what the machine has not, or it was too short for a log.
         SimulationFailed: states became infinite or not a number.
     """
-    further = further_axes(machine, tuple(machine.axes))
+    further = further_axes(machine)
     hand = LiveHand(further)
     session = begin(live(scenario, further), hand)
     station = session.station
@@ -271,7 +274,7 @@ class _Told:
         self._count = [len(notes), len(events)]
 
 
-def _status_of(session: Session, further: tuple[str, ...]) -> Callable[[], Status]:
+def _status_of(session: Session, further: Iterable[str]) -> Callable[[], Status]:
     plant, station = session.plant, session.station
     assert station
     around = surrounding_bodies(plant)

@@ -17,6 +17,7 @@ from hydrotele.output import check_target, whole_folder
 from hydrotele.run import Run, scenario_machine
 from hydrotele.scenario import Scenario, load_scenario
 from hydrotele.session import Session
+from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.native import stop_profiling_clock
 
 LONGEST = 600.0  # s of a drive without --duration
@@ -57,7 +58,7 @@ def drive_to_folder(wishes: Wishes) -> Path:
     target = wishes.target or Path("runs", scenario.name)
     check_target(target, "run")
     machine = scenario_machine(scenario)
-    device = open_device(wishes.device, further_axes(machine, tuple(machine.axes)))
+    device = open_device(wishes.device, tuple(further_axes(machine)))
     pacer = Pacer(wishes.speed)
     try:
         with first_interrupt() as interrupted, _watching(wishes, device, interrupted) as watch:
@@ -84,15 +85,25 @@ def _write(result: Run, target: Path, wishes: Wishes) -> None:
 def _scenario(wishes: Wishes) -> Scenario:
     """The scenario that is named, or the usual one of the machine."""
     overrides, name = dict(wishes.overrides), wishes.scenario
-    duration = wishes.duration or (None if name else LONGEST)
+    duration = LONGEST if wishes.duration is None else wishes.duration
     if name is None:
         own = _usual(overrides.get("machine", "cat215").strip('"'))
         name = str(own or _usual("cat215"))
         if own is None:  # a machine of the user's: what is known of none but cat215 is left out
             overrides = {"tool": "null", "sensors": "ideal", "servo": "{}"} | overrides
-    if duration is not None:
-        overrides["duration"] = repr(duration)
-    return load_scenario(name, overrides)
+    overrides["duration"] = repr(duration)
+    scenario = load_scenario(name, overrides)
+    if wishes.scenario is None and "pilot.force" not in overrides and _loose(scenario):
+        overrides |= {"pilot.force": '"true"', "sensors": "ideal"}
+        scenario = load_scenario(name, overrides)
+    return scenario
+
+
+def _loose(scenario: Scenario) -> list[str]:
+    """Joints that hang freely: with such, pressures do not tell the force at the tip."""
+    machine = scenario_machine(scenario)
+    known = {axis.joint for axis in machine.axes.values()} | set(following_joints(machine))
+    return [joint for joint in machine.joints if joint not in known]
 
 
 def _usual(machine: str) -> Path | None:
