@@ -112,7 +112,7 @@ class Session:
     @property
     def time(self) -> float:
         """Simulated time of the next tick [s]."""
-        return self.tick * self._dt
+        return self.tick / self.scenario.control_rate
 
     def advance(self) -> None:
         """Go on by one control tick.

@@ -137,8 +137,8 @@ def test_buttons_of_the_feller_and_their_repetition():
     device = Script(
         (0.0, Reading(commands=(0.0, 0.0))),
         (0.1, Reading(commands=(0.0, 1.0))),
-        (1.0, Reading(commands=(0.8, 1.0), said="hello")),
-        (1.02, Reading(commands=(0.8, 1.0))),
+        (1.14, Reading(commands=(0.8, 1.0), said="hello")),  # tick 228: 228 * 0.005 is not 1.14
+        (1.16, Reading(commands=(0.8, 1.0))),
         (2.0, Reading(commands=(0.8, 1.0), quit=True)),
     )
     said, shown = [], []
@@ -151,7 +151,7 @@ def test_buttons_of_the_feller_and_their_repetition():
     run = drive(scenario, machine, device, Pacer(0.0), watch, said.append)
     assert run.scenario.duration == 2.0 and "hello" in said
     assert run.measured["command.saw"][4] == 0.0 and run.measured["command.saw"][6] == 1.0
-    assert run.measured["angle.grab"][-1] > run.measured["angle.grab"][50] + 0.05
+    assert run.measured["angle.grab"][-1] > run.measured["angle.grab"][57] + 0.05
     assert shown[0]["saw"] == "+1" and shown[0]["grab"] == "+0.8" and shown[0]["time"] == "1.9 s"
     again = run_scenario(run.scenario)
     assert all(v.tobytes() == again.truth[c].tobytes() for c, v in run.truth.columns.items())
