@@ -268,15 +268,19 @@ def _estimator(
     kind = "static" if pilot.force == "true" else pilot.force
     return EndpointForce(
         machine, axes, kind, period * seen.every, sensors=sensors,
-        bandwidth=pilot.bandwidth, fast=2.0 * pilot.bandwidth,
+        bandwidth=_hertz(pilot), fast=2.0 * _hertz(pilot),
     )  # fmt: skip
+
+
+def _hertz(pilot: TeleopPilot) -> float:
+    return pilot.bandwidth / (2.0 * math.pi)
 
 
 def _task(pilot: TeleopPilot, seen: Feedback, period: float, k: int) -> TaskImpedance | None:
     """What identifies the task where that is reflected."""
     if pilot.reflection != "impedance":
         return None
-    bands = (2.0 * pilot.bandwidth, pilot.bandwidth)
+    bands = (2.0 * _hertz(pilot), _hertz(pilot))
     return TaskImpedance(k, period * seen.every, bands, late=pilot.force != "true")
 
 

@@ -4,6 +4,7 @@ Joystick axes x, y, z [m], rx, ry, rz [rad] move the task coordinates of the arm
 attitude and head [rad]. All SI, frozen; keys may carry units as suffixes.
 """
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -224,7 +225,7 @@ class TeleopPilot(Facts):
     control (40); `coupling_damping` [N s/m] is a tenth of it. `virtual_mass` [kg] is the slave's of
     four channels. References speed up by `acceleration` [m/s^2] or [rad/s^2]. `force` chooses where
     the contact force comes from: the pressures with the static or the dynamic model, through a
-    filter of a `bandwidth` [Hz], or the simulator's own (`true`).
+    filter of a `bandwidth` [rad/s] (`bandwidth_hz`), or the simulator's own (`true`).
 
     What structures can do: stiffness feedback is stable with every task and delay. Direct force
     bounces where `ratio` times the task's stiffness (and `scale`) is more than hand and joystick
@@ -251,7 +252,7 @@ class TeleopPilot(Facts):
     coupling_damping: NonNegative | None = None
     virtual_mass: Positive = 2.0
     force: Literal["static", "dynamic", "true"] = "dynamic"
-    bandwidth: Annotated[float, Field(gt=0, le=5)] = 1.5
+    bandwidth: Annotated[float, Field(gt=0, le=10.0 * math.pi)] = 3.0 * math.pi
     acceleration: Positive = 1.0
     coordinates: dict[Coordinate, Coupling] = {}
     stiffness: dict[JoystickAxis, dict[str, float]] = {}

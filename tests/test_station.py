@@ -277,6 +277,7 @@ BAD = {
     "long delay": ({"channel": {"delay_back": 2.0}}, "delay_back: 2 s is as long as the run"),
     "joystick": ({"joystick": "mine.yaml"}, "joystick 'mine.yaml'"),
     "gains": ({"gains": "digger"}, "pilot.gains.*excavator"),
+    "bandwidth": ({"bandwidth_hz": 6.0}, "bandwidth"),
     "nan": ({"ratio": float("nan")}, "ratio"),
     "stiffness": ({"stiffness": {"z": {"least": 5e3}}}, "pilot.stiffness.z.*ordered"),
     "arm button": ({"buttons": [{"at": 0, "axis": "boom", "command": 1}]}, "boom is moved by"),
