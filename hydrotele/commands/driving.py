@@ -112,6 +112,8 @@ def _usual(machine: str) -> Path | None:
 
 
 def _say(sentence: str) -> None:
+    if notes.is_terminal:
+        notes.file.write("\r\x1b[K")  # the status line gives way
     notes.print(f"[yellow]{sentence}[/]", soft_wrap=True)
 
 
