@@ -134,7 +134,10 @@ class Person:
                 pilot.operator.target, shown, numbers, time, p.reaction, self._sight
             )
         self._pushing, self._until = True, 0.0
-        self._paths = _paths(pilot.operator, count, self._step)
+        if isinstance(pilot.operator, Follow):
+            self._path = _followed(pilot.operator, count, self._step)
+        if isinstance(pilot.operator, Steer):
+            self._goals = _steered(pilot.operator, count, self._step)
 
     def decide(self, tick: int) -> None:
         """Choose what the handle should do until the next decision; `muscles` is written.
@@ -143,7 +146,7 @@ class Person:
             tick: the control tick, a multiple of `every`.
         """
         if isinstance(self._behaviour, Follow):
-            self.muscles.wanted[:] = self._paths[tick // self.every]
+            self.muscles.wanted[:] = self._path[tick // self.every]
         if self._live:
             self.muscles.wanted[:] = self._live()
         if tick == 0:
@@ -225,7 +228,7 @@ class Person:
     def _steer(self, tick: int) -> None:
         """Move the tip to where it should be, by sight."""
         pose = self._pose[max(0, tick - self._look), 0]
-        for c, goals in self._paths.items():
+        for c, goals in self._goals.items():
             axis = _axis_of(self._numbers, c)
             row, wanted = self._numbers.axis[axis], self.muscles.wanted
             error = row[SIGN] * (goals[tick // self.every] - pose[c])
@@ -303,23 +306,24 @@ def _coloured(white: np.ndarray, band: float, period: float) -> np.ndarray:
 
     share = 1.0 - math.exp(-band * period)
     scale = math.sqrt((2.0 - share) / share)
-    return scale * lfilter([share], [1.0, share - 1.0], white, axis=0)
+    return scale * np.asarray(lfilter([share], [1.0, share - 1.0], white, axis=0))
 
 
-def _paths(behaviour, count: int, step: float):
-    """Wanted displacements (n, 6) of `follow`, or coordinate -> (n,) of `steer`."""
+def _followed(behaviour: Follow, count: int, step: float) -> np.ndarray:
+    """Wanted displacements (n, 6) [m], [rad]."""
+    time, path = step * np.arange(count), np.zeros((count, 6))
+    for name, values in behaviour.path.items():
+        path[:, AXES.index(name)] = _at(time, behaviour.time, values, behaviour.interpolate)
+    return path
+
+
+def _steered(behaviour: Steer, count: int, step: float) -> dict[int, np.ndarray]:
+    """Coordinate -> (n,) where the tip should be [m], [rad]."""
     time = step * np.arange(count)
-    if isinstance(behaviour, Follow):
-        paths = np.zeros((count, 6))
-        for name, values in behaviour.path.items():
-            paths[:, AXES.index(name)] = _at(time, behaviour.time, values, behaviour.interpolate)
-        return paths
-    if isinstance(behaviour, Steer):
-        return {
-            COORDINATES.index(name): _at(time, behaviour.time, values, "hold")
-            for name, values in behaviour.points.items()
-        }
-    return {}
+    return {
+        COORDINATES.index(name): _at(time, behaviour.time, values, "hold")
+        for name, values in behaviour.points.items()
+    }
 
 
 def _at(time: np.ndarray, times, values, how: str) -> np.ndarray:
