@@ -143,7 +143,8 @@ class ForceTarget(Facts):
 class Regulate(Facts):
     """The operator makes a contact force from what he feels alone.
 
-    He knows how joystick and machine translate it (K_nom and K_r, or the direct ratio).
+    He knows how joystick and machine translate it (K_nom and K_r, or the direct ratio), and pushes
+    as one does under rate control.
     """
 
     kind: Literal["regulate"]

@@ -169,18 +169,30 @@ def worked(duration, **pilot):
         true.append(true[-1] + PERIOD * float(force @ speed))
         told.append(float(session.station._m.energy[0]))
         before = speed
-    return np.array(true), np.array(told), session.station
+    return np.array(true[:-1]), np.array(told[1:]), session.station  # read before it moves on
 
 
 @pytest.mark.parametrize("reflection", ["none", "stiffness", "direct_force"])
 def test_energy_at_the_handle_is_the_hands_work(reflection):
-    """Within a tenth of the largest: the force is estimated, 17 ms late."""
+    """Within a tenth of the largest: speeds are differences over 5 ms."""
     true, told, station = worked(4.0, plate={}, reflection=reflection, z=0.36)
     assert told[-1] == station.summary()["handle_energy_J"]
-    assert told.min() == pytest.approx(station.summary()["handle_least_energy_J"], abs=1e-12)
+    assert told.min() >= station.summary()["handle_least_energy_J"]
     assert np.abs(told - true).max() < 0.1 * np.abs(true).max()
     if reflection == "none":
         assert told.min() > -1e-5  # a spring and a damper are passive
+
+
+def test_a_joystick_that_shakes_the_hand_is_seen_as_active():
+    """Direct force of a bouncing machine: energy comes out, as much as MuJoCo says.
+
+    25 %: it bounces against its stops within a few periods, and turns, which counts, too.
+    """
+    hand = {"kind": "follow", "time": [0, 0.5, 1, 2, 2.5, 4],
+            "path": {"y": [0, 0, 0.004, 0.004, -0.004, -0.004],
+                     "z": [0, 0, -0.0025, -0.0025, 0, 0]}}  # fmt: skip
+    true, told, _ = worked(4.0, plate={}, reflection="direct_force", z=0.36, operator=hand)
+    assert true[-1] < -0.05 and told[-1] == pytest.approx(true[-1], rel=0.25)
 
 
 @pytest.mark.parametrize("force", ["dynamic", "true"])

@@ -169,11 +169,14 @@ def unpack_master_state(flat):
 def read_handle(numbers, qpos, period, s):
     """Measure the handle as finely as the sensing allows, and its rate by differences.
 
+    What the hand has put into it follows from the kinetic energy and the work of the coils, without
+    the lag of the hand's estimated force.
+
     Args:
         numbers: Master.
         qpos: (7,) of the flotor: position [m] and quaternion.
         period: since the last reading, scalar [s]; 0 for the first one.
-        s: MasterState; `handle` and `speed` are written.
+        s: MasterState; `handle`, `speed` and `energy` are written.
 
     Returns:
         Nothing.
@@ -189,8 +192,22 @@ def read_handle(numbers, qpos, period, s):
         value = qpos[i] if i < 3 else factor * qpos[i + 1]
         if numbers.step[i] > 0.0:
             value = np.rint(value / numbers.step[i]) * numbers.step[i]
-        s.speed[i] = (value - s.handle[i]) / period if period > 0.0 else 0.0
-        s.handle[i] = value
+        speed = (value - s.handle[i]) / period if period > 0.0 else 0.0
+        if period > 0.0:
+            own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
+            gained = 0.5 * own * (speed**2 - s.speed[i] ** 2)
+            s.energy[0] += gained - _given(numbers, s, i) * (value - s.handle[i])
+        s.speed[i], s.handle[i] = speed, value
+    s.energy[1] = min(s.energy[1], s.energy[0])
+
+
+@compiled
+def _given(numbers, s, i):
+    """What coils and weight together have put on an axis of the handle since the last reading."""
+    given = s.limited[0] * s.push[i]
+    if i < 3:  # what is missing of the flotor's weight
+        given += (1.0 - s.limited[0]) * numbers.mass[0] * numbers.gravity[i]
+    return given
 
 
 @compiled
@@ -279,7 +296,7 @@ def drive_coils(numbers, quaternion, period, s):
         numbers: Master.
         quaternion: (4,) of the flotor.
         period: scalar [s].
-        s: MasterState; `currents`, `limited`, `hand`, `momentum` and `energy` are written.
+        s: MasterState; `currents`, `limited`, `hand` and `momentum` are written.
 
     Returns:
         Nothing.
@@ -300,18 +317,11 @@ def drive_coils(numbers, quaternion, period, s):
             s.currents[i] = 0.0
         largest = max(largest, abs(s.currents[i]))
     s.limited[0] = numbers.most[0] / largest
-    power = 0.0
     for i in range(6):
         s.currents[i] *= s.limited[0]
         own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
-        given = s.limited[0] * s.push[i]
-        if i < 3:  # what is missing of the flotor's weight
-            given += (1.0 - s.limited[0]) * numbers.mass[0] * numbers.gravity[i]
         s.hand[i] = _OBSERVER * (own * s.speed[i] - s.momentum[i])
-        s.momentum[i] += period * (given + s.hand[i])
-        power += s.hand[i] * s.speed[i]
-    s.energy[0] += period * power
-    s.energy[1] = min(s.energy[1], s.energy[0])
+        s.momentum[i] += period * (_given(numbers, s, i) + s.hand[i])
 
 
 @compiled
