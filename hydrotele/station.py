@@ -26,7 +26,8 @@ from hydrotele.operate.plan import Plan
 from hydrotele.operate.resolved_motion import COORDINATES, arm_facts
 from hydrotele.operate.round_trip import to_the_hand, to_the_machine
 from hydrotele.operate.servo import DriveReferences
-from hydrotele.operate.slave import BLOCKED, SILENT, TRIPPED, slave
+from hydrotele.operate.slave import slave
+from hydrotele.operate.slave_table import BLOCKED, SILENT, TRIPPED
 from hydrotele.operate.task_impedance import TaskImpedance
 from hydrotele.operate.tip_over import push_back
 from hydrotele.scenario import Scenario

@@ -5,7 +5,7 @@ import numpy as np
 from hydrotele.joystick import AXES
 from hydrotele.operate.flat import flat_view
 from hydrotele.operate.master import MasterState
-from hydrotele.operate.slave import SlaveState
+from hydrotele.operate.slave_table import SlaveState
 
 _LENGTHS = ("m", "m", "m", "rad", "rad", "rad")
 _FORCES = ("N", "N", "N", "N m", "N m", "N m")

@@ -12,7 +12,25 @@ import numpy as np
 
 from hydrotele.compiled import compiled
 from hydrotele.joystick import Joystick
-from hydrotele.operate.axis_table import axis_table
+from hydrotele.operate.axis_table import (
+    COORDINATE,
+    COUPLING,
+    COUPLING_DAMPING,
+    DAMPING,
+    DEADBAND,
+    DROP,
+    GAIN,
+    LEAST,
+    LIMIT,
+    MOST,
+    NOMINAL,
+    OUTSIDE,
+    RATIO,
+    REFLECTED_MOST,
+    SIGN,
+    SLOPE,
+    axis_table,
+)
 from hydrotele.operate.flat import flat_state, flattened
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.compliance import GRAVITY, holding_wrench, turn_matrix
@@ -230,41 +248,43 @@ def reflect(numbers, packet, fresh, period, s):
     kind, mode = numbers.kind[0], numbers.kind[1]
     for i in range(6):
         row, x, v = numbers.axis[i], s.handle[i], s.speed[i]
-        c, sign, gain = int(row[10]), row[11], row[12]
-        stiff, rub, push = row[0], row[4], 0.0
+        c, sign, gain = int(row[COORDINATE]), row[SIGN], row[GAIN]
+        stiff, rub, push = row[NOMINAL], row[DAMPING], 0.0
         way = 1.0 if x > 0.0 else (-1.0 if x < 0.0 else 0.0)
-        if c >= 0 and kind != 0:
-            force = fresh * sign * packet[0, c]
+        if c >= 0 and kind != NONE:
+            force = fresh * sign * packet[FORCE, c]
             if not np.isfinite(force):
                 force = 0.0
-            kept = min(row[16], max(-row[16], force))
-            if mode == 1 and kind != 1 and kind != 5:
+            kept = min(row[REFLECTED_MOST], max(-row[REFLECTED_MOST], force))
+            if mode == POSITION and kind != STIFFNESS and kind != IMPEDANCE:
                 stiff = 0.0  # under position control the slave's place is the spring's rest
-            if kind == 1:
-                kept = min(row[5], max(-row[5], force))
-                stiff = min(row[2], max(row[1], stiff - row[3] * kept * way))
-            elif kind == 2:
-                push += row[13] * kept
-            elif kind == 3:
-                share = sign / gain if mode == 1 else sign
-                behind = share * (packet[3, c] - packet[1, c])
-                slower = share * (packet[4, c] - packet[2, c])
-                push -= fresh * (row[14] * behind + row[15] * slower)
-            elif kind == 4:
+            if kind == STIFFNESS:
+                kept = min(row[LIMIT], max(-row[LIMIT], force))
+                stiff = min(row[MOST], max(row[LEAST], stiff - row[SLOPE] * kept * way))
+            elif kind == DIRECT:
+                push += row[RATIO] * kept
+            elif kind == COORDINATING:
+                share = sign / gain if mode == POSITION else sign
+                behind = share * (packet[WANTED, c] - packet[PLACE, c])
+                slower = share * (packet[WANTED_SPEED, c] - packet[SPEED, c])
+                push -= fresh * (row[COUPLING] * behind + row[COUPLING_DAMPING] * slower)
+            elif kind == FOUR_CHANNEL:
                 push += _four_channels(row, mode, x, v, kept, sign, packet, c, fresh, period, s, i)
-            elif kind == 5:
-                felt = fresh * row[13] * gain
-                stiff = min(row[2], max(row[1], stiff + felt * packet[5, c]))
-                rub += min(rub, felt * packet[6, c])  # more makes a sampled flotor shake
+            elif kind == IMPEDANCE:
+                felt = fresh * row[RATIO] * gain
+                stiff = min(row[MOST], max(row[LEAST], stiff + felt * packet[TASK_STIFFNESS, c]))
+                rub += min(rub, felt * packet[TASK_DAMPING, c])  # more makes a sampled flotor shake
         s.stiffness[i] = stiff
-        beyond = abs(x) - row[6]
-        if row[8] >= 0.0 and beyond > 0.0:
-            stiff_out = row[8] + max(stiff - row[0], 0.0)
-            push -= way * (max(stiff * row[6] - row[7], 0.0) + stiff_out * beyond)
+        beyond = abs(x) - row[DEADBAND]
+        if row[OUTSIDE] >= 0.0 and beyond > 0.0:
+            stiff_out = row[OUTSIDE] + max(stiff - row[NOMINAL], 0.0)
+            push -= way * (max(stiff * row[DEADBAND] - row[DROP], 0.0) + stiff_out * beyond)
         else:
             push -= stiff * x
         total = push - rub * v + fresh * s.extra[i]
-        s.push[i] = total if np.isfinite(total) else -row[0] * x - row[4] * v  # the plain spring
+        s.push[i] = (
+            total if np.isfinite(total) else -row[NOMINAL] * x - row[DAMPING] * v
+        )  # the plain spring
 
 
 @compiled
@@ -273,10 +293,10 @@ def _four_channels(row, mode, x, v, force, sign, packet, c, fresh, period, s, i)
 
     Under rate control `C2 = s / k_v` differentiates the force, below 20 rad/s.
     """
-    gain, spring, damper = row[12], row[14], row[15]
-    place, speed = sign * packet[1, c], sign * packet[2, c]
-    reflected = row[13] * force
-    if mode == 1:
+    gain, spring, damper = row[GAIN], row[COUPLING], row[COUPLING_DAMPING]
+    place, speed = sign * packet[PLACE, c], sign * packet[SPEED, c]
+    reflected = row[RATIO] * force
+    if mode == POSITION:
         return reflected - fresh * (spring * (x - place / gain) + damper * (v - speed / gain))
     asked = s.integral[i] + period * gain * x
     s.integral[i] = min(place + WINDUP, max(place - WINDUP, asked))

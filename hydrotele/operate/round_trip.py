@@ -9,13 +9,8 @@ from hydrotele.compiled import compiled
 from hydrotele.operate.drive_rows import drive_row
 from hydrotele.operate.master import master_step, unpack_master, unpack_master_state
 from hydrotele.operate.muscles import pull, unpack_muscles
-from hydrotele.operate.slave import (
-    measure_task,
-    report,
-    slave_step,
-    unpack_slave,
-    unpack_slave_state,
-)
+from hydrotele.operate.slave import measure_task, report, slave_step
+from hydrotele.operate.slave_table import unpack_slave, unpack_slave_state
 
 QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
 

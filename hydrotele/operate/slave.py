@@ -6,78 +6,67 @@ With four channels a virtual mass stands between, which the hand's and the task'
 because a valve-controlled machine does not yield by itself.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from hydrotele.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine import Machine
-from hydrotele.operate.axis_table import LEVER
+from hydrotele.operate.axis_table import (
+    COORDINATE,
+    COUPLING,
+    COUPLING_DAMPING,
+    DEADBAND,
+    GAIN,
+    LEVER,
+    RATIO,
+    REACH,
+    REFLECTED_MOST,
+    SIGN,
+)
 from hydrotele.operate.flat import flat_state, flattened
-from hydrotele.operate.master import WINDUP, Master
+from hydrotele.operate.master import (
+    FORCE,
+    FOUR_CHANNEL,
+    PLACE,
+    POSITION,
+    RATE,
+    SPEED,
+    WANTED,
+    WANTED_SPEED,
+    WINDUP,
+    Master,
+)
 from hydrotele.operate.resolved_motion import COORDINATES, arm_facts, follow_pose
+from hydrotele.operate.slave_table import (
+    ACCELERATION,
+    AGE,
+    AXIS,
+    BLOCKED,
+    DAMPER,
+    EDGE,
+    FASTEST,
+    FOLLOWING,
+    LEAD,
+    LEVERAGE,
+    SCALE,
+    SHARE,
+    SILENCE,
+    SILENT,
+    SPRING,
+    STOP,
+    STRONGEST,
+    TRIPPED,
+    VIRTUAL_MASS,
+    WAY,
+    Slave,
+    SlaveState,
+)
 from hydrotele.teleoperation import Coupling, TeleopPilot
 
 _SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
 _BRAKE = 0.8  # of the acceleration: the rest makes up for the filter's lag
 _AHEAD = 0.02  # s over which the change of a rate is averaged before it is looked ahead
 _BLEND = 30.0  # rad/s, of measured task rates from held angles
-BLOCKED, SILENT, TRIPPED, AGE = range(4)  # of `SlaveState.flags`
-# rows of a command packet
-HANDLE, HANDLE_SPEED, HAND = range(3)
-
-
-class Slave(NamedTuple):
-    """Numbers of the slave's side; k joints and task coordinates.
-
-    Attributes:
-        arm: (9,) of `kinematics.task.task_numbers`.
-        ranges: (k, 2) joint ranges [rad].
-        start: (5,) pose at the start: r [m], theta [rad], z [m], attitude [rad], head [rad].
-        table: (k, 11) of every coordinate: joystick axis (-1 without), sign, gain, dead band,
-            reach, coupling, its damping, hand per machine force, lever of the virtual mass [1] or
-            [m^2], largest speed [m/s] or [rad/s], largest force that counts [N] or [N m].
-        limits: (5,) silence [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
-            mass [kg], lead of the drives [s].
-        kind: (2,) structure and mode.
-    """
-
-    arm: np.ndarray
-    ranges: np.ndarray
-    start: np.ndarray
-    table: np.ndarray
-    limits: np.ndarray
-    kind: np.ndarray
-
-
-class SlaveState(NamedTuple):
-    """What the slave's side knows and asks for.
-
-    Attributes:
-        pose: (5,) of the references [m], [rad].
-        rate: (5,) of it.
-        joint: (k,) joint references [rad].
-        joint_rate: (k,) [rad/s].
-        ahead: (k,) rates as they will be by the time the valves have moved [rad/s].
-        measured: (2, 5) pose of the measured joints and its filtered rate.
-        command: (3, 6) last packet: handle, its rate, hand's force.
-        force_integral: (5,) of the hand's force, for four channels under rate control.
-        asked: (5,) integral of the rate that the handle asks for, for the same [m], [rad].
-        flags: (4,) whether it is held at the edge, the line silent, the valves closed for good; age
-            of the last packet [s].
-    """
-
-    pose: np.ndarray
-    rate: np.ndarray
-    joint: np.ndarray
-    joint_rate: np.ndarray
-    ahead: np.ndarray
-    measured: np.ndarray
-    command: np.ndarray
-    force_integral: np.ndarray
-    asked: np.ndarray
-    flags: np.ndarray
 
 
 def slave(
@@ -104,13 +93,13 @@ def slave(
     table = np.zeros((k, 11))
     table[:, 0] = -1.0
     for axis, row in enumerate(numbers.axis):
-        if row[10] >= 0.0:
+        if row[COORDINATE] >= 0.0:
             lever = 1.0 if axis < 3 else LEVER**2
-            name = COORDINATES[int(row[10])]
+            name = COORDINATES[int(row[COORDINATE])]
             speed = pilot.coordinates.get(name, Coupling()).speed  # pyright: ignore - a Coordinate
-            table[int(row[10])] = (
-                axis, row[11], row[12], row[6], row[9], row[14], row[15], row[13], lever, speed,
-                row[16],
+            table[int(row[COORDINATE])] = (
+                axis, row[SIGN], row[GAIN], row[DEADBAND], row[REACH], row[COUPLING],
+                row[COUPLING_DAMPING], row[RATIO], lever, speed, row[REFLECTED_MOST],
             )  # fmt: skip
     safety = pilot.safety
     limits = np.array(
@@ -119,49 +108,6 @@ def slave(
     state = flat_state(SlaveState, [(5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,)])
     state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
     return flattened(Slave(arm, ranges, pose, table, limits, numbers.kind)), state
-
-
-@compiled
-def unpack_slave(flat, k):
-    """The parts of `flat_view(Slave)`.
-
-    Args:
-        flat: (21 + 13 k,) array.
-        k: number of joints, scalar.
-
-    Returns:
-        Slave, views of it.
-
-    Source: order and shapes of Slave.
-    """
-    a = 9 + 2 * k
-    b = a + 5
-    c = b + 11 * k
-    return Slave(
-        flat[0:9], flat[9:a].reshape(k, 2), flat[a:b], flat[b:c].reshape(k, 11), flat[c : c + 5],
-        flat[c + 5 : c + 7],
-    )  # fmt: skip
-
-
-@compiled
-def unpack_slave_state(flat, k):
-    """The parts of `flat_view(SlaveState)`.
-
-    Args:
-        flat: (52 + 3 k,) array.
-        k: number of joints, scalar.
-
-    Returns:
-        SlaveState, views of it.
-
-    Source: order and shapes of SlaveState.
-    """
-    a = 10 + 3 * k
-    return SlaveState(
-        flat[0:5], flat[5:10], flat[10 : 10 + k], flat[10 + k : 10 + 2 * k], flat[10 + 2 * k : a],
-        flat[a : a + 10].reshape(2, 5), flat[a + 10 : a + 28].reshape(3, 6),
-        flat[a + 28 : a + 33], flat[a + 33 : a + 38], flat[a + 38 : a + 42],
-    )  # fmt: skip
 
 
 @compiled
@@ -216,10 +162,10 @@ def ask(numbers, packet, arrived, force, period, s):
         for r in range(3):
             for i in range(6):
                 s.command[r, i] = packet[r, i] if np.isfinite(packet[r, i]) else 0.0
-        s.flags[3] = 0.0
+        s.flags[AGE] = 0.0
     else:
-        s.flags[3] += period
-    s.flags[1] = 1.0 if s.flags[3] > numbers.limits[0] else 0.0
+        s.flags[AGE] += period
+    s.flags[SILENT] = 1.0 if s.flags[AGE] > numbers.limits[SILENCE] else 0.0
     wanted, rate = np.zeros(5), np.zeros(5)
     for c in range(5):
         wanted[c] = s.pose[c]
@@ -227,29 +173,36 @@ def ask(numbers, packet, arrived, force, period, s):
             continue
         row = numbers.table[c]
         goal = 0.0
-        if row[0] >= 0.0 and s.flags[1] == 0.0:
-            i = int(row[0])
+        if row[AXIS] >= 0.0 and s.flags[SILENT] == 0.0:
+            i = int(row[AXIS])
             x, v, hand = s.command[0, i], s.command[1, i], s.command[2, i]
             goal = _wanted_rate(
-                numbers, row, c, row[1] * x, row[1] * v, row[1] * hand, force[c], period, s
+                numbers, row, c, row[WAY] * x, row[WAY] * v, row[WAY] * hand, force[c], period, s
             )
         else:
             s.asked[c], s.force_integral[c] = s.pose[c] - numbers.start[c], 0.0
-        goal = min(row[9], max(-row[9], goal))
-        change = numbers.limits[2] * period
+        goal = min(row[FASTEST], max(-row[FASTEST], goal))
+        change = numbers.limits[ACCELERATION] * period
         rate[c] = min(s.rate[c] + change, max(s.rate[c] - change, goal))
         wanted[c] += period * rate[c]
     before = s.joint_rate.copy()
     held = follow_pose(
-        numbers.arm, numbers.ranges, wanted, rate, s.flags[0] > 0.0, s.pose, s.joint, s.joint_rate
+        numbers.arm,
+        numbers.ranges,
+        wanted,
+        rate,
+        s.flags[BLOCKED] > 0.0,
+        s.pose,
+        s.joint,
+        s.joint_rate,
     )
-    lead = numbers.limits[4]
+    lead = numbers.limits[LEAD]
     for i in range(k):
         share = min(1.0, period / _AHEAD)
         change = (s.joint_rate[i] - before[i]) / period
         late = s.ahead[i] - before[i]
         s.ahead[i] = s.joint_rate[i] + late + share * (lead * change - late)
-    s.flags[0] = 1.0 if held else 0.0
+    s.flags[BLOCKED] = 1.0 if held else 0.0
     for c in range(5):
         s.rate[c] = 0.0 if held else rate[c]
         if held:
@@ -259,14 +212,14 @@ def ask(numbers, packet, arrived, force, period, s):
 @compiled
 def _wanted_rate(numbers, row, c, x, v, hand, force, period, s):
     """Rate that the handle asks a coordinate for."""
-    if numbers.kind[0] == 4:
+    if numbers.kind[0] == FOUR_CHANNEL:
         return _virtual_rate(numbers, row, c, x, v, hand, force, period, s)
-    if numbers.kind[1] == 1:
+    if numbers.kind[1] == POSITION:
         return _placed_rate(numbers, row, c, x, period, s)
-    beyond = min(row[4], abs(x)) - row[3]
+    beyond = min(row[STOP], abs(x)) - row[EDGE]
     if beyond <= 0.0:
         return 0.0
-    return row[2] * beyond if x > 0.0 else -row[2] * beyond
+    return row[SCALE] * beyond if x > 0.0 else -row[SCALE] * beyond
 
 
 @compiled
@@ -275,9 +228,13 @@ def _placed_rate(numbers, row, c, x, period, s):
 
     A long way is gone at the largest speed, and braked as the acceleration allows.
     """
-    gap = row[2] * x - (s.pose[c] - numbers.start[c])
+    gap = row[SCALE] * x - (s.pose[c] - numbers.start[c])
     size = abs(gap)
-    speed = min(row[9], 0.5 * _SMOOTH * size, np.sqrt(2.0 * _BRAKE * numbers.limits[2] * size))
+    speed = min(
+        row[FASTEST],
+        0.5 * _SMOOTH * size,
+        np.sqrt(2.0 * _BRAKE * numbers.limits[ACCELERATION] * size),
+    )
     speed = speed if gap > 0.0 else -speed
     return s.rate[c] + 2.0 * _SMOOTH * period * (speed - s.rate[c])
 
@@ -289,14 +246,16 @@ def _virtual_rate(numbers, row, c, x, v, hand, force, period, s):
     Under position control `M z'' = hand + ratio F + K (x - z) + B (x' - z')` with z = y / scale,
     under rate control `M y'' = k_v int hand + ratio F + K (k_v int x - y) + B (k_v x - y')`.
     """
-    gain, spring, damper = row[2], row[5], row[6]
-    mass = numbers.limits[3] * row[8]
-    scale = gain if numbers.kind[1] == 1 else 1.0
+    gain, spring, damper = row[SCALE], row[SPRING], row[DAMPER]
+    mass = numbers.limits[VIRTUAL_MASS] * row[LEVERAGE]
+    scale = gain if numbers.kind[1] == POSITION else 1.0
     place, speed = (s.pose[c] - numbers.start[c]) / scale, s.rate[c] / scale
-    felt = row[7] * min(row[10], max(-row[10], force)) if np.isfinite(force) else 0.0
+    felt = (
+        row[SHARE] * min(row[STRONGEST], max(-row[STRONGEST], force)) if np.isfinite(force) else 0.0
+    )
     ahead, ahead_speed, push = x, v, hand
-    if numbers.kind[1] == 0:
-        most = row[7] * row[10] + mass * numbers.limits[2]
+    if numbers.kind[1] == RATE:
+        most = row[SHARE] * row[STRONGEST] + mass * numbers.limits[ACCELERATION]
         total = s.force_integral[c] + period * gain * hand
         s.force_integral[c] = min(most, max(-most, total))
         asked = s.asked[c] + period * gain * x
@@ -321,8 +280,8 @@ def watch(numbers, joint, s):
     Source: following-error monitor, as drives have it.
     """
     for i in range(len(joint)):
-        if not abs(joint[i] - s.joint[i]) <= numbers.limits[1]:
-            s.flags[2] = 1.0
+        if not abs(joint[i] - s.joint[i]) <= numbers.limits[FOLLOWING]:
+            s.flags[TRIPPED] = 1.0
 
 
 @compiled
@@ -341,14 +300,14 @@ def report(numbers, force, s, packet):
     Source: this module.
     """
     for c in range(len(force)):
-        packet[0, c] = force[c]
-        packet[1, c] = s.measured[0, c] - numbers.start[c]
-        packet[2, c] = s.measured[1, c]
-        packet[3, c] = s.pose[c] - numbers.start[c]
-        packet[4, c] = s.rate[c]
-    if numbers.kind[0] == 4:
+        packet[FORCE, c] = force[c]
+        packet[PLACE, c] = s.measured[0, c] - numbers.start[c]
+        packet[SPEED, c] = s.measured[1, c]
+        packet[WANTED, c] = s.pose[c] - numbers.start[c]
+        packet[WANTED_SPEED, c] = s.rate[c]
+    if numbers.kind[0] == FOUR_CHANNEL:
         for c in range(len(force)):
-            packet[1, c], packet[2, c] = packet[3, c], packet[4, c]
+            packet[PLACE, c], packet[SPEED, c] = packet[WANTED, c], packet[WANTED_SPEED, c]
 
 
 @compiled

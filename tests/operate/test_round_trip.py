@@ -11,7 +11,8 @@ from hydrotele.operate.master import master
 from hydrotele.operate.muscles import Muscles
 from hydrotele.operate.resolved_motion import arm_facts
 from hydrotele.operate.round_trip import QUIET, SHARE, to_the_hand, to_the_machine
-from hydrotele.operate.slave import AGE, slave
+from hydrotele.operate.slave import slave
+from hydrotele.operate.slave_table import AGE
 from hydrotele.teleoperation import TeleopPilot
 
 CAT, STICK, PERIOD, FADE = load_machine("cat215", "bucket"), load_joystick(), 0.005, 0.2

@@ -8,13 +8,11 @@ from hydrotele.machine_file import load_machine
 from hydrotele.operate.flat import flat_view
 from hydrotele.operate.master import master
 from hydrotele.operate.resolved_motion import arm_facts, pose_to_joints
-from hydrotele.operate.slave import (
+from hydrotele.operate.slave import measure_task, slave, slave_step
+from hydrotele.operate.slave_table import (
     BLOCKED,
     SILENT,
     TRIPPED,
-    measure_task,
-    slave,
-    slave_step,
     unpack_slave,
     unpack_slave_state,
 )
