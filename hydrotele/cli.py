@@ -217,11 +217,12 @@ def excite(
 @analyse_app.command(
     "teleop",
     epilog="Examples:  hydrotele analyse teleop   |   "
-    "hydrotele analyse teleop my_case.yaml --structure rate_force --delay 0.1 --confirm",
+    "hydrotele analyse teleop my_case.yaml --structure rate_force --delay 0.1 --confirm   |   "
+    "hydrotele analyse teleop press_direct --set pilot.ratio=2.0e-5",
 )
 def analyse_teleop(
     file: Annotated[
-        Path | None, typer.Argument(help="Case (.yaml); default an axis of the CAT 215.")
+        Path | None, typer.Argument(help="Case (.yaml), scenario; default one of the CAT 215.")
     ] = None,
     out: Annotated[
         Path | None,
@@ -244,12 +245,16 @@ def analyse_teleop(
         bool,
         typer.Option("--confirm", help="Simulate sine sweeps and every cell of the map, too."),
     ] = False,
+    coordinate: Annotated[str | None, typer.Option(help="Of a scenario: r, theta, z ...")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Of a scenario.")] = None,
     json: Json = False,
 ) -> None:
     """Two-port of a teleoperator: what is felt, passivity, stability with delay, margins."""
-    from hydrotele.commands.analysing import analyse_teleop_to_folder
+    from hydrotele.commands.analysing_scenario import analyse_any_to_folder
+    from hydrotele.commands.words import overrides_of
 
-    analyse_teleop_to_folder(file, out, structure or [], delay, confirm, json)
+    pairs = overrides_of(set_ or [])
+    analyse_any_to_folder(file, out, structure, delay, confirm, coordinate, pairs, json)
 
 
 @app.command(

@@ -33,7 +33,6 @@ from hydrotele.operate.muscles import Muscles
 from hydrotele.operate.resolved_motion import COORDINATES
 from hydrotele.teleoperation import (
     Follow,
-    ForceTarget,
     Live,
     Regulate,
     Steer,
@@ -42,10 +41,12 @@ from hydrotele.teleoperation import (
 )
 
 DECISIONS = 50.0  # Hz
-_REFLEX = 0.05  # s, from where the hand is to what the muscles do: stretch reflex and cortex
+REFLEX = 0.05  # s, from where the hand is to what the muscles do: stretch reflex and cortex
 _HOLD = 0.8  # of the dead band: where a hand rests that feels without moving
-_CLOSE = 0.05  # of the largest target: a force error that a person leaves alone
-_PUSH = 0.4  # s of a correcting push
+_CLOSE = 0.05  # of the target: a force error that a person leaves alone
+_LEAST_CLOSE = 0.2  # of the largest target's: for targets near nothing
+_NOTICED = 0.2  # N: a force on the hand that stands out from its own tremor and the spring's
+_PUSH = 0.3  # s of a correcting push
 _LEAST_WAY = 3e-4  # m: a stiffness cannot be felt from a smaller displacement
 _LEANING = 0.3  # s in which a hand builds up a force
 _TREMOR_BAND = 2.0 * math.pi * 8.0  # rad/s of a physiological tremor
@@ -115,7 +116,7 @@ class Person:
         self.muscles = _muscles(pilot, joystick, numbers)
         white = rng.standard_normal((_ROUND, 6)) * _LEVERS
         self.tremor = p.tremor * _coloured(white, _TREMOR_BAND, period)
-        self.past = np.zeros((1 + max(1, round(_REFLEX / period)), 6))
+        self.past = np.zeros((1 + max(1, round(REFLEX / period)), 6))
         count = ticks // self.every + 1
         self._judgement = p.force_noise * _coloured(rng.standard_normal(count), _SLOW, self._step)
         sight = _coloured(rng.standard_normal(count), 4.0 * _SLOW, self._step)
@@ -123,16 +124,14 @@ class Person:
         self._imagined_gain = math.exp(p.imagination * rng.standard_normal())
         self._look = max(1, round(p.reaction / period))
         self._touch = max(1, round(p.touch / period))
-        self._reflex = max(1, round(_REFLEX / period))
+        self._reflex = max(1, round(REFLEX / period))
         self.believed = np.full(count, np.nan)
         self._imagined, self._errors = 0.0, []
         self._handle, self._hand = seen.master("handle"), seen.master("hand")
         self._pose, self._touching = seen.slave("measured"), seen.touching
         if isinstance(pilot.operator, Regulate | Track):
-            time, shown = self._step * np.arange(count), isinstance(pilot.operator, Track)
-            self._target = _prepared(
-                pilot.operator.target, shown, numbers, time, p.reaction, self._sight
-            )
+            time = self._step * np.arange(count)
+            self._target = _prepared(pilot.operator, pilot, numbers, time, self._sight)
         self._pushing, self._until = True, 0.0
         if isinstance(pilot.operator, Follow):
             self._path = _followed(pilot.operator, count, self._step)
@@ -166,14 +165,15 @@ class Person:
         touching = bool(self._touching[looked])
         believed = self._judge(tick, axis, press.way, felt, touching)
         self.believed[number] = press.side * believed
-        if not touching and believed < press.close:
+        if not touching and believed < press.noticed:
             reach = row[DEADBAND] + approach * (row[REACH] - row[DEADBAND])
             wanted[axis] = press.way * reach
         elif self._pilot.reflection == "direct_force":
             self._lean(axis, press.way, row, abs(goal), max(0, tick - self._reflex))
         else:
             error = press.side * goal - believed
-            self._pulse_or_feel(tick, axis, press.way, error, press.close)
+            close = max(_CLOSE * abs(goal), _LEAST_CLOSE * press.close)
+            self._pulse_or_feel(tick, axis, press.way, error, close)
 
     def _pulse_or_feel(self, tick: int, axis: int, way: float, error: float, close: float) -> None:
         """Rest inside the dead band where contact is felt; correct by short pushes beyond it."""
@@ -252,7 +252,8 @@ class _Target(NamedTuple):
         way: of the handle, to press harder.
         goal: (decisions,) what he aims at, as late and as rough as he sees it [N].
         displayed: (decisions,) what he is shown [N]; NaN without.
-        close: error that he leaves alone [N].
+        close: error that he leaves alone at the largest target [N].
+        noticed: force from which he believes in a contact that he does not see [N].
     """
 
     axis: int
@@ -262,20 +263,25 @@ class _Target(NamedTuple):
     goal: list[float]
     displayed: np.ndarray
     close: float
+    noticed: float
 
 
 def _prepared(
-    target: ForceTarget, shown: bool, numbers: Master, time: np.ndarray, late: float,
+    pressing: Regulate | Track, pilot: TeleopPilot, numbers: Master, time: np.ndarray,
     sight: np.ndarray,
 ) -> _Target:  # fmt: skip
+    target, shown, late = pressing.target, isinstance(pressing, Track), pilot.perception.reaction
     axis = _axis_of(numbers, COORDINATES.index(target.coordinate))
     largest = max(abs(f) for f in target.force) or 1.0
     side = math.copysign(1.0, next((f for f in target.force if f), 1.0))
     goal = np.interp(np.maximum(time - late * shown, 0.0), target.time, target.force)
     displayed = np.interp(time, target.time, target.force) if shown else np.full(len(time), np.nan)
     goal = goal + shown * largest * sight
-    row = numbers.axis[axis].tolist()
-    return _Target(axis, row, side, -side * row[SIGN], goal.tolist(), displayed, _CLOSE * largest)
+    row, close = numbers.axis[axis].tolist(), _CLOSE * largest
+    direct = pilot.reflection == "direct_force"
+    noticed = max(close, _NOTICED / max(row[RATIO], 1e-12)) if direct else close
+    way = -side * row[SIGN]
+    return _Target(axis, row, side, way, goal.tolist(), displayed, close, noticed)
 
 
 def _axis_of(numbers: Master, coordinate: int) -> int:

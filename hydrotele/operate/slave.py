@@ -63,9 +63,9 @@ from hydrotele.operate.slave_table import (
 )
 from hydrotele.teleoperation import Coupling, TeleopPilot
 
-_SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
+SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
 _BRAKE = 0.8  # of the acceleration: the rest makes up for the filter's lag
-_AHEAD = 0.02  # s over which the change of a rate is averaged before it is looked ahead
+AHEAD = 0.02  # s over which the change of a rate is averaged before it is looked ahead
 _BLEND = 30.0  # rad/s, of measured task rates from held angles
 
 
@@ -198,7 +198,7 @@ def ask(numbers, packet, arrived, force, period, s):
     )
     lead = numbers.limits[LEAD]
     for i in range(k):
-        share = min(1.0, period / _AHEAD)
+        share = min(1.0, period / AHEAD)
         change = (s.joint_rate[i] - before[i]) / period
         late = s.ahead[i] - before[i]
         s.ahead[i] = s.joint_rate[i] + late + share * (lead * change - late)
@@ -232,11 +232,11 @@ def _placed_rate(numbers, row, c, x, period, s):
     size = abs(gap)
     speed = min(
         row[FASTEST],
-        0.5 * _SMOOTH * size,
+        0.5 * SMOOTH * size,
         np.sqrt(2.0 * _BRAKE * numbers.limits[ACCELERATION] * size),
     )
     speed = speed if gap > 0.0 else -speed
-    return s.rate[c] + 2.0 * _SMOOTH * period * (speed - s.rate[c])
+    return s.rate[c] + 2.0 * SMOOTH * period * (speed - s.rate[c])
 
 
 @compiled

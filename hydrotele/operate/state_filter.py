@@ -53,6 +53,25 @@ def filter_delay(bandwidth: float) -> float:
     return _SQUARE / (2.0 * math.pi * bandwidth)
 
 
+def butterworth(bandwidth: float, s: np.ndarray) -> np.ndarray:
+    """Transfer function of the filter for readings that run straight from one to the next.
+
+    Args:
+        bandwidth: w / (2 pi), scalar [Hz], > 0.
+        s: (...) complex frequencies [rad/s].
+
+    Returns:
+        (...) `w^3 / (s^3 + 2 w s^2 + 2 w^2 s + w^3)` [1].
+
+    Source: Butterworth's filter of third order.
+
+    >>> abs(butterworth(1.0, np.array([2j * np.pi]))).round(4)
+    array([0.7071])
+    """
+    w = 2.0 * math.pi * bandwidth
+    return _CUBE * w**3 / (s**3 + _REAL * w * s**2 + _SQUARE * w**2 * s + _CUBE * w**3)
+
+
 def noise_gains(table: np.ndarray) -> np.ndarray:
     """Standard deviations of y, y', y'' for white readings of standard deviation 1.
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -25,6 +26,28 @@ _STEPS = 61  # tried before a margin is refined
 _REFINED = 1e-3  # of a margin
 _REACH = 1e3  # factors on the loop's gain that are tried, up and down
 _DELAYS = (1e-4, 10.0)  # s each way
+
+
+class Loop(Protocol):
+    """A teleoperator with hand and task whose stability can be asked for, such as a `Case`."""
+
+    @property
+    def task(self) -> Block:
+        """Impedance of the task."""
+        ...
+
+    @property
+    def hand(self) -> Block:
+        """Impedance of the hand."""
+        ...
+
+    def with_delay(self, delay: float) -> "Loop":
+        """The same with a delay [s] each way."""
+        ...
+
+    def port(self, structure: str, reflected: float = 1.0) -> TwoPort:
+        """The two-port of a structure; `reflected` is a factor on what comes back."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -161,7 +184,7 @@ def _counted(port: TwoPort, hand: Block, environment: Block) -> int | None:
         return None
 
 
-def gain_margin(case: Case, structure: str) -> float:
+def gain_margin(case: Loop, structure: str) -> float:
     """Factor on what comes back at which the loop's stability changes; see `Analysis`."""
 
     def right(factor: float) -> bool:
@@ -174,7 +197,7 @@ def gain_margin(case: Case, structure: str) -> float:
     return 0.0 if found is None else found
 
 
-def largest_delay(case: Case, structure: str) -> float:
+def largest_delay(case: Loop, structure: str) -> float:
     """Delay each way up to which the loop is stable [s]; see `Analysis`."""
 
     def right(delay: float) -> bool:
@@ -204,7 +227,7 @@ def _change(right: Callable[[float], bool], points: np.ndarray) -> float | None:
 
 
 def stability_map(
-    case: Case, structure: str, delays: np.ndarray, factors: np.ndarray
+    case: Loop, structure: str, delays: np.ndarray, factors: np.ndarray
 ) -> np.ndarray:
     """Where a structure is stable.
 
