@@ -40,7 +40,7 @@ def experiments_to_folder(
         findings = zhu1994(seeds, jobs, progress)
     if target:
         with whole_folder(target, "experiments") as folder:
-            _write(folder, name, findings)
+            _write(folder, name, seeds, findings)
     if as_json:
         print_json([finding.row() for finding in findings])
     else:
@@ -49,7 +49,7 @@ def experiments_to_folder(
     return findings
 
 
-def _write(folder: Path, name: str, findings: list[Finding]) -> None:
+def _write(folder: Path, name: str, seeds: int, findings: list[Finding]) -> None:
     from hydrotele.show.experiment_report import write_experiment_report
 
     notes.print("writing report.html ...", style="dim")
@@ -57,7 +57,8 @@ def _write(folder: Path, name: str, findings: list[Finding]) -> None:
     text = json.dumps(rows, indent=2, allow_nan=False)
     (folder / "experiments.json").write_text(text + "\n", encoding="utf-8")
     write_experiment_report(name, findings, folder / "report.html")
-    (folder / "table.md").write_text(markdown_table(findings), encoding="utf-8")
+    head = f"# Experiments of {name}\n\n`hydrotele experiments {name} --seeds {seeds}`\n\n"
+    (folder / "table.md").write_text(head + markdown_table(findings), encoding="utf-8")
     summary = {"kind": "experiments", "name": name, "hydrotele": hydrotele.__version__}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 

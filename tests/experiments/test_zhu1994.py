@@ -79,7 +79,7 @@ def test_json_is_a_list_of_rows(monkeypatch, tmp_path):
     assert result.exit_code == 0 and "1 of 2 as published" in result.stdout
     report = (folder / "report.html").read_text()
     assert "12 % off" in report and "data:image/png" in report
-    assert (folder / "table.md").read_text().count("\n") == 4
+    assert (folder / "table.md").read_text().count("\n") == 8
 
 
 def test_another_series_is_refused():
