@@ -156,6 +156,7 @@ def finished(session: Session, scenario: Scenario) -> Run:
     summary = summarise(plant, scenario, plan, record, looped.pins, looped.wall)
     if looped.station:
         measured = _with_station(measured, looped.station.log, scenario)
+        truth = _with_station(truth, looped.station.log, scenario)
         summary["teleoperation"] = looped.station.summary()
         summary["notes"] += looped.station.notes
     summary["notes"] += [f"{said} at {time:.2f} s" for time, said in looped.events]
@@ -166,12 +167,12 @@ def finished(session: Session, scenario: Scenario) -> Run:
     return Run(scenario, plant, plan, measured, truth, summary, looped.station)
 
 
-def _with_station(measured: Log, station: StationLog, scenario: Scenario) -> Log:
-    """The measured log with what the operator's station measured."""
+def _with_station(log: Log, station: StationLog, scenario: Scenario) -> Log:
+    """A log with what the operator's station measured and made."""
     every = round(scenario.control_rate / scenario.log_rate)
     columns, units = station.channels(every, scenario.rows)
     return dataclasses.replace(
-        measured, columns={**measured.columns, **columns}, units={**measured.units, **units}
+        log, columns={**log.columns, **columns}, units={**log.units, **units}
     )
 
 

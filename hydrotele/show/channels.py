@@ -45,7 +45,17 @@ TITLES: Mapping[str, str] = {
     "velocity": "joint velocity",
     "acceleration": "joint acceleration",
     "tip": "tip position",
+    "handle": "joystick's handle",
+    "hand_force": "force of the hand",
+    "handle_force": "force of the coils on the handle",
+    "handle_stiffness": "joystick's stiffness",
+    "coil_current": "coil current",
+    "tip_reference": "pose that was asked for",
+    "tip_pose": "measured pose of the tip",
+    "tip_force": "force felt at the tip",
 }
+# Kinds whose lengths and forces are shown in m and N: a tip is far away, a hand is weak.
+_PLAIN = ("tip", "tip_pose", "tip_reference", "hand_force", "handle_force")
 
 # One hue per axis: distinct on dark and on white, and for the colour blind (after Okabe and Ito).
 _HUES = (
@@ -102,8 +112,8 @@ def shown(log: Log, name: str) -> Trace:
         InputError: the log has no such channel.
     """
     channel, values = parse_channel(name), log[name]
-    if channel.kind == "tip":
-        return Trace(channel, "m", values)
+    if channel.kind in _PLAIN and log.units[name] != "rad":
+        return Trace(channel, log.units[name], values)
     unit, factor = shown_unit(log.units[name])
     return Trace(channel, unit, values * factor)
 

@@ -15,6 +15,7 @@ _TABS: Mapping[str, tuple[str, ...]] = {
     "Overview": ("command", "angle", "position", "pressure_head", "pressure_rod"),
     "Hydraulics": ("pressure_supply", "flow_supply", "flow_head", "flow_rod", "spool"),
     "Mechanics": ("length", "position", "force", "torque", "contact_force", "tip"),
+    "Teleoperation": ("tip_force", "handle", "hand_force", "handle_stiffness", "tip_pose"),
     "Rates": ("velocity", "acceleration", "piston_velocity", "spool_rate", "reference"),
 }
 _COMPARED = ("angle", "position", "pressure_head", "pressure_rod", "length")
