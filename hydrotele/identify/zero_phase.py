@@ -1,7 +1,6 @@
 """Zero-phase low-pass by a Butterworth filter run forwards and backwards, and differentiation."""
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from hydrotele.errors import InputError
 from hydrotele.identify.smoothed import Smoothed, checked_period, columns_of, per_column
@@ -57,6 +56,8 @@ def zero_phase(
             f" got {cutoff:g} Hz",
         )
     samples = _bridged(columns_of(values, 2, _WHERE), bridge)
+    from scipy.signal import butter, sosfiltfilt  # half a second that most runs do not need
+
     filtering = butter(order, cutoff, fs=1.0 / dt, output="sos")
     pad = round(3.0 / (cutoff * dt))  # the filter has forgotten its start after three periods
     if len(samples) <= pad:

@@ -60,6 +60,30 @@ def _stack(typingctx, size):
     return types.voidptr(types.int64), codegen
 
 
+@compiled
+def _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
+    """Spring and damper force on the joint of actuator i; the rest are offsets of fields."""
+    nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
+    nv = carray(_pointer(m + m_nv), (1,), np.int64)[0]
+    joints = carray(_pointer(m + m_njnt), (1,), np.int64)[0]
+    at_trnid = carray(_pointer(m + m_trnid), (1,), np.int64)[0]
+    joint = carray(_pointer(at_trnid), (2 * nu,), np.int32)[2 * i]
+    at_dofadr = carray(_pointer(m + m_dofadr), (1,), np.int64)[0]
+    dof = carray(_pointer(at_dofadr), (joints,), np.int32)[joint]
+    at_passive = carray(_pointer(d + d_passive), (1,), np.int64)[0]
+    return carray(_pointer(at_passive), (nv,), np.float64)[dof]
+
+
+@compiled
+def _gained_command(m, d, i, m_nu, m_gainprm, d_ctrl):
+    """Drive force of a plain force drive: its gain times its command."""
+    nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
+    at_gain = carray(_pointer(m + m_gainprm), (1,), np.int64)[0]
+    at_ctrl = carray(_pointer(d + d_ctrl), (1,), np.int64)[0]
+    gain = carray(_pointer(at_gain), (nu * _GAINS,), np.float64)[i * _GAINS]
+    return gain * carray(_pointer(at_ctrl), (nu,), np.float64)[i]
+
+
 @functools.cache
 def _compile_callbacks():
     """Compile (or load from the cache) the dynamics and bias callbacks for this MuJoCo."""
@@ -76,28 +100,6 @@ def _compile_callbacks():
     d_passive = data_at["qfrc_passive"]
     d_ctrl, d_act, d_act_dot = data_at["ctrl"], data_at["act"], data_at["act_dot"]
     d_length, d_velocity = data_at["actuator_length"], data_at["actuator_velocity"]
-
-    @compiled
-    def passive_force(m, d, i):
-        """Spring and damper force on the joint of actuator i."""
-        nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
-        nv = carray(_pointer(m + m_nv), (1,), np.int64)[0]
-        joints = carray(_pointer(m + m_njnt), (1,), np.int64)[0]
-        at_trnid = carray(_pointer(m + m_trnid), (1,), np.int64)[0]
-        joint = carray(_pointer(at_trnid), (2 * nu,), np.int32)[2 * i]
-        at_dofadr = carray(_pointer(m + m_dofadr), (1,), np.int64)[0]
-        dof = carray(_pointer(at_dofadr), (joints,), np.int32)[joint]
-        at_passive = carray(_pointer(d + d_passive), (1,), np.int64)[0]
-        return carray(_pointer(at_passive), (nv,), np.float64)[dof]
-
-    @compiled
-    def gained_command(m, d, i):
-        """Drive force of a plain force drive: its gain times its command."""
-        nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
-        at_gain = carray(_pointer(m + m_gainprm), (1,), np.int64)[0]
-        at_ctrl = carray(_pointer(d + d_ctrl), (1,), np.int64)[0]
-        gain = carray(_pointer(at_gain), (nu * _GAINS,), np.float64)[i * _GAINS]
-        return gain * carray(_pointer(at_ctrl), (nu,), np.float64)[i]
 
     @callback(_SIGNATURE)
     def advance(m, d, i):
@@ -159,9 +161,9 @@ def _compile_callbacks():
             drive -= user[u + _AREA_ROD] * (act[3] + dt * rate[3])
         if user[u + _INERTIA] == 0.0:
             return drive - actuator_friction(user, u, velocity)
-        push = drive + passive_force(m, d, i)
+        push = drive + _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)
         if user[u + _KIND] > 2.0:
-            push += gained_command(m, d, i)
+            push += _gained_command(m, d, i, m_nu, m_gainprm, d_ctrl)
         return drive - settled_friction(user, u, velocity, push, user[u + _INERTIA], dt)
 
     return advance, force
