@@ -87,6 +87,9 @@ def print_summary(summary: dict[str, Any]) -> None:
     for key, label in (("flow_balance", "flow balance"), ("energy_balance", "energy balance")):
         value = summary["balance"][key]
         rows.add_row(label, "-" if value is None else f"{value:.1e}")
+    if station := summary.get("teleoperation"):
+        gone, least = station["handle_energy_J"], station["handle_least_energy_J"]
+        rows.add_row("energy into the handle", f"{gone:.2f} J, least {least:.2f} J")
     for name, error in summary["tracking"].items():
         unit, factor = ("mm", 1e3) if error["unit"] == "m" else ("deg", 57.29577951308232)
         rms, largest = error["rms"] * factor, error["max"] * factor

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from hydrotele.errors import InputError
 from hydrotele.teleop.handle import Detent, StiffnessFeedback
-from hydrotele.teleop.passivity import PassivityObserver
 from hydrotele.teleop.recursive import RecursiveLeastSquares
 
 # Zhu 1994, Tables 6.7 and 6.8, the excavator's x: stiffness 300 .. 4000 N/m at up to 50 kN
@@ -49,23 +48,6 @@ def test_a_detent_never_pushes_outwards():
         Detent(deadband=1e-3, drop=5.0, inside=4e3, outside=300.0)
     with pytest.raises(InputError, match="negative"):
         Detent(deadband=1e-3, drop=-1.0, inside=4e3, outside=300.0)
-
-
-@pytest.mark.parametrize("late, passive", [(0, True), (60, False)])
-def test_a_spring_is_passive_and_a_late_one_is_not(late, passive):
-    """A spring of 300 N/m moved by 5 mm at 2 Hz, answering at once or 60 ms late."""
-    period, time = 1e-3, 1e-3 * np.arange(5000)
-    x = 5e-3 * np.sin(2 * np.pi * 2.0 * time)
-    held = 300.0 * np.where(np.arange(5000) >= late, np.roll(x, late), 0.0)
-    port = PassivityObserver()
-    for force, before, now in zip(held[1:], x[:-1], x[1:], strict=True):
-        port.add(0.5 * (force + 300.0 * before) if late == 0 else force, (now - before) / period,
-                 period)  # fmt: skip
-    # rounding of a sum of 5000 terms of some mJ
-    assert (port.least > -1e-9) == passive
-    assert PassivityObserver(stored=1.0, energy=-0.5, least=-0.5).passive
-    if not passive:
-        assert not port.passive
 
 
 def test_recursion_ends_where_least_squares_does():
