@@ -6,7 +6,7 @@ from hydrotele.compiled import compiled
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.machine import Machine
 
-_POINTS = 4001  # over a joint's range: interpolation is good to some 1e-7 of a moment arm
+POINTS = 4001  # over a joint's range: interpolation is good to some 1e-7 of a moment arm
 _LOW, _STEP = range(2)
 _WIDE = 1.0  # rad or m, of a joint without a range, whose drive is direct
 
@@ -22,11 +22,11 @@ def drive_tables(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, n
         (grid (k, 2): lowest joint position and step, table (k, POINTS, 3): d(drive)/d(joint), head
         and rod chamber volume [m^3]).
     """
-    grid, table = np.zeros((len(axes), 2)), np.ones((len(axes), _POINTS, 3))
+    grid, table = np.zeros((len(axes), 2)), np.ones((len(axes), POINTS, 3))
     for i, name in enumerate(axes):
         axis = machine.axes[name]
         low, high = machine.joints[axis.joint].range or (-_WIDE, _WIDE)
-        places = np.linspace(low, high, _POINTS)
+        places = np.linspace(low, high, POINTS)
         grid[i] = low, places[1] - places[0]
         linkage = axis_linkage(machine, name)
         table[i, :, 0] = linkage.rate(places)

@@ -12,7 +12,6 @@ randomised through `actuator_user`. Actuators without the marker are left alone.
 
 import ctypes
 import functools
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -31,22 +30,14 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.hydraulics.drive_side import settled_friction
 from hydrotele.hydraulics.parameters import MARKER
 from hydrotele.simulate.layout import field_offsets, option_offset, verify_layout
+from hydrotele.simulate.library import mujoco_library
+from hydrotele.simulate.pointers import pointer
 
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
 _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _OFFSET, _INERTIA = int(Slot.OFFSET), int(Slot.DRIVE_INERTIA)
 _GAINS = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
-
-
-@intrinsic
-def _pointer(typingctx, address):
-    """Reinterpret an int64 address as void*."""
-
-    def codegen(context, builder, signature, args):
-        return builder.inttoptr(args[0], cgutils.voidptr_t)
-
-    return types.voidptr(types.int64), codegen
 
 
 @intrinsic
@@ -63,25 +54,25 @@ def _stack(typingctx, size):
 @compiled
 def _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
     """Spring and damper force on the joint of actuator i; the rest are offsets of fields."""
-    nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
-    nv = carray(_pointer(m + m_nv), (1,), np.int64)[0]
-    joints = carray(_pointer(m + m_njnt), (1,), np.int64)[0]
-    at_trnid = carray(_pointer(m + m_trnid), (1,), np.int64)[0]
-    joint = carray(_pointer(at_trnid), (2 * nu,), np.int32)[2 * i]
-    at_dofadr = carray(_pointer(m + m_dofadr), (1,), np.int64)[0]
-    dof = carray(_pointer(at_dofadr), (joints,), np.int32)[joint]
-    at_passive = carray(_pointer(d + d_passive), (1,), np.int64)[0]
-    return carray(_pointer(at_passive), (nv,), np.float64)[dof]
+    nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
+    nv = carray(pointer(m + m_nv), (1,), np.int64)[0]
+    joints = carray(pointer(m + m_njnt), (1,), np.int64)[0]
+    at_trnid = carray(pointer(m + m_trnid), (1,), np.int64)[0]
+    joint = carray(pointer(at_trnid), (2 * nu,), np.int32)[2 * i]
+    at_dofadr = carray(pointer(m + m_dofadr), (1,), np.int64)[0]
+    dof = carray(pointer(at_dofadr), (joints,), np.int32)[joint]
+    at_passive = carray(pointer(d + d_passive), (1,), np.int64)[0]
+    return carray(pointer(at_passive), (nv,), np.float64)[dof]
 
 
 @compiled
 def _gained_command(m, d, i, m_nu, m_gainprm, d_ctrl):
     """Drive force of a plain force drive: its gain times its command."""
-    nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
-    at_gain = carray(_pointer(m + m_gainprm), (1,), np.int64)[0]
-    at_ctrl = carray(_pointer(d + d_ctrl), (1,), np.int64)[0]
-    gain = carray(_pointer(at_gain), (nu * _GAINS,), np.float64)[i * _GAINS]
-    return gain * carray(_pointer(at_ctrl), (nu,), np.float64)[i]
+    nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
+    at_gain = carray(pointer(m + m_gainprm), (1,), np.int64)[0]
+    at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
+    gain = carray(pointer(at_gain), (nu * _GAINS,), np.float64)[i * _GAINS]
+    return gain * carray(pointer(at_ctrl), (nu,), np.float64)[i]
 
 
 @functools.cache
@@ -103,60 +94,60 @@ def _compile_callbacks():
 
     @callback(_SIGNATURE)
     def advance(m, d, i):
-        if carray(_pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
+        if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
-        nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
-        at_user = carray(_pointer(m + m_user), (1,), np.int64)[0]
-        user = carray(_pointer(at_user), (nu * SLOTS,), np.float64)
+        nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
+        at_user = carray(pointer(m + m_user), (1,), np.int64)[0]
+        user = carray(pointer(at_user), (nu * SLOTS,), np.float64)
         if user[i * SLOTS] != MARKER:
             return 0.0
         first, count = int(user[i * SLOTS + _FIRST]), int(user[i * SLOTS + _COUNT])
         if i != first + count - 1:
             return 0.0
-        at_actadr = carray(_pointer(m + m_actadr), (1,), np.int64)[0]
-        start = 8 * carray(_pointer(at_actadr), (nu,), np.int32)[first]
-        at_act = carray(_pointer(d + d_act), (1,), np.int64)[0]
-        at_act_dot = carray(_pointer(d + d_act_dot), (1,), np.int64)[0]
-        at_ctrl = carray(_pointer(d + d_ctrl), (1,), np.int64)[0]
-        at_length = carray(_pointer(d + d_length), (1,), np.int64)[0]
-        at_velocity = carray(_pointer(d + d_velocity), (1,), np.int64)[0]
+        at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
+        start = 8 * carray(pointer(at_actadr), (nu,), np.int32)[first]
+        at_act = carray(pointer(d + d_act), (1,), np.int64)[0]
+        at_act_dot = carray(pointer(d + d_act_dot), (1,), np.int64)[0]
+        at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
+        at_length = carray(pointer(d + d_length), (1,), np.int64)[0]
+        at_velocity = carray(pointer(d + d_velocity), (1,), np.int64)[0]
         step_circuit(
             user,
             first,
             count,
-            carray(_pointer(at_act + start), (4 * count,), np.float64),
-            carray(_pointer(at_ctrl), (nu,), np.float64),
-            carray(_pointer(at_length), (nu,), np.float64),
-            carray(_pointer(at_velocity), (nu,), np.float64),
-            carray(_pointer(m + m_timestep), (1,), np.float64)[0],
-            carray(_pointer(at_act_dot + start), (4 * count,), np.float64),
+            carray(pointer(at_act + start), (4 * count,), np.float64),
+            carray(pointer(at_ctrl), (nu,), np.float64),
+            carray(pointer(at_length), (nu,), np.float64),
+            carray(pointer(at_velocity), (nu,), np.float64),
+            carray(pointer(m + m_timestep), (1,), np.float64)[0],
+            carray(pointer(at_act_dot + start), (4 * count,), np.float64),
             carray(_stack(0), (SCRATCH,), np.float64),
         )
         return 0.0
 
     @callback(_SIGNATURE)
     def force(m, d, i):
-        if carray(_pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
+        if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
-        nu = carray(_pointer(m + m_nu), (1,), np.int64)[0]
-        at_user = carray(_pointer(m + m_user), (1,), np.int64)[0]
-        user = carray(_pointer(at_user), (nu * SLOTS,), np.float64)
+        nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
+        at_user = carray(pointer(m + m_user), (1,), np.int64)[0]
+        user = carray(pointer(at_user), (nu * SLOTS,), np.float64)
         u = i * SLOTS
         if user[u] != MARKER:
             return 0.0
-        at_velocity = carray(_pointer(d + d_velocity), (1,), np.int64)[0]
-        velocity = carray(_pointer(at_velocity), (nu,), np.float64)[i]
-        dt = carray(_pointer(m + m_timestep), (1,), np.float64)[0]
+        at_velocity = carray(pointer(d + d_velocity), (1,), np.int64)[0]
+        velocity = carray(pointer(at_velocity), (nu,), np.float64)[i]
+        dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
         drive = 0.0
         if user[u + _KIND] > 2.0:  # Kind.FORCE: MuJoCo's own gain gives the drive force
             drive = -user[u + _OFFSET]
         else:
-            at_actadr = carray(_pointer(m + m_actadr), (1,), np.int64)[0]
-            start = 8 * carray(_pointer(at_actadr), (nu,), np.int32)[i]
-            at_act = carray(_pointer(d + d_act), (1,), np.int64)[0]
-            at_act_dot = carray(_pointer(d + d_act_dot), (1,), np.int64)[0]
-            act = carray(_pointer(at_act + start), (4,), np.float64)
-            rate = carray(_pointer(at_act_dot + start), (4,), np.float64)
+            at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
+            start = 8 * carray(pointer(at_actadr), (nu,), np.int32)[i]
+            at_act = carray(pointer(d + d_act), (1,), np.int64)[0]
+            at_act_dot = carray(pointer(d + d_act_dot), (1,), np.int64)[0]
+            act = carray(pointer(at_act + start), (4,), np.float64)
+            rate = carray(pointer(at_act_dot + start), (4,), np.float64)
             drive = user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
             drive -= user[u + _AREA_ROD] * (act[3] + dt * rate[3])
         if user[u + _INERTIA] == 0.0:
@@ -174,10 +165,8 @@ def stop_profiling_clock() -> None:
 
     `mjData.timer` then stays zero in this process; `mujoco.set_mjcb_time` brings a clock back.
     """
-    library = next(Path(mujoco.__file__).parent.glob("*mujoco.*[0-9]*"), None)
-    if library is None or not hasattr(ctypes.CDLL(str(library)), "mjcb_time"):
-        return
-    ctypes.c_void_p.in_dll(ctypes.CDLL(str(library)), "mjcb_time").value = None
+    if hasattr(mujoco_library(), "mjcb_time"):
+        ctypes.c_void_p.in_dll(mujoco_library(), "mjcb_time").value = None
 
 
 def install_hydraulics() -> None:

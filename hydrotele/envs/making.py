@@ -1,0 +1,62 @@
+"""From the keywords of `gymnasium.make` to a running task, and its spaces."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from hydrotele.datafile import suggest
+from hydrotele.errors import InputError
+from hydrotele.tasks.catalogue import TASKS
+from hydrotele.tasks.core import TaskCore
+from hydrotele.tasks.memory import DISABLED, NEXT_STEP, SAME_STEP
+from hydrotele.tasks.task import Options
+
+AUTORESET = {"NextStep": NEXT_STEP, "SameStep": SAME_STEP, "Disabled": DISABLED}
+
+
+def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode: int) -> TaskCore:
+    """A running task.
+
+    Args:
+        task: its name.
+        choices: fields of `tasks.task.Options`.
+        count: number of environments.
+        threads: that step them, 0 for one per core.
+        mode: of autoreset.
+
+    Returns:
+        The core.
+
+    Raises:
+        InputError: no such task, no such option, or a value that does not suit.
+    """
+    if task not in TASKS:
+        raise InputError(f"task {task!r}", suggest(task, TASKS))
+    known = {field.name for field in dataclasses.fields(Options)}
+    if strange := set(choices) - known:
+        name = sorted(strange)[0]
+        raise InputError(f"environment option {name!r}", suggest(name, known))
+    kept: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in choices.items()}
+    return TaskCore(TASKS[task], Options(**kept), count, threads, mode)
+
+
+def observation_space(core: TaskCore) -> Box:
+    """(o,) float32 in SI, with the ends at which readings saturate."""
+    return Box(core.low, core.high, dtype=np.float32)
+
+
+def action_space(core: TaskCore) -> Box:
+    """(a,) float32 from -1 to 1: full action to either side."""
+    return Box(-1.0, 1.0, (len(core.setup.axes),), np.float32)
+
+
+def info_of(core: TaskCore) -> dict[str, np.ndarray]:
+    """Name -> (n,) of the last step: the task's figures, variant, whether it became unstable."""
+    info = {
+        name: core.measures[:, i].copy() for i, (name, _) in enumerate(core.setup.task.measures)
+    }
+    info["variant"] = core.memory["variant"].copy()
+    info["fault"] = core.memory["fault"] != 0
+    return info

@@ -1,0 +1,35 @@
+"""The tasks."""
+
+import numpy as np
+
+from hydrotele.machine import Machine
+from hydrotele.tasks.task import Task
+from hydrotele.tasks.track import track_fields
+
+
+def _about_home(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
+    """Axes somewhere in the middle part of their ranges; the swing anywhere in front."""
+    places = {}
+    for name, axis in machine.axes.items():
+        low, high = machine.joints[axis.joint].range or (-0.5, 0.5)
+        places[name] = float(low + (high - low) * chance.uniform(0.3, 0.7))
+    return places
+
+
+TASKS = {
+    task.name: task
+    for task in (
+        Task(
+            name="TrackTrajectory",
+            kind="track",
+            sentence="All axes of an excavator follow Fourier references, without tool.",
+            reward="1 on the trajectory, less 1 for every 0.1 m that the tip is off, at least -1.",
+            machine="cat215",
+            tool="none",
+            start=_about_home,
+            fields=track_fields,
+            measures=(("tip_error", "m"),),
+        ),
+    )
+}
+"""Tasks by name."""

@@ -1,0 +1,85 @@
+"""The tasks in native code by their number: a goal, each control period, observation, reward.
+
+A task is a file of its own with four compiled functions of the same names and arguments; its number
+is its place in KINDS.
+"""
+
+from hydrotele.compiled import compiled
+from hydrotele.tasks.observation import observe_machine
+from hydrotele.tasks.track import begin_track, judge_track, observe_track
+
+KINDS = ("track",)
+_TRACK = 0
+
+
+@compiled
+def begin_task(f, e, w):
+    """Draw the goal of a new episode.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written.
+        w: World.
+
+    Returns:
+        Nothing.
+
+    Source: the task's own file.
+    """
+    if f.kind == _TRACK:
+        begin_track(f, e)
+
+
+@compiled
+def tick_task(f, e, w):
+    """What a task does after a control period: forces of the ground, a grapple that takes a log.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World.
+
+    Returns:
+        Nothing.
+
+    Source: the task's own file.
+    """
+
+
+@compiled
+def observe_task(f, e, w, out):
+    """Write the observation: of the machine, then of the task.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World.
+        out: (observations,) float32, written.
+
+    Returns:
+        Nothing.
+
+    Source: `observation.machine_fields` and the task's own file.
+    """
+    at = observe_machine(f, e, out)
+    if f.kind == _TRACK:
+        observe_track(f, e, out, at)
+
+
+@compiled
+def judge_task(f, e, w):
+    """Reward of the step that is over, and whether the task is.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World; `measures` is written.
+
+    Returns:
+        (reward, whether the episode ends), scalars.
+
+    Source: the task's own file.
+    """
+    if f.kind == _TRACK:
+        return judge_track(f, e, w)
+    return 0.0, False

@@ -1,0 +1,145 @@
+"""What a running episode remembers and what all episodes of a task share, as C-like records.
+
+Compiled functions get both as records and read their fields by name; from Python, `memory["joint"]`
+is an (n, AXES) array.
+"""
+
+import numpy as np
+
+AXES = 8  # axes of a machine at most
+ARM = 5  # of them those of the arm
+CHANNELS = 3 * AXES + 1  # sensors: positions, then head and rod of every valve, then the supply
+GOAL = 96  # numbers that a task keeps of its goal and its course
+NUMBERS = 64  # numbers of a task
+MEASURES = 8  # figures of a step that a task tells in `info`
+
+VALVE, JOINT_RATE, RESOLVED_MOTION = range(3)  # Facts.mode: what actions are
+ACTIONS = ("valve", "joint_rate", "resolved_motion")
+NEXT_STEP, SAME_STEP, DISABLED = range(3)  # Facts.autoreset
+STEP, RESET = range(2)  # Facts.call: what the native function is called for
+
+_F, _I, _U = np.float64, np.int64, np.uint64
+
+MEMORY = np.dtype(
+    [
+        ("random", _U),  # state of the episode's own random numbers
+        ("variant", _I),  # machine and start that this episode has
+        ("episode", _I),  # number of episodes begun
+        ("step", _I),  # environment steps since the start
+        ("tick", _I),  # control periods since the start
+        ("over", _I),  # whether the episode has ended
+        ("fault", _I),  # whether the simulation became unstable
+        ("warnings", _I),  # of MuJoCo, since the beginning
+        ("saturated", _I),  # observations that lay outside their bounds, since the beginning
+        ("position", _F, AXES),  # true axis positions [rad], [m]
+        ("tip", _F, 3),  # true place of the tip [m], world frame
+        ("joint", _F, AXES),  # axis positions as read [rad], [m]
+        ("rate", _F, AXES),  # difference quotients of the readings [rad/s], [m/s]
+        ("head", _F, AXES),  # head-side pressures as read [Pa]
+        ("rod", _F, AXES),  # rod-side pressures as read [Pa]
+        ("supply", _F),  # supply pressure as read [Pa]
+        ("error", _F, CHANNELS),  # random errors of this reading
+        ("reference", _F, AXES),  # axis positions asked for [rad], [m]
+        ("reference_rate", _F, AXES),  # their rates [rad/s], [m/s]
+        ("sampled_reference", _F, AXES),  # references when the sensors read
+        ("pose", _F, ARM),  # of the references: r [m], theta [rad], z [m], attitude, head [rad]
+        ("pose_rate", _F, ARM),  # [m/s], [rad/s]
+        ("blocked", _I),  # whether the arm stands at the edge of its workspace
+        ("load", _F, AXES),  # slow mean of the drive forces [N], [N m]
+        ("command", _F, AXES),  # to valves and drives [1], or in the drive's unit
+        ("drive", _F, (4, AXES)),  # wanted drive velocity, moment arm, chamber volumes
+        ("goal", _F, GOAL),  # the task's own
+    ],
+    align=True,
+)
+"""State of one episode."""
+
+FACTS = np.dtype(
+    [
+        ("call", _I),
+        ("count", _I),
+        ("kind", _I),  # number of the task
+        ("mode", _I),
+        ("autoreset", _I),
+        ("axes", _I),  # number of actuators k
+        ("hydraulic", _I),  # of them those with valves, which come first
+        ("arm_axes", _I),  # of them those of the arm, which come first
+        ("actions", _I),  # one for every driven axis, or for every coordinate of the arm and axis
+        ("observations", _I),
+        ("horizon", _I),  # steps of an episode
+        ("ticks", _I),  # control periods per step
+        ("substeps", _I),  # physics steps per control period
+        ("every", _I),  # control periods per reading of the sensors
+        ("noisy", _I),
+        ("timestep", _F),  # of the physics [s]
+        ("period", _F),  # of the control [s]
+        ("acceleration", _F),  # of joint rates at most [rad/s^2], [m/s^2]
+        ("axes_driven", _I),
+        ("driven_axis", _I, AXES),  # axes that actions move; those of the arm come first
+        ("qpos", _I, AXES),  # place of every axis' joint
+        ("dof", _I, AXES),
+        ("nq", _I),
+        ("nv", _I),
+        ("na", _I),
+        ("nbody", _I),
+        ("tip_site", _I),
+        ("closed", _I, AXES),  # whether the servo drives the axis
+        ("fastest", _F, AXES),  # rates at full action [rad/s], [m/s]
+        ("fastest_pose", _F, ARM),  # the same of the pose [m/s], [rad/s]
+        ("accelerations", _F, ARM),  # of the pose [m/s^2], [rad/s^2]
+        ("limit", _F, AXES),  # commands at full action [1], or in the drive's unit
+        ("arm", _F, 9),  # of kinematics.task.task_numbers
+        ("ranges", _F, (AXES, 2)),  # of the axes [rad], [m]
+        ("servo", _F, (AXES, 14)),  # of operate.servo.servo_numbers
+        ("feedforward", _F),
+        ("grid", _F, (AXES, 2)),  # of operate.drive_rows.drive_tables
+        ("accuracy", _F, CHANNELS),
+        ("converters", _F, (3, CHANNELS)),
+        ("numbers", _F, NUMBERS),  # of the task
+        ("delayed_command", _I),  # length of the ring of commands, 0 without delays
+        ("delayed_sensor", _I),  # length of the ring of sensed values, 0 without delays
+        ("variants", _I),
+        ("states", _I),  # length of a state
+        ("fields", _I),  # number of fields of the model that differ between variants
+        ("width", _I),  # of the terrain of an episode, 0 without
+        # addresses
+        ("memory", _I),
+        ("action", _I),  # (n, actions) float32
+        ("observation", _I),  # (n, observations) float32
+        ("final", _I),  # (n, observations) float32, before an autoreset in the same step
+        ("low", _I),  # (observations,) float32
+        ("high", _I),
+        ("reward", _I),  # (n,)
+        ("terminated", _I),  # (n,) uint8
+        ("truncated", _I),
+        ("measures", _I),  # (n, MEASURES)
+        ("table", _I),  # (k, POINTS, 3) of operate.drive_rows.drive_tables
+        ("starts", _I),  # (v, states)
+        ("start_tips", _I),  # (v, 3)
+        ("scales", _I),  # (v, CHANNELS) of the sensors
+        ("offsets", _I),
+        ("lags", _I),  # (v, CHANNELS) delays of the sensors [control periods]
+        ("delays", _I),  # (v, AXES, 2) of the commands: whole physics steps, rest of a step
+        ("commands", _I),  # (n, delayed_command, AXES) ring
+        ("sensed", _I),  # (n, delayed_sensor, CHANNELS) ring
+        ("places", _I),  # (fields, 3): address for all variants, address for all n, floats in each
+        ("terrain", _I),  # (n, width)
+        ("mj_step", _I),
+        ("mj_set_state", _I),
+        # where mjData and mjModel keep their members [byte]
+        ("at_qpos", _I),
+        ("at_qvel", _I),
+        ("at_act", _I),
+        ("at_ctrl", _I),
+        ("at_site", _I),
+        ("at_xfrc", _I),
+        ("at_xpos", _I),
+        ("at_xmat", _I),
+        ("at_warning", _I),
+        ("at_eq_active", _I),
+        ("at_user", _I),
+        ("at_eq_data", _I),
+    ],
+    align=True,
+)
+"""What all episodes share."""

@@ -1,0 +1,201 @@
+"""Machines and starts that episodes are drawn from: exact ones, compiled before the first episode.
+
+Every variant is a complete Machine with the effects that it has, standing still at its start with
+its valves closed. An episode takes one of them by copying numbers, which native code can do.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import MODEL_FIELDS
+
+from hydrotele.effects import EFFECTS, apply_effect
+from hydrotele.errors import InputError
+from hydrotele.machine import Machine
+from hydrotele.sensors import SensorError
+from hydrotele.simulate.fleet import STATE
+from hydrotele.simulate.plant import Plant, build_plant, rest_state
+from hydrotele.simulate.record import begin_leapfrog, split_delay
+from hydrotele.tasks.memory import AXES, CHANNELS
+from hydrotele.tasks.task import Options, Task
+
+_KEPT = 8  # sets of variants: many single environments of one process share theirs
+_KNOWN: dict[str, "Variants"] = {}
+
+
+@dataclasses.dataclass(frozen=True)
+class Variants:
+    """v machines with their starts.
+
+    Attributes:
+        plant: of the first one.
+        machines: the machines.
+        states: (v, s) complete states at the starts, as `begin_leapfrog` leaves them.
+        tips: (v, 3) places of the tip there [m].
+        fields: field of the model -> (v, size) where they differ.
+        scales: (v, CHANNELS) of the sensors.
+        offsets: (v, CHANNELS).
+        lags: (v, CHANNELS) delays of the sensors [s].
+        delays: (v, AXES, 2) of the commands: whole physics steps, rest of a step [1].
+    """
+
+    plant: Plant
+    machines: tuple[Machine, ...]
+    states: np.ndarray
+    tips: np.ndarray
+    fields: dict[str, np.ndarray]
+    scales: np.ndarray
+    offsets: np.ndarray
+    lags: np.ndarray
+    delays: np.ndarray
+
+
+def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
+    """Draw, compile and place all variants; those of the same choices are made once.
+
+    Args:
+        task: the task.
+        options: the user's; its effects are planted.
+        nominal: machine without them.
+
+    Returns:
+        The variants.
+
+    Raises:
+        InputError: an effect does not suit the machine, or what is randomised changes more than
+            numbers.
+    """
+    key = repr((task.name, options.effects, options.randomise, options.variants,
+                options.variant_seed, options.timestep))  # fmt: skip
+    if key not in _KNOWN:
+        _KNOWN[key] = _make(task, options, nominal)
+        while len(_KNOWN) > _KEPT:
+            _KNOWN.pop(next(iter(_KNOWN)))
+    return _KNOWN[key]
+
+
+def _make(task: Task, options: Options, nominal: Machine) -> Variants:
+    machines, plants, states, tips = [], [], [], []
+    for number in range(options.variants):
+        chance = np.random.default_rng([options.variant_seed, number])
+        joints = task.start(nominal, chance)
+        things = task.surroundings(nominal, chance)
+        machine = _changed(nominal, options, chance)
+        known = (p for m, p in zip(machines, plants, strict=True)
+                 if m == machine and p.surroundings == things)  # fmt: skip
+        plant = next(known, None)
+        if plant is None:
+            plant = build_plant(machine, options.timestep, task.ground, things)
+        machines.append(machine)
+        plants.append(plant)
+        data = rest_state(plant, _by_joint(machine, joints))
+        begin_leapfrog(plant.model, data)
+        state = np.zeros(mujoco.mj_stateSize(plant.model, STATE))
+        mujoco.mj_getState(plant.model, data, state, STATE)
+        states.append(state)
+        tips.append(data.site("tip").xpos.copy())
+    return Variants(
+        plants[0], tuple(machines), np.array(states), np.array(tips), _differing(plants),
+        *_sensor_tables(plants[0], machines), _delays(plants[0], machines),
+    )  # fmt: skip
+
+
+def _by_joint(machine: Machine, places: Mapping[str, float]) -> dict[str, float]:
+    """Positions of axes or joints by the joints' names."""
+    return {machine.axes[n].joint if n in machine.axes else n: v for n, v in places.items()}
+
+
+def _changed(nominal: Machine, options: Options, chance: np.random.Generator) -> Machine:
+    """The machine with what is planted and what is drawn."""
+    machine = nominal
+    for effect in options.effects:
+        machine = apply_effect(machine, *_said(effect), dict(effect.get("parameters", {})))
+    for effect in options.randomise:
+        drawn = {
+            key: float(chance.uniform(*_range(effect, key, value)))
+            for key, value in effect.get("parameters", {}).items()
+        }
+        machine = apply_effect(machine, *_said(effect), drawn)
+    return machine
+
+
+def _said(effect: Mapping[str, Any]) -> tuple[str, str]:
+    """Name and location of an effect that a user gave."""
+    keys = ("name", "location", "parameters")
+    if not isinstance(effect, Mapping) or "name" not in effect or set(effect) - set(keys):
+        raise InputError("effects", f"each needs {', '.join(keys)}, not {effect!r}")
+    return str(effect["name"]), str(effect.get("location", ""))
+
+
+def _range(effect: Mapping[str, Any], key: str, value: Any) -> tuple[float, float]:
+    """Range of a parameter that is drawn; a wrong one is named."""
+    where = f"randomise {effect.get('name')}: {key}"
+    try:
+        low, high = (float(end) for end in value)
+    except (TypeError, ValueError):
+        raise InputError(where, f"needs a range [low, high], not {value!r}") from None
+    if not (np.isfinite([low, high]).all() and low <= high):
+        raise InputError(where, f"needs a range that rises, not {value!r}")
+    return low, high
+
+
+def _differing(plants: list[Plant]) -> dict[str, np.ndarray]:
+    """Fields of the models that are not the same in all of them."""
+    first, fields = plants[0].model, {}
+    distinct = list({id(plant): plant for plant in plants}.values())
+    for name in sorted(MODEL_FIELDS):
+        values = [np.asarray(_of(plant.model, name)) for plant in distinct]
+        if any(value.shape != values[0].shape for value in values):
+            raise _structure(name)
+        if all(np.array_equal(value, values[0]) for value in values):
+            continue
+        if values[0].dtype != np.float64:
+            raise _structure(name)
+        fields[name] = np.array([np.asarray(_of(p.model, name)).ravel() for p in plants])
+    if any(plant.model.nv != first.nv for plant in distinct):
+        raise _structure("nv")
+    return fields
+
+
+def _structure(name: str) -> InputError:
+    known = ", ".join(sorted(EFFECTS))
+    message = (
+        f"the variants differ in more than numbers ({name} of the model): plant such an effect in"
+        f" all of them with `effects`; the library has {known}"
+    )
+    return InputError("randomise", message)
+
+
+def _of(model: mujoco.MjModel, name: str):
+    return getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)
+
+
+def channels(plant: Plant) -> list[str]:
+    """Channels in the order of the native sensors: positions, head and rod pressures, supply."""
+    names = [f"{plant.machine.position_kind(axis)}.{axis}" for axis in plant.axes]
+    for axis in plant.axes[: plant.hydraulic]:
+        names += [f"pressure_head.{axis}", f"pressure_rod.{axis}"]
+    return [*names, "pressure_supply"] if plant.hydraulic else names
+
+
+def _sensor_tables(plant: Plant, machines: list[Machine]):
+    """Scales, offsets and delays of all sensors of all variants."""
+    shape = (len(machines), CHANNELS)
+    scales, offsets, lags = np.ones(shape), np.zeros(shape), np.zeros(shape)
+    for v, machine in enumerate(machines):
+        for c, name in enumerate(channels(plant)):
+            defect = machine.sensor_errors.get(name, SensorError())
+            scales[v, c], offsets[v, c], lags[v, c] = defect.scale, defect.offset, defect.delay
+    return scales, offsets, lags
+
+
+def _delays(plant: Plant, machines: list[Machine]) -> np.ndarray:
+    delays = np.zeros((len(machines), AXES, 2))
+    for v, machine in enumerate(machines):
+        for i, name in enumerate(plant.axes):
+            late = machine.axes[name].command_delay
+            delays[v, i] = split_delay(late, plant.model.opt.timestep)
+    return delays
