@@ -52,11 +52,19 @@ def action_space(core: TaskCore) -> Box:
     return Box(-1.0, 1.0, (len(core.setup.axes),), np.float32)
 
 
-def info_of(core: TaskCore) -> dict[str, np.ndarray]:
-    """Name -> (n,) of the last step: the task's figures, variant, whether it became unstable."""
-    info = {
-        name: core.measures[:, i].copy() for i, (name, _) in enumerate(core.setup.task.measures)
-    }
-    info["variant"] = core.memory["variant"].copy()
-    info["fault"] = core.memory["fault"] != 0
+def info_of(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
+    """Name -> (n,) of the last step: the task's figures, variant, whether it became unstable.
+
+    Args:
+        core: the task.
+        final: of the episodes that ended in this step, where new ones have begun since.
+
+    Returns:
+        The figures.
+    """
+    told, which = core.setup.task.measures, "last_" if final else ""
+    figures = core.final_measures if final else core.measures
+    info = {name: figures[:, i].copy() for i, (name, _) in enumerate(told)}
+    info["variant"] = core.memory[f"{which}variant"].copy()
+    info["fault"] = core.memory[f"{which}fault"] != 0
     return info

@@ -118,20 +118,22 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _infos(self, chosen: np.ndarray | None) -> dict[str, Any]:
         there = np.zeros(self.num_envs, bool)
         there[slice(None) if chosen is None else chosen] = True
-        infos: dict[str, Any] = {}
-        for name, values in info_of(self.core).items():
-            infos[name], infos[f"_{name}"] = values, there.copy()
-        return infos
+        return _masked(info_of(self.core), there)
 
     def _with_final(self, infos: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
         """What the last steps of episodes ended with, beside the first of the new ones."""
         observations = np.full(self.num_envs, None, dtype=object)
         for number in np.flatnonzero(over):
             observations[number] = self.core.final[number].copy()
-        last = {k: (over.copy() if k.startswith("_") else v) for k, v in infos.items()}
-        return {**infos, "final_obs": observations, "_final_obs": over.copy(),
-                "final_info": last, "_final_info": over.copy()}  # fmt: skip
+        last = _masked(info_of(self.core, final=True), over)
+        final = {"final_obs": observations, "final_info": last}
+        return infos | _masked(final, over)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Give the simulations' memory back."""
         self.core.close()
+
+
+def _masked(infos: dict[str, Any], there: np.ndarray) -> dict[str, Any]:
+    """The same with gymnasium's masks beside: whose figures they are."""
+    return infos | {f"_{name}": there.copy() for name in infos}

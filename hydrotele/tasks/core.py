@@ -58,6 +58,7 @@ class TaskCore:
     Attributes:
         setup: the task as it was chosen.
         count: n.
+        simulations: their states, live.
         memory: (n,) records of MEMORY, live.
         observation: (n, o) float32, live.
         final: (n, o) float32 observations before an autoreset in the same step.
@@ -65,6 +66,7 @@ class TaskCore:
         terminated: (n,) uint8, live.
         truncated: (n,) uint8, live.
         measures: (n, MEASURES) figures of the step, live.
+        final_measures: (n, MEASURES) before an autoreset in the same step.
     """
 
     def __init__(
@@ -87,7 +89,7 @@ class TaskCore:
         self.count, self.setup = count, set_up(task, options)
         if count < 1:
             raise InputError("num_envs", f"must be at least 1, not {count}")
-        self._fleet = Fleet(self.setup.variants.plant.model, count, threads)
+        self.simulations = Fleet(self.setup.variants.plant.model, count, threads)
         self._make_arrays()
         self.facts = make_facts(self.setup, count, autoreset)
         self._link()
@@ -100,7 +102,8 @@ class TaskCore:
         self.observation, self.final = (np.zeros((n, o), np.float32) for _ in range(2))
         self.low = np.array([field.low for field in self.setup.fields], np.float32)
         self.high = np.array([field.high for field in self.setup.fields], np.float32)
-        self.reward, self.measures = np.zeros(n), np.zeros((n, MEASURES))
+        self.reward = np.zeros(n)
+        self.measures, self.final_measures = (np.zeros((n, MEASURES)) for _ in range(2))
         self.terminated, self.truncated = (np.zeros(n, np.uint8) for _ in range(2))
         self.terrain = np.zeros((n, self.setup.task.terrain))
         longest = 0
@@ -110,7 +113,7 @@ class TaskCore:
         late = v.lags / self.setup.clock.period
         self._sensed = np.zeros((n, int(np.ceil(late.max())) + 2 if late.any() else 0, CHANNELS))
         self._lags = late
-        self._expanded = {name: self._fleet.expand(name) for name in v.fields}
+        self._expanded = {name: self.simulations.expand(name) for name in v.fields}
 
     def _link(self) -> None:
         """Tell the native code where everything lies."""
@@ -124,7 +127,8 @@ class TaskCore:
             ("memory", self.memory), ("action", self.action), ("observation", self.observation),
             ("final", self.final), ("low", self.low), ("high", self.high),
             ("reward", self.reward), ("terminated", self.terminated),
-            ("truncated", self.truncated), ("measures", self.measures), ("starts", v.states),
+            ("truncated", self.truncated), ("measures", self.measures),
+            ("final_measures", self.final_measures), ("starts", v.states),
             ("start_tips", v.tips), ("scales", v.scales), ("offsets", v.offsets),
             ("lags", self._lags), ("delays", v.delays), ("commands", self._commands),
             ("sensed", self._sensed), ("places", self._places), ("terrain", self.terrain),
@@ -158,7 +162,7 @@ class TaskCore:
             raise RuntimeError("the first reset needs seeds")
         self.facts["call"] = RESET
         ids = None if chosen is None else np.ascontiguousarray(chosen, np.int32)
-        self._fleet.apply(advance.address, self.facts.ctypes.data, ids)
+        self.simulations.apply(advance.address, self.facts.ctypes.data, ids)
 
     def step(self, action: np.ndarray) -> None:
         """Advance all episodes by one environment step.
@@ -173,17 +177,17 @@ class TaskCore:
         if not np.isfinite(self.action).all():
             raise ValueError("an action is not a finite number")
         self.facts["call"] = STEP
-        self._fleet.apply(advance.address, self.facts.ctypes.data)
+        self.simulations.apply(advance.address, self.facts.ctypes.data)
 
     def model_and_data(self, number: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Model and state of one simulation, brought up to date by `mj_forward`, to look at."""
         model = copy.copy(self.setup.variants.plant.model)
         data = mujoco.MjData(model)
-        self._fleet.get_model(number, model)
-        self._fleet.get_data(number, data)
+        self.simulations.get_model(number, model)
+        self.simulations.get_data(number, data)
         mujoco.mj_forward(model, data)
         return model, data
 
     def close(self) -> None:
         """Give the simulations' memory back."""
-        self._fleet.close()
+        self.simulations.close()

@@ -16,7 +16,16 @@ from hydrotele.simulate.pointers import call_set_state, call_step, floats, point
 from hydrotele.tasks.act import act
 from hydrotele.tasks.chance import draw
 from hydrotele.tasks.kinds import begin_task, judge_task, observe_task, tick_task
-from hydrotele.tasks.memory import AXES, DISABLED, FACTS, MEMORY, NEXT_STEP, RESET, SAME_STEP
+from hydrotele.tasks.memory import (
+    AXES,
+    DISABLED,
+    FACTS,
+    MEASURES,
+    MEMORY,
+    NEXT_STEP,
+    RESET,
+    SAME_STEP,
+)
 from hydrotele.tasks.sense import sense
 from hydrotele.tasks.world import world
 
@@ -83,6 +92,7 @@ def _unstable(f, e, d):
 @compiled
 def _begin_episode(f, e, m, d, sim, w):
     """Put the simulation at the start of a variant, and draw a new goal."""
+    e.last_variant, e.last_fault = e.variant, e.fault
     e.variant = int(draw(e) * f.variants)
     start = f.starts + 8 * e.variant * f.states
     call_set_state(f.mj_set_state, m, d, start, STATE)
@@ -171,10 +181,9 @@ def _advance(m, d, sim, argument):
     reward[sim], terminated[sim], truncated[sim] = value, done, late
     e.over = 1 if done or late else 0
     if f.autoreset == SAME_STEP and e.over != 0:
-        measures = w.measures.copy()
+        floats(f.final_measures + 8 * sim * MEASURES, MEASURES)[:] = w.measures
         _observe(f, e, w, f.final, sim)
         _begin_episode(f, e, m, d, sim, w)
-        w.measures[:] = measures
     _observe(f, e, w, f.observation, sim)
 
 

@@ -29,6 +29,8 @@ MEMORY = np.dtype(
         ("tick", _I),  # control periods since the start
         ("over", _I),  # whether the episode has ended
         ("fault", _I),  # whether the simulation became unstable
+        ("last_variant", _I),  # of the episode before
+        ("last_fault", _I),
         ("warnings", _I),  # of MuJoCo, since the beginning
         ("saturated", _I),  # observations that lay outside their bounds, since the beginning
         ("position", _F, AXES),  # true axis positions [rad], [m]
@@ -113,6 +115,7 @@ FACTS = np.dtype(
         ("terminated", _I),  # (n,) uint8
         ("truncated", _I),
         ("measures", _I),  # (n, MEASURES)
+        ("final_measures", _I),  # (n, MEASURES) before an autoreset in the same step
         ("table", _I),  # (k, POINTS, 3) of operate.drive_rows.drive_tables
         ("starts", _I),  # (v, states)
         ("start_tips", _I),  # (v, 3)
