@@ -1,0 +1,315 @@
+"""One step of soil and bucket for a control loop: forces, cutting, filling, falling, sliding.
+
+Four surfaces of the bucket press on the soil, each a spring that yields at what soil mechanics lets
+it carry, along its own direction: the face (Coulomb's wedge ahead of it, pushed towards the
+machine), the edge (into the soil, along the floor), the floor's underside and the heel (Prandtl's
+zones below). Such an element holds a bucket that rests, gives back no more than the spring holds
+(some joules) and otherwise only takes energy: with a damper in parallel it may be held over a step
+of 5 ms against a machine of 20 t.
+"""
+
+import math
+
+from hydrotele.compiled import lean
+from hydrotele.soil.bucket import held_soil
+from hydrotele.soil.cutting import (
+    acting_rake,
+    acting_slope,
+    adhesion_factor,
+    bearing_pressure,
+    cohesion_factor,
+    failure_plane,
+    surcharge_factor,
+    wedge_weight_factor,
+)
+from hydrotele.soil.numbers import (
+    ADHESION,
+    CARRIED,
+    CELL,
+    COHESION,
+    DAMPING,
+    DENSITY,
+    DEPTH,
+    EDGE,
+    FACE,
+    FLOOR,
+    FLOOR_ANGLE,
+    FLOOR_LENGTH,
+    FORCE_R,
+    FORCE_Z,
+    FRICTION,
+    FRONT,
+    GRAVITY_AT,
+    HEEL,
+    HEEL_X,
+    HEEL_Z,
+    HIGH,
+    LAST_HEEL_R,
+    LAST_HEEL_Z,
+    LAST_R,
+    LAST_Z,
+    LOST,
+    LOW,
+    MASS,
+    MASS_R,
+    MASS_Z,
+    MOMENT,
+    OUT,
+    PLACED,
+    SLIDE,
+    STIFFNESS,
+    SWELL,
+    TIP,
+    TOOL_FRICTION,
+    WIDTH,
+)
+from hydrotele.soil.terrain import (
+    cell_of,
+    cut_cells_,
+    lay_down_,
+    slide_cells_,
+    surface_height,
+)
+
+AHEAD = 1.5  # cells from the edge to where the depth of a cut is read: what no cut has touched yet
+PLAY = 0.02  # m, how far the edge goes back before it pushes soil the other way
+SPILL_TIME = 0.3  # s, in which what a tilted bucket does not hold falls out
+SPILL_LEAST = 0.2  # m^3/s, so that it comes to an end
+HEEL_CONTACT = 0.4  # m, of a heel that is pressed in by a quarter of that
+SWEEPS = 2  # of sliding soil per step
+EARTH_AT_REST = 0.5  # horizontal over vertical pressure beside a blade
+
+
+@lean
+def cutting_force(n, depth, loose, rake, slope, load, out):
+    """Force of soil on a blade that is drawn through it towards the machine.
+
+    Args:
+        n: (k,) of `soil_numbers`.
+        depth: of the edge below the surface ahead, scalar [m].
+        loose: how much of that is loose, which has weight and no cohesion, scalar [m].
+        rake: of the blade against the horizontal, scalar [rad].
+        slope: of the surface, positive where it rises towards the machine, scalar [rad].
+        load: weight of soil in the bucket, which rests on the wedge, scalar [N].
+        out: (2,) written: force outwards and up [N].
+
+    Returns:
+        Nothing.
+
+    Source: see `cutting`; adhesion along the blade as in McKyes 1985, Eq. 3.10.
+    """
+    out[0], out[1] = 0.0, 0.0
+    if depth <= 0.0:
+        return
+    phi, delta = n[FRICTION], n[TOOL_FRICTION]
+    slope = acting_slope(slope, phi)
+    rake = acting_rake(rake, slope, phi, delta)
+    plane = failure_plane(rake, slope, phi, delta)
+    across = depth * math.cos(slope)
+    bank = min(max(depth - loose, 0.0), depth) * math.cos(slope)
+    weight = n[DENSITY] * n[GRAVITY_AT] * across * across * n[WIDTH]
+    force = weight * wedge_weight_factor(rake, slope, phi, delta, plane)
+    force += n[COHESION] * bank * n[WIDTH] * cohesion_factor(rake, phi, delta, plane)
+    stuck = n[ADHESION] * bank * n[WIDTH]
+    force += stuck * adhesion_factor(rake, phi, delta, plane)
+    resting = min(load, 4.0 * weight)  # a thin wedge carries no full bucket
+    force += resting * surcharge_factor(rake, slope, phi, delta, plane)
+    force = max(force, 0.0)
+    upright = rake - slope
+    out[0] = force * math.sin(upright + delta) + stuck * math.cos(upright) / math.sin(rake)
+    out[1] = -force * math.cos(upright + delta) + stuck * math.sin(upright) / math.sin(rake)
+
+
+@lean
+def yielding_force(n, state, place, along, rate, low, high):
+    """Force of one surface along its direction: a spring and a damper that yield.
+
+    Args:
+        n: (k,) of `soil_numbers`.
+        state: (STATE,) of the bucket; its deflection is changed [m].
+        place: of the deflection in it, scalar [1].
+        along: how far the surface moved against that direction, into the soil, scalar [m].
+        rate: at which it does, scalar [m/s].
+        low: least force, at most 0, scalar [N].
+        high: largest force, at least 0, scalar [N].
+
+    Returns:
+        force, scalar [N].
+
+    Source: Prandtl's elastic-plastic element; never gives more work than the spring holds.
+    """
+    k = n[STIFFNESS]
+    spring = min(max(k * (state[place] + along), low), high)
+    state[place] = spring / k
+    return min(max(spring + n[DAMPING] * rate, low), high)
+
+
+@lean
+def _spread(n, surface, loose, state, first, second, volume):
+    lost = lay_down_(n, surface, loose, first, 0.5 * volume)
+    lost += lay_down_(n, surface, loose, second, 0.5 * volume)
+    state[LOST] += lost
+    _touch(state, min(first, second), max(first, second), len(surface))
+
+
+@lean
+def _touch(state, low, high, count):
+    """Widen the range of cells that may slide."""
+    low, high = max(low - 1, 0), min(high + 1, count - 1)
+    if state[HIGH] <= state[LOW]:
+        state[LOW], state[HIGH] = low, high
+    else:
+        state[LOW], state[HIGH] = min(state[LOW], low), max(state[HIGH], high)
+
+
+@lean
+def _press(n, surface, loose, state, r, z, attitude, r_rate, z_rate, dt, out):
+    """Forces of all surfaces on the bucket; returns depths inside and outside of the edge."""
+    phi, delta = n[FRICTION], n[TOOL_FRICTION]
+    reach = AHEAD * n[CELL]
+    height = surface_height(n, surface, r - reach)
+    inside, outside = height - z, surface_height(n, surface, r + reach) - z
+    dr, dz = r - state[LAST_R], z - state[LAST_Z]
+    # the face
+    if inside > 0.0:
+        slope = math.atan2(surface_height(n, surface, r - 4.0 * reach) - height, 3.0 * reach)
+        over = surface_height(n, loose, r - reach)
+        rake = attitude + math.pi - n[FLOOR_ANGLE]
+        rake -= 2.0 * math.pi * math.floor((rake + math.pi) / (2.0 * math.pi))
+        load = state[CARRIED] / n[SWELL] * n[DENSITY] * n[GRAVITY_AT]
+        cutting_force(n, inside, over, rake, slope, load, out)
+        limit = math.hypot(out[0], out[1])
+        ar, az = (out[0] / limit, out[1] / limit) if limit > 0.0 else (1.0, 0.0)
+        f = yielding_force(n, state, FACE, -dr * ar - dz * az, -r_rate * ar - z_rate * az, 0.0,
+                           limit)  # fmt: skip
+        out[0], out[1] = f * ar, f * az
+    else:
+        state[FACE], out[0], out[1] = 0.0, 0.0, 0.0
+        rake = attitude + math.pi - n[FLOOR_ANGLE]
+        rake -= 2.0 * math.pi * math.floor((rake + math.pi) / (2.0 * math.pi))
+    # edge and underside of the floor
+    deepest = max(inside, outside)
+    if deepest > 0.0:
+        tilt = min(max(rake, 0.0), 0.5 * math.pi)
+        c, s = math.cos(tilt), math.sin(tilt)
+        weight = n[DENSITY] * n[GRAVITY_AT]
+        contact = min(deepest / max(s, 0.1), n[FLOOR_LENGTH])
+        shear = n[ADHESION] + EARTH_AT_REST * 0.5 * weight * deepest * math.tan(delta)
+        rub = 2.0 * n[WIDTH] * contact * shear
+        sharp = n[EDGE] * n[WIDTH] * min(deepest / n[EDGE], 1.0)
+        push = sharp * bearing_pressure(weight * deepest, n[COHESION], phi, 0.0) + rub
+        f = yielding_force(n, state, TIP, -dr * c - dz * s, -r_rate * c - z_rate * s, -rub, push)
+        out[0] += f * c
+        out[1] += f * s
+        yield_at = 0.0
+        if outside > 0.0:
+            contact = min(outside / max(s, 0.1), n[FLOOR_LENGTH])
+            pressure = bearing_pressure(0.5 * weight * outside, n[COHESION], phi, tilt)
+            yield_at = pressure * contact * n[WIDTH]
+        f = yielding_force(n, state, FLOOR, dr * s - dz * c, r_rate * s - z_rate * c, 0.0,
+                           yield_at)  # fmt: skip
+        out[0] -= f * s
+        out[1] += f * c
+    else:
+        state[TIP], state[FLOOR] = 0.0, 0.0
+    # the heel
+    c, s = math.cos(attitude), math.sin(attitude)
+    from_edge_r, from_edge_z = n[HEEL_X] * c - n[HEEL_Z] * s, n[HEEL_X] * s + n[HEEL_Z] * c
+    heel_r, heel_z = r + from_edge_r, z + from_edge_z
+    deep = surface_height(n, surface, heel_r) - heel_z
+    if deep > 0.0:
+        dr, dz = heel_r - state[LAST_HEEL_R], heel_z - state[LAST_HEEL_Z]
+        contact = min(4.0 * deep, HEEL_CONTACT)
+        pressure = bearing_pressure(0.5 * n[DENSITY] * n[GRAVITY_AT] * deep, n[COHESION], phi, 0.0)
+        up = yielding_force(n, state, HEEL, -dz, -dz / dt, 0.0, pressure * contact * n[WIDTH])
+        rub = up * math.tan(delta)
+        back = yielding_force(n, state, SLIDE, -dr, -dr / dt, -rub, rub)
+        out[0] += back
+        out[1] += up
+        out[2] = from_edge_r * up - from_edge_z * back
+    else:
+        state[HEEL], state[SLIDE], out[2] = 0.0, 0.0, 0.0
+    state[LAST_R], state[LAST_Z] = r, z
+    state[LAST_HEEL_R], state[LAST_HEEL_Z] = heel_r, heel_z
+    return inside, outside
+
+
+@lean
+def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out):
+    """Move the edge of the bucket to a place and say what the soil does to it.
+
+    Allocates nothing and touches nothing but its arguments, so that every environment may run in
+    its own thread. A change of `cutting_force` with depth is smooth: nothing jumps between cells.
+
+    Args:
+        n: (k,) of `soil_numbers`, not changed.
+        surface: (m,) height of the profile, changed [m].
+        loose: (m,) how much of it is loose, changed [m].
+        state: (STATE,) of the bucket, changed; see `numbers`.
+        r: radius of the edge, scalar [m].
+        z: height of the edge, scalar [m].
+        r_rate: its speed outwards, scalar [m/s].
+        z_rate: its speed upwards, scalar [m/s].
+        attitude: of the bucket, scalar [rad].
+        dt: time since the step before, scalar [s].
+        out: (OUT,) written: force outwards and up [N], moment about the edge [N m], mass carried
+            [kg] and its place from the edge [m]. The weight of what is carried is not in the force.
+
+    Returns:
+        Nothing.
+
+    Source: this module and `cutting`, `bucket`, `terrain`.
+    """
+    for i in range(OUT):
+        out[i] = 0.0
+    if state[PLACED] == 0.0:
+        c, s = math.cos(attitude), math.sin(attitude)
+        state[PLACED], state[LAST_R], state[LAST_Z], state[FRONT] = 1.0, r, z, r
+        state[LAST_HEEL_R] = r + n[HEEL_X] * c - n[HEEL_Z] * s
+        state[LAST_HEEL_Z] = z + n[HEEL_X] * s + n[HEEL_Z] * c
+        state[LOW], state[HIGH] = 0.0, len(surface) - 1.0
+    z_before, count = state[LAST_Z], len(surface)
+    inside, outside = _press(n, surface, loose, state, r, z, attitude, r_rate, z_rate, dt, out)
+    state[DEPTH] = max(inside, 0.0)
+    force_r, force_z, moment = out[FORCE_R], out[FORCE_Z], out[MOMENT]
+    here = cell_of(n, r)
+    wall = here if inside > 0.0 else -1
+    taken, pushed = 0.0, 0.0
+    if r < state[FRONT]:
+        taken = cut_cells_(n, surface, loose, state[FRONT], z_before, r, z)
+        state[FRONT] = r
+    elif r > state[FRONT] + PLAY:
+        pushed = cut_cells_(n, surface, loose, state[FRONT] + PLAY, z_before, r, z)
+        state[FRONT] = r - PLAY
+    if pushed > 0.0:
+        _spread(n, surface, loose, state, here + 1, here + 2, pushed)
+    if taken > 0.0:
+        state[CARRIED] += taken
+    if state[CARRIED] > 0.0:
+        held_soil(n, attitude, max(inside, 0.0), out)
+        most, rim = out[0], out[3]
+        centre_r, centre_z = out[1], out[2]
+        excess = state[CARRIED] - most
+        if excess > 0.0:
+            if wall >= 0:  # the pile ahead of the edge
+                falls = excess
+                _spread(n, surface, loose, state, here - 1, here - 2, falls)
+            else:
+                falls = min(excess, (excess / SPILL_TIME + SPILL_LEAST) * dt)
+                below = cell_of(n, r + rim)
+                _spread(n, surface, loose, state, below, below - 1, falls)
+            state[CARRIED] -= falls
+        out[MASS] = state[CARRIED] / n[SWELL] * n[DENSITY]
+        out[MASS_R], out[MASS_Z] = centre_r, centre_z
+    out[FORCE_R], out[FORCE_Z], out[MOMENT] = force_r, force_z, moment
+    if wall >= 0 or taken > 0.0:
+        _touch(state, here - 1, here + 1, count)
+    if state[HIGH] > state[LOW]:
+        slid = False
+        low, high = int(state[LOW]), int(state[HIGH])
+        for _ in range(SWEEPS):
+            slid |= slide_cells_(n, surface, loose, low, high, wall)
+        if slid:
+            state[LOW], state[HIGH] = max(low - 1, 0), min(high + 1, count - 1)
+        else:
+            state[LOW], state[HIGH] = 0.0, 0.0
