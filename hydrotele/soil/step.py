@@ -273,7 +273,7 @@ def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out)
     state[DEPTH] = max(inside, 0.0)
     force_r, force_z, moment = out[FORCE_R], out[FORCE_Z], out[MOMENT]
     here = cell_of(n, r)
-    wall = here if inside > 0.0 else -1
+    wall = here if inside > 0.0 or outside > 0.0 else -2  # a bucket stands there
     taken, pushed = 0.0, 0.0
     if r < state[FRONT]:
         taken = cut_cells_(n, surface, loose, state[FRONT], z_before, r, z)
@@ -283,15 +283,14 @@ def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out)
         state[FRONT] = r - PLAY
     if pushed > 0.0:
         _spread(n, surface, loose, state, here + 1, here + 2, pushed)
-    if taken > 0.0:
-        state[CARRIED] += taken
+    state[CARRIED] += taken
     if state[CARRIED] > 0.0:
         held_soil(n, attitude, max(inside, 0.0), out)
         most, rim = out[0], out[3]
         centre_r, centre_z = out[1], out[2]
         excess = state[CARRIED] - most
         if excess > 0.0:
-            if wall >= 0:  # the pile ahead of the edge
+            if inside > 0.0:  # the pile ahead of the edge
                 falls = excess
                 _spread(n, surface, loose, state, here - 1, here - 2, falls)
             else:
@@ -302,8 +301,8 @@ def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out)
         out[MASS] = state[CARRIED] / n[SWELL] * n[DENSITY]
         out[MASS_R], out[MASS_Z] = centre_r, centre_z
     out[FORCE_R], out[FORCE_Z], out[MOMENT] = force_r, force_z, moment
-    if wall >= 0 or taken > 0.0:
-        _touch(state, here - 1, here + 1, count)
+    if wall > -2:
+        _touch(state, min(max(here - 1, 0), count - 1), min(max(here + 1, 0), count - 1), count)
     if state[HIGH] > state[LOW]:
         slid = False
         low, high = int(state[LOW]), int(state[HIGH])

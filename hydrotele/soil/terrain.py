@@ -170,7 +170,7 @@ def slide_cells_(n, surface, loose, low, high, wall):
         loose: (m,) loose part of them, changed [m].
         low: first cell, scalar [1].
         high: last cell, scalar [1].
-        wall: cell between which and the one before it nothing slides, -1 for none, scalar [1].
+        wall: cell into which and from which nothing slides, -2 for none, scalar [1].
 
     Returns:
         Whether something slid.
@@ -179,14 +179,14 @@ def slide_cells_(n, surface, loose, low, high, wall):
     """
     slid = False
     for i in range(low, high):
-        if i + 1 != wall:
+        if i != wall and i + 1 != wall:
             if surface[i] >= surface[i + 1]:
                 slid |= slide_pair_(n, surface, loose, i, i + 1)
             else:
                 slid |= slide_pair_(n, surface, loose, i + 1, i)
     for j in range(low, high):
         i = high - 1 - (j - low)
-        if i + 1 != wall:
+        if i != wall and i + 1 != wall:
             if surface[i] >= surface[i + 1]:
                 slid |= slide_pair_(n, surface, loose, i, i + 1)
             else:
