@@ -137,7 +137,7 @@ def adhesion_factor(rake, friction, tool_friction, plane):
 def bearing_pressure(overburden, cohesion, friction, tilt):
     """Pressure at which soil yields under a smooth face that is pushed into it.
 
-    `(p + c cot phi) = (q + c cot phi) tan^2(45 deg + phi/2) e^(2 theta tan phi)`: a level face turns
+    `p + c cot phi = (q + c cot phi) tan^2(45 deg + phi/2) e^(2 theta tan phi)`: a level face turns
     the principal stresses by theta = 90 deg (Prandtl and Reissner's strip footing, N_q = 18.4 for
     30 deg), an upright one not at all (Rankine's passive wall).
 

@@ -46,7 +46,9 @@ class Soil(Facts):
         if self.adhesion > self.cohesion:
             raise ValueError("adhesion exceeds cohesion: soil would fail before it lets go")
         if self.cut_slope < self.repose:
-            raise ValueError("cut_slope is below repose: soil in the bank stands steeper than loose")
+            raise ValueError(
+                "cut_slope is below repose: soil in the bank stands steeper than loose"
+            )
         return self
 
 

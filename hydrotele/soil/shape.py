@@ -1,12 +1,13 @@
-"""The bucket seen from its side.
+r"""The bucket seen from its side.
 
 ```
-          pin o                        attitude a: of the line pin -> edge against the horizontal,
-             /|  <- mouth               positive raises the edge. The mouth looks along
-       shell( |     (pin to edge)       (sin a, -cos a): towards the machine at -90 deg (the arm
-             \\|  ^                     hangs, the bucket digs), straight up at -180 deg (curled
-    machine   v  rake                  in, it holds), straight down at 0 (dumped).
-   <-------- edge ------- ground
+             o pin        Attitude a: of the line pin -> edge against the horizontal, positive
+             |\           raises the edge. The mouth lies along that line and looks along
+             | \          (sin a, -cos a): towards the machine at -90 deg (drawn here: it digs),
+       mouth |  ) shell   straight up at -180 deg (curled in: it holds), straight down at 0
+             | /          (dumped).
+             |/ rake
+ machine <-- +-------     edge
 ```
 
 Here the machine is on the left, radius grows to the right. The floor runs from the edge back into

@@ -217,7 +217,7 @@ def test_cutting_force_is_bounded(rake, slope, depth, loose, load, soil):
     weight = s.density * 9.81 * depth * depth * CAT215.width
     # No factor exceeds 60: that of a rough upright blade in a steep surface is the largest.
     bound = 60.0 * (weight + load) + 60.0 * depth * CAT215.width * (s.cohesion + s.adhesion)
-    assert np.hypot(*out) <= bound
+    assert math.hypot(*out) <= bound
 
 
 def test_force_vanishes_with_depth_and_grows_with_it():

@@ -1,5 +1,6 @@
 """A bucket that digs, rests, carries and drops; energy, mass, threads."""
 
+import ctypes
 import math
 from concurrent.futures import ThreadPoolExecutor
 
@@ -7,7 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import (
+    carray,  # pyright: ignore[reportPrivateImportUsage] -- its documented API
+    types,
+)
 
+from hydrotele.compiled import callback
 from hydrotele.soil.facts import GRAVITY, SOILS
 from hydrotele.soil.numbers import (
     CARRIED,
@@ -22,6 +28,7 @@ from hydrotele.soil.numbers import (
     MASS_Z,
     MOMENT,
     OUT,
+    STATE,
     SWELL,
     bucket_state,
     level_profile,
@@ -267,3 +274,35 @@ def test_weight_of_what_is_carried_is_given_apart():
     assert out[MASS] == pytest.approx(0.5 / soil.swell * soil.density)
     assert out[FORCE_Z] == 0.0
     assert GRAVITY * out[MASS] > 6e3
+
+
+_POINTER = types.CPointer(types.float64)
+
+
+@callback(types.void(_POINTER, _POINTER, types.intp, _POINTER, _POINTER, _POINTER))
+def _native(numbers, profile, count, state, move, out):
+    n = carray(numbers, 64)
+    cells = carray(profile, 2 * count)
+    m = carray(move, 6)
+    soil_step(n, cells[:count], cells[count:], carray(state, STATE), m[0], m[1], m[2], m[3], m[4],
+              m[5], carray(out, OUT))  # fmt: skip
+
+
+def test_native_callback_gives_the_same():
+    python, native = Ground(), Ground()
+    cells = np.concatenate([native.surface, native.loose])
+    numbers = np.zeros(64)
+    numbers[: len(native.numbers)] = native.numbers
+    for k in range(300):
+        z = 0.02 - 0.001 * min(k, 100)
+        move = np.array([6.0 - 0.002 * k, z, -0.4, 0.0, -95.0 * DEGREE, DT])
+        soil_step(
+            python.numbers, python.surface, python.loose, python.state, move[0], move[1],
+            move[2], move[3], move[4], move[5], python.out,
+        )  # fmt: skip
+        arrays = (numbers, cells, native.state, move, native.out)
+        n, c, s, m, o = (a.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for a in arrays)
+        _native.ctypes(n, c, 140, s, m, o)
+        assert native.out.tolist() == python.out.tolist()
+    assert python.out[FORCE_R] > 1e3
+    assert cells.tolist() == [*python.surface, *python.loose]
