@@ -144,6 +144,16 @@ class TaskCore:
         names = ("r", "theta", "z", "attitude", "head")[: setup.arm_axes]
         return (*names, *setup.axes[setup.arm_axes :])
 
+    @property
+    def bytes_per_environment(self) -> int:
+        """Memory that one more environment takes: its state, its records, its results [byte]."""
+        arrays = (
+            self.memory, self.action, self.observation, self.final, self.reward, self.terminated,
+            self.truncated, self.measures, self.final_measures, self.terrain, self._commands,
+            self._sensed, self.simulations.state, *self._expanded.values(),
+        )  # fmt: skip
+        return sum(array.nbytes for array in arrays) // self.count
+
     def reset(self, seeds: np.ndarray | None = None, chosen: np.ndarray | None = None) -> None:
         """Begin new episodes.
 

@@ -155,6 +155,7 @@ def _step(f, e, m, d, sim, w, action):
     e.step += 1
     if _unstable(f, e, d):
         e.fault = 1
+        e.faults += 1
         return 0.0, True, False
     reward, done = judge_task(f, e, w)
     return reward, done, e.step >= f.horizon and not done

@@ -29,6 +29,7 @@ MEMORY = np.dtype(
         ("tick", _I),  # control periods since the start
         ("over", _I),  # whether the episode has ended
         ("fault", _I),  # whether the simulation became unstable
+        ("faults", _I),  # how often it did, since the beginning
         ("last_variant", _I),  # of the episode before
         ("last_fault", _I),
         ("warnings", _I),  # of MuJoCo, since the beginning
