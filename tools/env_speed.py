@@ -35,7 +35,8 @@ def main() -> None:
 
 def _ways(name: str, asked) -> list[str]:
     lines = [
-        f"`Sync` has {asked.loop} environments, `Async` {asked.processes}, batches {asked.batch}.\n",
+        f"Batches have {asked.batch} environments, `Sync` {asked.loop}, `Async` {asked.processes}.",
+        "",
         "| control rate [Hz] | physics steps per step | batched, 2 threads | 1 thread | Sync "
         "| Async | batched / Sync | batched / Async |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
