@@ -11,9 +11,9 @@ from hydrotele.soil.shape import Bucket, outline_from_edge
 (
     DENSITY, COHESION, FRICTION, TOOL_FRICTION, ADHESION, SWELL, REPOSE, CUT_SLOPE, STIFFNESS,
     DAMPING, WIDTH, INNER_WIDTH, EDGE, FLOOR_ANGLE, FLOOR_LENGTH, HEEL_X, HEEL_Z, START, CELL,
-    GRAVITY_AT, CORNERS,
-) = range(21)  # fmt: skip
-OUTLINE = 21
+    SIZE, GRAVITY_AT, CORNERS,
+) = range(22)  # fmt: skip
+OUTLINE = 22
 
 (
     CARRIED, FACE, TIP, FLOOR, HEEL, SLIDE, LAST_R, LAST_Z, LAST_HEEL_R, LAST_HEEL_Z, FRONT, PLACED,
@@ -58,12 +58,15 @@ def soil_numbers(soil: Soil, bucket: Bucket, start: float, cell: float) -> np.nd
         math.tan(soil.repose), math.tan(soil.cut_slope), soil.stiffness,
         soil.stiffness * soil.damping_time, bucket.width, bucket.inner_width, bucket.edge,
         bucket.floor_angle, bucket.floor_length, bucket.heel[0] - edge_x, bucket.heel[1] - edge_z,
-        start, cell, GRAVITY, len(outline), *outline.ravel(),
+        start, cell, np.hypot(*outline.T).max(), GRAVITY, len(outline), *outline.ravel(),
     ])  # fmt: skip
 
 
 def bucket_state() -> np.ndarray:
-    """State (STATE,) of an empty bucket that has not been placed yet; the first step places it."""
+    """State (STATE,) of an empty bucket that has not been placed yet: zeros.
+
+    The first step places it. Zeros written into it later begin anew.
+    """
     return np.zeros(STATE)
 
 

@@ -56,6 +56,7 @@ from hydrotele.soil.numbers import (
     MOMENT,
     OUT,
     PLACED,
+    SIZE,
     SLIDE,
     STIFFNESS,
     SWELL,
@@ -168,7 +169,8 @@ def _press(n, surface, loose, state, r, z, attitude, r_rate, z_rate, dt, out):
     phi, delta = n[FRICTION], n[TOOL_FRICTION]
     reach = AHEAD * n[CELL]
     height = surface_height(n, surface, r - reach)
-    inside, outside = height - z, surface_height(n, surface, r + reach) - z
+    inside = min(height - z, n[SIZE])  # what lies higher falls into the mouth
+    outside = min(surface_height(n, surface, r + reach) - z, n[SIZE])
     dr, dz = r - state[LAST_R], z - state[LAST_Z]
     # the face
     if inside > 0.0:
@@ -216,7 +218,7 @@ def _press(n, surface, loose, state, r, z, attitude, r_rate, z_rate, dt, out):
     c, s = math.cos(attitude), math.sin(attitude)
     from_edge_r, from_edge_z = n[HEEL_X] * c - n[HEEL_Z] * s, n[HEEL_X] * s + n[HEEL_Z] * c
     heel_r, heel_z = r + from_edge_r, z + from_edge_z
-    deep = surface_height(n, surface, heel_r) - heel_z
+    deep = min(surface_height(n, surface, heel_r) - heel_z, n[SIZE])
     if deep > 0.0:
         dr, dz = heel_r - state[LAST_HEEL_R], heel_z - state[LAST_HEEL_Z]
         contact = min(4.0 * deep, HEEL_CONTACT)

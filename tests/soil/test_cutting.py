@@ -11,7 +11,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from hydrotele.soil import bucket, cutting, step, terrain
+from hydrotele import soil
+from hydrotele.soil import bucket, cutting, step, terrain, wrench
 from hydrotele.soil.cutting import (
     acting_rake,
     acting_slope,
@@ -29,7 +30,7 @@ from hydrotele.soil.step import cutting_force
 
 DEGREE = math.pi / 180.0
 PLACES = {"n", "out", "state"}  # packed arrays: `numbers` lists their units
-ROOM = (bucket, cutting, step, terrain)
+ROOM = (bucket, cutting, step, terrain, wrench)
 
 
 def laws(module):
@@ -59,9 +60,10 @@ def test_docstring_names_every_argument_with_its_unit(name):
 
 
 def test_doctests_run():
-    result = doctest.testmod(cutting)
-    assert result.attempted >= 4
-    assert result.failed == 0
+    for module, least in ((cutting, 4), (soil, 9)):
+        result = doctest.testmod(module)
+        assert result.attempted >= least
+        assert result.failed == 0
 
 
 def passive(phi, delta, slope, batter):
@@ -195,9 +197,8 @@ def test_wedge_is_in_equilibrium(rake, slope, phi, delta, plane, c, a):
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-9 * scale)
 
 
-def numbers(**changes):
-    soil = SOILS["sandy_loam"].model_copy(update=changes)
-    return soil_numbers(soil, CAT215, 3.0, 0.05)
+def numbers():
+    return soil_numbers(SOILS["sandy_loam"], CAT215, 3.0, 0.05)
 
 
 def force(n, depth, rake=48 * DEGREE, slope=0.0, loose=0.0, load=0.0):
@@ -208,10 +209,10 @@ def force(n, depth, rake=48 * DEGREE, slope=0.0, loose=0.0, load=0.0):
 
 @given(
     rake=st.floats(-4, 4), slope=st.floats(-1.5, 1.5), depth=st.floats(0, 2),
-    loose=st.floats(0, 3), load=st.floats(0, 2e4), soil=st.sampled_from(sorted(SOILS)),
+    loose=st.floats(0, 3), load=st.floats(0, 2e4), name=st.sampled_from(sorted(SOILS)),
 )  # fmt: skip
-def test_cutting_force_is_bounded(rake, slope, depth, loose, load, soil):
-    s = SOILS[soil]
+def test_cutting_force_is_bounded(rake, slope, depth, loose, load, name):
+    s = SOILS[name]
     out = force(soil_numbers(s, CAT215, 3.0, 0.05), depth, rake, slope, loose, load)
     assert np.isfinite(out).all()
     weight = s.density * 9.81 * depth * depth * CAT215.width
@@ -244,8 +245,8 @@ def test_units_fit():
     # Lengths k times as long, cohesion and adhesion with them, give k^3 the force.
     small = force(numbers(), 0.1, load=1.0e3)
     wide = CAT215._replace(width=2.0 * CAT215.width)
-    soil = SOILS["sandy_loam"]
-    strong = soil.model_copy(update={"cohesion": 2 * soil.cohesion, "adhesion": 2 * soil.adhesion})
+    loam = SOILS["sandy_loam"]
+    strong = loam.model_copy(update={"cohesion": 2 * loam.cohesion, "adhesion": 2 * loam.adhesion})
     large = force(soil_numbers(strong, wide, 3.0, 0.05), 0.2, load=8.0e3)
     assert large == pytest.approx(8.0 * small, rel=1e-12)
 

@@ -249,7 +249,7 @@ def test_mass_is_conserved_and_all_stays_finite_in_wild_motion(data):
     points = data.draw(st.lists(place, min_size=2, max_size=4))
     outs = ground.path(*points, speed=2.0)
     assert np.isfinite(outs).all()
-    assert np.abs(outs[:, :2]).max() < 3e6  # N: floor and heel a metre deep in firm soil
+    assert np.abs(outs[:, :2]).max() < 3e6  # N: floor and heel of a buried bucket in firm soil
     assert ground.state[CARRIED] >= 0.0
     assert (ground.loose >= -1e-12).all()
     # Rounding of sums over some thousand steps of masses of some tonnes.
