@@ -284,11 +284,12 @@ def review(
 @app.command("list", epilog="Example:  hydrotele list scenarios --json")
 def list_(
     what: Annotated[
-        str, typer.Argument(help="machines, joysticks, scenarios, effects, or nothing for all.")
+        str,
+        typer.Argument(help="machines, joysticks, scenarios, effects, environments; or all."),
     ] = "all",
     json: Json = False,
 ) -> None:
-    """List what is shipped: machines with their tools, joysticks, scenarios, effects."""
+    """List what is shipped: machines with their tools, scenarios, effects, environments, ..."""
     from hydrotele.commands.catalogue import list_things
 
     list_things(what, json)

@@ -10,10 +10,10 @@ import warnings
 
 import gymnasium
 import numpy as np
-from study import options, publish
 
 import hydrotele.envs
 from hydrotele.tasks.memory import ACTIONS
+from tools.study import options, publish
 
 
 def main() -> None:

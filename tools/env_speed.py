@@ -12,10 +12,10 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-from study import options, publish
 
 import hydrotele.envs
 from hydrotele.tasks.core import TaskCore
+from tools.study import options, publish
 
 RATES = (1000.0, 200.0, 50.0)  # Hz: 1, 5 and 20 physics steps per environment step
 COUNTS = (64, 256, 1024, 4096)

@@ -10,11 +10,11 @@ from hydrotele.errors import InputError
 from hydrotele.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
 from hydrotele.machine_file import load_machine, machine_path, shipped_machines
 
-_KINDS = ("machines", "joysticks", "scenarios", "effects")
+_KINDS = ("machines", "joysticks", "scenarios", "effects", "environments")
 
 
 def list_things(what: str, as_json: bool) -> None:
-    """List machines, joysticks, scenarios, effects, or all of them.
+    """List machines, joysticks, scenarios, effects, environments, or all of them.
 
     Raises:
         InputError: there is no such list.
@@ -24,7 +24,7 @@ def list_things(what: str, as_json: bool) -> None:
     wanted = _KINDS if what == "all" else (what,)
     tables = {
         "machines": _machines, "joysticks": _joysticks, "scenarios": _scenarios,
-        "effects": _effects,
+        "effects": _effects, "environments": _environments,
     }  # fmt: skip
     data = {kind: tables[kind]() for kind in wanted}
     if as_json:
@@ -98,6 +98,21 @@ def _effects() -> list[dict]:
             }
         )
     return rows
+
+
+def _environments() -> list[dict]:
+    """Gymnasium environments."""
+    from hydrotele.tasks.catalogue import TASKS
+
+    return [
+        {
+            "name": f"hydrotele/{task.name}-v0",
+            "machine": f"{task.machine}, {task.tool or 'its first tool'}",
+            "what": task.sentence,
+            "reward": task.reward,
+        }
+        for task in TASKS.values()
+    ]
 
 
 def validate_files(paths: list[Path], as_json: bool) -> None:

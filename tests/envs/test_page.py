@@ -1,0 +1,12 @@
+"""The page about the environments says what they are."""
+
+from pathlib import Path
+
+from tools.environments_page import page
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_page_is_that_of_the_present_tasks():
+    written = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
+    assert written.endswith(page()), "python tools/environments_page.py --out docs/environments.md"
