@@ -69,7 +69,7 @@ CAT215 = Bucket(
     edge=0.03,
 )  # fmt: skip
 """Of the shapes in models/cat215/cat215.xml: side plates, floor, teeth; edge assumed. 0.59 m^3 to
-the mouth, 0.92 m^3 heaped at 35 deg."""
+the mouth, 0.91 m^3 heaped at 35 deg."""
 
 
 def outline_from_edge(bucket: Bucket) -> np.ndarray:
