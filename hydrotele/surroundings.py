@@ -1,8 +1,9 @@
-"""Facts of what stands around a machine: plates to press on, trees to fell. All SI, frozen."""
+"""Facts of what is around a machine: plates to press on, trees, logs. All SI, frozen."""
 
+import math
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from hydrotele.datafile import Facts, Name, NonNegative, Positive, Vector
 
@@ -43,4 +44,38 @@ class Tree(Facts):
     closed: float = 1.0
 
 
-Thing = Annotated[Plate | Tree, Field(discriminator="kind")]
+class LogOnGround(Facts):
+    """A log on the ground that a grapple picks up and puts down.
+
+    `position` [m] of its middle, `direction` [rad] of its axis in the horizontal plane, 0 along x;
+    diameter and length [m], density [kg/m^3]. `grab` is the machine's axis that closes the jaw: the
+    log is held beyond `closed` [rad] where it lies in the pocket, and let go below `open` [rad].
+    """
+
+    kind: Literal["log"] = "log"
+    position: tuple[float, float]
+    direction: float = 0.0
+    diameter: Positive = 0.35
+    length: Positive = 4.0
+    density: Positive = 830.0
+    grab: Name = "claw"
+    closed: float = 1.2
+    open: float = 1.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.open > self.closed:
+            raise ValueError(f"open {self.open:g} rad must not exceed closed {self.closed:g} rad")
+        if self.length < 2.0 * self.diameter:
+            raise ValueError(
+                f"length {self.length:g} m must be at least twice the diameter {self.diameter:g} m"
+            )
+        return self
+
+    @property
+    def mass(self) -> float:
+        """[kg]."""
+        return self.density * math.pi * self.diameter**2 / 4.0 * self.length
+
+
+Thing = Annotated[Plate | Tree | LogOnGround, Field(discriminator="kind")]

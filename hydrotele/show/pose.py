@@ -79,22 +79,29 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
 
 
 def logged_surroundings(log: Log) -> tuple[Thing, ...]:
-    """Plates and trees that a log of truth knows of."""
+    """Plates, trees and logs that a log of truth knows of."""
     return tuple(_THINGS.validate_json(log.metadata.get("surroundings", "[]")))
 
 
 def _place_things(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
-    """Put plates and trees where a log of truth has them; `rows` (n, nq) is written."""
+    """Put plates, trees and logs where a log of truth has them; `rows` (n, nq) is written."""
     for joint, place in thing_joints(model):
-        name = model.joint(joint).name
-        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_BALL:
+        name, kind = model.joint(joint).name, model.jnt_type[joint]
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            for k, letter in enumerate("xyz"):
+                rows[:, place + k] = log[f"truth.position.{name}_{letter}"]
+            _turn(log, name, rows[:, place + 3 : place + 7])
+        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            _turn(log, name.removesuffix("_turn"), rows[:, place : place + 4])
+        else:
             rows[:, place] = log[f"truth.position.{name}"]
-            continue
-        tree = name.removesuffix("_turn")
-        turns = np.column_stack([log[f"truth.angle.{tree}_r{c}"] for c in "xyz"])
-        for row, turn in zip(rows, turns, strict=True):
-            row[place : place + 4] = (1.0, 0.0, 0.0, 0.0)
-            mujoco.mju_quatIntegrate(row[place : place + 4], turn, 1.0)
+
+
+def _turn(log: Log, name: str, quaternions: np.ndarray) -> None:
+    turns = np.column_stack([log[f"truth.angle.{name}_r{c}"] for c in "xyz"])
+    for quaternion, turn in zip(quaternions, turns, strict=True):
+        quaternion[:] = (1.0, 0.0, 0.0, 0.0)
+        mujoco.mju_quatIntegrate(quaternion, turn, 1.0)
 
 
 def logged_positions(

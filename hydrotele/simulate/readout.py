@@ -163,18 +163,25 @@ def _hidden(plant: Plant, record: Record):
 
 
 def _put_things(plant: Plant, record: Record, put) -> None:
-    """Where plates and trees are; a tree's turning as a rotation vector."""
+    """Where plates, trees and logs are; turning as a rotation vector."""
     for joint, place in thing_joints(plant.model):
-        if plant.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
-            tree = plant.model.joint(joint).name.removesuffix("_turn")
-            vectors = np.empty((len(record.time), 3))
-            for row, quaternion in enumerate(record.qpos[:, place : place + 4]):
-                mujoco.mju_quat2Vel(vectors[row], quaternion, 1.0)
-            for letter, column in zip("xyz", vectors.T, strict=True):
-                put(f"truth.angle.{tree}_r{letter}", column, "rad")
+        name, kind = plant.model.joint(joint).name, plant.model.jnt_type[joint]
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            for letter, column in zip("xyz", record.qpos[:, place : place + 3].T, strict=True):
+                put(f"truth.position.{name}_{letter}", column, "m")
+            _put_turning(name, record.qpos[:, place + 3 : place + 7], put)
+        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            _put_turning(name.removesuffix("_turn"), record.qpos[:, place : place + 4], put)
         else:
-            name = plant.model.joint(joint).name
             put(f"truth.position.{name}", record.qpos[:, place], "m")
+
+
+def _put_turning(name: str, quaternions: np.ndarray, put) -> None:
+    vectors = np.empty((len(quaternions), 3))
+    for vector, quaternion in zip(vectors, quaternions, strict=True):
+        mujoco.mju_quat2Vel(vector, quaternion, 1.0)
+    for letter, column in zip("xyz", vectors.T, strict=True):
+        put(f"truth.angle.{name}_r{letter}", column, "rad")
 
 
 def _put_hydraulics(plant: Plant, record: Record, put) -> None:

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.simulate.plant import Plant
+from hydrotele.simulate.surroundings import is_thing
 
 _WHOLE = 1.0e-9  # of a step, by which a delay may miss a whole number of steps through rounding
 
@@ -67,7 +68,7 @@ def begin_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 def aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Positions (nq,) at the time of the activations.
 
-    A felled tree's ball joint and what comes after it stay as they are.
+    The ball joint of a tree or the free joint of a log and what comes after it stay as they are.
     """
     return align_positions(model, data.qpos, data.qvel)
 
@@ -76,7 +77,8 @@ def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -
     """Staggered positions (..., nq) a step back along velocities (..., nv); see `Record`."""
     if model.nq == model.nv:
         return qpos - model.opt.timestep * qvel
-    plain = int(np.argmax(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL))
+    turning = (mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE)
+    plain = int(np.argmax(np.isin(model.jnt_type, turning)))
     positions = qpos.copy()
     positions[..., :plain] -= model.opt.timestep * qvel[..., :plain]
     return positions
@@ -192,7 +194,7 @@ class Recorder:
 def surrounding_bodies(plant: Plant) -> np.ndarray:
     """Whether each body (nbody,) is the ground, fixed to it or one of the things around."""
     model = plant.model
-    named = [model.body(b).name.startswith(("plate_", "tree_")) for b in range(model.nbody)]
+    named = [is_thing(model.body(b).name) for b in range(model.nbody)]
     return (model.body_weldid == 0) | (np.array(named) & bool(plant.surroundings))
 
 

@@ -1,9 +1,9 @@
-"""What stands around a machine, in MuJoCo: plates on springs, trees that can be felled.
+"""What is around a machine, in MuJoCo: plates on springs, trees that can be felled, logs.
 
 A tree stands on stiff springs in its own joints, which are cut with it. The saw cuts while it
 spins: then it passes through wood, which costs it torque and the head a little feed force. A grab
 that has closed around the stem holds it by a weld, since friction of wood on steel is not the point
-here; from then on the stem touches the ground only.
+here; from then on the stem touches the ground only. A log never touches anything but the ground.
 """
 
 import math
@@ -14,7 +14,8 @@ import numpy as np
 from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
-from hydrotele.surroundings import Plate, Thing, Tree
+from hydrotele.simulate.holding import LET_GO, TAKEN, grip_numbers, grip_step
+from hydrotele.surroundings import LogOnGround, Plate, Thing, Tree
 
 _PLATE_SOLREF = (0.01, 1.0)  # s, 1: firm steel on steel, stiffer than any plate's spring
 _GAP = 0.02  # m, the kerf
@@ -24,26 +25,34 @@ _CUTTING = 30.0  # rad/s: slower, a saw does not cut
 _HIGH = 0.15  # m by which the saw may miss the height of the kerf
 _NORMALS = {"x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1)}
 _RIM = 0.3  # feed force per rim force
+_STEM_POCKET = (0.325, 0.0, -0.62), (0.325, 0.35, 0.0)  # m, in front of a head, between its arms
+_LEANING = math.acos(0.9)  # rad by which a stem may lean against the head
+_ASKEW = math.radians(20.0)  # by which a log may lie askew between the jaws
+_END = 0.3  # m of a log's end that no jaw holds
+_ROLLING = 30.0  # N s/m and N m s/rad: soil under a log lets it roll for half a second
+_SINK = 1.0e-5  # m by which a log's weight presses it into the ground's soft contact
+_PREFIXES = ("plate_", "tree_", "log_")
 
 
 def write_surroundings(root, machine: Machine, things: tuple[Thing, ...]) -> None:
-    """Add what stands around to an assembled MJCF.
+    """Add what is around to an assembled MJCF.
 
     Args:
         root: the MJCF document of the machine.
         machine: the machine.
-        things: plates and trees.
+        things: plates, trees and logs.
 
     Raises:
-        InputError: a tree's machine has no such saw or grab.
+        InputError: the machine has no such saw or grab, or its grab has no pocket for a log.
     """
-    degrees = 180.0 / math.pi if root.compiler.angle == "degree" else 1.0
     for number, thing in enumerate(things):
         where = f"surroundings.{number}"
         if isinstance(thing, Plate):
             _write_plate(root, f"plate_{number}", thing)
+        elif isinstance(thing, Tree):
+            _write_tree(root, f"tree_{number}", thing, machine, where)
         else:
-            _write_tree(root, f"tree_{number}", thing, machine, where, degrees)
+            _write_log(root, f"log_{number}", thing, machine, where)
 
 
 def _write_plate(root, name: str, plate: Plate) -> None:
@@ -64,12 +73,56 @@ def _write_plate(root, name: str, plate: Plate) -> None:
     )  # fmt: skip
 
 
-def _write_tree(root, name: str, tree: Tree, machine: Machine, where: str, degrees) -> None:
+def _need_axis(machine: Machine, axis: str, where: str) -> None:
+    if axis not in machine.axes:
+        raise InputError(where, f"the machine has no axis {axis!r}; {suggest(axis, machine.axes)}")
+
+
+def _hand(machine: Machine, grab: str) -> str:
+    """Name of the body on which a grab's jaw is hinged."""
+    return machine.links[machine.link_of(machine.axes[grab].joint)].parent
+
+
+def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
+    root.equality.add(
+        "weld", name=f"{name}_held", body1=_hand(machine, grab), body2=name, active=False,
+        solref=(0.01, 1.0), solimp=(0.99, 0.999, 0.001, 0.5, 2),
+    )  # fmt: skip
+
+
+def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str) -> None:
+    _need_axis(machine, log.grab, f"{where}.grab")
+    hand = _hand(machine, log.grab)
+    if root.find("site", f"{log.grab}_pocket") is None:
+        message = f"its link {hand!r} has no box site '{log.grab}_pocket' in the MJCF, for a log"
+        raise InputError(f"{where}.grab", message)
+    radius, half, mass = log.diameter / 2.0, log.length / 2.0, log.mass
+    turn = (math.cos(log.direction / 2.0), 0.0, 0.0, math.sin(log.direction / 2.0))
+    place = (*log.position, radius - _SINK)
+    body = root.worldbody.add("body", name=name, pos=place, quat=turn)
+    across = mass * (3.0 * radius**2 + log.length**2) / 12.0
+    body.add(
+        "inertial", mass=mass, pos=(0, 0, 0), diaginertia=(mass * radius**2 / 2, across, across)
+    )
+    body.add("joint", name=name, type="free", damping=_ROLLING, limited="false")
+    body.add(
+        "geom", name=name, type="capsule", size=(radius,), contype=2, conaffinity=1, mass=0,
+        fromto=(radius - half, 0, 0, half - radius, 0, 0), group=3,
+    )  # fmt: skip
+    for part, size, reach, colour in (
+        ("bark", radius, half - 0.01, (0.36, 0.26, 0.17, 1)),
+        ("wood", 0.96 * radius, half, (0.76, 0.60, 0.40, 1)),
+    ):
+        body.add(
+            "geom", name=f"{name}_{part}", type="cylinder", size=(size,), rgba=colour, mass=0,
+            fromto=(-reach, 0, 0, reach, 0, 0), contype=0, conaffinity=0, group=2,
+        )  # fmt: skip
+    _write_weld(root, machine, log.grab, name)
+
+
+def _write_tree(root, name: str, tree: Tree, machine: Machine, where: str) -> None:
     for part in ("saw", "grab"):
-        if getattr(tree, part) not in machine.axes:
-            axis = getattr(tree, part)
-            message = f"the machine has no axis {axis!r}; {suggest(axis, machine.axes)}"
-            raise InputError(f"{where}.{part}", message)
+        _need_axis(machine, getattr(tree, part), f"{where}.{part}")
     x, y = tree.position
     radius, half = tree.diameter / 2.0, tree.height / 2.0
     mass = tree.density * math.pi * radius**2 * tree.height
@@ -102,24 +155,36 @@ def _write_tree(root, name: str, tree: Tree, machine: Machine, where: str, degre
         pos=(0, 0, 0.86 * tree.height), contype=0, conaffinity=0, mass=0,
         rgba=(0.16, 0.33, 0.15, 1),
     )  # fmt: skip
-    head = machine.links[machine.link_of(machine.axes[tree.grab].joint)].parent
-    root.equality.add(
-        "weld", name=f"{name}_held", body1=head, body2=name, active=False,
-        solref=(0.01, 1.0), solimp=(0.99, 0.999, 0.001, 0.5, 2),
-    )  # fmt: skip
+    _write_weld(root, machine, tree.grab, name)
 
 
 def thing_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """(joint, its place in `qpos`) of plates and trees."""
+    """(joint, its place in `qpos`) of plates, trees and logs."""
     return [
-        (j, int(model.jnt_qposadr[j]))
-        for j in range(model.njnt)
-        if model.joint(j).name.startswith(("plate_", "tree_"))
+        (j, int(model.jnt_qposadr[j])) for j in range(model.njnt) if is_thing(model.joint(j).name)
     ]
 
 
+def is_thing(name: str) -> bool:
+    """Whether a body or joint of this name is a plate, tree or log."""
+    return name.startswith(_PREFIXES)
+
+
+def log_grip(machine: Machine, model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
+    """Numbers of `holding.grip_step` for a log.
+
+    Args:
+        machine: the machine.
+        model: its model; the box site `<grab>_pocket` is the pocket, along whose y logs lie.
+        log: the log.
+    """
+    site = model.site(f"{log.grab}_pocket")
+    reach = log.length / 2.0 - _END
+    return grip_numbers(log.closed, log.open, 1, _ASKEW, site.pos, site.size, 0, (-reach, reach))
+
+
 class Surroundings:
-    """Trees of a run while they are cut, held and laid down; plates need nothing.
+    """Trees and logs of a run while they are cut, held and laid down; plates need nothing.
 
     Attributes:
         events: (time [s], what happened).
@@ -140,6 +205,11 @@ class Surroundings:
             for n, thing in enumerate(things)
             if isinstance(thing, Tree)
         ]
+        self._logs = [
+            _Grip(machine, model, f"log_{n}", thing.grab, log_grip(machine, model, thing))
+            for n, thing in enumerate(things)
+            if isinstance(thing, LogOnGround)
+        ]
 
     def update(self, time: float, data: mujoco.MjData, period: float) -> None:
         """Saw and hold, once per control period.
@@ -151,11 +221,37 @@ class Surroundings:
         """
         for tree in self._trees:
             self.events += [(time, said) for said in tree.update(data, period)]
+        for log in self._logs:
+            change = log.update(data)
+            if change == TAKEN:
+                self.events.append((time, "the grapple holds the log"))
+            elif change == LET_GO:
+                self.events.append((time, "the grapple lets the log go"))
 
     def restore(self) -> None:
         """Plant felled trees again: the model is as it was before the run."""
         for tree in self._trees:
             tree.plant()
+
+
+class _Grip:
+    """A grab and one thing that it may hold."""
+
+    def __init__(self, machine: Machine, model: mujoco.MjModel, name: str, grab: str, grip) -> None:
+        self._hand, self._thing = model.body(_hand(machine, grab)).id, model.body(name).id
+        self._jaw = int(model.joint(machine.axes[grab].joint).qposadr[0])
+        self._weld, self._rows, self._grip = model.equality(f"{name}_held").id, model.eq_data, grip
+
+    def update(self, data: mujoco.MjData) -> int:
+        """Take it or let it go: TAKEN, LET_GO or UNCHANGED."""
+        hand, thing, weld = self._hand, self._thing, self._weld
+        change = grip_step(
+            self._grip, data.xpos[hand], data.xquat[hand], data.xpos[thing], data.xquat[thing],
+            data.qpos[self._jaw], bool(data.eq_active[weld]), self._rows[weld],
+        )  # fmt: skip
+        if change:
+            data.eq_active[weld] = change == TAKEN
+        return change
 
 
 class _Standing:
@@ -164,11 +260,11 @@ class _Standing:
     def __init__(self, machine: Machine, model: mujoco.MjModel, name: str, tree: Tree) -> None:
         self._model, self._tree, self.name = model, tree, name
         saw = machine.link_of(machine.axes[tree.saw].joint)
-        head = machine.links[machine.link_of(machine.axes[tree.grab].joint)].parent
-        self._saw, self._head = model.body(saw).id, model.body(head).id
+        grip = grip_numbers(tree.closed, tree.closed, 2, _LEANING, *_STEM_POCKET, 2)
+        self._grip = _Grip(machine, model, name, tree.grab, grip)
+        self._saw = model.body(saw).id
         self._spin = model.joint(machine.axes[tree.saw].joint).dofadr[0]
-        self._close = model.joint(machine.axes[tree.grab].joint).qposadr[0]
-        self._body, self._weld = model.body(name).id, model.equality(f"{name}_held").id
+        self._body = model.body(name).id
         self._stem = model.geom(name).id
         disc = [g for g in range(model.ngeom) if model.geom_bodyid[g] == self._saw
                 and model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CYLINDER]  # fmt: skip
@@ -182,7 +278,7 @@ class _Standing:
         self._solid = (model.geom_contype[self._disc], model.geom_conaffinity[self._disc])
         self._stiffness = model.jnt_stiffness[self._joints].copy()
         self._damping = model.dof_damping[self._dofs].copy()
-        self.depth, self.cut, self.held = 0.0, False, False
+        self.depth, self.cut = 0.0, False
 
     def plant(self) -> None:
         """Undo what cutting did to the model."""
@@ -208,13 +304,12 @@ class _Standing:
             if self.depth >= 0.98 * self._tree.diameter:
                 self._fell()
                 said.append("the tree is cut")
-        closed = float(data.qpos[self._close]) >= self._tree.closed
-        if not self.held and closed and self._in_pocket(data):
-            self._hold(data)
+        change = self._grip.update(data)
+        if change == TAKEN:
+            self._model.geom_contype[self._stem] = 2  # the ground only: head and stem are one
+            self._model.geom_conaffinity[self._stem] = 1
             said.append("the grab holds the tree")
-        if self.held and not closed:
-            data.eq_active[self._weld] = 0
-            self.held = False
+        elif change == LET_GO:
             said.append("the grab lets the tree go")
         return said
 
@@ -247,31 +342,3 @@ class _Standing:
         self._model.jnt_stiffness[self._joints] = 0.0
         self._model.dof_damping[self._dofs] = (5.0, 5.0, 5.0, 50.0, 50.0, 50.0)
         self.cut = True
-
-    def _in_pocket(self, data: mujoco.MjData) -> bool:
-        """Whether the stem stands in front of the head, between its arms."""
-        turn = data.xmat[self._head].reshape(3, 3)
-        stem = data.xmat[self._body].reshape(3, 3)[:, 2]
-        foot = turn.T @ (data.xpos[self._body] - data.xpos[self._head])
-        way = turn.T @ stem
-        if abs(way[2]) < 0.9:
-            return False
-        level = foot + way * (-0.62 - foot[2]) / way[2]
-        return bool(0.0 < level[0] < 0.65 and abs(level[1]) < 0.35)
-
-    def _hold(self, data: mujoco.MjData) -> None:
-        """Weld the stem to the head as it stands."""
-        head, stem = self._head, self._body
-        turn = data.xmat[head].reshape(3, 3)
-        inverse, relative = np.zeros(4), np.zeros(4)
-        mujoco.mju_negQuat(inverse, data.xquat[head])
-        mujoco.mju_mulQuat(relative, inverse, data.xquat[stem])
-        row = self._model.eq_data[self._weld]
-        row[:3] = 0.0
-        row[3:6] = turn.T @ (data.xpos[stem] - data.xpos[head])
-        row[6:10] = relative
-        row[10] = 1.0
-        data.eq_active[self._weld] = 1
-        self._model.geom_contype[self._stem] = 2  # the ground only: head and stem are one
-        self._model.geom_conaffinity[self._stem] = 1
-        self.held = True
