@@ -93,9 +93,13 @@ def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
 def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str) -> None:
     _need_axis(machine, log.grab, f"{where}.grab")
     hand = _hand(machine, log.grab)
-    if root.find("site", f"{log.grab}_pocket") is None:
+    pocket = root.find("site", f"{log.grab}_pocket")
+    if pocket is None:
         message = f"its link {hand!r} has no box site '{log.grab}_pocket' in the MJCF, for a log"
         raise InputError(f"{where}.grab", message)
+    if log.diameter >= 2.0 * pocket.size[2]:
+        message = f"{log.diameter:g} m does not go between jaws {2.0 * pocket.size[2]:g} m apart"
+        raise InputError(f"{where}.diameter", message)
     radius, half, mass = log.diameter / 2.0, log.length / 2.0, log.mass
     turn = (math.cos(log.direction / 2.0), 0.0, 0.0, math.sin(log.direction / 2.0))
     place = (*log.position, radius - _SINK)
@@ -170,17 +174,24 @@ def is_thing(name: str) -> bool:
     return name.startswith(_PREFIXES)
 
 
-def log_grip(machine: Machine, model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
+def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
     """Numbers of `holding.grip_step` for a log.
 
     Args:
-        machine: the machine.
-        model: its model; the box site `<grab>_pocket` is the pocket, along whose y logs lie.
+        model: the machine's. The box site `<grab>_pocket` is the room between the jaws: logs lie along
+            its y, between jaws on either side in z, below the head, and not deeper than the tips,
+            which its far end in x shows.
         log: the log.
+
+    Returns:
+        (GRIP,) numbers.
     """
-    site = model.site(f"{log.grab}_pocket")
+    site, radius = model.site(f"{log.grab}_pocket"), log.diameter / 2.0
+    low, high = site.pos - site.size + (radius, 0, radius), site.pos + site.size - (0, 0, radius)
     reach = log.length / 2.0 - _END
-    return grip_numbers(log.closed, log.open, 1, _ASKEW, site.pos, site.size, 0, (-reach, reach))
+    return grip_numbers(
+        log.closed, log.open, 1, _ASKEW, 0.5 * (low + high), 0.5 * (high - low), 0, (-reach, reach)
+    )
 
 
 class Surroundings:
@@ -206,7 +217,7 @@ class Surroundings:
             if isinstance(thing, Tree)
         ]
         self._logs = [
-            _Grip(machine, model, f"log_{n}", thing.grab, log_grip(machine, model, thing))
+            _Grip(machine, model, f"log_{n}", thing.grab, log_grip(model, thing))
             for n, thing in enumerate(things)
             if isinstance(thing, LogOnGround)
         ]

@@ -12,7 +12,7 @@ from hydrotele.simulate.closure import independent_dofs, motion_basis, pin_openi
 from hydrotele.simulate.plant import REST_PRESSURE, rest_state
 
 IN2 = 6.4516e-4
-TOOLS = ("none", "bucket", "grapple", "grapple_log")
+TOOLS = ("none", "bucket", "grapple", "grapple_log", "grapple_claw")
 
 
 def energy_drift(plant, seconds=5.0):
