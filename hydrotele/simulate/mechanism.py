@@ -78,7 +78,7 @@ def assemble(
         add_element(body, "site", name="tip", pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
     _write_scene(root, ground, looks)
-    write_surroundings(root, machine, surroundings)
+    write_surroundings(root, machine, surroundings, looks)
     return root
 
 

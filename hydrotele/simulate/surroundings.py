@@ -34,13 +34,16 @@ _SINK = 1.0e-5  # m by which a log's weight presses it into the ground's soft co
 _PREFIXES = ("plate_", "tree_", "log_")
 
 
-def write_surroundings(root, machine: Machine, things: tuple[Thing, ...]) -> None:
+def write_surroundings(
+    root, machine: Machine, things: tuple[Thing, ...], looks: bool = True
+) -> None:
     """Add what is around to an assembled MJCF.
 
     Args:
         root: the MJCF document of the machine.
         machine: the machine.
         things: plates, trees and logs.
+        looks: whether to write what only a picture needs, of logs.
 
     Raises:
         InputError: the machine has no such saw or grab, or its grab has no pocket for a log.
@@ -52,7 +55,9 @@ def write_surroundings(root, machine: Machine, things: tuple[Thing, ...]) -> Non
         elif isinstance(thing, Tree):
             _write_tree(root, f"tree_{number}", thing, machine, where)
         else:
-            _write_log(root, f"log_{number}", thing, machine, where)
+            body = _write_log(root, f"log_{number}", thing, machine, where)
+            if looks:
+                _draw_log(body, f"log_{number}", thing)
 
 
 def _write_plate(root, name: str, plate: Plate) -> None:
@@ -90,7 +95,7 @@ def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
     )  # fmt: skip
 
 
-def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str) -> None:
+def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
     _need_axis(machine, log.grab, f"{where}.grab")
     hand = _hand(machine, log.grab)
     pocket = root.find("site", f"{log.grab}_pocket")
@@ -113,6 +118,12 @@ def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str) 
         "geom", name=name, type="capsule", size=(radius,), contype=2, conaffinity=1, mass=0,
         fromto=(radius - half, 0, 0, half - radius, 0, 0), group=3,
     )  # fmt: skip
+    _write_weld(root, machine, log.grab, name)
+    return body
+
+
+def _draw_log(body, name: str, log: LogOnGround) -> None:
+    radius, half = log.diameter / 2.0, log.length / 2.0
     for part, size, reach, colour in (
         ("bark", radius, half - 0.01, (0.36, 0.26, 0.17, 1)),
         ("wood", 0.96 * radius, half, (0.76, 0.60, 0.40, 1)),
@@ -121,7 +132,6 @@ def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str) 
             "geom", name=f"{name}_{part}", type="cylinder", size=(size,), rgba=colour, mass=0,
             fromto=(-reach, 0, 0, reach, 0, 0), contype=0, conaffinity=0, group=2,
         )  # fmt: skip
-    _write_weld(root, machine, log.grab, name)
 
 
 def _write_tree(root, name: str, tree: Tree, machine: Machine, where: str) -> None:
@@ -178,9 +188,9 @@ def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
     """Numbers of `holding.grip_step` for a log.
 
     Args:
-        model: the machine's. The box site `<grab>_pocket` is the room between the jaws: logs lie along
-            its y, between jaws on either side in z, below the head, and not deeper than the tips,
-            which its far end in x shows.
+        model: the machine's. The box site `<grab>_pocket` is the room between the jaws: logs lie
+            along its y, between jaws on either side in z, below the head, and not deeper than the
+            tips, which its far end in x shows.
         log: the log.
 
     Returns:

@@ -22,7 +22,7 @@ def test_random_commands_make_no_nan_and_no_warning():
     assert result.returncode == 0, result.stdout + result.stderr
     lines = result.stdout.splitlines()
     assert {line.split(":")[0] for line in lines[:-1]} == {
-        "none", "bucket", "grapple", "grapple_log",
+        "none", "bucket", "grapple", "grapple_claw", "grapple_log",
     }  # fmt: skip
     for line in lines[:-1]:
         assert "NaN 0, warnings none" in line
