@@ -26,8 +26,8 @@ from hydrotele.tasks.variants import Variants, channels
 _CONTROL_RATE = 200.0  # Hz, of the servo at least
 _SHARE = 0.8  # of the speed at rated flow, or at what the pump gives, that a full action asks for
 _FORCE_RATE = 0.5  # rad/s or m/s of a force drive at full action
-_ACCELERATION = 1.0  # rad/s^2 or m/s^2
-_POSE_ACCELERATIONS = (1.0, 0.5, 1.0, 1.0, 0.8)  # m/s^2, rad/s^2
+ACCELERATION = 1.0  # rad/s^2 or m/s^2
+POSE_ACCELERATIONS = (1.0, 0.5, 1.0, 1.0, 0.8)  # m/s^2, rad/s^2
 
 
 class Timing(NamedTuple):
@@ -109,7 +109,7 @@ def make_facts(setup: Setup, count: int, autoreset: int) -> np.ndarray:
     facts["autoreset"], facts["count"] = autoreset, count
     clock = setup.clock
     facts["ticks"], facts["substeps"], facts["period"], facts["horizon"] = clock[:2] + clock[2:]
-    facts["timestep"], facts["acceleration"] = options.timestep, _ACCELERATION
+    facts["timestep"], facts["acceleration"] = options.timestep, ACCELERATION
     facts["axes"], facts["hydraulic"] = len(plant.axes), plant.hydraulic
     facts["arm_axes"], facts["axes_driven"] = setup.arm_axes, len(setup.axes)
     facts["actions"], facts["observations"] = len(setup.axes), len(setup.fields)
@@ -159,7 +159,7 @@ def _write_machine(facts: np.ndarray, setup: Setup, columns: list[int]) -> None:
     ]
     facts["fastest"][:k] = [full_rate(machine, name) for name in plant.axes]
     facts["fastest_pose"] = setup.task.pose_rates
-    facts["accelerations"] = _POSE_ACCELERATIONS
+    facts["accelerations"] = POSE_ACCELERATIONS
     facts["closed"][columns] = int(facts["mode"]) != VALVE
     ranges = [machine.joints[machine.axes[name].joint].range for name in plant.axes]
     facts["ranges"][:k] = [limits or (-np.inf, np.inf) for limits in ranges]
