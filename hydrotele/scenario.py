@@ -215,6 +215,8 @@ class Scenario(Facts):
             raise ValueError(
                 f"log_rate {self.log_rate:g} Hz must divide control_rate {self.control_rate:g} Hz"
             )
+        if not self.ground and any(thing.kind == "log" for thing in self.surroundings):
+            raise ValueError("a log needs ground to lie on: set ground: true or remove the log")
         if self.duration * self.control_rate > 2e7:
             raise ValueError("duration is too long: more than 2e7 control periods")
         if self.rows < 10:

@@ -134,6 +134,11 @@ def test_a_log_needs_a_grab_with_a_pocket():
         prepare(lowered(diameter=0.9))
 
 
+def test_a_log_needs_ground():
+    with pytest.raises(ValueError, match="needs ground to lie on"):
+        Scenario.model_validate(lowered().model_dump() | {"ground": False})
+
+
 @pytest.mark.parametrize(
     ("log", "message"),
     [({"open": 1.3}, "must not exceed closed"), ({"length": 0.5}, "at least twice the diameter")],
