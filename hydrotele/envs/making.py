@@ -68,3 +68,19 @@ def info_of(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
     info["variant"] = core.memory[f"{which}variant"].copy()
     info["fault"] = core.memory[f"{which}fault"] != 0
     return info
+
+
+def check_mode(mode: str | None, known: list[str]) -> None:
+    """Refuse a render mode that there is not.
+
+    Raises:
+        InputError: it is not known.
+    """
+    if mode is not None and mode not in known:
+        raise InputError(f"render_mode {mode!r}", f"choose one of {', '.join(known)}, or none")
+
+
+def with_rate(metadata: dict[str, Any], core: TaskCore) -> dict[str, Any]:
+    """Metadata of an environment with the pictures per second [Hz] that its steps make."""
+    rate = core.setup.options.control_rate
+    return {**metadata, "render_fps": int(rate) if rate == int(rate) else rate}

@@ -5,7 +5,17 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from hydrotele.envs.making import action_space, info_of, make_core, observation_space
+from hydrotele.envs.making import (
+    action_space,
+    check_mode,
+    info_of,
+    make_core,
+    observation_space,
+    with_rate,
+)
+from hydrotele.envs.stage import Camera, Stage
+from hydrotele.envs.window import ADVICE, TaskWindow
+from hydrotele.show.window import check_screen
 from hydrotele.tasks.memory import DISABLED
 
 
@@ -20,19 +30,32 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
 
-    def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(
+        self, task: str, render_mode: str | None = None, width: int = 640, height: int = 480,
+        camera: Camera = None, **options: Any,
+    ) -> None:  # fmt: skip
         """Compile the machine.
 
         Args:
             task: name of the task, as in `hydrotele/<Name>-v0`.
-            render_mode: None, `rgb_array` or `human`.
+            render_mode: None, `rgb_array` for pictures, or `human` for a window.
+            width: of pictures [pixel].
+            height: of pictures [pixel].
+            camera: a camera of the machine, such as `overview`, `side` or `cab`; without, one that
+                shows all that its arm reaches.
             **options: fields of `hydrotele.tasks.task.Options`.
 
         Raises:
-            InputError: an option is not known or does not suit.
+            InputError: an option is not known or does not suit, or there is no screen for a window.
         """
+        check_mode(render_mode, self.metadata["render_modes"])
+        if render_mode == "human":
+            check_screen(ADVICE)
         self.core = make_core(task, options, 1, 1, DISABLED)
-        self.render_mode = render_mode
+        self.metadata = with_rate(self.metadata, self.core)
+        self.render_mode, self._view = render_mode, (width, height, camera)
+        self._stage: Stage | None = None
+        self._window: TaskWindow | None = None
         self.observation_space = observation_space(self.core)
         self.action_space = action_space(self.core)
         self._begun = False
@@ -54,6 +77,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             seed = int(self.np_random.integers(2**62))
         self._begun = True
         self.core.reset(None if seed is None else np.array([seed]))
+        self._show()
         return self.core.observation[0].copy(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -70,6 +94,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         core = self.core
         core.step(action)
+        self._show()
         return (
             core.observation[0].copy(), float(core.reward[0]), bool(core.terminated[0]),
             bool(core.truncated[0]), self._info(),
@@ -78,6 +103,41 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _info(self) -> dict[str, Any]:
         return {name: values[0] for name, values in info_of(self.core).items()}
 
+    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Draw the machine and its goal.
+
+        Returns:
+            (height, width, 3) uint8, or None where no pictures were asked for: a window shows
+            every step by itself.
+
+        Raises:
+            InputError: there is no such camera, or no OpenGL works (says what to do).
+        """
+        if self.render_mode != "rgb_array":
+            if self.render_mode is None:
+                gymnasium.logger.warn("render() shows nothing without render_mode='rgb_array'")
+            return None
+        width, height, camera = self._view
+        return self._staged().picture(0, width, height, camera)
+
+    def _staged(self) -> Stage:
+        if self._stage is None:
+            self._stage = Stage(self.core)
+        return self._stage
+
+    def _show(self) -> None:
+        """Show this step where there is a window."""
+        if self.render_mode != "human":
+            return
+        if self._window is None:
+            self._window = TaskWindow(self._staged(), self._view[2], self.metadata["render_fps"])
+        self._window.show()
+
     def close(self) -> None:
-        """Give the simulation's memory back."""
+        """Close what shows the simulation, and give its memory back."""
+        if self._window:
+            self._window.close()
+        if self._stage:
+            self._stage.close()
+        self._stage = self._window = None
         self.core.close()

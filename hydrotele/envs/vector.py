@@ -2,11 +2,21 @@
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from hydrotele.envs.making import AUTORESET, action_space, info_of, make_core, observation_space
+from hydrotele.envs.making import (
+    AUTORESET,
+    action_space,
+    check_mode,
+    info_of,
+    make_core,
+    observation_space,
+    with_rate,
+)
+from hydrotele.envs.stage import Camera, Stage
 
 
 class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -20,7 +30,8 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def __init__(
         self, task: str, num_envs: int = 1, render_mode: str | None = None, threads: int = 0,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, **options: Any,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, width: int = 640,
+        height: int = 480, camera: Camera = None, shown: int | None = None, **options: Any,
     ) -> None:  # fmt: skip
         """Compile the machines.
 
@@ -30,20 +41,28 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             render_mode: None or `rgb_array`.
             threads: that step them; 0 for one per core. Results do not depend on it.
             autoreset_mode: of gymnasium.
+            width: of pictures [pixel].
+            height: of pictures [pixel].
+            camera: a camera of the machine; without, one that shows all that its arm reaches.
+            shown: number of environments, the first ones, that pictures are made of; without, all.
             **options: fields of `hydrotele.tasks.task.Options`.
 
         Raises:
             InputError: an option is not known or does not suit.
         """
+        check_mode(render_mode, self.metadata["render_modes"])
         mode = AutoresetMode(autoreset_mode)
         self.core = make_core(task, options, num_envs, threads, AUTORESET[mode.value])
-        self.metadata = {**self.metadata, "autoreset_mode": mode}
+        self.metadata = {**with_rate(self.metadata, self.core), "autoreset_mode": mode}
         self.num_envs, self.render_mode = num_envs, render_mode
         self.single_observation_space = observation_space(self.core)
         self.single_action_space = action_space(self.core)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._mode, self._begun = mode, False
+        self._view: tuple[int, int, Camera] = width, height, camera
+        self._stage: Stage | None = None
+        self._shown = num_envs if shown is None else min(shown, num_envs)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -129,8 +148,27 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         final = {"final_obs": observations, "final_info": last}
         return infos | _masked(final, over)
 
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Draw machines and their goals, one after the other.
+
+        Returns:
+            `shown` pictures (height, width, 3) uint8, or None without `render_mode`.
+
+        Raises:
+            InputError: there is no such camera, or no OpenGL works (says what to do).
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() shows nothing without render_mode='rgb_array'")
+            return None
+        if self._stage is None:
+            self._stage = Stage(self.core)
+        return tuple(self._stage.picture(n, *self._view) for n in range(self._shown))
+
     def close_extras(self, **kwargs: Any) -> None:
         """Give the simulations' memory back."""
+        if self._stage:
+            self._stage.close()
+            self._stage = None
         self.core.close()
 
 

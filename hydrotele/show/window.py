@@ -1,7 +1,5 @@
 """MuJoCo's window with the machine in it while it is driven."""
 
-import os
-import sys
 import threading
 from collections.abc import Callable, Sequence
 
@@ -9,9 +7,11 @@ import mujoco
 import numpy as np
 
 from hydrotele.errors import InputError
+from hydrotele.show.canvas import has_screen
 from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.plant import Plant
 
+_ADVICE = "add --no-viewer and choose --device gamepad, spacemouse or scripted:FILE"
 _PATIENCE = 5.0  # s that the last picture may take
 _DISTANCE, _AZIMUTH, _ELEVATION = 14.0, 120.0, -18.0  # m, deg, deg of the camera at first
 
@@ -79,15 +79,16 @@ class Window:
         self._handle.close()
 
 
-def check_screen() -> None:
+def check_screen(advice: str = _ADVICE) -> None:
     """Find out whether a window can be opened, since MuJoCo's viewer hangs where none can.
+
+    Args:
+        advice: what to do where it cannot.
 
     Raises:
         InputError: it cannot.
     """
-    advice = "add --no-viewer and choose --device gamepad, spacemouse or scripted:FILE"
-    seen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-    if sys.platform.startswith("linux") and not seen:
+    if not has_screen():
         raise InputError("viewer", f"there is no screen (DISPLAY is not set); {advice}")
     import glfw
 

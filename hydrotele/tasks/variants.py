@@ -19,6 +19,7 @@ from hydrotele.sensors import SensorError
 from hydrotele.simulate.fleet import STATE
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import begin_leapfrog, split_delay
+from hydrotele.surroundings import Thing
 from hydrotele.tasks.memory import AXES, CHANNELS
 from hydrotele.tasks.task import Options, Task
 
@@ -33,6 +34,7 @@ class Variants:
     Attributes:
         plant: of the first one.
         machines: the machines.
+        surroundings: what stands around each of them.
         states: (v, s) complete states at the starts, as `begin_leapfrog` leaves them.
         tips: (v, 3) places of the tip there [m].
         fields: field of the model -> (v, size) where they differ.
@@ -44,6 +46,7 @@ class Variants:
 
     plant: Plant
     machines: tuple[Machine, ...]
+    surroundings: tuple[tuple[Thing, ...], ...]
     states: np.ndarray
     tips: np.ndarray
     fields: dict[str, np.ndarray]
@@ -98,7 +101,8 @@ def _make(task: Task, options: Options, nominal: Machine) -> Variants:
         states.append(state)
         tips.append(data.site("tip").xpos.copy())
     return Variants(
-        plants[0], tuple(machines), np.array(states), np.array(tips), _differing(plants),
+        plants[0], tuple(machines), tuple(plant.surroundings for plant in plants),
+        np.array(states), np.array(tips), _differing(plants),
         *_sensor_tables(plants[0], machines), _delays(plants[0], machines),
     )  # fmt: skip
 
