@@ -1,4 +1,4 @@
-"""The same tasks for users of dm_control: `load("TrackTrajectory")` gives a `dm_env.Environment`."""
+"""The same tasks for dm_control: `load("TrackTrajectory")` gives a `dm_env.Environment`."""
 
 import collections
 from collections.abc import Mapping
@@ -59,10 +59,11 @@ class MachineEnvironment(dm_env.Environment):
     ) -> None:  # fmt: skip
         """Compile the machine; arguments as of `load`."""
         self.core = make_core(task_name, dict(options), 1, 1, DISABLED)
-        if isinstance(random, np.random.RandomState):
-            self._seed = int(random.randint(2**31))
-        else:
-            self._seed = int(np.random.SeedSequence().entropy % 2**62) if random is None else random
+        if random is None:
+            random = int(np.random.default_rng().integers(2**62))
+        elif isinstance(random, np.random.RandomState):
+            random = int(random.randint(2**31 - 1))
+        self._seed = random
         self._begun, self._over = False, True
         self._places = group([FLAT] * len(self.core.setup.fields) if flat else self._kinds())
         self.fields: dict[str, tuple[Field, ...]] = {
@@ -179,14 +180,26 @@ class Physics(engine.Physics):
     stage: Stage
 
     def render(
-        self, height: int = 240, width: int = 320, camera_id: Camera = FREE, **asked: Any
+        self, height: int = 240, width: int = 320, camera_id: Any = FREE, **asked: Any
     ) -> np.ndarray:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw it; arguments as of `dm_control.mujoco.Physics.render`, whose overlays, depth,
-        segmentation and so on need the OpenGL that dm_control has chosen.
-        """  # fmt: skip
-        if not any(value is not None and value is not False and value != () for value in asked.values()):
-            return self.stage.picture(0, width, height, camera_id)
-        return super().render(height, width, camera_id, **asked)
+        """Draw it as the environment does; what else is asked for, dm_control draws.
+
+        Args:
+            height: [pixel].
+            width: [pixel].
+            camera_id: as of `MachineEnvironment.render`.
+            **asked: overlays, depth, segmentation and so on, as of `dm_control.mujoco.Physics`; for
+                them MUJOCO_GL must name an OpenGL that works.
+
+        Returns:
+            (height, width, 3) uint8, or what dm_control gives.
+
+        Raises:
+            InputError: there is no such camera, or no OpenGL works (says what to do).
+        """
+        if any(value not in (None, False, ()) for value in asked.values()):
+            return super().render(height, width, camera_id, **asked)
+        return self.stage.picture(0, width, height, camera_id)
 
 
 def group(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import MODEL_FIELDS
 
-from hydrotele.errors import InputError
 from hydrotele.envs.goals import goal_markers
+from hydrotele.errors import InputError
 from hydrotele.show.canvas import Canvas
 from hydrotele.show.markers import Marker
 from hydrotele.show.pose import model_with_looks
@@ -15,7 +15,7 @@ from hydrotele.simulate.fleet import STATE
 from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.observation import reach
 
-_AZIMUTH, _ELEVATION = 215.0, -20.0  # degree: from ahead, aside and above
+_AZIMUTH, _ELEVATION = 215.0, -22.0  # degree: from ahead, aside and above
 _KEPT = 16  # compiled machines
 FREE = -1
 
@@ -62,8 +62,8 @@ class Stage:
         machine = self._core.setup.machine
         if machine.arm:
             far = reach(machine)
-            model.stat.center[:] = 0.3 * far, 0.0, 0.15 * far
-            model.stat.extent = far
+            model.stat.center[:] = 0.3 * far, 0.0, 0.1 * far
+            model.stat.extent = 0.85 * far
         model.vis.global_.azimuth, model.vis.global_.elevation = _AZIMUTH, _ELEVATION
 
     def show(self, number: int = 0) -> None:

@@ -19,7 +19,7 @@ from hydrotele.show.markers import Marker, write_markers
 PACKAGES = "libegl1 and libgl1-mesa-dri, or libosmesa6"
 _OFFSCREEN = ("egl", "osmesa")
 _LARGEST = 8192  # pixel
-_SHADOW = 4096  # pixel of the shadows' map at most
+_SHADOW = 4096  # pixel of the map of shadows at most
 _MARKERS = 1000
 
 
@@ -48,7 +48,7 @@ class Canvas:
         self.size = width, height
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         # A shadow needs no more pixels than it is seen with.
-        model.vis.quality.shadowsize = min(_SHADOW, 1 << (2 * max(width, height) - 1).bit_length())
+        model.vis.quality.shadowsize = min(_SHADOW, 1 << (max(width, height) - 1).bit_length())
         self._gl, self._context = _open(model, width, height)
         self._scene = mujoco.MjvScene(model, model.ngeom + _MARKERS)
         self._option, self._rectangle = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
@@ -131,4 +131,4 @@ def _candidates() -> tuple[str, ...]:
         return (wanted,)
     if sys.platform == "darwin":
         return ("cgl", "glfw")
-    return ("glfw", "egl") if has_screen() else ("egl",)
+    return ("egl", "glfw") if has_screen() else ("egl",)  # GLFW is for one thread only

@@ -37,9 +37,7 @@ def ball(middle, radius: float, colour) -> Marker:
 
 def line(start, end, radius: float, colour) -> Marker:
     """Give a round line from point to point [m]."""
-    return Marker(
-        _Geom.mjGEOM_CAPSULE, np.array(start), np.array(end), np.array([radius]), colour
-    )
+    return Marker(_Geom.mjGEOM_CAPSULE, np.array(start), np.array(end), np.array([radius]), colour)
 
 
 def arrow(start, end, radius: float, colour) -> Marker:

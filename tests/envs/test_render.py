@@ -1,0 +1,249 @@
+"""Pictures and windows of environments: what they show, where they come from, what they refuse."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.wrappers import AddRenderObservation, RenderCollection
+
+import hydrotele.envs
+from hydrotele.envs.goals import goal_markers
+from hydrotele.envs.single import MachineEnv
+from hydrotele.envs.stage import Stage
+from hydrotele.envs.vector import MachineVectorEnv
+from hydrotele.errors import InputError
+from hydrotele.show.canvas import Canvas
+
+SMALL = {"width": 80, "height": 60, "variants": 2, "duration": 0.2}
+_CHECKED = """
+import sys, warnings
+warnings.simplefilter("error")
+import gymnasium
+from gymnasium.utils.env_checker import check_env
+import hydrotele.envs
+env = gymnasium.make(sys.argv[1], render_mode="human", width=80, height=60, variants=1)
+check_env(env.unwrapped)
+env.close()
+print("clean")
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _renderer():
+    """Skip where this machine cannot draw."""
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    try:
+        Canvas(model, 8, 8).close()
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
+def env():
+    env = MachineEnv("TrackTrajectory", "rgb_array", action="joint_rate", **SMALL)
+    env.reset(seed=4)
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("name", hydrotele.envs.TASK_NAMES)
+def test_a_picture_of_every_task_shows_the_machine_and_changes_with_it(name):
+    options = SMALL | {"duration": 5.0, "width": 160, "height": 120}
+    env = MachineEnv(name, "rgb_array", action="joint_rate", **options)
+    env.reset(seed=1)
+    first = env.render()
+    assert first.shape == (120, 160, 3) and first.dtype == np.uint8
+    red, green, blue = np.moveaxis(first.astype(float), -1, 0)
+    yellow = (red > 120) & (green > 0.5 * red) & (blue < 0.4 * red)
+    assert 0.01 < yellow.mean() < 0.5
+    assert np.array_equal(env.render(), first) and not np.shares_memory(env.render(), first)
+    for _ in range(50):
+        env.step(np.ones(env.action_space.shape, np.float32))
+    assert (env.render() != first).any(axis=2).mean() > 0.01
+    env.close()
+
+
+@pytest.mark.parametrize("name", hydrotele.envs.TASK_NAMES)
+def test_the_goal_is_drawn(name):
+    """The same picture without its markers is another one."""
+    env = MachineEnv(name, "rgb_array", **SMALL)
+    env.reset(seed=1)
+    stage, whole = Stage(env.core), env.render()
+    assert stage.markers()
+    canvas = Canvas(stage.model, 80, 60)
+    stage.show()
+    bare = canvas.draw(stage.model, stage.data, stage.camera())
+    assert (bare != whole).any()
+    assert np.array_equal(
+        canvas.draw(stage.model, stage.data, stage.camera(), stage.markers()), whole
+    )
+    canvas.close()
+    env.close()
+
+
+def test_the_drawn_machine_stands_where_the_simulated_one_does(env):
+    for _ in range(5):
+        env.step(np.array([1.0, -1.0, 0.5], np.float32))
+    stage = Stage(env.core)
+    stage.show()
+    model, data = env.core.model_and_data()
+    for body in range(model.nbody):
+        drawn = stage.data.body(model.body(body).name).xpos
+        assert np.array_equal(drawn, data.xpos[body])
+
+
+def test_the_goal_starts_at_the_tip_and_goes_where_the_reference_does(env):
+    ball, off, *way = goal_markers(env.core, 0)
+    tip = env.core.memory["tip"][0]
+    # float arithmetic of closed kinematics against MuJoCo's pins, which open by 0.1 mm
+    assert ball.start == pytest.approx(tip, abs=2e-3)
+    assert np.array_equal(off.end, ball.start) and np.array_equal(way[0].start, ball.start)
+    gaps = [np.linalg.norm(a.end - b.start) for a, b in zip(way[:-1], way[1:], strict=True)]
+    assert max(gaps) == 0.0 and len(way) > 10
+
+
+def test_each_episode_is_drawn_with_its_own_machine():
+    """Boom cylinders with base pins in other places, among them those of one that is not first."""
+    ranges = {"x": [-0.05, 0.05], "z": [-0.05, 0.05]}
+    worn = {"name": "pin_offset", "location": "boom", "parameters": ranges}
+    env = MachineVectorEnv("TrackTrajectory", 8, randomise=[worn], **SMALL)
+    env.reset(seed=2)
+    stage, pins = Stage(env.core), set()
+    for number in range(8):
+        stage.show(number)
+        model, data = env.core.model_and_data(number)
+        for body in range(model.nbody):
+            drawn = stage.data.body(model.body(body).name).xpos
+            assert np.array_equal(drawn, data.xpos[body])
+        pins.add(stage.data.body("boom_tube").xpos[0])
+    assert len(pins) > 1
+    env.close()
+
+
+def test_pictures_of_the_first_environments():
+    env = MachineVectorEnv("TrackTrajectory", 8, "rgb_array", shown=2, **SMALL)
+    env.reset(seed=2)
+    frames = env.render()
+    assert isinstance(frames, tuple) and len(frames) == 2
+    assert all(frame.shape == (60, 80, 3) for frame in frames)
+    assert (frames[0] != frames[1]).any()
+    env.close()
+
+
+def test_batched_pictures_are_the_single_ones():
+    many = MachineVectorEnv("TrackTrajectory", 3, "rgb_array", **SMALL)
+    one = MachineEnv("TrackTrajectory", "rgb_array", **SMALL)
+    many.reset(seed=6)
+    for number, frame in enumerate(many.render()):
+        one.reset(seed=6 + number)
+        assert np.array_equal(one.render(), frame)
+    many.close()
+    one.close()
+
+
+@pytest.mark.parametrize("name", hydrotele.envs.TASK_NAMES)
+def test_the_checker_of_gymnasium_sees_pictures_and_windows(name):
+    """On a screen of its own, where every warning is an error."""
+    if not shutil.which("xvfb-run"):
+        pytest.skip("there is no xvfb-run for a window")
+    environment = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    done = subprocess.run(
+        ["xvfb-run", "-a", sys.executable, "-c", _CHECKED, f"hydrotele/{name}-v0"],
+        env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stdout.split() == ["clean"], done.stderr
+
+
+@pytest.mark.parametrize("camera", ["overview", "side", "cab", 0, "free"])
+def test_cameras_of_the_machine(camera, env):
+    other = MachineEnv("TrackTrajectory", "rgb_array", camera=camera, **SMALL)
+    other.reset(seed=4)
+    assert (other.render() != env.render()).any() == (camera != "free")
+    other.close()
+
+
+def test_wrappers_of_gymnasium_get_frames():
+    make = {"render_mode": "rgb_array", **SMALL}
+    env = RenderCollection(gymnasium.make("hydrotele/TrackTrajectory-v0", **make))
+    env.reset(seed=1)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    frames = env.render()
+    assert len(frames) == 4 and frames[0].shape == (60, 80, 3)
+    env.close()
+    env = AddRenderObservation(gymnasium.make("hydrotele/TrackTrajectory-v0", **make))
+    assert env.reset(seed=1)[0] in env.observation_space
+    env.close()
+
+
+def test_pictures_per_second_are_the_steps():
+    env = MachineEnv("TrackTrajectory", control_rate=20.0, variants=1)
+    assert env.metadata["render_fps"] == 20
+    env.close()
+
+
+def test_without_a_mode_there_is_no_picture():
+    env = MachineEnv("TrackTrajectory", variants=1)
+    env.reset(seed=1)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ({"camera": "drone"}, "choose one of overview, side, cab, free"),
+        ({"width": 0}, "must be 1 to"),
+        ({"height": 100_000}, "must be 1 to"),
+        ({"render_mode": "depth"}, "choose one of rgb_array, human"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(choices, message):
+    options = {"render_mode": "rgb_array", **SMALL} | choices
+    with pytest.raises(InputError, match=message):
+        env = MachineEnv("TrackTrajectory", **options)
+        env.reset(seed=1)
+        env.render()
+
+
+def test_a_window_without_a_screen_is_refused(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match="no screen.*rgb_array.*xvfb-run"):
+        MachineEnv("TrackTrajectory", "human", variants=1)
+
+
+def test_no_driver_says_what_to_install():
+    """In a process of its own, whose OpenGL is one that Linux does not have."""
+    code = (
+        "from hydrotele.envs.single import MachineEnv\n"
+        "env = MachineEnv('TrackTrajectory', 'rgb_array', variants=1); env.reset(seed=1)\n"
+        "try:\n env.render()\nexcept ValueError as error: print(error)"
+    )
+    hidden = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
+    environment = {k: v for k, v in os.environ.items() if k not in hidden}
+    environment["PYOPENGL_PLATFORM"] = "wgl"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert "libegl1" in done.stdout and "MUJOCO_GL=osmesa" in done.stdout
+
+
+def test_nothing_is_drawn_unasked():
+    """An environment that is stepped without pictures brings no OpenGL along."""
+    code = (
+        "import sys\nfrom hydrotele.envs.single import MachineEnv\n"
+        "env = MachineEnv('TrackTrajectory', variants=1)\nenv.reset(seed=1)\n"
+        "env.step(env.action_space.sample())\nprint('OpenGL' in sys.modules)"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "False"
