@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hydrotele.commands import drive_command
+from hydrotele.commands import drive_command, sweep_command
 from hydrotele.errors import InputError
 
 app = typer.Typer(
@@ -70,6 +70,7 @@ def run(
 
 
 app.command(epilog=drive_command.EPILOG)(drive_command.drive)
+app.command(epilog=sweep_command.EPILOG)(sweep_command.sweep)
 
 
 @app.command(

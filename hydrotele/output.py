@@ -23,6 +23,11 @@ OURS = {
     ),
     "identify": ("identify.json", "report.html", "identified/machine.*"),
     "two-port analysis": ("analysis.json", "report.html", "stability.png"),
+    "sweep": (
+        "sweep.yaml", "journal.jsonl", "table.parquet", "timings.csv", "report.html", "*.png",
+        "inputs/*/*", "inputs/*/*/*", "runs/*/*", ".*", ".scratch/*/*", ".scratch/*/run/*",
+        "runs/.*.part/*",
+    ),
 }  # fmt: skip
 """Kind of folder -> files that it holds beside `summary.json`, which states the kind."""
 

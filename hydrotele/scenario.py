@@ -4,8 +4,9 @@ Scenarios are YAML files; `scenarios/` holds the shipped ones. Keys may carry un
 in machine files.
 """
 
+import copy
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import yaml
 from pydantic import Field, model_validator
@@ -256,6 +257,30 @@ def scenario_path(name_or_path: str | Path) -> Path:
     )
 
 
+class ScenarioFile(NamedTuple):
+    """A scenario's file as read, before overrides and validation.
+
+    Attributes:
+        path: the file.
+        data: its keys and values.
+        lines: key path -> line number from 1.
+    """
+
+    path: Path
+    data: dict[str, Any]
+    lines: dict[tuple, int]
+
+
+def read_scenario_file(name_or_path: str | Path) -> ScenarioFile:
+    """Read the file of a scenario once, to make many scenarios from it with `scenario_from`.
+
+    Raises:
+        InputError: there is no such scenario, or it is no YAML mapping.
+    """
+    path = scenario_path(name_or_path)
+    return ScenarioFile(path, *read_yaml(path))
+
+
 def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = None) -> Scenario:
     """Read a scenario.
 
@@ -269,8 +294,16 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
     Raises:
         InputError: names file, line, key path and what is allowed.
     """
-    path = scenario_path(name_or_path)
-    data, lines = read_yaml(path)
+    return scenario_from(read_scenario_file(name_or_path), overrides)
+
+
+def scenario_from(file: ScenarioFile, overrides: dict[str, str] | None = None) -> Scenario:
+    """The scenario of a file that was read, with overrides as of `load_scenario`.
+
+    Raises:
+        InputError: names file, line, key path and what is allowed.
+    """
+    path, data, lines = file.path, copy.deepcopy(file.data), file.lines
     for key, text in (overrides or {}).items():
         _override(data, key, text)
     if "folder" in data:
@@ -278,7 +311,9 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
     data["folder"] = str(path.parent.resolve())
     kind = data["pilot"].get("kind") if isinstance(data.get("pilot"), dict) else None
     if isinstance(kind, str):  # pydantic names the pilot's kind in its key paths
-        lines |= {("pilot", kind, *k[1:]): n for k, n in lines.items() if k[:1] == ("pilot",)}
+        lines = lines | {
+            ("pilot", kind, *k[1:]): n for k, n in lines.items() if k[:1] == ("pilot",)
+        }
     source = f"{path} with --set {' '.join(overrides)}" if overrides else str(path)
     scenario = parse(Scenario, data, source, {} if overrides else lines)
     return _with_table(scenario, _at(path, lines, "pilot", "file"))

@@ -1,0 +1,112 @@
+"""The table of a sweep: a row per run, with a unit in every column that has one."""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import hydrotele
+from hydrotele.output import replacing
+from hydrotele.sweep.facts import Sweep
+from hydrotele.sweep.journal import Entry
+from hydrotele.sweep.numbers import key_unit
+from hydrotele.sweep.points import points
+
+
+class Table(NamedTuple):
+    """Columns of one length, in order of the runs.
+
+    Attributes:
+        columns: name -> values; None where there is none.
+        units: name -> unit, of those that have one.
+        varied: the keys that were varied.
+        figures: the numbers of the runs.
+    """
+
+    columns: dict[str, list[Any]]
+    units: dict[str, str]
+    varied: tuple[str, ...]
+    figures: tuple[str, ...]
+
+
+def make_table(
+    sweep: Sweep, seed: int, entries: Mapping[int, Entry], effect_units: Mapping[str, str]
+) -> Table:
+    """The table of all runs.
+
+    Args:
+        sweep: what was asked.
+        seed: of the base scenario.
+        entries: run number -> what is known of it; all of them.
+        effect_units: varied key of an effect -> unit.
+
+    Returns:
+        Columns `run`, the varied keys, `seed`, `status`, `reason`, `notes`, and the numbers.
+    """
+    rows = list(points(sweep))
+    varied = tuple(key for key in sweep.varied if key != "seed")
+    units = {key: unit for key in varied if (unit := effect_units.get(key) or key_unit(key))}
+    columns: dict[str, list[Any]] = {"run": [point.run for point in rows]}
+    columns |= {key: [point.values[key] for point in rows] for key in varied}
+    columns["seed"] = [point.values.get("seed", seed) + point.copy for point in rows]
+    found = [entries[point.run] for point in rows]
+    for name in ("status", "reason", "notes"):
+        columns[name] = [getattr(entry, name) for entry in found]
+    known = {name: unit for entry in found for name, (_, unit) in entry.numbers.items()}
+    for name, unit in known.items():
+        columns[name] = [entry.numbers.get(name, (None, unit))[0] for entry in found]
+    return Table(columns, units | known, varied, tuple(known))
+
+
+def save_table(table: Table, name: str, path: Path) -> None:
+    """Write the table as Parquet, whole or not at all; the same runs give the same bytes.
+
+    Args:
+        table: the table.
+        name: of the sweep, for the file's metadata.
+        path: file to write.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    fields, arrays = [], []
+    for column, values in table.columns.items():
+        array = pa.array(_plain(values), type=_type(pa, values))
+        metadata = {"unit": table.units[column]} if column in table.units else None
+        fields.append(pa.field(column, array.type, metadata=metadata))
+        arrays.append(array)
+    facts = {"sweep": name, "hydrotele": hydrotele.__version__,
+             "varied": json.dumps(table.varied)}  # fmt: skip
+    schema = pa.schema(fields, metadata=facts)
+    with replacing(path, ".parquet") as part:
+        pq.write_table(pa.Table.from_arrays(arrays, schema=schema), part, compression="zstd")
+        with open(part, "rb") as file:
+            os.fsync(file.fileno())
+
+
+def _kinds(values: Sequence[Any]) -> set[type]:
+    return {type(value) for value in values if value is not None}
+
+
+def _type(pa, values: Sequence[Any]):
+    """Type of a column: whole numbers, numbers, truth values, or text for everything else."""
+    kinds = _kinds(values)
+    if kinds == {bool}:
+        return pa.bool_()
+    if kinds == {int} and max(abs(v) for v in values if v is not None) < 2**63:
+        return pa.int64()
+    if kinds <= {int, float}:
+        return pa.float64()
+    return pa.string()
+
+
+def _plain(values: Sequence[Any]) -> list[Any]:
+    """Values as their column takes them: mixed ones and structures become JSON text."""
+    kinds = _kinds(values)
+    if kinds in ({bool}, {str}) or kinds <= {int, float}:
+        return list(values)
+    return [v if v is None or isinstance(v, str) else json.dumps(v) for v in values]
