@@ -76,9 +76,7 @@ def _study(file: SweepFile, swept: Swept, figures: list[str]) -> Study:
     )  # fmt: skip
 
 
-def _say(
-    file: SweepFile, target: Path, swept: Swept, figures: list[str], as_json: bool
-) -> None:
+def _say(file: SweepFile, target: Path, swept: Swept, figures: list[str], as_json: bool) -> None:
     found = spreads(swept.table, figures)
     if as_json:
         print_json({
@@ -89,17 +87,20 @@ def _say(
             "figures": found,
         })  # fmt: skip
         return
-    shown = table(f"{file.name}: {file.sweep.runs} runs", "", "unit", "smallest", "in run",
-                  "median", "largest", "in run")  # fmt: skip
+    title = f"{file.name}: {file.sweep.runs} runs"
+    shown = table(title, "", "unit", "smallest (run)", "median", "largest (run)")
+    shown.columns[0].overflow = "fold"
     for name, f in found.items():
-        shown.add_row(name, f["unit"], f"{f['min']:.4g}", str(f["min_run"]), f"{f['median']:.4g}",
-                      f"{f['max']:.4g}", str(f["max_run"]))  # fmt: skip
+        ends = (f"{f[end]:.4g} ({f[f'{end}_run']})" for end in ("min", "max"))
+        shown.add_row(name, f["unit"], next(ends), f"{f['median']:.4g}", next(ends))
     if found:
         out.print(shown)
+    elif len(swept.failed) < file.sweep.runs:
+        out.print("the runs do not differ in any number")
     if swept.failed:
         out.print(f"[red]{len(swept.failed)} of {file.sweep.runs} runs failed[/]")
     for entry in swept.failed[:_LISTED]:
-        varied = ", ".join(f"{key} {value}" for key, value in _values(swept, entry).items())
+        varied = ", ".join(f"{key} {_short(value)}" for key, value in _values(swept, entry).items())
         said = f"  run {entry.run} ({varied}): {entry.reason}"
         out.print(said, markup=False, soft_wrap=True)
     if len(swept.failed) > _LISTED:
@@ -112,6 +113,10 @@ def _say(
 def _values(swept: Swept, entry: Entry) -> dict[str, Any]:
     columns = swept.table.columns
     return {key: columns[key][entry.run - 1] for key in (*swept.table.varied, "seed")}
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 @contextlib.contextmanager

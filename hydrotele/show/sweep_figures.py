@@ -189,7 +189,8 @@ def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
             cells = _cells(study, keys, one.values)
             place.grid(False)
             place.set_facecolor("0.85")
-            image = place.imshow(cells, aspect="auto", origin="lower", cmap="viridis")
+            scale = "log" if _is_wide(cells[np.isfinite(cells)]) else "linear"
+            image = place.imshow(cells, aspect="auto", origin="lower", cmap="viridis", norm=scale)
             figure.colorbar(image, ax=place, pad=0.02)
             place.set_title(_folded(one.label))
             place.set_xticks(range(len(right)), [_short(v) for v in right])
@@ -235,5 +236,6 @@ def _folded(label: str) -> str:
     """A long label on two lines."""
     if len(label) <= 26:
         return label
-    middle = min((i for i, c in enumerate(label) if c == " "), key=lambda i: abs(i - len(label) / 2))
+    gaps = [i for i, letter in enumerate(label) if letter == " "]
+    middle = min(gaps, key=lambda i: abs(i - len(label) / 2))
     return f"{label[:middle]}\n{label[middle + 1 :]}"

@@ -1,8 +1,9 @@
 """Runs on a dask cluster: the scheduler gives those of a lost worker to another one."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from hydrotele.errors import InputError
 from hydrotele.sweep.running import Outcome, Task, failed, perform
@@ -11,7 +12,7 @@ _WAIT = 30  # s for the scheduler and the first worker
 _WHERE = "--dask"
 
 
-def cluster_outcomes(tasks: Iterable[Task], address: str) -> Iterator[Outcome]:
+def cluster_outcomes(tasks: Iterable[Task], address: str) -> Generator[Outcome]:
     """Do runs on a cluster, a few more at a time than it has threads.
 
     Args:
@@ -30,16 +31,17 @@ def cluster_outcomes(tasks: Iterable[Task], address: str) -> Iterator[Outcome]:
     except ImportError:
         message = "needs dask.distributed: pip install 'hydrotele[cluster]'"
         raise InputError(_WHERE, message) from None
-    where = {"scheduler_file": address} if Path(address).is_file() else {"address": address}
+    there = "scheduler_file" if Path(address).is_file() else "address"
+    facts: dict[str, Any] = {there: address, "timeout": f"{_WAIT}s", "set_as_default": False}
     try:
-        client = distributed.Client(**where, timeout=f"{_WAIT}s", set_as_default=False)
+        client = distributed.Client(**facts)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(_WHERE, f"no scheduler answers at {address}: {error}") from None
     with client:
         try:
             client.wait_for_workers(1, timeout=_WAIT)
         except TimeoutError:
-            message = f"the scheduler at {address} has no workers; start some: dask worker {address}"
+            message = f"the scheduler at {address} has no workers; start some with dask worker"
             raise InputError(_WHERE, message) from None
         yield from _outcomes(client, distributed, iter(tasks))
 

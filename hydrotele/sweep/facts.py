@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from hydrotele.datafile import Facts, Name, parse, read_yaml, suggest
 from hydrotele.errors import InputError
@@ -35,6 +35,23 @@ def _checked_value(value: Any) -> Any:
     return value
 
 
+def _checked_values(values: list[Any]) -> list[Any]:
+    """Values of a grid.
+
+    Raises:
+        ValueError: one cannot stand in a scenario, or stands there twice.
+    """
+    texts = [json.dumps(_checked_value(value)) for value in values]
+    for text in texts:
+        if texts.count(text) > 1:
+            raise ValueError(f"{text} stands twice; for more runs of it use repeat")
+    return values
+
+
+Value = Annotated[Any, AfterValidator(_checked_value)]
+Values = Annotated[list[Any], Field(min_length=1), AfterValidator(_checked_values)]
+
+
 class Distribution(Facts):
     """Where the values of a sampled key come from; exactly one of these.
 
@@ -45,7 +62,7 @@ class Distribution(Facts):
     uniform: tuple[float, float] | None = None
     log_uniform: tuple[float, float] | None = None
     normal: tuple[float, float] | None = None
-    choice: Annotated[list[Any], Field(min_length=1)] | None = None
+    choice: Annotated[list[Value], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _check(self):
@@ -59,8 +76,6 @@ class Distribution(Facts):
             raise ValueError("log_uniform needs low > 0")
         if self.normal and self.normal[1] <= 0.0:
             raise ValueError("normal must be [mean, standard deviation > 0]")
-        for value in self.choice or ():
-            _checked_value(value)
         return self
 
 
@@ -83,33 +98,18 @@ class Sweep(Facts):
     name: Name | None = None
     description: str = ""
     scenario: str
-    set: dict[Key, Any] = {}
-    grid: dict[Key, Annotated[list[Any], Field(min_length=1)]] = {}
+    set: dict[Key, Value] = {}
+    grid: dict[Key, Values] = {}
     sample: Sample | None = None
     repeat: Annotated[int, Field(ge=1, le=MOST_RUNS)] = 1
     figures: tuple[str, ...] = ()
     logs: bool = False
-
-    @field_validator("set", "grid")
-    @classmethod
-    def _finite(cls, values: dict[str, Any]) -> dict[str, Any]:
-        for key, value in values.items():
-            try:
-                _checked_value(value)
-            except ValueError as error:
-                raise ValueError(f"{key}: {error}") from None
-        return values
 
     @model_validator(mode="after")
     def _check(self):
         sampled = self.sample.keys if self.sample else {}
         if not self.grid and not sampled and self.repeat == 1:
             raise ValueError("nothing is varied; give a grid, a sample or repeat")
-        for key, values in self.grid.items():
-            texts = [json.dumps(value) for value in values]
-            for text in texts:
-                if texts.count(text) > 1:
-                    raise ValueError(f"grid.{key}: {text} stands twice; for more runs use repeat")
         varied = [*self.grid, *sampled]
         for key in varied:
             others = [*self.set, *varied]

@@ -1,4 +1,4 @@
-"""The folder of a sweep: begun whole, gone on with only by the same sweep, by one process at once."""
+"""The folder of a sweep: begun whole, gone on with by the same sweep, by one process at a time."""
 
 import contextlib
 import fcntl

@@ -53,7 +53,9 @@ class Inputs:
 
     def files(self) -> Files:
         """Path in the sweep's folder -> content, of all machines so far."""
-        return {name: text for copied in self._known.values() for name, text in copied.files.items()}
+        return {
+            name: text for copied in self._known.values() for name, text in copied.files.items()
+        }
 
     def files_of(self, scenario: Scenario) -> Files:
         """Those of the machines that one scenario of `named` names."""

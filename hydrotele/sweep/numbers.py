@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
 from hydrotele.datafile import UNIT_SUFFIXES, suggest
 from hydrotele.errors import InputError
 
@@ -48,6 +50,7 @@ def _flat(part: dict[str, Any], above: str, unit: str | None):
     unit = part.get("unit", unit)
     for key, value in part.items():
         name = f"{above}{key}"
+        value = value.item() if isinstance(value, np.generic) else value  # as the journal has it
         if isinstance(value, dict):
             yield from _flat(value, f"{name}.", unit)
         elif value is None or isinstance(value, (bool, int, float)):

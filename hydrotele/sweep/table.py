@@ -75,7 +75,7 @@ def save_table(table: Table, name: str, path: Path) -> None:
 
     fields, arrays = [], []
     for column, values in table.columns.items():
-        array = pa.array(_plain(values), type=_type(pa, values))
+        array = _array(pa, values)
         metadata = {"unit": table.units[column]} if column in table.units else None
         fields.append(pa.field(column, array.type, metadata=metadata))
         arrays.append(array)
@@ -88,25 +88,15 @@ def save_table(table: Table, name: str, path: Path) -> None:
             os.fsync(file.fileno())
 
 
-def _kinds(values: Sequence[Any]) -> set[type]:
-    return {type(value) for value in values if value is not None}
-
-
-def _type(pa, values: Sequence[Any]):
-    """Type of a column: whole numbers, numbers, truth values, or text for everything else."""
-    kinds = _kinds(values)
+def _array(pa, values: Sequence[Any]):
+    """A column: truth values, whole numbers, numbers, or text for everything else, as JSON."""
+    kinds = {type(value) for value in values if value is not None}
     if kinds == {bool}:
-        return pa.bool_()
-    if kinds == {int} and max(abs(v) for v in values if v is not None) < 2**63:
-        return pa.int64()
-    if kinds <= {int, float}:
-        return pa.float64()
-    return pa.string()
-
-
-def _plain(values: Sequence[Any]) -> list[Any]:
-    """Values as their column takes them: mixed ones and structures become JSON text."""
-    kinds = _kinds(values)
-    if kinds in ({bool}, {str}) or kinds <= {int, float}:
-        return list(values)
-    return [v if v is None or isinstance(v, str) else json.dumps(v) for v in values]
+        return pa.array(values, pa.bool_())
+    if kinds == {int} and all(v is None or abs(v) < 2**63 for v in values):
+        return pa.array(values, pa.int64())
+    if kinds <= {int, float} and kinds != {int}:
+        return pa.array([None if v is None else float(v) for v in values], pa.float64())
+    return pa.array(
+        [v if v is None or isinstance(v, str) else json.dumps(v) for v in values], pa.string()
+    )

@@ -9,7 +9,7 @@ import os
 import queue
 import signal
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -45,7 +45,7 @@ class _Worker:
         self.connection.close()
 
 
-def outcomes(tasks: Iterable[Task], jobs: int) -> Iterator[Outcome]:
+def outcomes(tasks: Iterable[Task], jobs: int) -> Generator[Outcome]:
     """Do runs in processes of their own, with one thread each.
 
     Args:
