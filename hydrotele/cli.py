@@ -286,11 +286,11 @@ def review(
 def list_(
     what: Annotated[
         str,
-        typer.Argument(help="machines, joysticks, scenarios, effects, environments; or all."),
+        typer.Argument(help="machines, joysticks, scenarios, sweeps, effects, environments; all."),
     ] = "all",
     json: Json = False,
 ) -> None:
-    """List what is shipped: machines with their tools, scenarios, effects, environments, ..."""
+    """List what is shipped: machines, scenarios, sweeps, effects, environments, ..."""
     from hydrotele.commands.catalogue import list_things
 
     list_things(what, json)
@@ -298,10 +298,10 @@ def list_(
 
 @app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
 def validate(
-    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios or logs.")],
+    files: Annotated[list[Path], typer.Argument(help="Machines, scenarios, sweeps, logs ...")],
     json: Json = False,
 ) -> None:
-    """Check a machine, a joystick, a scenario or a log; say what is wrong and where."""
+    """Check a machine, a joystick, a scenario, a sweep or a log; say what is wrong and where."""
     from hydrotele.commands.catalogue import validate_files
 
     validate_files(files, json)

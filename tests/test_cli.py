@@ -380,14 +380,14 @@ def test_validate_reports_every_file(tmp_path):
     assert code == 2 and [entry["valid"] for entry in found] == [False, True] and "bad.yaml" in err
 
 
-LISTS = ["machines", "joysticks", "scenarios", "effects", "environments"]
+LISTS = ["machines", "joysticks", "scenarios", "sweeps", "effects", "environments"]
 
 
 @pytest.mark.parametrize("what", LISTS)
 def test_list(what):
     code, out, _ = invoke("list", what, "--json")
     rows = json.loads(out)
-    assert code == 0 and len(rows) >= (1 if what in ("joysticks", "environments") else 4)
+    assert code == 0 and len(rows) >= (1 if what in ("joysticks", "sweeps", "environments") else 4)
     whole = json.loads(invoke("list", "--json")[1])
     assert whole[what] == rows and list(whole) == LISTS
     code, text, _ = invoke("list", what)

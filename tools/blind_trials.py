@@ -57,7 +57,7 @@ def _run_on_cluster(places: Sequence[Place], args: argparse.Namespace) -> Iterat
     try:
         from dask import distributed
     except ImportError:
-        message = "needs dask.distributed: pip install 'hydrotele[trials]'"
+        message = "needs dask.distributed: pip install 'hydrotele[cluster]'"
         raise InputError("--dask", message) from None
     options = ["--limit", str(args.limit), "--threads", str(args.threads)]
     options += ["--workflow", args.workflow] if args.workflow else []

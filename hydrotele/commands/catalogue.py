@@ -10,11 +10,11 @@ from hydrotele.errors import InputError
 from hydrotele.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
 from hydrotele.machine_file import load_machine, machine_path, shipped_machines
 
-_KINDS = ("machines", "joysticks", "scenarios", "effects", "environments")
+_KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environments")
 
 
 def list_things(what: str, as_json: bool) -> None:
-    """List machines, joysticks, scenarios, effects, environments, or all of them.
+    """List machines, joysticks, scenarios, sweeps, effects, environments, or all of them.
 
     Raises:
         InputError: there is no such list.
@@ -24,7 +24,7 @@ def list_things(what: str, as_json: bool) -> None:
     wanted = _KINDS if what == "all" else (what,)
     tables = {
         "machines": _machines, "joysticks": _joysticks, "scenarios": _scenarios,
-        "effects": _effects, "environments": _environments,
+        "sweeps": _sweeps, "effects": _effects, "environments": _environments,
     }  # fmt: skip
     data = {kind: tables[kind]() for kind in wanted}
     if as_json:
@@ -78,6 +78,17 @@ def _scenarios() -> list[dict]:
     return rows
 
 
+def _sweeps() -> list[dict]:
+    from hydrotele.sweep.facts import load_sweep, shipped_sweeps
+
+    rows = []
+    for name in shipped_sweeps():
+        sweep = load_sweep(name).sweep
+        facts = {"runs": sweep.runs, "scenario": sweep.scenario, "keys": list(sweep.varied)}
+        rows.append({"name": name, **facts, "description": sweep.description})
+    return rows
+
+
 def _effects() -> list[dict]:
     """Effects as they can sit on the CAT 215 with bucket, ranges at the last of the places."""
     from hydrotele.effects import EFFECTS
@@ -116,7 +127,7 @@ def _environments() -> list[dict]:
 
 
 def validate_files(paths: list[Path], as_json: bool) -> None:
-    """Check machines with all their tools, joysticks, scenarios and logs; say of each what it is.
+    """Check machines with all their tools, joysticks, scenarios, sweeps and logs; say what each is.
 
     Raises:
         InputError: something is wrong; all files have been reported by then.
@@ -157,10 +168,29 @@ def _validate(path: Path) -> tuple[str, str]:
         return "machine", _check_machine(path)
     if name in shipped_scenarios() or (path.is_file() and "pilot" in read_yaml(path)[0]):
         return "scenario", _check_scenario(load_scenario(path))
+    if name in _sweep_names() or (path.is_file() and "scenario" in read_yaml(path)[0]):
+        return "sweep", _check_sweep(path)
     if path.is_file():
         return "machine", _check_machine(path)
-    names = [*shipped_machines(), *shipped_joysticks(), *shipped_scenarios()]
-    raise InputError(path, f"is no file, machine, joystick or scenario; {suggest(name, names)}")
+    names = [*shipped_machines(), *shipped_joysticks(), *shipped_scenarios(), *_sweep_names()]
+    message = "is no file, machine, joystick, scenario or sweep"
+    raise InputError(path, f"{message}; {suggest(name, names)}")
+
+
+def _sweep_names() -> list[str]:
+    from hydrotele.sweep.facts import shipped_sweeps
+
+    return shipped_sweeps()
+
+
+def _check_sweep(path: Path) -> str:
+    from hydrotele.sweep.checking import check_points, open_base
+    from hydrotele.sweep.facts import load_sweep
+
+    file = load_sweep(path)
+    check_points(open_base(file))
+    varied = ", ".join(file.sweep.varied) or "seed"
+    return f"{file.sweep.runs} runs of {file.sweep.scenario}, varied: {varied}"
 
 
 def _is_joystick(path: Path) -> bool:

@@ -12,7 +12,7 @@ from hydrotele.commands.running import write_run
 from hydrotele.show.sweep_report import Study, write_sweep_report
 from hydrotele.sweep.facts import SweepFile, load_sweep
 from hydrotele.sweep.figures import default_figures, spreads
-from hydrotele.sweep.journal import Entry
+from hydrotele.sweep.journal import JOURNAL, Entry, finished
 from hydrotele.sweep.sweep import How, Progress, Swept, run_sweep
 
 _ALL_FAILED = 3
@@ -45,12 +45,12 @@ def sweep_to_folder(name: str, target: Path | None, wishes: Wishes) -> None:
     file = load_sweep(name)
     target = target or Path("runs", file.name)
     how = How(wishes.jobs, wishes.dask, wishes.fresh, wishes.retry_failed, write_run)
-    reached = [0]
     try:
-        with _bar(file.name, wishes.json, reached) as progress:
+        with _bar(file.name, wishes.json) as progress:
             swept = run_sweep(file, target, how, progress)
     except (KeyboardInterrupt, SystemExit) as stop:
-        said = f"{reached[0]} of {file.sweep.runs} runs are done and kept in {target}"
+        done = finished(target / JOURNAL)
+        said = f"{done} of {file.sweep.runs} runs are done and kept in {target}"
         notes.print(f"stopped: {said}; the same command goes on", markup=False, soft_wrap=True)
         code = stop.code if isinstance(stop, SystemExit) else 130
         raise typer.Exit(code if isinstance(code, int) else 1) from None
@@ -120,10 +120,10 @@ def _short(value: Any) -> str:
 
 
 @contextlib.contextmanager
-def _bar(name: str, quiet: bool, reached: list[int]) -> Iterator[Progress]:
-    """Progress that remembers how far it came; a bar with what is left, where somebody watches."""
+def _bar(name: str, quiet: bool) -> Iterator[Progress | None]:
+    """A bar with the time that is left on stderr; None where nobody watches."""
     if quiet or not notes.is_terminal:
-        yield lambda stage, done, *_: _note(reached, stage, done)
+        yield None
         return
     from rich.progress import (
         BarColumn,
@@ -142,7 +142,6 @@ def _bar(name: str, quiet: bool, reached: list[int]) -> Iterator[Progress]:
         last = ["check"]
 
         def update(stage: str, done: int, total: int, failed: int) -> None:
-            _note(reached, stage, done)
             if stage != last[0]:  # what was done before tells nothing about the time that is left
                 last[0] = stage
                 bar.reset(task, total=total, completed=done)
@@ -151,8 +150,3 @@ def _bar(name: str, quiet: bool, reached: list[int]) -> Iterator[Progress]:
                        failed=said)  # fmt: skip
 
         yield update
-
-
-def _note(reached: list[int], stage: str, done: int) -> None:
-    if stage == "run":
-        reached[0] = done

@@ -1,5 +1,6 @@
 """Runs on a dask cluster: the scheduler gives those of a lost worker to another one."""
 
+import logging
 from collections.abc import Generator, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -31,6 +32,7 @@ def cluster_outcomes(tasks: Iterable[Task], address: str) -> Generator[Outcome]:
     except ImportError:
         message = "needs dask.distributed: pip install 'hydrotele[cluster]'"
         raise InputError(_WHERE, message) from None
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what counts is said here
     there = "scheduler_file" if Path(address).is_file() else "address"
     facts: dict[str, Any] = {there: address, "timeout": f"{_WAIT}s", "set_as_default": False}
     try:
@@ -55,7 +57,8 @@ def _outcomes(client, distributed, waiting: Iterator[Task]) -> Iterator[Outcome]
         runs[future.key] = task.run
         return future
 
-    done = distributed.as_completed([submit(task) for task in islice(waiting, ahead)])
+    first = [submit(task) for task in islice(waiting, ahead)]
+    done = distributed.as_completed(first, loop=client.loop)
     for future in done:
         run = runs.pop(future.key)
         yield _outcome(distributed, future, run)
@@ -77,5 +80,6 @@ def _outcome(distributed, future, run: int) -> Outcome:
     if isinstance(error, ImportError):
         message = f"its workers need the same hydrotele as this computer: {error}"
         raise InputError(_WHERE, message)
-    said = f": {type(error).__name__}: {error}" if error else ""
-    raise InputError(_WHERE, f"the cluster gave up run {run}{said}")
+    said = f"{type(error).__name__}: {error}" if error else "is its scheduler still there?"
+    kept = "finished runs are kept, the same command goes on"
+    raise InputError(_WHERE, f"the cluster gave up run {run}: {said}; {kept}")

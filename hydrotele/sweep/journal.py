@@ -14,6 +14,7 @@ from hydrotele.output import replacing
 from hydrotele.sweep.numbers import Numbers
 
 OK, FAILED = "ok", "failed"
+JOURNAL = "journal.jsonl"
 
 
 class Entry(NamedTuple):
@@ -34,6 +35,12 @@ class Entry(NamedTuple):
     numbers: Numbers = {}
     notes: str = ""
     wall_seconds: float | None = None
+
+
+def finished(path: Path) -> int:
+    """Number of runs that a journal holds."""
+    lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
+    return len({line.partition(b",")[0] for line in lines})
 
 
 class Journal:

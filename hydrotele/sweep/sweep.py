@@ -22,7 +22,7 @@ from hydrotele.sweep.cluster import cluster_outcomes
 from hydrotele.sweep.facts import SweepFile
 from hydrotele.sweep.folder import SCRATCH, identity, sweep_folder, versions, write_summary
 from hydrotele.sweep.inputs import placed
-from hydrotele.sweep.journal import FAILED, OK, Entry, Journal
+from hydrotele.sweep.journal import FAILED, JOURNAL, OK, Entry, Journal
 from hydrotele.sweep.numbers import check_figures, possible_numbers
 from hydrotele.sweep.points import Point, points
 from hydrotele.sweep.running import Keep, Outcome, Task
@@ -92,7 +92,7 @@ def run_sweep(
     if how.dask:
         base.inputs.refuse_bound("--dask")
     with sweep_folder(target, base, checked, how.fresh):
-        with closing(Journal(target / "journal.jsonl")) as journal:
+        with closing(Journal(target / JOURNAL)) as journal:
             missing = _missing(base, journal, how.retry_failed)
             _do(base, target, journal, missing, how, checked, progress)
         entries = {run: journal.entries[run] for run in sorted(journal.entries)}

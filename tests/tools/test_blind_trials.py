@@ -255,7 +255,7 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 def test_a_cluster_runs_the_trials(tmp_path):
-    pytest.importorskip("distributed", reason="needs the extra 'trials'")
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     series = SmallSeries(tmp_path)
     script = tmp_path / "cluster.py"
     script.write_text(CLUSTER)
