@@ -368,7 +368,7 @@ def _override(data: dict[str, Any], key: str, text: str) -> None:
     for part in parts[:-1]:
         if isinstance(where, list) and part.isdigit() and int(part) < len(where):
             where = where[int(part)]
-        elif part.isdigit():
+        elif isinstance(where, dict) and part.isdigit():
             raise InputError(f"--set {key}", f"there is no entry {part}; set the whole list first")
         elif isinstance(where, dict):
             where = where.setdefault(part, {})

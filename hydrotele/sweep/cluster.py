@@ -32,7 +32,9 @@ def cluster_outcomes(tasks: Iterable[Task], address: str) -> Generator[Outcome]:
     except ImportError:
         message = "needs dask.distributed: pip install 'hydrotele[cluster]'"
         raise InputError(_WHERE, message) from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what counts is said here
+    for name in list(logging.root.manager.loggerDict):
+        if name.split(".")[0] == "distributed":  # what counts is said here
+            logging.getLogger(name).setLevel(logging.CRITICAL)
     there = "scheduler_file" if Path(address).is_file() else "address"
     facts: dict[str, Any] = {there: address, "timeout": f"{_WAIT}s", "set_as_default": False}
     try:
@@ -80,6 +82,6 @@ def _outcome(distributed, future, run: int) -> Outcome:
     if isinstance(error, ImportError):
         message = f"its workers need the same hydrotele as this computer: {error}"
         raise InputError(_WHERE, message)
-    said = f"{type(error).__name__}: {error}" if error else "is its scheduler still there?"
+    said = f"{type(error).__name__}: {error}" if error else "its scheduler may be gone"
     kept = "finished runs are kept, the same command goes on"
     raise InputError(_WHERE, f"the cluster gave up run {run}: {said}; {kept}")
