@@ -148,16 +148,18 @@ def _spots(values: Sequence[Any], steps: list[Any]) -> np.ndarray:
 
 
 def _means(binned: bool, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of y at every x, or over bins that hold equally many."""
-    if not binned:
-        there = np.unique(x)
+    """Means of y at every x, or over bins of neighbouring x where few runs share one.
+
+    Runs of the same x stay in one bin, so that every bin has its share of all other keys.
+    """
+    there = np.unique(x)
+    if not binned or len(x) >= _PER_BIN * len(there):
         return there, np.array([y[x == value].mean() for value in there])
-    bins = min(_MOST_BINS, len(x) // _PER_BIN)
+    bins = min(_MOST_BINS, len(there) // 2, len(x) // _PER_BIN)
     if bins < 2:
         return np.empty(0), np.empty(0)
-    parts = np.array_split(np.argsort(x, kind="stable"), bins)
-    return (np.array([x[part].mean() for part in parts]),
-            np.array([y[part].mean() for part in parts]))  # fmt: skip
+    parts = [np.isin(x, part) for part in np.array_split(there, bins)]
+    return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
 
 
 def _is_wide(values: np.ndarray) -> bool:

@@ -56,7 +56,7 @@ def _page(study: Study, images: dict[str, bytes]) -> str:
         why = "Means over the runs that succeeded are in the pictures, single runs here."
         parts.append(section("How far the numbers spread", why, _spreads(study)))
         why = ("Dots are runs, the line is their mean at each value of the key while all other keys"
-               " vary (of random values over bins of equally many runs); red crosses are runs that"
+               " vary (of random values over bins of neighbours); red crosses are runs that"
                " failed.")  # fmt: skip
         image = picture(images["main_effects.png"], "main effects")
         parts.append(section("What each key does", why, tag("figure", image)))
