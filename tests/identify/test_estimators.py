@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from hydrotele.errors import InputError
 from hydrotele.identify.estimators import autoregression, estimate
@@ -11,17 +12,17 @@ TRUTH = np.array([95.0, 200.0, 20.0, -3.0])
 
 def equations(rng, rows=400, drives=2):
     """Smooth columns, as motion makes them."""
-    steps = rng.normal(size=(rows, drives, 4))
-    for k in range(1, rows):
-        steps[k] = 0.95 * steps[k - 1] + 0.3 * steps[k]
-    return steps * np.array([1.0, 0.3, 2.0, 5.0])
+    return remembered(rng.normal(size=(rows, drives, 4)), 0.95, 0.3) * [1.0, 0.3, 2.0, 5.0]
 
 
 def correlated(rng, rows, drives, share):
-    noise = rng.normal(size=(rows, drives))
-    for k in range(1, rows):
-        noise[k] = share * noise[k - 1] + np.sqrt(1 - share**2) * noise[k]
-    return noise
+    return remembered(rng.normal(size=(rows, drives)), share, np.sqrt(1 - share**2))
+
+
+def remembered(fresh, share, weight):
+    """Rows that keep a share of the row before and add weighted fresh ones."""
+    after, _ = lfilter([weight], [1.0, -share], fresh[1:], axis=0, zi=share * fresh[:1])
+    return np.concatenate([fresh[:1], after])
 
 
 @pytest.mark.parametrize("options", [{}, {"covariance": np.array([[2.0, 0.5], [0.5, 1.0]])}])
