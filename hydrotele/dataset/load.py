@@ -138,7 +138,11 @@ def make_dataset(
               for c, keep in zip(channels, kept, strict=True) if not keep]  # fmt: skip
     channels = tuple(c for c, keep in zip(channels, kept, strict=True) if keep)
     notes += channel_facts.blind_axes(machine, axes, channels)
-    whole = {n: rows._replace(reading=rows.reading[:, kept]) for n, rows in mended.items()}
+    # row by row in memory, as filters cross it: every other layout is compiled anew
+    whole = {
+        n: rows._replace(reading=np.ascontiguousarray(rows.reading[:, kept]))
+        for n, rows in mended.items()
+    }
     parts, left = split(whole, origin, heldout)
     logs = {run.name: run.logs for run in files}
     made = {

@@ -260,8 +260,9 @@ def advance(model, sp, z, command, row, period, steps, trail):
         for i in range(nu):
             drive[V, i] = (drive[X, i] - drive[V, i]) / h
         if count > 0:
+            first = np.int64(0)  # numba compiles a function anew for a written number
             step_circuit(
-                model.user, 0, count, act, drive[COMMAND], drive[X], drive[V], h, sp.act_dot,
+                model.user, first, count, act, drive[COMMAND], drive[X], drive[V], h, sp.act_dot,
                 sp.scratch,
             )  # fmt: skip
             for k in range(4 * count):

@@ -119,7 +119,8 @@ def filter_run(
     moved, work = np.zeros(size), np.zeros((full, full))
     delta, pull = np.zeros(few), np.zeros(full)
     place(model, sp, z)
-    read_channels(model, sp, z, 0, steps, h, trail[:0], predicted[0])
+    first = np.int64(0)  # numba compiles a function anew for a written number
+    read_channels(model, sp, z, first, steps, h, trail[:0], predicted[0])
     begin_late(late, size, predicted[0], z)
     if fresh:
         _slopes(model, sp, z[:size], nudge, slope[0], moved)
