@@ -276,6 +276,7 @@ def test_a_cluster_runs_the_trials(tmp_path):
 def test_the_workflow_itself_answers_one_clean_and_one_planted_trial(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     asked = ["--out", str(tmp_path / "o"), "--single", "1", "--clean", "1", "--seed", "8"]
+    asked += ["--duration", "20"]  # s, half of a real series' runs
     done = subprocess.run(
         [sys.executable, str(SCRIPT), *asked], env=environment, capture_output=True, text=True,
         check=False,
