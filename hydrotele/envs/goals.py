@@ -2,7 +2,7 @@
 
 What a task lets its agent observe of the goal is drawn by the names of the fields: `wanted.r`,
 `wanted.theta` and so on are a pose of the tip, `wanted_in_200_ms.r` its way ahead, `wanted_force`
-and `force` are arrows at the tip. A kind of task that has more to show has a function here.
+and `force` are arrows at the tip, `goal.r` and so on is where a log shall lie. A kind of task that has more to show has a function here.
 """
 
 import math
@@ -19,10 +19,12 @@ from hydrotele.tasks.track import track_reference
 _GOAL = (0.10, 0.75, 0.25, 1.0)  # what is asked for
 _AHEAD = (0.15, 0.45, 0.95, 1.0)  # where that goes
 _OFF = (0.90, 0.15, 0.10, 1.0)  # what is wrong
-_BALL, _THICK, _THIN = 0.12, 0.03, 0.025  # m
+_BALL, _THICK, _THIN = 0.14, 0.04, 0.035  # m
 _WAY, _PIECES = 3.0, 30  # s of a reference that are shown ahead, lines that show it
 _POINTER = 0.9  # m, of the direction of a tool
 _METRES = 1.0 / 15.0e3  # m per N of an arrow
+_GHOST = (*_GOAL[:3], 0.45)
+_LOG, _HALF_LOG = 0.15, 1.5  # m, radius and half length of a log's ghost
 _ASIDE = 0.35  # m between the arrows of a force and of the one wanted
 
 
@@ -64,6 +66,11 @@ def observed_goal(core: TaskCore, number: int) -> list[Marker]:
             foot = tip + (0.0, aside, 0.0)
             top = foot + (0.0, 0.0, max(0.0, row[name]) * _METRES)
             markers.append(arrow(top, foot, 2.0 * _THICK, colour))
+    if "goal.sin_2_yaw" in row:
+        yaw = 0.5 * math.atan2(row["goal.sin_2_yaw"], row["goal.cos_2_yaw"])
+        half = _HALF_LOG * np.array([math.cos(yaw), math.sin(yaw), 0.0])
+        place = place_of_pose(row["goal.r"], row["goal.theta"], _LOG)
+        markers.append(line(place - half, place + half, _LOG, _GHOST))
     return markers
 
 

@@ -8,14 +8,15 @@ from mujoco.batch import MODEL_FIELDS
 
 from hydrotele.envs.goals import goal_markers
 from hydrotele.errors import InputError
+from hydrotele.kinematics.task import ALONG, BASE_RADIUS, BOOM, STICK
+from hydrotele.operate.resolved_motion import arm_facts
 from hydrotele.show.canvas import Canvas
 from hydrotele.show.markers import Marker
 from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.fleet import STATE
 from hydrotele.tasks.core import TaskCore
-from hydrotele.tasks.observation import reach
 
-_AZIMUTH, _ELEVATION = 215.0, -22.0  # degree: from ahead, aside and above
+_AZIMUTH, _ELEVATION = 232.0, -20.0  # degree: from ahead, aside and above
 _KEPT = 16  # compiled machines
 FREE = -1
 
@@ -61,9 +62,10 @@ class Stage:
         """Let MuJoCo's free camera show all that the arm reaches."""
         machine = self._core.setup.machine
         if machine.arm:
-            far = reach(machine)
-            model.stat.center[:] = 0.3 * far, 0.0, 0.1 * far
-            model.stat.extent = 0.85 * far
+            numbers = arm_facts(machine)[0]
+            far = float(numbers[[BASE_RADIUS, BOOM, STICK]].sum() + abs(numbers[ALONG]))
+            model.stat.center[:] = 0.42 * far, 0.0, 0.12 * far
+            model.stat.extent = far
         model.vis.global_.azimuth, model.vis.global_.elevation = _AZIMUTH, _ELEVATION
 
     def show(self, number: int = 0) -> None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-_GLOW = 0.4  # of their own light, so that they are seen in shadows
+_GLOW = 0.4
 _Geom = mujoco.mjtGeom
 
 
@@ -20,6 +20,7 @@ class Marker(NamedTuple):
         size: (3,) of MuJoCo's shape, or (1,) radius of a line [m].
         colour: (4,) red, green, blue, opacity, 0 .. 1.
         rotation: (9,) of a shape that has a middle.
+        glow: its own light, 0 .. 1, so that it is seen in shadows.
     """
 
     shape: int
@@ -28,6 +29,7 @@ class Marker(NamedTuple):
     size: np.ndarray
     colour: tuple[float, float, float, float]
     rotation: np.ndarray = np.eye(3).ravel()
+    glow: float = _GLOW
 
 
 def ball(middle, radius: float, colour) -> Marker:
@@ -73,5 +75,5 @@ def write_markers(scene: mujoco.MjvScene, markers: Sequence[Marker]) -> None:
         if marker.end is not None:
             width = float(marker.size[0])
             mujoco.mjv_connector(geom, marker.shape, width, marker.start, marker.end)
-        geom.category, geom.emission = mujoco.mjtCatBit.mjCAT_DECOR.value, _GLOW
+        geom.category, geom.emission = mujoco.mjtCatBit.mjCAT_DECOR.value, marker.glow
         scene.ngeom += 1
