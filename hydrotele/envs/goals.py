@@ -2,7 +2,8 @@
 
 What a task lets its agent observe of the goal is drawn by the names of the fields: `wanted.r`,
 `wanted.theta` and so on are a pose of the tip, `wanted_in_200_ms.r` its way ahead, `wanted_force`
-and `force` are arrows at the tip, `goal.r` and so on is where a log shall lie. A kind of task that has more to show has a function here.
+and `force` are arrows at the tip, `goal.r` and so on is where a log shall lie. A kind of task that
+has more to show has a function here.
 """
 
 import math
@@ -12,6 +13,7 @@ import numpy as np
 
 from hydrotele.kinematics.task import task_forward
 from hydrotele.show.markers import Marker, arrow, ball, line, polyline
+from hydrotele.surroundings import LogOnGround
 from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.memory import ARM
 from hydrotele.tasks.track import track_reference
@@ -24,7 +26,6 @@ _WAY, _PIECES = 3.0, 30  # s of a reference that are shown ahead, lines that sho
 _POINTER = 0.9  # m, of the direction of a tool
 _METRES = 1.0 / 15.0e3  # m per N of an arrow
 _GHOST = (*_GOAL[:3], 0.45)
-_LOG, _HALF_LOG = 0.15, 1.5  # m, radius and half length of a log's ghost
 _ASIDE = 0.35  # m between the arrows of a force and of the one wanted
 
 
@@ -66,11 +67,14 @@ def observed_goal(core: TaskCore, number: int) -> list[Marker]:
             foot = tip + (0.0, aside, 0.0)
             top = foot + (0.0, 0.0, max(0.0, row[name]) * _METRES)
             markers.append(arrow(top, foot, 2.0 * _THICK, colour))
-    if "goal.sin_2_yaw" in row:
-        yaw = 0.5 * math.atan2(row["goal.sin_2_yaw"], row["goal.cos_2_yaw"])
-        half = _HALF_LOG * np.array([math.cos(yaw), math.sin(yaw), 0.0])
-        place = place_of_pose(row["goal.r"], row["goal.theta"], _LOG)
-        markers.append(line(place - half, place + half, _LOG, _GHOST))
+    variant = int(core.memory["variant"][number])
+    for log in core.setup.variants.surroundings[variant]:
+        if isinstance(log, LogOnGround) and "goal.r" in row:
+            yaw = 0.5 * math.atan2(row["goal.sin_2_yaw"], row["goal.cos_2_yaw"])
+            half = 0.5 * log.length * np.array([math.cos(yaw), math.sin(yaw), 0.0])
+            radius = 0.5 * log.diameter
+            place = place_of_pose(row["goal.r"], row["goal.theta"], radius)
+            markers.append(line(place - half, place + half, radius, _GHOST))
     return markers
 
 
