@@ -64,7 +64,7 @@ class Stage:
         if machine.arm:
             numbers = arm_facts(machine)[0]
             far = float(numbers[[BASE_RADIUS, BOOM, STICK]].sum() + abs(numbers[ALONG]))
-            model.stat.center[:] = 0.42 * far, 0.0, 0.12 * far
+            model.stat.center[:] = 0.40 * far, 0.0, 0.18 * far
             model.stat.extent = far
         model.vis.global_.azimuth, model.vis.global_.elevation = _AZIMUTH, _ELEVATION
 
