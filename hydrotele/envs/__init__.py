@@ -9,7 +9,7 @@ code. `gymnasium.make("hydrotele.envs:hydrotele/TrackTrajectory-v0")` imports it
 from gymnasium.envs.registration import register
 
 TASK_NAMES = (
-    "TrackTrajectory",
+    "TrackTrajectory", "StraightLine", "HoldForce", "ReachFeller",
 )  # fmt: skip
 
 for _name in TASK_NAMES:

@@ -3,6 +3,9 @@
 import numpy as np
 
 from hydrotele.machine import Machine
+from hydrotele.tasks.force_task import HOLD_FORCE
+from hydrotele.tasks.line_task import STRAIGHT_LINE
+from hydrotele.tasks.reach_task import REACH_FELLER
 from hydrotele.tasks.task import Task
 from hydrotele.tasks.track import track_fields
 
@@ -30,6 +33,9 @@ TASKS = {
             fields=track_fields,
             measures=(("tip_error", "m"),),
         ),
+        STRAIGHT_LINE,
+        HOLD_FORCE,
+        REACH_FELLER,
     )
 }
 """Tasks by name."""

@@ -124,7 +124,7 @@ def make_facts(setup: Setup, count: int, autoreset: int) -> np.ndarray:
     facts["variants"], facts["states"] = setup.variants.states.shape
     facts["width"] = task.terrain
     if task.numbers:
-        numbers = task.numbers(setup.machine)
+        numbers = task.numbers(setup.machine, model)
         facts["numbers"][: len(numbers)] = numbers
     _write_machine(facts, setup, columns)
     _write_sensors(facts, setup)
@@ -198,4 +198,8 @@ def _write_layout(facts: np.ndarray) -> None:
         ("at_xmat", "xmat"), ("at_warning", "warning"), ("at_eq_active", "eq_active"),
     ):  # fmt: skip
         facts[name] = data[member]
-    facts["at_user"], facts["at_eq_data"] = model["actuator_user"], model["eq_data"]
+    for name, member in (
+        ("at_user", "actuator_user"), ("at_eq_data", "eq_data"), ("at_stiffness", "jnt_stiffness"),
+        ("at_damping", "dof_damping"),
+    ):  # fmt: skip
+        facts[name] = model[member]

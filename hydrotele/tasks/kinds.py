@@ -5,11 +5,14 @@ is its place in KINDS.
 """
 
 from hydrotele.compiled import compiled
+from hydrotele.tasks.force import begin_force, judge_force, observe_force, tick_force
+from hydrotele.tasks.line import begin_line, judge_line, observe_line
 from hydrotele.tasks.observation import observe_machine
+from hydrotele.tasks.reach import begin_reach, judge_reach, observe_reach
 from hydrotele.tasks.track import begin_track, judge_track, observe_track
 
-KINDS = ("track",)
-_TRACK = 0
+KINDS = ("track", "line", "force", "reach")
+_TRACK, _LINE, _FORCE, _REACH = range(4)
 
 
 @compiled
@@ -28,6 +31,12 @@ def begin_task(f, e, w):
     """
     if f.kind == _TRACK:
         begin_track(f, e)
+    elif f.kind == _LINE:
+        begin_line(f, e)
+    elif f.kind == _FORCE:
+        begin_force(f, e, w)
+    elif f.kind == _REACH:
+        begin_reach(f, e)
 
 
 @compiled
@@ -44,6 +53,8 @@ def tick_task(f, e, w):
 
     Source: the task's own file.
     """
+    if f.kind == _FORCE:
+        tick_force(f, e, w)
 
 
 @compiled
@@ -64,6 +75,12 @@ def observe_task(f, e, w, out):
     at = observe_machine(f, e, out)
     if f.kind == _TRACK:
         observe_track(f, e, out, at)
+    elif f.kind == _LINE:
+        observe_line(f, e, out, at)
+    elif f.kind == _FORCE:
+        observe_force(f, e, out, at)
+    elif f.kind == _REACH:
+        observe_reach(f, e, out, at)
 
 
 @compiled
@@ -82,4 +99,10 @@ def judge_task(f, e, w):
     """
     if f.kind == _TRACK:
         return judge_track(f, e, w)
+    if f.kind == _LINE:
+        return judge_line(f, e, w)
+    if f.kind == _FORCE:
+        return judge_force(f, e, w)
+    if f.kind == _REACH:
+        return judge_reach(f, e, w)
     return 0.0, False

@@ -143,6 +143,8 @@ FACTS = np.dtype(
         ("at_eq_active", _I),
         ("at_user", _I),
         ("at_eq_data", _I),
+        ("at_stiffness", _I),
+        ("at_damping", _I),
     ],
     align=True,
 )

@@ -1,9 +1,10 @@
 """What a task is, as facts in Python, and what a user may choose of it."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
+import mujoco
 import numpy as np
 
 from hydrotele.machine import Machine
@@ -32,9 +33,9 @@ class Task:
         start: (machine, random generator) -> axis or joint name -> position at the start.
         fields: (machine, driven axes) -> what `observe_<kind>` writes.
         measures: name and unit of every figure in `info`.
-        surroundings: (machine, random generator) -> what stands around.
+        surroundings: (machine, random generator, start) -> what stands around.
         ground: whether there is a hard ground.
-        numbers: machine -> (NUMBERS,) that the native code of the task reads.
+        numbers: (machine, MuJoCo model) -> up to NUMBERS that the task's native code reads.
         terrain: cells of the ground's profile, 0 without.
         pose_rates: of the tip at full action: r [m/s], theta [rad/s], z [m/s], attitude, head.
     """
@@ -51,9 +52,11 @@ class Task:
     more_axes: tuple[str, ...] = ()
     action: ActionKind = "valve"
     duration: float = 20.0
-    surroundings: Callable[[Machine, np.random.Generator], tuple[Thing, ...]] = lambda _, __: ()
+    surroundings: Callable[[Machine, np.random.Generator, dict[str, float]], tuple[Thing, ...]] = (
+        lambda *_: ()
+    )
     ground: bool = False
-    numbers: Callable[[Machine], np.ndarray] | None = None
+    numbers: Callable[[Machine, mujoco.MjModel], Sequence[float]] | None = None
     terrain: int = 0
     pose_rates: tuple[float, ...] = (0.5, 0.3, 0.5, 0.4, 0.25)
 

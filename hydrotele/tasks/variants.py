@@ -85,7 +85,7 @@ def _make(task: Task, options: Options, nominal: Machine) -> Variants:
     for number in range(options.variants):
         chance = np.random.default_rng([options.variant_seed, number])
         joints = task.start(nominal, chance)
-        things = task.surroundings(nominal, chance)
+        things = task.surroundings(nominal, chance, joints)
         machine = _changed(nominal, options, chance)
         known = (p for m, p in zip(machines, plants, strict=True)
                  if m == machine and p.surroundings == things)  # fmt: skip

@@ -1,0 +1,173 @@
+"""A force held against a plate on a spring, from above the plate on, with one change of the force.
+
+What the plate's spring and damper carry is the force: a load cell under the plate would read it.
+"""
+
+import math
+
+from hydrotele.compiled import compiled
+from hydrotele.machine import Machine
+from hydrotele.simulate.pointers import field
+from hydrotele.tasks.chance import between
+from hydrotele.tasks.observation import Field
+
+WEAKEST, STRONGEST = 1.0e4, 3.5e4  # N, forces that are wanted
+OVERLOAD = 1.0e5  # N
+FAILURE = -50.0  # reward of an overload or of leaving the plate: what a second on target pays
+CELL = 500.0  # N, largest error of the load cell: 1 % of 50 kN
+_CHANGE = 5.0e3  # N, smallest change of the force wanted
+_EARLY, _LATE = 0.4, 0.6  # shares of the duration between which it changes
+_TOUCH = 200.0  # N, from which on the plate counts as touched
+_RANGE = 2.0e5  # N, of the load cell
+_FIRST, _SECOND, _TIME, _FORCE, _READ, _PEAK = range(6)  # places in the goal
+PLATE_QPOS, PLATE_DOF, PLATE_JOINT, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y = range(7)  # in the numbers
+
+
+def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+    """What `observe_force` writes: force read and wanted, time since it was last changed."""
+    return [
+        Field("force", "N", -_RANGE, _RANGE),
+        Field("wanted_force", "N", 0.0, STRONGEST),
+        Field("time_since_change", "s", 0.0, 3600.0),
+    ]
+
+
+@compiled
+def plate_force(f, w):
+    """Force that the plate's spring and damper carry, positive when it is pressed down.
+
+    Args:
+        f: record of FACTS.
+        w: World.
+
+    Returns:
+        The force, scalar [N].
+
+    Source: `simulate.surroundings`; positions are a step ahead, see `simulate.record`.
+    """
+    dof, joint = int(f.numbers[PLATE_DOF]), int(f.numbers[PLATE_JOINT])
+    stiffness = field(w.model, f.at_stiffness, joint + 1)[joint]
+    damping = field(w.model, f.at_damping, dof + 1)[dof]
+    speed = w.qvel[dof]
+    place = w.qpos[int(f.numbers[PLATE_QPOS])] - f.timestep * speed
+    return -(stiffness * place + damping * speed)
+
+
+@compiled
+def begin_force(f, e, w):
+    """Draw the forces wanted and when they change.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written.
+        w: World.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    g = e.goal
+    g[_FIRST] = between(e, WEAKEST, STRONGEST)
+    # uniform over what is at least one smallest change away from the first
+    below = max(0.0, g[_FIRST] - _CHANGE - WEAKEST)
+    above = max(0.0, STRONGEST - g[_FIRST] - _CHANGE)
+    place = between(e, 0.0, below + above)
+    g[_SECOND] = WEAKEST + place if place < below else g[_FIRST] + _CHANGE + (place - below)
+    g[_TIME] = between(e, _EARLY, _LATE) * f.horizon * f.ticks * f.period
+    g[_PEAK] = 0.0
+    _read(f, e, w)
+
+
+@compiled
+def _read(f, e, w):
+    """Let the load cell read, if it is due; it is sampled with the other sensors."""
+    e.goal[_FORCE] = plate_force(f, w)
+    if e.tick % f.every == 0:
+        error = between(e, -CELL, CELL) if f.noisy else 0.0
+        e.goal[_READ] = e.goal[_FORCE] + error
+
+
+@compiled
+def tick_force(f, e, w):
+    """Read the load cell and remember the largest force of this step.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written.
+        w: World.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    _read(f, e, w)
+    e.goal[_PEAK] = max(e.goal[_PEAK], e.goal[_FORCE])
+
+
+@compiled
+def force_wanted(g, time):
+    """Force wanted at a time since the start [s], and the time since it was last changed.
+
+    Args:
+        g: (GOAL,) goal of the episode.
+        time: scalar [s].
+
+    Returns:
+        (force [N], time [s]), scalars.
+
+    Source: this module.
+    """
+    if time < g[_TIME]:
+        return g[_FIRST], time
+    return g[_SECOND], time - g[_TIME]
+
+
+@compiled
+def observe_force(f, e, out, at):
+    """Write force read, force wanted and the time since that was changed.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        out: (observations,) float32, written from `at` on.
+        at: scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `force_fields`.
+    """
+    out[at] = e.goal[_READ]
+    out[at + 1], out[at + 2] = force_wanted(e.goal, e.tick * f.period)
+
+
+@compiled
+def judge_force(f, e, w):
+    """Reward of the true force; the episode ends by an overload or away from the plate.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World; `measures` gets the error of the force [N], whether the plate is touched, whether
+            it was overloaded, whether the tip is no longer over it.
+
+    Returns:
+        (reward, whether the episode ends), scalars.
+
+    Source: this module.
+    """
+    g, n = e.goal, f.numbers
+    wanted = force_wanted(g, e.tick * f.period)[0]
+    overload = g[_PEAK] > OVERLOAD
+    aside = math.fabs(e.tip[0] - n[MIDDLE_X]) > n[HALF_X]
+    aside = aside or math.fabs(e.tip[1] - n[MIDDLE_Y]) > n[HALF_Y]
+    g[_PEAK] = 0.0
+    w.measures[0] = g[_FORCE] - wanted
+    w.measures[1] = 1.0 if g[_FORCE] > _TOUCH else 0.0
+    w.measures[2] = 1.0 if overload else 0.0
+    w.measures[3] = 1.0 if aside else 0.0
+    if overload or aside:
+        return FAILURE, True
+    return max(-1.0, 1.0 - abs(g[_FORCE] - wanted) / wanted), False
