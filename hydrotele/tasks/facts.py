@@ -12,7 +12,6 @@ from hydrotele.noise import channel_sensor, converter, sensor_set
 from hydrotele.operate.drive_rows import drive_tables
 from hydrotele.operate.resolved_motion import arm_facts
 from hydrotele.operate.servo import servo_numbers
-from hydrotele.scenario import Servo
 from hydrotele.sensors import SensorSet
 from hydrotele.simulate.feedback import samples_every
 from hydrotele.simulate.layout import field_offsets, verify_layout
@@ -153,7 +152,7 @@ def full_rate(machine: Machine, axis: str) -> float:
 
 def _write_machine(facts: np.ndarray, setup: Setup, columns: list[int]) -> None:
     plant, machine = setup.variants.plant, setup.machine
-    k, servo = len(plant.axes), Servo()
+    k, servo = len(plant.axes), setup.task.servo
     facts["limit"][:k] = [
         drive.command_limit if (drive := machine.axes[name].force) else 1.0 for name in plant.axes
     ]

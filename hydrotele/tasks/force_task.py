@@ -8,6 +8,7 @@ import numpy as np
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine import Machine
 from hydrotele.operate.resolved_motion import arm_facts
+from hydrotele.scenario import Servo
 from hydrotele.surroundings import Plate, Thing
 from hydrotele.tasks.force import force_fields
 from hydrotele.tasks.starts import draw_start
@@ -67,6 +68,7 @@ HOLD_FORCE = Task(
     measures=(("force_error", "N"), ("contact", "1"), ("overload", "1"), ("beside", "1")),
     surroundings=_plate,
     numbers=_numbers,
-    pose_rates=(0.3, 0.1, 0.3, 0.3),  # as `press_stiffness`
+    servo=Servo(position_gain=8.0),  # as `press_stiffness`
+    pose_rates=(0.3, 0.1, 0.3, 0.3, 0.25),  # as `press_stiffness`
 )
 """A force on a plate."""

@@ -31,6 +31,6 @@ STRAIGHT_LINE = Task(
     start=_start,
     fields=line_fields,
     measures=(("cross_track_error", "m"), ("along_track_error", "m"), ("attitude_error", "rad")),
-    pose_rates=(0.9, 0.3, 0.9, 0.4),  # half as much again as the fastest line
+    pose_rates=(0.9, 0.3, 0.9, 0.4, 0.25),  # half as much again as the fastest line
 )
 """A straight line of the tip."""

@@ -3,6 +3,7 @@
 import numpy as np
 
 from hydrotele.machine import Machine
+from hydrotele.scenario import Servo
 from hydrotele.tasks.reach import reach_fields
 from hydrotele.tasks.starts import draw_start
 from hydrotele.tasks.task import Task
@@ -29,6 +30,9 @@ REACH_FELLER = Task(
     start=_start,
     fields=reach_fields,
     measures=(("distance", "m"), ("attitude_error", "rad"), ("success", "1")),
+    servo=Servo(
+        axis_gains={"swing": 1.0, "boom": 2.0}
+    ),  # as in `feller_steps`: a heavy house on soft oil
     pose_rates=(0.5, 0.2, 0.5, 0.2, 0.2),
 )
 """A pose of a feller-buncher's head."""

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.machine import Machine
+from hydrotele.scenario import Servo
 from hydrotele.surroundings import Thing
 from hydrotele.tasks.memory import ACTIONS
 from hydrotele.tasks.observation import Field
@@ -38,6 +39,7 @@ class Task:
         numbers: (machine, MuJoCo model) -> up to NUMBERS that the task's native code reads.
         terrain: cells of the ground's profile, 0 without.
         pose_rates: of the tip at full action: r [m/s], theta [rad/s], z [m/s], attitude, head.
+        servo: gains of the joint servo (`joint_rate`, `resolved_motion`).
     """
 
     name: str
@@ -59,6 +61,7 @@ class Task:
     numbers: Callable[[Machine, mujoco.MjModel], Sequence[float]] | None = None
     terrain: int = 0
     pose_rates: tuple[float, ...] = (0.5, 0.3, 0.5, 0.4, 0.25)
+    servo: Servo = Servo()
 
 
 @dataclasses.dataclass(frozen=True)
