@@ -30,9 +30,7 @@ REACH_FELLER = Task(
     start=_start,
     fields=reach_fields,
     measures=(("distance", "m"), ("attitude_error", "rad"), ("success", "1")),
-    servo=Servo(
-        axis_gains={"swing": 1.0, "boom": 2.0}
-    ),  # as in `feller_steps`: a heavy house on soft oil
+    servo=Servo(axis_gains={"swing": 1.0, "boom": 2.0}),  # heavy on soft oil
     pose_rates=(0.5, 0.2, 0.5, 0.2, 0.2),
 )
 """A pose of a feller-buncher's head."""
