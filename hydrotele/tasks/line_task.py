@@ -10,7 +10,7 @@ from hydrotele.tasks.task import Task
 
 def _start(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
     """The bucket in the air before the machine, about as in Zhu 1994, Figs 6.45-6.48."""
-    return draw_start(machine, chance, (4.5, -0.5, 0.4, -2.0), (7.5, 0.5, 3.0, -1.2))
+    return draw_start(machine, chance, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
 
 
 STRAIGHT_LINE = Task(

@@ -20,7 +20,7 @@ PROGRESS, TIME, SUCCESS = 1.0, 0.01, 10.0  # reward per metre nearer, cost of a 
 LEVER = 1.0  # m: of what a rad of attitude counts
 _RADII, _SWING, _HEIGHTS = (4.5, 9.0), 1.0, (0.8, 4.0)  # m, rad to either side, m
 _ATTITUDE, _HEAD = 0.6, 0.4  # rad to either side of level and straight
-_DRAWS, _TRUE_SIZE = 64, 32  # draws of a pose, the first ones of them wherever it lies
+_DRAWS, _TRUE_SIZE = 140, 100  # draws of a pose, the first ones of them wherever it lies
 _SMALLER = 0.7  # factor of the way from one draw to the next after those
 _TARGET, _HELD, _LEFT = 0, 5, 6  # places in the goal
 
