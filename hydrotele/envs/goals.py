@@ -11,6 +11,8 @@ import numpy as np
 from hydrotele.kinematics.task import task_forward
 from hydrotele.show.markers import Marker, ball, line, polyline
 from hydrotele.tasks.core import TaskCore
+from hydrotele.tasks.force import FORCE_READ, force_wanted
+from hydrotele.tasks.line import SETTLE, line_pose
 from hydrotele.tasks.memory import ARM
 from hydrotele.tasks.track import track_reference
 
@@ -18,6 +20,9 @@ _GOAL = (0.10, 0.75, 0.25, 1.0)  # what is asked for
 _AHEAD = (0.15, 0.45, 0.95, 1.0)  # where that goes
 _OFF = (0.90, 0.15, 0.10, 1.0)  # what is wrong
 _WAY, _PIECES = 3.0, 30  # s of a reference that are shown ahead, lines that show it
+_METRES = 5.0e-5  # m of a bar per N
+_BESIDE = 0.15  # m between the bars of two forces
+_POINTER = 0.8  # m, of an attitude
 
 
 def goal_markers(core: TaskCore, number: int) -> list[Marker]:
@@ -56,4 +61,48 @@ def _track(core: TaskCore, number: int) -> list[Marker]:
     return [ball(way[0], 0.12, _GOAL), off, *polyline(way, 0.025, _AHEAD)]
 
 
-_GOALS: dict[str, Callable[[TaskCore, int], list[Marker]]] = {"track": _track}
+def _line(core: TaskCore, number: int) -> list[Marker]:
+    """The line, the place of the tip on it, and how far off the tip is."""
+    memory = core.memory[number]
+    now, pose, rate = float(memory["tick"]) * core.setup.clock.period, np.zeros(ARM), np.zeros(ARM)
+
+    def place(time: float) -> np.ndarray:
+        line_pose(memory["goal"], time, pose, rate)
+        return place_of_pose(pose)
+
+    end = core.setup.clock.horizon * core.setup.clock.ticks * core.setup.clock.period
+    way = np.array([place(time) for time in np.linspace(SETTLE, end, _PIECES + 1)])
+    wanted = place(now)
+    off = line(memory["tip"], wanted, 0.03, _OFF)
+    return [ball(wanted, 0.12, _GOAL), off, *polyline(way, 0.025, _AHEAD)]
+
+
+def _force(core: TaskCore, number: int) -> list[Marker]:
+    """Bars over the tip: the force wanted, and beside it that which the load cell read."""
+    memory, side = core.memory[number], np.array([0.0, _BESIDE, 0.0])
+    goal, foot = memory["goal"], memory["tip"] + np.array([0.6, 0.0, 0.0])
+    now = float(memory["tick"]) * core.setup.clock.period
+    wanted, _ = force_wanted(goal, now)
+    bars = ((wanted, -side, _GOAL), (float(goal[FORCE_READ]), side, _OFF))
+    return [
+        line(foot + way, foot + way + np.array([0.0, 0.0, _METRES * force]), 0.05, colour)
+        for force, way, colour in bars
+    ]
+
+
+def _reach(core: TaskCore, number: int) -> list[Marker]:
+    """The place wanted, how far off the tip is, and the attitude wanted."""
+    memory = core.memory[number]
+    pose = memory["goal"][:ARM]
+    wanted, level = place_of_pose(pose), math.cos(pose[3])
+    ahead = np.array([level * math.cos(pose[1]), level * math.sin(pose[1]), math.sin(pose[3])])
+    pointer = line(wanted - _POINTER * ahead, wanted, 0.04, _AHEAD)
+    return [ball(wanted, 0.12, _GOAL), line(memory["tip"], wanted, 0.03, _OFF), pointer]
+
+
+_GOALS: dict[str, Callable[[TaskCore, int], list[Marker]]] = {
+    "track": _track,
+    "line": _line,
+    "force": _force,
+    "reach": _reach,
+}

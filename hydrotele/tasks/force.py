@@ -19,7 +19,7 @@ _CHANGE = 5.0e3  # N, smallest change of the force wanted
 _EARLY, _LATE = 0.4, 0.6  # shares of the duration between which it changes
 _TOUCH = 200.0  # N, from which on the plate counts as touched
 _RANGE = 2.0e5  # N, of the load cell
-_FIRST, _SECOND, _TIME, _FORCE, _READ, _PEAK = range(6)  # places in the goal
+_FIRST, _SECOND, _TIME, _FORCE, FORCE_READ, _PEAK = range(6)  # places in the goal
 PLATE_QPOS, PLATE_DOF, PLATE_JOINT, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y = range(7)  # in the numbers
 
 
@@ -85,7 +85,7 @@ def _read(f, e, w):
     e.goal[_FORCE] = plate_force(f, w)
     if e.tick % f.every == 0:
         error = between(e, -CELL, CELL) if f.noisy else 0.0
-        e.goal[_READ] = e.goal[_FORCE] + error
+        e.goal[FORCE_READ] = e.goal[_FORCE] + error
 
 
 @compiled
@@ -139,7 +139,7 @@ def observe_force(f, e, out, at):
 
     Source: `force_fields`.
     """
-    out[at] = e.goal[_READ]
+    out[at] = e.goal[FORCE_READ]
     out[at + 1], out[at + 2] = force_wanted(e.goal, e.tick * f.period)
 
 

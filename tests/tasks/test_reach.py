@@ -27,7 +27,7 @@ def true_pose(core: TaskCore, n: int) -> np.ndarray:
     return pose
 
 
-def left(core: TaskCore) -> np.ndarray:
+def left(core: TaskCore) -> tuple[np.ndarray, np.ndarray]:
     """Distance and largest angle that are left, of all episodes, by places in space."""
     e, target = core.memory, core.memory["goal"][:, :ARM]
     place = np.stack([target[:, 0] * np.cos(target[:, 1]), target[:, 0] * np.sin(target[:, 1]),
