@@ -1,0 +1,33 @@
+"""The batched environments as stable-baselines3 wants them, and learning at its smallest."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="the extra `learn` is not installed")
+
+from hydrotele.envs.stable_baselines import StableVecEnv  # noqa: E402 - after the skip
+from hydrotele.envs.vector import MachineVectorEnv  # noqa: E402 - after the skip
+
+_SHORT = {"variants": 2, "duration": 0.1}
+
+
+def test_steps_and_ends_are_those_of_the_vector_environment():
+    ours = StableVecEnv("TrackTrajectory", 3, 1, **_SHORT)
+    theirs = MachineVectorEnv("TrackTrajectory", 3, None, 1, "SameStep", **_SHORT)
+    ours.seed(5)
+    assert np.array_equal(ours.reset(), theirs.reset(seed=[5, 6, 7])[0])
+    chance = np.random.default_rng(1)
+    for step in range(12):
+        action = chance.uniform(-1, 1, (3, 3)).astype(np.float32)
+        seen, reward, over, infos = ours.step(action)
+        observation, paid, terminated, truncated, told = theirs.step(action)
+        assert np.array_equal(seen, observation)
+        assert np.array_equal(reward, paid.astype(np.float32))
+        assert np.array_equal(over, terminated | truncated)
+        assert over.all() == (step % 5 == 4)
+        for number, info in enumerate(infos):
+            assert bool(info) == over[number]
+            if info:
+                assert info["TimeLimit.truncated"]
+                assert np.array_equal(info["terminal_observation"], told["final_obs"][number])
+                assert info["episode"]["l"] == 5

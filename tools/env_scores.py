@@ -1,0 +1,82 @@
+"""Scores of controllers in the control tasks: reference, zero and random actions.
+
+With ideal and real sensors, on the nominal machine and on machines of `usual_spread`.
+"""
+
+import numpy as np
+from study import options, publish
+
+from hydrotele.machine_file import load_machine
+from hydrotele.tasks.catalogue import TASKS
+from hydrotele.tasks.controllers.catalogue import CONTROLLERS, REFERENCES, make_controller
+from hydrotele.tasks.core import TaskCore
+from hydrotele.tasks.evaluation import SUCCESS, Scores, evaluate
+from hydrotele.tasks.memory import DISABLED
+from hydrotele.tasks.spread import usual_spread
+from hydrotele.tasks.task import REAL, Options
+
+HEAD = """Mean ± standard error over episodes that all controllers share (same seeds and machines);
+`reference` knows the nominal machine and what the observation says. Randomised machines have the
+effects of `hydrotele.tasks.spread.usual_spread`: other dead bands, flows and bandwidths of the
+valves, friction, stiffness of the oil, delay of the commands, payload.
+"""
+
+
+def names(scores: Scores) -> list[str]:
+    """The figures worth a column: of errors the RMS, of what is 0 or 1 the mean at the end."""
+    kept = [name for name in scores.figures if name.endswith("RMS")]
+    flags = [name for name in kept if np.isin(scores.figures[name], (0.0, 1.0)).all()]
+    found = ["return", *(name for name in kept if name not in flags)]
+    found += [name.replace("RMS", "final") for name in flags]
+    return found + [name for name in (SUCCESS,) if name in scores.figures]
+
+
+def row(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def table(name: str, asked) -> list[str]:
+    """Lines of the table of a task."""
+    task = TASKS[name]
+    lines = [f"\n## {name}\n\n{task.sentence} Reward: {task.reward}\n"]
+    spread = usual_spread(load_machine(task.machine, task.tool))
+    actions = asked.actions.split(",") if asked.actions else [task.action]
+    columns: list[str] = []
+    for action in actions:
+        for sensors in ("ideal", REAL):
+            for machine, randomise in (("nominal", ()), ("randomised", spread)):
+                choices = Options(
+                    action=action, sensors=sensors, randomise=randomise, variants=asked.variants
+                )
+                core = TaskCore(task, choices, min(asked.episodes, asked.batch), 0, DISABLED)
+                for kind in CONTROLLERS:
+                    if kind == "reference" and name not in REFERENCES:
+                        continue
+                    controller = make_controller(kind, core.setup)
+                    scores = evaluate(core, controller, asked.episodes, asked.seed)
+                    if not columns:
+                        columns = names(scores)
+                        heads = [f"{column} [{scores.units[column]}]" for column in columns]
+                        heads = ["actions", "sensors", "machine", "controller", *heads]
+                        lines += [row(heads), row(["---"] * len(heads))]
+                    cells = [f"{scores.mean(c):.4g} ± {scores.error(c):.1g}" for c in columns]
+                    lines.append(row([action, sensors, machine, kind, *cells]))
+                core.close()
+    return lines
+
+
+def main() -> None:
+    asked = options(
+        __doc__, tasks="all", actions="", episodes=64, batch=64, variants=32, seed=10**6
+    )
+    chosen = list(TASKS) if asked.tasks == "all" else asked.tasks.split(",")
+    if strange := sorted(set(chosen) - set(TASKS)):
+        raise SystemExit(f"--tasks {strange[0]}: choose of {', '.join(TASKS)}")
+    lines = [HEAD]
+    for name in chosen:
+        lines += table(name, asked)
+    publish("\n".join(lines) + "\n", "Scores of controllers in the control tasks", asked)
+
+
+if __name__ == "__main__":
+    main()
