@@ -9,7 +9,7 @@ code. `gymnasium.make("hydrotele.envs:hydrotele/TrackTrajectory-v0")` imports it
 from gymnasium.envs.registration import register
 
 TASK_NAMES = (
-    "TrackTrajectory", "StraightLine", "HoldForce", "ReachFeller",
+    "TrackTrajectory", "StraightLine", "HoldForce", "ReachFeller", "Grade",
 )  # fmt: skip
 
 for _name in TASK_NAMES:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from hydrotele.envs.bed_markers import bed_markers, plane_markers
 from hydrotele.kinematics.task import task_forward
 from hydrotele.show.markers import Marker, ball, line, polyline
 from hydrotele.tasks.core import TaskCore
@@ -100,9 +101,15 @@ def _reach(core: TaskCore, number: int) -> list[Marker]:
     return [ball(wanted, 0.12, _GOAL), line(memory["tip"], wanted, 0.03, _OFF), pointer]
 
 
+def _grade(core: TaskCore, number: int) -> list[Marker]:
+    """The soil, and the plane that it shall have."""
+    return [*bed_markers(core, number), *plane_markers(core, number, _GOAL)]
+
+
 _GOALS: dict[str, Callable[[TaskCore, int], list[Marker]]] = {
     "track": _track,
     "line": _line,
     "force": _force,
     "reach": _reach,
+    "grade": _grade,
 }

@@ -18,8 +18,9 @@ _AHEAD = 0.2  # rad or m by which a reference may lead its joint: a stalled arm 
 
 
 @compiled
-def _limited(value):
-    return min(1.0, max(-1.0, value))
+def _asked(f, action, a):
+    """An action as it counts."""
+    return 0.0 if a == f.locked else min(1.0, max(-1.0, action[a]))
 
 
 @compiled
@@ -32,7 +33,7 @@ def _joint_rates(f, e, action, first):
     """Move the references of axes by their own rates; actions from `first` on."""
     for a in range(first, f.actions):
         i = f.driven_axis[a]
-        goal = _limited(action[a]) * f.fastest[i]
+        goal = _asked(f, action, a) * f.fastest[i]
         rate = _towards(e.reference_rate[i], goal, f.acceleration * f.period)
         place = e.reference[i] + f.period * rate
         low = max(f.ranges[i, 0], e.joint[i] - _AHEAD)
@@ -49,7 +50,7 @@ def _pose_rates(f, e, action):
     for c in range(ARM):
         goal = 0.0
         if c < k:
-            goal = _limited(action[c]) * f.fastest_pose[c]
+            goal = _asked(f, action, c) * f.fastest_pose[c]
         e.pose_rate[c] = _towards(e.pose_rate[c], goal, f.accelerations[c] * f.period)
         wanted[c] = e.pose[c] + f.period * e.pose_rate[c]
     far = False
@@ -86,7 +87,7 @@ def act(f, e, action):
     if f.mode == VALVE:
         for a in range(f.actions):
             i = f.driven_axis[a]
-            e.command[i] = _limited(action[a]) * f.limit[i]
+            e.command[i] = _asked(f, action, a) * f.limit[i]
         return
     if f.mode == RESOLVED_MOTION:
         _pose_rates(f, e, action)

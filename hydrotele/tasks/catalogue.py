@@ -4,6 +4,7 @@ import numpy as np
 
 from hydrotele.machine import Machine
 from hydrotele.tasks.force_task import HOLD_FORCE
+from hydrotele.tasks.grade_task import GRADE
 from hydrotele.tasks.line_task import STRAIGHT_LINE
 from hydrotele.tasks.reach_task import REACH_FELLER
 from hydrotele.tasks.task import Task
@@ -36,6 +37,7 @@ TASKS = {
         STRAIGHT_LINE,
         HOLD_FORCE,
         REACH_FELLER,
+        GRADE,
     )
 }
 """Tasks by name."""

@@ -5,14 +5,16 @@ is its place in KINDS.
 """
 
 from hydrotele.compiled import compiled
+from hydrotele.tasks.bed import tick_bed
 from hydrotele.tasks.force import begin_force, judge_force, observe_force, tick_force
+from hydrotele.tasks.grade import begin_grade, judge_grade, observe_grade
 from hydrotele.tasks.line import begin_line, judge_line, observe_line
 from hydrotele.tasks.observation import observe_machine
 from hydrotele.tasks.reach import begin_reach, judge_reach, observe_reach
 from hydrotele.tasks.track import begin_track, judge_track, observe_track
 
-KINDS = ("track", "line", "force", "reach")
-_TRACK, _LINE, _FORCE, _REACH = range(4)
+KINDS = ("track", "line", "force", "reach", "grade")
+_TRACK, _LINE, _FORCE, _REACH, _GRADE = range(5)
 
 
 @compiled
@@ -37,6 +39,8 @@ def begin_task(f, e, w):
         begin_force(f, e, w)
     elif f.kind == _REACH:
         begin_reach(f, e)
+    elif f.kind == _GRADE:
+        begin_grade(f, e, w)
 
 
 @compiled
@@ -55,6 +59,8 @@ def tick_task(f, e, w):
     """
     if f.kind == _FORCE:
         tick_force(f, e, w)
+    elif f.kind == _GRADE:
+        tick_bed(f, e, w)
 
 
 @compiled
@@ -81,6 +87,8 @@ def observe_task(f, e, w, out):
         observe_force(f, e, out, at)
     elif f.kind == _REACH:
         observe_reach(f, e, out, at)
+    elif f.kind == _GRADE:
+        observe_grade(f, e, w, out, at)
 
 
 @compiled
@@ -105,4 +113,6 @@ def judge_task(f, e, w):
         return judge_force(f, e, w)
     if f.kind == _REACH:
         return judge_reach(f, e, w)
+    if f.kind == _GRADE:
+        return judge_grade(f, e, w)
     return 0.0, False

@@ -79,6 +79,7 @@ FACTS = np.dtype(
         ("acceleration", _F),  # of joint rates at most [rad/s^2], [m/s^2]
         ("axes_driven", _I),
         ("driven_axis", _I, AXES),  # axes that actions move; those of the arm come first
+        ("locked", _I),  # action that does nothing, -1 without
         ("qpos", _I, AXES),  # place of every axis' joint
         ("dof", _I, AXES),
         ("nq", _I),
@@ -86,6 +87,7 @@ FACTS = np.dtype(
         ("na", _I),
         ("nbody", _I),
         ("tip_site", _I),
+        ("tip_body", _I),
         ("closed", _I, AXES),  # whether the servo drives the axis
         ("fastest", _F, AXES),  # rates at full action [rad/s], [m/s]
         ("fastest_pose", _F, ARM),  # the same of the pose [m/s], [rad/s]
@@ -138,6 +140,7 @@ FACTS = np.dtype(
         ("at_site", _I),
         ("at_xfrc", _I),
         ("at_xpos", _I),
+        ("at_xipos", _I),
         ("at_xmat", _I),
         ("at_warning", _I),
         ("at_eq_active", _I),

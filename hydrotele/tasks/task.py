@@ -37,7 +37,8 @@ class Task:
         surroundings: (machine, random generator, start) -> what stands around.
         ground: whether there is a hard ground.
         numbers: (machine, MuJoCo model) -> up to NUMBERS that the task's native code reads.
-        terrain: cells of the ground's profile, 0 without.
+        terrain: floats that an episode keeps of its ground, 0 without.
+        swing_locked: whether the swing's action does nothing.
         pose_rates: of the tip at full action: r [m/s], theta [rad/s], z [m/s], attitude, head.
         servo: gains of the joint servo (`joint_rate`, `resolved_motion`).
     """
@@ -60,6 +61,7 @@ class Task:
     ground: bool = False
     numbers: Callable[[Machine, mujoco.MjModel], Sequence[float]] | None = None
     terrain: int = 0
+    swing_locked: bool = False
     pose_rates: tuple[float, ...] = (0.5, 0.3, 0.5, 0.4, 0.25)
     servo: Servo = Servo()
 

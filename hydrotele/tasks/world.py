@@ -24,8 +24,9 @@ class World(NamedTuple):
         tip: (3,) place of the arm's tip at the time of the activations [m].
         xfrc: (6 nbody,) forces and torques from outside on bodies, world frame [N], [N m].
         xpos: (3 nbody,) places of bodies [m], of the last physics step.
+        xipos: (3 nbody,) places of their centres of mass [m].
         xmat: (9 nbody,) their rotation matrices.
-        terrain: (width,) heights of the ground [m], empty without.
+        terrain: (width,) what the episode keeps of its ground, empty without.
         measures: (MEASURES,) figures of this step, for `info`.
         model: address of mjModel.
         data: address of mjData.
@@ -38,6 +39,7 @@ class World(NamedTuple):
     tip: np.ndarray
     xfrc: np.ndarray
     xpos: np.ndarray
+    xipos: np.ndarray
     xmat: np.ndarray
     terrain: np.ndarray
     measures: np.ndarray
@@ -70,6 +72,7 @@ def world(f, m, d, sim):
         floats(place + 24 * site, 3),
         field(d, f.at_xfrc, 6 * f.nbody),
         field(d, f.at_xpos, 3 * f.nbody),
+        field(d, f.at_xipos, 3 * f.nbody),
         field(d, f.at_xmat, 9 * f.nbody),
         floats(f.terrain + 8 * sim * f.width, f.width),
         floats(f.measures + 8 * sim * MEASURES, MEASURES),

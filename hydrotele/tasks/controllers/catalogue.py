@@ -5,11 +5,13 @@ from collections.abc import Callable
 from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
 from hydrotele.tasks.controllers.controller import Controller, Random, Zero
+from hydrotele.tasks.controllers.grade import grade_controller
 from hydrotele.tasks.controllers.track import track_controller
 from hydrotele.tasks.facts import Setup
 
 REFERENCES: dict[str, Callable[[Setup], Controller]] = {
     "TrackTrajectory": track_controller,
+    "Grade": grade_controller,
 }
 """Task -> what a good engineer would write for it, for every kind of actions that suits it."""
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from hydrotele.compiled import compiled
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import task_forward, task_inverse
 from hydrotele.operate.drive_rows import drive_row
 from hydrotele.operate.servo import servo_step
 
@@ -62,3 +62,28 @@ def forward_rows(arm, q, pose):
     """
     for i in range(len(q)):
         task_forward(arm, q[i], pose[i])
+
+
+@compiled
+def inverse_rows(arm, ranges, pose, q):
+    """Joint angles of n episodes for poses of the tip; those out of reach keep their angles.
+
+    Args:
+        arm: (9,) of `kinematics.task.task_numbers`.
+        ranges: (k, 2) of the joints [rad].
+        pose: (n, 5) r [m], theta [rad], z [m], attitude [rad], head [rad].
+        q: (n, k) joint angles, updated [rad].
+
+    Returns:
+        Nothing.
+
+    Source: `kinematics.task.task_inverse`.
+    """
+    k = q.shape[1]
+    found = np.empty(k)
+    for i in range(len(q)):
+        good = task_inverse(arm, pose[i], q[i, 0], found) == 0
+        for j in range(k):
+            good = good and ranges[j, 0] <= found[j] <= ranges[j, 1]
+        if good:
+            q[i] = found

@@ -1,0 +1,203 @@
+"""Grading: a low bank of soil with mounds is cut down to a plane, and the soil carried away."""
+
+import math
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.kinematics.task import task_forward
+from hydrotele.machine import Machine
+from hydrotele.soil.numbers import FORCE_R, FORCE_Z, MASS
+from hydrotele.soil.terrain import surface_height
+from hydrotele.tasks.bed import CELL, CELLS, START, lay_bed, result_of, soil_of, surface_of
+from hydrotele.tasks.chance import between, draw
+from hydrotele.tasks.memory import ARM
+from hydrotele.tasks.observation import Field, reach
+
+NEAR, FAR = 3.8, 5.8  # m, radii between which the ground is graded
+POINTS = 20  # means of the profile that are observed
+MIDDLE = 0.5 * (NEAR + FAR)  # m, where the height of the plane is told
+GRADED = 0.03  # m of error that counts as graded
+HOLD = 1.0  # s for which it must
+DEEPEST = 0.5  # m below the plane, at which the episode has failed
+SCALE = 0.01  # m of error less that pays 1
+TIME_COST = 0.05  # per s
+SUCCESS, FAILURE = 5.0, -5.0  # rewards at the end
+SCANNER = 0.01  # m, largest error of a mean of the profile as read, assumed
+SCALES = 30.0  # kg, of the mass carried as read, assumed
+_LEVEL = (0.15, 0.45)  # m, heights of the ground over what the machine stands on
+_SLOPE = 0.06  # rad
+_DOWN = (0.02, 0.08)  # m from the ground to the plane
+_HIGH, _LOW = (0.12, 0.30), (0.0, 0.10)  # m, heights of two mounds
+_LONG = (0.7, 1.3)  # m, half their lengths
+_MOST = 4000.0  # kg
+PLANE, TILT, ERROR, HELD, SOIL = range(5)  # places in the goal
+FIRST, LAST = round((NEAR - START) / CELL), round((FAR - START) / CELL)  # cells
+_EACH = (LAST - FIRST) // POINTS  # cells of a point
+assert 0 <= FIRST < LAST <= CELLS and _EACH * POINTS == LAST - FIRST
+
+
+def grade_radii() -> list[float]:
+    """Radii of the middles of the parts whose means are observed [m]."""
+    return [NEAR + (FAR - NEAR) * (p + 0.5) / POINTS for p in range(POINTS)]
+
+
+def grade_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+    """What `observe_grade` writes: errors of the profile, the edge over it, load, plane."""
+    far = reach(machine)
+    fields = [Field(f"profile_error.{p}", "m", -1.0, 2.0) for p in range(POINTS)]
+    return [
+        *fields,
+        Field("edge_height", "m", -2.0, far),
+        Field("carried_mass", "kg", -SCALES, _MOST),
+        Field("plane_height", "m", -1.0, 1.0),
+        Field("plane_slope", "rad", -0.1, 0.1),
+    ]
+
+
+@compiled
+def plane_height(g, r):
+    """Height that the ground shall have at a radius.
+
+    Args:
+        g: (GOAL,) goal of the episode.
+        r: radius, scalar [m].
+
+    Returns:
+        height, scalar [m].
+
+    Source: this module.
+    """
+    return g[PLANE] + math.tan(g[TILT]) * (r - MIDDLE)
+
+
+@compiled
+def profile_error(g, surface, first, last):
+    """Mean and root mean square of the ground's height over the plane in some cells.
+
+    Args:
+        g: (GOAL,) goal of the episode.
+        surface: (CELLS,) heights [m].
+        first: cell, scalar [1].
+        last: the cell after the last one, scalar [1].
+
+    Returns:
+        (mean, root mean square), scalars [m].
+
+    Source: this module.
+    """
+    total, square = 0.0, 0.0
+    for i in range(first, last):
+        over = surface[i] - plane_height(g, START + (i + 0.5) * CELL)
+        total += over
+        square += over * over
+    return total / (last - first), math.sqrt(square / (last - first))
+
+
+@compiled
+def _heap(surface, middle, half, height):
+    """Add a mound in the form of a raised cosine."""
+    for i in range(len(surface)):
+        place = (START + (i + 0.5) * CELL - middle) / half
+        if abs(place) < 1.0:
+            surface[i] += 0.5 * height * (1.0 + math.cos(math.pi * place))
+
+
+@compiled
+def begin_grade(f, e, w):
+    """Draw the soil, the ground and the plane.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written.
+        w: World; `terrain` and the first `measures` are written.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    g = e.goal
+    soils = int(f.numbers[len(f.numbers) - 1])
+    soil = int(draw(e) * soils)
+    g[SOIL] = soil
+    lay_bed(f, w, soil)
+    ground = between(e, _LEVEL[0], _LEVEL[1])
+    g[TILT] = between(e, -_SLOPE, _SLOPE)
+    g[PLANE] = ground
+    surface = surface_of(w)
+    for i in range(CELLS):
+        surface[i] = plane_height(g, START + (i + 0.5) * CELL)
+    g[PLANE] = ground - between(e, _DOWN[0], _DOWN[1])
+    half = between(e, _LONG[0], _LONG[1])
+    _heap(surface, between(e, NEAR + 0.3, FAR - 0.3), half, between(e, _HIGH[0], _HIGH[1]))
+    half = between(e, _LONG[0], _LONG[1])
+    _heap(surface, between(e, NEAR, FAR), half, between(e, _LOW[0], _LOW[1]))
+    g[ERROR], g[HELD] = profile_error(g, surface, FIRST, LAST)[1], 0.0
+    w.measures[0], w.measures[3] = g[ERROR], g[SOIL]
+
+
+@compiled
+def observe_grade(f, e, w, out, at):
+    """Write errors of the profile, the edge over it, the mass carried and the plane.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World.
+        out: (observations,) float32, written from `at` on.
+        at: scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `grade_fields`; the edge is where the sensors say.
+    """
+    g, surface = e.goal, surface_of(w)
+    pose = np.empty(ARM)
+    task_forward(f.arm, e.joint[: f.arm_axes], pose)
+    scan, scales = (SCANNER, SCALES) if f.noisy else (0.0, 0.0)
+    for p in range(POINTS):
+        first = FIRST + p * _EACH
+        mean = profile_error(g, surface, first, first + _EACH)[0]
+        out[at + p] = mean + (between(e, -scan, scan) if f.noisy else 0.0)
+    height = surface_height(soil_of(w), surface, pose[0])
+    out[at + POINTS] = pose[2] - height - (between(e, -scan, scan) if f.noisy else 0.0)
+    load = result_of(w)[MASS]
+    out[at + POINTS + 1] = load + (between(e, -scales, scales) if f.noisy else 0.0)
+    out[at + POINTS + 2] = g[PLANE]
+    out[at + POINTS + 3] = g[TILT]
+
+
+@compiled
+def judge_grade(f, e, w):
+    """Pay every centimetre that the ground comes nearer to the plane; time costs.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written.
+        w: World; `measures` gets the error [m], mass carried [kg], force of the soil [N], number
+            of the soil, whether the ground is graded, whether it was spoiled.
+
+    Returns:
+        (reward, whether the episode ends), scalars.
+
+    Source: this module.
+    """
+    g, out = e.goal, result_of(w)
+    dt = f.ticks * f.period
+    error = profile_error(g, surface_of(w), FIRST, LAST)[1]
+    reward = (g[ERROR] - error) / SCALE - TIME_COST * dt
+    g[ERROR] = error
+    g[HELD] = g[HELD] + dt if error < GRADED else 0.0
+    graded = g[HELD] >= HOLD - 0.5 * dt
+    spoiled = w.tip[2] < plane_height(g, math.hypot(w.tip[0], w.tip[1])) - DEEPEST
+    w.measures[0] = error
+    w.measures[1] = out[MASS]
+    w.measures[2] = math.hypot(out[FORCE_R], out[FORCE_Z])
+    w.measures[3] = g[SOIL]
+    w.measures[4] = 1.0 if graded else 0.0
+    w.measures[5] = 1.0 if spoiled else 0.0
+    if spoiled:
+        return reward + FAILURE, True
+    return (reward + SUCCESS, True) if graded else (reward, False)
