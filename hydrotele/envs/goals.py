@@ -10,7 +10,7 @@ import numpy as np
 
 from hydrotele.envs.bed_markers import bed_markers, plane_markers
 from hydrotele.kinematics.task import task_forward
-from hydrotele.show.markers import Marker, ball, line, polyline
+from hydrotele.show.markers import Marker, arrow, ball, line, polyline
 from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.force import FORCE_READ, force_wanted
 from hydrotele.tasks.line import SETTLE, line_pose
@@ -21,8 +21,9 @@ _GOAL = (0.10, 0.75, 0.25, 1.0)  # what is asked for
 _AHEAD = (0.15, 0.45, 0.95, 1.0)  # where that goes
 _OFF = (0.90, 0.15, 0.10, 1.0)  # what is wrong
 _WAY, _PIECES = 3.0, 30  # s of a reference that are shown ahead, lines that show it
-_METRES = 5.0e-5  # m of a bar per N
-_BESIDE = 0.15  # m between the bars of two forces
+_BALL, _THICK, _THIN = 0.15, 0.045, 0.035  # m
+_METRES = 7.0e-5  # m of an arrow per N
+_BESIDE = 0.3  # m between the arrows of two forces
 _POINTER = 0.8  # m, of an attitude
 
 
@@ -58,8 +59,8 @@ def _track(core: TaskCore, number: int) -> list[Marker]:
         return place_of_pose(pose)
 
     way = np.array([place(now + ahead) for ahead in np.linspace(0.0, _WAY, _PIECES + 1)])
-    off = line(memory["tip"], way[0], 0.03, _OFF)
-    return [ball(way[0], 0.12, _GOAL), off, *polyline(way, 0.025, _AHEAD)]
+    off = line(memory["tip"], way[0], _THICK, _OFF)
+    return [ball(way[0], _BALL, _GOAL), off, *polyline(way, _THIN, _AHEAD)]
 
 
 def _line(core: TaskCore, number: int) -> list[Marker]:
@@ -74,20 +75,21 @@ def _line(core: TaskCore, number: int) -> list[Marker]:
     end = core.setup.clock.horizon * core.setup.clock.ticks * core.setup.clock.period
     way = np.array([place(time) for time in np.linspace(SETTLE, end, _PIECES + 1)])
     wanted = place(now)
-    off = line(memory["tip"], wanted, 0.03, _OFF)
-    return [ball(wanted, 0.12, _GOAL), off, *polyline(way, 0.025, _AHEAD)]
+    off = line(memory["tip"], wanted, _THICK, _OFF)
+    return [ball(wanted, _BALL, _GOAL), off, *polyline(way, _THIN, _AHEAD)]
 
 
 def _force(core: TaskCore, number: int) -> list[Marker]:
-    """Bars over the tip: the force wanted, and beside it that which the load cell read."""
-    memory, side = core.memory[number], np.array([0.0, _BESIDE, 0.0])
-    goal, foot = memory["goal"], memory["tip"] + np.array([0.6, 0.0, 0.0])
+    """Arrows on the plate before the tip: the force wanted, and that which the load cell read."""
+    memory, side = core.memory[number], np.array([0.0, 0.5 * _BESIDE, 0.0])
+    goal, foot = memory["goal"], memory["tip"] - np.array([0.6, 0.0, 0.0])
     now = float(memory["tick"]) * core.setup.clock.period
     wanted, _ = force_wanted(goal, now)
-    bars = ((wanted, -side, _GOAL), (float(goal[FORCE_READ]), side, _OFF))
+    up = np.array([0.0, 0.0, _METRES])
+    pushes = ((wanted, -side, _GOAL), (float(goal[FORCE_READ]), side, _OFF))
     return [
-        line(foot + way, foot + way + np.array([0.0, 0.0, _METRES * force]), 0.05, colour)
-        for force, way, colour in bars
+        arrow(foot + way + max(0.0, force) * up, foot + way, 1.5 * _THICK, colour)
+        for force, way, colour in pushes
     ]
 
 
@@ -97,8 +99,8 @@ def _reach(core: TaskCore, number: int) -> list[Marker]:
     pose = memory["goal"][:ARM]
     wanted, level = place_of_pose(pose), math.cos(pose[3])
     ahead = np.array([level * math.cos(pose[1]), level * math.sin(pose[1]), math.sin(pose[3])])
-    pointer = line(wanted - _POINTER * ahead, wanted, 0.04, _AHEAD)
-    return [ball(wanted, 0.12, _GOAL), line(memory["tip"], wanted, 0.03, _OFF), pointer]
+    pointer = line(wanted - _POINTER * ahead, wanted, _THICK, _AHEAD)
+    return [ball(wanted, _BALL, _GOAL), line(memory["tip"], wanted, _THICK, _OFF), pointer]
 
 
 def _grade(core: TaskCore, number: int) -> list[Marker]:
