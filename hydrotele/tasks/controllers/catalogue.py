@@ -6,12 +6,17 @@ from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
 from hydrotele.tasks.controllers.controller import Controller, Random, Zero
 from hydrotele.tasks.controllers.grade import grade_controller
+from hydrotele.tasks.controllers.press import press_controller
+from hydrotele.tasks.controllers.tip import line_controller, reach_controller
 from hydrotele.tasks.controllers.track import track_controller
 from hydrotele.tasks.facts import Setup
 
 REFERENCES: dict[str, Callable[[Setup], Controller]] = {
     "TrackTrajectory": track_controller,
     "Grade": grade_controller,
+    "StraightLine": line_controller,
+    "HoldForce": press_controller,
+    "ReachFeller": reach_controller,
 }
 """Task -> what a good engineer would write for it, for every kind of actions that suits it."""
 
