@@ -10,6 +10,7 @@ from gymnasium.envs.registration import register
 
 TASK_NAMES = (
     "TrackTrajectory", "StraightLine", "HoldForce", "ReachFeller", "Grade",
+    "PlaceLog",
 )  # fmt: skip
 
 for _name in TASK_NAMES:

@@ -13,8 +13,10 @@ from hydrotele.kinematics.task import task_forward
 from hydrotele.show.markers import Marker, arrow, ball, line, polyline
 from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.force import FORCE_READ, force_wanted
+from hydrotele.tasks.grapple import HALF_LENGTH, RADIUS
 from hydrotele.tasks.line import SETTLE, line_pose
 from hydrotele.tasks.memory import ARM
+from hydrotele.tasks.place import GOAL_PLACE
 from hydrotele.tasks.track import track_reference
 
 _GOAL = (0.10, 0.75, 0.25, 1.0)  # what is asked for
@@ -108,10 +110,23 @@ def _grade(core: TaskCore, number: int) -> list[Marker]:
     return [*bed_markers(core, number), *plane_markers(core, number, _GOAL)]
 
 
+def _place(core: TaskCore, number: int) -> list[Marker]:
+    """The log's middle line where it shall lie, and its rim on the ground."""
+    x, y, yaw = core.memory[number]["goal"][GOAL_PLACE]
+    radius, half = core.facts["numbers"][RADIUS], core.facts["numbers"][HALF_LENGTH]
+    way = np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    aside = radius * np.array([-math.sin(yaw), math.cos(yaw), 0.0])
+    middle = np.array([x, y, 0.02])
+    ends = [middle + half * a * way + b * aside for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+    rim = polyline(np.array([*ends, ends[0]]), 0.03, _GOAL)
+    return [*rim, line(middle - half * way, middle + half * way, 0.03, _GOAL)]
+
+
 _GOALS: dict[str, Callable[[TaskCore, int], list[Marker]]] = {
     "track": _track,
     "line": _line,
     "force": _force,
     "reach": _reach,
     "grade": _grade,
+    "place": _place,
 }

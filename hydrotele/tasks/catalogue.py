@@ -6,6 +6,7 @@ from hydrotele.machine import Machine
 from hydrotele.tasks.force_task import HOLD_FORCE
 from hydrotele.tasks.grade_task import GRADE
 from hydrotele.tasks.line_task import STRAIGHT_LINE
+from hydrotele.tasks.place_task import PLACE_LOG
 from hydrotele.tasks.reach_task import REACH_FELLER
 from hydrotele.tasks.task import Task
 from hydrotele.tasks.track import track_fields
@@ -38,6 +39,7 @@ TASKS = {
         HOLD_FORCE,
         REACH_FELLER,
         GRADE,
+        PLACE_LOG,
     )
 }
 """Tasks by name."""

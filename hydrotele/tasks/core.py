@@ -134,6 +134,8 @@ class TaskCore:
             ("sensed", self._sensed), ("places", self._places), ("terrain", self.terrain),
         ):  # fmt: skip
             f[name] = array.ctypes.data
+        if "eq_data" in self._expanded:
+            f["eq_rows"] = self._expanded["eq_data"].ctypes.data
 
     @property
     def coordinates(self) -> tuple[str, ...]:

@@ -123,6 +123,7 @@ def make_facts(setup: Setup, count: int, autoreset: int) -> np.ndarray:
     facts["tip_body"] = model.site("tip").bodyid[0]
     theta = 1 if options.action == "resolved_motion" else 0  # place of the swing among actions
     facts["locked"] = theta if task.swing_locked else -1
+    facts["neq"], facts["eq_width"] = model.eq_data.shape
     facts["variants"], facts["states"] = setup.variants.states.shape
     facts["width"] = task.terrain
     if task.numbers:
@@ -197,8 +198,8 @@ def _write_layout(facts: np.ndarray) -> None:
     for name, member in (
         ("at_qpos", "qpos"), ("at_qvel", "qvel"), ("at_act", "act"), ("at_ctrl", "ctrl"),
         ("at_site", "site_xpos"), ("at_xfrc", "xfrc_applied"), ("at_xpos", "xpos"),
-        ("at_xipos", "xipos"), ("at_xmat", "xmat"), ("at_warning", "warning"),
-        ("at_eq_active", "eq_active"),
+        ("at_xipos", "xipos"), ("at_xquat", "xquat"), ("at_xmat", "xmat"),
+        ("at_warning", "warning"), ("at_eq_active", "eq_active"),
     ):  # fmt: skip
         facts[name] = data[member]
     for name, member in (

@@ -8,13 +8,15 @@ from hydrotele.compiled import compiled
 from hydrotele.tasks.bed import tick_bed
 from hydrotele.tasks.force import begin_force, judge_force, observe_force, tick_force
 from hydrotele.tasks.grade import begin_grade, judge_grade, observe_grade
+from hydrotele.tasks.grapple import tick_grapple
 from hydrotele.tasks.line import begin_line, judge_line, observe_line
 from hydrotele.tasks.observation import observe_machine
+from hydrotele.tasks.place import begin_place, judge_place, observe_place
 from hydrotele.tasks.reach import begin_reach, judge_reach, observe_reach
 from hydrotele.tasks.track import begin_track, judge_track, observe_track
 
-KINDS = ("track", "line", "force", "reach", "grade")
-_TRACK, _LINE, _FORCE, _REACH, _GRADE = range(5)
+KINDS = ("track", "line", "force", "reach", "grade", "place")
+_TRACK, _LINE, _FORCE, _REACH, _GRADE, _PLACE = range(6)
 
 
 @compiled
@@ -41,6 +43,8 @@ def begin_task(f, e, w):
         begin_reach(f, e)
     elif f.kind == _GRADE:
         begin_grade(f, e, w)
+    elif f.kind == _PLACE:
+        begin_place(f, e, w)
 
 
 @compiled
@@ -61,6 +65,8 @@ def tick_task(f, e, w):
         tick_force(f, e, w)
     elif f.kind == _GRADE:
         tick_bed(f, e, w)
+    elif f.kind == _PLACE:
+        tick_grapple(f, e, w)
 
 
 @compiled
@@ -89,6 +95,8 @@ def observe_task(f, e, w, out):
         observe_reach(f, e, out, at)
     elif f.kind == _GRADE:
         observe_grade(f, e, w, out, at)
+    elif f.kind == _PLACE:
+        observe_place(f, e, w, out, at)
 
 
 @compiled
@@ -115,4 +123,6 @@ def judge_task(f, e, w):
         return judge_reach(f, e, w)
     if f.kind == _GRADE:
         return judge_grade(f, e, w)
+    if f.kind == _PLACE:
+        return judge_place(f, e, w)
     return 0.0, False

@@ -86,6 +86,8 @@ FACTS = np.dtype(
         ("nv", _I),
         ("na", _I),
         ("nbody", _I),
+        ("neq", _I),  # equalities of the model
+        ("eq_width", _I),  # numbers of each
         ("tip_site", _I),
         ("tip_body", _I),
         ("closed", _I, AXES),  # whether the servo drives the axis
@@ -130,6 +132,7 @@ FACTS = np.dtype(
         ("sensed", _I),  # (n, delayed_sensor, CHANNELS) ring
         ("places", _I),  # (fields, 3): address for all variants, address for all n, floats in each
         ("terrain", _I),  # (n, width)
+        ("eq_rows", _I),  # (n, neq eq_width) of every simulation, 0 where no task writes them
         ("mj_step", _I),
         ("mj_set_state", _I),
         # where mjData and mjModel keep their members [byte]
@@ -141,6 +144,7 @@ FACTS = np.dtype(
         ("at_xfrc", _I),
         ("at_xpos", _I),
         ("at_xipos", _I),
+        ("at_xquat", _I),
         ("at_xmat", _I),
         ("at_warning", _I),
         ("at_eq_active", _I),

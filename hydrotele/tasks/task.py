@@ -39,6 +39,7 @@ class Task:
         numbers: (machine, MuJoCo model) -> up to NUMBERS that the task's native code reads.
         terrain: floats that an episode keeps of its ground, 0 without.
         swing_locked: whether the swing's action does nothing.
+        writes: fields of the model that its native code writes; a new episode has them anew.
         pose_rates: of the tip at full action: r [m/s], theta [rad/s], z [m/s], attitude, head.
         servo: gains of the joint servo (`joint_rate`, `resolved_motion`).
     """
@@ -59,9 +60,10 @@ class Task:
         lambda *_: ()
     )
     ground: bool = False
-    numbers: Callable[[Machine, mujoco.MjModel], Sequence[float]] | None = None
+    numbers: Callable[[Machine, mujoco.MjModel], Sequence[float] | np.ndarray] | None = None
     terrain: int = 0
     swing_locked: bool = False
+    writes: tuple[str, ...] = ()
     pose_rates: tuple[float, ...] = (0.5, 0.3, 0.5, 0.4, 0.25)
     servo: Servo = Servo()
 

@@ -37,7 +37,7 @@ class Variants:
         surroundings: what stands around each of them.
         states: (v, s) complete states at the starts, as `begin_leapfrog` leaves them.
         tips: (v, 3) places of the tip there [m].
-        fields: field of the model -> (v, size) where they differ.
+        fields: field of the model -> (v, size), where they differ or the task writes them.
         scales: (v, CHANNELS) of the sensors.
         offsets: (v, CHANNELS).
         lags: (v, CHANNELS) delays of the sensors [s].
@@ -102,7 +102,7 @@ def _make(task: Task, options: Options, nominal: Machine) -> Variants:
         tips.append(data.site("tip").xpos.copy())
     return Variants(
         plants[0], tuple(machines), tuple(plant.surroundings for plant in plants),
-        np.array(states), np.array(tips), _differing(plants),
+        np.array(states), np.array(tips), _differing(plants, task.writes),
         *_sensor_tables(plants[0], machines), _delays(plants[0], machines),
     )  # fmt: skip
 
@@ -146,15 +146,15 @@ def _range(effect: Mapping[str, Any], key: str, value: Any) -> tuple[float, floa
     return low, high
 
 
-def _differing(plants: list[Plant]) -> dict[str, np.ndarray]:
-    """Fields of the models that are not the same in all of them."""
+def _differing(plants: list[Plant], also: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Fields of the models that are not the same in all of them, and some that may be."""
     first, fields = plants[0].model, {}
     distinct = list({id(plant): plant for plant in plants}.values())
     for name in sorted(MODEL_FIELDS):
         values = [np.asarray(_of(plant.model, name)) for plant in distinct]
         if any(value.shape != values[0].shape for value in values):
             raise _structure(name)
-        if all(np.array_equal(value, values[0]) for value in values):
+        if name not in also and all(np.array_equal(value, values[0]) for value in values):
             continue
         if values[0].dtype != np.float64:
             raise _structure(name)

@@ -25,7 +25,11 @@ class World(NamedTuple):
         xfrc: (6 nbody,) forces and torques from outside on bodies, world frame [N], [N m].
         xpos: (3 nbody,) places of bodies [m], of the last physics step.
         xipos: (3 nbody,) places of their centres of mass [m].
+        xquat: (4 nbody,) quaternions of the bodies.
         xmat: (9 nbody,) their rotation matrices.
+        eq_active: (neq,) uint8, which equalities act; part of the state.
+        eq_data: (neq eq_width,) numbers of the equalities for the rest of this call.
+        eq_rows: the same from the next call on; empty unless the task writes them.
         terrain: (width,) what the episode keeps of its ground, empty without.
         measures: (MEASURES,) figures of this step, for `info`.
         model: address of mjModel.
@@ -40,7 +44,11 @@ class World(NamedTuple):
     xfrc: np.ndarray
     xpos: np.ndarray
     xipos: np.ndarray
+    xquat: np.ndarray
     xmat: np.ndarray
+    eq_active: np.ndarray
+    eq_data: np.ndarray
+    eq_rows: np.ndarray
     terrain: np.ndarray
     measures: np.ndarray
     model: int
@@ -63,6 +71,8 @@ def world(f, m, d, sim):
     Source: `simulate.layout`.
     """
     place = carray(pointer(d + f.at_site), (1,), np.int64)[0]
+    active = carray(pointer(d + f.at_eq_active), (1,), np.int64)[0]
+    numbers = f.neq * f.eq_width
     site = f.tip_site if f.tip_site >= 0 else 0
     return World(
         field(d, f.at_qpos, f.nq),
@@ -73,7 +83,11 @@ def world(f, m, d, sim):
         field(d, f.at_xfrc, 6 * f.nbody),
         field(d, f.at_xpos, 3 * f.nbody),
         field(d, f.at_xipos, 3 * f.nbody),
+        field(d, f.at_xquat, 4 * f.nbody),
         field(d, f.at_xmat, 9 * f.nbody),
+        carray(pointer(active), (f.neq,), np.uint8),
+        field(m, f.at_eq_data, numbers),
+        floats(f.eq_rows + 8 * sim * numbers, numbers if f.eq_rows else 0),
         floats(f.terrain + 8 * sim * f.width, f.width),
         floats(f.measures + 8 * sim * MEASURES, MEASURES),
         m,

@@ -1,0 +1,208 @@
+"""A log that a grapple picks up from the ground and lays down at another place, turned as asked.
+
+Where the log lies, and where it shall lie, is drawn for every episode; the log is moved there by
+its own six coordinates, so that one compiled model serves all of them.
+"""
+
+import math
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.kinematics.task import task_forward
+from hydrotele.machine import Machine
+from hydrotele.tasks.chance import between, draw
+from hydrotele.tasks.grapple import (
+    FREE_JOINTS,
+    PLACE,
+    RADIUS,
+    READ,
+    READINGS,
+    grip_distance,
+    is_held,
+    lean,
+    read_free_joints,
+)
+from hydrotele.tasks.memory import ARM
+from hydrotele.tasks.observation import Field, reach
+
+NEAR, STRAIGHT, KEEP = 0.3, math.radians(15.0), 0.5  # m, rad, s: what counts as placed
+PROGRESS, TIME, LEANING = 1.0, 0.005, 0.02  # per metre nearer, per step, per step and rad
+TAKING, SUCCESS, LOST = 5.0, 20.0, -20.0
+LEVER, ASKEW = 1.0, 0.5  # m: of what a rad counts, of the log and of the grapple
+_LYING = 0.05  # m by which a log that lies may be higher than it should
+_REACH = (2.3, 8.7)  # m from the axis of the house: where some part of the log can be held
+_RADII = (4.5, 6.5)  # m
+_ASIDE = (0.15, 0.5)  # rad from the grapple to the log
+_SLEW = (math.radians(30.0), math.radians(90.0))  # from the log to its goal
+_X, _Y, _YAW, _LEFT, _KEPT, _TAKEN = range(READ + READINGS, READ + READINGS + 6)  # in the goal
+GOAL_PLACE = slice(_X, _YAW + 1)  # x [m], y [m], yaw [rad] of the goal in the episode's memory
+_FASTEST = 10.0  # rad/s of a difference quotient of noisy readings
+
+
+def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+    """What `observe_place` writes: log, goal, whether it is held, the grapple's free joints."""
+    far = 2.0 * reach(machine)
+    fields = []
+    for what, high in (("log", ("z",)), ("goal", ())):
+        fields += [
+            Field(f"{what}.r", "m", 0.0, far), Field(f"{what}.theta", "rad", -math.pi, math.pi)
+        ]  # fmt: skip
+        fields += [Field(f"{what}.{name}", "m", -far, far) for name in high]
+        fields += [Field(f"{what}.{name}_2_yaw", "1", -1.0, 1.0) for name in ("sin", "cos")]
+    fields.append(Field("held", "1", 0.0, 1.0))
+    for name in FREE_JOINTS:
+        low, top = machine.joints[name].range or (-math.pi, math.pi)
+        fields.append(Field(f"angle.{name}", "rad", low - 0.15, top + 0.15))
+    fields += [Field(f"rate.{name}", "rad/s", -_FASTEST, _FASTEST) for name in FREE_JOINTS]
+    return fields
+
+
+@compiled
+def begin_place(f, e, w):
+    """Lay the log down before the machine and draw where it shall go.
+
+    Args:
+        f: record of FACTS; its numbers are those of `grapple.grapple_numbers`.
+        e: record of MEMORY; `goal` is written.
+        w: World; the log's coordinates are written.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    g, pose, at = e.goal, np.empty(ARM), int(f.numbers[PLACE])
+    task_forward(f.arm, e.position[: f.arm_axes], pose)
+    radius, theta = between(e, _RADII[0], _RADII[1]), pose[1] + _either_side(e, _ASIDE)
+    half = 0.5 * between(e, 0.0, math.pi)
+    w.qpos[at], w.qpos[at + 1] = radius * math.cos(theta), radius * math.sin(theta)
+    w.qpos[at + 3], w.qpos[at + 4], w.qpos[at + 5] = math.cos(half), 0.0, 0.0
+    w.qpos[at + 6] = math.sin(half)
+    theta += _either_side(e, _SLEW)
+    radius = between(e, _RADII[0], _RADII[1])
+    g[_X], g[_Y] = radius * math.cos(theta), radius * math.sin(theta)
+    g[_YAW] = between(e, 0.0, math.pi)
+    g[_LEFT], g[_KEPT], g[_TAKEN] = -1.0, 0.0, 0.0
+    read_free_joints(f, e, w)
+
+
+@compiled
+def _either_side(e, size):
+    value = between(e, size[0], size[1])
+    return value if draw(e) < 0.5 else -value
+
+
+@compiled
+def log_pose(f, w):
+    """Where the log is.
+
+    Args:
+        f: record of FACTS.
+        w: World.
+
+    Returns:
+        (x [m], y [m], z [m], and of its axis sine and cosine of twice the yaw, sine of the angle
+        to the horizontal plane), scalars; its ends are alike.
+
+    Source: this module.
+    """
+    at = int(f.numbers[PLACE])
+    a, b, c, d = w.qpos[at + 3], w.qpos[at + 4], w.qpos[at + 5], w.qpos[at + 6]
+    ax, ay, az = 1.0 - 2.0 * (c * c + d * d), 2.0 * (b * c + a * d), 2.0 * (b * d - a * c)
+    level = max(1.0e-12, ax * ax + ay * ay)
+    return (
+        w.qpos[at], w.qpos[at + 1], w.qpos[at + 2], 2.0 * ax * ay / level,
+        (ax * ax - ay * ay) / level, az,
+    )  # fmt: skip
+
+
+@compiled
+def yaw_between(sine, cosine, yaw):
+    """Angle between an axis without ends and another, scalar from 0 to pi/2 [rad].
+
+    Args:
+        sine: of twice the yaw of the first, scalar.
+        cosine: of the same, scalar.
+        yaw: of the second, scalar [rad].
+
+    Returns:
+        The angle.
+
+    Source: this module.
+    """
+    s, c = math.sin(2.0 * yaw), math.cos(2.0 * yaw)
+    return 0.5 * abs(math.atan2(sine * c - cosine * s, cosine * c + sine * s))
+
+
+@compiled
+def observe_place(f, e, w, out, at):
+    """Write log, goal, whether it is held, and what is read of the free joints.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World.
+        out: (observations,) float32, written from `at` on.
+        at: scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `place_fields`.
+    """
+    g = e.goal
+    x, y, z, sine, cosine, _ = log_pose(f, w)
+    out[at], out[at + 1], out[at + 2] = math.hypot(x, y), math.atan2(y, x), z
+    out[at + 3], out[at + 4] = sine, cosine
+    out[at + 5], out[at + 6] = math.hypot(g[_X], g[_Y]), math.atan2(g[_Y], g[_X])
+    out[at + 7], out[at + 8] = math.sin(2.0 * g[_YAW]), math.cos(2.0 * g[_YAW])
+    out[at + 9] = 1.0 if is_held(f, w) else 0.0
+    for c in range(READINGS):
+        out[at + 10 + c] = g[READ + c]
+
+
+@compiled
+def judge_place(f, e, w):
+    """Reward of bringing the grapple to the log and the log to its goal.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World; `measures` gets the log's distance from its goal [m], error of its yaw [rad],
+            whether it is held, success, the grapple's angle to plumb [rad].
+
+    Returns:
+        (reward, whether the log is placed or out of reach), scalars.
+
+    Source: this module.
+    """
+    g, held = e.goal, is_held(f, w)
+    x, y, z, sine, cosine, slope = log_pose(f, w)
+    height = z - f.numbers[RADIUS]
+    distance = math.sqrt((x - g[_X]) ** 2 + (y - g[_Y]) ** 2 + height**2)
+    yaw, swing = yaw_between(sine, cosine, g[_YAW]), lean(f, w)
+    lies = not held and height < _LYING and abs(slope) < _LYING
+    there = lies and distance <= NEAR and yaw <= STRAIGHT
+    left = distance + LEVER * yaw
+    if not (held or there):
+        apart, askew = grip_distance(f, w)
+        left += apart + ASKEW * askew
+    if g[_LEFT] < 0.0:  # the first step: before it no place of the grapple was known
+        g[_LEFT] = left
+    reward = PROGRESS * (g[_LEFT] - left) - TIME - LEANING * swing
+    g[_LEFT] = left
+    if held and g[_TAKEN] == 0.0:
+        g[_TAKEN] = 1.0
+        reward += TAKING
+    step = f.ticks * f.period
+    g[_KEPT] = g[_KEPT] + step if there else 0.0
+    placed = g[_KEPT] >= KEEP - 0.5 * step
+    lost = not held and not _REACH[0] <= math.hypot(x, y) <= _REACH[1]
+    w.measures[0], w.measures[1], w.measures[2] = distance, yaw, 1.0 if held else 0.0
+    w.measures[3], w.measures[4] = 1.0 if placed else 0.0, swing
+    if placed:
+        reward += SUCCESS
+    elif lost:
+        reward += LOST
+    return reward, placed or lost
