@@ -6,6 +6,7 @@ from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
 from hydrotele.tasks.controllers.controller import Controller, Random, Zero
 from hydrotele.tasks.controllers.grade import grade_controller
+from hydrotele.tasks.controllers.place import place_controller
 from hydrotele.tasks.controllers.press import press_controller
 from hydrotele.tasks.controllers.tip import line_controller, reach_controller
 from hydrotele.tasks.controllers.track import track_controller
@@ -17,6 +18,7 @@ REFERENCES: dict[str, Callable[[Setup], Controller]] = {
     "StraightLine": line_controller,
     "HoldForce": press_controller,
     "ReachFeller": reach_controller,
+    "PlaceLog": place_controller,
 }
 """Task -> what a good engineer would write for it, for every kind of actions that suits it."""
 

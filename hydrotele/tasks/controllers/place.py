@@ -8,11 +8,14 @@ import math
 
 import numpy as np
 
-from hydrotele.errors import InputError
 from hydrotele.operate.resolved_motion import arm_facts
+from hydrotele.scenario import Servo
 from hydrotele.tasks.controllers.controller import Controller, columns, position_columns, step_time
+from hydrotele.tasks.controllers.rows import inverse_rows
 from hydrotele.tasks.controllers.track import Asked
+from hydrotele.tasks.controllers.valve_law import ValveLaw
 from hydrotele.tasks.facts import ACCELERATION, POSE_ACCELERATIONS, Setup, full_rate
+from hydrotele.tasks.memory import ARM
 
 ABOVE, TAKE, CARRY, LAY = 2.5, 1.34, 2.6, 1.36  # m: heights of the stick's pin over the ground
 SWAY = 0.03  # m by which the closing jaw pushes the grapple to its own side
@@ -20,6 +23,7 @@ PERIOD = 2.0  # s of the pendulum
 SHUT, OPEN = 1.3, 0.0  # rad
 _SPEEDS = np.array([0.35, 0.2, 0.35, 0.5, 0.8])  # m/s, rad/s, m/s, rad/s, rad/s
 _GAINS = (3.0, 0.3)  # 1/s of `Asked`
+_LEAD = 0.06  # s by which valves are opened ahead: the spool's lag and half a step
 _R, _THETA, _Z, _TURN, _JAW = range(5)
 GO, DOWN, CLOSE, UP, SLEW, LOWER, RELEASE, LEAVE = range(8)
 _PAUSES = np.array([1.0, 0.3, 0.5, 0.5, 1.0, 0.3, 0.3, 1.0])  # s
@@ -50,34 +54,27 @@ def _nearest(angle: np.ndarray, turn: float) -> np.ndarray:
     return angle - turn * np.round(angle / turn)
 
 
-class PlaceByMoves:
-    """Rates of the stick's pin, of the grapple's rotation and of its jaw, phase by phase."""
+def pin_columns(setup: Setup) -> np.ndarray:
+    """Columns (5,) of r, theta and z of the pin, of the grapple's rotation and of its jaw."""
+    return np.concatenate([columns(setup, "tip", ("r", "theta", "z")), position_columns(setup)[3:]])
+
+
+class Moves:
+    """Where the stick's pin, the grapple's rotation and its jaw should be, phase by phase."""
 
     def __init__(self, setup: Setup) -> None:
-        """Look up the nominal machine and the columns.
-
-        Raises:
-            InputError: the actions are not rates of the tip.
-        """
-        if setup.options.action != "resolved_motion":
-            message = "the reference controller of PlaceLog needs 'resolved_motion'"
-            raise InputError(f"action {setup.options.action!r}", message)
+        """Look up the nominal machine and the columns."""
         self._aside = float(arm_facts(setup.machine)[0][2])
-        self._tip = np.concatenate(
-            [columns(setup, "tip", ("r", "theta", "z")), position_columns(setup)[3:]]
-        )
+        self._tip = pin_columns(setup)
         self._log = columns(setup, "log", ("r", "theta", "sin_2_yaw", "cos_2_yaw"))
         self._goal = columns(setup, "goal", ("r", "theta", "sin_2_yaw", "cos_2_yaw"))
         self._held = columns(setup, "held", [""])[0]
         rates = [full_rate(setup.machine, name) for name in setup.axes[3:]]
-        fastest = np.array([*setup.task.pose_rates[:3], *rates])
-        change = np.array([*POSE_ACCELERATIONS[:3], ACCELERATION, ACCELERATION])
-        self._speeds, self._dt = np.minimum(_SPEEDS, 0.8 * fastest), step_time(setup)
-        self._asked = Asked(setup, fastest, change, _GAINS)
+        self._speeds = np.minimum(_SPEEDS, 0.8 * np.array([*setup.task.pose_rates[:3], *rates]))
+        self._dt = step_time(setup)
 
     def begin(self, count: int) -> None:
         """Start `count` episodes."""
-        self._asked.begin(count)
         self._phase = np.full(count, GO)
         self._time, self._length, self._ramp = (np.zeros(count) for _ in range(3))
         self._from, self._to = np.zeros((count, 5)), np.zeros((count, 5))
@@ -85,12 +82,10 @@ class PlaceByMoves:
 
     def reset(self, mask: np.ndarray) -> None:
         """Forget the episodes of mask (n,)."""
-        self._asked.reset(mask)
         self._fresh |= mask
 
-    def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, 5) for observations (n, o)."""
-        seen = observation.astype(float)
+    def update(self, seen: np.ndarray) -> None:
+        """Go on by one step with observations (n, o)."""
         fresh = self._fresh.copy()
         self._to[fresh], self._phase[fresh], self._fresh[:] = seen[fresh][:, self._tip], GO, False
         self._plan(seen, fresh)
@@ -98,12 +93,11 @@ class PlaceByMoves:
         over = self._time > self._length + self._ramp + _PAUSES[self._phase]
         self._phase[over] = self._next(seen)[over]
         self._plan(seen, over)
-        share = course(self._time, self._length, self._ramp)[:, None]
-        before = course(self._time - self._dt, self._length, self._ramp)[:, None]
-        way = self._to - self._from
-        return self._asked.rates(
-            seen[:, self._tip], self._from + share * way, (share - before) / self._dt * way
-        )
+
+    def at(self, ahead: float) -> np.ndarray:
+        """Places (n, 5) `ahead` [s] from now: r [m], theta [rad], z [m], rotation, jaw [rad]."""
+        share = course(self._time + ahead, self._length, self._ramp)[:, None]
+        return self._from + share * (self._to - self._from)
 
     def _next(self, seen: np.ndarray) -> np.ndarray:
         """Phases (n,) after those that are over."""
@@ -169,6 +163,82 @@ class PlaceByMoves:
         return to
 
 
+class PlaceByTip:
+    """Moves by rates of the pin."""
+
+    def __init__(self, setup: Setup) -> None:
+        """Look up the nominal machine."""
+        self.moves, self._tip, self._dt = Moves(setup), pin_columns(setup), step_time(setup)
+        rates = [full_rate(setup.machine, name) for name in setup.axes[3:]]
+        change = np.array([*POSE_ACCELERATIONS[:3], ACCELERATION, ACCELERATION])
+        fastest = np.array([*setup.task.pose_rates[:3], *rates])
+        self._asked = Asked(setup, fastest, change, _GAINS)
+
+    def begin(self, count: int) -> None:
+        """Start `count` episodes."""
+        self.moves.begin(count)
+        self._asked.begin(count)
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Forget the episodes of mask (n,)."""
+        self.moves.reset(mask)
+        self._asked.reset(mask)
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Actions (n, 5) for observations (n, o)."""
+        seen = observation.astype(float)
+        self.moves.update(seen)
+        now = self.moves.at(0.0)
+        rate = (now - self.moves.at(-self._dt)) / self._dt
+        return self._asked.rates(seen[:, self._tip], now, rate)
+
+
+class PlaceByAxes:
+    """Moves by references of the axes, which are followed by their rates or by their valves."""
+
+    def __init__(self, setup: Setup) -> None:
+        """Look up the nominal machine."""
+        self.moves, self._joint = Moves(setup), position_columns(setup)
+        (self._arm, _, self._ranges), self._dt = arm_facts(setup.machine), step_time(setup)
+        fastest = np.array([full_rate(setup.machine, axis) for axis in setup.axes])
+        by_valves = setup.options.action == "valve"
+        self._valves = ValveLaw(setup, Servo()) if by_valves else None
+        self._asked = Asked(setup, fastest, np.full(len(fastest), ACCELERATION), _GAINS)
+
+    def begin(self, count: int) -> None:
+        """Start `count` episodes."""
+        for part in (self.moves, self._asked, self._valves):
+            if part:
+                part.begin(count)
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Forget the episodes of mask (n,)."""
+        for part in (self.moves, self._asked, self._valves):
+            if part:
+                part.reset(mask)
+
+    def _axes_at(self, ahead: float, joint: np.ndarray) -> np.ndarray:
+        """Positions (n, 5) of the axes `ahead` [s] from now, when they stand at `joint` (n, 5)."""
+        places, q = self.moves.at(ahead), joint[:, :3].copy()
+        pose = np.zeros((len(places), ARM))
+        pose[:, :3] = places[:, :3]
+        inverse_rows(self._arm, self._ranges, pose, q)
+        return np.hstack([q, places[:, 3:]])
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Actions (n, 5) for observations (n, o)."""
+        seen = observation.astype(float)
+        self.moves.update(seen)
+        joint = seen[:, self._joint]
+        now = self._axes_at(0.0, joint)
+        if self._valves:
+            later = self._axes_at(_LEAD + self._dt, joint)
+            rate = (later - self._axes_at(_LEAD, joint)) / self._dt
+            return self._valves(observation, now, rate)
+        rate = (now - self._axes_at(-self._dt, joint)) / self._dt
+        return self._asked.rates(joint, now, rate)
+
+
 def place_controller(setup: Setup) -> Controller:
-    """Controller of PlaceLog."""
-    return PlaceByMoves(setup)
+    """Controller of PlaceLog for the chosen kind of actions."""
+    return (PlaceByTip if setup.options.action == "resolved_motion" else PlaceByAxes)(setup)
