@@ -53,8 +53,8 @@ def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
     fields.append(Field("held", "1", 0.0, 1.0))
     for name in FREE_JOINTS:
         low, top = machine.joints[name].range or (-math.pi, math.pi)
-        fields.append(Field(f"angle.{name}", "rad", low - 0.15, top + 0.15))
-    fields += [Field(f"rate.{name}", "rad/s", -_FASTEST, _FASTEST) for name in FREE_JOINTS]
+        fields.append(Field(f"pendulum.{name}", "rad", low - 0.15, top + 0.15))
+    fields += [Field(f"pendulum_rate.{name}", "rad/s", -_FASTEST, _FASTEST) for name in FREE_JOINTS]
     return fields
 
 

@@ -216,7 +216,7 @@ def test_what_is_observed_is_what_stands_in_the_simulation():
         error = sensor.accuracy + 0.5 * sensor.span / 2**sensor.bits
         for name in ("grapple_pitch", "grapple_roll"):
             true = data.joint(name).qpos[0] - 1.0e-3 * data.joint(name).qvel[0]
-            assert seen[f"angle.{name}"] == pytest.approx(true, abs=1.01 * error)
+            assert seen[f"pendulum.{name}"] == pytest.approx(true, abs=1.01 * error)
 
 
 def test_goals_lie_where_a_log_can_be_brought():
