@@ -5,13 +5,11 @@ import math
 import mujoco
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.kinematics.task import REACHED, task_inverse
 from hydrotele.machine import Machine
-from hydrotele.operate.resolved_motion import arm_facts
 from hydrotele.surroundings import LogOnGround
 from hydrotele.tasks.grapple import grapple_numbers
 from hydrotele.tasks.place import place_fields
+from hydrotele.tasks.starts import draw_start
 from hydrotele.tasks.task import Task
 
 LOG_TO_PLACE = LogOnGround(position=(5.5, 0.0), direction=math.pi / 2.0)
@@ -22,12 +20,7 @@ _LOW, _HIGH = (4.5, -0.5, 2.2), (6.5, 0.5, 2.8)  # m, rad, m: the stick's pin at
 
 def _start(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
     """The open grapple hangs plumb, higher than a log on the ground."""
-    numbers, axes, _ = arm_facts(machine)
-    pose, q = np.zeros(5), np.zeros(len(axes))
-    pose[:3] = chance.uniform(_LOW, _HIGH)
-    if task_inverse(numbers, pose, pose[1], q) != REACHED:
-        raise InputError(f"start of {machine.name}", f"the arm does not reach {pose[:3]}")
-    joints = dict(zip(axes, q.tolist(), strict=True))
+    joints = draw_start(machine, chance, _LOW, _HIGH)
     plumb = -0.5 * math.pi - joints["boom"] - joints["stick"]
     turned = float(chance.uniform(-0.5, 0.5) * math.pi)
     return {**joints, "grapple_pitch": plumb, "grapple": turned, "claw": 0.0}
