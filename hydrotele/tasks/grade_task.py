@@ -52,7 +52,7 @@ GRADE = Task(
     fields=grade_fields,
     measures=(
         ("profile_rms", "m"), ("carried_mass", "kg"), ("soil_force", "N"), ("soil", "1"),
-        ("graded", "1"), ("spoiled", "1"),
+        ("success", "1"), ("spoiled", "1"),
     ),
     numbers=_numbers,
     terrain=TERRAIN,

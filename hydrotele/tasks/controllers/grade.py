@@ -20,6 +20,7 @@ _CLEAR, _HIGH = 0.5, 1.0  # m over the plane: of the edge before a pass, of a lo
 _CUTS = (NEAR, FAR + _LEAD), (-121.0 * _DEGREE, -106.0 * _DEGREE)  # radius -> attitude of a cut
 _HELD, _EMPTY = -165.0 * _DEGREE, -85.0 * _DEGREE
 _FAST = np.array([0.45, 0.35, 0.45])  # m/s, m/s, rad/s
+_CURLED = np.array([0.45, 0.25, 0.30])  # while boom and stick lift, the bucket's own rate is more
 _DRAWN, _LOWERED, _SUNK = 0.30, 0.20, 0.15  # m/s along the plane, in the air, into the soil
 _TOUCH = 0.03  # m of the edge over the ground, from which on it is drawn
 _CHANGE = np.array([0.8, 0.8, 0.8])  # m/s^2, m/s^2, rad/s^2
@@ -135,6 +136,7 @@ class Grade:
         fast[phase == DRAW, R] = _DRAWN
         fast[phase == LOWER, Z] = _LOWERED
         fast[phase == DRAW, Z] = _SUNK
+        fast[phase == CURL] = _CURLED
         self._goal = goal
         return goal, fast
 
