@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.machine import Machine
+from hydrotele.scenario import Servo
 from hydrotele.surroundings import LogOnGround
 from hydrotele.tasks.grapple import grapple_numbers
 from hydrotele.tasks.place import place_fields
@@ -59,5 +60,7 @@ PLACE_LOG = Task(
     ground=True,
     numbers=_numbers,
     writes=("eq_data",),
+    # with the usual 4 /s a late, sticky valve lets the boom swing, and the grapple with it
+    servo=Servo(position_gain=2.5, axis_gains={"boom": 2.0}),
 )  # fmt: skip
 """A log picked up and laid down with the CAT 215's claw."""

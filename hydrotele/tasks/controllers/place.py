@@ -9,7 +9,6 @@ import math
 import numpy as np
 
 from hydrotele.operate.resolved_motion import arm_facts
-from hydrotele.scenario import Servo
 from hydrotele.tasks.controllers.controller import Controller, columns, position_columns, step_time
 from hydrotele.tasks.controllers.rows import inverse_rows
 from hydrotele.tasks.controllers.track import Asked
@@ -202,7 +201,7 @@ class PlaceByAxes:
         (self._arm, _, self._ranges), self._dt = arm_facts(setup.machine), step_time(setup)
         fastest = np.array([full_rate(setup.machine, axis) for axis in setup.axes])
         by_valves = setup.options.action == "valve"
-        self._valves = ValveLaw(setup, Servo()) if by_valves else None
+        self._valves = ValveLaw(setup, setup.task.servo) if by_valves else None
         self._asked = Asked(setup, fastest, np.full(len(fastest), ACCELERATION), _GAINS)
 
     def begin(self, count: int) -> None:
