@@ -92,7 +92,7 @@ RECIPES = {
         {"action": "valve", "sensors": "real", "control_rate": 25.0},
         track_law,
         {"position": 6.75, "swing": 4.5, "lead": 0.135, "integral": 10.0, "pressure": 13.5,
-         "load_time": 5.0, "deadband": 1.0},
+         "load_time": 2.222, "deadband": 1.0},
         "tip_error RMS",
         most={"deadband": 1.0, "lead": 0.3},
         seconds=10.0,
