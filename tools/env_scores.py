@@ -23,11 +23,15 @@ valves, friction, stiffness of the oil, delay of the commands, payload.
 
 
 def names(scores: Scores) -> list[str]:
-    """The figures worth a column: of errors the RMS, of what is 0 or 1 the mean at the end."""
-    kept = [name for name in scores.figures if name.endswith("RMS")]
-    flags = [name for name in kept if np.isin(scores.figures[name], (0.0, 1.0)).all()]
-    found = ["return", *(name for name in kept if name not in flags)]
-    found += [name.replace("RMS", "final") for name in flags]
+    """The figures worth a column: the RMS of what varies, the end of what is 0 or 1."""
+    found = ["return"]
+    for name in scores.figures:
+        measure, _, what = name.rpartition(" ")
+        flag = scores.units[name] == "1" and np.isin(scores.figures[name], (0.0, 1.0)).all()
+        if what == "final" and flag:
+            found.append(name)
+        elif what == "final":
+            found.append(f"{measure} RMS")
     return found + [name for name in (SUCCESS,) if name in scores.figures]
 
 
@@ -59,7 +63,7 @@ def table(name: str, asked) -> list[str]:
                         heads = [f"{column} [{scores.units[column]}]" for column in columns]
                         heads = ["actions", "sensors", "machine", "controller", *heads]
                         lines += [row(heads), row(["---"] * len(heads))]
-                    cells = [f"{scores.mean(c):.4g} ± {scores.error(c):.1g}" for c in columns]
+                    cells = [f"{scores.mean(c):.4g} ± {scores.error(c):.2g}" for c in columns]
                     lines.append(row([action, sensors, machine, kind, *cells]))
                 core.close()
     return lines
