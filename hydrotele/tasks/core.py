@@ -114,6 +114,8 @@ class TaskCore:
         self._sensed = np.zeros((n, int(np.ceil(late.max())) + 2 if late.any() else 0, CHANNELS))
         self._lags = late
         self._expanded = {name: self.simulations.expand(name) for name in v.fields}
+        same = np.tile(v.plant.model.actuator_user.ravel(), (len(v.states), 1))
+        self._users = np.ascontiguousarray(v.fields.get("actuator_user", same))
 
     def _link(self) -> None:
         """Tell the native code where everything lies."""
@@ -129,7 +131,8 @@ class TaskCore:
             ("reward", self.reward), ("terminated", self.terminated),
             ("truncated", self.truncated), ("measures", self.measures),
             ("final_measures", self.final_measures), ("starts", v.states),
-            ("start_tips", v.tips), ("scales", v.scales), ("offsets", v.offsets),
+            ("start_tips", v.tips), ("users", self._users), ("scales", v.scales),
+            ("offsets", v.offsets),
             ("lags", self._lags), ("delays", v.delays), ("commands", self._commands),
             ("sensed", self._sensed), ("places", self._places), ("terrain", self.terrain),
         ):  # fmt: skip

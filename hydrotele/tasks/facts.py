@@ -203,7 +203,7 @@ def _write_layout(facts: np.ndarray) -> None:
     ):  # fmt: skip
         facts[name] = data[member]
     for name, member in (
-        ("at_user", "actuator_user"), ("at_eq_data", "eq_data"), ("at_stiffness", "jnt_stiffness"),
+        ("at_eq_data", "eq_data"), ("at_stiffness", "jnt_stiffness"),
         ("at_damping", "dof_damping"),
     ):  # fmt: skip
         facts[name] = model[member]

@@ -117,7 +117,7 @@ def _begin_episode(f, e, m, d, sim, w):
     tips = floats(f.start_tips + 24 * e.variant, 3)
     e.tip[:] = tips
     e.reference_rate[:], e.pose_rate[:] = 0.0, 0.0
-    sense(f, e, w, m, sim)
+    sense(f, e, w, sim)
     e.reference[:] = e.joint
     e.sampled_reference[:] = e.joint
     if f.arm_axes > 0:
@@ -149,7 +149,7 @@ def _step(f, e, m, d, sim, w, action):
         act(f, e, action)
         _physics(f, e, m, d, sim, w)
         e.tick += 1
-        sense(f, e, w, m, sim)
+        sense(f, e, w, sim)
         tick_task(f, e, w)  # after the physics: before, MuJoCo's places are another simulation's
     e.tip[:] = w.tip
     e.step += 1

@@ -124,6 +124,7 @@ FACTS = np.dtype(
         ("table", _I),  # (k, POINTS, 3) of operate.drive_rows.drive_tables
         ("starts", _I),  # (v, states)
         ("start_tips", _I),  # (v, 3)
+        ("users", _I),  # (v, k SLOTS) numbers of the actuators
         ("scales", _I),  # (v, CHANNELS) of the sensors
         ("offsets", _I),
         ("lags", _I),  # (v, CHANNELS) delays of the sensors [control periods]
@@ -148,7 +149,6 @@ FACTS = np.dtype(
         ("at_xmat", _I),
         ("at_warning", _I),
         ("at_eq_active", _I),
-        ("at_user", _I),
         ("at_eq_data", _I),
         ("at_stiffness", _I),
         ("at_damping", _I),

@@ -4,7 +4,7 @@ import numpy as np
 
 from hydrotele.compiled import compiled
 from hydrotele.hydraulics.circuit import ACTIVATIONS, SCRATCH, SLOTS
-from hydrotele.simulate.pointers import field, floats
+from hydrotele.simulate.pointers import floats
 from hydrotele.simulate.readout import state_supply
 from hydrotele.simulate.sensors import convert
 from hydrotele.tasks.chance import draw
@@ -30,7 +30,7 @@ def true_positions(f, e, w):
 
 
 @compiled
-def _sensed(f, e, w, m, out):
+def _sensed(f, e, w, out):
     """What stands before the sensors: positions [rad], [m], head and rod pressures, supply [Pa]."""
     k = f.axes
     for i in range(k):
@@ -39,7 +39,7 @@ def _sensed(f, e, w, m, out):
         out[k + 2 * i], out[k + 2 * i + 1] = w.act[4 * i + 2], w.act[4 * i + 3]
     if f.hydraulic > 0:
         scratch = np.empty(SCRATCH)
-        user = field(m, f.at_user, k * SLOTS)
+        user = floats(f.users + 8 * e.variant * k * SLOTS, k * SLOTS)
         act = w.act[: ACTIVATIONS * f.hydraulic]
         out[k + 2 * f.hydraulic] = state_supply(user, f.hydraulic, act, scratch)
 
@@ -64,14 +64,13 @@ def _late(f, e, sim, values):
 
 
 @compiled
-def sense(f, e, w, m, sim):
+def sense(f, e, w, sim):
     """Read the sensors, if a reading is due; otherwise they are held.
 
     Args:
         f: record of FACTS.
         e: record of MEMORY; readings are written.
         w: World.
-        m: address of its mjModel, scalar.
         sim: number of the simulation, scalar.
 
     Returns:
@@ -85,7 +84,7 @@ def sense(f, e, w, m, sim):
     if not due and f.delayed_sensor == 0:
         return
     values = np.zeros(CHANNELS)
-    _sensed(f, e, w, m, values)
+    _sensed(f, e, w, values)
     if f.delayed_sensor > 0:
         _late(f, e, sim, values)
     if not due:

@@ -163,6 +163,22 @@ def test_every_variant_behaves_as_its_own_machine():
         assert np.array_equal(core.simulations.state[number], state)
 
 
+def test_the_first_reading_of_an_episode_is_of_its_own_machine():
+    ranges = ({"name": "relief_pressure", "parameters": {"relief_pressure": [15e6, 30e6]}},)
+    core = TaskCore(TRACK, Options(randomise=ranges, variants=5, duration=0.04), 3)
+    core.reset(np.arange(3))
+    seen = set()
+    for _ in range(10):
+        fresh = core.memory["step"] == 0
+        for e in core.memory[fresh]:
+            # valves are closed, so that the pump's flow goes over its relief valve
+            machine = core.setup.variants.machines[e["variant"]]
+            assert e["supply"] == pytest.approx(machine.supply.relief_pressure, rel=1e-9)
+            seen.add(int(e["variant"]))
+        core.step(np.zeros((3, 3)))
+    assert len(seen) > 2
+
+
 def test_variants_stand_still_under_their_own_load():
     core = TaskCore(TRACK, Options(randomise=RANGES, variants=4), 8)
     core.reset(np.arange(8))
