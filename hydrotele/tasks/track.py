@@ -25,8 +25,8 @@ _ROOM = 0.9  # share of the way to the nearest end of a joint's range
 _FREE = 1.5  # rad or m of room of an axis without a range
 _FREQUENCY = 0
 _BASE = 1
-_AMPLITUDE = _BASE + AXES
-_PHASE = _AMPLITUDE + _HARMONICS * AXES
+_SINE = _BASE + AXES
+_COSINE = _SINE + _HARMONICS * AXES
 
 
 def track_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
@@ -61,16 +61,17 @@ def begin_track(f, e):
         total, rate = 0.0, 0.0
         for h in range(_HARMONICS):
             place = _HARMONICS * i + h
-            g[_AMPLITUDE + place] = draw(e)
-            g[_PHASE + place] = between(e, -math.pi, math.pi)
-            total += g[_AMPLITUDE + place]
-            rate += g[_AMPLITUDE + place] * (h + 1) * g[_FREQUENCY]
+            size, phase = draw(e), between(e, -math.pi, math.pi)
+            g[_SINE + place], g[_COSINE + place] = size * math.cos(phase), size * math.sin(phase)
+            total += size
+            rate += size * (h + 1) * g[_FREQUENCY]
         low, high = f.ranges[i, 0] - g[_BASE + i], f.ranges[i, 1] - g[_BASE + i]
         room = max(0.0, _ROOM * min(-low, high, _FREE))
         # from its start a sine goes up to twice its amplitude to one side
         scale = min(fastest / rate, 0.5 * room / total)
         for h in range(_HARMONICS):
-            g[_AMPLITUDE + _HARMONICS * i + h] *= scale
+            g[_SINE + _HARMONICS * i + h] *= scale
+            g[_COSINE + _HARMONICS * i + h] *= scale
 
 
 @compiled
@@ -88,11 +89,16 @@ def track_reference(g, i, time):
     Source: this module.
     """
     wave, rate = 0.0, 0.0
+    first_sine, first_cosine = math.sin(g[_FREQUENCY] * time), math.cos(g[_FREQUENCY] * time)
+    sine, cosine = first_sine, first_cosine
     for h in range(_HARMONICS):
-        size, phase = g[_AMPLITUDE + _HARMONICS * i + h], g[_PHASE + _HARMONICS * i + h]
-        turning = (h + 1) * g[_FREQUENCY]
-        wave += size * (math.sin(turning * time + phase) - math.sin(phase))
-        rate += size * turning * math.cos(turning * time + phase)
+        along, across = g[_SINE + _HARMONICS * i + h], g[_COSINE + _HARMONICS * i + h]
+        wave += along * sine + across * (cosine - 1.0)
+        rate += (h + 1) * g[_FREQUENCY] * (along * cosine - across * sine)
+        sine, cosine = (
+            sine * first_cosine + cosine * first_sine,
+            cosine * first_cosine - sine * first_sine,
+        )
     if time >= _FADE:
         return g[_BASE + i] + wave, rate
     part = max(0.0, time / _FADE)
