@@ -191,7 +191,7 @@ def train(name: str, asked: argparse.Namespace) -> int:
 def judge(name: str, asked: argparse.Namespace) -> list[tuple[str, Scores]]:
     """Scores of all controllers on episodes and machines that none has met."""
     recipe, task = RECIPES[name], TASKS[name]
-    taken = Options(**choices(name, asked.variants), variant_seed=JUDGED)
+    taken = Options(**choices(name, asked.episodes), variant_seed=JUDGED)  # most have their own
     core = TaskCore(task, taken, min(asked.episodes, 128), asked.threads, DISABLED)
     controllers = {
         "learned": Learned(asked.out, make_view(name, core.setup)),
@@ -239,7 +239,7 @@ def main() -> None:
     }.items():  # fmt: skip
         parser.add_argument(f"--{key}", type=type(value), default=value, help=f"{value}")
     asked = parser.parse_args()
-    torch.set_num_threads(asked.threads)
+    torch.set_num_threads(1)  # networks are small, and waiting threads take time from the physics
     if asked.tune:
         print(tuned(asked.task, asked))
         return
