@@ -3,6 +3,8 @@
 With ideal and real sensors, on the nominal machine and on machines of `usual_spread`.
 """
 
+import sys
+
 import numpy as np
 from study import options, publish
 
@@ -78,6 +80,7 @@ def main() -> None:
         raise SystemExit(f"--tasks {strange[0]}: choose of {', '.join(TASKS)}")
     lines = [HEAD]
     for name in chosen:
+        print(name, file=sys.stderr, flush=True)
         lines += table(name, asked)
     publish("\n".join(lines) + "\n", "Scores of controllers in the control tasks", asked)
 

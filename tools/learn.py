@@ -1,11 +1,13 @@
 """Teach a network a control task with PPO, and compare it with the reference controller.
 
 Both see the same sensors at the same rate and are scored on episodes and machines that neither has
-met. Needs the extra `learn`. Writes policy.zip, normalisation.npz and scores.md into FOLDER.
+met. Needs the extra `learn`. Writes policy.zip, normalisation.npz, training.json
+and scores.md into FOLDER.
 """
 
 import argparse
 import dataclasses
+import json
 import sys
 import time
 from collections.abc import Callable
@@ -166,8 +168,8 @@ def make_view(name: str, setup: Setup) -> AgentView:
     return AgentView(setup, recipe.history, law, recipe.share)
 
 
-def train(name: str, asked: argparse.Namespace) -> int:
-    """Learn, and write the policy; the number of steps."""
+def train(name: str, asked: argparse.Namespace) -> None:
+    """Learn, and write the policy."""
     recipe, task = RECIPES[name], TASKS[name]
     taken = {**choices(name, asked.variants), "variant_seed": TRAINED, "duration": recipe.seconds}
     setup = set_up(task, Options(**taken))
@@ -184,8 +186,9 @@ def train(name: str, asked: argparse.Namespace) -> int:
     model.save(asked.out / "policy.zip")
     scale = np.sqrt(env.obs_rms.var + env.epsilon)
     np.savez(asked.out / "normalisation.npz", mean=env.obs_rms.mean, scale=scale, most=env.clip_obs)
+    facts = {"steps": model.num_timesteps, "minutes": asked.minutes, "seed": asked.seed}
+    (asked.out / "training.json").write_text(json.dumps(facts), encoding="utf-8")
     plain.close()
-    return model.num_timesteps
 
 
 def judge(name: str, asked: argparse.Namespace) -> list[tuple[str, Scores]]:
@@ -244,15 +247,38 @@ def main() -> None:
         print(tuned(asked.task, asked))
         return
     if not asked.judge:
-        print(f"{train(asked.task, asked)} steps of the environment", file=sys.stderr)
+        train(asked.task, asked)
     scores = judge(asked.task, asked)
     figures = ["return", RECIPES[asked.task].figure]
-    lines = [compare(scores, figures), "", "Learned less the tuned reference, episode by episode:"]
-    lines += [difference(scores, figure) for figure in figures]
+    lines = [
+        compare(scores, figures),
+        "",
+        "Learned less the tuned reference, episode by episode:\n",
+    ]
+    lines += [f"- {difference(scores, figure)}" for figure in figures]
     text = "\n".join(lines)
     print(text)
-    command = f"python tools/learn.py {asked.task} --minutes {asked.minutes:g}"
-    (asked.out / "scores.md").write_text(f"`{command}`\n\n{text}\n", encoding="utf-8")
+    (asked.out / "scores.md").write_text(f"{head(asked)}\n\n{text}\n", encoding="utf-8")
+
+
+def head(asked: argparse.Namespace) -> str:
+    """What was done, for the file of scores."""
+    recipe = RECIPES[asked.task]
+    facts = json.loads((asked.out / "training.json").read_text(encoding="utf-8"))
+    command = f"python tools/learn.py {asked.task} --minutes {facts['minutes']:g}"
+    does = "acts on its own"
+    if recipe.corrects:
+        does = f"corrects the tuned reference by at most {recipe.share:g} of a full action"
+    options = ", ".join(f"{key} {value}" for key, value in recipe.options.items())
+    machines = "of `usual_spread`, other ones for learning and judging" if recipe.randomised else ""
+    gains = ", ".join(f"{key} {value:g}" for key, value in recipe.gains.items())
+    return (
+        f"# Learned against tuned: {asked.task}\n\n`{command} --seed {facts['seed']}`\n\n"
+        f"A network learned by PPO, in {facts['steps']:,} steps, {does}; it sees {recipe.history}"
+        f" steps. Both have {options}; machines {machines or 'nominal'}. The reference was tuned on"
+        f" the machines that were learned on (`--tune`): {gains}. Mean ± standard error of"
+        f" {asked.episodes} episodes that none has met."
+    )
 
 
 if __name__ == "__main__":

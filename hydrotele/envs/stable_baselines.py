@@ -103,7 +103,7 @@ class StableVecEnv(_Base):
         """Say how episodes ended."""
         names = [name for name, _ in self.core.setup.task.measures]
         for row, i in enumerate(ended):
-            figures = dict(zip(names, self.core.measures[i].tolist(), strict=False))
+            figures = dict(zip(names, self.core.final_measures[i].tolist(), strict=False))
             total, length = float(self._return[i]), int(self._length[i])
             self._infos[i] = {
                 **figures, "terminal_observation": last[row],

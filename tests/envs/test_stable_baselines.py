@@ -31,3 +31,4 @@ def test_steps_and_ends_are_those_of_the_vector_environment():
                 assert info["TimeLimit.truncated"]
                 assert np.array_equal(info["terminal_observation"], told["final_obs"][number])
                 assert info["episode"]["l"] == 5
+                assert info["tip_error"] == told["final_info"]["tip_error"][number] > 0.0
