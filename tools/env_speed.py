@@ -12,6 +12,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+from mujoco.batch import Batch
 
 import hydrotele.envs
 from hydrotele.tasks.core import TaskCore
@@ -37,9 +38,12 @@ def _ways(name: str, asked) -> list[str]:
     lines = [
         f"Batches have {asked.batch} environments, `Sync` {asked.loop}, `Async` {asked.processes}.",
         "",
+        "`Physics alone` is `mujoco.batch.Batch` with two threads on the same model and commands:",
+        "no environment on MuJoCo's steps can be faster.",
+        "",
         "| control rate [Hz] | physics steps per step | batched, 2 threads | 1 thread | Sync "
-        "| Async | batched / Sync | batched / Async |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| Async | physics alone | batched / Sync | batched / Async | physics alone / Sync |",
+        "| " + " | ".join(["---"] * 10) + " |",
     ]
     for rate in RATES:
         chosen = {"control_rate": rate, "sensors": "real", "duration": 1.0e4}
@@ -49,14 +53,16 @@ def _ways(name: str, asked) -> list[str]:
             gymnasium.make_vec(name, asked.loop, "sync", **chosen),
             gymnasium.make_vec(name, asked.processes, "async", **chosen),
         ]
-        speeds = _speeds([_stepper(env, asked.seconds) for env in made], asked.turns)
-        speeds = [speed * 1000.0 / rate for speed in speeds]
+        jobs = [_stepper(env, asked.seconds) for env in made]
+        jobs.append(_bare(made[0], round(1000.0 / rate), asked.seconds))
+        speeds = [speed * 1000.0 / rate for speed in _speeds(jobs, asked.turns)]
         for env in made:
             env.close()
-        batched, single, loop, processes = speeds
+        batched, single, loop, processes, bare = speeds
         lines.append(
             f"| {rate:g} | {1000 / rate:g} | {batched:,.0f} | {single:,.0f} | {loop:,.0f} |"
-            f" {processes:,.0f} | {batched / loop:.1f} | {batched / processes:.1f} |"
+            f" {processes:,.0f} | {bare:,.0f} | {batched / loop:.1f} | {batched / processes:.1f} |"
+            f" {bare / loop:.1f} |"
         )
     return lines
 
@@ -73,6 +79,25 @@ def _stepper(env, seconds: float) -> Callable[[], float]:
         while True:
             env.step(action)
             steps += env.num_envs
+            passed = time.perf_counter() - begin
+            if passed > seconds:
+                return steps / passed
+
+    return job
+
+
+def _bare(env, substeps: int, seconds: float) -> Callable[[], float]:
+    """The same simulations stepped by MuJoCo, without control, sensors and reward."""
+    core: TaskCore = env.unwrapped.core
+    batch = Batch(core.setup.variants.plant.model, core.count, nthread=2)
+    batch.state[:] = core.simulations.state
+    batch.ctrl[:] = core.action.astype(float)
+
+    def job() -> float:
+        begin, steps = time.perf_counter(), 0
+        while True:
+            batch.step(nstep=substeps)
+            steps += core.count
             passed = time.perf_counter() - begin
             if passed > seconds:
                 return steps / passed

@@ -36,7 +36,8 @@ PLACE_LOG = Task(
     kind="place",
     sentence=(
         "An excavator takes a log from the ground with a grapple that swings freely and lays it"
-        " down elsewhere, turned as asked."
+        " down elsewhere, turned as asked. Where log and goal lie is known exactly, also with real"
+        " sensors."
     ),
     reward=(
         "1 for every metre nearer: of the grapple to the log until it is held (a radian askew"
