@@ -80,8 +80,10 @@ class Fleet:
             chosen: (m,) int32 numbers of simulations, None for all.
 
         Raises:
-            RuntimeError: MuJoCo raised an error in one of them.
+            RuntimeError: they were closed, or MuJoCo raised an error in one of them.
         """
+        if not self._handle:
+            raise RuntimeError("the simulations were closed: make new ones")
         ids = None if chosen is None else chosen.ctypes.data
         count = self.count if chosen is None else len(chosen)
         if self._library.mjb_apply(self._handle, ids, count, function, argument, 1):

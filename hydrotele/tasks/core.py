@@ -187,7 +187,10 @@ class TaskCore:
 
         Raises:
             ValueError: the shape is wrong, or an action is not a number.
+            RuntimeError: there was no reset before, or the simulations were closed.
         """
+        if not self._seeded:
+            raise RuntimeError("reset before the first step")
         self.action[...] = action
         if not np.isfinite(self.action).all():
             raise ValueError("an action is not a finite number")

@@ -215,8 +215,21 @@ def test_an_action_that_is_no_number_is_refused():
     core = TaskCore(TRACK, Options(variants=1))
     with pytest.raises(RuntimeError, match="seeds"):
         core.reset()
+    with pytest.raises(RuntimeError, match="reset before"):
+        core.step(np.zeros(3))
     core.reset(np.array([0]))
     with pytest.raises(ValueError, match="finite"):
         core.step(np.array([0.0, np.nan, 0.0]))
     with pytest.raises(ValueError, match="shape|broadcast"):
         core.step(np.zeros(4))
+
+
+def test_a_closed_task_says_so():
+    core = TaskCore(TRACK, Options(variants=1))
+    core.reset(np.array([0]))
+    core.close()
+    core.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        core.step(np.zeros(3))
+    with pytest.raises(RuntimeError, match="closed"):
+        core.reset()
