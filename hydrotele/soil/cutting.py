@@ -64,7 +64,7 @@ def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
     Returns:
         N_g, scalar [1]; depth counts at right angles to the surface.
 
-    Source: McKyes 1985, Eq. 3.6; Luengo et al. 1998, Eq. 5.
+    Source: McKyes 1985, chapter 3; Luengo et al. 1998.
 
     >>> import math
     >>> phi = math.radians(30)
@@ -90,7 +90,7 @@ def surcharge_factor(rake, slope, friction, tool_friction, plane):
     Returns:
         N_q, scalar [1].
 
-    Source: Luengo et al. 1998, Eq. 7.
+    Source: Luengo et al. 1998.
     """
     return math.sin(plane + friction + slope) / math.sin(rake + tool_friction + friction + plane)
 
@@ -108,7 +108,7 @@ def cohesion_factor(rake, friction, tool_friction, plane):
     Returns:
         N_c, scalar [1].
 
-    Source: McKyes 1985, Eq. 3.7, simplified.
+    Source: McKyes 1985, chapter 3, simplified.
     """
     fan = rake + tool_friction + friction + plane
     return math.cos(friction) / (math.sin(plane) * math.sin(fan))
@@ -127,7 +127,7 @@ def adhesion_factor(rake, friction, tool_friction, plane):
     Returns:
         N_ca, scalar [1]; the adhesion itself, along the blade, comes on top.
 
-    Source: McKyes 1985, Eq. 3.9, simplified.
+    Source: McKyes 1985, chapter 3, simplified.
     """
     fan = rake + tool_friction + friction + plane
     return -math.cos(rake + friction + plane) / (math.sin(rake) * math.sin(fan))

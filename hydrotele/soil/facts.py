@@ -65,7 +65,8 @@ SOILS = {
         cut_slope=math.radians(80.0),
     ),
 }  # fmt: skip
-"""Soft: cohesion and friction of the sandy loam with 15 % moisture in Wong, Theory of Ground
+"""Typical soils to start with. The numbers are as remembered of the books named here, not looked up
+again: replace them by those of your ground. Soft: cohesion and friction of the sandy loam with 15 % moisture in Wong, Theory of Ground
 Vehicles, Table 2.3; density and swell of loam (bank 1540, loose 1245 kg/m^3) in the Caterpillar
 Performance Handbook, Weights of Materials. Sandy loam, moist: cohesion of the one with 11 %
 moisture there (4.83 kPa) with a friction between those of the two. Firm: density and swell of

@@ -97,7 +97,7 @@ def cutting_force(n, depth, loose, rake, slope, load, out):
     Returns:
         Nothing.
 
-    Source: see `cutting`; adhesion along the blade as in McKyes 1985, Eq. 3.10.
+    Source: see `cutting`; adhesion along the blade as in McKyes 1985, chapter 3.
     """
     out[0], out[1] = 0.0, 0.0
     if depth <= 0.0:
