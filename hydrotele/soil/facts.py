@@ -65,12 +65,13 @@ SOILS = {
         cut_slope=math.radians(80.0),
     ),
 }  # fmt: skip
-"""Typical soils to start with. The numbers are as remembered of the books named here, not looked up
-again: replace them by those of your ground. Soft: cohesion and friction of the sandy loam with 15 % moisture in Wong, Theory of Ground
-Vehicles, Table 2.3; density and swell of loam (bank 1540, loose 1245 kg/m^3) in the Caterpillar
-Performance Handbook, Weights of Materials. Sandy loam, moist: cohesion of the one with 11 %
-moisture there (4.83 kPa) with a friction between those of the two. Firm: density and swell of
-packed earth in the Handbook (1900, 1510 kg/m^3); cohesion and friction of a stiff sandy clay are
-assumed. Friction on steel is two thirds of that inside, as for steel against sand in Terzaghi and
-Peck; adhesion is a tenth of the cohesion, assumed. Stiffness: passive pressure is mobilised after
-some 2 % of the height of a wall (Clough and Duncan 1991), here 4 mm in 0.2 m for 12 kN."""
+"""Typical soils to start with. The numbers are as remembered of the books named here, not looked
+up again: replace them by those of your ground. Soft: cohesion and friction of the sandy loam with
+15 % moisture in Wong, Theory of Ground Vehicles, Table 2.3; density and swell of loam (bank 1540,
+loose 1245 kg/m^3) in the Caterpillar Performance Handbook, Weights of Materials. Sandy loam,
+moist: cohesion of the one with 11 % moisture there (4.83 kPa) with a friction between those of the
+two. Firm: density and swell of packed earth in the Handbook (1900, 1510 kg/m^3); cohesion and
+friction of a stiff sandy clay are assumed. Friction on steel is two thirds of that inside, as for
+steel against sand in Terzaghi and Peck; adhesion is a tenth of the cohesion, assumed. Stiffness:
+passive pressure is mobilised after some 2 % of the height of a wall (Clough and Duncan 1991), here
+4 mm in 0.2 m for 12 kN."""
