@@ -120,6 +120,7 @@ class Machine(Facts):
     arm: Arm | None = None
     log_columns: dict[str, str] = {}
     removed_bodies: tuple[str, ...] = ()
+    uncertainty: dict[str, NonNegative] = {}
 
     @property
     def joints(self) -> dict[str, Joint]:

@@ -5,6 +5,7 @@ of its deviations d. The loss is `sum e(d)^2 + d'd` (a unit-normal prior); a hyp
 `log det(1 + S'S)` for the room that its parameters take (Laplace's approximation of the evidence).
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,10 +15,12 @@ import numpy as np
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.machine import Machine
 from hydrotele.prediction.hypothesis import Guess
-from hydrotele.prediction.track import STEP, Track, fine_enough, track_run
+from hydrotele.prediction.levels import find_levels
+from hydrotele.prediction.track import STEP, Track, fine_enough, known_levels, track_run
 
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
 _STEPS = 6
+BLOCK = 2.0  # s of a run that count as one witness: longer than what a model lacks remembers
 _CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
 
 
@@ -45,34 +48,71 @@ class Fit:
         return self.gain - self.charge
 
 
+@dataclass(frozen=True)
+class Judged:
+    """A guess with noise levels of its own.
+
+    Attributes:
+        guess: the guess.
+        tracks: its tracks of the fit runs, linearised.
+        loss: -2 log of their likelihood times the prior of levels and deviations.
+    """
+
+    guess: Guess
+    tracks: tuple[Track, ...]
+    loss: float
+
+    def blocks(self, seconds: float = BLOCK) -> np.ndarray:
+        """(B,) -2 log likelihood of stretches of the runs, without constant."""
+        return np.concatenate([_blocks(track, seconds) for track in self.tracks])
+
+
 class Evidence:
     """Runs of a dataset, tracks of a base guess, and workers to try other guesses."""
 
     def __init__(
-        self, data: Dataset, runs: Sequence[RunData], jobs: int = 2, step: float = STEP
+        self, data: Dataset, runs: Sequence[RunData], jobs: int = 2, step: float = STEP,
+        lacking: bool = False,
     ):  # fmt: skip
-        """Take the runs to judge by and the largest step [s]; `close` ends the workers."""
-        self.step = step
-        self.data, self.runs = data, tuple(runs)
+        """Take the runs to judge by and the largest step [s]; `close` ends the workers.
+
+        With `lacking`, or where a channel's accuracy is not stated, noise levels are found from
+        the data for every base (`prediction.levels`); otherwise they are those that are stated.
+        """
+        self.step, self.lacking = step, lacking or not known_levels(data)
+        self.data, self.runs = dataclasses.replace(data, fit=tuple(runs)), tuple(runs)
         self._pool = ThreadPoolExecutor(jobs)
         self.tracks: tuple[Track, ...] = ()
         self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
+        self._slopes = dict[float, np.ndarray]()
 
     def close(self) -> None:
         """End the workers."""
         self._pool.shutdown()
 
     def track(self, machine: Machine, runs: Sequence[RunData] | None = None) -> tuple[Track, ...]:
-        """Tracks with gains of their own."""
+        """Tracks with gains of their own and the levels that the machine states."""
         runs = self.runs if runs is None else runs
         return tuple(
             self._pool.map(lambda run: track_run(machine, self.data, run, None, self.step), runs)
         )
 
-    def set_base(self, guess: Guess) -> None:
+    def judged(self, guess: Guess, near: Sequence[Track] = ()) -> Judged:
+        """A guess with noise levels of its own, found from those of tracks nearby."""
+        machine = guess.machine(self.data.machine)
+        if not self.lacking:
+            tracks = self.track(machine)
+        else:
+            tracks = find_levels(self.data, machine, near or self.tracks, self._pool.map, self.step)
+        loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
+        return Judged(guess, tracks, loss + _prior(guess))
+
+    def set_base(self, guess: Guess | Judged) -> Judged:
         """Compute gains anew for a guess; later errors are whitened with them."""
-        self.tracks = self.track(guess.machine(self.data.machine))
-        self._base, self._steps = guess, {}
+        judged = guess if isinstance(guess, Judged) else self.judged(guess)
+        self.tracks, self._base = judged.tracks, judged.guess
+        self._steps, self._slopes = {}, {}
+        return judged
 
     @property
     def base_loss(self) -> float:
@@ -131,9 +171,10 @@ class Evidence:
         return list(self._pool.map(function, items))
 
     def slopes(
-        self, guess: Guess, errors: np.ndarray, parallel: bool = True, step: float | None = None
-    ) -> np.ndarray:
-        """(E, P) change of the errors per deviation; `step` as for the errors [s]."""
+        self, guess: Guess, errors: np.ndarray, parallel: bool = True, step: float | None = None,
+        first: int = 0,
+    ) -> np.ndarray:  # fmt: skip
+        """(E, P - first) change of the errors per deviation, from the given one on."""
         nudges = guess.nudges()
 
         def column(index: int) -> np.ndarray:
@@ -142,13 +183,21 @@ class Evidence:
             moved[index] += nudge
             return (self.errors(guess.at(moved), step) - errors) / nudge
 
-        columns = range(len(guess.deviation))
+        columns = range(first, len(guess.deviation))
         found = self.map(column, columns) if parallel else [column(i) for i in columns]
         return np.column_stack(found) if found else np.zeros((len(errors), 0))
 
+    def base_slopes(self, step: float | None = None, parallel: bool = True) -> np.ndarray:
+        """(E, P) slopes of the base, kept until there is another base."""
+        step = step or self.step
+        if step not in self._slopes:
+            errors = self.errors(self._base, step)
+            self._slopes[step] = self.slopes(self._base, errors, parallel, step)
+        return self._slopes[step]
+
     def fit(
         self, guess: Guess, before: float, parallel: bool = True, steps: int = _STEPS,
-        step: float | None = None,
+        step: float | None = None, kept: np.ndarray | None = None,
     ) -> Fit:  # fmt: skip
         """Gauss-Newton with halved steps, from the guess.
 
@@ -158,13 +207,20 @@ class Evidence:
             parallel: whether this may use the workers (not from within one).
             steps: largest number of Gauss-Newton steps.
             step: largest step of the integrator [s]; the evidence's own if None.
+            kept: (E, K) slopes of the first K deviations, which are then not computed anew.
 
         Returns:
             The fit.
         """
+        first = 0 if kept is None else kept.shape[1]
+
+        def slopes_at(there: Guess, errors: np.ndarray) -> np.ndarray:
+            fresh = self.slopes(there, errors, parallel, step, first)
+            return fresh if kept is None else np.hstack([kept, fresh])
+
         errors = self.errors(guess, step)
         loss = _loss(errors, guess)
-        slopes = self.slopes(guess, errors, parallel, step)
+        slopes = slopes_at(guess, errors)
         for _ in range(steps):
             d = guess.deviation
             move = -np.linalg.solve(slopes.T @ slopes + np.eye(len(d)), slopes.T @ errors + d)
@@ -181,7 +237,7 @@ class Evidence:
             guess, errors, loss = better
             if fall < _CLOSE:
                 break
-            slopes = self.slopes(guess, errors, parallel, step)
+            slopes = slopes_at(guess, errors)
         information = slopes.T @ slopes + np.eye(slopes.shape[1])
         last = guess.parts[-1][0].size if guess.parts else 0
         return Fit(guess, loss, before - loss, charge(information, last), information)
@@ -202,4 +258,18 @@ def flat(whitened: np.ndarray) -> np.ndarray:
 
 
 def _loss(errors: np.ndarray, guess: Guess) -> float:
-    return float(errors @ errors + guess.deviation @ guess.deviation)
+    return float(errors @ errors) + _prior(guess)
+
+
+def _prior(guess: Guess) -> float:
+    return float(guess.deviation @ guess.deviation)
+
+
+def _blocks(track: Track, seconds: float) -> np.ndarray:
+    """-2 log likelihood of stretches of a run; the last, shorter one joins the one before."""
+    there = np.isfinite(track.whitened)
+    width = np.where(there, track.gains.spread, 1.0)
+    rows = np.where(there, track.whitened**2 + 2.0 * np.log(width), 0.0).sum(axis=1)
+    count = max(1, int(len(rows) * track.run.period / seconds))
+    edges = np.linspace(0, len(rows), count + 1).astype(int)
+    return np.add.reduceat(rows, edges[:-1])

@@ -73,14 +73,16 @@ def _slopes(model, sp, z, nudge, slope, moved):
 @compiled
 def filter_run(
     model, sp, late, z, spread, command, known, reading, noise, drift, startle, period, steps,
-    coarse, nudge, own, slope, gain, width, fresh, whitened, predicted, corrected,
+    coarse, nudge, own, slope, gain, width, fresh, columns, decay, whitened, predicted, corrected,
+    initial, flow,
 ):  # fmt: skip
     """Cross a run.
 
     Args:
         model: Model.
         sp: Space.
-        late: Late; its q readings are the last of the nz states, and are set here at first.
+        late: Late; its q readings follow the model's states, and are set here at first; m unknown
+            inputs are the last of the nz states.
         z: (nz,) state before the first row's readings; overwritten.
         spread: (nz, nz) its covariance; overwritten.
         command: (n, nu) commands.
@@ -100,9 +102,15 @@ def filter_run(
         gain: see slope.
         width: see slope.
         fresh: whether to compute gains; False keeps the given ones.
+        columns: (n, m, nz - q - m) what each unknown input, of size 1, adds to the model's states
+            over a row.
+        decay: by which factor inputs fall over a row.
         whitened: (n, c) written; NaN where missing.
         predicted: (n, c) written: readings predicted from the rows before.
-        corrected: (n, nz - q) written: the model's states after the row's readings.
+        corrected: (n, nz - q - m) written: the model's states after the row's readings.
+        initial: (nz, nz) written if `fresh`: covariance before the first row's readings.
+        flow: (n, nz, nz) written if `fresh`: d (state before the next row's readings) / d (state
+            after this row's), the latter along the first index; (0, nz, nz) keeps none.
 
     Returns:
         -2 log likelihood without its constant; infinite if the states broke down.
@@ -110,10 +118,12 @@ def filter_run(
     Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings.
     """
     rows, channels, full = reading.shape[0], reading.shape[1], len(z)
-    size, h, few = full - len(late.channel), period / steps, len(own)
+    inputs, h, few = columns.shape[1], period / steps, len(own)
+    begin = full - inputs  # of the inputs
+    size = begin - len(late.channel)
     trail = np.zeros((steps + 1, channels))
     rough = np.zeros((coarse + 1, channels))
-    if size == full:  # nothing is late
+    if size == begin:  # nothing is late
         trail, rough = trail[:0], rough[:0]
     reached = np.zeros((full + 1, full))
     moved, work = np.zeros(size), np.zeros((full, full))
@@ -125,6 +135,7 @@ def filter_run(
     if fresh:
         _slopes(model, sp, z[:size], nudge, slope[0], moved)
         spread_late(late, size, slope[0], spread)
+        initial[:] = spread
     loss = 0.0
     for row in range(rows):
         read_channels(model, sp, z, row, steps, h, trail[:0], predicted[row])
@@ -181,14 +192,26 @@ def filter_run(
                 if moves:
                     advance(model, sp, reached[s], command, row, period, coarse, rough)
                     move_late(model, late, size, rough, period / coarse, reached[s])
-                elif s > size and late.due[s - size - 1] < 0.0:
+                elif begin <= s < full:
+                    for r in range(size):
+                        reached[s, r] += nudge[s] * columns[row, s - begin, r]
+                    reached[s, s] += decay * nudge[s]
+                elif size < s < begin and late.due[s - size - 1] < 0.0:
                     reached[s, s - 1] += nudge[s]
             _carry(reached, nudge, spread, work, drift)
+            if len(flow) > 0:
+                for s in range(full):
+                    for r in range(full):
+                        flow[row, s, r] = reached[s, r]
             if not known[row]:
                 for s in range(full):
                     spread[s, s] += startle[s]
         advance(model, sp, z, command, row, period, steps, trail)
         move_late(model, late, size, trail, h, z)
+        for i in range(inputs):
+            for r in range(size):
+                z[r] += columns[row, i, r] * z[begin + i]
+            z[begin + i] *= decay
     return loss
 
 

@@ -1,6 +1,6 @@
 """A hypothesis: an effect at a place, its numbers counted in typical deviations from nominal."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +17,21 @@ _SMOOTH = ("timing", "sensor")  # laws whose effects have a slope at nominal, be
 class Hypothesis:
     """An effect at a place of the given machine, with p parameters.
 
-    Deviations are `(value - nominal) / scale`, so that the prior is a unit normal.
+    Deviations are `(value - nominal) / scale`, so that the prior is a unit normal. `change` makes
+    the machine that has it from parameter values; by default the library's effect of that name.
     """
 
     name: str
     location: str
     parameters: dict[str, Parameter]
+    change: Callable[[Machine, Mapping[str, float]], Machine] | None = None
+
+    def machine(self, nominal: Machine, deviation: np.ndarray) -> Machine:
+        """The machine that has it, at a deviation (p,)."""
+        values = self.values(deviation)
+        if self.change:
+            return self.change(nominal, values)
+        return EFFECTS[self.name].apply(nominal, self.location, values)
 
     @property
     def size(self) -> int:
@@ -136,6 +145,5 @@ class Guess:
     def machine(self, nominal: Machine) -> Machine:
         """The machine that has all these effects."""
         for hypothesis, deviation in self.parts:
-            effect = EFFECTS[hypothesis.name]
-            nominal = effect.apply(nominal, hypothesis.location, hypothesis.values(deviation))
+            nominal = hypothesis.machine(nominal, deviation)
         return nominal

@@ -1,76 +1,233 @@
-"""Noise levels from the data, where the machine states no accuracy of its sensors.
+"""Noise levels from the data: of every channel's readings, and of what the model lacks.
 
-Such a machine is usually known roughly, too: readings then differ from the model by what it lacks,
-not by noise. A filter that trusts every reading would follow them and see no difference; so here it
-forgets over a stated horizon, and an error counts by its mean over that horizon. The errors of the
-given model then have size 1 by construction: effects can be compared, but there is no floor below
-which a model counts as perfect.
+What a model lacks is counted as unknown inputs of its balances (`prediction.inputs`): force, flow
+into the chambers, command. All levels are those of the largest likelihood (Kristensen, Madsen and
+Jorgensen 2004, Automatica 40(2), section 3: grey-box models whose diffusion terms show where they
+lack something). An accuracy that a machine states is a prior for its channel. So likelihoods and
+intervals count what a model lacks, and a channel without a stated accuracy costs that channel its
+prior and nothing else.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 
 from hydrotele.dataset.load import Dataset, RunData
-from hydrotele.prediction.track import track_run
-from hydrotele.signals import parse_channel
+from hydrotele.dynamics.model import state_names
+from hydrotele.machine import Machine
+from hydrotele.noise import channel_sensor, converter
+from hydrotele.prediction.inputs import (
+    Input,
+    input_columns,
+    input_sizes,
+    possible_inputs,
+)
+from hydrotele.prediction.linear import linear_run, smooth
+from hydrotele.prediction.track import (
+    STARTLE,
+    STEP,
+    Levels,
+    Track,
+    by_kind,
+    state_drift,
+    track_run,
+)
 
-HORIZON = 0.5  # s over which the filter forgets: longer than a valve's lag, shorter than a motion
-_ROUNDS = 5
-_PRESSURES = ("pressure_head", "pressure_rod")
+LEAST = 1.0e-4  # of an input's largest size: below it an input is none
+_STATED = 0.5  # prior standard deviation of log(noise / stated): a data sheet is good to a factor
+_LACK = 4.0  # prior standard deviation of log(size / least): says next to nothing
+_NOISIER = 1.25  # times the rough noise that a channel's noise can be: what is slow is no noise
+_QUIETER = 0.3  # times the stated or the rough noise, whichever is smaller
+_ROWS = 6000  # of a run that tell its levels; more say the same again
+_ITERATIONS = 12  # of a round: what is left of the way is small against a round's own linearisation
+_SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
+_LOOSE = {"rate": 0.02, "drive_rate": 0.02, "spool": 0.02, "pressure_head": 1e5,
+          "pressure_rod": 1e5}  # fmt: skip
+# What 20 ms may add to a state at first, so that a model that lacks something follows the readings.
 
 
-def known_levels(data: Dataset) -> bool:
-    """Whether the noise of every channel is stated."""
-    return bool(np.all(np.isfinite(data.noise)))
+def rough_noise(data: Dataset) -> np.ndarray:
+    """(c,) noise of a reading, from third differences of the runs [channel's unit].
 
-
-def find_levels(data: Dataset, each: Callable = map) -> Dataset:
-    """The dataset with reading noise and drift for a filter that forgets over the horizon.
-
-    Args:
-        data: a dataset with unknown noise in some channels.
-        each: such as `map`, perhaps on several workers.
-
-    Returns:
-        The dataset with finite `noise`, and `drift`.
+    They take out what moves slowly against the rows; what moves faster makes it too large. Never
+    less than a converter's step over sqrt(12).
     """
-    unknown = ~np.isfinite(data.noise)
-    readings = np.concatenate([run.reading for run in data.fit])
-    noise = np.where(unknown, 0.01 * np.nanstd(readings, axis=0) + 1e-12, data.noise)
-    found = _forgetful(data, noise, unknown)
-    for _ in range(_ROUNDS):
-        tracks = list(each(lambda run, now=found: track_run(now.machine, now, run), data.fit))
-        size = _size_over_horizon([t.whitened for t in tracks], data.fit)
-        noise = np.where(unknown, noise * size, noise)
-        found = _forgetful(data, noise, unknown)
+    sensors = data.machine.sensors.get(data.sensors) if data.sensors else None
+    found = np.zeros(len(data.channels))
+    for c, channel in enumerate(data.channels):
+        values = np.concatenate([np.diff(run.reading[:, c], n=3) for run in data.fit])
+        values = values[np.isfinite(values)]
+        spread = 1.4826 * np.median(np.abs(values)) if len(values) else 0.0
+        if spread == 0.0 and len(values):  # more than half of the readings repeat
+            spread = float(np.std(values))
+        step = converter(channel_sensor(data.machine, sensors, channel), channel).step
+        found[c] = max(spread / np.sqrt(20.0), step / np.sqrt(12.0), 1e-12)
     return found
 
 
-def _forgetful(data: Dataset, noise: np.ndarray, unknown: np.ndarray) -> Dataset:
-    """Drift such that readings of unknown noise correct their state over the horizon."""
-    drift, machine = {}, data.machine
-    share = data.fit[0].period / HORIZON
-    for channel, level, free in zip(data.channels, noise, unknown, strict=True):
-        if not free:
-            continue
-        signal = parse_channel(channel)
-        if signal.kind in _PRESSURES:
-            drift[f"{signal.kind}.{signal.axis}"] = level * share
-        elif signal.axis in data.axes and signal.kind == machine.position_kind(signal.axis):
-            drift[f"position.{machine.axes[signal.axis].joint}"] = level * share
-    return dataclasses.replace(data, noise=noise, drift=drift)
+class Prior(NamedTuple):
+    """What is known of the levels before they are found.
+
+    Attributes:
+        noise: (c,) most likely noise [channel's unit].
+        width: (c,) standard deviation of its logarithm.
+        low: (c,) least noise.
+        high: (c,) largest noise.
+    """
+
+    noise: np.ndarray
+    width: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
 
-def _size_over_horizon(whitened: list[np.ndarray], runs: tuple[RunData, ...]) -> np.ndarray:
-    """Per channel (c,) size of the errors' sums over the horizon, were they white 1."""
-    sums, counts = [], []
-    for errors, run in zip(whitened, runs, strict=True):
-        rows = max(1, round(HORIZON / run.period))
-        windows = len(errors) // rows
-        cut = errors[: windows * rows].reshape(windows, rows, -1)[2:]
-        sums.append(np.nansum(cut, axis=1))
-        counts.append(np.isfinite(cut).sum(axis=1))
-    total, count = np.concatenate(sums), np.concatenate(counts)
-    return np.sqrt((total**2).sum(axis=0) / np.maximum(count.sum(axis=0), 1)) + 1e-9
+def noise_prior(data: Dataset) -> Prior:
+    """Prior of the readings' noise: what the machine states, and what the readings allow."""
+    rough, stated = rough_noise(data), np.isfinite(data.noise)
+    noise = np.where(stated, data.noise, rough)
+    width = np.where(stated, _STATED, 2.0 * _STATED)
+    return Prior(noise, width, _QUIETER * np.minimum(noise, rough), _NOISIER * rough)
+
+
+def find_levels(
+    data: Dataset, machine: Machine, start: Sequence[Track] = (), each: Callable = map,
+    step: float = STEP, rounds: int = 3,
+) -> tuple[Track, ...]:  # fmt: skip
+    """Levels of the largest posterior probability, given a machine.
+
+    Args:
+        data: the dataset; its `noise` is what the machine states, NaN where nothing.
+        machine: the machine.
+        start: tracks of a machine like it, with levels to begin with; without them every unknown
+            input is tried.
+        each: such as `map`, perhaps on several workers.
+        step: largest step of the integrator [s].
+        rounds: how often the runs are linearised anew.
+
+    Returns:
+        Tracks of the fit runs with these levels, linearised.
+    """
+    prior = noise_prior(data)
+    if start:
+        levels = start[0].levels
+        tracks = _crossed(data, machine, levels, start, each, step)
+    else:
+        noise = np.clip(prior.noise, prior.low, prior.high)
+        rough = Levels(noise, drift=_LOOSE)
+        tracks = _crossed(data, machine, rough, (), each, step)
+        inputs = possible_inputs(machine)
+        levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
+        tracks = _crossed(data, machine, levels, tracks, each, step)
+    for _ in range(rounds):
+        before = sum(track.loss for track in tracks) + levels.penalty
+        levels = _pruned(_most_likely(data, machine, levels, prior, tracks, each), machine)
+        tracks = _crossed(data, machine, levels, tracks, each, step)
+        if sum(track.loss for track in tracks) + levels.penalty > before - _SETTLED:
+            break
+    return tracks
+
+
+def _pruned(levels: Levels, machine: Machine) -> Levels:
+    """Levels without the inputs that are none."""
+    kept = levels.sizes > 2.0 * LEAST * input_sizes(machine, levels.inputs)
+    inputs = tuple(i for i, keep in zip(levels.inputs, kept, strict=True) if keep)
+    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept])
+
+
+def _crossed(
+    data: Dataset, machine: Machine, levels: Levels, near: Sequence[Track], each: Callable,
+    step: float,
+) -> tuple[Track, ...]:  # fmt: skip
+    """Linearised tracks with some levels; what inputs do is taken from tracks nearby."""
+
+    def cross(index: int) -> Track:
+        run, columns = data.fit[index], None
+        if near and levels.inputs:
+            columns = columns_of(machine, near[index], levels.inputs)
+        return track_run(machine, data, run, None, step, levels, columns, linearise=True)
+
+    return tuple(each(cross, range(len(data.fit))))
+
+
+def columns_of(machine: Machine, near: Track, inputs: Sequence[Input]) -> np.ndarray:
+    """(n, m, nz) what inputs do in a machine, from a linearised track of one like it."""
+    names, before = state_names(machine), list(near.names[: near.states.shape[1]])
+    if names == before:
+        return input_columns(machine, near.states, near.flow, near.run.period, inputs)
+    there = [before.index(n) for n in names if n in before]
+    here = [s for s, n in enumerate(names) if n in before]
+    states = np.zeros((len(near.states), len(names)))
+    flow = np.tile(np.eye(len(names)), (len(states), 1, 1))
+    states[:, here] = near.states[:, there]
+    flow[np.ix_(range(len(states)), here, here)] = near.flow[
+        np.ix_(range(len(states)), there, there)
+    ]
+    return input_columns(machine, states, flow, near.run.period, inputs)
+
+
+def _most_likely(
+    data: Dataset, machine: Machine, levels: Levels, prior: Prior, tracks: Sequence[Track],
+    each: Callable,
+) -> Levels:  # fmt: skip
+    """Levels of the largest posterior probability in the linearised runs."""
+    names, c, m = list(tracks[0].names), len(data.channels), len(levels.inputs)
+    runs = [(_part(track, names), track.run) for track in tracks]
+    largest = input_sizes(machine, levels.inputs)
+    first = len(names) - m
+
+    def of(x: np.ndarray) -> Levels:
+        return dataclasses.replace(levels, noise=np.exp(x[:c]), sizes=np.exp(x[c:]), drift={})
+
+    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+        now, slope = of(x), np.zeros(len(x))
+
+        def one(pair: tuple) -> tuple[float, np.ndarray, np.ndarray]:
+            run: RunData = pair[1]
+            drift = state_drift(names, now, run.period)
+            found = smooth(pair[0], now.noise**2, drift)
+            return found.loss, found.noise_slope, (drift * found.drift_slope)[first:]
+
+        total = 0.0
+        for value, per_noise, per_drift in each(one, runs):
+            total += value
+            slope[:c] += 2.0 * now.noise**2 * per_noise
+            slope[c:] += 2.0 * per_drift
+        off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
+        slope[:c] += 2.0 * off / prior.width
+        slope[c:] += 2.0 * lack / _LACK
+        return total + float(off @ off + lack @ lack), slope
+
+    low = np.log(np.concatenate([prior.low, LEAST * largest]))
+    high = np.log(np.concatenate([prior.high, largest]))
+    start = np.log(np.concatenate([levels.noise, np.maximum(levels.sizes, 3 * LEAST * largest)]))
+    found = minimize(
+        loss, np.clip(start, low, high), jac=True, method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": _ITERATIONS, "ftol": 1e-6},
+    )  # fmt: skip
+    x = found.x
+    off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
+    return dataclasses.replace(of(x), penalty=float(off @ off + lack @ lack))
+
+
+def _part(track: Track, names: list[str]):
+    """The start of a run, linearised."""
+    return linear_run(track, by_kind(names, STARTLE) ** 2, slice(0, _ROWS))
+
+
+def input_excess(track: Track) -> float:
+    """Twice the log likelihood that a track's unknown inputs bring, all else the same."""
+    if not track.levels.inputs:
+        return 0.0
+    names, m = list(track.names), len(track.levels.inputs)
+    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    drift = state_drift(names, track.levels, track.run.period)
+    noise = track.levels.noise**2
+    loss = smooth(run, noise, drift).loss
+    drift[len(names) - m :] = 0.0
+    initial = run.initial.copy()
+    initial[len(names) - m :] = 0.0
+    return smooth(run._replace(initial=initial), noise, drift).loss - loss

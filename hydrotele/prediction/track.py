@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
 from hydrotele.machine import Machine
 from hydrotele.prediction.filter import Gains, filter_run
+from hydrotele.prediction.inputs import Input, decay, input_drift
 from hydrotele.prediction.late import late_readings
 from hydrotele.prediction.start import find_rest, start_state
 
@@ -21,22 +22,48 @@ _STIFF = 1.0e-3  # s, where a transmission's spring is: with the oil it may ring
 
 
 @dataclass(frozen=True)
+class Levels:
+    """How large everything is that a model does not predict.
+
+    Attributes:
+        noise: (c,) standard deviation of a reading [channel's unit].
+        inputs: the m unknown inputs.
+        sizes: (m,) their stationary standard deviations [N], [N m], [m^3/s] or [1].
+        drift: kind of state -> standard deviation of what 20 ms add to it, where that is not the
+            floor that `DRIFT` states.
+        penalty: -2 log prior of the levels.
+    """
+
+    noise: np.ndarray
+    inputs: tuple[Input, ...] = ()
+    sizes: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    drift: Mapping[str, float] = field(default_factory=dict)
+    penalty: float = 0.0
+
+
+@dataclass(frozen=True)
 class Track:
     """One run crossed by one model.
 
     Attributes:
         run: the run.
+        levels: the noise levels that it was crossed with.
         loss: -2 log likelihood without its constant.
         whitened: (n, c) prediction errors over their predicted spread, NaN where missing.
         predicted: (n, c) one-step predictions [channel's unit].
         states: (n, nz) states after each row's readings.
         gains: gains and whiteners used.
-        names: the states that the gains know, those of readings on their way included.
+        names: the states that the gains know, those of readings on their way and of unknown inputs
+            included.
         start: (nz,) state before the first reading.
         rest: (t,) where the drives of transmissions rested in their backlash, see `start_state`.
+        columns: (n, m, nz) what unit inputs add to the model's states over a row.
+        initial: (nz, nz) covariance before the first reading, of all states; 0 with kept gains.
+        flow: (n, nz, nz) transition Jacobians as of `filter_run`; empty unless asked for.
     """
 
     run: RunData
+    levels: Levels
     loss: float
     whitened: np.ndarray
     predicted: np.ndarray
@@ -45,19 +72,23 @@ class Track:
     names: tuple[str, ...]
     start: np.ndarray
     rest: np.ndarray
+    columns: np.ndarray
+    initial: np.ndarray
+    flow: np.ndarray
 
 
 _NUDGE = {
     "position": 1e-6, "drive": 1e-6, "rate": 1e-5, "drive_rate": 1e-5, "spool": 1e-5,
     "spool_rate": 1e-3, "pressure_head": 100.0, "pressure_rod": 100.0,
-    "late": 1.0,
+    "late": 1.0, "input": 1.0,
 }  # fmt: skip
-# What a row of 20 ms may add to a state beyond the model: integrator error, not physics.
+# What 20 ms may add to a state beyond the model: integrator error, not physics.
 DRIFT = {
     "position": 2e-6, "drive": 2e-6, "rate": 2e-4, "drive_rate": 2e-4, "spool": 1e-4,
     "spool_rate": 1e-2, "pressure_head": 5e3, "pressure_rod": 5e3,
 }  # fmt: skip
-_STARTLE = {
+DRIFT_TIME = 0.02  # s over which a process noise adds its standard deviation, as of a random walk
+STARTLE = {
     "spool": 0.2,
     "spool_rate": 5.0,
     "pressure_head": 2e6,
@@ -79,9 +110,23 @@ def fine_enough(machine: Machine, step: float) -> float:
     return min(step, _STIFF) if springs else step
 
 
+def known_levels(data: Dataset) -> bool:
+    """Whether the machine states the accuracy of every channel."""
+    return bool(np.all(np.isfinite(data.noise)))
+
+
+def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
+    """(nz,) variance that a row adds to the states of a track by these names."""
+    drift = period / DRIFT_TIME * by_kind(names, {**DRIFT, **levels.drift}) ** 2
+    m = len(levels.inputs)
+    drift[len(names) - m :] = input_drift(levels.sizes, period)
+    return drift
+
+
 def track_run(
     machine: Machine, data: Dataset, run: RunData, kept: Track | None = None,
-    step: float = STEP,
+    step: float = STEP, levels: Levels | None = None, columns: np.ndarray | None = None,
+    linearise: bool = False,
 ) -> Track:  # fmt: skip
     """Cross a run with a machine.
 
@@ -89,13 +134,22 @@ def track_run(
         machine: the machine to try.
         data: the dataset that the run belongs to.
         run: the run.
-        kept: a track whose gains, whiteners and start are kept; None computes them anew.
+        kept: a track whose gains, whiteners, levels and start are kept; None computes them anew.
         step: largest step of the integrator [s].
+        levels: noise levels; without them those that the machine states, and no inputs.
+        columns: (n, m, nz) what unit inputs add to the states over a row.
+        linearise: whether to keep the transition Jacobians; only without `kept`.
 
     Returns:
         The track.
     """
     model = reduced_model(machine, data.channels)
+    names = state_names(machine)
+    if kept is not None:
+        levels, columns = kept.levels, _for_states(kept, names)
+    levels = levels or Levels(data.noise)
+    if columns is None:
+        columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
     play = model.transmission[:, BACKLASH] > 0.0
     rest = np.zeros(len(play))
     if kept is not None and len(kept.rest) == len(play):
@@ -106,24 +160,40 @@ def track_run(
             run, command=run.command[rows], command_known=run.command_known[rows],
             reading=run.reading[rows],
         )  # fmt: skip
-        rest = find_rest(lambda r: _cross(machine, model, data, first, None, step, r).loss, play)
-    return _cross(machine, model, data, run, kept, step, rest)
+        part = columns[rows]
+        rest = find_rest(
+            lambda r: _cross(machine, model, data, first, None, step, r, levels, part).loss, play
+        )
+    return _cross(machine, model, data, run, kept, step, rest, levels, columns, linearise)
+
+
+def _for_states(kept: Track, names: list[str]) -> np.ndarray:
+    """Columns of a kept track for a model with other states: 0 for those that it lacked."""
+    before = list(kept.names[: len(kept.start)])
+    if before == names:
+        return kept.columns
+    columns = np.zeros((*kept.columns.shape[:2], len(names)))
+    for s, name in enumerate(before):
+        if name in names:
+            columns[:, :, names.index(name)] = kept.columns[:, :, s]
+    return columns
 
 
 def _cross(
     machine: Machine, model: Model, data: Dataset, run: RunData, kept: Track | None, step: float,
-    rest: np.ndarray,
+    rest: np.ndarray, levels: Levels, columns: np.ndarray, linearise: bool = False,
 ) -> Track:  # fmt: skip
     step, coarse = fine_enough(machine, step), fine_enough(machine, COARSE)
     space = model_space(model)
     names, late = state_names(machine), late_readings(model, run.period)
-    rows, c, size = len(run.command), len(data.channels), len(names)
+    rows, c, size, m = len(run.command), len(data.channels), len(names), len(levels.inputs)
     start, spread = start_state(machine, data, run, model, names, rest)
     shown = [data.channels[k] for k in late.channel]
     names += [
         f"late.{channel}.{i - late.first[k]}"
         for i, (channel, k) in enumerate(zip(shown, late.channel, strict=True))
     ]
+    names += [f"input.{i.name}" for i in levels.inputs]
     full = len(names)
     if kept is None:
         gains = Gains(np.zeros((rows, c, full)), np.zeros((rows, c, full)), np.zeros((rows, c)))
@@ -140,12 +210,18 @@ def _cross(
     states = np.empty((rows, size))
     state, covariance = np.zeros(full), np.zeros((full, full))
     state[:size], covariance[:size, :size] = start, spread
+    at = np.arange(full - m, full)
+    covariance[at, at] = levels.sizes**2
+    flow, initial = np.empty((rows if linearise else 0, full, full)), np.zeros((full, full))
     loss = filter_run(
         model, space, late, state, covariance, run.command, run.command_known, run.reading,
-        data.noise**2, by_kind(names, {**DRIFT, **data.drift}) ** 2,
-        by_kind(names, _STARTLE) ** 2, run.period,
+        levels.noise**2, state_drift(names, levels, run.period),
+        by_kind(names, STARTLE) ** 2, run.period,
         max(1, round(run.period / step)), max(1, round(run.period / coarse)),
         by_kind(names, _NUDGE), np.array([names.index(name) for name in known]), *gains,
-        kept is None, whitened, predicted, states,
+        kept is None, columns, decay(run.period), whitened, predicted, states, initial, flow,
     )  # fmt: skip
-    return Track(run, loss, whitened, predicted, states, gains, known, start, rest)
+    return Track(
+        run, levels, loss, whitened, predicted, states, gains, known, start, rest, columns,
+        initial, flow,
+    )  # fmt: skip

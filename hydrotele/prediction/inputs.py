@@ -1,0 +1,142 @@
+"""Unknown inputs: force, flow and command that a machine has and its model lacks, as noise.
+
+Each acts on one balance of one axis and is an Ornstein-Uhlenbeck process: it keeps its sign for
+about a correlation time, as missing friction, leakage or valve opening does, and unlike white
+process noise. They are further states of the filter; their sizes are found from the data
+(`prediction.levels`), and a smoother reads them back, row by row.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.compiled import compiled
+from hydrotele.dynamics.integrate import accelerate, place
+from hydrotele.dynamics.linear import solve
+from hydrotele.dynamics.model import X, model_space, reduced_model
+from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.machine import Machine
+
+MEMORY = 0.3  # s, correlation time: longer than a valve's lag, shorter than a motion
+BALANCES = ("force", "flow_head", "flow_rod", "command")
+
+
+class Input(NamedTuple):
+    """An unknown input.
+
+    Attributes:
+        balance: out of `BALANCES`.
+        axis: the axis on which it acts.
+    """
+
+    balance: str
+    axis: str
+
+    @property
+    def name(self) -> str:
+        """Balance and axis."""
+        return f"{self.balance}.{self.axis}"
+
+
+def possible_inputs(machine: Machine, axes: Sequence[str] = ()) -> tuple[Input, ...]:
+    """Every unknown input of a machine, or of some of its axes; a force drive has one."""
+    found = []
+    for axis in actuator_order(machine):
+        if axes and axis not in axes:
+            continue
+        for balance in BALANCES if machine.axes[axis].hydraulic else BALANCES[:1]:
+            found.append(Input(balance, axis))
+    return tuple(found)
+
+
+def input_sizes(machine: Machine, inputs: Sequence[Input]) -> np.ndarray:
+    """(m,) the largest size of each input that makes sense: full force, rated flow, half stroke."""
+    sizes = []
+    for balance, axis in inputs:
+        facts = machine.axes[axis]
+        if balance == "command":
+            sizes.append(0.5)
+        elif balance != "force":
+            assert facts.valve
+            sizes.append(facts.valve.rated_flow)
+        elif facts.force:
+            sizes.append(abs(facts.force.gain) * facts.force.command_limit)
+        else:
+            assert machine.supply
+            sizes.append(machine.supply.relief_pressure * facts.hydraulic_drive.areas[0])
+    return np.array(sizes)
+
+
+@compiled
+def _drive_responses(model, sp, states, position, response):
+    """Drive positions (n, nu), and accelerations per unit drive force (n, nu, rates)."""
+    n, t = len(model.mech.free), len(model.transmission)
+    column = np.zeros(n + t)
+    for row in range(len(states)):
+        place(model, sp, states[row])
+        accelerate(model, sp, states[row], 0.0)
+        for i in range(len(model.gear)):
+            position[row, i] = sp.drive[X, i]
+            column[:] = 0.0
+            if model.gear[i] >= 0:
+                column[n + model.gear[i]] = 1.0
+            else:
+                for f in range(n):
+                    column[f] = sp.row[i, f]
+            solve(sp.mass, column)
+            response[row, i] = column
+
+
+def input_columns(
+    machine: Machine, states: np.ndarray, flow: np.ndarray, period: float, inputs: Sequence[Input]
+) -> np.ndarray:
+    """Change of the model's states over each row per unit of each input.
+
+    Args:
+        machine: the machine.
+        states: (n, nz) states of a run, row by row.
+        flow: (n, >= nz, >= nz) their transition Jacobians as of `filter.filter_run`.
+        period: time between rows [s].
+        inputs: m unknown inputs.
+
+    Returns:
+        (n, m, nz) changes [state's unit per input's unit], by the trapezoidal rule: half of what
+        acts in a row is carried along by the row's transition.
+    """
+    model = reduced_model(machine, ())
+    order = actuator_order(machine)
+    rows, size, nu = *states.shape, len(order)
+    first = 2 * (len(model.mech.free) + len(model.transmission))
+    rates = first // 2
+    position, response = np.empty((rows, nu)), np.empty((rows, nu, rates))
+    _drive_responses(model, model_space(model), states, position, response)
+    columns = np.zeros((rows, len(inputs), size))
+    for m, (balance, axis) in enumerate(inputs):
+        i = order.index(axis)
+        facts = machine.axes[axis]
+        if balance == "force":
+            columns[:, m, rates : 2 * rates] = response[:, i]
+        elif balance == "command":
+            assert facts.valve
+            columns[:, m, first + 4 * i + 1] = facts.valve.bandwidth**2
+        else:
+            assert machine.supply
+            side = 2 if balance == "flow_head" else 3
+            drive = facts.hydraulic_drive
+            volume = np.maximum(drive.volumes(position[:, i])[side - 2], drive.dead_volume)
+            oil = volume / machine.supply.bulk_modulus + drive.hose_compliance
+            columns[:, m, first + 4 * i + side] = 1.0 / oil
+    carried = np.einsum("rms,rsk->rmk", columns, flow[:, :size, :size])
+    return 0.5 * period * (columns + carried)
+
+
+def decay(period: float) -> float:
+    """By which factor an input falls over a row of a period [s]."""
+    return math.exp(-period / MEMORY)
+
+
+def input_drift(size: np.ndarray, period: float) -> np.ndarray:
+    """Variance that a row adds to inputs of stationary standard deviations `size` (m,)."""
+    return size**2 * (1.0 - decay(period) ** 2)
