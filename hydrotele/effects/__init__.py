@@ -71,13 +71,13 @@ def load_effects(path: str | Path) -> tuple[str, ...]:
     you trust. Nothing else in hydrotele runs a file that it finds.
 
     Args:
-        path: the file; it defines `EFFECT` or `EFFECTS`.
+        path: the file; it defines `EFFECT` or `EFFECTS`, and laws, or laws only.
 
     Returns:
         Names of its effects.
 
     Raises:
-        InputError: it cannot be read or run, defines no effect or one whose name is taken.
+        InputError: it cannot be read or run, defines nothing, or what has a name that is taken.
     """
     return read_effects(Path(path), EFFECTS)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from hydrotele.effects.effect import Effect
 from hydrotele.errors import InputError
-from hydrotele.terms.law import defined_by
+from hydrotele.terms.law import LAWS, defined_by
 
 GROUP = "hydrotele.effects"
 ENVIRONMENT = "HYDROTELE_EFFECTS"
@@ -23,7 +23,7 @@ _read: dict[str, tuple[str, ...]] = {}  # digest of a file's text -> names of it
 
 
 def read_effects(path: Path, library: dict[str, Effect]) -> tuple[str, ...]:
-    """Run a file and add its effects; one that was read before, or a copy of it, is not run again.
+    """Run a file and add its effects; a file that was read before, or its copy, is not run again.
 
     Args:
         path: the file.
@@ -33,7 +33,7 @@ def read_effects(path: Path, library: dict[str, Effect]) -> tuple[str, ...]:
         Names of its effects.
 
     Raises:
-        InputError: it cannot be read or run, defines no effect or one whose name is taken.
+        InputError: it cannot be read or run, defines nothing, or what has a name that is taken.
     """
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -42,9 +42,18 @@ def read_effects(path: Path, library: dict[str, Effect]) -> tuple[str, ...]:
     if path.suffix != ".py":
         raise InputError(path, "is no Python file: effects of your own stand in a .py file")
     if digest not in _read:
-        with defined_by(str(path.resolve())):
-            module = _run(path, digest)
-        _read[digest] = _add(library, _family(module), path)
+        source = str(path.resolve())
+        try:
+            with defined_by(source):
+                module = _run(path, digest)
+            family = _family(module)
+            if family or not any(law.source == source for law in LAWS.values()):
+                _add(library, family, path)
+        except InputError:
+            for name in [name for name, law in LAWS.items() if law.source == source]:
+                del LAWS[name]
+            raise
+        _read[digest] = tuple(effect.name for effect in family)
         _tell_children(path)
     return _read[digest]
 
@@ -76,9 +85,10 @@ def _family(content: Any) -> tuple[Any, ...]:
     return tuple(content) if isinstance(content, Iterable) else (content,)
 
 
-def _add(library: dict[str, Effect], family: tuple[Any, ...], where: object) -> tuple[str, ...]:
+def _add(library: dict[str, Effect], family: tuple[Any, ...], where: object) -> None:
     if not family:
-        raise InputError(where, "defines neither EFFECT = Effect(...) nor EFFECTS = (...)")
+        message = "defines neither EFFECT = Effect(...) nor EFFECTS = (...), nor a law"
+        raise InputError(where, message)
     for effect in family:
         if not isinstance(effect, Effect):
             message = f"{effect!r} is no hydrotele.effects.Effect"
@@ -87,7 +97,6 @@ def _add(library: dict[str, Effect], family: tuple[Any, ...], where: object) -> 
             message = f"effect {effect.name!r} exists already; choose another name"
             raise InputError(where, message)
     library.update((effect.name, effect) for effect in family)
-    return tuple(effect.name for effect in family)
 
 
 def _tell_children(path: Path) -> None:

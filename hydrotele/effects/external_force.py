@@ -7,8 +7,7 @@ from hydrotele.machine import Machine
 from hydrotele.terms.facts import Term
 
 CONSTANT, PULSE, DRAG = "external_force", "force_pulse", "speed_dependent_force"
-_BEGIN, _LENGTH = 10.0, 1.0  # s, of a pulse of no size
-_WINDOWS, _WINDOW = 12, 5.0  # s, the search for a pulse starts with a run's first minute in pieces
+_BEGIN, _LENGTH = 5.0, 5.0  # s, of a pulse of no size, from which a search starts
 _DRAG_UNITS = {"N": "N s^2/m^2", "N m": "N m s^2/rad^2"}
 
 
@@ -30,7 +29,7 @@ def _set_force(machine: Machine, location: str, values: Values) -> Machine:
 def _pulse(machine: Machine, location: str) -> dict[str, Parameter]:
     """Size as of a constant force, three times as large to be seen in a second.
 
-    A pulse of no size has no time: the search starts from windows of the run's first minute.
+    A pulse of no size has no time: see `_BEGIN`.
     """
 
     def present(parameter: str, absent: float) -> float:
@@ -38,14 +37,13 @@ def _pulse(machine: Machine, location: str) -> dict[str, Parameter]:
 
     size, whole = present("size", 0.0), largest_force(machine, location)
     start, duration = present("start", _BEGIN), present("duration", _LENGTH)
-    begins = tuple(_WINDOW * k for k in range(_WINDOWS))
     return {
         "size": Parameter(
             force_unit(machine, location), size, size - 0.5 * whole, size + 0.5 * whole,
-            0.03 * whole, 0.003 * whole, (0.03 * whole,) * _WINDOWS,
+            0.03 * whole, 0.003 * whole,
         ),
-        "start": Parameter("s", start, 0.0, 36000.0, 20.0, 0.05, begins),
-        "duration": Parameter("s", duration, 0.02, 600.0, 2.0, 0.05, (_WINDOW,) * _WINDOWS),
+        "start": Parameter("s", start, 0.0, 36000.0, 20.0, 0.05),
+        "duration": Parameter("s", duration, 0.02, 600.0, 5.0, 0.05),
     }  # fmt: skip
 
 

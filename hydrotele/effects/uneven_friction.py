@@ -9,7 +9,6 @@ from hydrotele.machine import Machine
 from hydrotele.terms.facts import Term
 
 LOAD, PLACE = "load_dependent_friction", "position_dependent_friction"
-_CENTRES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of the travel, where the search for a place starts
 
 
 def _coefficient(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -47,21 +46,17 @@ def _bump(machine: Machine, location: str) -> dict[str, Parameter]:
     low, high = _travel(machine, location)
     span, whole = high - low, largest_force(machine, location)
     coulomb, centre = present("coulomb", 0.0), present("centre", low + 0.5 * span)
-    width, count = present("width", 0.1 * span), len(_CENTRES)
+    width = present("width", 0.1 * span)
     unit = "m" if force_unit(machine, location) == "N" else "rad"
     return {
         "coulomb": Parameter(
             force_unit(machine, location), coulomb, 0.0, coulomb + 0.2 * whole, 0.02 * whole,
-            0.001 * whole, (0.02 * whole,) * count,
+            0.001 * whole,
         ),
         "centre": Parameter(
-            unit, centre, min(low, centre), max(high, centre), 0.25 * span, 0.01 * span,
-            tuple(low + part * span for part in _CENTRES),
+            unit, centre, min(low, centre), max(high, centre), 0.25 * span, 0.01 * span
         ),
-        "width": Parameter(
-            unit, width, 0.005 * span, 0.5 * span, 0.05 * span, 0.01 * span,
-            (0.1 * span,) * count,
-        ),
+        "width": Parameter(unit, width, 0.005 * span, 0.5 * span, 0.05 * span, 0.01 * span),
     }  # fmt: skip
 
 

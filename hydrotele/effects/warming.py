@@ -32,8 +32,8 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     ratio, slow = present["ratio"], present["time_constant"]
     assert isinstance(ratio, float) and isinstance(slow, float)
     return {
-        "ratio": Parameter("1", ratio, 0.1, 5.0, 0.3, 0.05, (0.7, 0.7, 1.4)),
-        "time_constant": Parameter("s", slow, 2.0, 36000.0, 300.0, 5.0, (20.0, 300.0, 20.0)),
+        "ratio": Parameter("1", ratio, 0.1, 5.0, 0.3, 0.05),
+        "time_constant": Parameter("s", slow, 2.0, 36000.0, 300.0, 5.0),
     }
 
 
