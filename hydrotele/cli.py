@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from hydrotele.commands import drive_command, sweep_command
+from hydrotele.commands.options import EffectFiles
 from hydrotele.errors import InputError
 
 app = typer.Typer(
@@ -60,6 +61,7 @@ def run(
     ] = None,
     tool: ToolName = None,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
+    effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
     """Simulate a scenario; write both logs, the rerun recording, the summary and the MJCF."""
@@ -89,6 +91,7 @@ def replay(
             help="Folder for plots and recordings; default runs/replay_LOG, with --json none.",
         ),
     ] = None,
+    effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
     """Drive the model with logged commands from the logged initial state; print the differences."""
@@ -99,7 +102,8 @@ def replay(
 
 @app.command(
     epilog="Examples:  hydrotele gap --machine cat215 --data measured/site_a   |   "
-    "hydrotele gap --data runs/a runs/b --heldout b"
+    "hydrotele gap --data runs/a runs/b --heldout b   |   "
+    "hydrotele gap --data logs --effects my_effects.py"
 )
 def gap(
     data: Logs,
@@ -112,11 +116,13 @@ def gap(
         Path | None, typer.Option("--out", "-o", help="Folder to write; default gap_DATA.")
     ] = None,
     effect: Annotated[
-        list[str] | None, typer.Option("--effect", help="Try only this effect; may be repeated.")
+        list[str] | None,
+        typer.Option("--effect", help="Try only the effect of this name; may be repeated."),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
     force: Force = False,
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
+    effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
     """Find where the model and measured logs disagree, name the effect, patch the model."""
@@ -176,6 +182,7 @@ def identify(
     ridge: Annotated[float, typer.Option(help="Ridge, share of the largest singular value.")] = 0.0,
     truncate: Annotated[float, typer.Option(help="Leave out smaller singular values.")] = 0.0,
     force: Force = False,
+    effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
     """Identify masses, friction and hydraulics from measured logs; write the identified machine."""
@@ -207,6 +214,7 @@ def excite(
     starts: Annotated[int, typer.Option(min=1, help="Searches from random motions.")] = 2,
     seed: Annotated[int, typer.Option(help="Of these.")] = 0,
     cycles: Annotated[float, typer.Option(min=1.0, help="Periods to run.")] = 3.0,
+    effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
     """Design the motion that tells a machine's parameters best, within its limits."""
@@ -275,6 +283,7 @@ def review(
     plot: Annotated[
         Path | None, typer.Option("--plot", help="Write a PNG of all channels instead.")
     ] = None,
+    effects: EffectFiles = None,
 ) -> None:
     """Look at a run: the machine moving in 3D, joints, pressures, flows and forces, in rerun."""
     from hydrotele.commands.reviewing import review_logs
@@ -288,6 +297,7 @@ def list_(
         str,
         typer.Argument(help="machines, joysticks, scenarios, sweeps, effects, environments; all."),
     ] = "all",
+    effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
     """List what is shipped: machines, scenarios, sweeps, effects, environments, ..."""
@@ -299,6 +309,7 @@ def list_(
 @app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
 def validate(
     files: Annotated[list[Path], typer.Argument(help="Machines, scenarios, sweeps, logs ...")],
+    effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
     """Check a machine, a joystick, a scenario, a sweep or a log; say what is wrong and where."""
@@ -318,6 +329,7 @@ def export(
         Path | None, typer.Option("--picture", help="Write a PNG of it instead.")
     ] = None,
     camera: Annotated[str, typer.Option(help="Camera of the picture.")] = "overview",
+    effects: EffectFiles = None,
 ) -> None:
     """Write the complete MJCF of a machine or joystick, or a picture of it."""
     from hydrotele.commands.catalogue import export_machine

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from hydrotele.datafile import Facts, Name, NonNegative, Positive, Vector, suggest
 from hydrotele.drives import Axis, Pin
 from hydrotele.sensors import SensorError, SensorSet
+from hydrotele.terms.facts import Term
 
 
 class Joint(Facts):
@@ -121,6 +122,7 @@ class Machine(Facts):
     log_columns: dict[str, str] = {}
     removed_bodies: tuple[str, ...] = ()
     uncertainty: dict[str, NonNegative] = {}
+    terms: tuple[Term, ...] = ()
 
     @property
     def joints(self) -> dict[str, Joint]:
@@ -183,6 +185,7 @@ class Machine(Facts):
             _expect(self.arm.tip.link, known, "arm.tip.link")
         for channel in self.sensor_errors:
             _expect(channel, self.sensed_channels, "sensor_errors")
+        _check_terms(self.terms, self.axes)
         if self.hydraulic_axes and self.supply is None:
             raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
         if len(self.hydraulic_axes) > 8:
@@ -193,6 +196,21 @@ class Machine(Facts):
 def _expect(name: str, valid, where: str) -> None:
     if name not in valid:
         raise ValueError(f"{where}: {name!r} is not known; {suggest(name, valid)}")
+
+
+def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis]) -> None:
+    seen = set()
+    for k, term in enumerate(terms):
+        _expect(term.axis, axes, f"terms.{k}.axis")
+        if term.balance.startswith("flow") and not axes[term.axis].hydraulic:
+            raise ValueError(f"terms.{k}: axis {term.axis} has no chambers for a {term.balance}")
+        key = (term.name, term.axis, term.balance)
+        if key in seen:
+            raise ValueError(
+                f"terms.{k}: {term.name} already adds to {term.balance} of {term.axis};"
+                " give the second one another name"
+            )
+        seen.add(key)
 
 
 def _refuse_names(links: dict[str, Link]) -> None:

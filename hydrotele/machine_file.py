@@ -6,6 +6,7 @@ the same name; saying the same number twice is refused.
 """
 
 import math
+import shutil
 from pathlib import Path
 
 import mujoco
@@ -16,6 +17,7 @@ from hydrotele.datafile import PSI, parse, read_yaml, split_unit, suggest, to_si
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.resources import models_folder
+from hydrotele.terms.law import LAWS
 
 MACHINE_FILE = "machine.yaml"
 
@@ -90,7 +92,9 @@ def save_machine(machine: Machine, path: str | Path) -> None:
         path: file to write. A shipped MJCF is referred to by its place among the shipped models, so
             that the file works with any installation. A user's is copied beside it as
             `<stem>.tree.xml`, so that the folder can be handed on, unless it needs further files.
+            So is a user's file that defines laws of its terms, which say so.
     """
+    machine = _with_law_files(machine, Path(path).parent)
     data = machine.model_dump(mode="json", exclude_defaults=True)
     tool = data.pop("tool", "none")
     for key in ("folder", "tools"):
@@ -109,6 +113,20 @@ def save_machine(machine: Machine, path: str | Path) -> None:
             copy.write_text(text, encoding="utf-8")
             data["mjcf"] = copy.name
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
+
+
+def _with_law_files(machine: Machine, folder: Path) -> Machine:
+    """The machine with the sources of its terms' laws named; files are copied into the folder."""
+    terms = []
+    for term in machine.terms:
+        source = LAWS[term.law].source
+        file = Path(source)
+        if source and file.is_file():
+            source = file.name
+            if not (folder / source).exists() or not file.samefile(folder / source):
+                shutil.copyfile(file, folder / source)
+        terms.append(term.model_copy(update={"source": source}))
+    return machine.model_copy(update={"terms": tuple(terms)})
 
 
 def _place(path: Path, lines, *keys: str) -> str:

@@ -19,6 +19,7 @@ FLOORS = (
     (
         "drives",
         "sensors",
+        "terms",
         "machine",
         "noise",
         "machine_file",
@@ -73,7 +74,7 @@ ONLY = {
 }
 
 HEAVY = {"rerun": {"show", "envs"}, "matplotlib": {"show", "envs"}, "gymnasium": {"show", "envs"}}
-MAX_LINES = 400
+MAX_LINES = 500
 UNFINISHED = re.compile(r"\b(?:TODO|FIXME|XXX|HACK)\b")
 MACHINE_PATH = re.compile(r"(?<![\w.:/~$}-])/(?:work|home|root|Users|mnt|srv|tmp)/\w")
 

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from hydrotele.commands.options import EffectFiles
+
 EPILOG = """\b
 Examples:  hydrotele drive   |   hydrotele drive fell_tree --device gamepad
            hydrotele drive --device scripted:moves.csv --no-viewer --speed 0
@@ -47,6 +49,7 @@ def drive(
         float, typer.Option(help="Simulated per real time; 0: as fast as it goes.")
     ] = 1.0,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
+    effects: EffectFiles = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,

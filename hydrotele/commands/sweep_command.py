@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from hydrotele.commands.options import EffectFiles
+
 EPILOG = """\b
 Examples:  hydrotele sweep servo_gains   |   hydrotele sweep my_sweep.yaml --jobs 8 --out runs/a
            hydrotele sweep my_sweep.yaml --dask tcp://10.0.0.5:8786
@@ -48,6 +50,7 @@ def sweep(
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit with status 3 where any run failed.")
     ] = False,
+    effects: EffectFiles = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,

@@ -15,6 +15,7 @@ from hydrotele.dynamics.model import (
     COMMAND,
     GEAR_DAMPING,
     GEAR_INERTIA,
+    GIVEN,
     LENGTH,
     POSITION,
     STIFFNESS,
@@ -24,17 +25,15 @@ from hydrotele.dynamics.model import (
 )
 from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_ROW, RATE, Q, move_links, place_links
 from hydrotele.dynamics.motion import LENGTH as BAR_LENGTH
+from hydrotele.dynamics.supply import add_commands, supply_of, term_force
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
     actuator_friction,
     actuator_friction_slope,
-    open_ports,
     step_circuit,
-    supply_pressure,
 )
 
-_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
 
 
@@ -132,6 +131,10 @@ def accelerate(model, sp, z, dt):
         own = v if gear < 0 else z[first + n + gear]
         push -= actuator_friction(user, u, own)
         slope = half * actuator_friction_slope(user, u, own)
+        if len(model.terms) > 0:
+            more, steep = term_force(model, sp, z, i, own)
+            push += more
+            slope -= half * steep
         if gear >= 0:
             damping = model.transmission[gear, GEAR_DAMPING]
             free = 0.5 * model.transmission[gear, BACKLASH]
@@ -242,7 +245,8 @@ def advance(model, sp, z, command, row, period, steps, trail):
     """
     total = len(model.mech.free) + len(model.transmission)
     nu, count, h = len(model.gear), model.hydraulic, period / steps
-    act, drive = z[2 * total :], sp.drive
+    act, drive, given = z[2 * total :], sp.drive, COMMAND
+    sp.time[0] = row * period
     _take_commands(model, drive, command, row, 0.0, h, period)
     place(model, sp, z)
     if len(trail) > 0:
@@ -260,13 +264,17 @@ def advance(model, sp, z, command, row, period, steps, trail):
         for i in range(nu):
             drive[V, i] = (drive[X, i] - drive[V, i]) / h
         if count > 0:
+            if len(model.terms) > 0:
+                add_commands(model, sp, act, h)
+                given = GIVEN
             first = np.int64(0)  # numba compiles a function anew for a written number
             step_circuit(
-                model.user, first, count, act, drive[COMMAND], drive[X], drive[V], h, sp.act_dot,
-                sp.scratch,
+                model.user, first, count, act, drive[given], drive[X], drive[V], h, sp.act_dot,
+                sp.scratch, model.terms, sp.time[0],
             )  # fmt: skip
             for k in range(4 * count):
                 act[k] += h * sp.act_dot[k]
+        sp.time[0] = row * period + (step + 1) * h
         kick = h if step < steps - 1 else 0.5 * h
         accelerate(model, sp, z, kick)
         for f in range(total):
@@ -316,18 +324,6 @@ def _shown(model, sp, z, c):
     if kind == SUPPLY:
         return supply_of(model, sp, z)
     return z[2 * (len(model.mech.free) + len(model.transmission)) + 4 * i + kind]
-
-
-@lean
-def supply_of(model, sp, z):
-    """Supply pressure in a state, scalar [Pa].
-
-    Source: nominal model, "Supply".
-    """
-    user, count = model.user, model.hydraulic
-    act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
-    open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
-    return supply_pressure(sp.scratch, count, user[_D], user[_RELIEF], user[_PUMP])
 
 
 @lean

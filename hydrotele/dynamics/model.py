@@ -11,6 +11,7 @@ from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
 from hydrotele.machine import Machine
 from hydrotele.sensors import SensorError
 from hydrotele.signals import parse_channel
+from hydrotele.terms.table import terms_table
 
 POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)
 _KINDS = {
@@ -18,7 +19,7 @@ _KINDS = {
     "pressure_rod": ROD, "pressure_supply": SUPPLY,
 }  # fmt: skip
 GEAR_INERTIA, STIFFNESS, GEAR_DAMPING, BACKLASH = range(4)  # columns of `transmission`
-X, V, COMMAND = range(3)  # rows of `Space.drive`
+X, V, COMMAND, GIVEN = range(4)  # rows of `Space.drive`
 
 
 class Model(NamedTuple):
@@ -39,6 +40,7 @@ class Model(NamedTuple):
         scale: (c,) sensor scales [1].
         offset: (c,) sensor offsets [channel's unit].
         lag: (c,) sensor delays [s].
+        terms: (k,) table of the machine's terms, see `terms.table`.
     """
 
     mech: Mechanism
@@ -53,6 +55,7 @@ class Model(NamedTuple):
     scale: np.ndarray
     offset: np.ndarray
     lag: np.ndarray
+    terms: np.ndarray
 
 
 class Space(NamedTuple):
@@ -60,12 +63,14 @@ class Space(NamedTuple):
 
     Attributes:
         motion: work space of the mechanism.
-        drive: (3, nu) of every drive: position X [m] or [rad], velocity V, COMMAND that arrived.
+        drive: (4, nu) of every drive: position X [m] or [rad], velocity V, COMMAND that arrived,
+            and that with its terms as GIVEN to the valve.
         row: (nu, n) d(load-side drive velocity) / d(independent rates).
         mass: (n + t, n + t) mass matrix, then its factor.
         force: (n + t,) forces, then acceleration.
         act_dot: (4 h,) rates of the activations.
         scratch: (SCRATCH,) work space of the circuit.
+        time: (1,) since the run's first row [s].
     """
 
     motion: Motion
@@ -75,6 +80,7 @@ class Space(NamedTuple):
     force: np.ndarray
     act_dot: np.ndarray
     scratch: np.ndarray
+    time: np.ndarray
 
 
 def predicted_channels(machine: Machine) -> tuple[str, ...]:
@@ -121,6 +127,7 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         scale=np.array([e.scale for e in errors], float),
         offset=np.array([e.offset for e in errors], float),
         lag=np.array([e.delay for e in errors], float),
+        terms=terms_table(machine.terms, order),
     )
 
 
@@ -129,8 +136,8 @@ def model_space(model: Model) -> Space:
     nu, n, size = len(model.gear), len(model.mech.free), state_size(model)
     total = (size - 4 * model.hydraulic) // 2
     return Space(
-        motion_space(model.mech), np.zeros((3, nu)), np.zeros((nu, n)), np.zeros((total, total)),
-        np.zeros(total), np.zeros(4 * model.hydraulic), np.zeros(SCRATCH),
+        motion_space(model.mech), np.zeros((4, nu)), np.zeros((nu, n)), np.zeros((total, total)),
+        np.zeros(total), np.zeros(4 * model.hydraulic), np.zeros(SCRATCH), np.zeros(1),
     )  # fmt: skip
 
 

@@ -14,21 +14,33 @@ a tight family); it is found by itself. Such a file says
    values it must behave as the given machine does.
 
 Whatever the facts of `Machine` can already say is simulated, estimated, saved and loaded without
-further code. A file whose name begins with an underscore holds helpers. Tests of all effects
+further code; what they cannot is a law of its own and a term that uses it (`hydrotele.terms`). A
+file whose name begins with an underscore holds helpers. Tests of all effects
 (`tests/effects/test_library.py`) take a new one along; a test of its own shows its physics.
+
+Effects of one's own need no change of this package: `load_effects` reads a file that defines them,
+and installed packages offer theirs as entry points of the group `hydrotele.effects`.
 """
 
 import importlib
 import math
 import pkgutil
 from collections.abc import Mapping
+from pathlib import Path
 
 from hydrotele.datafile import suggest
-from hydrotele.effects.effect import Effect, Parameter
+from hydrotele.effects._own import add_from_environment, add_plugins, read_effects
+from hydrotele.effects._terms import term_number, with_terms
+from hydrotele.effects.effect import Effect, Parameter, changed
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
+from hydrotele.terms.facts import Term
+from hydrotele.terms.law import DriveState, Numbers, Variable, law
 
-__all__ = ["EFFECTS", "Effect", "Parameter", "apply_effect"]
+__all__ = [
+    "EFFECTS", "DriveState", "Effect", "Numbers", "Parameter", "Term", "Variable", "apply_effect",
+    "changed", "law", "load_effects", "term_number", "with_terms",
+]  # fmt: skip
 
 
 def _discover() -> dict[str, Effect]:
@@ -52,6 +64,24 @@ EFFECTS: dict[str, Effect] = _discover()
 """Effects by name."""
 
 
+def load_effects(path: str | Path) -> tuple[str, ...]:
+    """Run a Python file that defines effects, and laws for them, and add them to the library.
+
+    Child processes load it, too. The file runs with all rights of the user: only load files that
+    you trust. Nothing else in hydrotele runs a file that it finds.
+
+    Args:
+        path: the file; it defines `EFFECT` or `EFFECTS`, and laws, or laws only.
+
+    Returns:
+        Names of its effects.
+
+    Raises:
+        InputError: it cannot be read or run, defines nothing, or what has a name that is taken.
+    """
+    return read_effects(Path(path), EFFECTS)
+
+
 def apply_effect(
     machine: Machine, name: str, location: str, parameters: Mapping[str, float]
 ) -> Machine:
@@ -71,7 +101,8 @@ def apply_effect(
             valid.
     """
     if name not in EFFECTS:
-        raise InputError(f"effect {name!r}", f"is not known; {suggest(name, EFFECTS)}")
+        own = "one of your own needs the file that defines it: --effects FILE.py"
+        raise InputError(f"effect {name!r}", f"is not known; {suggest(name, EFFECTS)}; {own}")
     effect = EFFECTS[name]
     places = effect.locations(machine)
     if not location and len(places) == 1:
@@ -91,3 +122,7 @@ def apply_effect(
                 f"{value:g} is outside {limits.low:g} .. {limits.high:g} {limits.unit}",
             )
     return effect.apply(machine, location, parameters)
+
+
+add_plugins(EFFECTS)
+add_from_environment(EFFECTS)

@@ -20,6 +20,8 @@ from hydrotele.hydraulics.laws import (
     spool_step,
     valve_opening,
 )
+from hydrotele.terms.law import DriveState
+from hydrotele.terms.table import added_flows
 
 
 class Slot(enum.IntEnum):
@@ -207,7 +209,7 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
 
 
 @compiled
-def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
+def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added):
     """Pressure rates of both chambers and their slopes with respect to their own pressure.
 
     `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`,
@@ -224,6 +226,8 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
         v: piston velocity, scalar [m/s] or [rad/s].
         ahead: time over which the slopes must hold, scalar [s]: a relief or make-up valve that
             would open within it counts as open in the slope (not in the rate).
+        added: flows of the machine's terms into both chambers [m^3/s] and their slopes with
+            respect to these chambers' pressures [m^3/(s Pa)], see `terms.table.added_flows`.
 
     Returns:
         (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]).
@@ -244,8 +248,8 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
         volume_rod += swept_rod * (user[u + _STROKE] - x)
     hose = beta * user[u + _HOSE]
     head, rod = beta / (volume_head + hose), beta / (volume_rod + hose)
-    rate_head = head * (q_head - swept_head * v - leak + r_head)
-    rate_rod = rod * (q_rod + swept_rod * v + leak + r_rod)
+    rate_head = head * (q_head - swept_head * v - leak + r_head + added[0])
+    rate_rod = rod * (q_rod + swept_rod * v + leak + r_rod + added[1])
     if k_head == 0.0:
         _, k_head = port_flow(p_head + ahead * rate_head, port, relief_gain, tank, makeup_gain)
     if k_rod == 0.0:
@@ -253,13 +257,26 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
     return (
         rate_head,
         rate_rod,
-        head * (slope_head + k_head - user[u + _LEAK]),
-        rod * (slope_rod + k_rod - user[u + _LEAK]),
+        head * (slope_head + k_head - user[u + _LEAK] + added[2]),
+        rod * (slope_rod + k_rod - user[u + _LEAK] + added[3]),
     )
 
 
 @compiled
-def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot, scratch):
+def _flows_of_terms(terms, i, user, time, x, v, spool, rate, p_head, p_rod, supply, command):
+    """What the terms add to the flows of an axis, see `terms.table.added_flows`."""
+    if terms is None:
+        return 0.0, 0.0, 0.0, 0.0
+    u = i * SLOTS
+    force = user[u + _AH] * p_head - user[u + _AR] * p_rod
+    s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command, force)
+    return added_flows(terms, i, s)
+
+
+@compiled
+def step_circuit(
+    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms=None, time=0.0
+):
     """Advance spools and chamber pressures of all axes that share a supply by one step.
 
     Spools follow their exact exponential; pressures take one step of the L-stable second-order
@@ -278,6 +295,8 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
         dt: step, scalar [s].
         act_dot: (4 count,) written: mean rates over the step, in the unit of `act` per [s].
         scratch: (SCRATCH,) work space.
+        terms: (n,) table of the machine's terms, None for none.
+        time: at the start of the step, scalar [s]; only terms see it.
 
     Returns:
         (supply pressure at the start of the step [Pa], at its end [Pa]).
@@ -297,9 +316,14 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
     p_start = supply_pressure(scratch, count, smoothing, relief, pump)
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
+        x, v = length[first + i] - dt * velocity[first + i], velocity[first + i]
+        more = _flows_of_terms(
+            terms, first + i, user, time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3],
+            p_start, command[first + i],
+        )  # fmt: skip
         head, rod, j_head, j_rod = pressure_rates(
             user, u, valve_opening(act[a], user[u + _DB]), p_start, act[a + 2], act[a + 3],
-            length[first + i] - dt * velocity[first + i], velocity[first + i], dt,
+            x, v, dt, more,
         )  # fmt: skip
         scratch[a + 2] = 1.0 / (1.0 - gamma_h * j_head)
         scratch[a + 3] = 1.0 / (1.0 - gamma_h * j_rod)
@@ -310,10 +334,15 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         k_head, k_rod = act_dot[a + 2], act_dot[a + 3]
+        x, v = length[first + i], velocity[first + i]
+        p_head, p_rod = act[a + 2] + dt * k_head, act[a + 3] + dt * k_rod
+        more = _flows_of_terms(
+            terms, first + i, user, time + dt, x, v, act_dot[a], act_dot[a + 1], p_head, p_rod,
+            p_end, command[first + i],
+        )  # fmt: skip
         head, rod, _, _ = pressure_rates(
-            user, u, valve_opening(act_dot[a], user[u + _DB]), p_end,
-            act[a + 2] + dt * k_head, act[a + 3] + dt * k_rod,
-            length[first + i], velocity[first + i], 0.0,
+            user, u, valve_opening(act_dot[a], user[u + _DB]), p_end, p_head, p_rod, x, v, 0.0,
+            more,
         )  # fmt: skip
         act_dot[a + 2] = 1.5 * k_head + 0.5 * scratch[a + 2] * (head - 2.0 * k_head)
         act_dot[a + 3] = 1.5 * k_rod + 0.5 * scratch[a + 3] * (rod - 2.0 * k_rod)

@@ -15,6 +15,7 @@ from hydrotele.simulate.drive_side import drive_and_load_dofs
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import drive_motion, state_flows
 from hydrotele.simulate.record import align_positions
+from hydrotele.simulate.term_readout import added_by_terms
 
 _LOOK_EVERY = 10  # steps, to see whether the machine touches something: a hit lasts longer
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -52,7 +53,9 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
     dt = model.opt.timestep
     qpos = align_positions(model, qpos[1:], qvel[1:])  # states at equal times, see record.py
     qvel, act = 0.5 * (qvel[1:] + qvel[:-1]), act[1:]
-    work, flow = _hydraulic_balance(plant, qpos, qvel, act, dt)
+    x, v = drive_motion(plant, qpos, qvel)
+    more = added_by_terms(plant.machine, states[1:, 0], act, x, v, controls)
+    work, flow = _hydraulic_balance(plant, x, v, act, more, dt)
     return {
         "seconds": len(controls) * dt,
         "flow_balance": flow,
@@ -60,22 +63,21 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
     }
 
 
-def _hydraulic_balance(plant, qpos, qvel, act, dt):
+def _hydraulic_balance(plant, x, v, act, more, dt):
     """Work of the drives (n,) [J] and the largest relative volume error."""
     user, count = plant.model.actuator_user, plant.hydraulic
-    x, v = drive_motion(plant, qpos, qvel)
     if not count:
         return np.zeros(len(x)), None
     table = state_flows(user.ravel(), count, np.ascontiguousarray(act), x, v)
     worst = 0.0
     power = np.zeros(len(x))
     for i in range(count):
-        power += table[:, 3 + 3 * i] * v[:, i]
-        worst = max(worst, *_volume_errors(plant, i, table, act, x, v, dt))
+        power += (table[:, 3 + 3 * i] + more[:, i, 0]) * v[:, i]
+        worst = max(worst, *_volume_errors(plant, i, table, act, x, v, more, dt))
     return np.concatenate([[0.0], np.cumsum(0.5 * dt * (power[1:] + power[:-1]))]), worst
 
 
-def _volume_errors(plant, i, table, act, x, v, dt):
+def _volume_errors(plant, i, table, act, x, v, more, dt):
     axis = plant.machine.axes[plant.axes[i]]
     valve, supply = axis.valve, plant.machine.supply
     drive = axis.hydraulic_drive
@@ -84,8 +86,8 @@ def _volume_errors(plant, i, table, act, x, v, dt):
     p_head, p_rod = act[:, ACTIVATIONS * i + 2], act[:, ACTIVATIONS * i + 3]
     leak = drive.leakage * (p_head - p_rod)
     sides = (
-        (p_head, table[:, 1 + 3 * i] - leak, head * v[:, i], volume_head),
-        (p_rod, table[:, 2 + 3 * i] + leak, -rod * v[:, i], volume_rod),
+        (p_head, table[:, 1 + 3 * i] - leak + more[:, i, 1], head * v[:, i], volume_head),
+        (p_rod, table[:, 2 + 3 * i] + leak + more[:, i, 2], -rod * v[:, i], volume_rod),
     )
     for pressure, inflow, swept, volume in sides:
         port = np.array([

@@ -80,7 +80,8 @@ def option_offset(name: str) -> int:
     return field_offsets("mjModel")["opt"] + option[name]
 
 
-_PROBE = """<mujoco><option timestep="0.0123"/><worldbody><body><joint name="j" type="slide"/>
+_PROBE = """<mujoco><option timestep="0.0123"/><custom><numeric name="n" data="1 2 3"/></custom>
+<worldbody><body><joint name="j" type="slide"/>
 <geom size="0.1"/></body></worldbody><actuator>
 <general joint="j" dyntype="integrator" user="1 2 3"/><motor joint="j"/></actuator></mujoco>"""
 
@@ -99,12 +100,13 @@ def verify_layout() -> None:
     in_model, in_data = field_offsets("mjModel"), field_offsets("mjData")
     wrong = [
         name
-        for name in ("actuator_user", "actuator_actadr", "actuator_biastype", "actuator_dyntype")
+        for name in ("actuator_user", "actuator_actadr", "actuator_biastype", "actuator_dyntype",
+                     "numeric_adr", "numeric_size", "numeric_data")  # fmt: skip
         if _read(model._address + in_model[name], np.int64) != getattr(model, name).ctypes.data
     ]
     wrong += [
         name
-        for name in ("nu", "nuser_actuator")
+        for name in ("nu", "nuser_actuator", "nnumeric")
         if _read(model._address + in_model[name], np.int64) != getattr(model, name)
     ]
     wrong += [

@@ -15,13 +15,14 @@ from hydrotele.datafile import Vector
 from hydrotele.drives import Axis, Cylinder, Pin
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS
-from hydrotele.hydraulics.parameters import actuator_numbers
+from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
 from hydrotele.kinematics.from_machine import pin_axis
 from hydrotele.machine import Link, Machine
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, write_drive_side
 from hydrotele.simulate.looks import name_geoms, without_looks
 from hydrotele.simulate.surroundings import write_surroundings
 from hydrotele.surroundings import Thing
+from hydrotele.terms.table import terms_table
 
 with warnings.catch_warnings():  # glfw warns when there is no screen, which nobody needs here
     warnings.simplefilter("ignore")
@@ -77,6 +78,9 @@ def assemble(
         body = _body(root, tip.link)
         add_element(body, "site", name="tip", pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
+    if machine.terms:
+        table = terms_table(machine.terms, actuator_order(machine))
+        root.custom.add("numeric", name="hydrotele_terms", size=len(table), data=table)
     _write_scene(root, ground, looks)
     write_surroundings(root, machine, surroundings, looks)
     return root

@@ -5,7 +5,8 @@ Every hydraulic actuator has four activations and carries its numbers in `actuat
 actuator's rates just before it calls back for it); the force is that of the pressures at the end of
 the step, as `actearly` does, or explicit stepping would add negative damping. The callbacks touch
 nothing but the mjModel and mjData that they are given, so they are thread-safe, and a model can be
-randomised through `actuator_user`. Actuators without the marker are left alone.
+randomised through `actuator_user`. Actuators without the marker are left alone. The terms of a
+machine stand in custom numbers of its model, which may differ between the models of a batch, too.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
 # numba's intrinsics are called without their typing context, and carray is its documented API.
@@ -25,17 +26,23 @@ from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
     actuator_friction,
+    open_ports,
     step_circuit,
+    supply_pressure,
 )
 from hydrotele.hydraulics.drive_side import settled_friction
+from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state
 from hydrotele.hydraulics.parameters import MARKER
 from hydrotele.simulate.layout import field_offsets, option_offset, verify_layout
 from hydrotele.simulate.library import mujoco_library
-from hydrotele.simulate.pointers import pointer
+from hydrotele.simulate.pointers import floats, pointer
+from hydrotele.terms.table import COMMAND, COUNT, FORCE, added_with_slope
+from hydrotele.terms.table import MARKER as TERMS
 
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
 _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _OFFSET, _INERTIA = int(Slot.OFFSET), int(Slot.DRIVE_INERTIA)
+_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 _GAINS = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
 
@@ -45,7 +52,7 @@ def _stack(typingctx, size):
     """Work space on the stack of the calling function, zero cost and private to the thread."""
 
     def codegen(context, builder, signature, args):
-        space = cgutils.alloca_once(builder, cgutils.voidptr_t, size=SCRATCH)
+        space = cgutils.alloca_once(builder, cgutils.voidptr_t, size=2 * SCRATCH)
         return builder.bitcast(space, cgutils.voidptr_t)
 
     return types.voidptr(types.int64), codegen
@@ -66,13 +73,44 @@ def _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
 
 
 @compiled
-def _gained_command(m, d, i, m_nu, m_gainprm, d_ctrl):
-    """Drive force of a plain force drive: its gain times its command."""
-    nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
+def _gain(m, i, m_gainprm):
+    """Drive force of a plain force drive per command, 0 for a valve."""
     at_gain = carray(pointer(m + m_gainprm), (1,), np.int64)[0]
-    at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
-    gain = carray(pointer(at_gain), (nu * _GAINS,), np.float64)[i * _GAINS]
-    return gain * carray(pointer(at_ctrl), (nu,), np.float64)[i]
+    return floats(at_gain + 8 * _GAINS * i, 1)[0]
+
+
+@compiled
+def _terms_of(m, m_nnumeric, m_adr, m_size, m_data):
+    """Table of the terms of a model, (n,) numbers, none without terms."""
+    count = carray(pointer(m + m_nnumeric), (1,), np.int64)[0]
+    if count > 0:
+        data = carray(pointer(m + m_data), (1,), np.int64)[0]
+        at = carray(pointer(m + m_adr), (1,), np.int64)[0]
+        sizes = carray(pointer(m + m_size), (1,), np.int64)[0]
+        for k in range(count):
+            place = data + 8 * np.int64(carray(pointer(at), (count,), np.int32)[k])
+            size = np.int64(carray(pointer(sizes), (count,), np.int32)[k])
+            if size > COUNT and floats(place, 1)[0] == TERMS:
+                return floats(place, size)
+    return floats(m, 0)
+
+
+@compiled
+def _state(d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, velocity, nu, scratch):
+    """State of a drive with the pressures at the end of the step; the rest are offsets."""
+    count, act = int(user[_COUNT]), floats(d, 0)
+    x = floats(carray(pointer(d + d_length), (1,), np.int64)[0], nu)[i]
+    command = floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu)[i]
+    time, supply = floats(d + d_time, 1)[0], 0.0
+    if count > 0:
+        start = floats(carray(pointer(d + d_act), (1,), np.int64)[0], 4 * count)
+        rate = floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0], 4 * count)
+        act = scratch[SCRATCH:]
+        for k in range(4 * count):
+            act[k] = start[k] + dt * rate[k]
+        open_ports(user, act, act, scratch, 0, count, 0.0, act)
+        supply = supply_pressure(scratch, count, user[_D], user[_RELIEF], user[_PUMP])
+    return drive_state(user, i, count, act, supply, time, x, velocity, command, gain)
 
 
 @functools.cache
@@ -88,7 +126,9 @@ def _compile_callbacks():
         model_at["njnt"],
         model_at["actuator_gainprm"],
     )
-    d_passive = data_at["qfrc_passive"]
+    m_nnumeric, m_at = model_at["nnumeric"], model_at["numeric_adr"]
+    m_size, m_data = model_at["numeric_size"], model_at["numeric_data"]
+    d_passive, d_time = data_at["qfrc_passive"], data_at["time"]
     d_ctrl, d_act, d_act_dot = data_at["ctrl"], data_at["act"], data_at["act_dot"]
     d_length, d_velocity = data_at["actuator_length"], data_at["actuator_velocity"]
 
@@ -111,18 +151,24 @@ def _compile_callbacks():
         at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
         at_length = carray(pointer(d + d_length), (1,), np.int64)[0]
         at_velocity = carray(pointer(d + d_velocity), (1,), np.int64)[0]
+        act = carray(pointer(at_act + start), (4 * count,), np.float64)
+        command = carray(pointer(at_ctrl), (nu,), np.float64)
+        length = carray(pointer(at_length), (nu,), np.float64)
+        velocity = carray(pointer(at_velocity), (nu,), np.float64)
+        dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
+        time = carray(pointer(d + d_time), (1,), np.float64)[0]
+        scratch = carray(_stack(0), (2 * SCRATCH,), np.float64)
+        terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
+        if len(terms) > 0 and first == 0:
+            given = scratch[SCRATCH:]
+            add_to_commands(
+                user, terms, count, act, command, length, velocity, dt, time, scratch, given
+            )
+            command = given
         step_circuit(
-            user,
-            first,
-            count,
-            carray(pointer(at_act + start), (4 * count,), np.float64),
-            carray(pointer(at_ctrl), (nu,), np.float64),
-            carray(pointer(at_length), (nu,), np.float64),
-            carray(pointer(at_velocity), (nu,), np.float64),
-            carray(pointer(m + m_timestep), (1,), np.float64)[0],
-            carray(pointer(at_act_dot + start), (4 * count,), np.float64),
-            carray(_stack(0), (SCRATCH,), np.float64),
-        )
+            user, first, count, act, command, length, velocity, dt,
+            carray(pointer(at_act_dot + start), (4 * count,), np.float64), scratch, terms, time,
+        )  # fmt: skip
         return 0.0
 
     @callback(_SIGNATURE)
@@ -150,12 +196,29 @@ def _compile_callbacks():
             rate = carray(pointer(at_act_dot + start), (4,), np.float64)
             drive = user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
             drive -= user[u + _AREA_ROD] * (act[3] + dt * rate[3])
+        terms, steep = _terms_of(m, m_nnumeric, m_at, m_size, m_data), 0.0
+        gain = _gain(m, i, m_gainprm) if user[u + _KIND] > 2.0 else 0.0
+        if len(terms) > 0:
+            s = _state(
+                d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, velocity, nu,
+                carray(_stack(0), (2 * SCRATCH,), np.float64),
+            )  # fmt: skip
+            more, steep = added_with_slope(terms, FORCE, i, s)
+            if gain != 0.0:
+                extra, slope = added_with_slope(terms, COMMAND, i, s)
+                more += gain * extra
+                steep += gain * slope
+            drive += more
         if user[u + _INERTIA] == 0.0:
             return drive - actuator_friction(user, u, velocity)
         push = drive + _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)
-        if user[u + _KIND] > 2.0:
-            push += _gained_command(m, d, i, m_nu, m_gainprm, d_ctrl)
-        return drive - settled_friction(user, u, velocity, push, user[u + _INERTIA], dt)
+        if gain != 0.0:
+            at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
+            push += gain * carray(pointer(at_ctrl), (nu,), np.float64)[i]
+        damping = max(0.0, -steep)  # of the terms, implicit as friction is: the drive side is light
+        inertia = user[u + _INERTIA] + dt * damping
+        rubbing = settled_friction(user, u, velocity, push, inertia, dt)
+        return drive - damping * (dt / inertia) * (push - rubbing) - rubbing
 
     return advance, force
 

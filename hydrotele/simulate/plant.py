@@ -20,6 +20,7 @@ from hydrotele.simulate.closure import (
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, wind_up
 from hydrotele.simulate.mechanism import add_element, assemble, mjcf_text
 from hydrotele.simulate.native import install_hydraulics
+from hydrotele.simulate.term_readout import terms_at_rest
 from hydrotele.surroundings import Thing
 
 REST_PRESSURE = 2.0e6  # Pa, in the chamber that carries no load when a machine stands
@@ -150,6 +151,7 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
     close_loops(plant.machine, plant.model, data, dict(joints or {}))
     forces = holding_forces(plant.machine, plant.model, data)
     wind_up(plant.machine, plant.model, data, dict(zip(plant.axes, forces, strict=True)))
+    forces = forces - terms_at_rest(plant.machine, data, plant.drive_qpos, forces)
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
         head, rod = plant.machine.axes[name].hydraulic_drive.areas
         p_head, p_rod = (forces[i] + rod * REST_PRESSURE) / head, REST_PRESSURE

@@ -17,6 +17,7 @@ from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record
 from hydrotele.simulate.surroundings import thing_joints
+from hydrotele.simulate.term_readout import added_by_terms
 
 _D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 
@@ -192,6 +193,7 @@ def _put_hydraulics(plant: Plant, record: Record, put) -> None:
     user = plant.model.actuator_user.ravel()
     table = state_flows(user, count, np.ascontiguousarray(record.act), x, v)
     put("pressure_supply", table[:, 0], "Pa")
+    more = added_by_terms(plant.machine, record.time, record.act, x, v, record.command)
     total = np.zeros(len(record.time))
     for i, name in enumerate(plant.axes[:count]):
         cylinder = plant.machine.axes[name].cylinder
@@ -199,7 +201,8 @@ def _put_hydraulics(plant: Plant, record: Record, put) -> None:
         put(f"truth.spool_rate.{name}", record.act[:, ACTIVATIONS * i + 1], "1/s")
         put(f"truth.flow_head.{name}", table[:, 1 + 3 * i], "m^3/s")
         put(f"truth.flow_rod.{name}", table[:, 2 + 3 * i], "m^3/s")
-        put(f"truth.force.{name}", table[:, 3 + 3 * i], "N" if cylinder else "N m")
+        force = table[:, 3 + 3 * i] + more[:, i, 0]
+        put(f"truth.force.{name}", force, "N" if cylinder else "N m")
         if cylinder:
             put(f"truth.piston_velocity.{name}", v[:, i], "m/s")
         fed_head = record.act[:, ACTIVATIONS * i] > 0.0

@@ -29,6 +29,23 @@ CASES = {
         ("joint_flexibility", "swing", {"compliance": 2e-7}),
         ("joint_flexibility", "boom", {"compliance": 2e-8}),
     ),
+    "forces of terms": (
+        ("external_force", "stick", {"force": 9e3}),
+        ("force_pulse", "boom", {"size": -3e4, "start": 0.3, "duration": 0.4}),
+        ("speed_dependent_force", "swing", {"coefficient": 2e4}),
+        ("load_dependent_friction", "boom", {"coefficient": 0.05}),
+        ("position_dependent_friction", "stick", {"coulomb": 1e4, "centre": 0.6, "width": 0.1}),
+    ),
+    "flows of terms": (
+        ("orifice_leakage", "boom", {"flow": 4e-4}),
+        ("warming", "all", {"ratio": 0.2, "time_constant": 2.0}),
+    ),
+    "commands of terms": (("command_offset", "stick", {"offset": 0.08}),),
+    "terms on a flexible drive": (
+        ("joint_flexibility", "boom", {"compliance": 2e-8}),
+        ("load_dependent_friction", "boom", {"coefficient": 0.05}),
+        ("external_force", "boom", {"force": 2e4}),
+    ),
 }
 
 
@@ -109,9 +126,22 @@ def test_readings_are_those_of_the_plant(case, machine_of, reduced_of):
         assert beyond(nominal), "without the effect it would be seen"
 
 
-def test_a_plain_force_drive(machine_of, reduced_of):
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (),
+        (
+            ("command_offset", "slide", {"offset": 0.3}),
+            ("force_pulse", "slide", {"size": -60.0, "start": 0.4, "duration": 0.3}),
+            ("speed_dependent_force", "slide", {"coefficient": 150.0}),
+        ),
+    ],
+)
+def test_a_plain_force_drive(effects, machine_of, reduced_of):
     machine = machine_of("emps")
-    plan = scenario("emps", machine.axes, (), 2.5e-4, size=2.0)
+    for effect in effects:
+        machine = apply_effect(machine, *effect)
+    plan = scenario("emps", machine.axes, effects, 2.5e-4, size=2.0)
     found = differences(reduced_of, machine, plan, 40)
     error, travel = found["position.slide"]
     assert error < 1e-3 * travel  # three times what the plant's first-order step leaves

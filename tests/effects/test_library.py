@@ -28,7 +28,10 @@ PLACES = {
     "pump_flow_limit": {"supply"}, "relief_pressure": {"supply"}, "command_delay": {"all", *ARM},
     "angle_offset": ARM, "angle_scale": ARM, "angle_delay": ARM, "length_offset": {"boom", "stick"},
     "pressure_offset": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
-    "pressure_delay": ARM,
+    "pressure_delay": ARM, "external_force": ARM, "force_pulse": ARM,
+    "speed_dependent_force": ARM, "load_dependent_friction": ARM,
+    "position_dependent_friction": ARM, "orifice_leakage": ARM, "warming": {"all"},
+    "command_offset": ARM,
 }  # fmt: skip
 machine_of = functools.cache(load_machine)
 CASES = [
@@ -149,6 +152,8 @@ def test_is_felt(machine, tool, name, place):
     given = usual(machine_of(machine, tool), name, place)
     if name == "pump_flow_limit":  # felt only where it is less than what the valves ask for
         given["pump_flow"] = 0.3 * machine_of(machine, tool).supply.pump_flow
+    if name == "force_pulse":  # the usual one comes after the end of this run
+        given["start"] = 0.1
     planted = {"name": name, "location": place, "parameters": given}
     plain, run = plain_run(machine, tool), run_scenario(short(machine, tool, [planted]))
     seen = EFFECTS[name].law == "sensor"

@@ -1,0 +1,61 @@
+"""Oil and grease that warm up during a run: less viscous friction, more leakage."""
+
+from hydrotele.effects._terms import with_terms
+from hydrotele.effects.effect import Effect, Parameter, Values
+from hydrotele.machine import Machine
+from hydrotele.terms.facts import Term
+
+NAME, ALL = "warming", "all"
+_SLOW = 300.0  # s, in which a tank of some hundred litres warms up
+
+
+def _viscous(machine: Machine) -> dict[str, float]:
+    """Axes with viscous friction."""
+    found = {name: axis.drive.friction.viscous for name, axis in machine.axes.items()}
+    return {name: viscous for name, viscous in found.items() if viscous}
+
+
+def _leaking(machine: Machine) -> dict[str, float]:
+    """Axes with leakage."""
+    found = {n: axis.hydraulic_drive.leakage for n, axis in machine.hydraulic_axes.items()}
+    return {name: leakage for name, leakage in found.items() if leakage}
+
+
+def _place(machine: Machine) -> tuple[str, ...]:
+    return (ALL,) if _viscous(machine) or _leaking(machine) else ()
+
+
+def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Viscosity at the end over that at the beginning: 20 K halve it; 5 % are two kelvins."""
+    term = next((term for term in machine.terms if term.name == NAME), None)
+    present = dict(term.parameters) if term else {"ratio": 1.0, "time_constant": _SLOW}
+    ratio, slow = present["ratio"], present["time_constant"]
+    assert isinstance(ratio, float) and isinstance(slow, float)
+    return {
+        "ratio": Parameter("1", ratio, 0.1, 5.0, 0.3, 0.05),
+        "time_constant": Parameter("s", slow, 2.0, 36000.0, 300.0, 5.0),
+    }
+
+
+def _apply(machine: Machine, location: str, values: Values) -> Machine:
+    """Terms that change what friction and leakage the machine has now, their even part."""
+    if values["ratio"] == 1.0:
+        return with_terms(machine, NAME, [])
+    numbers = dict(values)
+    terms = [
+        Term(name=NAME, axis=axis, balance="force", law="viscous_drift",
+             parameters={"viscous": viscous, **numbers})
+        for axis, viscous in _viscous(machine).items()
+    ]  # fmt: skip
+    for axis, leakage in _leaking(machine).items():
+        for balance, signed in (("flow_rod", leakage), ("flow_head", -leakage)):
+            drift = {"leakage": signed, **numbers}
+            terms.append(Term(name=NAME, axis=axis, balance=balance, law="leakage_drift",
+                              parameters=drift))  # fmt: skip
+    return with_terms(machine, NAME, terms)
+
+
+EFFECT = Effect(
+    NAME, "oil that warms up: less viscous friction, more leakage", "force", _place, _parameters,
+    _apply,
+)  # fmt: skip

@@ -1,0 +1,51 @@
+"""A term of a machine: which law adds to which balance of which drive."""
+
+from typing import Literal
+
+from pydantic import model_validator
+
+from hydrotele.datafile import Facts, Name, NonNegative, suggest
+from hydrotele.terms import laws as _laws  # noqa: F401 - puts the laws of this package into LAWS
+from hydrotele.terms.law import LAWS, VARIABLES, Value
+
+BALANCES = ("force", "flow_head", "flow_rod", "command")
+Balance = Literal["force", "flow_head", "flow_rod", "command"]
+
+
+class Term(Facts):
+    """A law that adds to a balance of a drive.
+
+    `balance` is `force` (on the drive [N] or [N m]), `flow_head` or `flow_rod` (into a chamber
+    [m^3/s]) or `command` (to valve or drive [1] or [V]). `name` says what put it there, such as an
+    effect's name. In `domain` a variable's range, beyond which it counts with the nearer end; the
+    `uncertainty` is the standard deviation of what the law adds. `source` is the file or plug-in
+    that defines the law, empty for laws of hydrotele.
+    """
+
+    name: Name
+    axis: Name
+    balance: Balance
+    law: str
+    parameters: dict[str, Value] = {}
+    domain: dict[str, tuple[float, float]] = {}
+    uncertainty: NonNegative | None = None
+    description: str = ""
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.law not in LAWS and self.source:
+            raise ValueError(
+                f"the law {self.law!r} is defined by {self.source}, which is not loaded: if it is a"
+                " file that you trust, name it on the command line with --effects FILE; if it is a"
+                " plug-in, install it"
+            )
+        if self.law not in LAWS:
+            raise ValueError(f"law {self.law!r} is not known; {suggest(self.law, LAWS)}")
+        for variable, (low, high) in self.domain.items():
+            if variable not in VARIABLES:
+                raise ValueError(f"domain: {variable!r}; {suggest(variable, VARIABLES)}")
+            if not low < high:
+                raise ValueError(f"domain of {variable}: [{low:g}, {high:g}] must rise")
+        LAWS[self.law].numbers(self.parameters)
+        return self

@@ -1,0 +1,269 @@
+"""Terms as one array of numbers that every simulator reads, and their compiled evaluation.
+
+A law is found through a table of this process, address by address, whose place compiled code knows
+as a symbol: so neither models nor exported files hold addresses, and compiled code can be cached on
+disk. A row of terms holds the law's place in that table and a checksum of its name; where the two
+do not agree, as in a file of another process, the term adds nothing.
+"""
+# pyright: reportCallIssue=false, reportPrivateImportUsage=false, reportArgumentType=false
+# numba's intrinsics are called without their typing context.
+
+import threading
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+from llvmlite import binding, ir
+from numba import carray, cfunc, njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from hydrotele.compiled import compiled, lean
+from hydrotele.errors import InputError
+from hydrotele.terms.facts import BALANCES, Term
+from hydrotele.terms.law import LAWS, VARIABLES, DriveState, Law, Numbers, Variable
+
+FORCE, FLOW_HEAD, FLOW_ROD, COMMAND = range(len(BALANCES))
+MARKER = 215325.75  # of a table of terms among other custom numbers of a model
+NO_TERMS = np.zeros(0)
+COUNT = 1  # place of the number of terms, after the marker
+_AXIS, _BALANCE, _LAW, _CHECKSUM, _PARAMETERS, _DOMAIN, _RANGES, _ROW = range(8)  # of a term
+_HEAD = 2
+_MOST = 1024  # laws in a process
+_SPEED = 1.0e-6  # m/s or rad/s, and of the speed: difference for slopes, small against 5 mm/s
+_PRESSURE = 100.0  # Pa, the same: small against the smoothing of an orifice
+
+_registered = np.zeros((_MOST, 2), np.int64)  # address and checksum of every law
+_kept: list = []  # the compiled functions at these addresses
+_places: dict[str, int] = {}
+_lock = threading.Lock()
+binding.add_symbol("hydrotele_laws", _registered.ctypes.data)
+
+
+def law_place(name: str) -> int:
+    """Place of a law among those of this process; compiles it when it is first asked for.
+
+    Raises:
+        InputError: the law is not known here, or numba cannot compile it.
+    """
+    with _lock:
+        if name not in _places:
+            if name not in LAWS:
+                message = "is not known in this process; load the file that defines it first"
+                raise InputError(f"law {name}", message)
+            if len(_kept) == _MOST:
+                raise InputError(f"law {name}", f"is more than the {_MOST} that a process can use")
+            called = _callable_from_c(LAWS[name])
+            _registered[len(_kept)] = called.address, checksum(name)
+            _kept.append(called)
+            _places[name] = len(_kept) - 1
+        return _places[name]
+
+
+def checksum(name: str) -> int:
+    """A number for a law's name that a float holds exactly."""
+    return zlib.crc32(name.encode())
+
+
+def _callable_from_c(law: Law):
+    """C function `double(double *parameters, double *state)` of a law."""
+    places, arguments = 1, []
+    for kind in law.kinds.values():
+        if kind is Numbers:
+            arguments.append(f"p[int(p[{places}]) : int(p[{places + 1}])]")
+            places += 2
+        else:
+            arguments.append(f"int(p[{places}])" if kind is Variable else f"p[{places}]")
+            places += 1
+    state = ", ".join(f"s[{k}]" for k in range(len(VARIABLES)))
+    text = (
+        "def call(parameters, s):\n"
+        "    p = carray(parameters, (int(parameters[0]),))\n"
+        f"    return float(function(DriveState({state}), {', '.join(arguments)}))\n"
+    )
+    own = compiled(law.function) if not law.source else _compiled_anew(law.function)
+    names = {"carray": carray, "DriveState": DriveState, "function": own}
+    exec(text, names)  # the number of arguments differs from law to law
+    pointer = types.CPointer(types.float64)
+    try:
+        return cfunc(types.float64(pointer, pointer), error_model="numpy")(names["call"])
+    except Exception as error:  # whatever numba says of a user's function
+        if not law.source:
+            raise
+        why = str(error).strip().splitlines()
+        message = f"cannot be compiled by numba: {why[0]} ... {why[-1]}"
+        raise InputError(f"{law.source}: law {law.name}", message) from None
+
+
+def _compiled_anew(function):
+    """A user's function; a cache on disk would miss changes of the files that it uses."""
+    return njit(error_model="numpy", nogil=True)(function)
+
+
+def terms_table(terms: Sequence[Term], order: Sequence[str]) -> np.ndarray:
+    """Terms as the numbers that compiled code reads.
+
+    Args:
+        terms: of a machine.
+        order: axis names in actuator order.
+
+    Returns:
+        (n,) numbers, none where there are no terms: marker, count, a row per term, then the laws'
+        parameters and the ranges of variables.
+
+    Raises:
+        InputError: a law is not known in this process, or cannot be compiled.
+    """
+    if not terms:
+        return NO_TERMS
+    rows, back, first = [], [], _HEAD + _ROW * len(terms)
+    for term in terms:
+        numbers = LAWS[term.law].numbers(term.parameters) if term.law in LAWS else None
+        place = law_place(term.law)
+        assert numbers is not None
+        ranges = [x for name, ends in term.domain.items() for x in (VARIABLES.index(name), *ends)]
+        at = first + len(back)
+        rows += [
+            order.index(term.axis), BALANCES.index(term.balance), place, checksum(term.law), at,
+            at + len(numbers), len(term.domain),
+        ]  # fmt: skip
+        back += [*numbers, *ranges]
+    return np.array([MARKER, len(terms), *rows, *back], float)
+
+
+@intrinsic
+def _laws(typingctx):
+    """Address of the table of laws of this process."""
+
+    def codegen(context, builder, signature, args):
+        integer, name = ir.IntType(64), "hydrotele_laws"
+        place = builder.module.globals.get(name) or ir.GlobalVariable(builder.module, integer, name)
+        return builder.ptrtoint(place, integer)
+
+    return types.int64(), codegen
+
+
+@intrinsic
+def _word(typingctx, address):
+    """The int64 at an address."""
+
+    def codegen(context, builder, signature, args):
+        place = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
+        return builder.load(place)
+
+    return types.int64(types.int64), codegen
+
+
+@intrinsic
+def _call(typingctx, function, terms, at, state):
+    """Value of the law at an address, with its parameters at a place of the table."""
+
+    def codegen(context, builder, signature, args):
+        function, terms, at, state = args
+        real = ir.DoubleType()
+        table = context.make_array(signature.args[1])(context, builder, value=terms)
+        parameters = builder.gep(table.data, [at])
+        space = cgutils.alloca_once(builder, state.type)
+        builder.store(state, space)
+        kind = ir.FunctionType(real, [real.as_pointer()] * 2).as_pointer()
+        variables = builder.bitcast(space, real.as_pointer())
+        return builder.call(builder.inttoptr(function, kind), [parameters, variables])
+
+    return types.float64(function, terms, at, state), codegen
+
+
+@lean
+def _bounded(terms, at, k, value):
+    """A variable inside the domain of a term."""
+    first = int(terms[at + _DOMAIN])
+    for j in range(first, first + 3 * int(terms[at + _RANGES]), 3):
+        if int(terms[j]) == k:
+            value = min(terms[j + 2], max(terms[j + 1], value))
+    return value
+
+
+@lean
+def added(terms, balance, axis, s):
+    """What the terms add to a balance of a drive.
+
+    Args:
+        terms: (n,) table of `terms_table`.
+        balance: FORCE, FLOW_HEAD, FLOW_ROD or COMMAND.
+        axis: index of the actuator.
+        s: DriveState.
+
+    Returns:
+        Their sum, scalar [N], [N m], [m^3/s], [1] or [V].
+    """
+    total = 0.0
+    if len(terms) == 0:
+        return total
+    for term in range(int(terms[COUNT])):
+        at = _HEAD + _ROW * term
+        if int(terms[at + _AXIS]) != axis or int(terms[at + _BALANCE]) != balance:
+            continue
+        place = int(terms[at + _LAW])
+        if place < 0 or place >= _MOST:
+            continue
+        entry = _laws() + 16 * place
+        address = _word(entry)
+        if address == 0 or _word(entry + 8) != int(terms[at + _CHECKSUM]):
+            continue
+        seen = s
+        if terms[at + _RANGES] > 0.0:
+            seen = DriveState(
+                _bounded(terms, at, 0, s.time), _bounded(terms, at, 1, s.position),
+                _bounded(terms, at, 2, s.velocity), _bounded(terms, at, 3, s.spool),
+                _bounded(terms, at, 4, s.spool_rate), _bounded(terms, at, 5, s.pressure_head),
+                _bounded(terms, at, 6, s.pressure_rod), _bounded(terms, at, 7, s.pressure_supply),
+                _bounded(terms, at, 8, s.command), _bounded(terms, at, 9, s.force),
+            )  # fmt: skip
+        total += _call(address, terms, int(terms[at + _PARAMETERS]), seen)
+    return total
+
+
+@lean
+def _moved(s, velocity, head, rod):
+    """The state with another velocity and other pressures."""
+    return DriveState(
+        s.time, s.position, s.velocity + velocity, s.spool, s.spool_rate, s.pressure_head + head,
+        s.pressure_rod + rod, s.pressure_supply, s.command, s.force,
+    )  # fmt: skip
+
+
+@lean
+def added_with_slope(terms, balance, axis, s):
+    """What the terms add to force or command, and its slope with respect to the velocity.
+
+    Args:
+        terms: (n,) table of `terms_table`.
+        balance: FORCE or COMMAND.
+        axis: index of the actuator.
+        s: DriveState.
+
+    Returns:
+        (sum, d sum / d velocity), by a forward difference.
+    """
+    value = added(terms, balance, axis, s)
+    step = _SPEED * (1.0 + abs(s.velocity))
+    beyond = added(terms, balance, axis, _moved(s, step, 0.0, 0.0))
+    return value, (beyond - value) / step
+
+
+@lean
+def added_flows(terms, axis, s):
+    """What the terms add to the flows into both chambers of an axis, and slopes for a stiff step.
+
+    Args:
+        terms: (n,) table of `terms_table`.
+        axis: index of the actuator.
+        s: DriveState.
+
+    Returns:
+        (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)], both <= 0), the
+        slopes by forward differences.
+    """
+    head, rod = added(terms, FLOW_HEAD, axis, s), added(terms, FLOW_ROD, axis, s)
+    more = added(terms, FLOW_HEAD, axis, _moved(s, 0.0, _PRESSURE, 0.0))
+    less = added(terms, FLOW_ROD, axis, _moved(s, 0.0, 0.0, _PRESSURE))
+    return head, rod, min(0.0, (more - head) / _PRESSURE), min(0.0, (less - rod) / _PRESSURE)

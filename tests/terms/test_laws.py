@@ -1,0 +1,205 @@
+"""Laws: values by hand, refusals that teach, and compiled calls that no wrong table can harm."""
+
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from hydrotele.errors import InputError
+from hydrotele.terms import laws
+from hydrotele.terms.facts import Term
+from hydrotele.terms.formula import formula_arguments
+from hydrotele.terms.law import LAWS, VARIABLES, DriveState, law
+from hydrotele.terms.table import (
+    FLOW_ROD,
+    FORCE,
+    NO_TERMS,
+    added,
+    added_flows,
+    added_with_slope,
+    terms_table,
+)
+
+STATE = DriveState(
+    time=1.7, position=0.43, velocity=-0.21, spool=0.3, spool_rate=-2.0, pressure_head=9.0e6,
+    pressure_rod=4.0e6, pressure_supply=2.0e7, command=0.4, force=1.2e5,
+)  # fmt: skip
+USED = {
+    "constant": {"value": 12.0},
+    "pulse": {"size": 5.0, "start": 1.6, "duration": 1.0, "edge": 0.4},
+    "ramp": {"rate": 3.0, "start": 0.2},
+    "exponential_drift": {"value": 7.0, "time_constant": 2.0},
+    "linear_table": {"variable": "velocity", "points": [-1, -0.2, 0.5], "values": [4, 1, -2]},
+    "table2": {
+        "row_variable": "position", "column_variable": "velocity", "row_points": [0, 0.5, 1],
+        "column_points": [-1, 0], "values": [[1, 2], [3, 5], [7, 11]],
+    },
+    "formula": {"1": 2.0, "velocity * abs(velocity)": -3.0, "above(position, 0.4) ** 2": 1e3},
+    "quadratic_drag": {"coefficient": 40.0},
+    "load_friction": {"coefficient": 0.04, "smoothing_velocity": 0.1},
+    "friction_bump": {"coulomb": 900.0, "centre": 0.5, "width": 0.1, "smoothing_velocity": 0.1},
+    "orifice_leakage": {"flow_gain": 1e-8, "smoothing": 5e4},
+    "viscous_drift": {"viscous": 6e3, "ratio": 0.4, "time_constant": 3.0},
+    "leakage_drift": {"leakage": 2e-12, "ratio": 0.4, "time_constant": 3.0},
+}  # fmt: skip
+
+
+def force_term(law, parameters, **more):
+    return Term(name="t", axis="a", balance="force", law=law, parameters=parameters, **more)
+
+
+def by_hand(name, p):
+    """Every law written anew, with NumPy."""
+    s, warm = STATE, 1 - math.exp(-1.7 / 3.0)
+    drop, m = s.pressure_head - s.pressure_rod, 1 - 0.6 * warm
+    return {
+        "constant": 12.0,
+        "pulse": 5.0 * 0.5 * (1 + math.sin(math.pi / 2 * 0.1 / 0.2)),
+        "ramp": 3.0 * 1.5,
+        "exponential_drift": 7.0 * (1 - math.exp(-0.85)),
+        "linear_table": np.interp(-0.21, [-1, -0.2, 0.5], [4, 1, -2]),
+        "table2": 0.14 * (0.21 * 1 + 0.79 * 2) + 0.86 * (0.21 * 3 + 0.79 * 5),
+        "formula": 2.0 + 3.0 * 0.21**2 + 1e3 * 0.03**2,
+        "quadratic_drag": 40.0 * 0.21**2,
+        "load_friction": 0.04 * 1.2e5 * math.tanh(2.1),
+        "friction_bump": 900.0 * math.exp(-0.5 * 0.7**2) * math.tanh(2.1),
+        "orifice_leakage": 1e-8 * math.sqrt(drop),
+        "viscous_drift": 6e3 * (m - 1) * 0.21,
+        "leakage_drift": 2e-12 * (1 / m - 1) * drop,
+    }[name]
+
+
+def test_every_law_of_the_package_is_tried_here():
+    assert {name for name, known in LAWS.items() if not known.source} == set(USED)
+
+
+@pytest.mark.parametrize("name", USED)
+def test_compiled_laws_are_those_by_hand(name):
+    table = terms_table([force_term(name, USED[name])], ["a"])
+    # smoothing of the orifice over its pressure drop squared: 1e-4 / 4
+    assert added(table, FORCE, 0, STATE) == pytest.approx(by_hand(name, USED[name]), rel=3e-5)
+    assert added(table, FORCE, 1, STATE) == 0.0, "another axis"
+    assert added(table, FLOW_ROD, 0, STATE) == 0.0, "another balance"
+    assert added(NO_TERMS, FORCE, 0, STATE) == 0.0
+
+
+@pytest.mark.parametrize("text", [
+    "sign(velocity, 0.1)", "root(pressure_head - pressure_rod, 2e6)", "bump(position, 0.5, 0.2)",
+    "below(position, 0.9)", "rise(time, 2.0)", "sin(position, 0.3)", "cos(position, 0.3) ** 3",
+    "abs(velocity) * command * spool_rate", "force ** 2 * pressure_supply",
+])  # fmt: skip
+def test_basic_functions_of_formulas(text):
+    s, tanh, sin, cos, exp = STATE._asdict(), math.tanh, math.sin, math.cos, math.exp
+    functions = {
+        "sign": lambda e, w: tanh(e / w), "root": lambda e, d: e / (e * e + d * d) ** 0.25,
+        "bump": lambda e, c, w: exp(-((e - c) ** 2) / (2 * w * w)),
+        "below": lambda e, a: max(0, a - e), "rise": lambda e, t: 1 - exp(-e / t),
+        "sin": lambda e, n: sin(2 * math.pi * e / n), "cos": lambda e, n: cos(2 * math.pi * e / n),
+        "abs": abs,
+    }  # fmt: skip
+    table = terms_table([force_term("formula", {text: -2.5})], ["a"])
+    expected = -2.5 * eval(text, functions, s)
+    assert added(table, FORCE, 0, STATE) == pytest.approx(expected, rel=1e-12)
+    assert expected != 0.0
+
+
+def test_terms_add_up_and_know_their_slopes():
+    terms = [
+        force_term("quadratic_drag", {"coefficient": 40.0}),
+        force_term("constant", USED["constant"]),
+    ]
+    value, slope = added_with_slope(terms_table(terms, ["a"]), FORCE, 0, STATE)
+    assert value == pytest.approx(12.0 + 40.0 * 0.21**2)
+    assert slope == pytest.approx(-80.0 * 0.21, rel=1e-4)  # a forward difference of 1e-6
+    leak = [
+        Term(name="t", axis="a", balance=b, law="orifice_leakage",
+             parameters={"flow_gain": k, "smoothing": 1e3})
+        for b, k in (("flow_rod", 1e-8), ("flow_head", -1e-8))
+    ]  # fmt: skip
+    head, rod, by_head, by_rod = added_flows(terms_table(leak, ["a"]), 0, STATE)
+    assert -head == rod == pytest.approx(1e-8 * math.sqrt(5e6))
+    exact = -0.5e-8 / math.sqrt(5e6)
+    assert [by_head, by_rod] == pytest.approx([exact, exact], rel=1e-4)  # differences of 100 Pa
+
+
+def test_beyond_its_domain_a_variable_counts_with_the_nearer_end():
+    law_ = ("formula", {"velocity": 1.0, "position": 10.0})
+    bounded = force_term(*law_, domain={"velocity": (-0.1, 0.1), "position": (0.0, 1.0)})
+    table = terms_table([bounded], ["a"])
+    assert added(table, FORCE, 0, STATE) == pytest.approx(-0.1 + 4.3)
+    assert added(table, FORCE, 0, STATE._replace(velocity=0.05)) == pytest.approx(0.05 + 4.3)
+
+
+def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
+    """As in a file that another process has exported."""
+    table = terms_table([force_term("constant", {"value": 12.0})], ["a"])
+    law_at, checksum_at = 4, 5
+    assert added(table, FORCE, 0, STATE) == 12.0
+    for place in (-1.0, 500.0, 1023.0, 1024.0, 1e9, -1e9):
+        wrong = table.copy()
+        wrong[law_at] = place
+        assert added(wrong, FORCE, 0, STATE) == 0.0
+    wrong = table.copy()
+    wrong[checksum_at] += 1
+    assert added(wrong, FORCE, 0, STATE) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("law_", "parameters", "message"),
+    [
+        ("puls", {}, "law 'puls' is not known; did you mean 'pulse'"),
+        ("pulse", {"size": 1.0}, "needs the parameters start, duration, too"),
+        ("constant", {"value": 1.0, "vlaue": 2.0}, "parameter 'vlaue'; did you mean 'value'"),
+        ("constant", {"value": [1.0, 2.0]}, "must be a finite number, not"),
+        ("constant", {"value": "much"}, "must be a finite number, not 'much'"),
+        ("linear_table", {"variable": "speed", "points": [0, 1], "values": [0, 1]},
+         "'speed' is no variable; .*valid: command"),
+        ("linear_table", {"variable": "velocity", "points": [0, 1, 1], "values": [0, 1, 2]},
+         "must be at least two numbers that rise"),
+        ("linear_table", {"variable": "velocity", "points": [0, 1], "values": [0, 1, 2]},
+         "2 points need as many values"),
+        ("table2", USED["table2"] | {"values": [1.0, 2.0]}, "must be 3 rows of 2 numbers"),
+        ("formula", {}, "at least one product"),
+        ("formula", {"velocity +": 1.0}, "it cannot be read"),
+        ("formula", {"speed": 1.0}, "'speed' is no variable"),
+        ("formula", {"velocity ** 9": 1.0}, "whole number from 1 to 6"),
+        ("formula", {"bump(position, 0.1)": 1.0}, r"the function is bump\(e, c, w\)"),
+        ("formula", {"sign(velocity, 0)": 1.0}, "must be positive"),
+        ("formula", {"__import__('os')": 1.0}, "is no function; .*abs"),
+        ("formula", {"velocity": "fast"}, "the coefficient 'fast' is no number"),
+    ],
+)  # fmt: skip
+def test_refused_with_what_is_valid(law_, parameters, message):
+    with pytest.raises(ValidationError, match=message):
+        force_term(law_, parameters)
+
+
+def test_domains_are_checked():
+    with pytest.raises(ValidationError, match="domain: 'speed'; .*velocity"):
+        force_term("constant", {"value": 1.0}, domain={"speed": (0.0, 1.0)})
+    with pytest.raises(ValidationError, match="must rise"):
+        force_term("constant", {"value": 1.0}, domain={"velocity": (1.0, 0.0)})
+
+
+def test_a_taken_name_or_an_unknown_kind_of_argument_is_refused():
+    def constant(s, value):
+        return value
+
+    def odd(s, value: dict):
+        return 0.0
+
+    with pytest.raises(InputError, match="already defined by hydrotele"):
+        law(constant)
+    with pytest.raises(InputError, match="not float, Variable or Numbers"):
+        law(odd)
+    assert LAWS["constant"].function is laws.constant
+
+
+def test_formulas_have_as_many_numbers_as_they_say():
+    numbers = formula_arguments({"1": 1.0, "velocity * sin(position - velocity, 2)": 2.0})
+    assert numbers["numbers"] == [
+        2, 1.0, 0, 2.0, 2,
+        0, VARIABLES.index("velocity"), -1, 0.0, 0.0, 1,
+        8, VARIABLES.index("position"), VARIABLES.index("velocity"), 2.0, 0.0, 1,
+    ]  # fmt: skip
