@@ -22,44 +22,76 @@ from hydrotele.hydraulics.laws import (
 )
 
 
+CURVE_KNOTS = 8  # of a valve's flow curve, per direction
+
+
 class Slot(enum.IntEnum):
-    """Places of an actuator's numbers in `actuator_user`, all SI."""
+    """Places of an actuator's numbers in `actuator_user`, all SI; a new number is a new line.
 
-    MARKER = 0
-    KIND = 1
-    FIRST = 2
-    COUNT = 3
-    AREA_HEAD = 4
-    AREA_ROD = 5
-    VOLUME_HEAD = 6
-    VOLUME_ROD = 7
-    STROKE = 8
-    LEAKAGE = 9
-    BANDWIDTH = 10
-    DAMPING = 11
-    DEADBAND = 12
-    FLOW_GAIN = 13
-    ORIFICE_SMOOTHING = 14
-    PORT_RELIEF = 15
-    RELIEF_GAIN = 16
-    MAKEUP_GAIN = 17
-    BULK_MODULUS = 18
-    TANK_PRESSURE = 19
-    RELIEF_PRESSURE = 20
-    PUMP_FLOW = 21
-    COULOMB = 22
-    STRIBECK = 23
-    STRIBECK_VELOCITY = 24
-    VISCOUS = 25
-    COULOMB_VELOCITY = 26
-    OFFSET = 27
-    COULOMB_ASYMMETRY = 28
-    VISCOUS_ASYMMETRY = 29
-    HOSE_COMPLIANCE = 30
-    DRIVE_INERTIA = 31
+    CURVES, the last, begins two flow curves, of the positive and of the negative direction: number
+    of knots (0: straight), CURVE_KNOTS travels and CURVE_KNOTS openings each.
+    """
+
+    @staticmethod
+    def _generate_next_value_(name, start, count, last_values):
+        return count
+
+    MARKER = enum.auto()
+    KIND = enum.auto()
+    FIRST = enum.auto()
+    COUNT = enum.auto()
+    AREA_HEAD = enum.auto()
+    AREA_ROD = enum.auto()
+    VOLUME_HEAD = enum.auto()
+    VOLUME_ROD = enum.auto()
+    STROKE = enum.auto()
+    LEAKAGE = enum.auto()
+    BANDWIDTH = enum.auto()
+    DAMPING = enum.auto()
+    DEADBAND = enum.auto()
+    FLOW_GAIN = enum.auto()
+    ORIFICE_SMOOTHING = enum.auto()
+    PORT_RELIEF = enum.auto()
+    RELIEF_GAIN = enum.auto()
+    MAKEUP_GAIN = enum.auto()
+    BULK_MODULUS = enum.auto()
+    TANK_PRESSURE = enum.auto()
+    RELIEF_PRESSURE = enum.auto()
+    PUMP_FLOW = enum.auto()
+    COULOMB = enum.auto()
+    STRIBECK = enum.auto()
+    STRIBECK_VELOCITY = enum.auto()
+    VISCOUS = enum.auto()
+    COULOMB_VELOCITY = enum.auto()
+    OFFSET = enum.auto()
+    COULOMB_ASYMMETRY = enum.auto()
+    VISCOUS_ASYMMETRY = enum.auto()
+    HOSE_COMPLIANCE = enum.auto()
+    DRIVE_INERTIA = enum.auto()
+    DEADBAND_NEGATIVE = enum.auto()
+    SLEW_LIMIT = enum.auto()
+    METERING_PA = enum.auto()
+    METERING_BT = enum.auto()
+    METERING_PB = enum.auto()
+    METERING_AT = enum.auto()
+    COMPENSATED_DROP = enum.auto()
+    HOLDING_HEAD = enum.auto()
+    HOLDING_HEAD_RATIO = enum.auto()
+    HOLDING_HEAD_RANGE = enum.auto()
+    HOLDING_ROD = enum.auto()
+    HOLDING_ROD_RATIO = enum.auto()
+    HOLDING_ROD_RANGE = enum.auto()
+    LOAD_SENSING_MARGIN = enum.auto()
+    PUMP_DROOP = enum.auto()
+    STOP_LOW = enum.auto()
+    STOP_HIGH = enum.auto()
+    STOP_STIFFNESS = enum.auto()
+    STOP_DAMPING = enum.auto()
+    CURVES = enum.auto()
 
 
-SLOTS = 32
+CURVE = 1 + 2 * CURVE_KNOTS  # numbers of one flow curve
+SLOTS = Slot.CURVES + 2 * CURVE
 ACTIVATIONS = 4
 MAX_AXES = 8
 SCRATCH = 4 * MAX_AXES
@@ -77,11 +109,19 @@ _ROS2 = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approxi
 _NEWTON_STEPS = 60
 _FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the flow balance of 1e-6 that is promised
 
-(
-    _AH, _AR, _VH, _VR, _STROKE, _LEAK, _W, _Z, _DB, _K, _D, _PORT, _KR, _KM, _BETA, _TANK,
-    _RELIEF, _PUMP, _FC, _FS, _VS, _B, _V0,
-) = (int(slot) for slot in list(Slot)[4:27])  # fmt: skip
-_AC, _AV, _HOSE = (int(slot) for slot in list(Slot)[28:31])
+_AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
+_VH, _VR = int(Slot.VOLUME_HEAD), int(Slot.VOLUME_ROD)
+_STROKE, _LEAK = int(Slot.STROKE), int(Slot.LEAKAGE)
+_W, _Z = int(Slot.BANDWIDTH), int(Slot.DAMPING)
+_DB, _K = int(Slot.DEADBAND), int(Slot.FLOW_GAIN)
+_D, _PORT = int(Slot.ORIFICE_SMOOTHING), int(Slot.PORT_RELIEF)
+_KR, _KM = int(Slot.RELIEF_GAIN), int(Slot.MAKEUP_GAIN)
+_BETA, _TANK = int(Slot.BULK_MODULUS), int(Slot.TANK_PRESSURE)
+_RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
+_FC, _FS = int(Slot.COULOMB), int(Slot.STRIBECK)
+_VS, _B = int(Slot.STRIBECK_VELOCITY), int(Slot.VISCOUS)
+_V0, _AC = int(Slot.COULOMB_VELOCITY), int(Slot.COULOMB_ASYMMETRY)
+_AV, _HOSE = int(Slot.VISCOUS_ASYMMETRY), int(Slot.HOSE_COMPLIANCE)
 
 
 @compiled
