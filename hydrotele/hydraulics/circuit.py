@@ -21,7 +21,6 @@ from hydrotele.hydraulics.laws import (
     valve_opening,
 )
 
-
 CURVE_KNOTS = 8  # of a valve's flow curve, per direction
 
 
