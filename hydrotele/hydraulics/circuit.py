@@ -160,7 +160,7 @@ def circuit_supply(user, first, count, ports):
         user: (nu * SLOTS,) actuator numbers.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `open_ports` writes it.
+        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
 
     Returns:
         p_s, scalar [Pa].
