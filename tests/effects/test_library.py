@@ -152,9 +152,9 @@ def test_is_felt(machine, tool, name, place):
     """A machine that has it moves, or is seen, and not as the one without it."""
     given = usual(machine_of(machine, tool), name, place)
     if name == "pump_droop":  # felt only where the pump's flow is short
-        given["droop"] = 0.9 * EFFECTS[name].parameters(machine_of(machine, tool), place)[
-            "droop"
-        ].high
+        given["droop"] = (
+            0.9 * EFFECTS[name].parameters(machine_of(machine, tool), place)["droop"].high
+        )
     if name == "pump_flow_limit":  # felt only where it is less than what the valves ask for
         given["pump_flow"] = 0.3 * machine_of(machine, tool).supply.pump_flow
     planted = {"name": name, "location": place, "parameters": given}
