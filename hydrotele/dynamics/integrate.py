@@ -31,6 +31,7 @@ from hydrotele.hydraulics.circuit import (
     Slot,
     actuator_friction,
     actuator_friction_slope,
+    actuator_stop,
     step_circuit,
 )
 
@@ -99,8 +100,8 @@ def load_position(model, sp, i):
 def accelerate(model, sp, z, dt):
     """Linearly implicit acceleration over a kick; leaves the mechanism where `place` put it.
 
-    `a = (M + dt/2 D)^-1 (sum J' F - h)` with the slope D of friction and dampers, which is of
-    second order and stable however steep the friction is.
+    `a = (M + dt/2 D + dt^2/4 K)^-1 (sum J' F - h)` with the slope D of friction and dampers and the
+    stiffness K of end stops, which is of second order and stable however steep these are.
 
     Args:
         model: Model.
@@ -147,6 +148,10 @@ def accelerate(model, sp, z, dt):
             push, slope = spring, half * damping
             for f in range(n):
                 sp.mass[n + gear, f] -= slope * sp.row[i, f]
+        at = sp.drive[X, i] if gear < 0 else load_position(model, sp, i)
+        stop, stiff, damped = actuator_stop(user, u, at, v)
+        push += stop
+        slope += half * (damped + half * stiff)
         for f in range(n):
             sp.force[f] += sp.row[i, f] * push
             for g in range(f + 1):

@@ -2,13 +2,11 @@
 
 from hydrotele.compiled import lean
 from hydrotele.dynamics.model import COMMAND, GIVEN, V, X
-from hydrotele.hydraulics.circuit import Slot, open_ports, supply_pressure
+from hydrotele.hydraulics.circuit import circuit_supply, open_ports
 from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state
 from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
 from hydrotele.terms.table import added_with_slope
-
-_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 
 
 @lean
@@ -20,7 +18,7 @@ def supply_of(model, sp, z):
     user, count = model.user, model.hydraulic
     act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
     open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
-    return supply_pressure(sp.scratch, count, user[_D], user[_RELIEF], user[_PUMP])
+    return circuit_supply(user, 0, count, sp.scratch)
 
 
 @lean

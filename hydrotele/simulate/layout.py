@@ -100,8 +100,15 @@ def verify_layout() -> None:
     in_model, in_data = field_offsets("mjModel"), field_offsets("mjData")
     wrong = [
         name
-        for name in ("actuator_user", "actuator_actadr", "actuator_biastype", "actuator_dyntype",
-                     "numeric_adr", "numeric_size", "numeric_data")  # fmt: skip
+        for name in (
+            "actuator_user",
+            "actuator_actadr",
+            "actuator_biastype",
+            "actuator_dyntype",
+            "numeric_adr",
+            "numeric_size",
+            "numeric_data",
+        )  # fmt: skip
         if _read(model._address + in_model[name], np.int64) != getattr(model, name).ctypes.data
     ]
     wrong += [
