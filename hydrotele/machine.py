@@ -182,6 +182,9 @@ class Machine(Facts):
             _expect(self.arm.tip.link, known, "arm.tip.link")
         for channel in self.sensor_errors:
             _expect(channel, self.sensed_channels, "sensor_errors")
+        for name, sensors in self.sensors.items():
+            for channel in sensors.channels:
+                _expect(channel, self.sensed_channels, f"sensors.{name}.channels")
         if self.hydraulic_axes and self.supply is None:
             raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
         if len(self.hydraulic_axes) > 8:

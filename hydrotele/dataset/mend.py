@@ -86,7 +86,7 @@ def _out_of_sensor(data: _Data, run: str, channel: str, noise: float) -> list[st
         notes.append(f"{run}: {bad} infinite readings of {channel} were left out.")
     for what, noted, rows in (
         ("at the end of its sensor", _CLIPPED,
-         value_range.clipped(data.sensor(channel), channel, reading)),
+         value_range.clipped(data.sensor(channel), channel, reading, period)),
         ("which nothing physical explains", 0.0,
          value_range.spikes(data.machine, channel, reading, period, noise)),
     ):  # fmt: skip
@@ -150,7 +150,7 @@ def _floors(data: _Data, run: str, channel: str) -> list[float]:
     kind = channel.partition("_")[0].partition(".")[0]
     witnesses += [
         (c, r) for c in data.channels for r in data.runs
-        if c != channel and c.startswith(kind) and data.sensor(c).accuracy == sensor.accuracy
+        if c != channel and c.startswith(kind) and data.sensor(c).error_rms == sensor.error_rms
     ]  # fmt: skip
     floors = (stuck.noise_floor(v) for c, r in witnesses
               if (v := data.column(c, r)) is not None)  # fmt: skip

@@ -39,6 +39,7 @@ class Model(NamedTuple):
         scale: (c,) sensor scales [1].
         offset: (c,) sensor offsets [channel's unit].
         lag: (c,) sensor delays [s].
+        time_constant: (c,) time constants of the sensors' first-order lags [s].
     """
 
     mech: Mechanism
@@ -53,6 +54,7 @@ class Model(NamedTuple):
     scale: np.ndarray
     offset: np.ndarray
     lag: np.ndarray
+    time_constant: np.ndarray
 
 
 class Space(NamedTuple):
@@ -121,6 +123,7 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         scale=np.array([e.scale for e in errors], float),
         offset=np.array([e.offset for e in errors], float),
         lag=np.array([e.delay for e in errors], float),
+        time_constant=np.array([e.time_constant for e in errors], float),
     )
 
 

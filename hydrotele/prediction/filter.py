@@ -19,7 +19,7 @@ from hydrotele.dynamics.integrate import (
     supply_of,
 )
 from hydrotele.dynamics.mechanism import JOINT
-from hydrotele.prediction.late import begin_late, move_late, spread_late
+from hydrotele.prediction.late import begin_late, move_late, nudge_late, spread_late
 
 
 class Gains(NamedTuple):
@@ -181,8 +181,8 @@ def filter_run(
                 if moves:
                     advance(model, sp, reached[s], command, row, period, coarse, rough)
                     move_late(model, late, size, rough, period / coarse, reached[s])
-                elif s > size and late.due[s - size - 1] < 0.0:
-                    reached[s, s - 1] += nudge[s]
+                else:
+                    nudge_late(late, s - size, nudge[s], reached[s, size:])
             _carry(reached, nudge, spread, work, drift)
             if not known[row]:
                 for s in range(full):

@@ -28,7 +28,9 @@ PLACES = {
     "pump_flow_limit": {"supply"}, "relief_pressure": {"supply"}, "command_delay": {"all", *ARM},
     "angle_offset": ARM, "angle_scale": ARM, "angle_delay": ARM, "length_offset": {"boom", "stick"},
     "pressure_offset": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
-    "pressure_delay": ARM,
+    "pressure_delay": ARM, "angle_lag": ARM, "pressure_lag": ARM,
+    "pressure_scale": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
+    "clock_offset": {"positions", "pressures"},
 }  # fmt: skip
 machine_of = functools.cache(load_machine)
 CASES = [
