@@ -27,6 +27,8 @@ from hydrotele.log_checks import (
 )
 from hydrotele.output import replacing
 
+LEFT_OUT = "none"  # the alias of columns that are no channel and not wanted
+
 
 @dataclass(frozen=True, eq=False)
 class Log:
@@ -131,8 +133,8 @@ def load_log(
     Args:
         path: the file.
         aliases: the file's own column name -> channel name, with a minus before it where the sign
-            is the other way round; names that the file lacks are ignored, and so
-            are all of them for logs that hydrotele wrote.
+            is the other way round, or `none` for a column to leave out; names that the file lacks
+            are ignored, and so are all of them for logs that hydrotele wrote.
         required: channels that must be there, after renaming.
         minimum_rows: fewer rows are refused.
         maximum_dropped: fraction of the samples [1] that may be missing or come off time by more
@@ -163,10 +165,12 @@ def load_log(
 
 def _renamed(table: Table, aliases: Mapping[str, str]) -> Table:
     names = [aliases.get(name, name) for name in table.names]
-    signs = [-1.0 if name.startswith("-") else 1.0 for name in names]
+    kept = [place for place, name in enumerate(names) if name != LEFT_OUT]
+    signs = [-1.0 if names[place].startswith("-") else 1.0 for place in kept]
     return table._replace(
-        names=[name.removeprefix("-") for name in names],
-        values=[sign * values for sign, values in zip(signs, table.values, strict=True)],
+        names=[names[place].removeprefix("-") for place in kept],
+        values=[sign * table.values[place] for sign, place in zip(signs, kept, strict=True)],
+        units=[table.units[place] for place in kept],
     )
 
 

@@ -156,7 +156,9 @@ def _check_names(table: Table, required: Sequence[str]) -> None:
             parse_channel(name)
         except ValueError as error:
             raise InputError(
-                table.where(name), f"{error}. Rename it, give it an alias or remove it"
+                table.where(name),
+                f"{error}. Rename it, give it an alias or remove it"
+                " (log_columns in the machine file gives aliases; none leaves a column out)",
             ) from None
     for name, count in Counter(table.names).items():
         if count > 1:

@@ -309,6 +309,17 @@ def test_ranges_stand_in_the_machine_file(tmp_path):
             type(RIG.axes["slide"]).model_validate(facts)
 
 
+def test_columns_that_are_no_channels_can_be_left_out(tmp_path):
+    for seed, name in enumerate("ab"):
+        log = stroke(seed=seed)
+        table = np.column_stack([log.time, *log.columns.values(), log.time])
+        csv(tmp_path / f"{name}.csv", ",".join(["time", *log.columns, "Marker 1"]), table)
+    with pytest.raises(InputError, match="Marker 1.*none leaves a column out"):
+        load_dataset(tmp_path, RIG)
+    data = load_dataset(tmp_path, RIG.model_copy(update={"log_columns": {"Marker 1": "none"}}))
+    assert len(data.channels) == 2 and data.notes == ()
+
+
 # Stated accuracies
 
 
