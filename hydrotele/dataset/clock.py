@@ -11,6 +11,7 @@ _GAIN = 0.1  # of a stamp's deviation that the tracking clock takes over
 _NOTED = 0.02  # of a step: jitter below this is rounding
 _LOST = 0.005  # of a step over a whole run, for a round period
 _NO_CLOCK = 0.22  # RMS of a step; stamps without any clock have 1 / sqrt(12) = 0.29
+_SHARED = 0.01  # of the rows may be nearest to a tick that another row has
 _FINE = 5  # ticks per step where rows keep no common clock, so that they are off by a tenth at most
 _PACE = 0.5  # of a step by which one may be longer or shorter
 _PACED = 0.9  # of the steps must be so for a log that has a pace at least
@@ -68,7 +69,8 @@ def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
         period, start = np.polyfit(tick, time, 1)
     period, start = float(period), float(start)
     off = (time - start) / period - tick
-    if np.sqrt(np.mean(off**2)) > _NO_CLOCK:
+    shared = np.mean(np.diff(tick) == 0)
+    if np.sqrt(np.mean(off**2)) > _NO_CLOCK or shared > _SHARED:
         return _wandering(time, where)
     return _clock(time, tick, off, start, period, where)
 

@@ -157,6 +157,11 @@ def make_dataset(
                      for column in range(len(channels))])  # fmt: skip
     notes += [f"{c} has no good reading in any run; it was dropped."
               for c, keep in zip(channels, kept, strict=True) if not keep]  # fmt: skip
+    if not kept.any():
+        raise InputError(
+            ", ".join(mended), "no reading of any channel is usable: look at the columns, their"
+            f" units and sensors. {' '.join(notes)}",
+        )  # fmt: skip
     channels = tuple(c for c, keep in zip(channels, kept, strict=True) if keep)
     notes += channel_facts.blind_axes(machine, axes, channels)
     whole, behind = {}, {}

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.dataset import stuck, value_range
+from hydrotele.dataset.refresh import refreshed_every, stale
 from hydrotele.dataset.rows import Rows
 from hydrotele.machine import Machine
 from hydrotele.noise import channel_sensor, converter
@@ -69,12 +70,14 @@ def mend(
     for column, channel in enumerate(channels):
         for run in data.runs:
             notes += _out_of_sensor(data, run, channel, noise[column])
+            notes += _stale(data, run, channel)
+    fresh = {name: rows.reading.copy() for name, rows in data.runs.items()}
     found = [(run, ch, _frozen(data, run, ch)) for run in data.runs for ch in channels]
     for run, channel, parts in found:  # after all were judged: a frozen one is a poor witness
         notes += _take_out_frozen(data, run, channel, parts)
     for run in data.runs:
         notes += _take_out_repeated_rows(data, run)
-        notes += _take_out_useless(data, run, runs[run].reading)
+        notes += _take_out_useless(data, run, fresh[run])
     return data.runs, tuple(notes)
 
 
@@ -96,6 +99,19 @@ def _out_of_sensor(data: _Data, run: str, channel: str, noise: float) -> list[st
                          f" first at {first:.6g} s.")  # fmt: skip
         reading[rows] = np.nan
     return notes
+
+
+def _stale(data: _Data, run: str, channel: str) -> list[str]:
+    """Leave out rows that only repeat a channel's last value because it is refreshed less often."""
+    reading, period = data.column(channel, run), data.runs[run].period
+    assert reading is not None
+    every = refreshed_every(reading)
+    if every == 1.0:
+        return []
+    step = period * float(np.median(np.diff(np.flatnonzero(np.isfinite(reading)))))
+    reading[stale(reading, every)] = np.nan
+    return [f"{run}: {channel} is refreshed every {1e3 * every * step:.3g} ms only; the rows between"
+            " repeat it and count as missing."]  # fmt: skip
 
 
 def _count(data: _Data) -> int:

@@ -13,6 +13,7 @@ SHORTEST = 0.5  # [s] of a run: a fast servo's stroke, of which the unknown star
 FEWEST = 50  # rows of a run
 _SHORTEST_PIECE = 10.0  # [s] of a piece of a single run, if it is to be fitted in several
 _PIECES = 3
+_SHARE = 0.15, 0.6  # of a run that was cut, which a piece that judges the others should have
 _FIT = 0.75  # of a single run
 _HELD_OUT = ("test", "heldout", "validation")
 
@@ -84,7 +85,7 @@ def split(
     marked = [name for name in names if name.lower().startswith(_HELD_OUT)]
     if marked == names:
         marked = []
-    chosen = heldout or (marked or [sorted(runs)[-1] if len(names) == 1 else names[-1]])[0]
+    chosen = heldout or (marked or [_last_piece(runs) if len(names) == 1 else names[-1]])[0]
     pieces = [n for n in runs if chosen in (n, origin[n])]
     judge = max(pieces, key=lambda n: seconds(runs[n]))
     aside = set(marked if heldout is None else ()) | {chosen}
@@ -98,6 +99,14 @@ def split(
         raise InputError(f"held-out run {chosen!r}", "leaves no run to fit: add one")
     parts = tuple(Part(n, n, runs[n]) for n in fit)
     return Split(parts, Part(judge, judge, runs[judge])), notes
+
+
+def _last_piece(runs: Mapping[str, Rows]) -> str:
+    """Of the pieces of one run the last that is neither a scrap nor nearly all; else the last."""
+    total = sum(map(seconds, runs.values()))
+    low, high = _SHARE
+    fair = [name for name, rows in runs.items() if low * total <= seconds(rows) <= high * total]
+    return (fair or list(runs))[-1]
 
 
 def _split_in_time(name: str, rows: Rows) -> Split:

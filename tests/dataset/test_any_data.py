@@ -10,6 +10,7 @@ from hydrotele.dataset.clock import fit_clock
 from hydrotele.dataset.files import RunFiles
 from hydrotele.dataset.load import Dataset, load_dataset, make_dataset
 from hydrotele.dataset.mask import Masked, read_mask
+from hydrotele.dataset.refresh import refreshed_every, stale
 from hydrotele.dataset.rows import Rows
 from hydrotele.errors import InputError
 from hydrotele.log import Log, save_log
@@ -116,6 +117,53 @@ def test_rates_about_one_kilohertz(rate, count):
     assert (run.behind is None) == (count == 1)
 
 
+@pytest.mark.parametrize(("rate", "held"), [(1000.0, 20), (10_000.0, 10), (100.0, 25)])
+def test_a_channel_that_is_refreshed_slowly_counts_once(rate, held):
+    """Positions at every row, pressures from a bus; nothing is refreshed but its own rows."""
+    log = stroke(12.0, rate)
+    place = np.arange(len(log)) // held * held
+    slow = with_column(log, "pressure_head.slide", log["pressure_head.slide"][place], "Pa")
+    data = dataset(slow, stroke(seed=1))
+    run, spot = data.fit[0], data.channels.index("pressure_head.slide")
+    read = np.isfinite(run.reading[:, spot]).sum()
+    assert read == pytest.approx(len(log) / held, rel=0.01)
+    assert np.isfinite(run.reading[:, 1 - spot]).all()
+    assert f"refreshed every {1e3 * held / rate:.3g} ms" in " ".join(data.notes)
+    assert "stuck" not in " ".join(data.notes)
+    assert data.noise_of(run)[spot] == pytest.approx(data.noise[spot])
+
+
+def test_a_clock_that_runs_apart_refreshes_after_two_or_three_rows():
+    """20 Hz in a log of 50 Hz; at rest the same value is refreshed as often."""
+    value = np.random.default_rng(0).normal(size=400)
+    value[200:300] = value[200]
+    held = value[(np.arange(1000) * 0.4 + 0.1).astype(int)]
+    every = refreshed_every(held)
+    assert every == pytest.approx(2.5, abs=0.02)
+    fresh = ~stale(held, every)
+    assert fresh.sum() == pytest.approx(400, abs=2)
+    assert np.array_equal(fresh[1:500], np.diff(held[:500]) != 0.0)
+    assert fresh[500:750].sum() == pytest.approx(100, abs=2)
+
+
+def test_a_quiet_coarse_sensor_is_not_taken_for_a_slow_one():
+    """Without noise it repeats between the steps of its converter, as long as the speed has it."""
+    for rate in (100.0, 1000.0):
+        log = stroke(8.0, rate, sensors=False)
+        coarse = np.rint((0.25 + 0.1 * np.sin(2 * np.pi * log.time)) / 5e-3) * 5e-3
+        data = dataset(with_column(log, "position.slide", coarse, "m"), stroke(seed=1))
+        assert "refreshed" not in " ".join(data.notes)
+
+
+def test_a_log_without_any_reading_is_refused():
+    log = stroke()
+    empty = dataclasses.replace(log, columns={
+        c: v if c.startswith("command") else np.full(len(log), np.nan)
+        for c, v in log.columns.items()})  # fmt: skip
+    with pytest.raises(InputError, match="no reading of any channel is usable"):
+        dataset(empty, empty)
+
+
 # Masks
 
 
@@ -215,6 +263,22 @@ def test_rows_that_wander_off_any_clock_stand_at_their_own_times():
     error = run.reading[read, data.channels.index("position.slide")] - wanted
     # a tenth of a step at 0.63 m/s is 0.66 mm at most, 0.37 mm RMS; half a step would be 3 mm
     assert np.abs(error).max() < 0.9e-3
+
+
+def test_a_log_of_two_rates_keeps_its_times():
+    time = np.concatenate([np.arange(2000) * 0.013, 26.0 + np.arange(1000) * 0.01])
+    clock, notes = fit_clock(time, "a log")
+    assert len(clock.row) == 3000 and "keep no common clock" in notes[0]
+    assert np.abs(clock.start + clock.period * clock.tick - time).max() <= 0.1 * 0.013
+
+
+def test_the_piece_that_judges_is_no_scrap():
+    log = stroke(20.0)
+    valid = np.ones(len(log))
+    valid[700:760], valid[1300:1360], valid[1900:1930] = 0.0, 0.0, 0.0
+    data = dataset(with_column(log, "valid", valid))
+    assert data.heldout.name == "a_part3" and len(data.heldout.reading) == 540
+    assert [r.name for r in data.fit] == ["a_part1", "a_part2", "a_part4"]
 
 
 def test_unsorted_time_is_refused(tmp_path):
