@@ -110,8 +110,9 @@ def _stale(data: _Data, run: str, channel: str) -> list[str]:
         return []
     step = period * float(np.median(np.diff(np.flatnonzero(np.isfinite(reading)))))
     reading[stale(reading, every)] = np.nan
-    return [f"{run}: {channel} is refreshed every {1e3 * every * step:.3g} ms only; the rows between"
-            " repeat it and count as missing."]  # fmt: skip
+    lasts = 1e3 * every * step
+    return [f"{run}: {channel} is refreshed every {lasts:.3g} ms only; the rows between repeat it"
+            " and count as missing."]  # fmt: skip
 
 
 def _count(data: _Data) -> int:
