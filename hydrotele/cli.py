@@ -120,6 +120,7 @@ def gap(
         typer.Option("--effect", help="Try only the effect of this name; may be repeated."),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
+    mask: Annotated[Path | None, typer.Option(help="CSV run,begin,end [s] not to use.")] = None,
     force: Force = False,
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
     effects: EffectFiles = None,
@@ -130,7 +131,7 @@ def gap(
 
     gap_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,
-        effect or [], jobs, force,
+        effect or [], jobs, force, mask,
     )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """CSV from a data logger or a spreadsheet, as a table; the checks scale its units to SI."""
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,12 +13,16 @@ from hydrotele.log_checks import Table, place
 _HEADER = re.compile(r"(?P<name>.*?)\s*(\[(?P<unit>[^\[\]]*)\])?", re.DOTALL)
 
 
-def read_csv(path: Path) -> Table:
+def read_csv(path: Path, missing: bool = False) -> Table:
     """Read a CSV log: a header of `name` or `name [unit]`, then one line of numbers per row.
 
     The separator is a comma, a semicolon or a tab, whichever the header has most of; decimals have
     a point. Lines that start with `#` are comments, of which `# key: value` becomes metadata. A
     known unit is scaled to SI by `checked`.
+
+    Args:
+        path: the file.
+        missing: read empty cells as NaN instead of refusing them.
 
     Raises:
         InputError: not readable as UTF-8 text, empty, no header, a row of the wrong width, or a
@@ -30,7 +35,7 @@ def read_csv(path: Path) -> Table:
     if any(map(_is_number, names)):
         remedy = "write a header of channel names above the numbers, such as time,angle.boom [deg]"
         raise InputError(path, f"the first line {header[:40]!r} holds numbers, not names: {remedy}")
-    cells = [_parse_row(source, names, row, separator, lines) for row in enumerate(rows)]
+    cells = [_parse_row(source, names, row, separator, lines, missing) for row in enumerate(rows)]
     values = np.array(cells, dtype=np.float64).reshape(len(rows), len(names))
     return Table(source, names, list(values.T), units, metadata, np.array(lines, dtype=np.int64))
 
@@ -81,8 +86,9 @@ def _is_number(text: str) -> bool:
 
 
 def _parse_row(
-    source: str, names: Sequence[str], row: tuple[int, str], separator: str, lines: Sequence[int]
-) -> list[float]:
+    source: str, names: Sequence[str], row: tuple[int, str], separator: str, lines: Sequence[int],
+    missing: bool,
+) -> list[float]:  # fmt: skip
     """Return the numbers of one row, given as (row number, line)."""
     number, line = row
     cells = line.split(separator)
@@ -99,13 +105,18 @@ def _parse_row(
             f"separator ({separator!r}) is missing or superfluous",
         )
     return [
-        _number(source, name, cell, number, lines) for name, cell in zip(names, cells, strict=True)
+        _number(source, name, cell, number, lines, missing)
+        for name, cell in zip(names, cells, strict=True)
     ]
 
 
-def _number(source: str, name: str, cell: str, row: int, lines: Sequence[int]) -> float:
+def _number(
+    source: str, name: str, cell: str, row: int, lines: Sequence[int], missing: bool
+) -> float:
     """Return the number in a cell that may be quoted."""
     text = cell.strip().strip('"').strip()
+    if missing and not text:
+        return math.nan
     try:
         if "_" not in text:
             return float(text)

@@ -245,8 +245,10 @@ class Transmission(Facts):
 class Axis(Facts):
     """One driven joint with exactly one of cylinder, motor or force.
 
-    `command_delay` [s] passes before a command reaches the valve or the drive. Without an
-    `end_stop` the machine's own estimate holds (`Machine.end_stop`).
+    `command_delay` [s] passes before a command reaches the valve or the drive. A valve's commands
+    are fractions in [-1, 1]; where logs have them in another unit, `command_range: [low, high]`
+    [command_unit] says which values stand for -1 and 1, such as [-10, 10] V or [4, 20] mA. Without
+    an `end_stop` the machine's own estimate holds (`Machine.end_stop`).
     """
 
     joint: Name
@@ -256,6 +258,8 @@ class Axis(Facts):
     valve: Valve | None = None
     four_bar: FourBar | None = None
     command_delay: NonNegative = 0.0
+    command_unit: str = "1"
+    command_range: tuple[float, float] = (-1.0, 1.0)
     transmission: Transmission | None = None
     load_holding: LoadHolding = LoadHolding()
     end_stop: EndStop | None = None
@@ -269,6 +273,19 @@ class Axis(Facts):
             raise ValueError("a cylinder or motor needs a valve; a plain force drive has none")
         if self.force and self.load_holding != LoadHolding():
             raise ValueError("a plain force drive has no oil for load_holding valves to hold")
+        if self.command_range[0] == self.command_range[1]:
+            raise ValueError("command_range must be [low, high], the commands of -1 and 1")
+        stated = self.command_unit != "1" or self.command_range != (-1.0, 1.0)
+        if stated and self.force:
+            raise ValueError(
+                "command_unit and command_range are those of a valve; a plain force drive has"
+                " force.command_unit and force.command_limit"
+            )
+        if self.command_unit != "1" and self.command_range == (-1.0, 1.0):
+            raise ValueError(
+                f"command_unit {self.command_unit!r} needs the command_range [low, high] of its"
+                " values, such as [-10, 10]"
+            )
         if self.four_bar and not self.cylinder:
             raise ValueError("a four_bar linkage is moved by a cylinder")
         return self

@@ -15,8 +15,19 @@ import numpy as np
 from hydrotele import signals
 from hydrotele.csv_import import read_csv
 from hydrotele.errors import InputError
-from hydrotele.log_checks import Table, check_values, checked, lacks, lost_samples
+from hydrotele.log_checks import (
+    CommandRange,
+    Table,
+    check_values,
+    checked,
+    in_range,
+    lacks,
+    lost_samples,
+    with_valid,
+)
 from hydrotele.output import replacing
+
+LEFT_OUT = "none"  # the alias of columns that are no channel and not wanted
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,31 +125,37 @@ def load_log(
     required: Sequence[str] = (),
     minimum_rows: int = 10,
     maximum_dropped: float = 0.0,
+    missing: bool = False,
+    commands: Mapping[str, CommandRange] | None = None,
 ) -> Log:
     """Read and check one run, `.parquet` or `.csv`.
 
     Args:
         path: the file.
         aliases: the file's own column name -> channel name, with a minus before it where the sign
-            is the other way round; names that the file lacks are ignored, and so
-            are all of them for logs that hydrotele wrote.
+            is the other way round, or `none` for a column to leave out; names that the file lacks
+            are ignored, and so are all of them for logs that hydrotele wrote.
         required: channels that must be there, after renaming.
         minimum_rows: fewer rows are refused.
         maximum_dropped: fraction of the samples [1] that may be missing or come off time by more
             than half a step; `Log.gaps` says where they are.
+        missing: accept NaN, null and empty cells in every column but time; they become NaN.
+        commands: command channel -> what its column holds, where that is no fraction in [-1, 1];
+            ignored for logs that hydrotele wrote.
 
     Raises:
         InputError: the file cannot be used; names file, column and row, and what to do.
     """
     path = Path(path)
-    table = _read(path)
-    if aliases and "hydrotele" not in table.metadata:
-        table = _renamed(table, aliases)
+    table = _read(path, missing)
+    if "hydrotele" not in table.metadata:
+        table = with_valid(_renamed(table, aliases or {}))
+        table = in_range(table, commands or {})
     names = table.names
     rows, needed = len(table.values[0]) if names else 0, max(minimum_rows, 2)
     if rows < needed:
         raise InputError(path, f"the run is too short: {rows} rows, {needed} are needed")
-    table = checked(table, required, maximum_dropped)
+    table = checked(table, required, maximum_dropped, missing)
     columns = dict(zip(names, table.values, strict=True))
     units = dict(zip(names, map(str, table.units), strict=True))
     time = columns.pop("time")
@@ -148,10 +165,12 @@ def load_log(
 
 def _renamed(table: Table, aliases: Mapping[str, str]) -> Table:
     names = [aliases.get(name, name) for name in table.names]
-    signs = [-1.0 if name.startswith("-") else 1.0 for name in names]
+    kept = [place for place, name in enumerate(names) if name != LEFT_OUT]
+    signs = [-1.0 if names[place].startswith("-") else 1.0 for place in kept]
     return table._replace(
-        names=[name.removeprefix("-") for name in names],
-        values=[sign * values for sign, values in zip(signs, table.values, strict=True)],
+        names=[names[place].removeprefix("-") for place in kept],
+        values=[sign * table.values[place] for sign, place in zip(signs, kept, strict=True)],
+        units=[table.units[place] for place in kept],
     )
 
 
@@ -232,17 +251,17 @@ def _parquet_bytes(table: Table) -> memoryview:
     return memoryview(stream.getvalue())
 
 
-def _read(path: Path) -> Table:
+def _read(path: Path, missing: bool) -> Table:
     if not path.is_file():
         raise InputError(path, "is not a file: give the path of a .parquet or .csv log")
     if path.suffix.lower() == ".csv":
-        return read_csv(path)
+        return read_csv(path, missing)
     if path.suffix.lower() == ".parquet":
-        return _read_parquet(path)
+        return _read_parquet(path, missing)
     raise InputError(path, f"a log ends in .parquet or .csv, not in {path.suffix!r}")
 
 
-def _read_parquet(path: Path) -> Table:
+def _read_parquet(path: Path, missing: bool) -> Table:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -262,11 +281,13 @@ def _read_parquet(path: Path) -> Table:
         if spec.name.startswith("__index_level_"):  # pandas writes its row labels so
             continue
         where = f"{path}, column {spec.name!r}"
-        if not (pa.types.is_floating(spec.type) or pa.types.is_integer(spec.type)):
+        number = pa.types.is_floating(spec.type) or pa.types.is_integer(spec.type)
+        flag = pa.types.is_boolean(spec.type) and spec.name in ("valid", "mask")
+        if not (number or flag):
             raise InputError(
                 where, f"holds {spec.type}, not numbers: write it as float64 or remove it"
             )
-        if column.null_count:
+        if column.null_count and not missing:
             row = int(np.flatnonzero(column.is_null().to_numpy())[0])
             raise InputError(f"{where}, row {row}", "is null: remove the row or fill it in")
         with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaN

@@ -7,10 +7,26 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.errors import InputError
-from hydrotele.signals import allowed_units, magnitude_limits, parse_channel, to_si, usual_unit
+from hydrotele.signals import (
+    allowed_units,
+    canonical_unit,
+    magnitude_limits,
+    parse_channel,
+    to_si,
+    usual_unit,
+)
 
+_PLAY = 0.02  # of half a command's range, by which a converter may read beyond it
 _LONGEST_STEP = 1.0  # [s] slower than any log of a hydraulic machine
 _NOTHING = 1e-2  # [Pa] no unit makes less a working pressure; a dead sensor is no unit error
+
+
+class CommandRange(NamedTuple):
+    """What a log's command column holds: `low` stands for -1 and `high` for 1, both in `unit`."""
+
+    unit: str
+    low: float
+    high: float
 
 
 class Table(NamedTuple):
@@ -45,27 +61,92 @@ def place(source: str, column: str, row: int | None, lines: Sequence | np.ndarra
     return f"{text}, row {row}" + ("" if lines is None else f" (line {lines[row]})")
 
 
-def checked(table: Table, required: Sequence[str], maximum_dropped: float) -> Table:
+def with_valid(table: Table) -> Table:
+    """A column `mask`, 1 where a row may not be used, as the column `valid`, 1 where it may."""
+    values = [1.0 - column if name == "mask" else column
+              for name, column in zip(table.names, table.values, strict=True)]  # fmt: skip
+    names = ["valid" if name == "mask" else name for name in table.names]
+    return table._replace(names=names, values=values)
+
+
+def in_range(table: Table, ranges: Mapping[str, CommandRange]) -> Table:
+    """Commands in volts, mA, counts or whatever the machine states, as fractions in [-1, 1].
+
+    A column whose own unit is a fraction or percent is left to the usual conversion. Readings up
+    to 2 % beyond the range, a converter's play, count as its end.
+
+    Args:
+        table: as read, with the channels' names.
+        ranges: command channel -> what its column holds.
+
+    Raises:
+        InputError: a column is in another unit or goes beyond its range; says what to correct.
+    """
+    values, units = list(table.values), list(table.units)
+    for place, name in enumerate(table.names):
+        if name not in ranges:
+            continue
+        known, column, axis = ranges[name], values[place], name.partition(".")[2]
+        own, stated = canonical_unit(known.unit), canonical_unit(units[place] or known.unit)
+        if stated != own:
+            (si, factor), (own_si, own_factor) = to_si(stated), to_si(own)
+            if si == "1" != own_si:
+                continue
+            if si != own_si:
+                raise InputError(
+                    table.where(name),
+                    f"is in {stated!r}, the machine's commands are in {own!r}: correct"
+                    f" axes.{axis}.command_unit in the machine file, or convert the column",
+                )
+            column = column * (factor / own_factor)
+        middle, half = 0.5 * (known.low + known.high), 0.5 * (known.high - known.low)
+        share = (column - middle) / half
+        if len(beyond := np.flatnonzero(np.abs(share) > 1.0 + _PLAY)):
+            row = int(beyond[0])
+            raise InputError(
+                table.where(name, row),
+                f"is {column[row]:g} {own}, beyond the machine's command_range {known.low:g} .."
+                f" {known.high:g} {own}: correct axes.{axis}.command_range in the machine file, or"
+                " the column",
+            )
+        values[place], units[place] = np.clip(share, -1.0, 1.0), "1"
+    return table._replace(values=values, units=units)
+
+
+def checked(
+    table: Table, required: Sequence[str], maximum_dropped: float, missing: bool = False
+) -> Table:
     """Check a table and return it with every column in a SI unit, assumed where none is stated.
+
+    Args:
+        table: as read.
+        required: channels that must be there.
+        maximum_dropped: fraction of the samples that may be missing [1].
+        missing: accept NaN in every column but time.
 
     Raises:
         InputError: the first offence, with column and row and what to do.
     """
     _check_names(table, required)
     si = _in_si(table)
-    check_values(si, maximum_dropped)
+    check_values(si, maximum_dropped, missing)
     for name, values, unit, stated in zip(si.names, si.values, si.units, table.units, strict=True):
         _check_magnitude(si, name, values, str(unit), stated is not None)
     return si
 
 
-def check_values(table: Table, maximum_dropped: float) -> None:
+def check_values(table: Table, maximum_dropped: float, missing: bool = False) -> None:
     """Refuse values that are not finite, and a time that does not rise or lacks samples.
+
+    Args:
+        table: in SI.
+        maximum_dropped: fraction of the samples that may be missing [1].
+        missing: accept NaN in every column but time.
 
     Raises:
         InputError: the first offence, with column and row and what to do.
     """
-    _check_finite(table)
+    _check_finite(table, missing)
     _check_time(table, maximum_dropped)
 
 
@@ -75,7 +156,9 @@ def _check_names(table: Table, required: Sequence[str]) -> None:
             parse_channel(name)
         except ValueError as error:
             raise InputError(
-                table.where(name), f"{error}. Rename it, give it an alias or remove it"
+                table.where(name),
+                f"{error}. Rename it, give it an alias or remove it"
+                " (log_columns in the machine file gives aliases; none leaves a column out)",
             ) from None
     for name, count in Counter(table.names).items():
         if count > 1:
@@ -114,9 +197,10 @@ def _in_si(table: Table) -> Table:
     return table._replace(values=columns, units=units)
 
 
-def _check_finite(table: Table) -> None:
+def _check_finite(table: Table, missing: bool) -> None:
     for name, values in zip(table.names, table.values, strict=True):
-        bad = np.flatnonzero(~np.isfinite(values))
+        allowed = missing and name != "time"
+        bad = np.flatnonzero(np.isinf(values) if allowed else ~np.isfinite(values))
         if len(bad):
             remedy = "remove the row or fill it in"
             raise InputError(table.where(name, int(bad[0])), f"is {values[bad[0]]}: {remedy}")
@@ -163,12 +247,24 @@ def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, sta
             remedy = "looks like milliseconds or less, write seconds"
             raise InputError(table.where(name, 1), f"rises by {step:g} per row: {remedy}")
         return
+    size = np.abs(values[np.isfinite(values)])
+    if not len(size):
+        return
+    if name == "valid" and len(bad := np.flatnonzero((values != 0.0) & (values != 1.0))):
+        if not np.isnan(values[bad]).all():
+            row = int(bad[~np.isnan(values[bad])][0])
+            remedy = "write 1 where the row may be used and 0 where not"
+            raise InputError(table.where(name, row), f"is {values[row]:g}: {remedy}")
     limits = magnitude_limits(name, unit, stated=stated)
-    size = np.abs(values)
     target = unit if stated else f"{unit} and state the unit"
     if unit == "1":
-        target = "values in [-1, 1] or state the unit"
+        axis = name.partition(".")[2]
+        target = (
+            "values in [-1, 1], or state in the machine file what they are, such as"
+            f" axes.{axis}: {{command_unit: V, command_range: [-10, 10]}}"
+        )
     remedy = f"looks like {limits.looks_like}, write {target}"
+    size = np.nan_to_num(np.abs(values))
     if len(high := np.flatnonzero(size > limits.largest)):
         row = int(high[0])
         raise InputError(table.where(name, row), f"is {values[row]:g}: {remedy}")

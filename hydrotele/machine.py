@@ -235,6 +235,9 @@ class Machine(Facts):
         for channel in self.sensor_errors:
             _expect(channel, self.sensed_channels, "sensor_errors")
         _check_terms(self.terms, self.axes)
+        for name, sensors in self.sensors.items():
+            for channel in sensors.channels:
+                _expect(channel, self.sensed_channels, f"sensors.{name}.channels")
         if self.hydraulic_axes and self.supply is None:
             raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
         if len(self.hydraulic_axes) > 8:

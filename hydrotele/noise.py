@@ -1,8 +1,11 @@
-"""How well a machine's sensors read: which sensor a channel has, its converter, its noise."""
+"""How a machine's sensors read: which sensor a channel has, its lag, its converter, its noise."""
 
 import math
 from typing import NamedTuple
 
+import numpy as np
+
+from hydrotele.compiled import compiled
 from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
@@ -41,7 +44,8 @@ def channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) ->
     if sensors is None:
         return Sensor()
     kind, _, axis = channel.partition(".")
-    sensor: Sensor = getattr(sensors, _KINDS[kind])
+    of_kind: Sensor = getattr(sensors, _KINDS[kind])
+    sensor = sensors.channels.get(channel, of_kind)
     if kind == "length" and sensor.bits and sensor.span is None:
         cylinder = machine.axes[axis].cylinder
         assert cylinder
@@ -71,6 +75,30 @@ def converter(sensor: Sensor, channel: str) -> Converter:
 
 
 def noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
-    """Standard deviation of one reading [channel's unit]: uniform error plus converter."""
+    """Standard deviation of one reading [channel's unit]: random error plus converter."""
     sensor = channel_sensor(machine, sensors, channel)
-    return math.sqrt(sensor.accuracy**2 / 3.0 + converter(sensor, channel).step ** 2 / 12.0)
+    return math.sqrt(sensor.error_rms**2 + converter(sensor, channel).step ** 2 / 12.0)
+
+
+@compiled
+def first_order(shown, before, now, ratio):
+    """What a first-order lag shows after a step over which its input runs straight.
+
+    `T dy/dt = x - y` with `x` from `before` to `now`, integrated exactly.
+
+    Args:
+        shown: y at the step's start, scalar or array [channel's unit].
+        before: input at the step's start, alike.
+        now: input at the step's end, alike.
+        ratio: length of the step over the time constant T, scalar, positive [1].
+
+    Returns:
+        y at the step's end, as `shown`.
+
+    Source: step and ramp response of the first-order lag.
+
+    >>> float(round(first_order(0.0, 1.0, 1.0, 1.0), 6))
+    0.632121
+    """
+    gone = -np.expm1(-ratio)
+    return shown + gone * (before - shown) + (1.0 - gone / ratio) * (now - before)

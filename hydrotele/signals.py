@@ -46,6 +46,7 @@ class Channel(NamedTuple):
 MEASURED: Mapping[str, Kind] = {
     "time": Kind(("s",), "time of the row", "none"),
     "command": Kind(("1", "V", "N"), "valve command in [-1, 1], drive voltage or force"),
+    "valid": Kind(("1",), "1 where the row may be used, 0 in contact or where it may not", "none"),
     "reference": Kind(("rad", "m"), "what the controller was asked for"),
     "handle": Kind(("m", "rad"), "displacement of the joystick's handle"),
     "hand_force": Kind(("N", "N m"), "estimated force of the hand on the handle"),

@@ -29,6 +29,7 @@ def gap_to_folder(
     data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
     sensors: str | None, target: Path | None, as_json: bool, recording: bool,
     effects: Sequence[str] = (), jobs: int | None = None, force: bool = False,
+    mask: Path | None = None,
 ) -> Path:  # fmt: skip
     """Find the gap between a model and logs; write everything into a folder, whole or not at all.
 
@@ -44,6 +45,7 @@ def gap_to_folder(
         effects: names of the effects to try; none means all.
         jobs: processes to use, None to let the search choose.
         force: accept logs whose metadata name another machine or tool.
+        mask: file of stretches that may not be used.
 
     Returns:
         The folder.
@@ -58,7 +60,7 @@ def gap_to_folder(
     check_target(target, "gap")
     stop_profiling_clock()
     model = machine_of(data, machine, tool)
-    dataset = load_dataset(list(data), model, sensors, heldout, force=force)
+    dataset = load_dataset(list(data), model, sensors, heldout, force=force, mask=mask)
     gap = _search(dataset, effects, jobs, quiet=as_json)
     with whole_folder(target, "gap") as folder:
         write_gap(gap, dataset, folder, recording, data)

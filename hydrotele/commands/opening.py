@@ -3,10 +3,11 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from hydrotele.dataset.files import command_ranges
 from hydrotele.errors import InputError
 from hydrotele.log import Log, load_log
 from hydrotele.machine import Machine
-from hydrotele.machine_file import MACHINE_FILE, load_machine, machine_path
+from hydrotele.machine_file import MACHINE_FILE, load_machine
 
 _LOGS = (".parquet", ".csv")
 
@@ -50,8 +51,11 @@ def open_log(
     file = log_path(path, which)
     beside = file.parent / MACHINE_FILE
     chosen = machine or (str(beside) if beside.is_file() else None)
-    log = load_log(file, aliases=_aliases(chosen)) if chosen else load_log(file)
-    if chosen is None:
+    if chosen:
+        first = load_machine(chosen, tool)
+        log = load_log(file, aliases=first.log_columns, commands=command_ranges(first))
+    else:
+        log = load_log(file)
         chosen = log.metadata.get("machine")
         if not chosen:
             raise InputError(file, "its metadata names no machine: give --machine")
@@ -64,13 +68,6 @@ def open_log(
         message = f"is no log of {found.name}: it has none of {', '.join(positions)}"
         raise InputError(file, message)
     return found, log
-
-
-def _aliases(machine: str) -> dict[str, str]:
-    from hydrotele.datafile import read_yaml
-
-    columns = read_yaml(machine_path(machine))[0].get("log_columns")
-    return dict(columns) if isinstance(columns, dict) else {}
 
 
 def data_name(data: Sequence[Path]) -> str:
@@ -86,8 +83,11 @@ def machine_of(data: Sequence[Path], name: str | None, tool: str | None) -> Mach
     if name is None and log and (log.parent / MACHINE_FILE).is_file():
         name = str(log.parent / MACHINE_FILE)
     if log and log.suffix.lower() == ".parquet":
-        columns = load_machine(name, tool).log_columns if name else None
-        metadata = load_log(log, aliases=columns, maximum_dropped=1.0).metadata
+        known = load_machine(name, tool) if name else None
+        metadata = load_log(
+            log, aliases=known.log_columns if known else None, maximum_dropped=1.0, missing=True,
+            commands=command_ranges(known) if known else None,
+        ).metadata  # fmt: skip
     name = name or metadata.get("machine")
     if not name:
         raise InputError(data[0], "its metadata names no machine: give --machine")

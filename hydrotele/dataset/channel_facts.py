@@ -83,7 +83,7 @@ def sensors(
 
 def noise(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
     """Standard deviation of one reading [channel's unit], NaN without a stated accuracy."""
-    if channel_sensor(machine, sensors, channel).accuracy == 0.0:
+    if channel_sensor(machine, sensors, channel).error_rms == 0.0:
         return math.nan
     return noise_rms(machine, sensors, channel)
 

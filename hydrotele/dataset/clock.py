@@ -1,4 +1,4 @@
-"""The clock of a log: time stamps that jitter or lack rows, as whole ticks of a uniform period."""
+"""The clock of a log: stamps that jitter, wander or lack rows, as ticks of a uniform period."""
 
 from typing import NamedTuple
 
@@ -11,6 +11,10 @@ _GAIN = 0.1  # of a stamp's deviation that the tracking clock takes over
 _NOTED = 0.02  # of a step: jitter below this is rounding
 _LOST = 0.005  # of a step over a whole run, for a round period
 _NO_CLOCK = 0.22  # RMS of a step; stamps without any clock have 1 / sqrt(12) = 0.29
+_SHARED = 0.01  # of the rows may be nearest to a tick that another row has
+_FINE = 5  # ticks per step where rows keep no common clock, so that they are off by a tenth at most
+_PACE = 0.5  # of a step by which one may be longer or shorter
+_PACED = 0.9  # of the steps must be so for a log that has a pace at least
 
 
 class Clock(NamedTuple):
@@ -21,19 +25,24 @@ class Clock(NamedTuple):
         period: time between ticks [s].
         row: (n,) rows of the log that are used, rising.
         tick: (n,) their ticks, rising, the first is 0.
+        hold: ticks for which a row's command holds at most, if no other comes.
     """
 
     start: float
     period: float
     row: np.ndarray
     tick: np.ndarray
+    hold: int = 1
 
 
 def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
     """Uniform clock behind time stamps.
 
     The period is that of the rows, by least squares, so that a clock that is a little fast or slow
-    loses no row. Of two rows at one tick the nearer one is used.
+    loses no row. Of two rows at one tick the nearer one is used. Stamps that only jitter about
+    their ticks are taken for inexact stamps of exact rows; where the rows wander off any common
+    clock, as those of a loop that sleeps between rows, the stamps are believed and stand on a clock
+    five times as fast, with nothing on the ticks between.
 
     Args:
         time: (n,) rising [s].
@@ -60,13 +69,33 @@ def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
         period, start = np.polyfit(tick, time, 1)
     period, start = float(period), float(start)
     off = (time - start) / period - tick
-    if np.sqrt(np.mean(off**2)) > _NO_CLOCK:
+    shared = np.mean(np.diff(tick) == 0)
+    if np.sqrt(np.mean(off**2)) > _NO_CLOCK or shared > _SHARED:
+        return _wandering(time, where)
+    return _clock(time, tick, off, start, period, where)
+
+
+def _wandering(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
+    step = np.diff(time)
+    period = float(np.median(step))
+    paced = np.abs(step / period - 1.0) <= _PACE
+    if paced.mean() < _PACED:
         raise InputError(
             where,
-            f"the time stamps follow no clock: they are {100 * np.sqrt(np.mean(off**2)):.0f} % of a"
-            f" step of {period:.4g} s off on average. Log, or resample, at a fixed rate",
+            f"the time stamps follow no clock: {100 * np.mean(~paced):.0f} % of the steps are more"
+            f" than {100 * _PACE:.0f} % off the usual one of {period:.4g} s. Log, or resample, at a"
+            " fixed rate",
         )
-    return _clock(time, tick, off, start, period, where)
+    fine = period / _FINE
+    tick, row = np.unique(np.rint((time - time[0]) / fine).astype(int), return_index=True)
+    scatter = 100 * float(np.std(step[paced] / period))
+    notes = (
+        f"{where}: the rows keep no common clock, their steps scatter by {scatter:.2g} %; each"
+        f" stands at its own time on a clock of {1 / fine:.6g} Hz.",
+    )
+    if extra := len(time) - len(row):
+        notes += (f"{where}: {extra} rows share a tick with another row and were left out.",)
+    return Clock(float(time[0]), fine, row, tick, int((1.0 + _PACE) * _FINE) + 1), notes
 
 
 def _clock(time, tick, off, start, period, where) -> tuple[Clock, tuple[str, ...]]:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from hydrotele.errors import InputError
 from hydrotele.log import Log, load_log
+from hydrotele.log_checks import CommandRange
 from hydrotele.machine import Machine
 
 MEASURED = "measured"  # stem of the log in a run folder, beside `truth`
@@ -50,7 +51,10 @@ def read_runs(
         raise InputError(min(twice), "is given twice: name it once")
     logs = []
     for name, file in named:
-        log = load_log(file, aliases=aliases, maximum_dropped=1.0).without_truth()
+        log = load_log(
+            file, aliases=aliases, maximum_dropped=1.0, missing=True,
+            commands=command_ranges(machine),
+        ).without_truth()  # fmt: skip
         if not force:
             _check_machine(log, machine)
         logs.append((name, log))
@@ -70,6 +74,15 @@ def read_runs(
                 message = f"run {name!r} is there twice, also as {others[0].source}: rename one"
                 raise InputError(found[0].source, message)
     return tuple(RunFiles(*run) for run in sorted(runs, key=lambda run: run[0]))
+
+
+def command_ranges(machine: Machine) -> dict[str, CommandRange]:
+    """What the command columns of a machine's logs hold, where it is no fraction in [-1, 1]."""
+    return {
+        f"command.{name}": CommandRange(axis.command_unit, *axis.command_range)
+        for name, axis in machine.axes.items()
+        if axis.command_range != (-1.0, 1.0)
+    }
 
 
 def _files(path: Path) -> list[tuple[str, Path]]:
@@ -96,7 +109,8 @@ def _record(folder: Path) -> Path | None:
 
 
 def _sensors(log: Log) -> set[str]:
-    return {name for name in log.columns if not name.startswith(("command.", "reference."))}
+    others = ("command.", "reference.", "valid")
+    return {name for name in log.columns if not name.startswith(others)}
 
 
 def _apart(logs: Sequence[Log]) -> bool:
@@ -154,5 +168,10 @@ def check_commands(run: RunFiles, machine: Machine) -> None:
             if log.units[channel] != unit:
                 raise InputError(
                     f"{log.source}, column {channel!r}",
-                    f"is in {log.units[channel]!r}, the drive takes {unit!r}: convert the column",
+                    f"is in {log.units[channel]!r}, the drive takes {unit!r}: convert the column"
+                    + (
+                        f", or state axes.{name}.command_unit and command_range in the machine file"
+                        if axis.valve
+                        else ""
+                    ),
                 )

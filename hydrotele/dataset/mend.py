@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.dataset import stuck, value_range
+from hydrotele.dataset.refresh import refreshed_every, stale
 from hydrotele.dataset.rows import Rows
 from hydrotele.machine import Machine
 from hydrotele.noise import channel_sensor, converter
@@ -69,12 +70,14 @@ def mend(
     for column, channel in enumerate(channels):
         for run in data.runs:
             notes += _out_of_sensor(data, run, channel, noise[column])
+            notes += _stale(data, run, channel)
+    fresh = {name: rows.reading.copy() for name, rows in data.runs.items()}
     found = [(run, ch, _frozen(data, run, ch)) for run in data.runs for ch in channels]
     for run, channel, parts in found:  # after all were judged: a frozen one is a poor witness
         notes += _take_out_frozen(data, run, channel, parts)
     for run in data.runs:
         notes += _take_out_repeated_rows(data, run)
-        notes += _take_out_useless(data, run, runs[run].reading)
+        notes += _take_out_useless(data, run, fresh[run])
     return data.runs, tuple(notes)
 
 
@@ -86,7 +89,7 @@ def _out_of_sensor(data: _Data, run: str, channel: str, noise: float) -> list[st
         notes.append(f"{run}: {bad} infinite readings of {channel} were left out.")
     for what, noted, rows in (
         ("at the end of its sensor", _CLIPPED,
-         value_range.clipped(data.sensor(channel), channel, reading)),
+         value_range.clipped(data.sensor(channel), channel, reading, period)),
         ("which nothing physical explains", 0.0,
          value_range.spikes(data.machine, channel, reading, period, noise)),
     ):  # fmt: skip
@@ -96,6 +99,20 @@ def _out_of_sensor(data: _Data, run: str, channel: str, noise: float) -> list[st
                          f" first at {first:.6g} s.")  # fmt: skip
         reading[rows] = np.nan
     return notes
+
+
+def _stale(data: _Data, run: str, channel: str) -> list[str]:
+    """Leave out rows that only repeat a channel's last value because it is refreshed less often."""
+    reading, period = data.column(channel, run), data.runs[run].period
+    assert reading is not None
+    every = refreshed_every(reading)
+    if every == 1.0:
+        return []
+    step = period * float(np.median(np.diff(np.flatnonzero(np.isfinite(reading)))))
+    reading[stale(reading, every)] = np.nan
+    lasts = 1e3 * every * step
+    return [f"{run}: {channel} is refreshed every {lasts:.3g} ms only; the rows between repeat it"
+            " and count as missing."]  # fmt: skip
 
 
 def _count(data: _Data) -> int:
@@ -150,7 +167,7 @@ def _floors(data: _Data, run: str, channel: str) -> list[float]:
     kind = channel.partition("_")[0].partition(".")[0]
     witnesses += [
         (c, r) for c in data.channels for r in data.runs
-        if c != channel and c.startswith(kind) and data.sensor(c).accuracy == sensor.accuracy
+        if c != channel and c.startswith(kind) and data.sensor(c).error_rms == sensor.error_rms
     ]  # fmt: skip
     floors = (stuck.noise_floor(v) for c, r in witnesses
               if (v := data.column(c, r)) is not None)  # fmt: skip

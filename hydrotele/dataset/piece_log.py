@@ -25,8 +25,9 @@ def measured_only(run: RunFiles) -> RunFiles:
 
 
 def piece_log(
-    logs: Sequence[Log], name: str, rows: Rows, axes: Sequence[str], channels: Sequence[str]
-) -> Log:
+    logs: Sequence[Log], name: str, rows: Rows, axes: Sequence[str], channels: Sequence[str],
+    as_logged: bool = True,
+) -> Log:  # fmt: skip
     """Log of a run or of a piece of it.
 
     Args:
@@ -35,13 +36,14 @@ def piece_log(
         rows: its rows.
         axes: the nu axes.
         channels: the c channels.
+        as_logged: whether the rows stand for what was logged; False for means and masked rows.
 
     Returns:
-        Of one file its rows as logged, with time stamps and all columns; of several files a log on
-        the common clock, with commands and channels, NaN where missing.
+        Of one file its rows as logged, with time stamps and all columns; else a log on the common
+        clock, with commands and channels, NaN where missing.
     """
     first = logs[0]
-    if len(logs) == 1:
+    if len(logs) == 1 and as_logged:
         after = rows.start + rows.period * (len(rows.command) - 0.5)
         inside = (first.time > rows.start - 0.5 * rows.period) & (first.time < after)
         if inside.all():

@@ -1,4 +1,7 @@
-"""The rows of one run, from one file or several, on one uniform clock; cut where rows lack long."""
+"""The rows of one run, from one file or several, on one uniform clock; cut where rows lack long.
+
+A file says with its column `valid` which rows may not be used, such as those in contact.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,11 +10,14 @@ import numpy as np
 
 from hydrotele.dataset.clock import Clock, fit_clock
 from hydrotele.dataset.files import RunFiles
+from hydrotele.dataset.mask import Masked, unmasked
 from hydrotele.dataset.offset import clock_offset
 from hydrotele.log import Log
 
 LONGEST_GAP = 1.0  # [s] without rows, after which the commands' history is lost and a run is cut
+LONGEST_MASK = 0.2  # [s] masked, after which nobody knows the state and a run is cut
 _FINEST = 5  # times as many ticks as the commands' file has rows
+_SLOW = 20.0  # [Hz] below it a row lasts as long as a valve takes
 _OFF = 0.05  # of a row's period that a reading may be off its tick
 
 
@@ -24,6 +30,7 @@ class Rows(NamedTuple):
         command: (n, nu) commands, held from row to row.
         known: (n,) whether the command of the row was logged.
         reading: (n, c) readings, NaN where missing.
+        valid: (n,) whether the row may be used; its readings are NaN where not.
     """
 
     start: float
@@ -31,10 +38,11 @@ class Rows(NamedTuple):
     command: np.ndarray
     known: np.ndarray
     reading: np.ndarray
+    valid: np.ndarray
 
 
 def run_rows(
-    run: RunFiles, axes: Sequence[str], channels: Sequence[str]
+    run: RunFiles, axes: Sequence[str], channels: Sequence[str], masks: Sequence[Masked] = ()
 ) -> tuple[tuple[Rows, ...], tuple[str, ...]]:
     """Put a run on one clock.
 
@@ -46,9 +54,10 @@ def run_rows(
         run: its files.
         axes: the nu axes.
         channels: the c channels.
+        masks: stretches that may not be used, besides what the files say.
 
     Returns:
-        (its pieces, cut where more than a second lacks; notes).
+        (its pieces, cut where more than a second lacks or more than 0.2 s are masked; notes).
 
     Raises:
         InputError: time stamps follow no clock.
@@ -68,22 +77,78 @@ def run_rows(
                      " off their time.")  # fmt: skip
     ticks = [_ticks(clock, clocks[0].start, period) for clock in clocks]
     every = np.unique(np.concatenate(ticks))
-    command, commanded = _spread(logs, clocks, ticks, every, commands)
-    reading, _ = _spread(logs, clocks, ticks, every, channels)
+    command = _spread(logs, clocks, ticks, every, commands)
+    commanded = np.isin(every, ticks[0])
+    own = [place for place, name in enumerate(commands) if name in logs[0]]
+    commanded &= np.isfinite(command[:, own]).all(axis=1)
+    reading = _spread(logs, clocks, ticks, every, channels)
     pieces = np.split(np.arange(len(every)), 1 + np.flatnonzero(
         np.diff(every) * period > LONGEST_GAP))  # fmt: skip
     if lost := [every[p[0]] - every[p[0] - 1] for p in pieces[1:]]:
         seconds = ", ".join(f"{n * period:.3g} s" for n in lost)
         notes.append(f"{run.name}: nothing was logged for {seconds}; the run was cut there.")
+    fine *= clocks[0].hold
     rows = tuple(
         _dense(clocks[0].start, period, fine, every[p], command[p], commanded[p], reading[p])
         for p in pieces
     )
+    notes += _unread(run, logs, channels)
     if missing := sum(int((~r.known).sum()) for r in rows):
         share = 100 * missing / sum(len(r.known) for r in rows)
         notes.append(f"{run.name}: {missing} rows ({share:.2g} %) were not logged; they count as"
                      " missing and their commands as held.")  # fmt: skip
+    if (rate := 1.0 / clocks[0].period) < _SLOW:
+        notes.append(f"{run.name}: is logged at {rate:.3g} Hz; its commands count as held between"
+                     " rows, and delays and lags are known to a row at best.")  # fmt: skip
+    rows = tuple(_masked(run, logs, clocks, piece, masks) for piece in rows)
+    if masked := sum(float((~r.valid).sum()) * r.period for r in rows):
+        rows = tuple(part for piece in rows for part in _cut_masked(piece))
+        notes.append(f"{run.name}: {masked:.3g} s are masked; their readings are not used, and the"
+                     f" run was cut where that lasts more than {LONGEST_MASK:g} s.")  # fmt: skip
     return rows, tuple(notes)
+
+
+def _masked(run: RunFiles, logs, clocks, rows: Rows, masks: Sequence[Masked]) -> Rows:
+    """Rows with the readings of those that may not be used taken out."""
+    time = rows.start + rows.period * np.arange(len(rows.command))
+    valid = unmasked(masks, run.name, time)
+    for log, clock in zip(logs, clocks, strict=True):
+        if "valid" in log:
+            stamps = clock.start + clock.period * clock.tick
+            latest = np.searchsorted(stamps, time + 0.5 * rows.period, side="right") - 1
+            valid &= (log["valid"][clock.row] == 1.0)[np.maximum(latest, 0)]
+    reading = np.where(valid[:, None], rows.reading, np.nan)
+    return rows._replace(valid=valid, reading=reading)
+
+
+def _cut_masked(rows: Rows) -> list[Rows]:
+    """Pieces of a run between its long masked stretches."""
+    edges = np.flatnonzero(np.diff(rows.valid, prepend=True, append=True))
+    begin, end = edges[::2], edges[1::2]
+    long = (end - begin) * rows.period > LONGEST_MASK
+    starts = [0, *end[long].tolist()]
+    ends = [*begin[long].tolist(), len(rows.valid)]
+    return [cut(rows, a, b) for a, b in zip(starts, ends, strict=True) if a < b]
+
+
+def cut(rows: Rows, first: int, last: int) -> Rows:
+    """Rows first .. last - 1 of a run, with their own start."""
+    part = slice(int(first), int(last))
+    return Rows(
+        rows.start + int(first) * rows.period, rows.period, rows.command[part], rows.known[part],
+        rows.reading[part], rows.valid[part],
+    )  # fmt: skip
+
+
+def _unread(run: RunFiles, logs: Sequence[Log], channels: Sequence[str]) -> list[str]:
+    """Note on cells that hold no number."""
+    counts = {
+        name: int(np.isnan(log[name]).sum())
+        for log in logs for name in log.columns
+        if name in channels or name.startswith("command.")
+    }  # fmt: skip
+    said = ", ".join(f"{count} of {name}" for name, count in counts.items() if count)
+    return [f"{run.name}: {said} are NaN or empty; they count as missing."] if said else []
 
 
 def _name(run: RunFiles, log: Log) -> str:
@@ -135,15 +200,15 @@ def _ticks(clock: Clock, start: float, period: float) -> np.ndarray:
     return np.rint((clock.start - start + clock.tick * clock.period) / period).astype(int)
 
 
-def _spread(logs, clocks, ticks, every, names) -> tuple[np.ndarray, np.ndarray]:
-    """Columns (n, k) of all files at the common ticks, and whether the first file has the row."""
+def _spread(logs, clocks, ticks, every, names) -> np.ndarray:
+    """Columns (n, k) of all files at the common ticks."""
     values = np.full((len(every), len(names)), np.nan)
     for column, name in enumerate(names):
         holder = next((i for i, log in enumerate(logs) if name in log), None)
         if holder is not None:
             rows = np.searchsorted(every, ticks[holder])
             values[rows, column] = logs[holder][name][clocks[holder].row]
-    return values, np.isin(every, ticks[0])
+    return values
 
 
 def _dense(start, period, fine, tick, command, commanded, reading) -> Rows:
@@ -163,4 +228,5 @@ def _dense(start, period, fine, tick, command, commanded, reading) -> Rows:
     if len(own):
         latest = np.searchsorted(place[own], np.arange(n), side="right") - 1
         age = np.where(latest >= 0, np.arange(n) - place[own][np.maximum(latest, 0)], n)
-    return Rows(start + float(tick[0]) * period, period, held, age < fine, full)
+    first = start + float(tick[0]) * period
+    return Rows(first, period, held, age < fine, full, np.ones(n, dtype=bool))

@@ -6,12 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.datafile import suggest
-from hydrotele.dataset.rows import Rows
+from hydrotele.dataset.rows import Rows, cut
 from hydrotele.errors import InputError
 
-SHORTEST = 5.0  # [s] of a run; the start, whose state is unknown, takes up to a second of it
-_SHORTEST_PIECE = 10.0  # [s] of a piece of a single run
+SHORTEST = 0.5  # [s] of a run: a fast servo's stroke, of which the unknown start takes a part
+FEWEST = 50  # rows of a run
+_SHORTEST_PIECE = 10.0  # [s] of a piece of a single run, if it is to be fitted in several
 _PIECES = 3
+_SHARE = 0.15, 0.6  # of a run that was cut, which a piece that judges the others should have
 _FIT = 0.75  # of a single run
 _HELD_OUT = ("test", "heldout", "validation")
 
@@ -40,6 +42,16 @@ class Split(NamedTuple):
 def seconds(rows: Rows) -> float:
     """Length of a run [s]."""
     return len(rows.command) * rows.period
+
+
+def too_short(rows: Rows) -> str | None:
+    """What a run lacks in length, as words; None if it is long enough."""
+    if seconds(rows) >= SHORTEST - 1e-9 and len(rows.command) >= FEWEST:
+        return None
+    return (
+        f"{seconds(rows):.3g} s long ({len(rows.command)} rows); {SHORTEST:g} s and {FEWEST} rows"
+        " are needed"
+    )
 
 
 def split(
@@ -73,7 +85,7 @@ def split(
     marked = [name for name in names if name.lower().startswith(_HELD_OUT)]
     if marked == names:
         marked = []
-    chosen = heldout or (marked or [sorted(runs)[-1] if len(names) == 1 else names[-1]])[0]
+    chosen = heldout or (marked or [_last_piece(runs) if len(names) == 1 else names[-1]])[0]
     pieces = [n for n in runs if chosen in (n, origin[n])]
     judge = max(pieces, key=lambda n: seconds(runs[n]))
     aside = set(marked if heldout is None else ()) | {chosen}
@@ -89,15 +101,24 @@ def split(
     return Split(parts, Part(judge, judge, runs[judge])), notes
 
 
+def _last_piece(runs: Mapping[str, Rows]) -> str:
+    """Of the pieces of one run the last that is neither a scrap nor nearly all; else the last."""
+    total = sum(map(seconds, runs.values()))
+    low, high = _SHARE
+    fair = [name for name, rows in runs.items() if low * total <= seconds(rows) <= high * total]
+    return (fair or list(runs))[-1]
+
+
 def _split_in_time(name: str, rows: Rows) -> Split:
     total = seconds(rows)
-    if total * (1.0 - _FIT) < SHORTEST - 1e-9:
+    n = len(rows.command)
+    least = max(SHORTEST, FEWEST * rows.period) / (1.0 - _FIT)
+    if total < least - 1e-9:
         raise InputError(
             name,
             f"is the only run and {total:.3g} s long; its last quarter is held out, which asks for"
-            f" {SHORTEST / (1 - _FIT):.0f} s or more: log longer, or a second run",
+            f" {least:.3g} s or more: log longer, or a second run",
         )
-    n = len(rows.command)
     count = int(np.clip(_FIT * total // _SHORTEST_PIECE, 1, _PIECES))
     edges = np.linspace(0, round(_FIT * n), count + 1).astype(int)
     fit = tuple(
@@ -105,12 +126,3 @@ def _split_in_time(name: str, rows: Rows) -> Split:
         for i, (a, b) in enumerate(zip(edges, edges[1:], strict=False))
     )
     return Split(fit, Part(f"{name}_heldout", name, cut(rows, edges[-1], n)))
-
-
-def cut(rows: Rows, first: int, last: int) -> Rows:
-    """Rows first .. last - 1 of a run, with their own start."""
-    part = slice(int(first), int(last))
-    return Rows(
-        rows.start + int(first) * rows.period, rows.period, rows.command[part], rows.known[part],
-        rows.reading[part],
-    )  # fmt: skip

@@ -1,7 +1,8 @@
 """Sensors that froze, and rows that a logger wrote twice.
 
 A noisy sensor rarely reads the same value twice in a row: with a uniform error of +-a and a
-converter step q, with probability q / 2a at most. A long repeat is then impossible by chance. That
+converter step q, with probability q / 2a at most; with a normal one, whose density is at most
+1 / (sigma sqrt(2 pi)), likewise. A long repeat is then impossible by chance. That
 holds only for a sensor that is as noisy as stated; of one that is quieter, or whose noise is not
 stated, repeats at rest are the rule, and only the motion of others can convict it.
 """
@@ -39,9 +40,10 @@ def repeat_probability(sensor: Sensor, channel: str) -> float | None:
     >>> repeat_probability(Sensor(accuracy=0.002, bits=12, span=1.024), "length.boom")
     0.0625
     """
-    if sensor.accuracy == 0.0:
+    if sensor.error_rms == 0.0:
         return None
-    share = converter(sensor, channel).step / (2.0 * sensor.accuracy)
+    width = 2.0 * sensor.accuracy or math.sqrt(2.0 * math.pi) * sensor.standard_deviation
+    share = converter(sensor, channel).step / width
     return max(share, 1.0e-9) if share <= 0.5 else None
 
 
@@ -110,7 +112,7 @@ def as_noisy_as_stated(sensor: Sensor, channel: str, floors: Sequence[float]) ->
         channel: channel name.
         floors: `noise_floor` of these channels, the best witnesses first; NaN tells nothing.
     """
-    stated = math.hypot(sensor.accuracy / math.sqrt(3), converter(sensor, channel).step / 12**0.5)
+    stated = math.hypot(sensor.error_rms, converter(sensor, channel).step / 12**0.5)
     known = [floor for floor in floors if math.isfinite(floor)]
     return bool(known) and known[0] >= _QUIET * stated
 

@@ -15,7 +15,8 @@ _VACUUM = -1.0e6  # [Pa] below it no sensor of absolute or gauge pressure reads
 _PRESSURE_PLAY = 2.0  # times the highest relief pressure; ports overshoot their relief
 _HARDEST = 500.0  # [rad/s^2] or [m/s^2]: end stops hit at full speed stay below it
 _SPIKE = 20.0  # standard deviations of one reading
-_NEAR_CLIP = 5  # rows before and after a clipped one in which readings near the end are suspect
+_NEAR_CLIP = 0.1  # [s] before and after a clipped row in which readings near the end are suspect
+_WIDE = 3.46  # standard deviations of a random error, within which readings near an end are suspect
 
 
 def limits(machine: Machine, channel: str) -> tuple[float, float]:
@@ -73,7 +74,7 @@ def check_range(machine: Machine, channel: str, reading: np.ndarray, where: str)
     )
 
 
-def clipped(sensor: Sensor, channel: str, reading: np.ndarray) -> np.ndarray:
+def clipped(sensor: Sensor, channel: str, reading: np.ndarray, period: float) -> np.ndarray:
     """Which readings stand at an end of the converter, or so near beside such that they may have.
 
     A sensor at its end cuts half of its noise off. Leaving out only the cut readings would keep
@@ -83,6 +84,7 @@ def clipped(sensor: Sensor, channel: str, reading: np.ndarray) -> np.ndarray:
         sensor: the channel's sensor, with its span.
         channel: channel name.
         reading: (n,) readings, NaN where missing [channel's unit].
+        period: time between rows [s].
 
     Returns:
         (n,) bool.
@@ -94,8 +96,10 @@ def clipped(sensor: Sensor, channel: str, reading: np.ndarray) -> np.ndarray:
     for distance in (reading - low, high - reading):
         cut = np.nan_to_num(distance, nan=math.inf) <= 0.25 * step
         if cut.any():
-            beside = np.convolve(cut, np.ones(2 * _NEAR_CLIP + 1), mode="same") > 0.5
-            near = np.nan_to_num(distance, nan=math.inf) <= 2 * sensor.accuracy + step
+            rows = min(max(1, round(_NEAR_CLIP / period)), (len(cut) - 1) // 2)
+            beside = np.convolve(cut, np.ones(2 * rows + 1), mode="same") > 0.5
+            reach = (2 * sensor.accuracy or _WIDE * sensor.standard_deviation) + step
+            near = np.nan_to_num(distance, nan=math.inf) <= reach
             at_end |= cut | (beside & near)
     return at_end
 
@@ -126,8 +130,9 @@ def spikes(
         return bad
     bend = reading[1:-1] - 0.5 * (reading[:-2] + reading[2:])
     apart = np.abs(reading[2:] - reading[:-2])
-    if not math.isfinite(noise):
-        noise = 1.2 * float(np.nanmedian(np.abs(bend))) if np.isfinite(bend).any() else 0.0
+    if not math.isfinite(noise):  # bends of 0 are those of a coarse sensor between its steps
+        bent = np.abs(bend[np.isfinite(bend) & (bend != 0.0)])
+        noise = 1.2 * float(np.median(bent)) if len(bent) else 0.0
     allowed = max(_SPIKE * noise, 0.5 * _HARDEST * period**2)
     with np.errstate(invalid="ignore"):
         bad[1:-1] |= (np.abs(bend) > allowed) & (apart < 0.25 * np.abs(bend))

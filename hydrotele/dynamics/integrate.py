@@ -26,6 +26,7 @@ from hydrotele.dynamics.model import (
 from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_ROW, RATE, Q, move_links, place_links
 from hydrotele.dynamics.motion import LENGTH as BAR_LENGTH
 from hydrotele.dynamics.supply import add_commands, supply_of, term_force
+from hydrotele.dynamics.transducers import follow_trail, show_late
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
@@ -240,8 +241,8 @@ def advance(model, sp, z, command, row, period, steps, trail):
         row: index of the row to cross.
         period: length of a row, scalar [s].
         steps: steps per row.
-        trail: (>= steps + 1, c) written: what the channels with a lag show at every step of the
-            row; (0, c) keeps nothing.
+        trail: (>= steps + 1, c) written: what the late channels would show at every step of the
+            row if they were not; (0, c) keeps nothing.
 
     Returns:
         Nothing.
@@ -300,13 +301,13 @@ def _take_commands(model, drive, command, row, begin, end, period):
 
 @lean
 def write_trail(model, sp, z, out):
-    """Keep what the channels with a lag show in a state, after `place`.
+    """Keep what the late channels would show in a state if they were not, after `place`.
 
     Args:
         model: Model.
         sp: Space.
         z: (nz,) state.
-        out: (c,) written where a channel has a lag [channel's unit].
+        out: (c,) written where a channel is late [channel's unit].
 
     Returns:
         Nothing.
@@ -314,7 +315,7 @@ def write_trail(model, sp, z, out):
     Source: nominal model, "Sensors".
     """
     for c in range(len(model.kind)):
-        if model.lag[c] > 0.0:
+        if show_late(model, c):
             out[c] = _shown(model, sp, z, c)
 
 
@@ -339,11 +340,11 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
         model: Model.
         sp: Space.
         z: (nz,) state.
-        row: index of the row, for channels with a lag.
+        row: index of the row, for late channels.
         steps: steps per row.
         h: step, scalar [s].
-        trail: as `advance` writes it, of all rows so far; (0, c) shows channels with a lag
-            without it.
+        trail: as `advance` writes it and `follow_trail` changes it, of all rows so far; (0, c)
+            shows late channels as if they were not.
         out: (c,) written [channel's unit].
 
     Returns:
@@ -353,7 +354,7 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
     """
     place(model, sp, z)
     for c in range(len(model.kind)):
-        if model.lag[c] > 0.0 and len(trail) > 0:
+        if len(trail) > 0 and show_late(model, c):
             back = max(0.0, row * steps - model.lag[c] / h)
             low = int(math.floor(back))
             part = back - low
@@ -388,9 +389,12 @@ def simulate_rows(model, sp, z, command, period, steps, out, states):
     trail = np.zeros((rows * steps + 1, len(model.kind)))
     place(model, sp, z)
     write_trail(model, sp, z, trail[0])
+    shown = trail[0].copy()
     for row in range(rows):
         read_channels(model, sp, z, row, steps, period / steps, trail, out[row])
         for s in range(len(z)):
             states[row, s] = z[s]
         if row < rows - 1:
-            advance(model, sp, z, command, row, period, steps, trail[row * steps :])
+            ahead = trail[row * steps : (row + 1) * steps + 1]
+            advance(model, sp, z, command, row, period, steps, ahead)
+            follow_trail(model, ahead, period / steps, shown)

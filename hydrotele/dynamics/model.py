@@ -41,6 +41,7 @@ class Model(NamedTuple):
         offset: (c,) sensor offsets [channel's unit].
         lag: (c,) sensor delays [s].
         terms: (k,) table of the machine's terms, see `terms.table`.
+        time_constant: (c,) time constants of the sensors' first-order lags [s].
     """
 
     mech: Mechanism
@@ -56,6 +57,7 @@ class Model(NamedTuple):
     offset: np.ndarray
     lag: np.ndarray
     terms: np.ndarray
+    time_constant: np.ndarray
 
 
 class Space(NamedTuple):
@@ -128,6 +130,7 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         offset=np.array([e.offset for e in errors], float),
         lag=np.array([e.delay for e in errors], float),
         terms=terms_table(machine.terms, order),
+        time_constant=np.array([e.time_constant for e in errors], float),
     )
 
 

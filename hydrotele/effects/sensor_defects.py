@@ -1,4 +1,4 @@
-"""Sensors that read with an offset, another scale, or late."""
+"""Sensors that read with an offset, another scale, late, or by a clock of their own."""
 
 import math
 
@@ -64,6 +64,16 @@ def _angle_delay(machine: Machine, location: str) -> dict[str, Parameter]:
     return _late(_error(machine, _position(machine, location)).delay)
 
 
+def _slow(present: float) -> dict[str, Parameter]:
+    """Transducers and their filters have time constants of 1 to 50 ms; 3 ms is worth naming."""
+    high = max(0.3, present)
+    return {"time_constant": Parameter("s", present, 0.0, high, 0.02, 0.003, starts=(0.01, 0.04))}
+
+
+def _angle_lag(machine: Machine, location: str) -> dict[str, Parameter]:
+    return _slow(_error(machine, _position(machine, location)).time_constant)
+
+
 def _length_offset(machine: Machine, location: str) -> dict[str, Parameter]:
     """Fractions of the stroke: mounted to a centimetre, worth naming from a millimetre on."""
     cylinder = machine.axes[location].cylinder
@@ -99,17 +109,76 @@ def _set_pressure(machine: Machine, location: str, values: Values) -> Machine:
     return _with(machine, _transducer(location), offset=values["offset"])
 
 
+def _pressure_scale(machine: Machine, location: str) -> dict[str, Parameter]:
+    """A wrong span setting or supply voltage; a calibrated transducer is right to 0.25 %."""
+    present = _error(machine, _transducer(location)).scale
+    low, high = min(0.8, present), max(1.2, present)
+    return {"ratio": Parameter("1", present, low, high, 0.02, 0.003)}
+
+
+def _set_pressure_scale(machine: Machine, location: str, values: Values) -> Machine:
+    return _with(machine, _transducer(location), scale=values["ratio"])
+
+
+def _both(axis: str) -> tuple[str, ...]:
+    return tuple(f"pressure_{side}.{axis}" for side in _SIDES)
+
+
+def _common(machine: Machine, channels: tuple[str, ...], field: str) -> float:
+    """What all channels have in common of a delay or time constant [s]: the least of them."""
+    return min(getattr(_error(machine, channel), field) for channel in channels)
+
+
+def _with_common(machine: Machine, channels: tuple[str, ...], field: str, value: float) -> Machine:
+    """The least of the channels gets the value, the others shift as much."""
+    more = value - _common(machine, channels, field)
+    for channel in channels:
+        shifted = getattr(_error(machine, channel), field) + more
+        machine = _with(machine, channel, **{field: max(0.0, shifted)})
+    return machine
+
+
 def _pressure_delay(machine: Machine, location: str) -> dict[str, Parameter]:
-    return _late(min(_error(machine, f"pressure_{side}.{location}").delay for side in _SIDES))
+    return _late(_common(machine, _both(location), "delay"))
 
 
 def _set_pressure_delay(machine: Machine, location: str, values: Values) -> Machine:
-    """Both transducers of an axis; the faster one gets the delay, the other shifts as much."""
-    delays = {s: _error(machine, f"pressure_{s}.{location}").delay for s in _SIDES}
-    more = values["delay"] - min(delays.values())
-    for side, delay in delays.items():
-        machine = _with(machine, f"pressure_{side}.{location}", delay=max(0.0, delay + more))
-    return machine
+    return _with_common(machine, _both(location), "delay", values["delay"])
+
+
+def _pressure_lag(machine: Machine, location: str) -> dict[str, Parameter]:
+    return _slow(_common(machine, _both(location), "time_constant"))
+
+
+def _set_pressure_lag(machine: Machine, location: str, values: Values) -> Machine:
+    return _with_common(machine, _both(location), "time_constant", values["time_constant"])
+
+
+def _clocks(machine: Machine) -> dict[str, tuple[str, ...]]:
+    """Groups of channels that one logger may have stamped; one axis alone has its own delays."""
+    pressures = tuple(c for c in machine.sensed_channels if c.startswith("pressure"))
+    positions = tuple(c for c in machine.sensed_channels if not c.startswith("pressure"))
+    groups = {}
+    if len(machine.axes) > 1:
+        groups["positions"] = positions
+    if len(machine.hydraulic_axes) > 1:
+        groups["pressures"] = pressures
+    return groups
+
+
+def _clock_offset(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Seconds by which a group of sensors is stamped late, against commands and other sensors.
+
+    A group is never early, which would be a response before its command; against the other group
+    either sign is possible, as an offset of one or of the other. Loggers are off by some 10 ms.
+    """
+    present = _common(machine, _clocks(machine)[location], "delay")
+    high = max(0.5, present)
+    return {"offset": Parameter("s", present, 0.0, high, 0.02, 0.003, starts=(0.02, 0.1))}
+
+
+def _set_clock_offset(machine: Machine, location: str, values: Values) -> Machine:
+    return _with_common(machine, _clocks(machine)[location], "delay", values["offset"])
 
 
 EFFECTS = (
@@ -126,6 +195,10 @@ EFFECTS = (
         _set_angle("delay", "delay"),
     ),
     Effect(
+        "angle_lag", "a position sensor behind a first-order lag", "sensor", axes, _angle_lag,
+        _set_angle("time_constant", "time_constant"),
+    ),
+    Effect(
         "length_offset", "a cylinder's length sensor with an offset", "sensor", cylinders,
         _length_offset, _set_length,
     ),
@@ -136,5 +209,17 @@ EFFECTS = (
     Effect(
         "pressure_delay", "pressure transducers of an axis that read late", "sensor", valves,
         _pressure_delay, _set_pressure_delay,
+    ),
+    Effect(
+        "pressure_scale", "a pressure transducer with another scale", "sensor", _ports,
+        _pressure_scale, _set_pressure_scale,
+    ),
+    Effect(
+        "pressure_lag", "pressure transducers of an axis behind a first-order lag", "sensor",
+        valves, _pressure_lag, _set_pressure_lag,
+    ),
+    Effect(
+        "clock_offset", "a clock of the positions or of the pressures that is late", "sensor",
+        lambda machine: tuple(_clocks(machine)), _clock_offset, _set_clock_offset,
     ),
 )  # fmt: skip

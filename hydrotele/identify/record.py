@@ -297,7 +297,8 @@ def _reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, 
     column = dataset.channels.index(channel)
     error = dataset.machine.sensor_errors.get(channel, SensorError())
     values = (run.reading[:, column] - error.offset) / error.scale
-    if error.delay:
+    if error.late:
+        late = error.delay + error.time_constant  # of motions slower than the lag
         rows = np.arange(len(values), dtype=float)
-        values = np.interp(rows + error.delay / run.period, rows, values, right=np.nan)
-    return values, float(dataset.noise[column]) / error.scale
+        values = np.interp(rows + late / run.period, rows, values, right=np.nan)
+    return values, float(dataset.noise_of(run)[column]) / error.scale

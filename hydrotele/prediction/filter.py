@@ -19,7 +19,7 @@ from hydrotele.dynamics.integrate import (
     supply_of,
 )
 from hydrotele.dynamics.mechanism import JOINT
-from hydrotele.prediction.late import begin_late, move_late, spread_late
+from hydrotele.prediction.late import begin_late, move_late, nudge_late, spread_late
 
 
 class Gains(NamedTuple):
@@ -196,8 +196,8 @@ def filter_run(
                     for r in range(size):
                         reached[s, r] += nudge[s] * columns[row, s - begin, r]
                     reached[s, s] += decay * nudge[s]
-                elif size < s < begin and late.due[s - size - 1] < 0.0:
-                    reached[s, s - 1] += nudge[s]
+                else:
+                    nudge_late(late, s - size, nudge[s], reached[s, size:begin])
             _carry(reached, nudge, spread, work, drift)
             if len(flow) > 0:
                 for s in range(full):

@@ -280,6 +280,4 @@ def smooth(run: LinearRun, noise: np.ndarray, drift: np.ndarray, states: bool = 
     disturbance[:-1] = own[:-1] * pulls[1:]
     known[:-1] = own[:-1] * lacks[1:]
     deviation = before + np.einsum("rsk,rk->rs", covariance, pulls) if states else before[:0]
-    return Smoothed(
-        loss, noise_slope, drift_slope, whitened, width, disturbance, known, deviation
-    )
+    return Smoothed(loss, noise_slope, drift_slope, whitened, width, disturbance, known, deviation)

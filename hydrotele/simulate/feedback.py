@@ -1,6 +1,7 @@
 """What the controller sees: joint positions and pressures, sampled, with error, converted, held."""
 
 import dataclasses
+import math
 
 import mujoco
 import numpy as np
@@ -10,16 +11,17 @@ from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import circuit_scratch
 from hydrotele.noise import channel_sensor, converter
 from hydrotele.sensors import SensorError, SensorSet
+from hydrotele.simulate.past import Past
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import state_supply
-from hydrotele.simulate.record import Past, aligned_positions
+from hydrotele.simulate.record import aligned_positions
 from hydrotele.simulate.sensors import convert, sensor_errors
 
 
 @compiled
 def read_sensors(
-    qpos, places, act, supply_act, user, count, scales, offsets, errors, steps, low, high, joint,
-    head, rod, work,
+    qpos, places, act, supply_act, slow_supply, user, count, scales, offsets, errors, steps, low,
+    high, joint, head, rod, work,
 ):  # fmt: skip
     """Readings of the fed-back sensors in a state.
 
@@ -28,6 +30,8 @@ def read_sensors(
         places: (k,) place of each axis' joint in `qpos`.
         act: (na,) activations; pressures [Pa].
         supply_act: (na,) activations that the supply's sensor sees.
+        slow_supply: supply pressure behind its sensor's first-order lag, scalar [Pa]; NaN without
+            one.
         user: (k * SLOTS,) actuator numbers.
         count: number of hydraulic axes.
         scales: (c,) scales of the sensors [1], in the order of `errors`.
@@ -60,7 +64,10 @@ def read_sensors(
     if count == 0:
         return 0.0
     c = k + 2 * count
-    value = scales[c] * state_supply(user, count, supply_act, work) + offsets[c]
+    supply = slow_supply
+    if np.isnan(supply):
+        supply = state_supply(user, count, supply_act, work)
+    value = scales[c] * supply + offsets[c]
     return convert(value + errors[c], steps[c], low[c], high[c])
 
 
@@ -98,7 +105,9 @@ class Feedback:
         defects = [self.plant.machine.sensor_errors.get(n, SensorError()) for n in self.errors]
         self._scales = np.array([d.scale for d in defects])
         self._offsets = np.array([d.offset for d in defects])
-        self._late = [(place, d.delay) for place, d in enumerate(defects) if d.delay]
+        self._late = [
+            (place, (d.delay, d.time_constant)) for place, d in enumerate(defects) if d.late
+        ]
         self._user = self.plant.model.actuator_user.ravel()
         self._work = circuit_scratch()
 
@@ -115,22 +124,23 @@ class Feedback:
         before = self.joint.copy()
         plant, (steps, low, high) = self.plant, self.converters
         qpos, act, supply_act = aligned_positions(plant.model, data), data.act, data.act
+        slow_supply = math.nan
         if past and self._late:
-            qpos, act, supply_act = self._seen_late(qpos, act, past)
+            qpos, act, supply_act, slow_supply = self._seen_late(qpos, act, past)
         self.supply = read_sensors(
-            qpos, plant.qpos, act, supply_act, self._user, plant.hydraulic, self._scales,
-            self._offsets, self._table[tick // self.every], steps, low, high, self.joint, self.head,
-            self.rod, self._work,
+            qpos, plant.qpos, act, supply_act, slow_supply, self._user, plant.hydraulic,
+            self._scales, self._offsets, self._table[tick // self.every], steps, low, high,
+            self.joint, self.head, self.rod, self._work,
         )  # fmt: skip
         if tick:
             self.rate[:] = (self.joint - before) / self.period
 
     def _seen_late(self, qpos, act, past: Past):
-        """States in which what every sensor reads stands as it was its delay ago."""
-        qpos, act, supply_act = qpos.copy(), act.copy(), act
+        """States in which what every sensor reads stands as its delay and lag let it through."""
+        qpos, act, supply_act, slow_supply = qpos.copy(), act.copy(), act, math.nan
         axes = len(self.plant.axes)
         for place, lag in self._late:
-            old_qpos, old_act = past.at(lag)
+            old_qpos, old_act, old_supply = past.at(lag)
             if place < axes:
                 qpos[self.plant.qpos[place]] = old_qpos[self.plant.qpos[place]]
             elif place < axes + 2 * self.plant.hydraulic:
@@ -138,7 +148,8 @@ class Feedback:
                 act[4 * i + 2 + side] = old_act[4 * i + 2 + side]
             else:
                 supply_act = old_act
-        return qpos, act, supply_act
+                slow_supply = old_supply if lag[1] else math.nan
+        return qpos, act, supply_act, slow_supply
 
 
 def feedback(

@@ -109,21 +109,23 @@ def _sensed(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.nda
 
 
 def late_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
-    """True values of the channels whose sensors read late, as they stood that long ago.
+    """True values of the channels whose sensors read late, as their delay and lag let them through.
 
     Args:
         plant: the plant that ran.
         record: its states, with those before.
 
     Returns:
-        Channel -> (n,) values in SI; only channels with a delay.
+        Channel -> (n,) values in SI; only channels with a delay or a time constant.
     """
     values = {}
     for channel, error in plant.machine.sensor_errors.items():
-        if not error.delay:
+        if not error.late:
             continue
-        qpos, act = record.late[error.delay]
-        if channel == "pressure_supply":
+        qpos, act, supply = record.late[error.delay, error.time_constant]
+        if channel == "pressure_supply" and error.time_constant:
+            values[channel] = supply
+        elif channel == "pressure_supply":
             user, scratch = plant.model.actuator_user.ravel(), circuit_scratch()
             values[channel] = np.array(
                 [state_supply(user, plant.hydraulic, row, scratch) for row in act]

@@ -10,12 +10,16 @@ but for friction.
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Protocol
 
 import mujoco
 import numpy as np
 
+from hydrotele.machine import Machine
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.surroundings import is_thing
+
+Lag = tuple[float, float]  # delay and time constant of a sensor [s]
 
 _WHOLE = 1.0e-9  # of a step, by which a delay may miss a whole number of steps through rounding
 
@@ -37,7 +41,8 @@ class Record:
         command: (n, nu) mean command over the row's interval.
         contact: (n, 3) sum of the forces on the machine of ground and things, world frame [N].
         tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
-        late: sensor delay [s] -> (qpos (n, nq), act (n, na)) that long before each row.
+        late: delay and time constant of a sensor [s] -> (qpos (n, nq), act (n, na), supply
+            pressure (n,)) as such a sensor shows them, see `past.Past.at`.
     """
 
     time: np.ndarray
@@ -48,7 +53,9 @@ class Record:
     command: np.ndarray
     contact: np.ndarray
     tip: np.ndarray
-    late: Mapping[float, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
+    late: Mapping[Lag, tuple[np.ndarray, np.ndarray, np.ndarray]] = dataclasses.field(
+        default_factory=dict
+    )
 
 
 def begin_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -84,6 +91,12 @@ def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -
     return positions
 
 
+def sensor_lags(machine: Machine) -> tuple[Lag, ...]:
+    """Delays and time constants of the machine's late sensors, each pair once, sorted."""
+    errors = machine.sensor_errors.values()
+    return tuple(sorted({(e.delay, e.time_constant) for e in errors if e.late}))
+
+
 def split_delay(delay: float, timestep: float) -> tuple[int, float]:
     """Whole steps of a delay [s] and the fraction of a step [s] that is left, in [0, 1)."""
     steps = math.floor(delay / timestep + _WHOLE)
@@ -91,37 +104,12 @@ def split_delay(delay: float, timestep: float) -> tuple[int, float]:
     return steps, rest if rest > _WHOLE else 0.0
 
 
-class Past:
-    """States of the last physics steps, for sensors that read late.
+class Sight(Protocol):
+    """What tells what late sensors show, such as `past.Past`."""
 
-    Args:
-        plant: the plant, with the delays of its `sensor_errors`.
-        data: state at the start, as `begin_leapfrog` left it; it stands for all times before.
-    """
-
-    def __init__(self, plant: Plant, data: mujoco.MjData) -> None:
-        """Make room for the longest delay."""
-        self._model = plant.model
-        h = plant.model.opt.timestep
-        self.lags = tuple(sorted({e.delay for e in plant.machine.sensor_errors.values()} - {0.0}))
-        self._parts = {lag: split_delay(lag, h) for lag in self.lags}
-        size = 2 + max((steps for steps, _ in self._parts.values()), default=0)
-        self._qpos = np.tile(aligned_positions(plant.model, data), (size, 1))
-        self._act = np.tile(data.act, (size, 1))
-        self._now = 0
-
-    def keep(self, data: mujoco.MjData) -> None:
-        """Remember the state after a step."""
-        self._now = (self._now + 1) % len(self._qpos)
-        self._qpos[self._now] = aligned_positions(self._model, data)
-        self._act[self._now] = data.act
-
-    def at(self, lag: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (nq,) and activations (na,) that long ago, linear between two steps."""
-        steps, part = self._parts[lag]
-        new, old = (self._now - steps) % len(self._qpos), (self._now - steps - 1) % len(self._qpos)
-        qpos = self._qpos[new] + part * (self._qpos[old] - self._qpos[new])
-        return qpos, self._act[new] + part * (self._act[old] - self._act[new])
+    def at(self, lag: Lag) -> tuple[np.ndarray, np.ndarray, float]:
+        """Positions (nq,), activations (na,) and supply pressure [Pa] that such a sensor shows."""
+        ...
 
 
 class Recorder:
@@ -143,12 +131,12 @@ class Recorder:
         self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
         self.command, self.contact = np.zeros((rows, model.nu)), np.zeros((rows, 3))
         self.tip = np.zeros((rows, 3 if self.tip_site >= 0 else 0))
-        lags = {error.delay for error in plant.machine.sensor_errors.values()} - {0.0}
         self.late = {
-            lag: (np.zeros((rows, model.nq)), np.zeros((rows, model.na))) for lag in sorted(lags)
+            lag: (np.zeros((rows, model.nq)), np.zeros((rows, model.na)), np.zeros(rows))
+            for lag in sensor_lags(plant.machine)
         }
 
-    def take(self, row: int, time: float, data: mujoco.MjData, past: Past) -> None:
+    def take(self, row: int, time: float, data: mujoco.MjData, past: Sight) -> None:
         """Keep the present state, before the next step is made.
 
         Args:
@@ -166,8 +154,8 @@ class Recorder:
         self.qvel[row] = data.qvel - 0.5 * h * data.qacc
         self.qacc[row] = data.qacc
         self.act[row] = data.act
-        for lag, (qpos, act) in self.late.items():
-            qpos[row], act[row] = past.at(lag)
+        for lag, (qpos, act, supply) in self.late.items():
+            qpos[row], act[row], supply[row] = past.at(lag)
         if self.tip_site >= 0:
             self.tip[row] = data.site_xpos[self.tip_site]
         if data.ncon:
@@ -184,7 +172,7 @@ class Recorder:
 
     def record(self, rows: int | None = None) -> Record:
         """All rows as a Record, or the first ones."""
-        late = {lag: (qpos[:rows], act[:rows]) for lag, (qpos, act) in self.late.items()}
+        late = {lag: (q[:rows], a[:rows], p[:rows]) for lag, (q, a, p) in self.late.items()}
         return Record(
             self.time[:rows], self.qpos[:rows], self.qvel[:rows], self.qacc[:rows],
             self.act[:rows], self.command[:rows], self.contact[:rows], self.tip[:rows], late,

@@ -1,4 +1,4 @@
-"""Sensors: scale and offset, uniform error inside a bound, then an analogue-to-digital converter.
+"""Sensors: scale and offset, a random error, then an analogue-to-digital converter.
 
 Every channel draws from its own stream, keyed by the scenario's seed and the channel's name, so
 that leaving a channel out changes no other.
@@ -16,20 +16,22 @@ from hydrotele.sensors import Sensor, SensorSet
 
 
 def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:
-    """Uniform errors of a channel for a whole run.
+    """Random errors of a channel for a whole run.
 
     Args:
-        sensor: its accuracy [channel's unit].
+        sensor: its accuracy or standard deviation [channel's unit].
         seed: the scenario's seed.
         channel: channel name, which selects the stream.
         count: number of samples n.
 
     Returns:
-        (n,) errors, uniform in [-accuracy, accuracy].
+        (n,) errors, uniform in [-accuracy, accuracy], or normal.
 
     Source: Khoshzaban 1992, section 4.4.3 (uniform error inside the sensor's bound).
     """
     stream = np.random.Generator(np.random.PCG64([seed, zlib.crc32(channel.encode())]))
+    if sensor.standard_deviation:
+        return stream.normal(0.0, sensor.standard_deviation, count)
     return stream.uniform(-1.0, 1.0, count) * sensor.accuracy
 
 
@@ -102,7 +104,7 @@ def measure(
     readings = {}
     for channel, values in defective(machine, truth).items():
         sensor = channel_sensor(machine, sensors, channel)
-        if sensor.accuracy or sensor.bits:
+        if sensor.error_rms or sensor.bits:
             error = (errors or {}).get(channel)
             if error is None:
                 error = sensor_errors(sensor, seed, channel, len(values))

@@ -10,8 +10,9 @@ import itertools
 import mujoco
 import numpy as np
 
+from hydrotele.simulate.past import Past
 from hydrotele.simulate.plant import Plant
-from hydrotele.simulate.record import Past, split_delay
+from hydrotele.simulate.record import split_delay
 
 
 class DelayLine:

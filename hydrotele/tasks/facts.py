@@ -185,7 +185,7 @@ def _write_sensors(facts: np.ndarray, setup: Setup) -> None:
     facts["every"], facts["noisy"] = samples_every(1.0 / clock.period, sensors), sensors is not None
     for c, name in enumerate(channels(plant)):
         kind = channel_sensor(machine, sensors, name)
-        facts["accuracy"][c] = kind.accuracy
+        facts["accuracy"][c] = kind.accuracy or 3**0.5 * kind.standard_deviation  # of equal RMS
         facts["converters"][:, c] = converter(kind, name)
 
 

@@ -192,6 +192,11 @@ def _sensor_tables(plant: Plant, machines: list[Machine]):
     for v, machine in enumerate(machines):
         for c, name in enumerate(channels(plant)):
             defect = machine.sensor_errors.get(name, SensorError())
+            if defect.time_constant:
+                raise InputError(
+                    f"sensor_errors.{name}",
+                    "environments know no time_constant of a sensor: give it as a delay",
+                )
             scales[v, c], offsets[v, c], lags[v, c] = defect.scale, defect.offset, defect.delay
     return scales, offsets, lags
 

@@ -351,8 +351,10 @@ def test_single_run_is_split_without_overlap(seconds, start):
 @pytest.mark.parametrize(
     ("logs", "message"),
     [
-        ({"only": made_up(1, 15.0)}, "only run and 15 s long.*20 s or more"),
-        ({"a": made_up(1), "b": made_up(2, 4.0)}, "4 s long; 5 s are needed"),
+        ({"only": made_up(1, 3.0)}, "only run and 3 s long.*4 s or more"),
+        ({"only": made_up(1, 1.8, 1000.0)}, "only run and 1.8 s long.*2 s or more"),
+        ({"a": made_up(1), "b": made_up(2, 0.8)}, r"0.8 s long \(40 rows\); 0.5 s and 50 rows"),
+        ({"a": made_up(1), "b": made_up(2, 0.4, 1000.0)}, "0.4 s long .400 rows.; 0.5 s and"),
     ],
 )
 def test_too_short_runs_are_refused(logs, message):
@@ -481,7 +483,7 @@ def test_infinite_and_missing_readings_in_memory():
     angle[10:13], angle[20] = np.nan, np.inf
     data = dataset(a=changed(log, angle_boom=angle), b=made_up(2))
     assert np.flatnonzero(np.isnan(column(data, "a", "angle.boom"))).tolist() == [10, 11, 12, 20]
-    assert "1 infinite" in data.notes[0]
+    assert "3 of angle.boom are NaN" in data.notes[0] and "1 infinite" in data.notes[1]
 
 
 def test_a_run_at_rest_is_said():
@@ -504,14 +506,33 @@ def csv(log: Log, path: Path, spoil=lambda text: text) -> Path:
     return path
 
 
-def test_nan_in_a_csv_is_refused_with_its_line(tmp_path):
+def test_cells_without_a_number_count_as_missing_and_are_said(tmp_path):
     log = made_up(1)
-    angle = log["angle.boom"].copy()
-    angle[7] = np.nan
-    path = csv(changed(log, angle_boom=angle), tmp_path / "a.csv")
+    angle, command = log["angle.boom"].copy(), log["command.stick"].copy()
+    angle[7:9], command[20] = np.nan, np.nan
+    damaged = changed(log, angle_boom=angle, command_stick=command)
+    for spoil in (lambda text: text, lambda text: text.replace("nan", "")):
+        path = csv(damaged, tmp_path / "a.csv", spoil)
+        data = load_dataset([path, write(tmp_path, {"b": made_up(2)}) / "b.parquet"], CAT)
+        run = data.fit[0]
+        assert np.flatnonzero(np.isnan(column(data, "a", "angle.boom"))).tolist() == [7, 8]
+        assert np.flatnonzero(~run.command_known).tolist() == [20]
+        assert run.command[20, 2] == run.command[19, 2]
+        assert "1 of command.stick, 2 of angle.boom are NaN or empty" in data.notes[0]
+
+
+def test_nan_in_the_time_is_refused_with_its_line(tmp_path):
+    log = made_up(1)
+
+    def spoil(text):
+        lines = text.split("\n")
+        lines[8] = "," + lines[8].partition(",")[2]
+        return "\n".join(lines)
+
+    path = csv(log, tmp_path / "a.csv", spoil)
     with pytest.raises(InputError) as caught:
         load_dataset(path, CAT)
-    for word in (str(path), "angle.boom", "row 7", "line 9", "remove the row or fill it in"):
+    for word in (str(path), "'time'", "row 7", "line 9", "remove the row or fill it in"):
         assert word in str(caught.value)
 
 
@@ -613,5 +634,8 @@ def test_ec20():
     commands = np.concatenate([r.command for r in runs_of(data)])
     assert np.array_equal(commands[:, 0], -log["command.boom"])  # the joystick's other way round
     # A converter's step without an accuracy is no floor of the noise.
-    assert np.isnan(data.noise).all() and data.notes == ()
-    assert all(np.isfinite(r.reading).all() for r in runs_of(data))
+    assert np.isnan(data.noise).all() and len(data.notes) == 2
+    # The record is resampled to 50 Hz, its angles change every second or third row only: 20 Hz.
+    assert all("is refreshed every 49.9 ms only" in note for note in data.notes)
+    read = np.concatenate([np.isfinite(r.reading) for r in runs_of(data)])
+    assert read.mean(axis=0) == pytest.approx([0.4, 0.4], abs=0.002)

@@ -31,11 +31,13 @@ PLACES = {
     "pressure_delay": ARM, "external_force": ARM, "force_pulse": ARM,
     "speed_dependent_force": ARM, "load_dependent_friction": ARM,
     "position_dependent_friction": ARM, "orifice_leakage": ARM, "warming": {"all"},
-    "command_offset": ARM,
-    "pressure_delay": ARM, "valve_gain_direction": ARM, "valve_deadband_direction": ARM,
+    "command_offset": ARM, "valve_gain_direction": ARM, "valve_deadband_direction": ARM,
     "metering_edges": ARM, "flow_curve": ARM, "spool_slew": ARM, "load_compensation": ARM,
     "load_holding": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
     "pump_droop": {"supply"}, "end_stop_stiffness": {"boom", "stick"},
+    "angle_lag": ARM, "pressure_lag": ARM,
+    "pressure_scale": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
+    "clock_offset": {"positions", "pressures"},
 }  # fmt: skip
 machine_of = functools.cache(load_machine)
 CASES = [

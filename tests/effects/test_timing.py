@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.signal import lsim, lti
 
 from hydrotele.effects import apply_effect
 from hydrotele.log import Log
@@ -117,11 +118,14 @@ DEFECTS = [
     ("length_offset", "stick", {"offset": -0.004}),
     ("pressure_offset", "boom.head", {"offset": 60e3}),
     ("pressure_delay", "stick", {"delay": 0.0275}),
+    ("pressure_lag", "swing", {"time_constant": 0.017}),
+    ("angle_lag", "stick", {"time_constant": 0.03}),
+    ("pressure_scale", "boom.rod", {"ratio": 0.98}),
 ]
 
 
 def test_the_log_shows_the_defects_and_the_truth_does_not():
-    """A lag of 13 ms is exact to the step, one of 27.5 ms linear within it: 1e-6 of 28 MPa."""
+    """A delay of 13 ms is exact to the step, one of 27.5 ms linear within it: 1e-6 of 28 MPa."""
     run = run_scenario(scenario(*DEFECTS, duration=2.0))
     fine = run_scenario(scenario(*DEFECTS, duration=2.0, log_rate=1000, rate=1000)).truth
     truth, seen = run.truth, run.measured
@@ -138,26 +142,81 @@ def test_the_log_shows_the_defects_and_the_truth_does_not():
     np.testing.assert_allclose(seen["angle.swing"], late("angle.swing", 0.013), atol=1e-12)
     for channel in ("pressure_head.stick", "pressure_rod.stick"):
         np.testing.assert_allclose(seen[channel], late(channel, 0.0275), atol=28.0)
-    for channel in ("angle.stick", "length.boom", "pressure_rod.boom", "pressure_supply"):
+    np.testing.assert_allclose(
+        seen["pressure_rod.boom"], 0.98 * truth["pressure_rod.boom"], rtol=1e-14
+    )
+    for channel in ("length.boom", "pressure_supply"):
         assert np.array_equal(seen[channel], truth[channel])
+
+
+def lagged(values, time, constant):
+    """First-order lag of densely sampled values, by SciPy; at rest before the first."""
+    system = lti([1.0], [constant, 1.0])
+    return values[0] + lsim(system, values - values[0], time)[1]
+
+
+def test_a_lag_filters_what_the_log_shows():
+    """SciPy's simulation of `1 / (T s + 1)` gives the readings, also behind a delay.
+
+    Both run straight between the steps of 1 ms, so that only rounding differs.
+    """
+    effects = [
+        ("pressure_lag", "swing", {"time_constant": 0.017}),
+        ("angle_lag", "stick", {"time_constant": 0.03}),
+        ("pressure_lag", "stick", {"time_constant": 0.002}),
+        ("pressure_delay", "stick", {"delay": 0.012}),
+    ]
+    run = run_scenario(scenario(*effects, duration=2.0, log_rate=1000, rate=1000))
+    truth, seen = run.truth, run.measured
+    for channel, constant in (
+        ("pressure_head.swing", 0.017), ("pressure_rod.swing", 0.017), ("angle.stick", 0.03),
+    ):  # fmt: skip
+        wanted = lagged(truth[channel], truth.time, constant)
+        np.testing.assert_allclose(seen[channel], wanted, rtol=1e-9, atol=1e-9)
+        assert np.abs(seen[channel] - truth[channel]).max() > 0.01 * np.ptp(truth[channel])
+    wanted = lagged(truth["pressure_rod.stick"], truth.time, 0.002)
+    np.testing.assert_allclose(seen["pressure_rod.stick"][12:], wanted[:-12], rtol=1e-9)
+    assert np.array_equal(seen["angle.boom"], truth["angle.boom"])
+
+
+def test_a_clock_offset_shifts_a_whole_group():
+    offset = [("clock_offset", "pressures", {"offset": 0.02})]
+    run = run_scenario(scenario(*offset, log_rate=1000, rate=1000))
+    for channel in run.measured.columns:
+        if channel.startswith("pressure"):
+            late, true = run.measured[channel][20:], run.truth[channel][:-20]
+            np.testing.assert_allclose(late, true, rtol=1e-12)
+        else:
+            assert np.array_equal(run.measured[channel], run.truth[channel])
 
 
 def test_the_supply_sensor_can_be_late_too():
     machine = load_machine("cat215")
-    errors = {"pressure_supply": {"delay": 0.1, "offset": 1e5}}
-    machine = type(machine).model_validate(machine.model_dump() | {"sensor_errors": errors})
+    supply, old = supply_and_reading(machine, {"delay": 0.1, "offset": 1e5})
+    np.testing.assert_allclose(old[5:], supply[:-5], rtol=1e-12)
+    assert (old[:5] == supply[0]).all() and np.ptp(supply) > 1e6
+    supply, old = supply_and_reading(machine, {"time_constant": 0.05, "delay": 0.02})
+    slow = lagged(supply, 1e-3 * np.arange(len(supply)), 0.05)
+    np.testing.assert_allclose(old[20:], slow[:-20], rtol=1e-9)
+
+
+def supply_and_reading(machine, error):
+    """Supply pressure and what its sensor shows of it, at every row or every step."""
+    steps = 1 if "time_constant" in error else 20
+    machine = type(machine).model_validate(
+        machine.model_dump() | {"sensor_errors": {"pressure_supply": error}}
+    )
     plant = build_plant(machine, ground=False)
     data = rest_state(plant)
     begin_leapfrog(plant.model, data)
-    stepper, recorder = Stepper(plant, data, 20), Recorder(plant, 30)
-    for row in range(30):
+    rows = 600 // steps
+    stepper, recorder = Stepper(plant, data, steps), Recorder(plant, rows)
+    for row in range(rows):
         recorder.take(row, 0.02 * row, data, stepper.past)
         stepper.advance(np.array([0.9, 0.9, 0.9]))
     record = recorder.record()
     supply = true_channels(plant, record)[0]["pressure_supply"]
-    old = late_channels(plant, record)["pressure_supply"]
-    np.testing.assert_allclose(old[5:], supply[:-5], rtol=1e-12)
-    assert (old[:5] == supply[0]).all() and np.ptp(supply) > 1e6
+    return supply, late_channels(plant, record)["pressure_supply"]
 
 
 def test_the_controller_sees_what_the_log_shows():

@@ -160,3 +160,69 @@ def test_a_drive_may_rest_anywhere_in_its_backlash(rest):
     w = track.whitened[20:]
     assert np.sqrt(np.mean(w**2)) == pytest.approx(1.0, abs=0.04)
     assert np.abs(w).max() < 6.0  # no reading is a surprise; from a wrong rest some are 20
+
+
+def lagging(machine):
+    """Transducers with a first-order lag, one of them behind a delay of more than a row."""
+    for name, place, values in (
+        ("pressure_lag", "boom", {"time_constant": 0.012}),
+        ("pressure_delay", "boom", {"delay": 0.0335}),
+        ("angle_lag", "stick", {"time_constant": 0.03}),
+    ):
+        machine = apply_effect(machine, name, place, values)
+    return machine
+
+
+@pytest.mark.parametrize("first", [0, 200])
+def test_errors_of_lagging_transducers_are_white_and_of_size_one(first):
+    """From rest and from the middle of a motion; limits as of the clean machine."""
+    machine = lagging(load_machine("cat215"))
+    data, _ = machine_data(machine, machine, seed=7)
+    run = dataclasses.replace(
+        data.heldout, command=data.heldout.command[first:], reading=data.heldout.reading[first:],
+        command_known=data.heldout.command_known[first:],
+    )  # fmt: skip
+    w = track_run(machine, data, run).whitened[50:]
+    n = len(w)
+    assert np.sqrt(np.mean(w**2, axis=0)) == pytest.approx(np.ones(w.shape[1]), abs=1.9 / n**0.5)
+    assert np.all(np.abs(np.mean(w[1:] * w[:-1], axis=0)) < 4.5 / n**0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "constant"),
+    [
+        ("pressure_lag", "boom", 0.012),
+        ("pressure_lag", "swing", 0.004),
+        ("angle_lag", "boom", 0.03),
+    ],
+)
+def test_a_time_constant_is_found_without_bias(name, place, constant):
+    """The likelihood is a parabola over the time constant; three of its widths are allowed."""
+    nominal = load_machine("cat215")
+    slow = [
+        apply_effect(nominal, name, place, {"time_constant": constant + d})
+        for d in (-1e-3, 0.0, 1e-3)
+    ]
+    data, _ = machine_data(nominal, slow[1], seed=2)
+    below, there, above = (track_run(m, data, data.heldout) for m in slow)
+    curvature = (above.loss + below.loss - 2.0 * there.loss) / 1e-3**2
+    lowest = -(above.loss - below.loss) / (2.0 * 1e-3) / curvature
+    assert curvature > 0.0 and 1.0 / np.sqrt(0.5 * curvature) < 1e-3  # it is seen to 1 ms
+    assert abs(lowest) < 3.0 / np.sqrt(0.5 * curvature)
+
+
+def test_a_vanishing_time_constant_is_none():
+    """1 us against none: what a step of 1 ms changes in it is beyond any noise."""
+    nominal = load_machine("cat215")
+    data, _ = machine_data(nominal, nominal)
+    quick = apply_effect(nominal, "pressure_lag", "boom", {"time_constant": 1e-6})
+    none, some = (track_run(m, data, data.heldout) for m in (nominal, quick))
+    assert some.loss == pytest.approx(none.loss, abs=0.5)
+
+
+def test_gains_carry_a_lag_that_only_one_of_two_machines_has(clean):
+    data, _ = clean
+    prompt, slow = data.machine, lagging(data.machine)
+    for first, second in ((prompt, slow), (slow, prompt)):
+        other = track_run(second, data, data.heldout, track_run(first, data, data.heldout))
+        assert np.isfinite(other.whitened).all()
