@@ -31,11 +31,12 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
     """The same flow out of the head side into the rod side."""
     valve, gain = machine.axes[location].valve, values["flow"] / _root(machine)
     assert valve
-    signs = (("flow_rod", gain), ("flow_head", -gain))
+    numbers = {"smoothing": valve.smoothing}
     terms = [
-        Term(name=NAME, axis=location, balance=balance, law="orifice_leakage",
-             parameters={"flow_gain": signed, "smoothing": valve.smoothing})
-        for balance, signed in signs
+        Term(name=NAME, axis=location, balance="flow_rod", law="orifice_leakage",
+             parameters={"flow_gain": gain, **numbers}),
+        Term(name=NAME, axis=location, balance="flow_head", law="orifice_leakage",
+             parameters={"flow_gain": -gain, **numbers}),
     ]  # fmt: skip
     return with_terms(machine, NAME, terms if gain else [], [location])
 

@@ -48,10 +48,13 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
         for axis, viscous in _viscous(machine).items()
     ]  # fmt: skip
     for axis, leakage in _leaking(machine).items():
-        for balance, signed in (("flow_rod", leakage), ("flow_head", -leakage)):
-            drift = {"leakage": signed, **numbers}
-            terms.append(Term(name=NAME, axis=axis, balance=balance, law="leakage_drift",
-                              parameters=drift))  # fmt: skip
+        into_rod, into_head = {"leakage": leakage, **numbers}, {"leakage": -leakage, **numbers}
+        terms += [
+            Term(name=NAME, axis=axis, balance="flow_rod", law="leakage_drift",
+                 parameters=into_rod),
+            Term(name=NAME, axis=axis, balance="flow_head", law="leakage_drift",
+                 parameters=into_head),
+        ]  # fmt: skip
     return with_terms(machine, NAME, terms)
 
 

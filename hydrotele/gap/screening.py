@@ -7,9 +7,10 @@ import numpy as np
 
 from hydrotele.prediction.evidence import Evidence
 from hydrotele.prediction.hypothesis import WIDE, Guess, Hypothesis
-from hydrotele.prediction.track import COARSE, Track
+from hydrotele.prediction.track import COARSE, Track, first_rows
 
-_FEW = 24  # candidates that are tried on all runs
+_FEW = 16  # candidates that are tried on all runs
+_GLANCE = 20.0  # s of the run that fits worst on which all are tried
 _BENT = 0.5  # sides of nominal that differ by this share of their squares are no straight line
 
 
@@ -50,7 +51,8 @@ def screen(evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis]) -
     open_ones = [h for h in candidates if h.key not in taken]
     worst = max(evidence.tracks, key=lambda t: float(np.nanmean(t.whitened**2)))
     if len(evidence.tracks) > 1 and len(open_ones) > _FEW:
-        first = _rank(evidence, guess, open_ones, (worst,))
+        rows = round(_GLANCE / worst.run.period)
+        first = _rank(evidence, guess, open_ones, (first_rows(worst, rows),))
         open_ones = [s.hypothesis for s in first[:_FEW]]
     return _rank(evidence, guess, open_ones, evidence.tracks)
 

@@ -22,8 +22,9 @@ ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines 
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
+_STEPS = 3  # of Gauss-Newton for a candidate
 _MIDDLE = 2.0e-3  # s, step for the fits that choose between candidates
-_SHORT = 6  # candidates that are fitted after a screening
+_SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
 _RIVALS = 3  # candidates that are judged in the place of a named effect
@@ -189,8 +190,10 @@ def _free(candidates: Sequence[Hypothesis], guess: Guess) -> list[Hypothesis]:
     group = _calibration_of(guess)
     if group is None:
         return list(candidates)
-    return [c for c in candidates
-            if not any(f"{c.name}.{c.location}.{key}" in group.parameters for key in c.parameters)]  # fmt: skip
+    return [
+        c for c in candidates
+        if not any(f"{c.name}.{c.location}.{key}" in group.parameters for key in c.parameters)
+    ]  # fmt: skip
 
 
 def _best_single(
@@ -208,7 +211,7 @@ def _best_single(
         step = evidence.step_of(more, _MIDDLE)
         kept = evidence.base_slopes(step, parallel=False)
         before = _loss_of(evidence, now.guess, step)
-        return evidence.fit(more, before, parallel=False, step=step, kept=kept)
+        return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
 
     fits = sorted(evidence.map(fitted, short), key=lambda fit: -fit.score)
     inside = [fit for fit in fits if fit.score > ENTER and not _strained(fit.guess, -1)]
@@ -453,7 +456,7 @@ def _rivals(
         step = evidence.step_of(more, _MIDDLE)
         kept = evidence.base_slopes(step, parallel=False)
         before = _loss_of(evidence, rest.guess, step)
-        return evidence.fit(more, before, parallel=False, step=step, kept=kept)
+        return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
 
     fits = sorted(evidence.map(fitted, pool), key=lambda fit: -fit.score)
     plausible = [f for f in fits if f.score > 0.0 and not _strained(f.guess, -1)][:_RIVALS]

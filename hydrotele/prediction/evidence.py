@@ -21,6 +21,7 @@ from hydrotele.prediction.track import STEP, Track, fine_enough, known_levels, t
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
 _STEPS = 6
 BLOCK = 2.0  # s of a run that count as one witness: longer than what a model lacks remembers
+_ROUNDS = 2  # of linearisation for the levels of the first base; later ones start from near by
 _CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
 
 
@@ -103,7 +104,10 @@ class Evidence:
         if not self.lacking:
             tracks = self.track(machine)
         else:
-            tracks = find_levels(self.data, machine, near or self.tracks, self._pool.map, self.step)
+            near = near or self.tracks
+            tracks = find_levels(
+                self.data, machine, near, self._pool.map, self.step, 1 if near else _ROUNDS
+            )
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + _prior(guess))
 
@@ -153,7 +157,7 @@ class Evidence:
         """What the evidence's own step takes back from the errors of the base in a track."""
         if step == self.step:
             return 0.0
-        key = track.run.name, step
+        key = f"{track.run.name} {len(track.whitened)}", step
         if key not in self._steps:
             machine = self._base.machine(self.data.machine)
             self._steps[key] = flat(track.whitened) - self._errors(machine, track, step)

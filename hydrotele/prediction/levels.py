@@ -25,7 +25,8 @@ from hydrotele.prediction.inputs import (
     input_sizes,
     possible_inputs,
 )
-from hydrotele.prediction.linear import linear_run, smooth
+from hydrotele.prediction.linear import LinearRun, linear_run, smooth
+from hydrotele.prediction.stretches import busiest_rows
 from hydrotele.prediction.track import (
     STARTLE,
     STEP,
@@ -41,7 +42,7 @@ _STATED = 0.5  # prior standard deviation of log(noise / stated): a data sheet i
 _LACK = 4.0  # prior standard deviation of log(size / least): says next to nothing
 _NOISIER = 1.25  # times the rough noise that a channel's noise can be: what is slow is no noise
 _QUIETER = 0.3  # times the stated or the rough noise, whichever is smaller
-_ROWS = 6000  # of a run that tell its levels; more say the same again
+_ROWS = 3000  # of all runs together that tell the levels; more say the same again
 _ITERATIONS = 12  # of a round: what is left of the way is small against a round's own linearisation
 _SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
 _LOOSE = {"rate": 0.02, "drive_rate": 0.02, "spool": 0.02, "pressure_head": 1e5,
@@ -174,7 +175,9 @@ def _most_likely(
 ) -> Levels:  # fmt: skip
     """Levels of the largest posterior probability in the linearised runs."""
     names, c, m = list(tracks[0].names), len(data.channels), len(levels.inputs)
-    runs = [(_part(track, names), track.run) for track in tracks]
+    rows = max(_ROWS // len(tracks), _ROWS // 8)
+    runs = [(_part(track, names, rows), track.run) for track in tracks]
+    weight = sum(len(t.run.command) for t in tracks) / sum(len(r.error) for r, _ in runs)
     largest = input_sizes(machine, levels.inputs)
     first = len(names) - m
 
@@ -196,9 +199,9 @@ def _most_likely(
             slope[:c] += 2.0 * now.noise**2 * per_noise
             slope[c:] += 2.0 * per_drift
         off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
-        slope[:c] += 2.0 * off / prior.width
-        slope[c:] += 2.0 * lack / _LACK
-        return total + float(off @ off + lack @ lack), slope
+        slope[:c] += 2.0 * off / prior.width / weight
+        slope[c:] += 2.0 * lack / _LACK / weight
+        return total + float(off @ off + lack @ lack) / weight, slope
 
     low = np.log(np.concatenate([prior.low, LEAST * largest]))
     high = np.log(np.concatenate([prior.high, largest]))
@@ -213,9 +216,9 @@ def _most_likely(
     return dataclasses.replace(of(x), penalty=float(off @ off + lack @ lack))
 
 
-def _part(track: Track, names: list[str]):
-    """The start of a run, linearised."""
-    return linear_run(track, by_kind(names, STARTLE) ** 2, slice(0, _ROWS))
+def _part(track: Track, names: list[str], rows: int) -> LinearRun:
+    """The stretch of a run in which the commands change most, linearised."""
+    return linear_run(track, by_kind(names, STARTLE) ** 2, busiest_rows(track.run, rows))
 
 
 def input_excess(track: Track) -> float:

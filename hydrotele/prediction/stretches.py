@@ -35,6 +35,17 @@ def busiest(data: Dataset, most: float = MOST_SECONDS) -> Dataset:
     return dataclasses.replace(data, fit=tuple(runs), notes=(*data.notes, *notes))
 
 
+def busiest_rows(run: RunData, rows: int) -> slice:
+    """The stretch of some rows of a run in which its commands change most; all if it is shorter."""
+    if rows >= len(run.command):
+        return slice(0, len(run.command))
+    spread = np.std(run.command, axis=0)
+    jumps = np.abs(np.diff(run.command, axis=0)) / np.where(spread > 0.0, spread, 1.0)
+    passed = np.concatenate([[0.0], np.cumsum(jumps.sum(axis=1))])
+    first = int(np.argmax(passed[rows - 1 :] - passed[: len(passed) - rows + 1]))
+    return slice(first, first + rows)
+
+
 def _busiest_row(data: Dataset, run: RunData, rows: int) -> int:
     spread = np.std(np.concatenate([r.command for r in data.fit]), axis=0)
     jumps = np.abs(np.diff(run.command, axis=0)) / np.where(spread > 0.0, spread, 1.0)

@@ -17,7 +17,8 @@ from hydrotele.prediction.start import find_rest, start_state
 STEP = (
     1.0e-3  # s: 2 ms leaves errors of 1000 in the loss where the pump is starved, 1 ms none of 100
 )
-COARSE = 4.0e-3  # s, for the covariance and for a first look at a candidate
+COARSE = 4.0e-3  # s, for a first look at a candidate
+_TANGENT = 7.0e-3  # s, for the transition Jacobians: a covariance need not be exact
 _STIFF = 1.0e-3  # s, where a transmission's spring is: with the oil it may ring at 150 Hz
 
 
@@ -110,6 +111,21 @@ def fine_enough(machine: Machine, step: float) -> float:
     return min(step, _STIFF) if springs else step
 
 
+def first_rows(track: Track, rows: int) -> Track:
+    """The first rows of a track, for a look at less than its run; without transition Jacobians."""
+    part = slice(0, rows)
+    run = dataclasses.replace(
+        track.run, command=track.run.command[part], command_known=track.run.command_known[part],
+        reading=track.run.reading[part],
+    )  # fmt: skip
+    gains = Gains(*(np.ascontiguousarray(table[part]) for table in track.gains))
+    return dataclasses.replace(
+        track, run=run, gains=gains, whitened=track.whitened[part],
+        predicted=track.predicted[part], states=track.states[part], columns=track.columns[part],
+        flow=track.flow[:0],
+    )  # fmt: skip
+
+
 def known_levels(data: Dataset) -> bool:
     """Whether the machine states the accuracy of every channel."""
     return bool(np.all(np.isfinite(data.noise)))
@@ -183,7 +199,7 @@ def _cross(
     machine: Machine, model: Model, data: Dataset, run: RunData, kept: Track | None, step: float,
     rest: np.ndarray, levels: Levels, columns: np.ndarray, linearise: bool = False,
 ) -> Track:  # fmt: skip
-    step, coarse = fine_enough(machine, step), fine_enough(machine, COARSE)
+    step, coarse = fine_enough(machine, step), fine_enough(machine, _TANGENT)
     space = model_space(model)
     names, late = state_names(machine), late_readings(model, run.period)
     rows, c, size, m = len(run.command), len(data.channels), len(names), len(levels.inputs)

@@ -80,6 +80,7 @@ def option_offset(name: str) -> int:
     return field_offsets("mjModel")["opt"] + option[name]
 
 
+_ARRAYS = ("actuator_user", "actuator_actadr", "numeric_adr", "numeric_size", "numeric_data")
 _PROBE = """<mujoco><option timestep="0.0123"/><custom><numeric name="n" data="1 2 3"/></custom>
 <worldbody><body><joint name="j" type="slide"/>
 <geom size="0.1"/></body></worldbody><actuator>
@@ -100,15 +101,7 @@ def verify_layout() -> None:
     in_model, in_data = field_offsets("mjModel"), field_offsets("mjData")
     wrong = [
         name
-        for name in (
-            "actuator_user",
-            "actuator_actadr",
-            "actuator_biastype",
-            "actuator_dyntype",
-            "numeric_adr",
-            "numeric_size",
-            "numeric_data",
-        )  # fmt: skip
+        for name in (*_ARRAYS, "actuator_biastype", "actuator_dyntype")
         if _read(model._address + in_model[name], np.int64) != getattr(model, name).ctypes.data
     ]
     wrong += [

@@ -1,5 +1,6 @@
 """A term of a machine: which law adds to which balance of which drive."""
 
+from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import model_validator
@@ -26,7 +27,7 @@ class Term(Facts):
     axis: Name
     balance: Balance
     law: str
-    parameters: dict[str, Value] = {}
+    parameters: Mapping[str, Value] = {}
     domain: dict[str, tuple[float, float]] = {}
     uncertainty: NonNegative | None = None
     description: str = ""

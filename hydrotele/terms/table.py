@@ -35,7 +35,7 @@ _PRESSURE = 100.0  # Pa, the same: small against the smoothing of an orifice
 
 _registered = np.zeros((_MOST, 2), np.int64)  # address and checksum of every law
 _kept: list = []  # the compiled functions at these addresses
-_places: dict[str, int] = {}
+_places: dict[str, tuple[Law, int]] = {}
 _lock = threading.Lock()
 binding.add_symbol("hydrotele_laws", _registered.ctypes.data)
 
@@ -47,17 +47,19 @@ def law_place(name: str) -> int:
         InputError: the law is not known here, or numba cannot compile it.
     """
     with _lock:
-        if name not in _places:
-            if name not in LAWS:
-                message = "is not known in this process; load the file that defines it first"
-                raise InputError(f"law {name}", message)
+        if name not in LAWS:
+            message = "is not known in this process; load the file that defines it first"
+            raise InputError(f"law {name}", message)
+        law, place = _places.get(name, (None, 0))
+        if law is not LAWS[name]:
             if len(_kept) == _MOST:
                 raise InputError(f"law {name}", f"is more than the {_MOST} that a process can use")
             called = _callable_from_c(LAWS[name])
             _registered[len(_kept)] = called.address, checksum(name)
             _kept.append(called)
-            _places[name] = len(_kept) - 1
-        return _places[name]
+            place = len(_kept) - 1
+            _places[name] = LAWS[name], place
+        return place
 
 
 def checksum(name: str) -> int:
@@ -118,9 +120,8 @@ def terms_table(terms: Sequence[Term], order: Sequence[str]) -> np.ndarray:
         return NO_TERMS
     rows, back, first = [], [], _HEAD + _ROW * len(terms)
     for term in terms:
-        numbers = LAWS[term.law].numbers(term.parameters) if term.law in LAWS else None
         place = law_place(term.law)
-        assert numbers is not None
+        numbers = LAWS[term.law].numbers(term.parameters)
         ranges = [x for name, ends in term.domain.items() for x in (VARIABLES.index(name), *ends)]
         at = first + len(back)
         rows += [

@@ -22,7 +22,10 @@ def test_layout_is_that_of_the_installed_mujoco(fresh):
     layout.verify_layout()
 
 
-@pytest.mark.parametrize("field", ["actuator_user", "actuator_actadr", "nuser_actuator", "nu"])
+@pytest.mark.parametrize(
+    "field",
+    ["actuator_user", "actuator_actadr", "nuser_actuator", "nu", "nnumeric", "numeric_data"],
+)
 def test_model_fields_lie_where_the_bindings_show_them(field):
     model = mujoco.MjModel.from_xml_string(layout._PROBE)
     address = model._address + layout.field_offsets("mjModel")[field]
@@ -38,6 +41,10 @@ def test_model_fields_lie_where_the_bindings_show_them(field):
         ("mjModel", "actuator_actadr", 8),
         ("mjModel", "nu", -8),
         ("mjModel", "nuser_actuator", 8),
+        ("mjModel", "nnumeric", 8),
+        ("mjModel", "numeric_adr", 8),
+        ("mjModel", "numeric_size", 8),
+        ("mjModel", "numeric_data", 8),
         ("mjData", "ctrl", 8),
         ("mjData", "act", 8),
         ("mjData", "act_dot", 8),
