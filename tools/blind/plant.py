@@ -135,7 +135,7 @@ def _read(run: Run, channel: str, values: np.ndarray) -> np.ndarray:
 
 
 def shown(error: SensorError, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """What a defective sensor shows of true values (n,) at times (n,) [s], straight between rows."""
+    """What a defective sensor shows of true values (n,) at times (n,) [s], row to row straight."""
     if error.time_constant:
         lag = lti([1.0], [error.time_constant, 1.0])
         values = values[0] + lsim(lag, values - values[0], time - time[0])[1]
