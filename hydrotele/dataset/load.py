@@ -1,7 +1,7 @@
 """Logs of one machine, made ready for learning: one clock, one set of channels, gaps marked."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +51,15 @@ class RunData:
     log: Log
     valid: np.ndarray | None = None
     behind: np.ndarray | None = None
+
+    def part(self, first: int, last: int) -> "RunData":
+        """Rows first .. last - 1, with their own start; the log stays that of the whole run."""
+        rows = slice(first, last)
+        return replace(
+            self, start=self.start + first * self.period, command=self.command[rows],
+            command_known=self.command_known[rows], reading=self.reading[rows],
+            valid=None if self.valid is None else self.valid[rows],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,9 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "length_offset": ("sweeps",),
     "angle_delay": ("steps",),
     "pressure_delay": ("steps",),
+    "angle_lag": ("steps",),
+    "pressure_lag": ("steps",),
+    "clock_offset": ("steps",),
     "command_delay": ("steps",),
     "spool_lag": ("steps",),
     "valve_deadband": ("steps", "reversals"),
@@ -104,6 +107,7 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "pump_flow_limit": ("surges",),
     "relief_pressure": ("surges",),
     "pressure_offset": ("poses", "reversals"),
+    "pressure_scale": ("poses", "reversals"),
 }
 """Effect -> the motions that bring it out."""
 

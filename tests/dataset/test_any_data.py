@@ -185,6 +185,13 @@ def test_a_short_mask_takes_readings_out_and_a_long_one_cuts():
     assert data.heldout.valid.all() and data.heldout.log is not None
 
 
+def test_a_part_of_a_run():
+    run = dataset(with_column(stroke(), "valid", np.ones(400)), stroke(seed=1)).fit[0]
+    part = run.part(100, 150)
+    assert part.start == pytest.approx(1.0) and len(part.valid) == len(part.command) == 50
+    assert np.array_equal(part.reading, run.reading[100:150])
+
+
 def test_a_column_mask_is_the_other_way_round(tmp_path):
     import pyarrow as pa
     import pyarrow.parquet as pq

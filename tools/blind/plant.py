@@ -6,6 +6,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.signal import lsim, lti
 
 from hydrotele.hydraulics.circuit import circuit_scratch
 from hydrotele.hydraulics.parameters import actuator_order
@@ -130,5 +131,12 @@ def _misread(time, channels, beyond: Planted | None) -> dict[str, np.ndarray]:
 def _read(run: Run, channel: str, values: np.ndarray) -> np.ndarray:
     """What a sensor with the defects of the library reads of true values, without noise."""
     error = run.plant.machine.sensor_errors.get(channel, SensorError())
-    time = run.truth.time
+    return shown(error, run.truth.time, values)
+
+
+def shown(error: SensorError, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """What a defective sensor shows of true values (n,) at times (n,) [s], row to row straight."""
+    if error.time_constant:
+        lag = lti([1.0], [error.time_constant, 1.0])
+        values = values[0] + lsim(lag, values - values[0], time - time[0])[1]
     return error.scale * np.interp(time - error.delay, time, values) + error.offset

@@ -15,11 +15,12 @@ from hydrotele.machine import Machine
 from hydrotele.noise import noise_rms, sensor_set
 from hydrotele.sensors import SensorError
 from hydrotele.simulate.drive_side import flexible_axes
+from hydrotele.simulate.past import Past
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.readout import true_channels
-from hydrotele.simulate.record import Past, Recorder, begin_leapfrog
+from hydrotele.simulate.record import Recorder, begin_leapfrog
 from hydrotele.simulate.stepping import DelayLine
-from tools.blind.plant import Recorded
+from tools.blind.plant import Recorded, shown
 
 RESTART = 0.5  # s
 TIMESTEP = 1.0e-3  # s
@@ -60,8 +61,7 @@ def _differences(plant: Plant, run: Recorded) -> dict[str, np.ndarray]:
     table = {}
     for channel, reading in run.readings.items():
         error = machine.sensor_errors.get(channel, SensorError())
-        time = run.truth.time - error.delay
-        expected = error.scale * np.interp(time, run.truth.time, predicted[channel]) + error.offset
+        expected = shown(error, run.truth.time, predicted[channel])
         difference = (reading - expected) / noise_rms(machine, sensors, channel)
         if _free_zero(machine, channel):
             difference = difference - difference.mean()
