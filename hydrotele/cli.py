@@ -129,6 +129,48 @@ def gap(
 
 
 @app.command(
+    epilog="Examples:  hydrotele compare cat215 gap_site_a --data measured/site_a   |   "
+    "hydrotele compare ec20 --data long.parquet --baseline table --baseline mlp --out compared"
+)
+def compare(
+    machine: Annotated[
+        list[str],
+        typer.Argument(
+            help="Shipped machines, folders with machine.yaml, folders of gap or identify."
+        ),
+    ],
+    data: Logs,
+    tool: ToolName = None,
+    heldout: HeldOut = None,
+    sensors: Sensors = None,
+    horizons: Annotated[
+        str, typer.Option(help="Seconds of the free runs; the run's end always counts.")
+    ] = "1,5,10,30",
+    baseline: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--baseline",
+            help="Black box fitted on the other runs: table, arx or mlp; may be repeated.",
+        ),
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="Judge on the fitted runs, too.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for compare.json and a picture.")
+    ] = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Compare models by free runs on measured commands: RMS errors per channel and horizon."""
+    from hydrotele.commands.comparing import compare_models
+    from hydrotele.commands.words import numbers_of
+
+    compare_models(
+        machine, data, tool, heldout, sensors, numbers_of("--horizons", horizons), baseline or [],
+        every, out, json, force,
+    )  # fmt: skip
+
+
+@app.command(
     epilog="Examples:  hydrotele identify --machine cat215 --data logs   |   "
     "hydrotele identify --machine emps --data main.parquet --asymmetry"
 )
