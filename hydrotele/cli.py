@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hydrotele.commands import drive_command, sweep_command
+from hydrotele.commands import compare_command, drive_command, sweep_command
 from hydrotele.errors import InputError
 
 app = typer.Typer(
@@ -71,6 +71,7 @@ def run(
 
 app.command(epilog=drive_command.EPILOG)(drive_command.drive)
 app.command(epilog=sweep_command.EPILOG)(sweep_command.sweep)
+app.command(epilog=compare_command.EPILOG)(compare_command.compare)
 
 
 @app.command(
@@ -125,48 +126,6 @@ def gap(
     gap_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,
         effect or [], jobs, force,
-    )  # fmt: skip
-
-
-@app.command(
-    epilog="Examples:  hydrotele compare cat215 gap_site_a --data measured/site_a   |   "
-    "hydrotele compare ec20 --data long.parquet --baseline table --baseline mlp --out compared"
-)
-def compare(
-    machine: Annotated[
-        list[str],
-        typer.Argument(
-            help="Shipped machines, folders with machine.yaml, folders of gap or identify."
-        ),
-    ],
-    data: Logs,
-    tool: ToolName = None,
-    heldout: HeldOut = None,
-    sensors: Sensors = None,
-    horizons: Annotated[
-        str, typer.Option(help="Seconds of the free runs; the run's end always counts.")
-    ] = "1,5,10,30",
-    baseline: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--baseline",
-            help="Black box fitted on the other runs: table, arx or mlp; may be repeated.",
-        ),
-    ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Judge on the fitted runs, too.")] = False,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for compare.json and a picture.")
-    ] = None,
-    force: Force = False,
-    json: Json = False,
-) -> None:
-    """Compare models by free runs on measured commands: RMS errors per channel and horizon."""
-    from hydrotele.commands.comparing import compare_models
-    from hydrotele.commands.words import numbers_of
-
-    compare_models(
-        machine, data, tool, heldout, sensors, numbers_of("--horizons", horizons), baseline or [],
-        every, out, json, force,
     )  # fmt: skip
 
 

@@ -103,13 +103,14 @@ def fit_mlp(data: Dataset) -> Prepare:
 
     scales, features, targets = _samples(data)
     every = max(1, len(features) // _MOST_ROWS)
+    shown, told = features[::every], targets[::every]
     network = MLPRegressor(
         hidden_layer_sizes=_LAYERS, activation="tanh", early_stopping=True, max_iter=_EPOCHS,
-        random_state=0, n_iter_no_change=5, batch_size=min(200, len(features)),
+        random_state=0, n_iter_no_change=5, batch_size=min(200, len(features)),  # pyright: ignore - its stub says str
     )  # fmt: skip
     with warnings.catch_warnings():  # the last epoch is no failure: the best one is kept
         warnings.simplefilter("ignore", ConvergenceWarning)
-        network.fit(features[::every], targets[::every])
+        network.fit(shown, told[:, 0] if told.shape[1] == 1 else told)
     layers = list(zip(network.coefs_, network.intercepts_, strict=True))
 
     def rate(features: np.ndarray) -> np.ndarray:

@@ -249,7 +249,7 @@ def _judge(runner: Runner, run: RunData, starts: np.ndarray, count: int) -> Hori
     """Errors of the windows of one length."""
     predicted = runner.run(starts, count)
     measured = run.reading[starts[:, None] + np.arange(1, count + 1)]
-    gone = _left(predicted, run.reading).any(axis=(1, 2))
+    gone = np.any(_left(predicted, run.reading), axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.where(gone[:, None, None], np.inf, predicted - measured)
     error = np.where(np.isnan(measured), np.nan, error)
