@@ -29,7 +29,6 @@ from hydrotele.prediction.free_run import (
     chained,
     free_run_errors,
     machine_runner,
-    with_levels,
 )
 from hydrotele.signals import usual_unit
 from hydrotele.simulate.native import stop_profiling_clock
@@ -184,11 +183,9 @@ def _compare(
     judged: Sequence[RunData], horizons: Sequence[float], progress: Callable | None,
 ) -> list[Compared]:  # fmt: skip
     say = progress or (lambda said, share: None)
-    say("noise", 0.0)
-    level = with_levels(dataset)
     total = (len(named) + len(baselines)) * (len(judged) + 1)
     models: list[tuple[str, str, Callable[[], Prepare]]] = [
-        (name, "machine", lambda machine=machine: machine_runner(machine, level))
+        (name, "machine", lambda machine=machine: machine_runner(machine, dataset))
         for name, machine in named.items()
     ]
     models += [(n, "baseline", lambda n=n: fit_baseline(n, dataset)) for n in baselines]

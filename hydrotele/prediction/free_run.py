@@ -93,7 +93,8 @@ def with_levels(data: Dataset) -> Dataset:
 
     Stated noise is kept. Where none is stated, the readings' roughness tells it, and the state may
     drift as fast as the readings do: what matters here is where a free run starts, not how likely a
-    model is, and a model may be far off.
+    model is, and a model may be far off. Positions drift, too: oil in a closed valve is so stiff
+    that a rate alone would not move them.
 
     Args:
         data: the dataset.
@@ -115,7 +116,8 @@ def with_levels(data: Dataset) -> Dataset:
         if signal.kind.startswith("pressure_"):
             drift[f"{signal.kind}.{signal.axis}"] = moves * period
         elif signal.axis in machine.axes and signal.kind == machine.position_kind(signal.axis):
-            drift[f"rate.{machine.axes[signal.axis].joint}"] = moves * share
+            joint = machine.axes[signal.axis].joint
+            drift[f"position.{joint}"], drift[f"rate.{joint}"] = moves * period, moves * share
     return dataclasses.replace(data, noise=noise, drift=drift)
 
 
@@ -131,16 +133,16 @@ def machine_runner(machine: Machine, data: Dataset, step: float = STEP) -> Prepa
 
     Args:
         machine: the machine.
-        data: a dataset with noise levels, see `with_levels`; for its channels.
+        data: the dataset, for its channels and noise; see `with_levels`.
         step: largest step of the integrator [s].
 
     Returns:
         What prepares a run.
     """
-    model = reduced_model(machine, data.channels)
+    model, level = reduced_model(machine, data.channels), with_levels(data)
 
     def prepare(run: RunData) -> Runner:
-        track = track_run(machine, data, run, step=step)
+        track = track_run(machine, level, run, step=step)
         steps = max(1, round(run.period / fine_enough(machine, step)))
         before = _shown(model, track.states) if np.any(model.lag > 0.0) else None
 

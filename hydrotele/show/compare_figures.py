@@ -43,7 +43,7 @@ def draw_free_runs(
                           ls="-" if k < len(_COLOURS) else "--", label=name)  # fmt: skip
             room = _ROOM * (high - low) or 1.0
             plot.set_ylim(factor * (low - room), factor * (high + room))
-            plot.set_ylabel(f"{channel}\n[{shown}]")
+            plot.set_ylabel(channel.replace(".", "\n") + f" [{shown}]")
         plots[0].set_title(title)
         plots[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8.5,
                         ncols=min(4, 1 + len(predicted)), borderaxespad=0.1)  # fmt: skip

@@ -14,7 +14,7 @@ from hydrotele.machine_file import load_machine, save_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario
 
-ASYMMETRY = ("friction_asymmetry", "slide", {"viscous_asymmetry": 0.3})
+ASYMMETRY = ("friction_asymmetry", "slide", {"coulomb_asymmetry": 0.0, "viscous_asymmetry": 0.3})
 
 
 def invoke(*words):

@@ -107,7 +107,7 @@ def simulated(folder, *effects):
         }  # fmt: skip
         scenario = Scenario(
             name=name, machine="cat215", control_rate=50, log_rate=50, duration=8.0, ground=False,
-            pilot=pilot, seed=seed,
+            pilot=pilot, seed=seed, sensors="khoshzaban1992",
             effects=[dict(zip(("name", "location", "parameters"), e, strict=True))
                      for e in effects],
         )  # fmt: skip
