@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hydrotele.commands import drive_command, sweep_command
+from hydrotele.commands import compare_command, drive_command, sweep_command
 from hydrotele.commands.options import EffectFiles
 from hydrotele.errors import InputError
 
@@ -73,6 +73,7 @@ def run(
 
 app.command(epilog=drive_command.EPILOG)(drive_command.drive)
 app.command(epilog=sweep_command.EPILOG)(sweep_command.sweep)
+app.command(epilog=compare_command.EPILOG)(compare_command.compare)
 
 
 @app.command(

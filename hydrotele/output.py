@@ -21,6 +21,7 @@ OURS = {
         "gap.json", "report.html", "recording.rrd", "next_experiment.yaml",
         "patched/machine.*", "patched/effects.yaml",
     ),
+    "compare": ("compare.json", "*.png"),
     "identify": ("identify.json", "report.html", "identified/machine.*"),
     "two-port analysis": ("analysis.json", "report.html", "stability.png"),
     "sweep": (

@@ -32,3 +32,21 @@ def chosen(machine: str | None, tool: str | None) -> dict[str, str]:
     if tool is not None:
         pairs["tool"] = json_text(tool)
     return pairs
+
+
+def numbers_of(option: str, text: str) -> list[float]:
+    """Positive numbers of an option, separated by commas.
+
+    Raises:
+        InputError: there is none, or one is no positive number.
+
+    >>> numbers_of("--horizons", "1, 5,30")
+    [1.0, 5.0, 30.0]
+    """
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(0.0 < number < float("inf") for number in numbers):
+        raise InputError(f"{option} {text}", "must be positive numbers, for example 1,5,30")
+    return numbers
