@@ -687,8 +687,9 @@ def simulate(machine, start, commands, closed, reference, ahead, arm, gains, noi
     """Run the machine along given commands, or under a controller that sees its sensors.
 
     The controller opens each valve for the flow that the reference asks for, plus the position
-    error times a gain: `o = A (x_r' + K (x_r - x)) / Q_rated`, over the dead band, in steps of
-    1/2048. A row's command leaves at once and holds until the next row.
+    error times a gain, less what damps: `o = A (x_r' + K (x_r - x) - G (F - F_slow)) / Q_rated`
+    with the pressure force F, over the dead band, in steps of 1/2048. A row's command leaves at
+    once and holds until the next row.
 
     Args:
         machine: `Machine`.
@@ -698,7 +699,8 @@ def simulate(machine, start, commands, closed, reference, ahead, arm, gains, noi
         reference: (rows, n) joint references [rad] or [m].
         ahead: (rows, n) their rates, ahead of time by the lead [rad/s] or [m/s].
         arm: (rows, n) dx/dq at the references.
-        gains: (4, n) position gain [1/s], stated rated flow [m^3/s], dead band [1], area [m^2].
+        gains: (7, n) K [1/s], stated rated flow [m^3/s], dead band [1], area of head and of rod
+            [m^2], G [m/(s N)], share of a row in the slow mean [1].
         noise: (rows, c) error of each reading before the converter [channel's unit].
         period: of a row [s].
         steps: of the integrator in a row.
@@ -715,7 +717,8 @@ def simulate(machine, start, commands, closed, reference, ahead, arm, gains, noi
     u, terms, memory = np.zeros(n), np.zeros((6, n)), np.zeros(2)
     readings, clean = np.zeros((rows, c)), np.zeros((rows, c))
     history = np.zeros((rows * steps + 1, c))
-    now, lagged = np.zeros(c), np.zeros(c)
+    now, lagged, load = np.zeros(c), np.zeros(c), np.zeros(n)
+    first_head = c - 1 - 2 * n
     for row in range(rows):
         if restart > 0 and row % restart == 0:
             y[:] = states[row]
@@ -748,8 +751,12 @@ def simulate(machine, start, commands, closed, reference, ahead, arm, gains, noi
                     states[row] = y
                 if closed:
                     for i in range(n):
+                        force = gains[3, i] * readings[row, first_head + i]
+                        force -= gains[4, i] * readings[row, first_head + n + i]
+                        load[i] += (force - load[i]) * (gains[6, i] if row > 0 else 1.0)
                         speed = ahead[row, i] + gains[0, i] * (reference[row, i] - readings[row, i])
-                        o = gains[3, i] * arm[row, i] * speed / gains[1, i]
+                        speed = arm[row, i] * speed - gains[5, i] * (force - load[i])
+                        o = gains[3, i] * speed / gains[1, i]
                         o = o * (1.0 - gains[2, i]) + gains[2, i] * math.tanh(o / 0.01)
                         o = min(1.0, max(-1.0, o))
                         commands[row, i] = math.floor(o * 2048.0 + 0.5) / 2048.0
