@@ -150,22 +150,30 @@ def _heavy(machine, facts, place, rng):
 
 
 def _soft_deadband(machine, facts, place, rng):
-    i, p = _at(facts, place), {"deadband": rng.uniform(0.07, 0.17), "edge": rng.uniform(0.005, 0.03)}
+    i, p = (
+        _at(facts, place),
+        {"deadband": rng.uniform(0.07, 0.17), "edge": rng.uniform(0.005, 0.03)},
+    )
     return _forms(_drives(machine, i, deadband=p["deadband"]), i, soft_edge=p["edge"]), p
 
 
 def _tustin(machine, facts, place, rng):
     i, d = _at(facts, place), machine.drives
-    p = {"extra": d.coulomb[i] * log_uniform(rng, 1.0, 4.0), "velocity": log_uniform(rng, 0.01, 0.08)}
-    machine = _drives(machine, i, stribeck=d.stribeck[i] + p["extra"], stribeck_velocity=p["velocity"])
+    p = {
+        "extra": d.coulomb[i] * log_uniform(rng, 1.0, 4.0),
+        "velocity": log_uniform(rng, 0.01, 0.08),
+    }
+    machine = _drives(
+        machine, i, stribeck=d.stribeck[i] + p["extra"], stribeck_velocity=p["velocity"]
+    )
     return _forms(machine, i, exponential=1.0), p
 
 
 def _bristles(machine, facts, place, rng):
     i, d = _at(facts, place), machine.drives
-    turning = not d.cylinder[i]
+    ends = (5e-5, 1e-3) if d.cylinder[i] else (2e-4, 2e-3)
     p = {"coulomb": d.coulomb[i] + _piston_force(machine, i) * log_uniform(rng, 0.01, 0.06),
-         "presliding": log_uniform(rng, 2e-4, 2e-3) if turning else log_uniform(rng, 5e-5, 1e-3)}  # fmt: skip
+         "presliding": log_uniform(rng, *ends)}  # fmt: skip
     return _forms(_drives(machine, i, coulomb=p["coulomb"]), i, presliding=p["presliding"]), p
 
 

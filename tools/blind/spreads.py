@@ -17,6 +17,7 @@ A  assumption of this project: nothing published was at hand.
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +50,8 @@ def _rub(machine: Machine, place: str):
 
 def _oil(machine: Machine, place: str) -> float:
     """Compliance of half a full chamber [m^3/Pa]."""
-    drive = machine.axes[place].hydraulic_drive
-    stroke = machine.axes[place].cylinder.stroke if machine.axes[place].cylinder else 0.0  # type: ignore[union-attr]
+    drive, cylinder = machine.axes[place].hydraulic_drive, machine.axes[place].cylinder
+    stroke = cylinder.stroke if cylinder else 0.0
     assert machine.supply
     return (drive.dead_volume + 0.5 * drive.areas[0] * stroke) / machine.supply.bulk_modulus
 
@@ -219,13 +220,13 @@ def off_everywhere(machine: Machine, rng: Rng) -> tuple[Machine, dict[str, tuple
         numbers[path] = (value, value * factor)
         return value * factor
 
-    def walk(node: object, path: str):
+    def walk(node: Any, path: str) -> Any:
         if isinstance(node, dict):
             return {key: walk(item, f"{path}.{key}".lstrip(".")) for key, item in node.items()}
         if not hasattr(node, "model_copy"):
             return node
         update = {}
-        for key in type(node).model_fields:  # type: ignore[attr-defined]
+        for key in type(node).model_fields:
             item, here = getattr(node, key), f"{path}.{key}".lstrip(".")
             if key == "inertia":  # one factor, so that the body stays possible
                 ratio = wrong(here, key, 1.0)
@@ -240,6 +241,6 @@ def off_everywhere(machine: Machine, rng: Rng) -> tuple[Machine, dict[str, tuple
             elif key in ("links", "axes", "supply", "cylinder", "motor", "valve", "friction",
                          "tube", "rod", "base_pin", "rod_pin"):  # fmt: skip
                 update[key] = walk(item, here)
-        return node.model_copy(update=update)  # type: ignore[attr-defined]
+        return node.model_copy(update=update)
 
     return walk(machine, ""), numbers

@@ -31,7 +31,7 @@ def draw_unknown(
     Returns:
         (the machine, what was drawn).
     """
-    n = len(facts.axes)
+    n, names = len(facts.axes), list(facts.axes)
     target, axis = str(rng.choice(TARGETS)), int(rng.integers(n))
     if target == "pump_flow":
         axis = 0
@@ -67,8 +67,11 @@ def draw_unknown(
         float(low), float(high),
     )  # fmt: skip
     told = {
-        "name": "unknown_term", "acts_on": target, "location": list(facts.axes)[axis],
-        "variables": [f"{VARIABLES[k]}.{list(facts.axes)[i]}" for k, i in zip(kinds, of, strict=True)],
-        "gate": ["always", "switch", "play", "window"][gate], "size": size, "low": low, "high": high,
-    }  # fmt: skip
+        "name": "unknown_term",
+        "acts_on": target,
+        "location": names[axis],
+        "variables": [f"{VARIABLES[k]}.{names[i]}" for k, i in zip(kinds, of, strict=True)],
+        "gate": ["always", "switch", "play", "window"][gate],
+        "parameters": {"size": size, "low": low, "high": high},
+    }
     return machine._replace(added=added), told

@@ -332,7 +332,8 @@ def arm_equations(mechanism, q, w, M, h):
             else:
                 r = e1 * f
                 _add_part(m, inertia, pin + r, 1j * r, e1 * f1, -r, 1j * e1 * f1, e1 * f2,
-                          q[1] + angle, 1.0, first.imag, second.imag, mechanism, w, M, h)  # fmt: skip
+                          q[1] + angle, 1.0, first.imag, second.imag,
+                          mechanism, w, M, h)  # fmt: skip
 
 
 @_jit

@@ -167,7 +167,9 @@ def _with_transmissions(facts: Facts, forms: Forms) -> Forms:
         if (t := axis.transmission) is None:
             continue
         if axis.cylinder:
-            raise ValueError("the independent machine has no spring between a cylinder and its link")
+            raise ValueError(
+                "the independent machine has no spring between a cylinder and its link"
+            )
         columns["drive_inertia"][i], columns["gap"][i] = t.inertia, t.backlash
         columns["contact"][i] = t.stiffness
         # Hunt and Crossley's factor that takes a tap of 0.05 rad/s as the linear damper does

@@ -12,7 +12,19 @@ from hydrotele.machine import Machine as Facts
 from hydrotele.noise import noise_rms, sensor_set
 from tools.blind.motions import RATE, motions
 from tools.blind.world import (
-    PA, PB, QD, STATES, U, WD, Machine, Q, S, W, arm_equations, linkage, simulate,
+    PA,
+    PB,
+    QD,
+    STATES,
+    WD,
+    Machine,
+    Q,
+    S,
+    U,
+    W,
+    arm_equations,
+    linkage,
+    simulate,
 )  # fmt: skip
 from tools.blind.world_machine import channels, independent_machine, stated_errors
 
@@ -124,10 +136,8 @@ def _rig_references(facts: Facts, rng: np.random.Generator, duration: float) -> 
     middle, half = 0.5 * (low + high), 0.35 * (high - low)
     start = np.clip(time, 0.0, 1.0) ** 2
     for name, speed in (("fit_1", 0.05), ("fit_2", 0.12), ("fit_3", 0.25)):
-        waves = sum(
-            np.sin(2 * np.pi * f * time + p) / f
-            for f, p in zip(rng.uniform(0.1, 1.0, 4), rng.uniform(0, 6.28, 4), strict=True)
-        )
+        tones, phases = rng.uniform(0.1, 1.0, 4), rng.uniform(0.0, 2.0 * np.pi, 4)
+        waves = np.sin(2.0 * np.pi * np.outer(time, tones) + phases) @ (1.0 / tones)
         path = waves - waves[0]
         path *= speed / np.sqrt(np.mean(np.gradient(path, time) ** 2))
         path = start * path
@@ -167,11 +177,11 @@ def rest_state(machine: Machine, q: np.ndarray) -> np.ndarray:
         y[i, Q] = y[i, QD] = q[i]
         y[i, PB], y[i, PA] = rod, (force + d.area_rod[i] * rod) / d.area_head[i]
     quiet = machine._replace(added=machine.added._replace(target=-1))
-    rows, zeros = 100, np.zeros((100, n))
+    rows, zeros, steps = 100, np.zeros((100, n)), 100 if machine.mechanism.rig else 40
     states = np.zeros((rows, n, STATES))
     c = len(machine.sensors.scale)
     simulate(quiet, y, zeros.copy(), False, zeros, zeros, zeros, np.ones((7, n)),
-             np.zeros((rows, c)), 0.02, 100 if machine.mechanism.rig else 40, 0, states)  # fmt: skip
+             np.zeros((rows, c)), 0.02, steps, 0, states)  # fmt: skip
     return states[-1]
 
 
@@ -252,7 +262,8 @@ def travelled(machine: Machine, run: WorldRun) -> dict[str, np.ndarray]:
     return {
         "position": places[:, :, 0], "velocity": places[:, :, 1] * s[:, :, W],
         "pressure_head": s[:, :, PA], "pressure_rod": s[:, :, PB], "spool": s[:, :, S],
-        "command": run.commands, "load_pressure": s[:, :, PA] - s[:, :, PB] * d.area_rod / d.area_head,
+        "command": run.commands,
+        "load_pressure": s[:, :, PA] - s[:, :, PB] * d.area_rod / d.area_head,
         "supply": np.repeat(run.clean[:, -1:], n, axis=1), "time": time,
     }  # fmt: skip
 
@@ -291,5 +302,3 @@ def visibility(without: Machine, model: Facts, runs: list[WorldRun]) -> float:
         difference[:, 0] -= difference[:, 0].mean() if model.arm else 0.0  # where swing is zero
         total += float(np.sum(difference**2))
     return float(np.sqrt(total))
-
-
