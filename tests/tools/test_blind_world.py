@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hydrotele.dataset.load import load_dataset
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.log import load_log
+from hydrotele.log import load_log, save_log
 from hydrotele.machine_file import load_machine
 from tools.blind.forms import FORMS
+from tools.blind.open_loop import open_loop_error
 from tools.blind.spreads import SIZES, draw_library_effect, off_everywhere
 from tools.blind.trials import Place
 from tools.blind.world import PA, PB, STATES, Q, R, S, W, simulate
@@ -126,7 +128,8 @@ def test_numbers_are_off_within_their_bounds_and_the_truth_is_known():
     ratios = np.array([true / model for model, true in numbers.values()])
     assert np.all(np.abs(ratios - 1.0) <= 0.1 + 1e-12) and np.all(ratios != 1.0)
     told = true_parameters(CAT, off)
-    assert told["valve_deadband(boom)"]["deadband"] == off.axes["boom"].valve.deadband
+    valve = off.axes["boom"].valve
+    assert valve and told["valve_deadband(boom)"]["deadband"] == valve.deadband
     ratio = numbers["axes.stick.valve.rated_flow"]
     assert told["valve_gain(stick)"]["ratio"] == pytest.approx(ratio[1] / ratio[0])
     for label, values in true_parameters(CAT, CAT).items():
@@ -172,6 +175,20 @@ def test_the_rig_has_trials_too():
     drawn = draw_trial(RIG, "near", 0, rng)
     run = record_run(drawn.world, RIG, references(RIG, rng, 2.0)[1], drawn.noise, rng)
     assert np.ptp(run.log["position.slide"]) > 0.01  # m
+
+
+def test_open_loop_errors_of_the_true_model_are_noise_and_of_a_wrong_one_are_not(tmp_path):
+    rng = np.random.default_rng(6)
+    for asked_for in references(CAT, rng, 10.0):
+        run = record_run(nominal_world(CAT), CAT, asked_for, Noise({}), rng)
+        save_log(run.log, tmp_path / f"{run.name}.parquet")
+    data = load_dataset(tmp_path, CAT)
+    true = open_loop_error(CAT, data, data.heldout)
+    other = apply_effect(CAT, "valve_deadband", "boom", {"deadband": 0.1})
+    wrong = open_loop_error(other, data, data.heldout)
+    # 500 rows know a size to 3 %; what the start is off by adds to it
+    assert all(0.8 < size < 1.6 for size in true.values()), true
+    assert wrong["length.boom"] > 3.0 * true["length.boom"]
 
 
 def effect(name, place, probability=0.95, low=0.5, high=1.5):

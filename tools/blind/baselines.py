@@ -13,8 +13,8 @@
 
 All get the logs and the nominal machine only. Free runs are made by the independent machine in its
 nominal form, which is the nominal model; each window starts from smoothed readings. `closed` is the
-share of the mean square above the error that a perfect model has with such starts. Needs the extra
-`baselines`.
+share of the mean square above the error that a perfect model has with such starts. An answer that
+does not lower the error of free runs in the fit runs is dropped. Needs the extra `baselines`.
 """
 
 import argparse
@@ -45,6 +45,7 @@ from tools.blind.world_trials import load_world_series
 WINDOW = 5.0  # s
 _EVERY = 4  # of the windows is fitted
 _FITTED = 6  # best effects of the linearised pass that are fitted in full
+_BETTER = 0.98  # of the nominal model's mean square in the fit runs, or the answer is dropped
 _THRESHOLD = 0.15  # of a regression's largest normalised coefficient
 
 
@@ -457,7 +458,14 @@ def run_method(name: str, folder: Path, facts: Facts, limit: float) -> dict[str,
     def rms(predict: Callable) -> float:
         return float(np.sqrt(np.mean(errors(problem, predict, last) ** 2)))
 
-    before, after = rms(world_prediction(problem, facts)), rms(answer.predict)
+    nominal = world_prediction(problem, facts)
+    sizes = [
+        sum(float(np.sum(errors(problem, predict, run, _EVERY) ** 2)) for run in range(last))
+        for predict in (nominal, answer.predict)
+    ]
+    if sizes[1] > _BETTER * sizes[0]:
+        answer = Answer(None, nominal)
+    before, after = rms(nominal), rms(answer.predict)
     perfect = floor(problem, np.random.default_rng(0))
     return {
         "named": answer.named, "before": before, "after": after, "floor": perfect,
