@@ -35,6 +35,7 @@ from hydrotele.machine import Machine as Facts
 from hydrotele.machine_file import load_machine
 from hydrotele.noise import noise_rms, sensor_set
 from tools.blind.score import share
+from tools.blind.spreads import SIZES
 from tools.blind.trials import Place, write_json
 from tools.blind.world import PA, PB, QD, STATES, WD, Machine, Q, R, S, W, linkage, simulate
 from tools.blind.world_judge import closed
@@ -197,7 +198,8 @@ class Number(NamedTuple):
 def library_numbers(facts: Facts) -> list[list[Number]]:
     """Parameters of all effects that the independent machine can have, by effect and place."""
     found = []
-    for name, effect in EFFECTS.items():
+    for name in SIZES:
+        effect = EFFECTS[name]
         for place in effect.locations(facts):
             if name == "joint_flexibility" and facts.axes[place].cylinder:
                 continue
