@@ -60,7 +60,7 @@ class Problem(NamedTuple):
         readings: (rows, c) of each run.
         states: (rows, n, STATES) smoothed states of each run.
         size: (c,) standard deviation of a reading.
-        until: clock at which the method has to stop [s].
+        until: processor time at which the method has to stop [s].
     """
 
     facts: Facts
@@ -85,7 +85,7 @@ def make_problem(folder: Path, facts: Facts, limit: float) -> Problem:
     Args:
         folder: of the four logs.
         facts: the nominal machine.
-        limit: time that the method has [s].
+        limit: processor time that the method has [s].
 
     Returns:
         The problem.
@@ -97,7 +97,7 @@ def make_problem(folder: Path, facts: Facts, limit: float) -> Problem:
     readings = [np.column_stack([log[name] for name in names]) for log in logs]
     period = float(logs[0].time[1] - logs[0].time[0])
     states = [_smoothed(facts, log, u, period) for log, u in zip(logs, commands, strict=True)]
-    return Problem(facts, period, commands, readings, states, size, time.monotonic() + limit)
+    return Problem(facts, period, commands, readings, states, size, time.process_time() + limit)
 
 
 def _smoothed(facts: Facts, log: Log, commands: np.ndarray, period: float) -> np.ndarray:
@@ -239,7 +239,7 @@ def best_single(problem: Problem) -> Answer:
     base = _output_error(problem, problem.facts)
     ranking = []
     for group in library_numbers(problem.facts):
-        if time.monotonic() > problem.until:
+        if time.process_time() > problem.until:
             break
         columns = []
         for k in range(len(group)):
@@ -254,7 +254,7 @@ def best_single(problem: Problem) -> Answer:
     ranking.sort(key=lambda row: -row[0])
     best = (float(base @ base), None, problem.facts)
     for _, group, guess in ranking[:_FITTED]:
-        if time.monotonic() > problem.until:
+        if time.process_time() > problem.until:
             break
         low = np.array([(p.low - p.nominal) / p.scale for p in group])
         high = np.array([(p.high - p.nominal) / p.scale for p in group])
@@ -297,7 +297,7 @@ def evolution(problem: Problem) -> Answer:
     strategy = cma.CMAEvolutionStrategy(
         np.zeros(len(numbers)), 0.3, {"bounds": [low, high], "seed": 1, "verbose": -9}
     )
-    while not strategy.stop() and time.monotonic() < problem.until:
+    while not strategy.stop() and time.process_time() < problem.until:
         asked = strategy.ask()
         strategy.tell(asked, [loss(x) for x in asked])
     found = np.asarray(strategy.result.xbest)
@@ -386,11 +386,36 @@ def _training(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(features), np.concatenate(targets)
 
 
+def _size(problem: Problem, predict: Callable) -> float:
+    """Sum of the squared errors of the free runs that are fitted."""
+    runs = range(len(problem.commands) - 1)
+    return sum(float(np.sum(errors(problem, predict, run, _EVERY) ** 2)) for run in runs)
+
+
+def _helpful(problem: Problem, correction: Callable, order: list[tuple[int, int]]) -> np.ndarray:
+    """Mask (n, 3) of the balances whose correction lowers the error of free runs, one by one.
+
+    A regression that fits every row can still spoil a free run; all balances at once mostly do.
+    """
+    mask = np.zeros((len(problem.facts.axes), 3))
+    best = _size(problem, world_prediction(problem, problem.facts))
+    for i, k in order:
+        if time.process_time() > problem.until:
+            break
+        mask[i, k] = 1.0
+        size = _size(problem, _corrected(problem, lambda y: mask * correction(y)))
+        if size < _BETTER * best:
+            best = size
+        else:
+            mask[i, k] = 0.0
+    return mask
+
+
 def sparse(problem: Problem) -> Answer:
-    """Sequentially thresholded least squares of every balance; the strongest term is named."""
+    """Sequentially thresholded least squares of every balance; the best one's term is named."""
     features, targets = _training(problem)
     n, m = features.shape[1:]
-    weights, strongest = np.zeros((n, m, 3)), (0.0, None)
+    weights, told = np.zeros((n, m, 3)), {}
     names = list(problem.facts.axes)
     for i in range(n):
         size = np.maximum(features[:, i].std(axis=0), 1e-9)
@@ -405,17 +430,19 @@ def sparse(problem: Problem) -> Answer:
                     break
                 kept = kept[large]
             weights[i, kept, k] = found / size[kept]
-            explained = np.var(X[:, kept] @ found) / np.var(target)
+            explained = float(np.var(X[:, kept] @ found) / np.var(target))
             term = _TERMS[kept[int(np.argmax(np.abs(found)))]]
-            meaning = _MEANINGS.get(("force" if k == 0 else "flow", term))
-            if meaning and explained > max(strongest[0], 0.05):
-                strongest = (float(explained), f"{meaning}({names[i]})")
+            told[i, k] = (explained, _MEANINGS.get(("force" if k == 0 else "flow", term)))
     machine = nominal_world(problem.facts)
 
     def correction(states: np.ndarray) -> np.ndarray:
         return np.einsum("rim,imk->rik", _features(machine, states), weights)
 
-    return Answer(strongest[1], _corrected(problem, correction))
+    order = sorted(told, key=lambda at: -told[at][0])
+    mask = _helpful(problem, correction, order)
+    first = next((at for at in order if mask[at] and told[at][1]), None)
+    named = f"{told[first][1]}({names[first[0]]})" if first else None
+    return Answer(named, _corrected(problem, lambda y: mask * correction(y)))
 
 
 def network(problem: Problem) -> Answer:
@@ -424,21 +451,24 @@ def network(problem: Problem) -> Answer:
     from sklearn.preprocessing import StandardScaler
 
     features, targets = _training(problem)
-    flat = features[:, :, 1:].reshape(len(features), -1)
-    inputs = StandardScaler().fit(flat)
-    outputs = StandardScaler().fit(targets.reshape(len(targets), -1))
+    flat, wanted = features[:, :, 1:].reshape(len(features), -1), targets.reshape(len(targets), -1)
+    inputs, outputs = StandardScaler().fit(flat), StandardScaler().fit(wanted)
     model = MLPRegressor(
-        hidden_layer_sizes=(48, 48), early_stopping=True, max_iter=200, random_state=1, alpha=1e-3
+        hidden_layer_sizes=(48, 48), early_stopping=True, max_iter=400, random_state=1, alpha=1e-3
     )
-    model.fit(inputs.transform(flat), outputs.transform(targets.reshape(len(targets), -1)))
-    machine = nominal_world(problem.facts)
+    model.fit(inputs.transform(flat), outputs.transform(wanted))
+    machine, n = nominal_world(problem.facts), targets.shape[1]
 
     def correction(states: np.ndarray) -> np.ndarray:
         seen = _features(machine, states)[:, :, 1:].reshape(len(states), -1)
         found = outputs.inverse_transform(model.predict(inputs.transform(np.nan_to_num(seen))))
         return found.reshape(len(states), -1, 3)
 
-    return Answer(None, _corrected(problem, correction))
+    left = wanted - outputs.inverse_transform(model.predict(inputs.transform(flat)))
+    explained = (1.0 - left.var(axis=0) / wanted.var(axis=0)).reshape(n, 3)
+    order = sorted(np.ndindex(n, 3), key=lambda at: -explained[at])
+    mask = _helpful(problem, correction, order)
+    return Answer(None, _corrected(problem, lambda y: mask * correction(y)))
 
 
 METHODS: dict[str, Callable[[Problem], Answer]] = {
@@ -461,11 +491,7 @@ def run_method(name: str, folder: Path, facts: Facts, limit: float) -> dict[str,
         return float(np.sqrt(np.mean(errors(problem, predict, last) ** 2)))
 
     nominal = world_prediction(problem, facts)
-    sizes = [
-        sum(float(np.sum(errors(problem, predict, run, _EVERY) ** 2)) for run in range(last))
-        for predict in (nominal, answer.predict)
-    ]
-    if sizes[1] > _BETTER * sizes[0]:
+    if _size(problem, answer.predict) > _BETTER * _size(problem, nominal):
         answer = Answer(None, nominal)
     before, after = rms(nominal), rms(answer.predict)
     perfect = floor(problem, np.random.default_rng(0))
@@ -508,7 +534,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of a series")
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--only", nargs="+", metavar="ID", help="these trials")
-    parser.add_argument("--limit", type=float, default=600.0, help="per method and trial [s]")
+    parser.add_argument(
+        "--limit", type=float, default=600.0, help="processor time per method and trial [s]"
+    )
     args = parser.parse_args()
     series = load_world_series(args.out)
     facts, rows = load_machine(series.machine), []
