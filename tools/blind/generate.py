@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hydrotele.errors import InputError
-from hydrotele.log import save_log
+from hydrotele.log import Log, save_log
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
 from hydrotele.simulate.record import SimulationFailed
@@ -63,7 +63,7 @@ def make_trial(place: Place, series: Series) -> None:
     place.key.chmod(0o600)
     place.folder.mkdir(parents=True, exist_ok=True)
     place.seal.write_text(key_hash(place) + "\n")
-    _write_logs(place, runs)
+    write_logs(place, {name: run.log for name, run in runs.items()})
 
 
 def key_hash(place: Place) -> str:
@@ -94,11 +94,12 @@ def _key(machine, kind: str, planted: list[Planted], runs: dict[str, Recorded]) 
     return {"class": kind, "effects": effects}
 
 
-def _write_logs(place: Place, runs: dict[str, Recorded]) -> None:
+def write_logs(place: Place, logs: dict[str, Log]) -> None:
+    """Write a trial's logs, all or none."""
     part = place.folder / f".data.{os.getpid()}.{secrets.token_hex(4)}.part"
     part.mkdir()
-    for name, run in runs.items():
-        save_log(run.log, part / f"{name}.parquet")
+    for name, log in logs.items():
+        save_log(log, part / f"{name}.parquet")
     try:
         part.rename(place.data)
     except OSError:  # another process was faster, with the same bits

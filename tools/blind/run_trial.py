@@ -87,6 +87,7 @@ def ask(
             target.chmod(0o444)
         command = [part.replace("{data}", str(copy)) for part in workflow]
         environment = {name: os.environ[name] for name in _PASSED if name in os.environ}
+        environment["PYTHONPATH"] = str(ROOT)  # the search is this checkout's, as its stamp says
         try:
             done = subprocess.run(
                 command, cwd=folder, env=environment, stdin=subprocess.DEVNULL,
