@@ -252,7 +252,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
     total = len(model.mech.free) + len(model.transmission)
     nu, count, h = len(model.gear), model.hydraulic, period / steps
     act, drive, given = z[2 * total :], sp.drive, COMMAND
-    sp.time[0] = row * period
+    sp.time[0] = sp.time[1] + row * period
     _take_commands(model, drive, command, row, 0.0, h, period)
     place(model, sp, z)
     if len(trail) > 0:
@@ -280,7 +280,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
             )  # fmt: skip
             for k in range(4 * count):
                 act[k] += h * sp.act_dot[k]
-        sp.time[0] = row * period + (step + 1) * h
+        sp.time[0] = sp.time[1] + row * period + (step + 1) * h
         kick = h if step < steps - 1 else 0.5 * h
         accelerate(model, sp, z, kick)
         for f in range(total):

@@ -72,7 +72,7 @@ class Space(NamedTuple):
         force: (n + t,) forces, then acceleration.
         act_dot: (4 h,) rates of the activations.
         scratch: (SCRATCH,) work space of the circuit.
-        time: (1,) since the run's first row [s].
+        time: (2,) now, and of the run's first row; only terms see it [s].
     """
 
     motion: Motion
@@ -140,7 +140,7 @@ def model_space(model: Model) -> Space:
     total = (size - 4 * model.hydraulic) // 2
     return Space(
         motion_space(model.mech), np.zeros((4, nu)), np.zeros((nu, n)), np.zeros((total, total)),
-        np.zeros(total), np.zeros(4 * model.hydraulic), np.zeros(SCRATCH), np.zeros(1),
+        np.zeros(total), np.zeros(4 * model.hydraulic), np.zeros(SCRATCH), np.zeros(2),
     )  # fmt: skip
 
 

@@ -1,14 +1,15 @@
-"""The workflow: find, name, add, show; from a Dataset to a Gap."""
+"""The workflow: find, name, calibrate, learn, add, show; from a Dataset to a Gap."""
 
+import dataclasses
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from hydrotele.dataset.load import Dataset
 from hydrotele.gap.balances import balances
 from hydrotele.gap.constancy import constancy
+from hydrotele.gap.discover import Discovery, describe, discover
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.floor import perfect_tracks
 from hydrotele.gap.residuals import residual_tests, rms
@@ -18,31 +19,28 @@ from hydrotele.gap.result import (
     Estimate,
     Gap,
     GapSize,
+    Lack,
     NamedEffect,
     Prediction,
     Verdict,
 )
-from hydrotele.gap.search import MOST, Found, search
-from hydrotele.gap.unknown import describe_unknown
+from hydrotele.gap.search import Found, lacking, search, weights
 from hydrotele.machine import Machine
-from hydrotele.prediction.evidence import Evidence, Fit
+from hydrotele.prediction.calibration import CALIBRATION
+from hydrotele.prediction.evidence import Evidence, Judged
 from hydrotele.prediction.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.prediction.inputs import input_sizes, input_units
 from hydrotele.prediction.intervals import spreads
-from hydrotele.prediction.levels import find_levels, known_levels
 from hydrotele.prediction.stretches import busiest
-from hydrotele.prediction.track import STEP, Track
+from hydrotele.prediction.track import STEP, Levels, Track, known_levels, track_run
 
-_MOST_UNFLOORED = 4  # real machines without stated noise lack more than one effect
-_ROUGH_STEP = 2.0e-3  # s, where the noise is not known and far above the integrator's errors
-_NO_FLOOR = (
-    "The machine states no accuracy of its sensors: an error counts by its mean over half a second,"
-    " in units of the given model's errors, and it cannot be said whether what remains is noise or"
-    " another effect."
-)
 SURE = 0.95  # probability below which an effect is called ambiguous
-DOUBTFUL = 0.1  # largest probability next to an unknown effect; 2 of 48 blind ones were true
+PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
+_MECHANISM, _STEEP = 0.35, 0.07  # see `_mechanism`
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _NORMAL95 = 1.96
+_FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
+_OFF = 0.05  # by which noise must differ from the stated to be noted
 Progress = Callable[[str, float], None]
 
 
@@ -67,40 +65,44 @@ def find_gap(
     tell = progress or (lambda text, share: None)
     candidates = hypotheses(data.machine, effects)
     data = busiest(data)
-    floored = known_levels(data)
-    if not floored:
-        tell("find the noise levels", 0.0)
-        with ThreadPoolExecutor(jobs) as pool:
-            data = find_levels(data, pool.map)
-    evidence = Evidence(data, data.fit, jobs, STEP if floored else _ROUGH_STEP)
+    evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
     try:
-        found = search(evidence, candidates, progress, MOST if floored else _MOST_UNFLOORED)
-        runs = (data.heldout, *data.fit)
-        tell("judge on the held-out run", 0.95)
-        before = evidence.track(data.machine, runs)
-        patched = found.guess.machine(data.machine)
-        after = evidence.track(patched, runs) if found.guess.parts else before
-        tests, floor = _tests(evidence, found.guess, after) if floored else ({}, None)
+        found = search(evidence, candidates, progress)
+        discovery = Discovery(found.judged, ())
+        if lacking(found.judged, evidence) > 0.0 and not effects:
+            tell("learn laws of what no effect explains", 0.93)
+            discovery = discover(evidence, found.judged)
+        tell("judge on the held-out run", 0.96)
+        judge = _Judge(data, discovery.judged)
+        nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)
+        before = judge.tracks(nominal, evidence.map)
+        after = judge.tracks(patched, evidence.map) if discovery.judged.guess.parts else before
+        tests, floor = judge.tests(evidence, discovery.judged, patched, after)
+        evidence.set_base(discovery.judged)
         scatter = tests.get("constancy", {}).get("value", 1.0)
-        spread = spreads(evidence, found.fit, scatter) if found.fit else np.zeros(0)
+        spread = spreads(evidence, discovery.judged.guess, scatter)
+        shares = judge.shares(found, discovery, before[0], after[0], floor)
     finally:
         evidence.close()
-    unit = 1.0 if floored else rms(np.concatenate([t.whitened for t in before[1:]]))
     failed = any(not test["passed"] for test in tests.values())
-    named = _named(found, spread, failed)
-    verdict = _verdict(named, failed)
-    predictions = tuple(_prediction(t, data, unit) for t in before)
-    improved = tuple(_prediction(t, data, unit) for t in after)
-    unknown = describe_unknown(patched, data, improved) if failed else None
+    named = _named(found, spread, shares, rms(after[:1]), floor)
+    learned = discovery.described(evidence.data.machine, spread, shares)
+    verdict = _verdict(named, failed, floor)
+    predictions = tuple(_prediction(t, data) for t in before)
+    improved = tuple(_prediction(t, data) for t in after)
+    lacks = _lacks(data.machine, found.judged)
+    unknown = None
+    if failed or learned:
+        unknown = describe(data.machine, lacks, learned, improved, before[0].run)
     laws, units = _laws(data, patched)
     tell("done", 1.0)
     return Gap(
-        machine=data.machine,
+        machine=nominal,
         patched=patched,
         verdict=verdict,
         effects=named,
-        unknown=unknown,
-        size=GapSize(rms(before[0].whitened) / unit, rms(after[0].whitened) / unit, floor),
+        unknown=unknown if verdict != "no_gap" else None,
+        size=GapSize(rms(before[:1]), rms(after[:1]), floor),
         ranking=tuple(
             Candidate(
                 s.hypothesis.name, s.hypothesis.location, s.gain, s.gain - s.score,
@@ -113,51 +115,127 @@ def find_gap(
         laws=laws,
         law_units=units,
         tests=tests,
-        next_experiment=_experiment(data.machine, verdict, named, unknown),
-        notes=(*data.notes, *_notes(found), *([] if floored else [_NO_FLOOR])),
+        next_experiment=_experiment(nominal, verdict, named, unknown),
+        calibration=_calibration(discovery.judged.guess, spread),
+        learned=learned,
+        lacks=lacks,
+        noise=_noise(data, judge.levels),
+        notes=(*data.notes, *_notes(found, data, judge.levels, floor)),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 
 
-def _tests(evidence: Evidence, guess: Guess, tracks: Sequence[Track]):
-    """Tests of what a guess leaves, and the noise floor, against readings made by the guess."""
-    data = evidence.data
-    perfect = perfect_tracks(guess.machine(data.machine), data, tracks)
-    tests = residual_tests(tracks, data.channels, perfect)
-    if guess.parts:
-        made = Evidence(data, [track.run for track in perfect[1:]], 1, evidence.step)
-        try:
-            evidence.set_base(guess)
-            made.set_base(guess)
-            tests["constancy"] = constancy(evidence, guess, made)
-        finally:
-            made.close()
-    return tests, rms(perfect[0].whitened)
+class _Judge:
+    """Tracks that only the sensors' noise may disturb, with the noise that was found."""
+
+    def __init__(self, data: Dataset, judged: Judged) -> None:
+        self.data, self.levels = data, Levels(judged.tracks[0].levels.noise)
+        self.runs = (data.heldout, *data.fit)
+
+    def tracks(
+        self, machine: Machine, each: Callable, runs: Sequence | None = None
+    ) -> tuple[Track, ...]:
+        """Tracks of the held-out run and the fit runs, or of some runs."""
+        return tuple(each(
+            lambda run: track_run(machine, self.data, run, levels=self.levels),
+            self.runs if runs is None else runs,
+        ))  # fmt: skip
+
+    def tests(
+        self, evidence: Evidence, judged: Judged, machine: Machine, tracks: Sequence[Track]
+    ) -> tuple[dict, float | None]:
+        """Tests of what a guess leaves, and the noise floor: what readings of its own leave.
+
+        A floor is refused where the perfect machine's own runs cannot be followed: they left the
+        model's range, or the filter does not hold them.
+        """
+        noisy = dataclasses.replace(self.data, noise=self.levels.noise)
+        perfect = perfect_tracks(machine, noisy, tracks)
+        floor = rms(perfect[:1])
+        holds = np.isfinite(floor) and _FLOOR[0] < floor < _FLOOR[1]
+        tests = residual_tests(tracks, self.data.channels, perfect if holds else ())
+        if judged.guess.parts and holds:
+            made = Evidence(noisy, [track.run for track in perfect[1:]], 1, evidence.step)
+            try:
+                evidence.set_base(judged)
+                made.set_base(judged.guess)
+                tests["constancy"] = constancy(evidence, judged.guess, made)
+            finally:
+                made.close()
+        return tests, floor if holds else None
+
+    def shares(
+        self, found: Found, discovery: Discovery, before: Track, after: Track, floor: float | None
+    ) -> dict[tuple[str, str], float]:
+        """Part -> share of the held-out run's gap that comes back without it."""
+        whole = rms([before]) ** 2 - (floor or 1.0) ** 2
+        parts, table = discovery.judged.guess.parts, {}
+        for index, (hypothesis, _) in enumerate(parts):
+            rest = found.without[index] if index < len(found.without) else None
+            guess = discovery.judged.guess.without(index)
+            if rest is not None and not discovery.laws:
+                guess = rest.guess  # fitted without it
+            machine = guess.machine(self.data.machine)
+            (track,) = self.tracks(machine, map, (self.data.heldout,))
+            back = rms([track]) ** 2 - rms([after]) ** 2
+            table[hypothesis.key] = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0 else 0.0
+        return table
 
 
-def _verdict(named: Sequence[NamedEffect], failed: bool) -> Verdict:
-    if failed:
-        return "unknown"
+def _verdict(named: Sequence[NamedEffect], failed: bool, floor: float | None) -> Verdict:
+    sure = [effect for effect in named if effect.probability >= SURE]
     if not named:
-        return "no_gap"
-    return "named" if all(effect.probability >= SURE for effect in named) else "ambiguous"
+        return "unknown" if failed or floor is None else "no_gap"
+    if not failed:
+        return "named" if len(sure) == len(named) else "ambiguous"
+    closed = sum(effect.share for effect in sure)
+    return "partly" if sure and closed >= PARTLY else "unknown"
 
 
-def _named(found: Found, spread: np.ndarray, failed: bool) -> tuple[NamedEffect, ...]:
+def _mechanism(part: float) -> float:
+    """Probability that an effect is the mechanism and not something else of the same balance.
+
+    `part` is the share of what the runs lacked without it that it takes away. A law of another
+    form in the same balance is imitated by the wrong effect to some part only; the right effect in
+    another form leaves little. The line between them is where blind trials put it
+    (`docs/results/blind_trials`).
+    """
+    return float(1.0 / (1.0 + np.exp(-(part - _MECHANISM) / _STEEP)))
+
+
+def _named(
+    found: Found, spread: np.ndarray, shares: Mapping, after: float, floor: float | None
+) -> tuple[NamedEffect, ...]:
     effects, first = [], 0
+    ideal = _ideal_loss(found)
     for index, (hypothesis, deviation) in enumerate(found.guess.parts):
         own = spread[first : first + hypothesis.size]
         first += hypothesis.size
-        chance, others = _chances(found.scores[index], found.rivals[index])
-        if failed:
-            chance = min(chance, DOUBTFUL)
+        rest = found.without[index]
+        if hypothesis.name == CALIBRATION or rest is None:
+            continue
+        chance, others = _chances(found, index, rest)
+        part = (rest.loss - found.judged.loss) / max(rest.loss - ideal, 1.0)
+        chance *= _mechanism(part)
         effects.append(
             NamedEffect(
                 hypothesis.name, hypothesis.location, chance,
-                _estimates(hypothesis, deviation, own), others,
+                _estimates(hypothesis, deviation, own), others, shares[hypothesis.key],
             )
         )  # fmt: skip
     return tuple(sorted(effects, key=lambda effect: -effect.probability))
+
+
+def _ideal_loss(found: Found) -> float:
+    """-2 log likelihood of a model that lacks nothing, with the noise that was found."""
+    total = 0.0
+    for track in found.judged.tracks:
+        noise = track.levels.noise
+        there = np.isfinite(track.whitened).sum(axis=0)
+        floor = np.nanmin(np.where(np.isfinite(track.whitened), track.gains.spread, np.inf), axis=0)
+        width = np.maximum(noise, np.where(np.isfinite(floor), floor, noise))
+        total += float(there @ (1.0 + 2.0 * np.log(width)))
+    return min(total, found.judged.loss)
 
 
 def _estimates(hypothesis: Hypothesis, deviation: np.ndarray, spread: np.ndarray):
@@ -170,25 +248,53 @@ def _estimates(hypothesis: Hypothesis, deviation: np.ndarray, spread: np.ndarray
     return table
 
 
-def _chances(score: float, rivals: Sequence[Fit]) -> tuple[float, tuple[Alternative, ...]]:
-    """Probability of an effect and of its rivals, from their evidence."""
-    scores = np.array([score, *(fit.score for fit in rivals)])
-    weights = np.exp(0.5 * (scores - scores.max()))
-    weights /= weights.sum()
-    others = []
-    for fit, weight in zip(rivals, weights[1:], strict=True):
-        rival = fit.guess.parts[-1][0]
-        if weight >= _WORTH_TELLING:
-            others.append(Alternative(rival.name, rival.location, float(weight)))
-    return float(weights[0]), tuple(others)
+def _chances(found: Found, index: int, rest: Judged) -> tuple[float, tuple[Alternative, ...]]:
+    """Probability of an effect against its rivals and against none, and those of the rivals."""
+    rivals = [r for r in found.rivals[index] if np.isfinite(r.judged.loss)]
+    chances = weights(
+        [found.judged.blocks(), rest.blocks(), *(r.judged.blocks() for r in rivals)],
+        [found.charges[index], 0.0, *(r.charge for r in rivals)],
+    )
+    others = [
+        Alternative(r.hypothesis.name, r.hypothesis.location, float(chance))
+        for r, chance in zip(rivals, chances[2:], strict=True) if chance >= _WORTH_TELLING
+    ]  # fmt: skip
+    return float(chances[0]), tuple(others)
 
 
-def _prediction(track: Track, data: Dataset, unit: float) -> Prediction:
+def _prediction(track: Track, data: Dataset) -> Prediction:
     run = track.run
     clock = run.start + run.period * np.arange(len(run.command))
     return Prediction(
-        run.name, clock, data.channels, track.predicted, run.reading, track.whitened / unit
+        run.name, clock, data.channels, track.predicted, run.reading, track.whitened
     )
+
+
+def _lacks(machine: Machine, judged: Judged) -> tuple[Lack, ...]:
+    """The unknown inputs that remain, the largest first."""
+    levels = judged.tracks[0].levels
+    largest, units = input_sizes(machine, levels.inputs), input_units(machine, levels.inputs)
+    found = [
+        Lack(i.balance, i.axis, float(size), unit, float(size / most))
+        for i, size, most, unit in zip(levels.inputs, levels.sizes, largest, units, strict=True)
+    ]
+    return tuple(sorted(found, key=lambda lack: -lack.part))
+
+
+def _calibration(guess: Guess, spread: np.ndarray) -> dict[str, Estimate]:
+    first = 0
+    for hypothesis, deviation in guess.parts:
+        if hypothesis.name == CALIBRATION:
+            return _estimates(hypothesis, deviation, spread[first : first + hypothesis.size])
+        first += hypothesis.size
+    return {}
+
+
+def _noise(data: Dataset, levels: Levels) -> dict[str, tuple[float, float]]:
+    return {
+        channel: (float(found), float(stated))
+        for channel, found, stated in zip(data.channels, levels.noise, data.noise, strict=True)
+    }
 
 
 def _laws(data: Dataset, patched: Machine):
@@ -222,16 +328,31 @@ def _experiment(machine: Machine, verdict: Verdict, named: Sequence[NamedEffect]
     return next_experiment(machine, "these effects cannot be told apart with this data", pairs)
 
 
-def _notes(found: Found) -> list[str]:
-    if not found.weak:
-        return []
-    hypothesis, deviation = found.weak.guess.parts[-1]
-    values = hypothesis.values(deviation)
-    told = ", ".join(
-        f"{key} {values[key]:.4g} {p.unit} (model: {p.nominal:.4g})"
-        for key, p in hypothesis.parameters.items()
-    )
-    return [
-        f"A trace of {hypothesis.name} at {hypothesis.location}, {told}, is smaller than worth"
-        " naming and was left out."
-    ]
+def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> list[str]:
+    notes = []
+    ratio = levels.noise / data.noise
+    off = [f"{channel} {100 * (r - 1):+.0f} %" for channel, r in zip(data.channels, ratio, strict=True)
+           if np.isfinite(r) and abs(r - 1.0) > _OFF]  # fmt: skip
+    if off:
+        notes.append(f"Noise that differs from what the machine states: {', '.join(off)}.")
+    if not known_levels(data):
+        unstated = [c for c, n in zip(data.channels, data.noise, strict=True) if not np.isfinite(n)]
+        notes.append(f"The machine states no accuracy of {', '.join(unstated)}; the noise there was"
+                     " found from the readings.")  # fmt: skip
+    if floor is None:
+        notes.append(
+            "What a perfect model would leave cannot be told: runs made with the patched machine"
+            " itself cannot be followed. So it is not said that nothing is missing."
+        )
+    if found.weak:
+        hypothesis, deviation = found.weak.guess.parts[-1]
+        values = hypothesis.values(deviation)
+        told = ", ".join(
+            f"{key} {values[key]:.4g} {p.unit} (model: {p.nominal:.4g})"
+            for key, p in hypothesis.parameters.items()
+        )
+        notes.append(
+            f"A trace of {hypothesis.name} at {hypothesis.location}, {told}, is smaller than worth"
+            " naming and was left out."
+        )
+    return notes

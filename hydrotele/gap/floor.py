@@ -1,6 +1,7 @@
 """What a perfect model would score: runs simulated by the model with the sensors' noise."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,17 +28,17 @@ def clean_run(machine: Machine, data: Dataset, run: RunData, start: np.ndarray, 
         A run with simulated readings. The noise is uniform, as the sensors' errors are.
     """
     model = reduced_model(machine, data.channels)
+    space = model_space(model)
+    space.time[1] = run.start
     rows = len(run.command)
     shown, states = np.empty((rows, len(data.channels))), np.empty((rows, state_size(model)))
     simulate_rows(
-        model, model_space(model), start.copy(), run.command, run.period,
+        model, space, start.copy(), run.command, run.period,
         max(1, round(run.period / (0.5 * STEP))), shown, states,
     )  # fmt: skip
-    noise = np.random.default_rng(seed).uniform(-1.0, 1.0, shown.shape) * np.sqrt(3.0) * data.noise
+    noise = np.random.default_rng(seed).uniform(-1.0, 1.0, shown.shape) * np.sqrt(3.0) * data.noise_of(run)
     reading = np.where(np.isnan(run.reading), np.nan, shown + noise)
-    return RunData(
-        run.name, run.start, run.period, run.command, run.command_known, reading, run.log
-    )
+    return replace(run, reading=reading)
 
 
 def perfect_tracks(machine: Machine, data: Dataset, tracks: Sequence[Track]) -> tuple[Track, ...]:

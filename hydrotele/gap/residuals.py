@@ -16,8 +16,8 @@ from hydrotele.prediction.track import Track
 _EXPECTED = (1.0, 1.0, 0.0)  # of white noise of size 1, in the order of LIMITS
 ALLOWED = 5.0  # times what the filter leaves on simulated readings, which varies by two
 
-_SETTLE = 25  # rows until the start no longer matters
-_WINDOW = 50  # rows, 1 s at 50 Hz: longer than any ringing of the errors, shorter than a motion
+_SETTLE = 0.5  # s until the start no longer matters
+_WINDOW = 1.0  # s, longer than any ringing of the errors, shorter than a motion
 _LAGS = 5
 LIMITS = {"mean_square": 1.12, "window_means": 1.8, "autocorrelation": 60.0}
 """Largest value of a test in any channel that still passes, for a smooth model."""
@@ -60,7 +60,7 @@ def residual_tests(
 
 def _values(tracks: Sequence[Track]) -> list[np.ndarray]:
     """Per test the values (c,) of all channels over all runs."""
-    parts = [_measures(track.whitened) for track in tracks]
+    parts = [_measures(track.whitened, track.run.period) for track in tracks]
     weights = np.array([p[0] for p in parts])
     total = np.maximum(weights.sum(axis=0), 1.0)
     return [
@@ -69,19 +69,19 @@ def _values(tracks: Sequence[Track]) -> list[np.ndarray]:
     ]
 
 
-def _measures(whitened: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _measures(whitened: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Per channel (c,): rows with a reading, mean square, window means, autocorrelation."""
-    w = whitened[_SETTLE:]
+    w, window = settled(whitened, period), max(2, round(_WINDOW / period))
     there = np.isfinite(w)
     count = there.sum(axis=0).astype(float)
     w = np.where(there, w, 0.0)
     some = np.maximum(count, 1.0)
     square = (w**2).sum(axis=0) / some
-    windows = len(w) // _WINDOW
+    windows = len(w) // window
     cut, filled = (
-        a[: windows * _WINDOW].reshape(windows, _WINDOW, -1).sum(axis=1) for a in (w, there)
+        a[: windows * window].reshape(windows, window, -1).sum(axis=1) for a in (w, there)
     )
-    full = filled > _WINDOW // 2
+    full = filled > window // 2
     means = np.where(full, cut**2 / np.maximum(filled, 1), 0.0).sum(axis=0)
     means /= np.maximum(full.sum(axis=0), 1)
     echo = np.zeros(w.shape[1])
@@ -90,6 +90,12 @@ def _measures(whitened: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     return count, square, means, echo - _LAGS
 
 
-def rms(whitened: np.ndarray) -> float:
-    """RMS of whitened errors over all channels, the settling rows left out."""
-    return float(np.sqrt(np.nanmean(whitened[_SETTLE:] ** 2)))
+def settled(whitened: np.ndarray, period: float) -> np.ndarray:
+    """Whitened errors (n, c) without those of a run's start, at most half of them."""
+    return whitened[min(round(_SETTLE / period), len(whitened) // 2) :]
+
+
+def rms(tracks: Sequence[Track]) -> float:
+    """RMS of the whitened errors of tracks over all channels, without the runs' starts."""
+    parts = [settled(track.whitened, track.run.period).ravel() for track in tracks]
+    return float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2)))

@@ -1,5 +1,6 @@
 """What the search for a gap yields."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -8,7 +9,7 @@ import numpy as np
 
 from hydrotele.machine import Machine
 
-Verdict = Literal["named", "no_gap", "unknown", "ambiguous"]
+Verdict = Literal["named", "partly", "ambiguous", "unknown", "no_gap"]
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,75 @@ class Alternative:
 
 @dataclass(frozen=True)
 class NamedEffect:
-    """An effect that the data ask for."""
+    """An effect that the data ask for.
+
+    Attributes:
+        name: of the library's effect.
+        location: where it sits.
+        probability: that it is this effect there, and neither a rival nor something unknown.
+        parameters: its numbers.
+        alternatives: rivals that the data cannot rule out.
+        share: of the gap on the held-out run that it closes, by what comes back without it.
+    """
 
     name: str
     location: str
     probability: float
     parameters: Mapping[str, Estimate]
     alternatives: tuple[Alternative, ...] = ()
+    share: float = math.nan
+
+
+@dataclass(frozen=True)
+class LearnedLaw:
+    """A law found from the data, in physical variables, that no effect of the library states.
+
+    Attributes:
+        balance: force, flow or command, to which it adds.
+        axis: of the drive.
+        formula: in words of the variables.
+        description: one sentence.
+        resembles: the library's effect that has nearly this form, or empty.
+        variable: on what it depends.
+        points: (k,) values of the variable [its unit].
+        values: (k,) what the law adds there [unit].
+        spread: (k,) standard deviations of the values.
+        unit: of the values.
+        variable_unit: of the points.
+        share: of the gap on the held-out run that it closes.
+    """
+
+    balance: str
+    axis: str
+    formula: str
+    description: str
+    resembles: str
+    variable: str
+    points: tuple[float, ...]
+    values: tuple[float, ...]
+    spread: tuple[float, ...]
+    unit: str
+    variable_unit: str
+    share: float = math.nan
+
+
+@dataclass(frozen=True)
+class Lack:
+    """What a model lacks in one balance, as an unknown input of the filter.
+
+    Attributes:
+        balance: force, flow_head, flow_rod or command.
+        axis: on which it acts.
+        size: its standard deviation [unit].
+        unit: SI.
+        part: of the largest that makes sense (full force, rated flow, full command).
+    """
+
+    balance: str
+    axis: str
+    size: float
+    unit: str
+    part: float
 
 
 @dataclass(frozen=True)
@@ -47,11 +110,11 @@ class Unknown:
     """A disagreement that no effect of the library explains.
 
     Attributes:
-        law: the law that fails, such as `force` or `flow`.
+        law: the law that fails: force, flow, valve or sensor.
         channel: the channel that shows it most.
-        depends_on: quantities that it depends on, such as `length.stick`.
+        depends_on: quantities that it depends on, such as `position.stick`.
         description: one paragraph in plain words.
-        term: the sparse-regression term that holds up on the held-out run, or None.
+        term: the learned law's formula, or None.
         windows: (start, end) [s] in the held-out run where it shows most.
     """
 
@@ -65,10 +128,9 @@ class Unknown:
 
 @dataclass(frozen=True)
 class GapSize:
-    """RMS of normalised one-step prediction errors of the held-out run; a perfect model has 1.
+    """RMS of one-step prediction errors of the held-out run in units of the sensors' noise.
 
-    Where the machine states no accuracy of its sensors, the given model's errors on the fitted runs
-    have size 1, and `noise_floor`, the size that a perfect model's have, is None.
+    `noise_floor` is what a perfect model has, near 1; None where it cannot be told.
     """
 
     before: float
@@ -123,7 +185,7 @@ class Gap:
     Attributes:
         machine: the model that was given.
         patched: the model with the named effects; the same object if nothing was named.
-        verdict: named, no_gap, unknown or ambiguous.
+        verdict: named, partly, ambiguous, unknown or no_gap.
         effects: the named effects, the surest first.
         unknown: what no effect explains, or None.
         size: the gap on the held-out run before and after.
@@ -136,6 +198,10 @@ class Gap:
         tests: name of a residual test -> {"value", "limit", "passed"} of the final model.
         next_experiment: what would separate the alternatives or show the unknown better, or None;
             has "reason" and "scenario" (a scenario as a dict).
+        calibration: uncertain number -> what the data ask for, where numbers were calibrated.
+        learned: laws found from the data, in the patched machine.
+        lacks: what the patched machine still lacks, balance by balance, the largest first.
+        noise: channel -> (found, stated) standard deviation of a reading [SI]; NaN if not stated.
         notes: what was left out or mended in the data, one sentence each.
         seconds: wall time of the search.
     """
@@ -153,5 +219,9 @@ class Gap:
     law_units: Mapping[str, str] = field(default_factory=dict)
     tests: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     next_experiment: Mapping[str, Any] | None = None
+    calibration: Mapping[str, Estimate] = field(default_factory=dict)
+    learned: tuple[LearnedLaw, ...] = ()
+    lacks: tuple[Lack, ...] = ()
+    noise: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     seconds: float = 0.0

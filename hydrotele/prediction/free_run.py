@@ -5,7 +5,6 @@ drift, or miss the noise and arrive. So a model is started at many rows of a run
 of the state there, runs freely on the commands, and is compared with the readings on its way.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from hydrotele.dynamics.integrate import advance, read_channels
 from hydrotele.dynamics.model import Model, model_space, reduced_model
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
-from hydrotele.prediction.track import STEP, fine_enough, track_run
+from hydrotele.prediction.track import DRIFT_TIME, STEP, Levels, fine_enough, track_run
 from hydrotele.signals import parse_channel
 
 HORIZONS = (1.0, 5.0, 10.0, 30.0)  # s
@@ -88,8 +87,8 @@ class RunErrors:
     horizons: dict[str, HorizonError]
 
 
-def with_levels(data: Dataset) -> Dataset:
-    """The dataset with noise levels for a filter whose states follow the readings.
+def following_levels(data: Dataset) -> Levels:
+    """Noise levels for a filter whose states follow the readings.
 
     Stated noise is kept. Where none is stated, the readings' roughness tells it, and the state may
     drift as fast as the readings do: what matters here is where a free run starts, not how likely a
@@ -100,12 +99,14 @@ def with_levels(data: Dataset) -> Dataset:
         data: the dataset.
 
     Returns:
-        The dataset with finite `noise`, and `drift`.
+        The levels.
 
     Source: noise of a smooth signal from second differences, whose variance is six times its own.
     """
-    noise, drift, machine = data.noise.copy(), dict(data.drift), data.machine
+    noise, machine = data.noise.copy(), data.machine
+    drift: dict[str, float] = {}
     period = data.fit[0].period
+    per_time = math.sqrt(DRIFT_TIME / period)
     ahead = max(1, round(_RATE_OVER / period))
     share = np.sqrt(period / _FOLLOW)
     for c in np.flatnonzero(~np.isfinite(data.noise)):
@@ -114,11 +115,12 @@ def with_levels(data: Dataset) -> Dataset:
         noise[c] = max(rough, _SMALLEST * _size(columns), 1e-12)
         moves = _size([column[ahead:] - column[:-ahead] for column in columns]) / (ahead * period)
         if signal.kind.startswith("pressure_"):
-            drift[f"{signal.kind}.{signal.axis}"] = moves * period
+            drift[f"{signal.kind}.{signal.axis}"] = moves * period * per_time
         elif signal.axis in machine.axes and signal.kind == machine.position_kind(signal.axis):
             joint = machine.axes[signal.axis].joint
-            drift[f"position.{joint}"], drift[f"rate.{joint}"] = moves * period, moves * share
-    return dataclasses.replace(data, noise=noise, drift=drift)
+            drift[f"position.{joint}"] = moves * period * per_time
+            drift[f"rate.{joint}"] = moves * share * per_time
+    return Levels(noise, drift=drift)
 
 
 def _size(parts: Sequence[np.ndarray]) -> float:
@@ -133,16 +135,16 @@ def machine_runner(machine: Machine, data: Dataset, step: float = STEP) -> Prepa
 
     Args:
         machine: the machine.
-        data: the dataset, for its channels and noise; see `with_levels`.
+        data: the dataset, for its channels and noise; see `following_levels`.
         step: largest step of the integrator [s].
 
     Returns:
         What prepares a run.
     """
-    model, level = reduced_model(machine, data.channels), with_levels(data)
+    model, levels = reduced_model(machine, data.channels), following_levels(data)
 
     def prepare(run: RunData) -> Runner:
-        track = track_run(machine, level, run, step=step)
+        track = track_run(machine, data, run, step=step, levels=levels)
         steps = max(1, round(run.period / fine_enough(machine, step)))
         before = _shown(model, track.states) if np.any(model.lag > 0.0) else None
 
@@ -151,8 +153,10 @@ def machine_runner(machine: Machine, data: Dataset, step: float = STEP) -> Prepa
             for made, row in zip(out, starts, strict=True):
                 if np.isfinite(track.states[row]).all():
                     past = np.zeros((1, len(model.lag))) if before is None else before
-                    _run_from(model, model_space(model), track.states[row].copy(), run.command,
-                              int(row), run.period, steps, past, made)  # fmt: skip
+                    space = model_space(model)
+                    space.time[1] = run.start
+                    _run_from(model, space, track.states[row].copy(), run.command, int(row),
+                              run.period, steps, past, made)  # fmt: skip
             return out
 
         return Runner(track.predicted, free)

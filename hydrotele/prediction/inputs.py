@@ -69,6 +69,16 @@ def input_sizes(machine: Machine, inputs: Sequence[Input]) -> np.ndarray:
     return np.array(sizes)
 
 
+def input_units(machine: Machine, inputs: Sequence[Input]) -> list[str]:
+    """SI unit of each input."""
+    units = {"command": "1", "flow_head": "m^3/s", "flow_rod": "m^3/s"}
+    return [units.get(i.balance) or ("N m" if _turns(machine, i.axis) else "N") for i in inputs]
+
+
+def _turns(machine: Machine, axis: str) -> bool:
+    return machine.axes[axis].cylinder is None and machine.position_kind(axis) == "angle"
+
+
 @compiled
 def _drive_responses(model, sp, states, position, response):
     """Drive positions (n, nu), and accelerations per unit drive force (n, nu, rates)."""

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from hydrotele.prediction.evidence import Evidence, Fit
+from hydrotele.prediction.evidence import Evidence
+from hydrotele.prediction.hypothesis import Guess
 
 _CHANCE = 3.0  # chi-square per degree of freedom that two degrees exceed in 5 % of all cases
 
 
-def spreads(evidence: Evidence, fit: Fit, scatter: float = 1.0) -> np.ndarray:
-    """Standard deviations of a fit's numbers.
+def spreads(evidence: Evidence, guess: Guess, scatter: float = 1.0) -> np.ndarray:
+    """Standard deviations of a guess's numbers.
 
     Where runs by themselves ask for sizes that scatter beyond chance, the noise's part is widened
     to that scatter (Birge 1932, Phys. Rev. 40, 207). What halving the integrator's step would
@@ -16,14 +17,14 @@ def spreads(evidence: Evidence, fit: Fit, scatter: float = 1.0) -> np.ndarray:
     the expression of uncertainty in measurement, 4.3.7).
 
     Args:
-        evidence: with the fit's guess as its base.
-        fit: the fit.
+        evidence: with the guess as its base.
+        guess: fitted.
         scatter: chi-square per degree of freedom of the sizes that the runs ask for.
 
     Returns:
         (P,) standard deviations, in typical deviations.
     """
-    guess, step = fit.guess, evidence.step_of(fit.guess, evidence.step)
+    step = evidence.step_of(guess, evidence.step)
     errors = evidence.errors(guess, step)
     slopes = evidence.slopes(guess, errors, step=step)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])

@@ -12,7 +12,8 @@ from hydrotele.hydraulics.circuit import SLOTS, Slot
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
 
-_LOOK = 5  # rows whose mean starts the filter
+_LATEST = 1.0  # s after which a channel's first reading says nothing of the start
+_LOOK = 0.1  # s whose mean starts the filter, or the first reading after it
 _WIDE = {
     "position": 0.02, "drive": 0.0, "rate": 0.05, "drive_rate": 0.0, "spool": 0.02,
     "spool_rate": 0.2, "pressure_head": 1e6, "pressure_rod": 1e6,
@@ -48,7 +49,7 @@ def start_state(
     wide = np.array([_WIDE[name.partition(".")[0]] for name in names])
     shown = {}
     for c, name in enumerate(data.channels):
-        head = run.reading[:_LOOK, c]
+        head = run.reading[: _first_rows(run, c), c]
         if np.isfinite(head).any():
             value = float(np.nanmean(head))
             shown[name] = (value - model.offset[c]) / model.scale[c]
@@ -65,6 +66,14 @@ def start_state(
     spread = np.diag(wide**2)
     _place_drives(model, state, spread, np.zeros(len(model.transmission)) if rest is None else rest)
     return state, spread
+
+
+def _first_rows(run: RunData, c: int) -> int:
+    """Rows that show a channel's first readings."""
+    rows = max(1, round(_LOOK / run.period))
+    good = np.flatnonzero(np.isfinite(run.reading[:, c]))
+    late = len(good) and good[0] >= rows and good[0] * run.period < _LATEST
+    return int(good[0]) + 1 if late else rows
 
 
 def _place_drives(model: Model, state: np.ndarray, spread: np.ndarray, rest: np.ndarray) -> None:

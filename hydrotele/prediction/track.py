@@ -114,10 +114,7 @@ def fine_enough(machine: Machine, step: float) -> float:
 def first_rows(track: Track, rows: int) -> Track:
     """The first rows of a track, for a look at less than its run; without transition Jacobians."""
     part = slice(0, rows)
-    run = dataclasses.replace(
-        track.run, command=track.run.command[part], command_known=track.run.command_known[part],
-        reading=track.run.reading[part],
-    )  # fmt: skip
+    run = track.run.part(0, min(rows, len(track.run.command)))
     gains = Gains(*(np.ascontiguousarray(table[part]) for table in track.gains))
     return dataclasses.replace(
         track, run=run, gains=gains, whitened=track.whitened[part],
@@ -164,6 +161,7 @@ def track_run(
     if kept is not None:
         levels, columns = kept.levels, _for_states(kept, names)
     levels = levels or Levels(data.noise)
+    noise = levels.noise if run.behind is None else levels.noise / np.sqrt(run.behind)
     if columns is None:
         columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
     play = model.transmission[:, BACKLASH] > 0.0
@@ -171,16 +169,14 @@ def track_run(
     if kept is not None and len(kept.rest) == len(play):
         rest = kept.rest
     elif kept is None and play.any():
-        rows = slice(0, round(_LOOK / run.period))
-        first = dataclasses.replace(
-            run, command=run.command[rows], command_known=run.command_known[rows],
-            reading=run.reading[rows],
-        )  # fmt: skip
-        part = columns[rows]
+        rows = min(max(2, round(_LOOK / run.period)), len(run.command))
+        first, part = run.part(0, rows), columns[:rows]
         rest = find_rest(
-            lambda r: _cross(machine, model, data, first, None, step, r, levels, part).loss, play
+            lambda r: _cross(
+                machine, model, data, first, None, step, r, levels, part, noise
+            ).loss, play,
         )
-    return _cross(machine, model, data, run, kept, step, rest, levels, columns, linearise)
+    return _cross(machine, model, data, run, kept, step, rest, levels, columns, noise, linearise)
 
 
 def _for_states(kept: Track, names: list[str]) -> np.ndarray:
@@ -197,10 +193,12 @@ def _for_states(kept: Track, names: list[str]) -> np.ndarray:
 
 def _cross(
     machine: Machine, model: Model, data: Dataset, run: RunData, kept: Track | None, step: float,
-    rest: np.ndarray, levels: Levels, columns: np.ndarray, linearise: bool = False,
+    rest: np.ndarray, levels: Levels, columns: np.ndarray, noise: np.ndarray,
+    linearise: bool = False,
 ) -> Track:  # fmt: skip
     step, coarse = fine_enough(machine, step), fine_enough(machine, _TANGENT)
     space = model_space(model)
+    space.time[1] = run.start
     names, late = state_names(machine), late_readings(model, run.period)
     rows, c, size, m = len(run.command), len(data.channels), len(names), len(levels.inputs)
     start, spread = start_state(machine, data, run, model, names, rest)
@@ -231,7 +229,7 @@ def _cross(
     flow, initial = np.empty((rows if linearise else 0, full, full)), np.zeros((full, full))
     loss = filter_run(
         model, space, late, state, covariance, run.command, run.command_known, run.reading,
-        levels.noise**2, state_drift(names, levels, run.period),
+        noise**2, state_drift(names, levels, run.period),
         by_kind(names, STARTLE) ** 2, run.period,
         max(1, round(run.period / step)), max(1, round(run.period / coarse)),
         by_kind(names, _NUDGE), np.array([names.index(name) for name in known]), *gains,

@@ -16,7 +16,7 @@ from hydrotele.prediction.free_run import (
     free_run_errors,
     machine_runner,
     window_starts,
-    with_levels,
+    following_levels,
 )
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario
@@ -164,8 +164,8 @@ def test_levels_without_stated_accuracy_let_the_state_follow(late):
     """Noise found from the roughness of the readings: 0.058 deg, white, within a third."""
     data = load_dataset(late, load_machine("cat215"))
     bare = dataclasses.replace(data, noise=np.full(len(data.noise), np.nan), sensors=None)
-    found = with_levels(bare)
-    assert with_levels(data) is not found and np.array_equal(with_levels(data).noise, data.noise)
+    found = following_levels(bare)
+    assert np.array_equal(following_levels(data).noise, data.noise)
     swing = data.channels.index("angle.swing")
     assert found.noise[swing] == pytest.approx(data.noise[swing], rel=0.33)
     assert np.isfinite(found.noise).all() and isinstance(found, Dataset)
