@@ -12,7 +12,7 @@ _DIRECTIONS = ("positive", "negative")
 
 
 def _progression(machine: Machine, location: str) -> dict[str, Parameter]:
-    """0.3 opens to 42 % at half travel; notches for fine control come to 0.6, good to 4 %."""
+    """0.3 opens to 42 % at half travel; estimates: fine control comes to 0.6, notches to 4 %."""
     return dict.fromkeys(_DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
 
 

@@ -12,7 +12,7 @@ EDGES = {
 
 
 def _edges(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Spools for unequal cylinders meter out half of what they meter in; 3 % is a notch's cut."""
+    """Estimates: spools for unequal cylinders differ by tens of per cent; 3 % is a notch's cut."""
     valve = machine.axes[location].valve
     assert valve
     present = {

@@ -9,7 +9,7 @@ def _travel_time(machine: Machine, location: str) -> dict[str, Parameter]:
     """Time from centre to full opening, in units of the spool's own 1 / w; 0 without a limit.
 
     A step to full opening moves a free spool of damping 0.9 at most at 0.38 w, so that a limit is
-    felt from a travel time of 2.6 / w on; makers state 3 to 30 times that.
+    felt from a travel time of 2.6 / w on; the sizes are estimates, 3 times that and more.
     """
     valve = machine.axes[location].valve
     assert valve

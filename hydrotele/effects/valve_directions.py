@@ -38,10 +38,11 @@ def _deadbands(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_deadbands(machine: Machine, location: str, values: Values) -> Machine:
-    present = dict(zip(DIRECTIONS, _valve(machine, location).deadbands, strict=True))
-    for direction, band in values.items():
-        if band != present[direction]:
-            machine = changed(machine, f"axes.{location}.valve.{direction}.deadband", band)
+    present = _valve(machine, location).deadbands
+    for direction, band in zip(DIRECTIONS, present, strict=True):
+        if values[direction] != band:
+            path = f"axes.{location}.valve.{direction}.deadband"
+            machine = changed(machine, path, values[direction])
     return machine
 
 

@@ -93,7 +93,7 @@ def find_gap(
     lacks = _lacks(data.machine, found.judged)
     unknown = None
     if failed or learned:
-        unknown = describe(data.machine, lacks, learned, improved, before[0].run)
+        unknown = describe(lacks, learned, improved)
     laws, units = _laws(data, patched)
     tell("done", 1.0)
     return Gap(
@@ -265,9 +265,7 @@ def _chances(found: Found, index: int, rest: Judged) -> tuple[float, tuple[Alter
 def _prediction(track: Track, data: Dataset) -> Prediction:
     run = track.run
     clock = run.start + run.period * np.arange(len(run.command))
-    return Prediction(
-        run.name, clock, data.channels, track.predicted, run.reading, track.whitened
-    )
+    return Prediction(run.name, clock, data.channels, track.predicted, run.reading, track.whitened)
 
 
 def _lacks(machine: Machine, judged: Judged) -> tuple[Lack, ...]:

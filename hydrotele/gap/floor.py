@@ -36,7 +36,11 @@ def clean_run(machine: Machine, data: Dataset, run: RunData, start: np.ndarray, 
         model, space, start.copy(), run.command, run.period,
         max(1, round(run.period / (0.5 * STEP))), shown, states,
     )  # fmt: skip
-    noise = np.random.default_rng(seed).uniform(-1.0, 1.0, shown.shape) * np.sqrt(3.0) * data.noise_of(run)
+    noise = (
+        np.random.default_rng(seed).uniform(-1.0, 1.0, shown.shape)
+        * np.sqrt(3.0)
+        * data.noise_of(run)
+    )
     reading = np.where(np.isnan(run.reading), np.nan, shown + noise)
     return replace(run, reading=reading)
 

@@ -69,7 +69,9 @@ def _values(tracks: Sequence[Track]) -> list[np.ndarray]:
     ]
 
 
-def _measures(whitened: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _measures(
+    whitened: np.ndarray, period: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Per channel (c,): rows with a reading, mean square, window means, autocorrelation."""
     w, window = settled(whitened, period), max(2, round(_WINDOW / period))
     there = np.isfinite(w)

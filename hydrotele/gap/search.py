@@ -118,8 +118,10 @@ def search(
                 candidates = [c for c in candidates if c.key != added.key]
                 refused += 1
                 continue
-        if not _calibration_of(now.guess) and lacking(grown, evidence) > LACKING and (
-            best is None or not tried
+        if (
+            not _calibration_of(now.guess)
+            and lacking(grown, evidence) > LACKING
+            and (best is None or not tried)
         ):
             tell("calibrate the uncertain numbers", done + 0.04)
             tried = True
@@ -132,7 +134,7 @@ def search(
                 evidence.set_base(grown)
         if best is None:
             break
-        for part in grown.guess.parts[len(now.guess.parts):]:
+        for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = ranked
         now, fit = grown, settled
         now, fit = _promoted(evidence, now, fit, candidates)
@@ -260,7 +262,7 @@ def _best_pair(
         kept = evidence.base_slopes(_MIDDLE, parallel=False)
         before = _loss_of(evidence, now.guess, _MIDDLE)
         found = evidence.fit(more, before, parallel=False, step=_MIDDLE, kept=kept)
-        sizes = sum(h.size for h, _ in more.parts[len(now.guess.parts):])
+        sizes = sum(h.size for h, _ in more.parts[len(now.guess.parts) :])
         return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
                    found.information)  # fmt: skip
 

@@ -172,9 +172,8 @@ def track_run(
         rows = min(max(2, round(_LOOK / run.period)), len(run.command))
         first, part = run.part(0, rows), columns[:rows]
         rest = find_rest(
-            lambda r: _cross(
-                machine, model, data, first, None, step, r, levels, part, noise
-            ).loss, play,
+            lambda r: _cross(machine, model, data, first, None, step, r, levels, part, noise).loss,
+            play,
         )
     return _cross(machine, model, data, run, kept, step, rest, levels, columns, noise, linearise)
 

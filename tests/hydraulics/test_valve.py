@@ -20,7 +20,9 @@ from hydrotele.machine import Supply
 from hydrotele.machine_file import load_machine
 
 CAT = load_machine("cat215", "none")
-TANK, SMOOTHING, BOOM = 0.3e6, 5.0e4, list(CAT.hydraulic_axes).index("boom")
+CYLINDER = CAT.axes["boom"].cylinder
+assert CYLINDER
+TANK, SMOOTHING = 0.3e6, 5.0e4
 CURVE = {"travel": (0.0, 0.2, 0.5, 1.0), "opening": (0.0, 0.02, 0.3, 0.8)}
 
 
@@ -299,8 +301,8 @@ def test_chambers_keep_their_volume_beyond_the_ends():
         swept = user[Slot.AREA_HEAD if v < 0 else Slot.AREA_ROD] * abs(v)
         assert squeezed == pytest.approx(32e6 + swept / 1e-9, rel=0.01), "over the port relief"
         np.testing.assert_array_equal(
-            CAT.axes["boom"].cylinder.volumes(np.array([x])),
-            CAT.axes["boom"].cylinder.volumes(np.array([0.0 if x < 0 else 1.05])),
+            CYLINDER.volumes(np.array([x])),
+            CYLINDER.volumes(np.array([0.0 if x < 0 else 1.05])),
         )
 
 
@@ -316,6 +318,6 @@ def test_stroke_and_joint_range_end_the_travel():
     assert numbers["swing"][Slot.STOP_STIFFNESS] == 0.0, "it turns without end"
     low, high = numbers["boom"][Slot.STOP_LOW], numbers["boom"][Slot.STOP_HIGH]
     assert 0.0 < low < 0.1 and 1.04 < high < 1.05, "-42 .. 58 deg lie inside the stroke"
-    force = 28e6 * CAT.axes["boom"].cylinder.area_head
+    force = 28e6 * CYLINDER.area_head
     assert numbers["boom"][Slot.STOP_STIFFNESS] == pytest.approx(force / 1e-3)
     assert len(numbers["boom"]) == SLOTS

@@ -10,6 +10,8 @@ from hydrotele.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 
 EMPS = load_machine("emps")
+DRIVE = EMPS.axes["slide"].force
+assert DRIVE
 MASS, HIGH = 95.11, 0.28
 
 
@@ -26,12 +28,11 @@ def carriage(stiffness, damping, timestep):
 def test_a_force_presses_it_in_by_the_force_over_the_stiffness(stiffness):
     plant = carriage(stiffness, 2.0 * np.sqrt(stiffness * MASS), 1e-3)
     data = rest_state(plant, {"slide": 0.279})
-    volt = EMPS.axes["slide"].force.gain
     for _ in range(4000):
         data.ctrl[0] = 5.0
         mujoco.mj_step(plant.model, data)
     # the solver stops at a relative 1e-8 of the cost; MuJoCo's impedance ends at 0.9999
-    assert data.qpos[0] - HIGH == pytest.approx(5.0 * volt / stiffness, rel=1e-3)
+    assert data.qpos[0] - HIGH == pytest.approx(5.0 * DRIVE.gain / stiffness, rel=1e-3)
 
 
 def hit(plant, speed, end):
