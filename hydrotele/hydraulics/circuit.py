@@ -37,6 +37,7 @@ _FACTORS = 4 * MAX_AXES
 
 _ROS2 = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approximate Jacobian
 _NEWTON_STEPS = 60
+_NO_FLOWS = (0.0, 0.0, 0.0, 0.0)
 _FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the flow balance of 1e-6 that is promised
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
@@ -239,8 +240,6 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
 @compiled
 def _flows_of_terms(terms, i, user, time, x, v, spool, rate, p_head, p_rod, supply, command):
     """What the terms add to the flows of an axis, see `terms.table.added_flows`."""
-    if terms is None:
-        return 0.0, 0.0, 0.0, 0.0
     u = i * SLOTS
     force = user[u + _AH] * p_head - user[u + _AR] * p_rod
     s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command, force)
@@ -289,10 +288,13 @@ def step_circuit(
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         x, v = length[first + i] - dt * velocity[first + i], velocity[first + i]
-        more = _flows_of_terms(
-            terms, first + i, user, time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3],
-            p_start, command[first + i],
-        )  # fmt: skip
+        more = _NO_FLOWS
+        if terms is not None:
+            if len(terms) > 0:
+                more = _flows_of_terms(
+                    terms, first + i, user, time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3],
+                    p_start, command[first + i],
+                )  # fmt: skip
         head, rod, j_head, j_rod = pressure_rates(
             user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3], x, v, dt, more,
         )  # fmt: skip
@@ -306,10 +308,13 @@ def step_circuit(
         k_head, k_rod = act_dot[a + 2], act_dot[a + 3]
         x, v = length[first + i], velocity[first + i]
         p_head, p_rod = act[a + 2] + dt * k_head, act[a + 3] + dt * k_rod
-        more = _flows_of_terms(
-            terms, first + i, user, time + dt, x, v, act_dot[a], act_dot[a + 1], p_head, p_rod,
-            p_end, command[first + i],
-        )  # fmt: skip
+        more = _NO_FLOWS
+        if terms is not None:
+            if len(terms) > 0:
+                more = _flows_of_terms(
+                    terms, first + i, user, time + dt, x, v, act_dot[a], act_dot[a + 1], p_head,
+                    p_rod, p_end, command[first + i],
+                )  # fmt: skip
         head, rod, _, _ = pressure_rates(
             user, u, scratch[a + 3], p_end, p_head, p_rod, x, v, 0.0, more,
         )  # fmt: skip

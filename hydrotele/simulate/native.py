@@ -158,7 +158,9 @@ def _compile_callbacks():
         dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
         time = carray(pointer(d + d_time), (1,), np.float64)[0]
         scratch = carray(_stack(0), (2 * SCRATCH,), np.float64)
-        terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
+        terms = floats(m, 0)
+        if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
+            terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
         if len(terms) > 0 and first == 0:
             given = scratch[SCRATCH:]
             add_to_commands(
@@ -196,7 +198,9 @@ def _compile_callbacks():
             rate = carray(pointer(at_act_dot + start), (4,), np.float64)
             drive = user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
             drive -= user[u + _AREA_ROD] * (act[3] + dt * rate[3])
-        terms, steep = _terms_of(m, m_nnumeric, m_at, m_size, m_data), 0.0
+        terms, steep = floats(m, 0), 0.0
+        if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
+            terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
         gain = _gain(m, i, m_gainprm) if user[u + _KIND] > 2.0 else 0.0
         if len(terms) > 0:
             s = _state(
