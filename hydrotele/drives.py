@@ -75,9 +75,13 @@ class Cylinder(Facts):
         return self.area_head, self.area_rod
 
     def volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Head and rod chamber volumes [m^3] at piston displacements x [m], any shape."""
-        left = self.stroke - x
-        return self.dead_volume + self.area_head * x, self.dead_volume + self.area_rod * left
+        """Head and rod chamber volumes [m^3] at piston displacements x [m], any shape.
+
+        Beyond an end of the stroke they stay what they are at that end.
+        """
+        inside = np.clip(x, 0.0, self.stroke)
+        left = self.stroke - inside
+        return self.dead_volume + self.area_head * inside, self.dead_volume + self.area_rod * left
 
 
 class Motor(Facts):
@@ -110,18 +114,110 @@ class ForceDrive(Facts):
     offset: float = 0.0
 
 
+class FlowCurve(Facts):
+    """Opening [1] over spool travel beyond the dead band [1], linear between 2 to 8 knots.
+
+    Travel goes from 0 to 1; opening begins at 0, never falls, and is 1 where the rated flow is.
+    """
+
+    travel: tuple[float, ...]
+    opening: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _check(self):
+        travel, opening = self.travel, self.opening
+        if not 2 <= len(travel) <= 8 or len(opening) != len(travel):
+            raise ValueError(
+                f"needs 2 to 8 knots of travel and as many of opening; has {len(travel)} and"
+                f" {len(opening)}"
+            )
+        if travel[0] != 0.0 or travel[-1] != 1.0 or np.any(np.diff(travel) <= 0.0):
+            raise ValueError(f"travel {travel} must rise from 0 to 1")
+        if opening[0] != 0.0 or np.any(np.diff(opening) < 0.0) or opening[-1] == 0.0:
+            raise ValueError(f"opening {opening} must begin at 0, never fall, and end above 0")
+        return self
+
+
+class Metering(Facts):
+    """One direction of a spool: its dead band, the gains of its two edges, its flow curve.
+
+    `inlet` and `outlet` [1] scale the flow gain from the pump into the fed chamber (P-A or P-B) and
+    from the other one to tank (B-T or A-T). Without a dead band of its own it has the valve's.
+    """
+
+    deadband: Annotated[float, Field(ge=0, lt=1)] | None = None
+    inlet: Positive = 1.0
+    outlet: Positive = 1.0
+    curve: FlowCurve | None = None
+
+
 class Valve(Facts):
-    """A spool valve: rated_flow [m^3/s] at rated_pressure_drop [Pa], bandwidth [rad/s]."""
+    """A spool valve: rated_flow [m^3/s] at rated_pressure_drop [Pa], bandwidth [rad/s].
+
+    `slew_limit` [1/s] is the fastest that its spool can move. With `compensation: pressure` the
+    drop over the inlet edge never exceeds `compensated_drop` [Pa] (the rated one, if not given), so
+    that the flow follows the opening whatever the load, as long as the supply suffices.
+    `positive` and `negative` say how the two directions of travel differ; a positive command feeds
+    the head side.
+    """
 
     rated_flow: Positive
     rated_pressure_drop: Positive = 7.0e6
     deadband: Annotated[float, Field(ge=0, lt=1)] = 0.0
     bandwidth: Positive
     damping: Positive = 0.9
+    slew_limit: Positive | None = None
+    compensation: Literal["none", "pressure"] = "none"
+    compensated_drop: Positive | None = None
+    positive: Metering = Metering()
+    negative: Metering = Metering()
     port_relief: Positive = 32.0e6
     smoothing: Positive = 5.0e4
     port_relief_gain: NonNegative = 1.0e-9
     makeup_gain: NonNegative = 5.0e-9
+
+    @property
+    def deadbands(self) -> tuple[float, float]:
+        """Dead band in the positive and in the negative direction [1]."""
+        own = (self.positive.deadband, self.negative.deadband)
+        forward, backward = (self.deadband if d is None else d for d in own)
+        return forward, backward
+
+    @property
+    def held_drop(self) -> float:
+        """Pressure drop that the compensator holds over the inlet edge [Pa], 0 without one."""
+        if self.compensation == "none":
+            return 0.0
+        return self.compensated_drop or self.rated_pressure_drop
+
+
+class Counterbalance(Facts):
+    """A load-holding valve at a chamber: oil leaves only when p + pilot_ratio p_pilot > setting.
+
+    `setting` [Pa]; p_pilot is the pressure of the other chamber; `override` [1] is the fraction of
+    the setting beyond it at which the valve is fully open. Oil enters freely through its check.
+    """
+
+    setting: Positive
+    pilot_ratio: NonNegative = 3.0
+    override: Positive = 0.2
+
+
+class LoadHolding(Facts):
+    """Counterbalance valves at the head and the rod side of a drive."""
+
+    head: Counterbalance | None = None
+    rod: Counterbalance | None = None
+
+
+class EndStop(Facts):
+    """What a drive meets at the ends of its travel: a spring [N/m] or [N m/rad] and a damper.
+
+    The damper [N s/m] or [N m s/rad] works only while the spring is pressed, and never pulls.
+    """
+
+    stiffness: Positive
+    damping: NonNegative
 
 
 class FourBar(Facts):
@@ -149,7 +245,8 @@ class Transmission(Facts):
 class Axis(Facts):
     """One driven joint with exactly one of cylinder, motor or force.
 
-    `command_delay` [s] passes before a command reaches the valve or the drive.
+    `command_delay` [s] passes before a command reaches the valve or the drive. Without an
+    `end_stop` the machine's own estimate holds (`Machine.end_stop`).
     """
 
     joint: Name
@@ -160,6 +257,8 @@ class Axis(Facts):
     four_bar: FourBar | None = None
     command_delay: NonNegative = 0.0
     transmission: Transmission | None = None
+    load_holding: LoadHolding = LoadHolding()
+    end_stop: EndStop | None = None
 
     @model_validator(mode="after")
     def _check(self):
@@ -168,6 +267,8 @@ class Axis(Facts):
             raise ValueError(f"needs exactly one of cylinder, motor, force; has {drives or 'none'}")
         if (self.force is None) == (self.valve is None):
             raise ValueError("a cylinder or motor needs a valve; a plain force drive has none")
+        if self.force and self.load_holding != LoadHolding():
+            raise ValueError("a plain force drive has no oil for load_holding valves to hold")
         if self.four_bar and not self.cylinder:
             raise ValueError("a four_bar linkage is moved by a cylinder")
         return self

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from hydrotele.datafile import Facts, Name, NonNegative, Positive, Vector, suggest
-from hydrotele.drives import Axis, Pin
+from hydrotele.drives import Axis, EndStop, Pin
 from hydrotele.sensors import SensorError, SensorSet
 
 
@@ -60,16 +60,44 @@ class Closure(Facts):
     b: Pin
 
 
-class Supply(Facts):
-    """Pump and tank shared by all valves; pressures [Pa], flow [m^3/s], bulk modulus [Pa]."""
+UNLIMITED_FLOW = 1.0e3  # m^3/s, beyond any demand: the flow of a supply without a limit
+_STOP_GIVES = 1.0e-3  # m: what tube, gland and pins stretch under a cylinder's largest force
+_STOP_TURNS = 2.0e-3  # rad: the same of a slewing or rotating drive
+_STOP_RETARDATION = 5.0e-3  # s: 75 rad/s of a boom on its stop then decay within two swings
 
+
+class Supply(Facts):
+    """Pump and tank shared by all valves; pressures [Pa], flow [m^3/s], bulk modulus [Pa].
+
+    `constant_flow`: the pump gives `pump_flow`; what the valves do not draw goes over the relief
+    valve. `load_sensing`: it holds the highest load pressure plus `load_sensing_margin`, as far as
+    `pump_flow` and `relief_pressure` allow. `constant_pressure`: it holds `relief_pressure`
+    whatever is drawn. `pump_droop` [m^3/(s Pa)] is by how much its flow falls with its pressure.
+    """
+
+    kind: Literal["constant_flow", "load_sensing", "constant_pressure"] = "constant_flow"
     relief_pressure: Positive
     tank_pressure: NonNegative
-    pump_flow: Positive
+    pump_flow: Positive = UNLIMITED_FLOW
+    pump_droop: NonNegative = 0.0
+    load_sensing_margin: Positive = 2.0e6
     bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
 
     @model_validator(mode="after")
     def _check(self):
+        if self.kind == "constant_pressure":
+            if self.pump_flow != UNLIMITED_FLOW or self.pump_droop:
+                raise ValueError(
+                    "a constant_pressure supply has no pump_flow and no pump_droop: leave them out,"
+                    " or choose kind constant_flow or load_sensing"
+                )
+        elif self.pump_flow >= UNLIMITED_FLOW:
+            raise ValueError(f"pump_flow is missing; a {self.kind} supply needs it")
+        if self.pump_droop * self.relief_pressure >= self.pump_flow:
+            raise ValueError(
+                f"pump_droop {self.pump_droop:g} m^3/(s Pa) leaves nothing of pump_flow"
+                f" {self.pump_flow:g} m^3/s at relief_pressure {self.relief_pressure:g} Pa"
+            )
         if self.tank_pressure >= self.relief_pressure:
             raise ValueError(
                 f"tank_pressure {self.tank_pressure:g} Pa is not below relief_pressure"
@@ -138,6 +166,27 @@ class Machine(Facts):
     def position_kind(self, axis: str) -> str:
         """`angle` for a hinge axis, `position` for a slide."""
         return "angle" if self.joints[self.axes[axis].joint].type == "hinge" else "position"
+
+    def end_stop(self, axis: str) -> EndStop | None:
+        """What the drive of an axis meets at the ends of its travel; None where it has no ends.
+
+        Where the machine does not say, the drive's largest force presses the stop in by 1 mm, or
+        2 mrad, which is what tube, gland and pins of a heavy cylinder stretch under it.
+        """
+        facts = self.axes[axis]
+        joint = self.joints[facts.joint]
+        if facts.cylinder is None and joint.range is None:
+            return None
+        if facts.end_stop or (facts.force and not facts.force.gain):
+            return facts.end_stop
+        if facts.force:
+            most = abs(facts.force.gain) * facts.force.command_limit
+        else:
+            assert self.supply
+            most = self.supply.relief_pressure * facts.hydraulic_drive.areas[0]
+        turns = facts.cylinder is None and joint.type == "hinge"
+        stiffness = most / (_STOP_TURNS if turns else _STOP_GIVES)
+        return EndStop(stiffness=stiffness, damping=_STOP_RETARDATION * stiffness)
 
     @property
     def sensed_channels(self) -> tuple[str, ...]:

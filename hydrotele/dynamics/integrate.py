@@ -29,13 +29,14 @@ from hydrotele.hydraulics.circuit import (
     Slot,
     actuator_friction,
     actuator_friction_slope,
+    actuator_stop,
+    circuit_supply,
     open_ports,
     step_circuit,
-    supply_pressure,
 )
 
-_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
+_STOP = int(Slot.STOP_STIFFNESS)
 
 
 @lean
@@ -100,8 +101,8 @@ def load_position(model, sp, i):
 def accelerate(model, sp, z, dt):
     """Linearly implicit acceleration over a kick; leaves the mechanism where `place` put it.
 
-    `a = (M + dt/2 D)^-1 (sum J' F - h)` with the slope D of friction and dampers, which is of
-    second order and stable however steep the friction is.
+    `a = (M + dt/2 D + dt^2/4 K)^-1 (sum J' F - h)` with the slope D of friction and dampers and the
+    stiffness K of end stops, which is of second order and stable however steep these are.
 
     Args:
         model: Model.
@@ -144,6 +145,11 @@ def accelerate(model, sp, z, dt):
             push, slope = spring, half * damping
             for f in range(n):
                 sp.mass[n + gear, f] -= slope * sp.row[i, f]
+        if user[u + _STOP] > 0.0:
+            at = sp.drive[X, i] if gear < 0 else load_position(model, sp, i)
+            stop, stiff, damped = actuator_stop(user, u, at, v)
+            push += stop
+            slope += half * (damped + half * stiff)
         for f in range(n):
             sp.force[f] += sp.row[i, f] * push
             for g in range(f + 1):
@@ -327,7 +333,7 @@ def supply_of(model, sp, z):
     user, count = model.user, model.hydraulic
     act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
     open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
-    return supply_pressure(sp.scratch, count, user[_D], user[_RELIEF], user[_PUMP])
+    return circuit_supply(user, 0, count, sp.scratch)
 
 
 @lean

@@ -6,7 +6,6 @@ its activations `spool, spool_rate, p_head, p_rod` at `act[4 i ...]`, counted fr
 hydraulic axis.
 """
 
-import enum
 import math
 
 import numpy as np
@@ -15,94 +14,24 @@ from hydrotele.compiled import compiled
 from hydrotele.hydraulics.laws import (
     friction,
     friction_slope,
-    orifice,
     port_flow,
     spool_step,
-    valve_opening,
+    stop_force,
 )
+from hydrotele.hydraulics.slots import SLOTS, Kind, Slot
+from hydrotele.hydraulics.valve import axis_opening, chamber_flows, inlet_flow, inlet_gain
 
-CURVE_KNOTS = 8  # of a valve's flow curve, per direction
+__all__ = [
+    "ACTIVATIONS", "MAX_AXES", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
+    "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_state", "chamber_flows",
+    "circuit_scratch", "circuit_supply", "open_ports", "pressure_rates", "step_circuit",
+    "supply_pressure",
+]  # fmt: skip
 
-
-class Slot(enum.IntEnum):
-    """Places of an actuator's numbers in `actuator_user`, all SI; a new number is a new line.
-
-    CURVES, the last, begins two flow curves, of the positive and of the negative direction: number
-    of knots (0: straight), CURVE_KNOTS travels and CURVE_KNOTS openings each.
-    """
-
-    @staticmethod
-    def _generate_next_value_(name, start, count, last_values):
-        return count
-
-    MARKER = enum.auto()
-    KIND = enum.auto()
-    FIRST = enum.auto()
-    COUNT = enum.auto()
-    AREA_HEAD = enum.auto()
-    AREA_ROD = enum.auto()
-    VOLUME_HEAD = enum.auto()
-    VOLUME_ROD = enum.auto()
-    STROKE = enum.auto()
-    LEAKAGE = enum.auto()
-    BANDWIDTH = enum.auto()
-    DAMPING = enum.auto()
-    DEADBAND = enum.auto()
-    FLOW_GAIN = enum.auto()
-    ORIFICE_SMOOTHING = enum.auto()
-    PORT_RELIEF = enum.auto()
-    RELIEF_GAIN = enum.auto()
-    MAKEUP_GAIN = enum.auto()
-    BULK_MODULUS = enum.auto()
-    TANK_PRESSURE = enum.auto()
-    RELIEF_PRESSURE = enum.auto()
-    PUMP_FLOW = enum.auto()
-    COULOMB = enum.auto()
-    STRIBECK = enum.auto()
-    STRIBECK_VELOCITY = enum.auto()
-    VISCOUS = enum.auto()
-    COULOMB_VELOCITY = enum.auto()
-    OFFSET = enum.auto()
-    COULOMB_ASYMMETRY = enum.auto()
-    VISCOUS_ASYMMETRY = enum.auto()
-    HOSE_COMPLIANCE = enum.auto()
-    DRIVE_INERTIA = enum.auto()
-    DEADBAND_NEGATIVE = enum.auto()
-    SLEW_LIMIT = enum.auto()
-    METERING_PA = enum.auto()
-    METERING_BT = enum.auto()
-    METERING_PB = enum.auto()
-    METERING_AT = enum.auto()
-    COMPENSATED_DROP = enum.auto()
-    HOLDING_HEAD = enum.auto()
-    HOLDING_HEAD_RATIO = enum.auto()
-    HOLDING_HEAD_RANGE = enum.auto()
-    HOLDING_ROD = enum.auto()
-    HOLDING_ROD_RATIO = enum.auto()
-    HOLDING_ROD_RANGE = enum.auto()
-    LOAD_SENSING_MARGIN = enum.auto()
-    PUMP_DROOP = enum.auto()
-    STOP_LOW = enum.auto()
-    STOP_HIGH = enum.auto()
-    STOP_STIFFNESS = enum.auto()
-    STOP_DAMPING = enum.auto()
-    CURVES = enum.auto()
-
-
-CURVE = 1 + 2 * CURVE_KNOTS  # numbers of one flow curve
-SLOTS = Slot.CURVES + 2 * CURVE
 ACTIVATIONS = 4
 MAX_AXES = 8
-SCRATCH = 4 * MAX_AXES
-
-
-class Kind(enum.IntEnum):
-    """What an actuator is: a cylinder, a rotary motor or a plain force drive with friction."""
-
-    CYLINDER = 1
-    MOTOR = 2
-    FORCE = 3
-
+SCRATCH = 8 * MAX_AXES  # ports, then the factors of the pressures
+_FACTORS = 4 * MAX_AXES
 
 _ROS2 = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approximate Jacobian
 _NEWTON_STEPS = 60
@@ -112,35 +41,41 @@ _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _VH, _VR = int(Slot.VOLUME_HEAD), int(Slot.VOLUME_ROD)
 _STROKE, _LEAK = int(Slot.STROKE), int(Slot.LEAKAGE)
 _W, _Z = int(Slot.BANDWIDTH), int(Slot.DAMPING)
-_DB, _K = int(Slot.DEADBAND), int(Slot.FLOW_GAIN)
+_SLEW, _DROP = int(Slot.SLEW_LIMIT), int(Slot.COMPENSATED_DROP)
 _D, _PORT = int(Slot.ORIFICE_SMOOTHING), int(Slot.PORT_RELIEF)
 _KR, _KM = int(Slot.RELIEF_GAIN), int(Slot.MAKEUP_GAIN)
 _BETA, _TANK = int(Slot.BULK_MODULUS), int(Slot.TANK_PRESSURE)
 _RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
+_MARGIN, _DROOP = int(Slot.LOAD_SENSING_MARGIN), int(Slot.PUMP_DROOP)
 _FC, _FS = int(Slot.COULOMB), int(Slot.STRIBECK)
 _VS, _B = int(Slot.STRIBECK_VELOCITY), int(Slot.VISCOUS)
 _V0, _AC = int(Slot.COULOMB_VELOCITY), int(Slot.COULOMB_ASYMMETRY)
 _AV, _HOSE = int(Slot.VISCOUS_ASYMMETRY), int(Slot.HOSE_COMPLIANCE)
+_LOW, _HIGH = int(Slot.STOP_LOW), int(Slot.STOP_HIGH)
+_HARD, _SOFT = int(Slot.STOP_STIFFNESS), int(Slot.STOP_DAMPING)
 
 
 @compiled
-def supply_pressure(ports, count, smoothing, relief, pump_flow):
+def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0):
     """Largest pressure up to the relief setting at which the valves draw no more than the pump.
 
-    Solves `sum_i k_i g(p_s - p_i) = Q_pump` over the valves whose load check is open, by Newton's
-    method in `sqrt(p_s - min p_i)` inside a bracket, which is halved where Newton fails.
+    Solves `sum_i k_i g(min(p_s - p_i, d_i)) = Q_pump - c_p p_s` over the valves whose load check is
+    open, by Newton's method in `sqrt(p_s - min p_i)` inside a bracket, which is halved where Newton
+    fails.
 
     Args:
-        ports: (>= 4 count,) per axis `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa] and two unused places.
+        ports: (>= 4 count,) per axis `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa], the drop `d_i` that
+            its compensator holds [Pa], 0 without one, and a place that is not read.
         count: number of axes.
         smoothing: orifice smoothing d, scalar [Pa].
         relief: relief setting, scalar [Pa].
         pump_flow: Q_pump, scalar [m^3/s].
+        droop: c_p, by which the pump's flow falls with its pressure, scalar [m^3/(s Pa)].
 
     Returns:
         p_s, scalar [Pa].
 
-    Source: nominal model, "Supply".
+    Source: nominal model, "Supply"; droop: leakage of a pump, Merritt 1967, section 4.
 
     >>> import numpy as np
     >>> one_valve = np.array([2.0e-6, 5.0e6, 0.0, 0.0])
@@ -157,10 +92,13 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow):
         for i in range(count):
             drop = p - ports[4 * i + 1]
             if drop > 0.0 and ports[4 * i] > 0.0:
-                flow, gain = orifice(drop, ports[4 * i], smoothing)
+                flow, gain = inlet_flow(drop, ports[4 * i], smoothing, ports[4 * i + 2])
                 demand += flow
                 slope += gain
         excess = demand - pump_flow
+        if droop > 0.0:
+            excess += droop * p
+            slope += droop
         if excess > 0.0:
             high = p
         elif p == relief:
@@ -188,7 +126,8 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
         user: (nu * SLOTS,) actuator numbers.
         act: (4 count,) activations; pressures [Pa].
         spool: (4 count,) array whose every fourth entry is the spool position to use [1].
-        ports: (>= 4 count,) written: `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa].
+        ports: (>= 4 count,) written: `k_i` [m^3/(s sqrt(Pa))], `p_i` and `d_i` [Pa], opening
+            [1].
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ahead: time to look ahead with `rate`, scalar [s].
@@ -201,8 +140,9 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
     """
     for i in range(count):
         u = (first + i) * SLOTS
-        opening = valve_opening(spool[4 * i], user[u + _DB])
-        ports[4 * i] = user[u + _K] * abs(opening)
+        opening = axis_opening(user, u, spool[4 * i])
+        ports[4 * i] = inlet_gain(user, u, opening)
+        ports[4 * i + 2], ports[4 * i + 3] = user[u + _DROP], opening
         side = 2 if opening > 0.0 else 3
         ports[4 * i + 1] = act[4 * i + side]
         if ahead != 0.0:
@@ -210,39 +150,32 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
 
 
 @compiled
-def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
-    """Valve flows into both chambers of an axis and their slopes.
+def circuit_supply(user, first, count, ports):
+    """Supply pressure of a circuit: what pump and relief give, or what load sensing asks for.
 
-    With o > 0 the head side is fed through its load check and the rod side drains to tank; with
-    o < 0 the other way round.
+    A load-sensing pump holds `max p_i + margin` over the open valves (tank pressure counts as a
+    load), as far as relief setting and flow allow.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
-        opening: o, scalar [1].
-        p_supply: scalar [Pa].
-        p_head: scalar [Pa].
-        p_rod: scalar [Pa].
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        ports: (>= 4 count,) as `open_ports` writes it.
 
     Returns:
-        (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]).
+        p_s, scalar [Pa].
 
-    Source: nominal model, "Orifice".
+    Source: nominal model, "Supply".
     """
-    if opening == 0.0:
-        return 0.0, 0.0, 0.0, 0.0
-    gain, smoothing = user[u + _K] * abs(opening), user[u + _D]
-    tank = user[u + _TANK]
-    q_in, slope_in = 0.0, 0.0
-    if opening > 0.0:
-        if p_supply > p_head:
-            q_in, slope_in = orifice(p_supply - p_head, gain, smoothing)
-        q_out, slope_out = orifice(p_rod - tank, gain, smoothing)
-        return q_in, -q_out, -slope_in, -slope_out
-    if p_supply > p_rod:
-        q_in, slope_in = orifice(p_supply - p_rod, gain, smoothing)
-    q_out, slope_out = orifice(p_head - tank, gain, smoothing)
-    return -q_out, q_in, -slope_out, -slope_in
+    s = first * SLOTS
+    most = user[s + _RELIEF]
+    if user[s + _MARGIN] > 0.0:
+        load = user[s + _TANK]
+        for i in range(count):
+            if ports[4 * i] > 0.0:
+                load = max(load, ports[4 * i + 1])
+        most = min(most, load + user[s + _MARGIN])
+    return supply_pressure(ports, count, user[s + _D], most, user[s + _PUMP], user[s + _DROOP])
 
 
 @compiled
@@ -250,7 +183,8 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
     """Pressure rates of both chambers and their slopes with respect to their own pressure.
 
     `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`,
-    where a hose of compliance C_h counts as `beta C_h` of volume.
+    where a hose of compliance C_h counts as `beta C_h` of volume. Beyond an end of the stroke the
+    volumes stay what they are at that end.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
@@ -279,8 +213,9 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
     swept_head, swept_rod = user[u + _AH], user[u + _AR]
     volume_head, volume_rod = user[u + _VH], user[u + _VR]
     if user[u + 1] == 1.0:  # Kind.CYLINDER
-        volume_head += swept_head * x
-        volume_rod += swept_rod * (user[u + _STROKE] - x)
+        inside = min(max(x, 0.0), user[u + _STROKE])
+        volume_head += swept_head * inside
+        volume_rod += swept_rod * (user[u + _STROKE] - inside)
     hose = beta * user[u + _HOSE]
     head, rod = beta / (volume_head + hose), beta / (volume_rod + hose)
     rate_head = head * (q_head - swept_head * v - leak + r_head)
@@ -328,34 +263,32 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
         u, a = (first + i) * SLOTS, 4 * i
         bounded = min(1.0, max(-1.0, command[first + i]))
         act_dot[a], act_dot[a + 1] = spool_step(
-            act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt
+            act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]
         )
-    shared = first * SLOTS
-    relief, pump, smoothing = user[shared + _RELIEF], user[shared + _PUMP], user[shared + _D]
     open_ports(user, act, act, scratch, first, count, 0.0, act_dot)
-    p_start = supply_pressure(scratch, count, smoothing, relief, pump)
+    p_start = circuit_supply(user, first, count, scratch)
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         head, rod, j_head, j_rod = pressure_rates(
-            user, u, valve_opening(act[a], user[u + _DB]), p_start, act[a + 2], act[a + 3],
+            user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3],
             length[first + i] - dt * velocity[first + i], velocity[first + i], dt,
         )  # fmt: skip
-        scratch[a + 2] = 1.0 / (1.0 - gamma_h * j_head)
-        scratch[a + 3] = 1.0 / (1.0 - gamma_h * j_rod)
-        act_dot[a + 2] = head * scratch[a + 2]
-        act_dot[a + 3] = rod * scratch[a + 3]
+        f = _FACTORS + a
+        scratch[f], scratch[f + 1] = 1.0 / (1.0 - gamma_h * j_head), 1.0 / (1.0 - gamma_h * j_rod)
+        act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
     open_ports(user, act, act_dot, scratch, first, count, dt, act_dot)
-    p_end = supply_pressure(scratch, count, smoothing, relief, pump)
+    p_end = circuit_supply(user, first, count, scratch)
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         k_head, k_rod = act_dot[a + 2], act_dot[a + 3]
         head, rod, _, _ = pressure_rates(
-            user, u, valve_opening(act_dot[a], user[u + _DB]), p_end,
+            user, u, scratch[a + 3], p_end,
             act[a + 2] + dt * k_head, act[a + 3] + dt * k_rod,
             length[first + i], velocity[first + i], 0.0,
         )  # fmt: skip
-        act_dot[a + 2] = 1.5 * k_head + 0.5 * scratch[a + 2] * (head - 2.0 * k_head)
-        act_dot[a + 3] = 1.5 * k_rod + 0.5 * scratch[a + 3] * (rod - 2.0 * k_rod)
+        f = _FACTORS + a
+        act_dot[a + 2] = 1.5 * k_head + 0.5 * scratch[f] * (head - 2.0 * k_head)
+        act_dot[a + 3] = 1.5 * k_rod + 0.5 * scratch[f + 1] * (rod - 2.0 * k_rod)
         act_dot[a] = (act_dot[a] - act[a]) / dt
         act_dot[a + 1] = (act_dot[a + 1] - act[a + 1]) / dt
     return p_start, p_end
@@ -408,6 +341,29 @@ def actuator_friction_slope(user, u, velocity):
 
 
 @compiled
+def actuator_stop(user, u, position, velocity):
+    """Force of the ends of an actuator's travel, and its slopes.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        u: place of this actuator in `user`.
+        position: of the load side, scalar [m] or [rad].
+        velocity: of the load side, scalar [m/s] or [rad/s].
+
+    Returns:
+        (force towards the inside [N] or [N m], its stiffness [N/m] or [N m/rad], its damping
+        [N s/m] or [N m s/rad]); all 0 inside.
+
+    Source: `laws.stop_force`.
+    """
+    if user[u + _HARD] == 0.0:
+        return 0.0, 0.0, 0.0
+    return stop_force(
+        position, velocity, user[u + _LOW], user[u + _HIGH], user[u + _HARD], user[u + _SOFT]
+    )
+
+
+@compiled
 def axis_state(user, i, supply, act, x, v):
     """Flows and force of one axis in a state, for logs and balances.
 
@@ -425,7 +381,7 @@ def axis_state(user, i, supply, act, x, v):
     Source: nominal model, "Orifice" and "Piston force".
     """
     u = i * SLOTS
-    opening = valve_opening(act[0], user[u + _DB])
+    opening = axis_opening(user, u, act[0])
     q_head, q_rod, _, _ = chamber_flows(user, u, opening, supply, act[2], act[3])
     force = user[u + _AH] * act[2] - user[u + _AR] * act[3] - actuator_friction(user, u, v)
     return q_head, q_rod, force

@@ -90,6 +90,67 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
 
 
 @compiled
+def holding_share(pressure, pilot, setting, pilot_ratio, override):
+    """Share of the outlet that a counterbalance valve leaves open, and its slope.
+
+    `(p + R p_pilot - p_set) / p_o` between 0 and 1; oil into the chamber passes its check freely.
+
+    Args:
+        pressure: p of the held chamber, scalar [Pa].
+        pilot: p_pilot of the chamber being fed, scalar [Pa].
+        setting: p_set, scalar [Pa].
+        pilot_ratio: R, scalar [1].
+        override: p_o, pressure beyond the setting that opens it fully, scalar [Pa], > 0.
+
+    Returns:
+        (share [1], d share/dp [1/Pa]).
+
+    Source: static characteristic of a pilot-assisted relief valve, as in makers' data sheets.
+
+    >>> holding_share(10.0e6, 5.0e6, 24.0e6, 3.0, 4.0e6)
+    (0.25, 2.5e-07)
+    """
+    share = (pressure + pilot_ratio * pilot - setting) / override
+    if share <= 0.0:
+        return 0.0, 0.0
+    if share >= 1.0:
+        return 1.0, 0.0
+    return share, 1.0 / override
+
+
+@compiled
+def stop_force(position, velocity, low, high, stiffness, damping):
+    """Force of an end stop: a spring and a damper that push and never pull.
+
+    `F = max(0, k (x_low - x) - c v)` below the lower end, `-max(0, k (x - x_high) + c v)` above the
+    upper one, 0 between.
+
+    Args:
+        position: x, scalar [m] or [rad].
+        velocity: v, scalar [m/s] or [rad/s].
+        low: x_low, scalar [m] or [rad].
+        high: x_high, scalar [m] or [rad].
+        stiffness: k, scalar [N/m] or [N m/rad].
+        damping: c, scalar [N s/m] or [N m s/rad].
+
+    Returns:
+        (F [N] or [N m], -dF/dx [N/m] or [N m/rad], -dF/dv [N s/m] or [N m s/rad]).
+
+    Source: Kelvin-Voigt contact without adhesion.
+
+    >>> stop_force(1.001, 0.0, 0.0, 1.0, 1.0e8, 1.0e5)[1:]
+    (100000000.0, 100000.0)
+    """
+    if low <= position <= high:
+        return 0.0, 0.0, 0.0
+    end = low if position < low else high
+    force = -stiffness * (position - end) - damping * velocity
+    if (force > 0.0) != (position < low):
+        return 0.0, 0.0, 0.0
+    return force, stiffness, damping
+
+
+@compiled
 def friction(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
@@ -164,8 +225,8 @@ def friction_slope(
 
 
 @compiled
-def spool_step(spool, spool_rate, command, bandwidth, damping, dt):
-    """One step of the spool `s'' = w^2 (u - s) - 2 z w s'` with the command held.
+def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.0):
+    """One step of the spool `s'' = w^2 (u - s) - 2 z w s'`, `|s'| <= s_max`, with the command held.
 
     The exact exponential is cut after its fourth power of `w dt`: for z <= 1 the error is below
     `(w dt)^5 / 30` of `u - s` per step (1.1e-8 for 8 Hz and 1 ms). For `w dt > 0.5` the step is
@@ -178,6 +239,7 @@ def spool_step(spool, spool_rate, command, bandwidth, damping, dt):
         bandwidth: w, natural frequency, scalar [rad/s].
         damping: z, scalar [1].
         dt: step, scalar [s].
+        slew_limit: s_max, what the pilot stage can do, scalar [1/s]; 0 for no limit.
 
     Returns:
         (s, s') at the end of the step.
@@ -194,10 +256,14 @@ def spool_step(spool, spool_rate, command, bandwidth, damping, dt):
     c = 2.0 * damping * bandwidth
     e, v = spool - command, spool_rate
     for _ in range(parts):
+        e0, v0 = e, v
         e1, v1 = v, -w2 * e - c * v
         e2, v2 = v1, -w2 * e1 - c * v1
         e3, v3 = v2, -w2 * e2 - c * v2
         v4 = -w2 * e3 - c * v3
         e += h * (e1 + h * (e2 / 2 + h * (e3 / 6 + h * v3 / 24)))
         v += h * (v1 + h * (v2 / 2 + h * (v3 / 6 + h * v4 / 24)))
+        if slew_limit > 0.0 and abs(v) > slew_limit:
+            v = math.copysign(slew_limit, v)
+            e = e0 + 0.5 * h * (min(max(v0, -slew_limit), slew_limit) + v)
     return e + command, v

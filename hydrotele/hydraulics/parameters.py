@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
-from hydrotele.drives import Axis
-from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
+from hydrotele.drives import Axis, Counterbalance, FlowCurve, Valve
+from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS, SLOTS, Kind, Slot
+from hydrotele.kinematics.from_machine import drive_travel
 from hydrotele.machine import Machine, Supply
 
 MARKER = 215325.0  # CAT 215, CAT 325: no other model writes this into actuator_user[0]
@@ -33,6 +34,7 @@ def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
         numbers[Slot.MARKER] = MARKER
         numbers[Slot.COUNT] = count if axis.hydraulic else 0
         _write_friction(numbers, axis)
+        _write_end_stop(numbers, machine, name)
         if axis.transmission:
             numbers[Slot.DRIVE_INERTIA] = axis.transmission.inertia
         if axis.hydraulic and machine.supply:
@@ -55,6 +57,13 @@ def _write_friction(numbers: np.ndarray, axis: Axis) -> None:
     numbers[Slot.VISCOUS_ASYMMETRY] = friction.viscous_asymmetry
 
 
+def _write_end_stop(numbers: np.ndarray, machine: Machine, name: str) -> None:
+    stop, travel = machine.end_stop(name), drive_travel(machine, name)
+    if stop and travel:
+        numbers[Slot.STOP_LOW], numbers[Slot.STOP_HIGH] = travel
+        numbers[Slot.STOP_STIFFNESS], numbers[Slot.STOP_DAMPING] = stop.stiffness, stop.damping
+
+
 def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     valve = axis.valve
     assert valve is not None
@@ -65,14 +74,49 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     numbers[Slot.VOLUME_HEAD] = numbers[Slot.VOLUME_ROD] = drive.dead_volume
     numbers[Slot.LEAKAGE] = drive.leakage
     numbers[Slot.HOSE_COMPLIANCE] = drive.hose_compliance
-    numbers[Slot.BANDWIDTH], numbers[Slot.DAMPING] = valve.bandwidth, valve.damping
-    numbers[Slot.DEADBAND] = valve.deadband
-    numbers[Slot.FLOW_GAIN] = valve.rated_flow / math.sqrt(valve.rated_pressure_drop)
-    numbers[Slot.ORIFICE_SMOOTHING] = valve.smoothing
-    numbers[Slot.PORT_RELIEF] = valve.port_relief
-    numbers[Slot.RELIEF_GAIN] = valve.port_relief_gain
-    numbers[Slot.MAKEUP_GAIN] = valve.makeup_gain
+    _write_valve(numbers, valve)
+    _write_holding(numbers, Slot.HOLDING_HEAD, axis.load_holding.head)
+    _write_holding(numbers, Slot.HOLDING_ROD, axis.load_holding.rod)
     numbers[Slot.BULK_MODULUS] = supply.bulk_modulus
     numbers[Slot.TANK_PRESSURE] = supply.tank_pressure
     numbers[Slot.RELIEF_PRESSURE] = supply.relief_pressure
     numbers[Slot.PUMP_FLOW] = supply.pump_flow
+    numbers[Slot.PUMP_DROOP] = supply.pump_droop
+    if supply.kind == "load_sensing":
+        numbers[Slot.LOAD_SENSING_MARGIN] = supply.load_sensing_margin
+
+
+def _write_valve(numbers: np.ndarray, valve: Valve) -> None:
+    numbers[Slot.BANDWIDTH], numbers[Slot.DAMPING] = valve.bandwidth, valve.damping
+    numbers[Slot.SLEW_LIMIT] = valve.slew_limit or 0.0
+    numbers[Slot.DEADBAND], numbers[Slot.DEADBAND_NEGATIVE] = valve.deadbands
+    numbers[Slot.FLOW_GAIN] = valve.rated_flow / math.sqrt(valve.rated_pressure_drop)
+    numbers[Slot.METERING_PA], numbers[Slot.METERING_BT] = (
+        valve.positive.inlet, valve.positive.outlet
+    )  # fmt: skip
+    numbers[Slot.METERING_PB], numbers[Slot.METERING_AT] = (
+        valve.negative.inlet, valve.negative.outlet
+    )  # fmt: skip
+    numbers[Slot.COMPENSATED_DROP] = valve.held_drop
+    numbers[Slot.ORIFICE_SMOOTHING] = valve.smoothing
+    numbers[Slot.PORT_RELIEF] = valve.port_relief
+    numbers[Slot.RELIEF_GAIN] = valve.port_relief_gain
+    numbers[Slot.MAKEUP_GAIN] = valve.makeup_gain
+    _write_curve(numbers, int(Slot.CURVES), valve.positive.curve)
+    _write_curve(numbers, Slot.CURVES + CURVE, valve.negative.curve)
+
+
+def _write_curve(numbers: np.ndarray, first: int, curve: FlowCurve | None) -> None:
+    if curve is None:
+        return
+    count = len(curve.travel)
+    numbers[first] = count
+    numbers[first + 1 : first + 1 + count] = curve.travel
+    numbers[first + 1 + CURVE_KNOTS : first + 1 + CURVE_KNOTS + count] = curve.opening
+
+
+def _write_holding(numbers: np.ndarray, first: int, valve: Counterbalance | None) -> None:
+    """Setting, pilot ratio and override pressure, which follow each other in `Slot`."""
+    if valve:
+        override = valve.override * valve.setting
+        numbers[first : first + 3] = valve.setting, valve.pilot_ratio, override

@@ -109,6 +109,49 @@ def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
     )
 
 
+def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
+    """The range of an axis' joint in the coordinate of its drive.
+
+    Args:
+        machine: the machine.
+        name: axis name.
+
+    Returns:
+        (low, high) piston displacement [m], or joint coordinate [rad] or [m] of a drive without a
+        cylinder; None where the joint has no range, or the linkage has no closed form or turns back
+        within it.
+    """
+    axis = machine.axes[name]
+    limits = machine.joints[axis.joint].range
+    if limits is None or axis.cylinder is None:
+        return limits
+    try:
+        linkage = axis_linkage(machine, name)
+    except InputError:
+        return None
+    if linkage.rate(limits[0]) * linkage.rate(limits[1]) <= 0.0:
+        return None
+    first, second = (float(linkage.length(q)) - axis.cylinder.closed_length for q in limits)
+    return min(first, second), max(first, second)
+
+
+def drive_travel(machine: Machine, name: str) -> tuple[float, float] | None:
+    """Where the travel of an axis' drive ends: its stroke, and its joint's range inside it.
+
+    Args:
+        machine: the machine.
+        name: axis name.
+
+    Returns:
+        (low, high) of the drive's coordinate [m] or [rad]; None where it has no ends.
+    """
+    cylinder, limits = machine.axes[name].cylinder, range_at_drive(machine, name)
+    if cylinder is None:
+        return limits
+    low, high = limits or (0.0, cylinder.stroke)
+    return max(0.0, low), min(cylinder.stroke, high)
+
+
 def _four_bar(machine: Machine, axis: Axis) -> FourBar:
     assert axis.four_bar and axis.cylinder
     output = machine.link_of(axis.joint)

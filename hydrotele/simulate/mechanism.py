@@ -16,7 +16,7 @@ from hydrotele.drives import Axis, Cylinder, Pin
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS
 from hydrotele.hydraulics.parameters import actuator_numbers
-from hydrotele.kinematics.from_machine import pin_axis
+from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
 from hydrotele.machine import Link, Machine
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, write_drive_side
 from hydrotele.simulate.looks import name_geoms, without_looks
@@ -68,6 +68,7 @@ def assemble(
     for name, axis in machine.axes.items():
         if axis.cylinder:
             _write_cylinder(root, name, axis.cylinder, pin_axis(machine, name), timestep)
+            _write_travel(root, machine, name)
     for name in flexible_axes(machine):
         write_drive_side(root, machine, name)
     for name, closure in machine.closures.items():
@@ -187,10 +188,16 @@ def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep:
         rod = tube.add("body", name=f"{name}_rod")
         rod.add("joint", name=f"{name}_rod", type="slide", axis=(1, 0, 0))
     rod.pos = (cylinder.closed_length, 0.0, 0.0)
-    root.find("joint", f"{name}_rod").range = (0.0, cylinder.stroke)
     _set_inertial(rod, cylinder.rod.mass, (-cylinder.rod.com, 0, 0), cylinder.rod.inertia)
     rod_end = Pin(link=f"{name}_rod", position=(0.0, 0.0, 0.0))
     _connect(root, f"{name}_pin", rod_end, cylinder.rod_pin, timestep)
+
+
+def _write_travel(root, machine: Machine, name: str) -> None:
+    """Ends of a cylinder's travel, at its rod alone: two stops would share the load."""
+    root.find("joint", f"{name}_rod").range = drive_travel(machine, name)
+    if range_at_drive(machine, name):
+        root.find("joint", machine.axes[name].joint).limited = "false"
 
 
 def _connect(root, name: str, a: Pin, b: Pin, timestep: float) -> None:

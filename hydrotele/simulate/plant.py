@@ -20,6 +20,7 @@ from hydrotele.simulate.closure import (
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, wind_up
 from hydrotele.simulate.mechanism import add_element, assemble, mjcf_text
 from hydrotele.simulate.native import install_hydraulics
+from hydrotele.simulate.stops import set_stops, write_stops
 from hydrotele.surroundings import Thing
 
 REST_PRESSURE = 2.0e6  # Pa, in the chamber that carries no load when a machine stands
@@ -62,6 +63,7 @@ class Plant:
         root = assemble(
             self.machine, self.model.opt.timestep, self.ground, surroundings=self.surroundings
         )
+        write_stops(root, self.machine, self.model)
         home = rest_state(self)
         pressures = {"act": home.act} if self.model.na else {}
         add_element(root.keyframe, "key", name="home", qpos=home.qpos, **pressures)
@@ -102,6 +104,7 @@ def build_plant(
         model = mujoco.MjModel.from_xml_string(text)
     except ValueError as error:
         raise InputError(f"machine {machine.name}", f"does not compile: {error}") from None
+    set_stops(machine, model)
     if not _can_touch(model):  # then looking for contacts is a tenth of a step, for nothing
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     axes = tuple(actuator_order(machine))

@@ -7,18 +7,15 @@ from hydrotele.compiled import compiled
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS,
     SCRATCH,
-    Slot,
     axis_state,
     circuit_scratch,
+    circuit_supply,
     open_ports,
-    supply_pressure,
 )
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record
 from hydrotele.simulate.surroundings import thing_joints
-
-_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 
 
 @compiled
@@ -37,7 +34,7 @@ def state_supply(user, count, act, scratch):
     Source: nominal model, "Supply".
     """
     open_ports(user, act, act, scratch, 0, count, 0.0, act)
-    return supply_pressure(scratch, count, user[_D], user[_RELIEF], user[_PUMP])
+    return circuit_supply(user, 0, count, scratch)
 
 
 @compiled
