@@ -3,7 +3,8 @@
 Pure functions on flat arrays laid out as MuJoCo keeps them, so that the native callbacks, the
 tests and an estimator run the same code. Axis `i` reads its numbers at `user[i * SLOTS + Slot]` and
 its activations `spool, spool_rate, p_head, p_rod` at `act[4 i ...]`, counted from the first
-hydraulic axis.
+hydraulic axis. An axis with a pump of its own (`Kind.PUMPED`, see `pump`) has the speed of its pump
+and the pressure of its load cylinder in the places of spool and spool rate.
 """
 
 import math
@@ -18,14 +19,22 @@ from hydrotele.hydraulics.laws import (
     spool_step,
     stop_force,
 )
-from hydrotele.hydraulics.slots import SLOTS, Kind, Slot
+from hydrotele.hydraulics.pump import (
+    load_force,
+    load_pressure_step,
+    pump_flows,
+    pump_piston_friction,
+    pump_pressure_rates,
+    pump_speed_step,
+)
+from hydrotele.hydraulics.slots import PUMP, SLOTS, Kind, Slot
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows, inlet_flow, inlet_gain
 
 __all__ = [
     "ACTIVATIONS", "MAX_AXES", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
     "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_state", "chamber_flows",
-    "circuit_scratch", "circuit_supply", "open_ports", "pressure_rates", "step_circuit",
-    "supply_pressure",
+    "circuit_scratch", "circuit_supply", "open_ports", "pressure_rates", "pumped_force",
+    "step_circuit", "supply_pressure",
 ]  # fmt: skip
 
 ACTIVATIONS = 4
@@ -53,6 +62,7 @@ _V0, _AC = int(Slot.COULOMB_VELOCITY), int(Slot.COULOMB_ASYMMETRY)
 _AV, _HOSE = int(Slot.VISCOUS_ASYMMETRY), int(Slot.HOSE_COMPLIANCE)
 _LOW, _HIGH = int(Slot.STOP_LOW), int(Slot.STOP_HIGH)
 _HARD, _SOFT = int(Slot.STOP_STIFFNESS), int(Slot.STOP_DAMPING)
+_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
 @compiled
@@ -140,6 +150,9 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
     """
     for i in range(count):
         u = (first + i) * SLOTS
+        if user[u + _KIND] == _PUMPED:  # draws nothing from the supply
+            ports[4 * i], ports[4 * i + 3] = 0.0, spool[4 * i]
+            continue
         opening = axis_opening(user, u, spool[4 * i])
         ports[4 * i] = inlet_gain(user, u, opening)
         ports[4 * i + 2], ports[4 * i + 3] = user[u + _DROP], opening
@@ -189,7 +202,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
     Args:
         user: (nu * SLOTS,) actuator numbers.
         u: place of this axis in `user`.
-        opening: o, scalar [1].
+        opening: o, scalar [1]; of an axis with a pump of its own the speed of it [rad/s].
         p_supply: scalar [Pa].
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
@@ -203,6 +216,8 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
 
     Source: nominal model, "Chambers".
     """
+    if user[u + _KIND] == _PUMPED:
+        return _pumped_rates(user, u, opening, p_head, p_rod, x, v)
     q_head, q_rod, slope_head, slope_rod = chamber_flows(user, u, opening, p_supply, p_head, p_rod)
     leak = user[u + _LEAK] * (p_head - p_rod)
     port, relief_gain = user[u + _PORT], user[u + _KR]
@@ -230,6 +245,54 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
         head * (slope_head + k_head - user[u + _LEAK]),
         rod * (slope_rod + k_rod - user[u + _LEAK]),
     )
+
+
+@compiled
+def _pumped_rates(user, u, speed, p_head, p_rod, x, v):
+    """`pressure_rates` of an axis with a pump of its own."""
+    volumes, area_head, area_rod = _pumped_volumes(user, u, x), user[u + _AH], user[u + _AR]
+    return pump_pressure_rates(
+        user, u + PUMP, speed, p_head, p_rod, volumes, (area_head * v, area_rod * v),
+        user[u + _LEAK],
+    )  # fmt: skip
+
+
+@compiled
+def _pumped_volumes(user, u, x):
+    """Volumes of both chambers and the oil that the piston has taken from the accumulator."""
+    inside = min(max(x, 0.0), user[u + _STROKE])
+    area_head, area_rod = user[u + _AH], user[u + _AR]
+    return (
+        user[u + _VH] + area_head * inside,
+        user[u + _VR] + area_rod * (user[u + _STROKE] - inside),
+        (area_head - area_rod) * inside,
+    )
+
+
+@compiled
+def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
+    """Force of an axis with a pump of its own, after its load cylinder and friction.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        u: place of this actuator in `user`.
+        p_load: pressure in the load cylinder, scalar [Pa].
+        p_head: scalar [Pa].
+        p_rod: scalar [Pa].
+        v: piston velocity, scalar [m/s].
+        other: what else acts on the piston, scalar [N].
+        dt: step over which friction acts, scalar [s]; see `pump_piston_friction`.
+
+    Returns:
+        Force, scalar [N].
+
+    Source: nominal model, "Piston force", with the friction of `pump_piston_friction`.
+    """
+    force = user[u + _AH] * p_head - user[u + _AR] * p_rod - load_force(user, u + PUMP, p_load)
+    seal = (
+        user[u + _FC], user[u + _FS], user[u + _VS], user[u + _B], user[u + _AC], user[u + _AV],
+    )  # fmt: skip
+    return force - pump_piston_friction(user, u + PUMP, seal, v, force + other, p_load, dt)
 
 
 @compiled
@@ -262,6 +325,14 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         bounded = min(1.0, max(-1.0, command[first + i]))
+        if user[u + _KIND] == _PUMPED:
+            act_dot[a] = pump_speed_step(
+                user, u + PUMP, act[a], bounded, act[a + 2], act[a + 3], dt
+            )
+            act_dot[a + 1] = load_pressure_step(
+                user, u + PUMP, act[a + 1], velocity[first + i], dt
+            )
+            continue
         act_dot[a], act_dot[a + 1] = spool_step(
             act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]
         )
@@ -381,6 +452,10 @@ def axis_state(user, i, supply, act, x, v):
     Source: nominal model, "Orifice" and "Piston force".
     """
     u = i * SLOTS
+    if user[u + _KIND] == _PUMPED:
+        taken = _pumped_volumes(user, u, x)[2]
+        q_head, q_rod, _, _ = pump_flows(user, u + PUMP, act[0], act[2], act[3], taken)
+        return q_head, q_rod, pumped_force(user, u, act[1], act[2], act[3], v, 0.0, 0.0)
     opening = axis_opening(user, u, act[0])
     q_head, q_rod, _, _ = chamber_flows(user, u, opening, supply, act[2], act[3])
     force = user[u + _AH] * act[2] - user[u + _AR] * act[3] - actuator_friction(user, u, v)

@@ -12,50 +12,14 @@ pressure in the load cylinder [Pa]. The numbers stand in one block, placed as `P
 pressures are above the atmosphere's.
 """
 
-import enum
 import math
 
 from hydrotele.compiled import compiled
+from hydrotele.hydraulics.slots import PumpSlot
 
 ATMOSPHERE = 101325.0  # Pa
-STALLED = 1.0e-9  # rad/s
+STALLED = 1.0e-9  # rad/s, of a pump that stands while its valve is open
 _THINNEST = 0.1 * ATMOSPHERE  # Pa absolute: below it the air is not let grow any further
-
-
-class PumpSlot(enum.IntEnum):
-    """Places of a pump drive's numbers in its block, all SI."""
-
-    DISPLACEMENT = 0
-    LEAKAGE = 1
-    RATED_SPEED = 2
-    BULK_MODULUS = 3
-    COMPLIANCE_HEAD = 4
-    COMPLIANCE_ROD = 5
-    AIR_HEAD = 6
-    AIR_ROD = 7
-    ACCUMULATOR_PRESSURE = 8
-    GAS_VOLUME = 9
-    LINE_EXTENDING = 10
-    LINE_RETRACTING = 11
-    VOLTAGE = 12
-    RESISTANCE = 13
-    EMF = 14
-    INERTIA = 15
-    DRAG = 16
-    BREAKAWAY = 17
-    BREAKAWAY_SPEED = 18
-    VISCOUS_DRAG = 19
-    TORQUE_LOSS = 20
-    MOVING_MASS = 21
-    LOAD_AREA = 22
-    LOAD_RELIEF = 23
-    LOAD_OVERRIDE = 24
-    LOAD_STIFFNESS = 25
-    LOAD_VOID = 26
-    LOAD_VOID_PRESSURE = 27
-    LOAD_FRICTION = 28
-    LOAD_RETURN = 29
-
 
 _D, _LEAK, _RATED = PumpSlot.DISPLACEMENT.value, PumpSlot.LEAKAGE.value, PumpSlot.RATED_SPEED.value
 _BETA, _GAS = PumpSlot.BULK_MODULUS.value, PumpSlot.GAS_VOLUME.value
@@ -97,7 +61,7 @@ def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
     Source: DC motor and gear pump with torque losses in textbook form (Merritt 1967, ch. 4).
 
     >>> import numpy as np
-    >>> user = np.zeros(30)
+    >>> user = np.zeros(len(PumpSlot))
     >>> user[PumpSlot.RATED_SPEED] = 200.0
     >>> pump_speed_step(user, 0, 0.0, -0.5, 1.0e6, 1.0e6, 1.0e-3)
     -100.0

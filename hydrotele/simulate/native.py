@@ -24,7 +24,9 @@ from hydrotele.hydraulics.circuit import (
     SCRATCH,
     SLOTS,
     Slot,
+    Kind,
     actuator_friction,
+    pumped_force,
     step_circuit,
 )
 from hydrotele.hydraulics.drive_side import settled_friction
@@ -36,6 +38,7 @@ from hydrotele.simulate.pointers import pointer
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
 _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _OFFSET, _INERTIA = int(Slot.OFFSET), int(Slot.DRIVE_INERTIA)
+_FORCE, _PUMPED = float(Kind.FORCE), float(Kind.PUMPED)
 _GAINS = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
 
@@ -139,7 +142,7 @@ def _compile_callbacks():
         velocity = carray(pointer(at_velocity), (nu,), np.float64)[i]
         dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
         drive = 0.0
-        if user[u + _KIND] > 2.0:  # Kind.FORCE: MuJoCo's own gain gives the drive force
+        if user[u + _KIND] == _FORCE:  # MuJoCo's own gain gives the drive force
             drive = -user[u + _OFFSET]
         else:
             at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
@@ -148,12 +151,17 @@ def _compile_callbacks():
             at_act_dot = carray(pointer(d + d_act_dot), (1,), np.int64)[0]
             act = carray(pointer(at_act + start), (4,), np.float64)
             rate = carray(pointer(at_act_dot + start), (4,), np.float64)
+            if user[u + _KIND] == _PUMPED:
+                return pumped_force(
+                    user, u, act[1] + dt * rate[1], act[2] + dt * rate[2], act[3] + dt * rate[3],
+                    velocity, 0.0, dt,
+                )  # fmt: skip
             drive = user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
             drive -= user[u + _AREA_ROD] * (act[3] + dt * rate[3])
         if user[u + _INERTIA] == 0.0:
             return drive - actuator_friction(user, u, velocity)
         push = drive + _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)
-        if user[u + _KIND] > 2.0:
+        if user[u + _KIND] == _FORCE:
             push += _gained_command(m, d, i, m_nu, m_gainprm, d_ctrl)
         return drive - settled_friction(user, u, velocity, push, user[u + _INERTIA], dt)
 
