@@ -22,6 +22,7 @@ STRETCH = FIRMWARE_RPM * 4096 / 60_000  # of the logged speed
 _STANDING = 1500  # rows before the reference moves
 _BEFORE, _JUDGED = 2000, 25_000  # rows: what is judged begins 2 s before the reference moves
 _SMOOTHED = 51  # rows
+_CREEP = 1.0e-6  # rad/s: keeps the sign of the valve while the pump stands
 
 
 class EhaRun(NamedTuple):
@@ -62,7 +63,7 @@ def load_run(path: Path) -> EhaRun:
         name=name,
         log=log,
         start={c: float(log[c][:_STANDING].mean()) for c in CHANNELS[1:]},
-        speed=np.abs(log["speed.pump"]) / STRETCH * valve,
+        speed=np.maximum(np.abs(log["speed.pump"]) / STRETCH, _CREEP) * valve,
         measured=smoothed(np.column_stack([log[c] for c in CHANNELS])),
         judged=slice(max(0, first - _BEFORE), first - _BEFORE + _JUDGED),
         active=slice(0, int(on[-1]) + 1),
@@ -74,9 +75,9 @@ def load_runs(folder: Path) -> list[EhaRun]:
     return [load_run(path) for path in sorted(folder.glob("run_*.parquet"))]
 
 
-def smoothed(values: np.ndarray) -> np.ndarray:
-    """(n, 3) position as it is and pressures as a centred mean over 51 ms, shorter at the ends."""
-    kernel = np.ones(_SMOOTHED)
+def smoothed(values: np.ndarray, rows: int = _SMOOTHED) -> np.ndarray:
+    """(n, 3) position as it is, pressures as a centred mean over `rows`, fewer at the ends."""
+    kernel = np.ones(rows)
     weight = np.convolve(np.ones(len(values)), kernel, "same")
     columns = [np.convolve(column, kernel, "same") / weight for column in values.T[1:]]
     return np.column_stack([values[:, 0], *columns])
