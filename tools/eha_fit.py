@@ -9,11 +9,11 @@ that of `models/eha`.
 """
 
 import argparse
-import functools
 import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from eha_runs import (
@@ -65,8 +65,10 @@ def first_values(machines: dict[int, Machine]) -> dict[str, float]:
 
 
 def _number(machine: Machine, path: str) -> float:
-    return float(functools.reduce(lambda at, name: at[name] if isinstance(at, dict) else getattr(at, name),
-                                  path.split("."), machine))  # fmt: skip
+    node: Any = machine
+    for name in path.split("."):
+        node = node[name] if isinstance(node, dict) else getattr(node, name)
+    return float(node)
 
 
 def with_values(machine: Machine, group: int, values: dict[str, float]) -> Machine:

@@ -122,8 +122,8 @@ def ec20(folder: Path, jobs: int) -> None:
         print(f"  velocity fit, held out, {axis}: {fit:.1f} -> {after[axis]:.1f} %")
 
 
-# Run -> the authors' position RMS under control [mm]; then the README's open-loop figures of a simple
-# fit: position [mm], head and rod pressure [bar].
+# Run -> the authors' position RMS under control [mm]; then open loop as the folder's README has it:
+# position [mm], head and rod pressure [bar].
 _EHA_FIGURES = {
     "1_1": (0.32, 1.5, 1.3, 1.8),
     "1_4": (0.38, 1.1, 1.3, 2.0),

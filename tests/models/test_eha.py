@@ -85,7 +85,8 @@ def test_speed_drives_it_without_a_motor():
     rows = in_mujoco(machine, np.full(3000, 0.5))
     speed = (rows[-1, 0] - rows[1500, 0]) / 1.499
     leak = pump.leakage * (rows[-1, 1] - rows[-1, 2])
-    assert speed == pytest.approx((0.5 * pump.rated_speed * pump.displacement - leak) / area, rel=1e-2)
+    flow = 0.5 * pump.rated_speed * pump.displacement - leak
+    assert speed == pytest.approx(flow / area, rel=1.0e-2)
 
 
 def test_stands_still_under_load_with_the_valve_shut():
@@ -97,13 +98,13 @@ def test_stands_still_under_load_with_the_valve_shut():
 
 
 def test_runs_as_a_scenario_and_its_chambers_balance():
-    """A run logs pump speed and load pressure as truth; volumes balance to 1e-4.
+    """A run logs pump speed and load pressure as truth; volumes balance to 1e-4 (7.7e-6 seen).
 
     Air makes the compliance a curve, which the audit's trapezia follow to second order only.
     """
     scenario = load_scenario("eha_strokes")
     run = run_scenario(scenario)
-    assert run.summary["balance"]["flow_balance"] < 1.0e-3
+    assert run.summary["balance"]["flow_balance"] < 1.0e-4
     assert {"truth.speed.piston", "truth.pressure_load.piston"} <= set(run.truth.columns)
     assert "pressure_supply" not in run.measured
     assert run.truth["position.piston"].max() > 0.01
