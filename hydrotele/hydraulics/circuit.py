@@ -329,9 +329,7 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
             act_dot[a] = pump_speed_step(
                 user, u + PUMP, act[a], bounded, act[a + 2], act[a + 3], dt
             )
-            act_dot[a + 1] = load_pressure_step(
-                user, u + PUMP, act[a + 1], velocity[first + i], dt
-            )
+            act_dot[a + 1] = load_pressure_step(user, u + PUMP, act[a + 1], velocity[first + i], dt)
             continue
         act_dot[a], act_dot[a + 1] = spool_step(
             act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]

@@ -23,8 +23,8 @@ from hydrotele.compiled import callback, compiled
 from hydrotele.hydraulics.circuit import (
     SCRATCH,
     SLOTS,
-    Slot,
     Kind,
+    Slot,
     actuator_friction,
     pumped_force,
     step_circuit,

@@ -17,7 +17,6 @@ from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record
 from hydrotele.simulate.surroundings import thing_joints
 
-
 _SPOOL = ("spool", "1"), ("spool_rate", "1/s")
 
 
