@@ -1,4 +1,4 @@
-"""A pump as drive: an electric motor turns a pump in one direction, a switched valve picks the side.
+"""A pump as drive: a motor turns a pump in one direction, a switched valve picks the side.
 
 The pump draws from the other chamber, whose line also leads to a gas accumulator: it takes up what
 the two sides of the piston differ by. The command is the duty of the motor's bridge with the sign

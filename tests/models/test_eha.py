@@ -69,7 +69,7 @@ def test_load_raises_the_head_pressure_by_its_relief():
     for tool in ("load_20_bar", "load_30_bar"):
         rows = in_mujoco(ideal(tool), duty)
         means[tool] = rows[2000:, 1].mean()
-        assert 0.02 < rows[-1, 0] < 0.05
+        assert 0.02 < rows[-1, 0] < 0.06  # on its way, short of the end at 0.065
     load = load_machine("eha", "load_30_bar").loads["piston"]
     expected = 10.0e5 * (1.0 + load.friction)
     assert means["load_30_bar"] - means["load_20_bar"] == pytest.approx(expected, abs=2.0e5)
