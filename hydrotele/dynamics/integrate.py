@@ -38,7 +38,7 @@ from hydrotele.hydraulics.circuit import (
 )
 
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
-_STOP, _KIND, _PUMPED = int(Slot.STOP_STIFFNESS), int(Slot.KIND), float(Kind.PUMPED)
+_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
 @lean
@@ -152,11 +152,10 @@ def accelerate(model, sp, z, dt):
             push, slope = spring, half * damping
             for f in range(n):
                 sp.mass[n + gear, f] -= slope * sp.row[i, f]
-        if user[u + _STOP] > 0.0:
-            at = sp.drive[X, i] if gear < 0 else load_position(model, sp, i)
-            stop, stiff, damped = actuator_stop(user, u, at, v)
-            push += stop
-            slope += half * (damped + half * stiff)
+        at = sp.drive[X, i] if gear < 0 else load_position(model, sp, i)
+        stop, stiff, damped = actuator_stop(user, u, at, v)
+        push += stop
+        slope += half * (damped + half * stiff)
         for f in range(n):
             sp.force[f] += sp.row[i, f] * push
             for g in range(f + 1):

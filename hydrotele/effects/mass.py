@@ -43,8 +43,11 @@ def _move_com(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _ratio(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A model from drawings knows a moment of inertia to some 20 %; 5 % is its usual rounding."""
-    return {"ratio": Parameter("1", 1.0, 0.3, 3.0, 0.2, 0.05)}
+    """A model from drawings knows a moment of inertia to some 20 %; 5 % is its usual rounding.
+
+    The range holds what attachments, ballast, or a wrong unit of the drawings do.
+    """
+    return {"ratio": Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05)}
 
 
 def _scale_inertia(machine: Machine, location: str, values: Values) -> Machine:

@@ -1,4 +1,4 @@
-"""A pump or a main relief valve with other limits than in the model."""
+"""A pump or a main relief valve with other limits, or another droop, than in the model."""
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
 from hydrotele.machine import Machine
@@ -8,11 +8,30 @@ def _place(machine: Machine) -> tuple[str, ...]:
     return ("supply",) if machine.supply and machine.hydraulic_axes else ()
 
 
+def _pumping(machine: Machine) -> tuple[str, ...]:
+    """Where a pump limits the flow: not on a constant-pressure supply."""
+    supply = machine.supply
+    return _place(machine) if supply and supply.kind != "constant_pressure" else ()
+
+
 def _pump(machine: Machine, location: str) -> dict[str, Parameter]:
     """Engine speed and wear take tens of per cent; 2 % is the droop of an engine's governor."""
     assert machine.supply
     q = machine.supply.pump_flow
     return {"pump_flow": Parameter("m^3/s", q, 0.1 * q, 2.5 * q, 0.15 * q, 0.02 * q)}
+
+
+def _droop(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Leakage and an engine's governor take 5 % at full pressure; 1 % is what a new pump loses."""
+    assert machine.supply
+    whole = machine.supply.pump_flow / machine.supply.relief_pressure
+    present = machine.supply.pump_droop
+    high = max(0.6 * whole, present)
+    return {"droop": Parameter("m^3/(s Pa)", present, 0.0, high, 0.05 * whole, 0.01 * whole)}
+
+
+def _set_droop(machine: Machine, location: str, values: Values) -> Machine:
+    return changed(machine, "supply.pump_droop", values["droop"])
 
 
 def _relief(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -30,7 +49,11 @@ def _set(machine: Machine, location: str, values: Values) -> Machine:
 
 
 EFFECTS = (
-    Effect("pump_flow_limit", "another flow of the pump", "supply", _place, _pump, _set),
+    Effect("pump_flow_limit", "another flow of the pump", "supply", _pumping, _pump, _set),
+    Effect(
+        "pump_droop", "a pump whose flow falls with its pressure", "supply", _pumping, _droop,
+        _set_droop,
+    ),
     Effect(
         "relief_pressure", "another setting of the main relief valve", "supply", _place, _relief,
         _set,

@@ -12,6 +12,15 @@ def _valve(machine: Machine, location: str) -> Valve:
     return valve
 
 
+def _common_deadband(machine: Machine) -> tuple[str, ...]:
+    """Valves that have a dead band for both directions, or for one of them."""
+    return tuple(
+        name for name in valves(machine)
+        if any(way.deadband is None
+               for way in (_valve(machine, name).positive, _valve(machine, name).negative))
+    )  # fmt: skip
+
+
 def _deadband(machine: Machine, location: str) -> dict[str, Parameter]:
     """Overlaps are a few per cent of the stroke; 0.4 % is a spool's usual hysteresis."""
     present = _valve(machine, location).deadband
@@ -23,8 +32,11 @@ def _set_deadband(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _gain(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A makers' flow rating is good to 5 or 10 %; 2 % is the linearity of a spool."""
-    return {"ratio": Parameter("1", 1.0, 0.3, 2.0, 0.15, 0.02)}
+    """A makers' flow rating is good to 5 or 10 %; 2 % is the linearity of a spool.
+
+    The range is that of another spool in the same body.
+    """
+    return {"ratio": Parameter("1", 1.0, 0.05, 5.0, 0.15, 0.02)}
 
 
 def _scale_gain(machine: Machine, location: str, values: Values) -> Machine:
@@ -44,7 +56,12 @@ def _set_bandwidth(machine: Machine, location: str, values: Values) -> Machine:
 
 EFFECTS = (
     Effect(
-        "valve_deadband", "another overlap of a valve", "valve", valves, _deadband, _set_deadband
+        "valve_deadband",
+        "another overlap of a valve",
+        "valve",
+        _common_deadband,
+        _deadband,
+        _set_deadband,
     ),
     Effect("valve_gain", "another flow gain of a valve", "valve", valves, _gain, _scale_gain),
     Effect(

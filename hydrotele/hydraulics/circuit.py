@@ -85,7 +85,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0):
     Returns:
         p_s, scalar [Pa].
 
-    Source: nominal model, "Supply"; droop: leakage of a pump, Merritt 1967, section 4.
+    Source: nominal model, "Supply"; droop: leakage proportional to the pressure (Merritt 1967).
 
     >>> import numpy as np
     >>> one_valve = np.array([2.0e-6, 5.0e6, 0.0, 0.0])
@@ -173,7 +173,7 @@ def circuit_supply(user, first, count, ports):
         user: (nu * SLOTS,) actuator numbers.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `open_ports` writes it.
+        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
 
     Returns:
         p_s, scalar [Pa].

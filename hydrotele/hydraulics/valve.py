@@ -35,7 +35,7 @@ def axis_opening(user, u, spool):
     Returns:
         Opening o, scalar [1], with the sign of the spool.
 
-    Source: flow characteristic as valve makers tabulate it; Merritt 1967, chapter 5 (overlap).
+    Source: flow characteristic as valve makers tabulate it.
     """
     deadband, c = user[u + _DB], u + _CURVES
     if spool < 0.0:
@@ -83,7 +83,7 @@ def inlet_flow(drop, gain, smoothing, compensated):
     Returns:
         (q [m^3/s], dq/d(drop) [m^3/(s Pa)] >= 0).
 
-    Source: Merritt 1967, section 5 (flow control valves): k sqrt of a constant drop.
+    Source: pressure-compensated flow control, an orifice with a held drop (Merritt 1967).
 
     >>> inlet_flow(9.0e6, 1.0e-6, 5.0e4, 1.0e6) == inlet_flow(2.0e6, 1.0e-6, 5.0e4, 1.0e6)
     True

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from hydrotele.drives import EndStop
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import predicted_channels, state_names
 from hydrotele.effects import apply_effect
@@ -29,14 +30,30 @@ CASES = {
         ("joint_flexibility", "swing", {"compliance": 2e-7}),
         ("joint_flexibility", "boom", {"compliance": 2e-8}),
     ),
+    "valves": (
+        ("valve_gain_direction", "boom", {"positive": 1.3, "negative": 0.6}),
+        ("valve_deadband_direction", "stick", {"positive": 0.02, "negative": 0.09}),
+        ("flow_curve", "swing", {"positive": 0.5, "negative": -0.4}),
+        ("metering_edges", "stick", {"p_a": 0.8, "b_t": 0.5, "p_b": 1.2, "a_t": 1.4}),
+        ("spool_slew", "boom", {"travel_time": 0.6}),
+    ),
+    "load_compensation": (
+        ("load_compensation", "boom", {"regulation": 0.9}),
+        ("load_compensation", "stick", {"regulation": 0.7}),
+    ),
+    "load_holding": (("load_holding", "boom.head", {"setting": 40e6}),),
+    "pump_droop": (("pump_droop", "supply", {"droop": 7e-11}),),
 }
 
 
-def scenario(name, axes, effects, timestep, size=0.4):
-    """All axes driven by held sines; shut at first, so that late commands have a past."""
+def scenario(name, axes, effects, timestep, size=0.4, shape=np.sin):
+    """All axes driven by held sines, or waves of another shape.
+
+    They are shut at first, so that late commands have a past.
+    """
     time = PERIOD * np.arange(ROWS)
     wave = np.where(np.arange(ROWS) > 3, size, 0.0)
-    columns = {a: (wave * np.sin(5.0 * time + i)).tolist() for i, a in enumerate(axes)}
+    columns = {a: (wave * shape(5.0 * time + i)).tolist() for i, a in enumerate(axes)}
     machine, _, tool = name.partition("/")
     keys = {
         "name": "t",
@@ -73,7 +90,12 @@ def begin(machine, model, z, state):
 
 def differences(reduced_of, machine, plan, steps):
     """Readings of plant and reduced model: channel -> (largest difference, travel)."""
-    run, channels = run_scenario(plan), predicted_channels(machine)
+    return differences_of(reduced_of, machine, run_scenario(plan), steps)
+
+
+def differences_of(reduced_of, machine, run, steps):
+    """The same of a run of the plant."""
+    channels = predicted_channels(machine)
     model, space, z = reduced_of(machine, channels)
     begin(machine, model, z, json.loads(run.truth.metadata["initial_state"]))
     command = np.column_stack([run.truth[f"command.{a}"] for a in run.plant.axes])
@@ -107,6 +129,32 @@ def test_readings_are_those_of_the_plant(case, machine_of, reduced_of):
     if CASES[case]:
         nominal = differences(reduced_of, machine_of(name), plan, 40)
         assert beyond(nominal), "without the effect it would be seen"
+
+
+def run_into(phase):
+    """A wave that goes one way only over these rows."""
+    return np.sign(np.sin(0.5 * phase))
+
+
+@pytest.mark.parametrize("size", [1.0, -1.0])
+def test_a_cylinder_that_runs_into_its_end(machine_of, reduced_of, size):
+    """Two programs, one spring: MuJoCo's soft limit and the reduced model's force."""
+    machine = machine_of("rig")
+    plan = scenario("rig", machine.axes, (), 1.25e-4, size, run_into)
+    found = differences(reduced_of, machine, plan, 160)
+    assert not beyond(found)
+    run = run_scenario(plan)
+    end = run.truth["length.slide"][-1]
+    depth = end - machine.axes["slide"].cylinder.stroke if size > 0 else -end
+    rest = {side: run.truth[f"pressure_{side}.slide"][-1] for side in ("head", "rod")}
+    head, rod = machine.axes["slide"].cylinder.areas
+    push = abs(head * rest["head"] - rod * rest["rod"])
+    # pressed in by the force over the stiffness; 150 N of dry friction may hold some of it back
+    stiffness = machine.end_stop("slide").stiffness
+    assert depth == pytest.approx(push / stiffness, abs=200.0 / stiffness)
+    without = machine.model_copy(update={"axes": {"slide": machine.axes["slide"].model_copy(
+        update={"end_stop": EndStop(stiffness=1e-6, damping=0.0)})}})  # fmt: skip
+    assert beyond(differences_of(reduced_of, without, run, 40)), "without it, it leaves the stroke"
 
 
 def test_a_plain_force_drive(machine_of, reduced_of):

@@ -28,7 +28,10 @@ PLACES = {
     "pump_flow_limit": {"supply"}, "relief_pressure": {"supply"}, "command_delay": {"all", *ARM},
     "angle_offset": ARM, "angle_scale": ARM, "angle_delay": ARM, "length_offset": {"boom", "stick"},
     "pressure_offset": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
-    "pressure_delay": ARM,
+    "pressure_delay": ARM, "valve_gain_direction": ARM, "valve_deadband_direction": ARM,
+    "metering_edges": ARM, "flow_curve": ARM, "spool_slew": ARM, "load_compensation": ARM,
+    "load_holding": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
+    "pump_droop": {"supply"}, "end_stop_stiffness": {"boom", "stick"},
 }  # fmt: skip
 machine_of = functools.cache(load_machine)
 CASES = [
@@ -37,9 +40,10 @@ CASES = [
     for effect in EFFECTS.values()
     for place in effect.locations(machine_of(name, tool))
 ]
+LATER = {"load_holding", "end_stop_stiffness"}  # felt on the way back and at the ends: test_valve
 FELT = [
     case for case in CASES
-    if case[:2] in (("cat215", "bucket"), ("emps", None))
+    if case[2] not in LATER and case[:2] in (("cat215", "bucket"), ("emps", None))
     and case[3] in (lambda places: (places[0], places[-1]))(
         EFFECTS[case[2]].locations(machine_of(*case[:2]))
     )
@@ -84,7 +88,7 @@ def test_nominal_values_change_nothing_and_others_something(machine, tool, name,
     assert before == load_machine(machine, tool), "the caller's machine is untouched"
     type(after).model_validate(after.model_dump())  # still a possible machine
     if name not in ("payload", "com_offset", "inertia_error", "base_tilt", "link_length",
-                    "pin_offset", "valve_gain"):  # fmt: skip
+                    "pin_offset", "valve_gain", "valve_gain_direction", "flow_curve"):  # fmt: skip
         again = {k: p.nominal for k, p in EFFECTS[name].parameters(after, place).items()}
         assert again == pytest.approx(changed, rel=1e-12), "the machine shows what was set"
 
@@ -147,6 +151,10 @@ def plain_run(machine, tool):
 def test_is_felt(machine, tool, name, place):
     """A machine that has it moves, or is seen, and not as the one without it."""
     given = usual(machine_of(machine, tool), name, place)
+    if name == "pump_droop":  # felt only where the pump's flow is short
+        given["droop"] = (
+            0.9 * EFFECTS[name].parameters(machine_of(machine, tool), place)["droop"].high
+        )
     if name == "pump_flow_limit":  # felt only where it is less than what the valves ask for
         given["pump_flow"] = 0.3 * machine_of(machine, tool).supply.pump_flow
     planted = {"name": name, "location": place, "parameters": given}

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from hydrotele.hydraulics import circuit
+from hydrotele.hydraulics import circuit, valve
 from hydrotele.hydraulics import laws as hydraulics
 from hydrotele.hydraulics.laws import (
     friction,
@@ -36,7 +36,7 @@ def laws(module):
     }
 
 
-LAWS = {f"{m.__name__}.{n}": f for m in (hydraulics, circuit) for n, f in laws(m).items()}
+LAWS = {f"{m.__name__}.{n}": f for m in (hydraulics, valve, circuit) for n, f in laws(m).items()}
 
 
 def section(text, title):

@@ -82,6 +82,7 @@ def user_of(*gains):
         numbers[Slot.FLOW_GAIN], numbers[Slot.ORIFICE_SMOOTHING] = gain, SMOOTHING
         numbers[Slot.STRIBECK_VELOCITY] = numbers[Slot.COULOMB_VELOCITY] = 1.0
         numbers[Slot.TANK_PRESSURE] = 0.3e6
+        numbers[Slot.METERING_PA : Slot.METERING_AT + 1] = 1.0
     return user
 
 

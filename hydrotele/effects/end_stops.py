@@ -1,0 +1,37 @@
+"""End stops that are harder or softer than in the model."""
+
+from hydrotele.drives import EndStop
+from hydrotele.effects._sizes import drive_turns
+from hydrotele.effects.effect import Effect, Parameter, Values, changed
+from hydrotele.machine import Machine
+
+
+def _ending(machine: Machine) -> tuple[str, ...]:
+    """Axes whose drives have ends."""
+    return tuple(name for name in machine.axes if machine.end_stop(name))
+
+
+def _stiffness(machine: Machine, location: str) -> dict[str, Parameter]:
+    """A cushion is fifty times softer than steel; 10 % is what the lever of a pin changes."""
+    stop = machine.end_stop(location)
+    assert stop
+    k = stop.stiffness
+    unit = "N m/rad" if drive_turns(machine, location) else "N/m"
+    return {"stiffness": Parameter(unit, k, 0.01 * k, 20.0 * k, 0.5 * k, 0.1 * k)}
+
+
+def _set(machine: Machine, location: str, values: Values) -> Machine:
+    """The damper changes with the spring, so that their time constant stays."""
+    stop = machine.end_stop(location)
+    assert stop
+    if values["stiffness"] == stop.stiffness:
+        return machine
+    damping = stop.damping * values["stiffness"] / stop.stiffness
+    other = EndStop(stiffness=values["stiffness"], damping=damping)
+    return changed(machine, f"axes.{location}.end_stop", other)
+
+
+EFFECT = Effect(
+    "end_stop_stiffness", "another stiffness of a drive's end stops", "force", _ending, _stiffness,
+    _set,
+)  # fmt: skip
