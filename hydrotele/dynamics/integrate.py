@@ -26,19 +26,15 @@ from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_ROW, RATE, Q, move_lin
 from hydrotele.dynamics.motion import LENGTH as BAR_LENGTH
 from hydrotele.hydraulics.circuit import (
     SLOTS,
-    Kind,
     Slot,
-    actuator_friction,
-    actuator_friction_slope,
     actuator_stop,
     circuit_supply,
+    force_after_friction,
     open_ports,
-    pumped_force,
     step_circuit,
 )
 
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
-_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
 @lean
@@ -133,13 +129,9 @@ def accelerate(model, sp, z, dt):
         for f in range(n):
             v += sp.row[i, f] * z[first + f]
         own = v if gear < 0 else z[first + n + gear]
-        if user[u + _KIND] == _PUMPED:
-            a = 2 * first + 4 * i
-            push = pumped_force(user, u, z[a + 1], z[a + 2], z[a + 3], own, 0.0, dt)
-            slope = 0.0
-        else:
-            push -= actuator_friction(user, u, own)
-            slope = half * actuator_friction_slope(user, u, own)
+        act = z[2 * first + 4 * i :]
+        push, damping = force_after_friction(user, u, push, act, own, dt)
+        slope = half * damping
         if gear >= 0:
             damping = model.transmission[gear, GEAR_DAMPING]
             free = 0.5 * model.transmission[gear, BACKLASH]

@@ -12,29 +12,25 @@ import math
 import numpy as np
 
 from hydrotele.compiled import compiled
-from hydrotele.hydraulics.laws import (
-    friction,
-    friction_slope,
-    port_flow,
-    spool_step,
-    stop_force,
+from hydrotele.hydraulics.actuator import (
+    actuator_friction,
+    actuator_friction_slope,
+    actuator_stop,
+    force_after_friction,
+    pumped_force,
+    pumped_rates,
+    pumped_volumes,
 )
-from hydrotele.hydraulics.pump import (
-    load_force,
-    load_pressure_step,
-    pump_flows,
-    pump_piston_friction,
-    pump_pressure_rates,
-    pump_speed_step,
-)
+from hydrotele.hydraulics.laws import port_flow, spool_step
+from hydrotele.hydraulics.pump import load_pressure_step, pump_flows, pump_speed_step
 from hydrotele.hydraulics.slots import PUMP, SLOTS, Kind, Slot
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows, inlet_flow, inlet_gain
 
 __all__ = [
     "ACTIVATIONS", "MAX_AXES", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
     "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_state", "chamber_flows",
-    "circuit_scratch", "circuit_supply", "open_ports", "pressure_rates", "pumped_force",
-    "step_circuit", "supply_pressure",
+    "circuit_scratch", "circuit_supply", "force_after_friction", "open_ports", "pressure_rates",
+    "pumped_force", "step_circuit", "supply_pressure",
 ]  # fmt: skip
 
 ACTIVATIONS = 4
@@ -56,12 +52,7 @@ _KR, _KM = int(Slot.RELIEF_GAIN), int(Slot.MAKEUP_GAIN)
 _BETA, _TANK = int(Slot.BULK_MODULUS), int(Slot.TANK_PRESSURE)
 _RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 _MARGIN, _DROOP = int(Slot.LOAD_SENSING_MARGIN), int(Slot.PUMP_DROOP)
-_FC, _FS = int(Slot.COULOMB), int(Slot.STRIBECK)
-_VS, _B = int(Slot.STRIBECK_VELOCITY), int(Slot.VISCOUS)
-_V0, _AC = int(Slot.COULOMB_VELOCITY), int(Slot.COULOMB_ASYMMETRY)
-_AV, _HOSE = int(Slot.VISCOUS_ASYMMETRY), int(Slot.HOSE_COMPLIANCE)
-_LOW, _HIGH = int(Slot.STOP_LOW), int(Slot.STOP_HIGH)
-_HARD, _SOFT = int(Slot.STOP_STIFFNESS), int(Slot.STOP_DAMPING)
+_HOSE = int(Slot.HOSE_COMPLIANCE)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
@@ -217,7 +208,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
     Source: nominal model, "Chambers".
     """
     if user[u + _KIND] == _PUMPED:
-        return _pumped_rates(user, u, opening, p_head, p_rod, x, v)
+        return pumped_rates(user, u, opening, p_head, p_rod, x, v)
     q_head, q_rod, slope_head, slope_rod = chamber_flows(user, u, opening, p_supply, p_head, p_rod)
     leak = user[u + _LEAK] * (p_head - p_rod)
     port, relief_gain = user[u + _PORT], user[u + _KR]
@@ -245,54 +236,6 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead):
         head * (slope_head + k_head - user[u + _LEAK]),
         rod * (slope_rod + k_rod - user[u + _LEAK]),
     )
-
-
-@compiled
-def _pumped_rates(user, u, speed, p_head, p_rod, x, v):
-    """`pressure_rates` of an axis with a pump of its own."""
-    volumes, area_head, area_rod = _pumped_volumes(user, u, x), user[u + _AH], user[u + _AR]
-    return pump_pressure_rates(
-        user, u + PUMP, speed, p_head, p_rod, volumes, (area_head * v, area_rod * v),
-        user[u + _LEAK],
-    )  # fmt: skip
-
-
-@compiled
-def _pumped_volumes(user, u, x):
-    """Volumes of both chambers and the oil that the piston has taken from the accumulator."""
-    inside = min(max(x, 0.0), user[u + _STROKE])
-    area_head, area_rod = user[u + _AH], user[u + _AR]
-    return (
-        user[u + _VH] + area_head * inside,
-        user[u + _VR] + area_rod * (user[u + _STROKE] - inside),
-        (area_head - area_rod) * inside,
-    )
-
-
-@compiled
-def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
-    """Force of an axis with a pump of its own, after its load cylinder and friction.
-
-    Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
-        p_load: pressure in the load cylinder, scalar [Pa].
-        p_head: scalar [Pa].
-        p_rod: scalar [Pa].
-        v: piston velocity, scalar [m/s].
-        other: what else acts on the piston, scalar [N].
-        dt: step over which friction acts, scalar [s]; see `pump_piston_friction`.
-
-    Returns:
-        Force, scalar [N].
-
-    Source: nominal model, "Piston force", with the friction of `pump_piston_friction`.
-    """
-    force = user[u + _AH] * p_head - user[u + _AR] * p_rod - load_force(user, u + PUMP, p_load)
-    seal = (
-        user[u + _FC], user[u + _FS], user[u + _VS], user[u + _B], user[u + _AC], user[u + _AV],
-    )  # fmt: skip
-    return force - pump_piston_friction(user, u + PUMP, seal, v, force + other, p_load, dt)
 
 
 @compiled
@@ -364,75 +307,6 @@ def step_circuit(user, first, count, act, command, length, velocity, dt, act_dot
 
 
 @compiled
-def actuator_friction(user, u, velocity):
-    """Friction of one actuator at a velocity.
-
-    Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
-        velocity: scalar [m/s] or [rad/s].
-
-    Returns:
-        Friction force, scalar [N] or [N m], with the sign of the velocity.
-
-    Source: nominal model, "Piston force".
-    """
-    return friction(
-        velocity,
-        user[u + _FC],
-        user[u + _FS],
-        user[u + _VS],
-        user[u + _B],
-        user[u + _V0],
-        user[u + _AC],
-        user[u + _AV],
-    )
-
-
-@compiled
-def actuator_friction_slope(user, u, velocity):
-    """Slope of `actuator_friction` with respect to the velocity.
-
-    Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
-        velocity: scalar [m/s] or [rad/s].
-
-    Returns:
-        dF_f/dv, scalar [N s/m] or [N m s/rad].
-
-    Source: derivative of the nominal model's "Piston force".
-    """
-    return friction_slope(
-        velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _B], user[u + _V0],
-        user[u + _AC], user[u + _AV],
-    )  # fmt: skip
-
-
-@compiled
-def actuator_stop(user, u, position, velocity):
-    """Force of the ends of an actuator's travel, and its slopes.
-
-    Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
-        position: of the load side, scalar [m] or [rad].
-        velocity: of the load side, scalar [m/s] or [rad/s].
-
-    Returns:
-        (force towards the inside [N] or [N m], its stiffness [N/m] or [N m/rad], its damping
-        [N s/m] or [N m s/rad]); all 0 inside.
-
-    Source: `laws.stop_force`.
-    """
-    if user[u + _HARD] == 0.0:
-        return 0.0, 0.0, 0.0
-    return stop_force(
-        position, velocity, user[u + _LOW], user[u + _HIGH], user[u + _HARD], user[u + _SOFT]
-    )
-
-
-@compiled
 def axis_state(user, i, supply, act, x, v):
     """Flows and force of one axis in a state, for logs and balances.
 
@@ -451,7 +325,7 @@ def axis_state(user, i, supply, act, x, v):
     """
     u = i * SLOTS
     if user[u + _KIND] == _PUMPED:
-        taken = _pumped_volumes(user, u, x)[2]
+        taken = pumped_volumes(user, u, x)[2]
         q_head, q_rod, _, _ = pump_flows(user, u + PUMP, act[0], act[2], act[3], taken)
         return q_head, q_rod, pumped_force(user, u, act[1], act[2], act[3], v, 0.0, 0.0)
     opening = axis_opening(user, u, act[0])
