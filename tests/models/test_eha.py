@@ -81,12 +81,13 @@ def test_speed_drives_it_without_a_motor():
     Below 1 % is the compression while the pressures still settle.
     """
     machine = changed(ideal("none"), "axes.piston.pump.motor", None)
-    pump, area = machine.axes["piston"].pump, machine.axes["piston"].cylinder.area_head
+    pump, cylinder = machine.axes["piston"].pump, machine.axes["piston"].cylinder
+    assert pump and cylinder
     rows = in_mujoco(machine, np.full(3000, 0.5))
     speed = (rows[-1, 0] - rows[1500, 0]) / 1.499
     leak = pump.leakage * (rows[-1, 1] - rows[-1, 2])
     flow = 0.5 * pump.rated_speed * pump.displacement - leak
-    assert speed == pytest.approx(flow / area, rel=1.0e-2)
+    assert speed == pytest.approx(flow / cylinder.area_head, rel=1.0e-2)
 
 
 def test_stands_still_under_load_with_the_valve_shut():
