@@ -26,8 +26,8 @@ from hydrotele.machine import Machine
 from hydrotele.prediction.evidence import Evidence, Judged, charge
 from hydrotele.prediction.hypothesis import Hypothesis
 from hydrotele.prediction.inputs import Input, input_sizes, input_units
-from hydrotele.prediction.linear import linear_run, smooth
-from hydrotele.prediction.track import STARTLE, Track, by_kind, state_drift
+from hydrotele.prediction.levels import smoothed, smoothed_inputs
+from hydrotele.prediction.track import Track
 from hydrotele.terms.facts import Term
 
 LEARNED = "learned"
@@ -195,19 +195,10 @@ def _drives_of(model, sp, states, position, velocity):
 
 def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
     machine = judged.guess.machine(nominal)
-    names, m = list(track.names), len(track.levels.inputs)
     size = track.states.shape[1]
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
-    told = smooth(
-        run, track.levels.noise**2, state_drift(names, track.levels, track.run.period), True
-    )
+    run, told = smoothed(track)
     states = track.states - run.correction[:, :size] + told.deviation[:, :size]
-    fading = np.diag(track.flow[0])[len(names) - m :] if m else np.zeros(0)
-    held, inputs = np.zeros(m), np.zeros((len(states), m))
-    for row in range(len(states)):  # what the track's own filter took the inputs to be
-        inputs[row] = held
-        held = fading * (held + run.correction[row, len(names) - m :])
-    inputs += told.deviation[:, len(names) - m :]
+    inputs = smoothed_inputs(track, (run, told))
     model = reduced_model(machine, ())
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
@@ -466,8 +457,10 @@ def _resembles(law: Learned, along: np.ndarray) -> str:
     way = np.tanh(v / law.smoothing)
     forms: dict[str, np.ndarray] = {}
     if law.balance == "force":
-        forms = {"coulomb_friction": way, "viscous_friction": v, "speed_dependent_force": v * abs(v),
-                 "external_force": np.ones_like(v)}  # fmt: skip
+        forms = {
+            "coulomb_friction": way, "viscous_friction": v, "external_force": np.ones_like(v),
+            "speed_dependent_force": v * abs(v),
+        }  # fmt: skip
         if "force" in s:
             forms["load_dependent_friction"] = abs(s["force"]) * way
     elif law.balance in (THROUGH, "flow_head", "flow_rod") and "pressure_head" in s:
@@ -517,8 +510,10 @@ def describe(
         )  # fmt: skip
         words += [one.description for one in learned]
     if not words:
-        words = [f"The readings of {channel} differ from the model by more than their noise, and no"
-                 " balance of forces or flows explains it: the sensor or the geometry."]  # fmt: skip
+        words = [
+            f"The readings of {channel} differ from the model by more than their noise, and no"
+            " balance of forces or flows explains it: look at the sensor and at the geometry."
+        ]
     return Unknown(law, channel, depends, " ".join(words), term, _windows(after[0], channel))
 
 

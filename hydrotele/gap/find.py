@@ -31,7 +31,7 @@ from hydrotele.prediction.evidence import Evidence, Judged
 from hydrotele.prediction.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.prediction.inputs import input_sizes, input_units
 from hydrotele.prediction.intervals import spreads
-from hydrotele.prediction.stretches import busiest
+from hydrotele.prediction.stretches import busiest, thinned
 from hydrotele.prediction.track import STEP, Levels, Track, known_levels, track_run
 
 SURE = 0.95  # probability below which an effect is called ambiguous
@@ -64,7 +64,7 @@ def find_gap(
     begin = time.perf_counter()
     tell = progress or (lambda text, share: None)
     candidates = hypotheses(data.machine, effects)
-    data = busiest(data)
+    data = thinned(busiest(data))
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
     try:
         found = search(evidence, candidates, progress)
@@ -329,8 +329,10 @@ def _experiment(machine: Machine, verdict: Verdict, named: Sequence[NamedEffect]
 def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> list[str]:
     notes = []
     ratio = levels.noise / data.noise
-    off = [f"{channel} {100 * (r - 1):+.0f} %" for channel, r in zip(data.channels, ratio, strict=True)
-           if np.isfinite(r) and abs(r - 1.0) > _OFF]  # fmt: skip
+    off = [
+        f"{channel} {100 * (r - 1):+.0f} %" for channel, r in zip(data.channels, ratio, strict=True)
+        if np.isfinite(r) and abs(r - 1.0) > _OFF
+    ]  # fmt: skip
     if off:
         notes.append(f"Noise that differs from what the machine states: {', '.join(off)}.")
     if not known_levels(data):

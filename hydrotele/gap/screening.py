@@ -94,7 +94,9 @@ def _rank(
 
         rated = []
         for start in hypothesis.starts:
-            if np.any(start):
+            if np.any(start) and hypothesis.size > 1:
+                rated.append(_point(hypothesis, ground, start, shift_to(start)))
+            elif np.any(start):
                 line = _line(hypothesis, ground, (shift_to(start) / start[0])[:, None])
                 rated.append(Screened(hypothesis, line.score, line.gain, start))
             else:
