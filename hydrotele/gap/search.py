@@ -23,6 +23,7 @@ ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines 
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
+_SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
 _STEPS = 3  # of Gauss-Newton for a candidate
 _MIDDLE = 2.0e-3  # s, step for the fits that choose between candidates
 _SHORT = 5  # candidates that are fitted after a screening
@@ -391,7 +392,7 @@ def _promoted(
 def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
     """Fit with levels and gains computed anew until they no longer matter."""
     fit = None
-    for _ in range(3):
+    for _ in range(_SETTLES):
         evidence.set_base(judged)
         kept = evidence.base_slopes() if _calibration_of(judged.guess) else None
         fit = evidence.fit(judged.guess, 0.0, kept=kept)

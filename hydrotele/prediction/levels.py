@@ -42,6 +42,7 @@ from hydrotele.prediction.track import (
 WHITE = ("rate", "drive_rate", "spool", "pressure_head", "pressure_rod")
 """Kinds of states to which white noise is added, too: ripple and what the rows are too slow for."""
 _MOST = 1.0e4  # times its floor that white noise can reach
+_RIPPLE = 10.0  # times its floor from which white noise counts as there
 LEAST = 1.0e-4  # of an input's largest size: below it an input is none
 _STATED = 0.5  # prior standard deviation of log(noise / stated): a data sheet is good to a factor
 _LACK = 4.0  # prior standard deviation of log(size / least): says next to nothing
@@ -260,6 +261,26 @@ def smoothed(track: Track) -> tuple[LinearRun, Smoothed]:
     run = linear_run(track, by_kind(names, STARTLE) ** 2)
     drift = state_drift(names, track.levels, track.run.period)
     return run, smooth(run, track.levels.noise**2, drift, True)
+
+
+def undisturbed_loss(track: Track) -> float:
+    """-2 log likelihood to expect of a track whose unknown inputs were nothing, noise as found."""
+    names, m = list(track.names), len(track.levels.inputs)
+    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    drift = state_drift(names, track.levels, track.run.period)
+    initial = run.initial.copy()
+    first = len(names) - m
+    drift[first:], initial[first:] = 0.0, 0.0
+    width = smooth(run._replace(initial=initial), track.levels.noise**2, drift).width
+    there = np.isfinite(track.whitened)
+    return float(np.sum(1.0 + 2.0 * np.log(width[there])))
+
+
+def rippled(levels: Levels) -> bool:
+    """Whether white process noise is more than what an integrator leaves."""
+    return any(
+        size > _RIPPLE * DRIFT[name.partition(".")[0]] for name, size in levels.drift.items()
+    )
 
 
 def input_excess(track: Track) -> float:
