@@ -13,7 +13,7 @@ import numpy as np
 
 from hydrotele.gap.screening import Screened, screen
 from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
-from hydrotele.prediction.evidence import Evidence, Fit, Judged, charge
+from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
 from hydrotele.prediction.inputs import Input
 from hydrotele.prediction.levels import input_excess, smoothed_inputs
@@ -24,8 +24,8 @@ LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be 
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
 _SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
+_ROOM = 3.0  # times the room to a bound that an effect gets that stands there
 _STEPS = 3  # of Gauss-Newton for a candidate
-_MIDDLE = 2.0e-3  # s, step for the fits that choose between candidates
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
@@ -253,11 +253,11 @@ def _best_single(
     short = [s for s in ranked[:_SHORT] if s.score > bar]
     if not short:
         return None, 0.0
-    evidence.base_slopes(_MIDDLE)
+    evidence.base_slopes(MIDDLE)
 
     def fitted(candidate: Screened) -> Fit:
         more = now.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, _MIDDLE)
+        step = evidence.step_of(more, MIDDLE)
         kept = evidence.base_slopes(step, parallel=False)
         before = _loss_of(evidence, now.guess, step)
         return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
@@ -306,9 +306,9 @@ def _best_pair(
         for index in pair:
             start = pool[index].start
             more = more.plus(pool[index].hypothesis, start)
-        kept = evidence.base_slopes(_MIDDLE, parallel=False)
-        before = _loss_of(evidence, now.guess, _MIDDLE)
-        found = evidence.fit(more, before, parallel=False, step=_MIDDLE, kept=kept)
+        kept = evidence.base_slopes(MIDDLE, parallel=False)
+        before = _loss_of(evidence, now.guess, MIDDLE)
+        found = evidence.fit(more, before, parallel=False, step=MIDDLE, kept=kept)
         sizes = sum(h.size for h, _ in more.parts[len(now.guess.parts) :])
         return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
                    found.information)  # fmt: skip
@@ -327,7 +327,7 @@ def _calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
     judged, gain, cost = now, 0.0, 0.0
     guess = now.guess.plus(group, np.zeros(group.size))
     for _ in range(3):
-        step = evidence.step_of(guess, _MIDDLE)
+        step = evidence.step_of(guess, MIDDLE)
         errors = evidence.errors(guess, step)
         slopes = evidence.slopes(guess, errors, step=step)
         fit = evidence.fit(guess, 0.0, step=step, kept=slopes, steps=3)
@@ -394,17 +394,37 @@ def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
     fit = None
     for _ in range(_SETTLES):
         evidence.set_base(judged)
-        kept = evidence.base_slopes() if _calibration_of(judged.guess) else None
-        fit = evidence.fit(judged.guess, 0.0, kept=kept)
+        kept = evidence.base_slopes(MIDDLE) if _calibration_of(judged.guess) else None
+        fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if kept is not None else None)
         moved = fit.guess.deviation - judged.guess.deviation
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
         if np.all(np.abs(moved) < 0.3 * spread):
             break
-        judged = evidence.judged(fit.guess)
+        judged = evidence.judged(_widened(fit.guess))
     assert fit
     if fit.guess is not judged.guess:
         judged = evidence.set_base(evidence.judged(fit.guess))
     return judged, fit
+
+
+def _widened(guess: Guess) -> Guess:
+    """A guess in which effects that stand at a bound have three times as much room.
+
+    A bound at zero is physical and stays.
+    """
+    parts = []
+    for hypothesis, deviation in guess.parts:
+        table, values = dict(hypothesis.parameters), hypothesis.values(deviation)
+        for key, p in hypothesis.parameters.items():
+            if hypothesis.name == CALIBRATION:
+                continue
+            if values[key] >= p.high:
+                table[key] = replace(p, high=p.nominal + _ROOM * (p.high - p.nominal))
+            elif values[key] <= p.low and p.low != 0.0:
+                low = p.low / _ROOM if p.low > 0.0 else p.nominal - _ROOM * (p.nominal - p.low)
+                table[key] = replace(p, low=low)
+        parts.append((replace(hypothesis, parameters=table), deviation))
+    return Guess(tuple(parts))
 
 
 def worth_naming(guess: Guess, index: int, score: float) -> bool:
@@ -445,7 +465,7 @@ def _rests(
     """For each part the guess without it, fitted and judged (None for calibration); scores."""
     rests: list[Judged | None] = []
     scores: list[float] = []
-    slopes = evidence.base_slopes() if now.guess.parts else np.zeros((0, 0))
+    slopes = evidence.base_slopes(MIDDLE) if now.guess.parts else np.zeros((0, 0))
     sizes = np.cumsum([0, *(h.size for h, _ in now.guess.parts)])
     for index, (hypothesis, _) in enumerate(now.guess.parts):
         assert fit
@@ -456,7 +476,7 @@ def _rests(
         smaller = now.guess.without(index)
         kept = np.delete(slopes, np.s_[sizes[index] : sizes[index + 1]], axis=1)
         if smaller.parts:
-            smaller = evidence.fit(smaller, 0.0, kept=kept, steps=2).guess
+            smaller = evidence.fit(smaller, 0.0, kept=kept, steps=2, step=MIDDLE).guess
         rest = evidence.judged(smaller, base.tracks) if smaller.parts else base
         cost = charge(_last(fit.information, now.guess, index), hypothesis.size)
         score = rest.loss - now.loss - cost
@@ -498,11 +518,11 @@ def _rivals(
     if not pool:
         return ()
     evidence.set_base(rest)
-    evidence.base_slopes(_MIDDLE)
+    evidence.base_slopes(MIDDLE)
 
     def fitted(candidate: Screened) -> Fit:
         more = rest.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, _MIDDLE)
+        step = evidence.step_of(more, MIDDLE)
         kept = evidence.base_slopes(step, parallel=False)
         before = _loss_of(evidence, rest.guess, step)
         return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
@@ -516,7 +536,10 @@ def _rivals(
             continue
         if judged.loss < now.loss + _HOPELESS:  # worth a second look at its own levels
             evidence.set_base(judged)
-            again = evidence.fit(judged.guess, 0.0, step=evidence.step_of(judged.guess, _MIDDLE))
+            step = evidence.step_of(judged.guess, MIDDLE)
+            again = evidence.fit(
+                judged.guess, 0.0, step=step, kept=evidence.base_slopes(step), steps=3
+            )
             better = evidence.judged(again.guess)
             judged = min(judged, better, key=lambda j: j.loss)
             evidence.set_base(rest)
