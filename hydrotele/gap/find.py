@@ -9,7 +9,8 @@ import numpy as np
 from hydrotele.dataset.load import Dataset
 from hydrotele.gap.balances import balances
 from hydrotele.gap.constancy import constancy
-from hydrotele.gap.discover import Discovery, describe, discover
+from hydrotele.gap.description import describe, learned_laws
+from hydrotele.gap.discover import Discovery, discover
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.floor import perfect_tracks
 from hydrotele.gap.residuals import residual_tests, rms
@@ -86,7 +87,7 @@ def find_gap(
         evidence.close()
     failed = any(not test["passed"] for test in tests.values())
     named = _named(found, spread, shares, rms(after[:1]), floor)
-    learned = discovery.described(evidence.data.machine, spread, shares)
+    learned = learned_laws(discovery, nominal, spread, shares)
     verdict = _verdict(named, failed, floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
