@@ -116,8 +116,8 @@ def _resembles(law: Learned, along: np.ndarray) -> str:
     way = np.tanh(v / law.smoothing)
     forms: dict[str, np.ndarray] = {}
     if law.balance == "force":
-        forms = {"coulomb_friction": way, "viscous_friction": v, "speed_dependent_force": v * abs(v),
-                 "external_force": np.ones_like(v)}  # fmt: skip
+        forms = {"coulomb_friction": way, "viscous_friction": v, "external_force": np.ones_like(v),
+                 "speed_dependent_force": v * abs(v)}  # fmt: skip
         if "force" in s:
             forms["load_dependent_friction"] = abs(s["force"]) * way
     elif law.balance in (THROUGH, "flow_head", "flow_rod") and "pressure_head" in s:

@@ -84,13 +84,13 @@ def learned_words(
 ) -> str:
     """What a learned law does, in a sentence or two.
 
-    >>> learned_words("force", "boom", "position", "sign(velocity, 0.01)", 9e3, "N", "")
-    'A force on the boom drive, 9 kN RMS, that varies with position and changes sign with the motion.'
+    >>> learned_words("force", "boom", "position", "velocity", 9e3, "N", "")
+    'A force on the boom drive, 9 kN RMS, that varies with position and grows with the velocity.'
     """
     how = f"that varies with the {variable_words(variable)}"
     how = how.replace("the position", "position").replace("the time", "time")
     if factor == "velocity":
-        how += " and grows in proportion to the velocity"
+        how += " and grows with the velocity"
     elif factor:
         how += " and changes sign with the motion"
     text = f"{_capital(_LACKS[balance].format(axis=axis))}, {amount(size, unit)} RMS, {how}."
@@ -177,6 +177,15 @@ def chance_words(probability: float) -> str:
     return "under 0.1 %" if probability < 0.001 else f"{100 * probability:.3g} %"
 
 
+def share_words(share: float) -> str:
+    """A share of the gap in percent, `-` where it is not known.
+
+    >>> share_words(0.634), share_words(math.nan)
+    ('63 %', '-')
+    """
+    return f"{100 * share:.0f} %" if math.isfinite(share) else "-"
+
+
 def gap_closed(size: GapSize) -> float:
     """Part of the gap that the patch closes, at most 1; NaN where none is known above the noise."""
     if size.noise_floor is None:
@@ -254,7 +263,7 @@ def _effect(effect: NamedEffect, run: str) -> str:
     what = f"{effect_title(effect)} ({known.sentence})" if known else effect_title(effect)
     text = _capital(f"{what}: {facts}. Probability {chance_words(effect.probability)}.")
     if math.isfinite(effect.share):
-        text += f" Without it {100 * effect.share:.0f} % of the gap on {run} comes back."
+        text += f" Without it {share_words(effect.share)} of the gap on {run} comes back."
     return text
 
 
@@ -268,7 +277,8 @@ def _calibrated(gap: Gap) -> tuple[str, ...]:
     ]
     count = len(gap.calibration)
     many = f"{count} uncertain numbers were" if count > 1 else "One uncertain number was"
-    return (f"{many} calibrated within what the machine file allows; most moved: {', '.join(told)}.",)
+    most = f"most moved: {', '.join(told)}"
+    return (f"{many} calibrated within what the machine file allows; {most}.",)
 
 
 def _agreement(gap: Gap) -> str:
@@ -356,11 +366,10 @@ def _located(gap: Gap) -> tuple[str, ...]:
     if unknown.depends_on:
         on = _listed([channel_words(name) for name in unknown.depends_on], "and")
         where += f"; it changes with the {on}"
-    learned = (
-        f"{'One law was' if len(gap.learned) == 1 else f'{len(gap.learned)} laws were'} learned from"
-        " the data for it and written into the patched machine.",
-    )  # fmt: skip
-    return (f"{where}.", unknown.description, *(learned if gap.learned else ()))
+    count = len(gap.learned)
+    many = "One law was" if count == 1 else f"{count} laws were"
+    learned = f"{many} learned from the data for it and written into the patched machine."
+    return (f"{where}.", unknown.description, *([learned] if gap.learned else []))
 
 
 def _experiment(gap: Gap) -> tuple[str, ...]:
