@@ -13,10 +13,10 @@ from hydrotele.machine_file import load_machine
 from hydrotele.prediction.free_run import (
     Runner,
     chained,
+    following_levels,
     free_run_errors,
     machine_runner,
     window_starts,
-    following_levels,
 )
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario
