@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from hydrotele.dataset.load import Dataset
-from hydrotele.gap.balances import balances
+from hydrotele.gap.balances import run_balances
 from hydrotele.gap.constancy import constancy
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, discover
@@ -95,7 +95,7 @@ def find_gap(
     unknown = None
     if failed or learned:
         unknown = describe(lacks, learned, improved)
-    laws, units = _laws(data, patched)
+    laws, units = _laws(data, patched, judge.levels.noise)
     tell("done", 1.0)
     return Gap(
         machine=nominal,
@@ -296,11 +296,11 @@ def _noise(data: Dataset, levels: Levels) -> dict[str, tuple[float, float]]:
     }
 
 
-def _laws(data: Dataset, patched: Machine):
+def _laws(data: Dataset, patched: Machine, noise: np.ndarray):
     """Balance residuals of the held-out run before and after."""
-    log = data.heldout.log
-    before = balances(data.machine, log, data.sensors)
-    after = balances(patched, log, data.sensors) if patched is not data.machine else before
+    before = after = run_balances(data.machine, data, data.heldout, noise)
+    if patched is not data.machine:
+        after = run_balances(patched, data, data.heldout, noise)
     laws, units = {}, {}
     for law, places in before.items():
         laws[law] = {
@@ -330,7 +330,8 @@ def _experiment(machine: Machine, verdict: Verdict, named: Sequence[NamedEffect]
 def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> list[str]:
     notes = []
     ratio = levels.noise / data.noise
-    off = [f"{channel} {100 * (r - 1):+.0f} %" for channel, r in zip(data.channels, ratio, strict=True)
+    off = [f"{channel} {100 * (r - 1):+.0f} %"
+           for channel, r in zip(data.channels, ratio, strict=True)
            if np.isfinite(r) and abs(r - 1.0) > _OFF]  # fmt: skip
     if off:
         notes.append(f"Noise that differs from what the machine states: {', '.join(off)}.")
