@@ -27,7 +27,7 @@ from hydrotele.gap.result import Gap
 from hydrotele.identify.zero_phase import zero_phase
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
-from hydrotele.prediction.levels import find_levels
+from hydrotele.prediction.free_run import following_levels
 from hydrotele.prediction.stretches import busiest
 from hydrotele.prediction.track import track_run
 
@@ -66,7 +66,8 @@ def velocity_fit(machine: Machine, data: Dataset, cutoff: float) -> dict[str, fl
     rows, lead = round(WINDOW / run.period), round(LEAD / run.period)
     hidden = np.arange(len(run.reading)) % rows >= lead
     reading = np.where(hidden[:, None], np.nan, run.reading)
-    states = track_run(machine, data, dataclasses.replace(run, reading=reading)).states
+    hiding = dataclasses.replace(run, reading=reading)
+    states = track_run(machine, data, hiding, levels=following_levels(data)).states
     names, fits = state_names(machine), {}
     for column, channel in enumerate(data.channels):
         axis = channel.partition(".")[2]
@@ -116,7 +117,7 @@ def ec20(folder: Path, jobs: int) -> None:
     machine = data.machine
     gap = find_gap(data, lambda text, _: print(f"  {text}", file=sys.stderr), jobs=jobs)
     print(f"EC20: {gap.verdict}: {named(gap)}  ({gap.seconds:.0f} s)")
-    judged = find_levels(busiest(data))
+    judged = busiest(data)
     before, after = (velocity_fit(m, judged, 2.0) for m in (machine, gap.patched))
     for axis, fit in before.items():
         print(f"  velocity fit, held out, {axis}: {fit:.1f} -> {after[axis]:.1f} %")

@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from hydrotele.dataset.load import Dataset
-from hydrotele.gap.balances import balances
+from hydrotele.gap.balances import run_balances
 from hydrotele.gap.constancy import constancy
-from hydrotele.gap.discover import Discovery, describe, discover
+from hydrotele.gap.description import describe, learned_laws
+from hydrotele.gap.discover import Discovery, discover
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.floor import perfect_tracks
 from hydrotele.gap.residuals import residual_tests, rms
@@ -88,7 +89,7 @@ def find_gap(
         evidence.close()
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
     named = _named(found, spread, shares, rms(after[:1]), floor)
-    learned = discovery.described(evidence.data.machine, spread, shares)
+    learned = learned_laws(discovery, nominal, spread, shares)
     verdict = _verdict(named, failed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
@@ -96,7 +97,7 @@ def find_gap(
     unknown = None
     if failed or learned:
         unknown = describe(lacks, learned, improved)
-    laws, units = _laws(data, patched)
+    laws, units = _laws(data, patched, judge.levels.noise)
     tell("done", 1.0)
     return Gap(
         machine=nominal,
@@ -305,11 +306,11 @@ def _noise(data: Dataset, levels: Levels) -> dict[str, tuple[float, float]]:
     }
 
 
-def _laws(data: Dataset, patched: Machine):
+def _laws(data: Dataset, patched: Machine, noise: np.ndarray):
     """Balance residuals of the held-out run before and after."""
-    log = data.heldout.log
-    before = balances(data.machine, log, data.sensors)
-    after = balances(patched, log, data.sensors) if patched is not data.machine else before
+    before = after = run_balances(data.machine, data, data.heldout, noise)
+    if patched is not data.machine:
+        after = run_balances(patched, data, data.heldout, noise)
     laws, units = {}, {}
     for law, places in before.items():
         laws[law] = {
