@@ -263,7 +263,7 @@ def _shapes(machine: Machine, i: Input, balance: str, seen: Sequence[_Seen]) -> 
             continue
         span = np.quantile(x, [0.02, 0.98])
         edges = np.quantile(x, np.linspace(0.02, 0.98, _KNOTS + 2)[1:-1])
-        even = np.linspace(*span, _KNOTS + 2)[1:-1]
+        even = np.linspace(span[0], span[1], _KNOTS + 2)[1:-1]
         knots = tuple(sorted({float(_number(k)) for k in 0.5 * (edges + even)}))
         factors = ["", sign, "velocity"]
         if variable == "velocity":
@@ -335,12 +335,12 @@ def _law(
             (("flow_head", -1.0), ("flow_rod", 1.0)) if balance == THROUGH else ((balance, 1.0),)
         )
         for side, sign in sides:
-            terms.append(Term(
-                name=name, axis=i.axis, balance=side, law="formula",
-                parameters={p: sign * value for p, value in found.items()}, domain=domain,
-                uncertainty=uncertainty,
-                description=f"learned from data: {balance} over {shape.variable}",
-            ))  # fmt: skip
+            terms.append(Term.model_validate({
+                "name": name, "axis": i.axis, "balance": side, "law": "formula",
+                "parameters": {p: sign * value for p, value in found.items()}, "domain": domain,
+                "uncertainty": uncertainty,
+                "description": f"learned from data: {balance} over {shape.variable}",
+            }))  # fmt: skip
         return nominal.model_copy(update={"terms": tuple(terms)})
 
     location = f"{i.axis}.{shape.variable.replace(' ', '')}"

@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hydrotele.gap.calibrating import calibrated, calibration_of, free_of_calibration, promoted
+from hydrotele.gap.pulses import timed
 from hydrotele.gap.screening import Screened, screen
-from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
+from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
-from hydrotele.prediction.inputs import Input
-from hydrotele.prediction.levels import input_excess, smoothed_inputs
+from hydrotele.prediction.levels import input_excess
 from hydrotele.prediction.track import COARSE
 
 ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines stay below 14.7
@@ -94,13 +95,13 @@ def search(
     tell("find noise levels of the given model", 0.0)
     base = now = evidence.set_base(Guess())
     fit, weak, first, refused, tried = None, None, (), 0, False
-    candidates = _timed(candidates, base)
+    candidates = timed(candidates, base)
     rankings: dict[tuple[str, str], Sequence[Screened]] = {}
     worth = 0.0
     while refused < _REFUSED:
         done = 0.85 * (1.0 - 0.7 ** len(now.guess.parts)) + 0.05
         tell(f"try every effect ({_named_so_far(now.guess)} named so far)", done)
-        ranked = screen(evidence, now.guess, _free(candidates, now.guess))
+        ranked = screen(evidence, now.guess, free_of_calibration(candidates, now.guess))
         first = first or tuple(ranked)
         best, worth = _best_single(evidence, now, ranked)
         if best is None and lacking(now, evidence) > LACKING and len(ranked) > 1:
@@ -122,14 +123,14 @@ def search(
                 refused += 1
                 continue
         if (
-            not _calibration_of(now.guess)
+            not calibration_of(now.guess)
             and lacking(grown, evidence) > LACKING
             and (best is None or not tried)
         ):
             tell("calibrate the uncertain numbers", done + 0.04)
             tried = True
             evidence.set_base(now)
-            other, gain = _calibrated(evidence, now)
+            other, gain = calibrated(evidence, now)
             if other and gain > max(worth, ENTER):
                 best = other
                 grown, settled = settle(evidence, other)
@@ -140,7 +141,8 @@ def search(
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = ranked
         now, fit = grown, settled
-        now, fit = _promoted(evidence, now, fit, candidates)
+        if own := promoted(evidence, now, candidates):
+            now, fit = settle(evidence, evidence.judged(own))
     tell("drop what is needless", 0.87)
     now, fit, without = _pruned(evidence, base, now, fit)
     tell("compare rivals", 0.9)
@@ -152,50 +154,6 @@ def search(
         rest = without[index]
         rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
     return Found(base, now, fit, first, tuple(charges), without, tuple(rivals), weak)
-
-
-def _timed(candidates: Sequence[Hypothesis], base: Judged) -> list[Hypothesis]:
-    """Candidates of which those that act for a while only begin when the unknown inputs say so."""
-    inputs = base.tracks[0].levels.inputs
-    series = None
-    found = []
-    for candidate in candidates:
-        acts = Input("force", candidate.location)
-        if not {"size", "start", "duration"} <= candidate.parameters.keys() or acts not in inputs:
-            found.append(candidate)
-            continue
-        if series is None:
-            series = [smoothed_inputs(t) for t in base.tracks]
-        place = inputs.index(acts)
-        spans = [
-            _loudest(u[:, place], t.run.period) for u, t in zip(series, base.tracks, strict=True)
-        ]
-        best = int(np.argmax([span[0] for span in spans]))
-        _, size, first, rows = spans[best]
-        run, table = base.tracks[best].run, dict(candidate.parameters)
-        table["size"] = replace(table["size"], starts=(size,))
-        for key, value in (
-            ("start", run.start + first * run.period),
-            ("duration", rows * run.period),
-        ):
-            table[key] = replace(table[key], nominal=value)
-        found.append(replace(candidate, parameters=table))
-    return found
-
-
-def _loudest(u: np.ndarray, period: float) -> tuple[float, float, int, int]:
-    """The span of a series (n,) whose mean stands out most: its score, mean, first row, rows."""
-    total = np.concatenate([[0.0], np.cumsum(u - np.median(u))])
-    best = (0.0, 0.0, 0, 1)
-    rows = max(2, round(0.1 / period))
-    while rows < 0.7 * len(u):
-        sums = total[rows:] - total[:-rows]
-        at = int(np.argmax(np.abs(sums)))
-        score = float(sums[at] ** 2 / rows)
-        if score > best[0]:
-            best = score, float(sums[at] / rows), at, rows
-        rows = max(rows + 1, int(1.3 * rows))
-    return best
 
 
 def lacking(judged: Judged, evidence: Evidence) -> float:
@@ -228,21 +186,6 @@ def weights(blocks: Sequence[np.ndarray], charges: Sequence[float], seed: int = 
 
 def _named_so_far(guess: Guess) -> int:
     return sum(h.name != CALIBRATION for h, _ in guess.parts)
-
-
-def _calibration_of(guess: Guess) -> Hypothesis | None:
-    return next((h for h, _ in guess.parts if h.name == CALIBRATION), None)
-
-
-def _free(candidates: Sequence[Hypothesis], guess: Guess) -> list[Hypothesis]:
-    """Candidates that change no number that is calibrated already."""
-    group = _calibration_of(guess)
-    if group is None:
-        return list(candidates)
-    return [
-        c for c in candidates
-        if not any(f"{c.name}.{c.location}.{key}" in group.parameters for key in c.parameters)
-    ]  # fmt: skip
 
 
 def _best_single(
@@ -318,83 +261,12 @@ def _best_pair(
     return _best_of(evidence, now, fits)
 
 
-def _calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
-    """All uncertain numbers fitted together, judged, and the score of that."""
-    taken = {f"{h.name}.{h.location}.{key}" for h, _ in now.guess.parts for key in h.parameters}
-    group = calibration(evidence.data.machine, frozenset(taken))
-    if not group.parameters:
-        return None, 0.0
-    judged, gain, cost = now, 0.0, 0.0
-    guess = now.guess.plus(group, np.zeros(group.size))
-    for _ in range(3):
-        step = evidence.step_of(guess, MIDDLE)
-        errors = evidence.errors(guess, step)
-        slopes = evidence.slopes(guess, errors, step=step)
-        fit = evidence.fit(guess, 0.0, step=step, kept=slopes, steps=3)
-        before, judged = judged.loss, evidence.judged(fit.guess)
-        guess, cost = fit.guess, charge(fit.information, group.size)
-        gain = now.loss - judged.loss - cost
-        if before - judged.loss < ENTER:
-            break
-        evidence.set_base(judged)
-    evidence.set_base(now)
-    return (judged, gain) if gain > ENTER else (None, 0.0)
-
-
-def _promoted(
-    evidence: Evidence, now: Judged, fit: Fit, candidates: Sequence[Hypothesis]
-) -> tuple[Judged, Fit]:
-    """Numbers that calibration moves beyond what is uncertain become effects of their own.
-
-    What the others move by is what uncertain means: the scale of all deviations, if it is larger
-    than the stated one, is taken for each.
-    """
-    place = next((i for i, (h, _) in enumerate(now.guess.parts) if h.name == CALIBRATION), -1)
-    if place < 0:
-        return now, fit
-    group, deviation = now.guess.parts[place]
-    table = numbers(evidence.data.machine)
-    keys = list(group.parameters)
-    usual = max(1.0, 1.4826 * float(np.median(np.abs(deviation))))
-    moved: dict[tuple[str, str], float] = {}
-    for key, d in zip(keys, deviation, strict=True):
-        effect = table[key].effect
-        if effect is None:
-            continue
-        known = next((c for c in candidates if c.key == effect[:2]), None)
-        if known is None or abs(d * table[key].parameter.scale) < known.parameters[effect[2]].least:
-            continue
-        ratio = usual * table[key].parameter.scale / known.parameters[effect[2]].scale
-        gain = (d / usual) ** 2 * (1.0 - min(ratio, 1.0) ** 2) + 2.0 * np.log(min(ratio, 1.0))
-        moved[effect[:2]] = moved.get(effect[:2], 0.0) + gain
-    effects = [key for key, gain in moved.items() if gain > ENTER]
-    if not effects:
-        return now, fit
-    parts, gone = list(now.guess.parts), set()
-    for name, location in effects:
-        known = next(c for c in candidates if c.key == (name, location))
-        start = []
-        for key, p in known.parameters.items():
-            full = f"{name}.{location}.{key}"
-            if full in keys:
-                gone.add(full)
-                value = p.nominal + deviation[keys.index(full)] * table[full].parameter.scale
-                start.append((value - p.nominal) / p.scale)
-            else:
-                start.append(0.0)
-        parts.append((known, np.clip(start, known.low, known.high)))
-    rest = calibration(evidence.data.machine, frozenset(set(table) - set(keys) | gone))
-    kept = np.array([d for key, d in zip(keys, deviation, strict=True) if key not in gone])
-    parts[place] = (rest, kept)
-    return settle(evidence, evidence.judged(Guess(tuple(parts))))
-
-
 def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
     """Fit with levels and gains computed anew until they no longer matter."""
     fit = None
     for _ in range(_SETTLES):
         evidence.set_base(judged)
-        kept = evidence.base_slopes(MIDDLE) if _calibration_of(judged.guess) else None
+        kept = evidence.base_slopes(MIDDLE) if calibration_of(judged.guess) else None
         fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if kept is not None else None)
         moved = fit.guess.deviation - judged.guess.deviation
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
@@ -512,7 +384,7 @@ def _rivals(
         Rivals, the most likely first.
     """
     taken = {h.key for h, _ in now.guess.parts}
-    free = {c.key for c in _free([s.hypothesis for s in ranking], now.guess)}
+    free = {c.key for c in free_of_calibration([s.hypothesis for s in ranking], now.guess)}
     pool = [s for s in ranking if s.hypothesis.key not in taken and s.score > 0.0
             and s.hypothesis.key in free][: 2 * _RIVALS]  # fmt: skip
     if not pool:

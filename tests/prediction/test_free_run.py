@@ -164,9 +164,7 @@ LAGGING = (("angle_lag", "boom", {"time_constant": 0.12}),)
 
 
 def test_sensors_with_a_first_order_lag_are_followed_from_any_row(tmp_path):
-    """The first rows of a window show what the sensor showed before; 0.12 s forgotten at once
-    would be off by rate times lag, some 0.3 deg.
-    """
+    """A lag of 0.12 s that is forgotten at a window's start is off by rate times lag, 0.3 deg."""
     machine = load_machine("cat215")
     for name, place, parameters in LAGGING:
         machine = apply_effect(machine, name, place, parameters)
