@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hydrotele.effects import EFFECTS
 from hydrotele.gap.calibrating import calibrated, calibration_of, free_of_calibration, promoted
 from hydrotele.gap.pulses import timed
 from hydrotele.gap.screening import Screened, screen
@@ -101,7 +102,8 @@ def search(
     while refused < _REFUSED:
         done = 0.85 * (1.0 - 0.7 ** len(now.guess.parts)) + 0.05
         tell(f"try every effect ({_named_so_far(now.guess)} named so far)", done)
-        ranked = screen(evidence, now.guess, free_of_calibration(candidates, now.guess))
+        open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
+        ranked = screen(evidence, now.guess, open_ones)
         first = first or tuple(ranked)
         best, worth = _best_single(evidence, now, ranked)
         if best is None and lacking(now, evidence) > LACKING and len(ranked) > 1:
@@ -154,6 +156,22 @@ def search(
         rest = without[index]
         rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
     return Found(base, now, fit, first, tuple(charges), without, tuple(rivals), weak)
+
+
+def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:
+    """Candidates without those of balances of an axis in which nothing is lacking any more.
+
+    At first all are tried: an effect may show where unknown inputs are too faint to be found.
+    """
+    if not now.guess.parts:
+        return list(candidates)
+    axes = {i.axis for i in now.tracks[0].levels.inputs}
+    sound = set(evidence.data.axes) - axes
+    return [
+        c for c in candidates
+        if c.location.partition(".")[0] not in sound
+        or c.name not in EFFECTS or EFFECTS[c.name].law not in ("force", "flow", "valve")
+    ]  # fmt: skip
 
 
 def lacking(judged: Judged, evidence: Evidence) -> float:
