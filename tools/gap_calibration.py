@@ -22,13 +22,14 @@ import numpy as np
 from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.residuals import LIMITS, residual_tests
 from hydrotele.gap.screening import screen
-from hydrotele.gap.search import ENTER, best_addition
+from hydrotele.gap.search import ENTER
 from hydrotele.machine_file import load_machine
 from hydrotele.prediction.evidence import Evidence
 from hydrotele.prediction.hypothesis import Guess, hypotheses
 from tools.blind.run_trial import ROOT
 from tools.blind.trials import Place, Series, begin_series, load_series, write_json
 
+_FITTED = 3  # of the screened effects
 _SHARES = (0.5, 0.9, 0.98, 1.0)
 
 
@@ -39,15 +40,18 @@ def measure_trial(out: Path, trial: str, machine_name: str, pulls: bool) -> str:
         command = [sys.executable, "-m", "tools.blind.generate", str(out), trial]
         subprocess.run(command, cwd=ROOT, check=True)
     data = load_dataset(place.data, load_machine(machine_name))
-    evidence, nominal = Evidence(data, data.fit, 1), Guess()
+    evidence, nominal = Evidence(data, data.fit, 1, lacking=True), Guess()
     try:
-        evidence.set_base(nominal)
-        ranked = screen(evidence, nominal, hypotheses(data.machine))
-        best = best_addition(evidence, nominal, ranked, bar=-np.inf)
+        base = evidence.set_base(nominal)
+        ranked = screen(evidence, nominal, hypotheses(data.machine))[:_FITTED]
+        before = float(np.sum(evidence.base_errors**2))
+        fits = [evidence.fit(nominal.plus(s.hypothesis, s.start), before) for s in ranked]
+        best = max(fits, key=lambda fit: fit.score)
+        score = base.loss - evidence.judged(best.guess).loss - best.charge
         hypothesis, deviation = best.guess.parts[-1]
         tracks = evidence.track(data.machine, (data.heldout, *data.fit))
         noted = {
-            "score": best.score,
+            "score": score,
             "effect": f"{hypothesis.name}({hypothesis.location})",
             "worth_naming": bool(np.any(np.abs(deviation) >= hypothesis.least)),
             "tests": {k: t["value"] for k, t in residual_tests(tracks, data.channels).items()},

@@ -61,9 +61,7 @@ def right(gap: Gap, answer: dict) -> bool:
 
 def described(gap: Gap) -> str:
     """What was found, in a table's cell."""
-    if gap.unknown:
-        return f"{gap.unknown.law}: {gap.unknown.term or gap.unknown.channel}"
-    parts = []
+    parts = [f"{gap.unknown.law}: {gap.unknown.term or gap.unknown.channel}"] if gap.unknown else []
     for effect in gap.effects:
         for key, p in effect.parameters.items():
             parts.append(
@@ -96,9 +94,10 @@ if __name__ == "__main__":
         wrong += not good
         truth = "; ".join(f"{n} {p} {v:.5g}" for n, p, v, _ in expected(answer)[1])
         size = gap.size
+        floor = "-" if size.noise_floor is None else f"{size.noise_floor:.3f}"
         print(
             f"| {case} | {truth or answer['category']} | {gap.verdict} | {described(gap)} |"
-            f" {size.before:.3f} | {size.after:.3f} | {size.noise_floor:.3f} |"
+            f" {size.before:.3f} | {size.after:.3f} | {floor} |"
             f" {gap.seconds:.0f} | {'yes' if good else 'NO'} |",
             flush=True,
         )

@@ -154,7 +154,8 @@ def _crossed(
         run, columns = data.fit[index], None
         if near and levels.inputs:
             columns = columns_of(machine, near[index], levels.inputs)
-        return track_run(machine, data, run, None, step, levels, columns, linearise=True)
+        rest = near[index].rest if near else None
+        return track_run(machine, data, run, None, step, levels, columns, True, rest)
 
     return tuple(each(cross, range(len(data.fit))))
 

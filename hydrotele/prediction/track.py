@@ -139,7 +139,7 @@ def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
 def track_run(
     machine: Machine, data: Dataset, run: RunData, kept: Track | None = None,
     step: float = STEP, levels: Levels | None = None, columns: np.ndarray | None = None,
-    linearise: bool = False,
+    linearise: bool = False, rest: np.ndarray | None = None,
 ) -> Track:  # fmt: skip
     """Cross a run with a machine.
 
@@ -152,6 +152,8 @@ def track_run(
         levels: noise levels; without them those that the machine states, and no inputs.
         columns: (n, m, nz) what unit inputs add to the states over a row.
         linearise: whether to keep the transition Jacobians; only without `kept`.
+        rest: (t,) where drives rest in their backlash, from a track of a machine like it; it is
+            looked for where this is None or of another machine.
 
     Returns:
         The track.
@@ -165,10 +167,14 @@ def track_run(
     if columns is None:
         columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
     play = model.transmission[:, BACKLASH] > 0.0
-    rest = np.zeros(len(play))
+    if rest is None or len(rest) != len(play):
+        rest = np.zeros(len(play))
+        unknown = kept is None and bool(play.any())
+    else:
+        unknown = False
     if kept is not None and len(kept.rest) == len(play):
         rest = kept.rest
-    elif kept is None and play.any():
+    elif unknown:
         rows = min(max(2, round(_LOOK / run.period)), len(run.command))
         first, part = run.part(0, rows), columns[:rows]
         rest = find_rest(

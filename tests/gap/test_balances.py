@@ -196,7 +196,9 @@ def test_a_plain_drive_needs_no_pressures():
     mass_only = changed(machine, f"axes.{name}.force.friction", type(f)(**{
         "coulomb": f.coulomb, "viscous": f.viscous, "smoothing_velocity": f.smoothing_velocity
     }))  # fmt: skip
-    position = 0.1 * np.sin(3 * time) / 3 + np.random.default_rng(2).normal(0, 1e-6, 6000)
+    middle = 0.13  # m, far from both ends of the travel
+    position = middle + 0.1 * np.sin(3 * time) / 3
+    position += np.random.default_rng(2).normal(0, 1e-6, 6000)
     columns = {f"command.{name}": force / drive.gain, f"position.{name}": position}
     log = Log(time, columns, {f"command.{name}": drive.command_unit, f"position.{name}": "m"})
     found = balances(mass_only, log, None)

@@ -27,16 +27,16 @@ def fitted(name, location, values, step=1e-3):
 def test_only_scatter_beyond_chance_widens():
     evidence, fit, noise = fitted("angle_offset", "boom", {"offset": 0.01})
     # steps hardly matter to an offset
-    assert spreads(evidence, fit) == pytest.approx(noise, rel=0.05)
-    assert spreads(evidence, fit, 2.5) == pytest.approx(noise, rel=0.05)
-    assert spreads(evidence, fit, 16.0) == pytest.approx(4.0 * noise, rel=0.05)
+    assert spreads(evidence, fit.guess) == pytest.approx(noise, rel=0.05)
+    assert spreads(evidence, fit.guess, 2.5) == pytest.approx(noise, rel=0.05)
+    assert spreads(evidence, fit.guess, 16.0) == pytest.approx(4.0 * noise, rel=0.05)
     evidence.close()
 
 
 def test_what_half_the_step_changes_is_added():
     """At 10 ms the steps show in a delay; a fit at half the step moves as far as is stated."""
     evidence, fit, noise = fitted("command_delay", "all", {"delay": 0.05}, step=10e-3)
-    wide = spreads(evidence, fit)
+    wide = spreads(evidence, fit.guess)
     finer = Evidence(evidence.data, evidence.data.fit, 1, 5e-3)
     finer.set_base(fit.guess)
     moved = finer.fit(fit.guess, 0.0).guess.deviation - fit.guess.deviation

@@ -1,0 +1,58 @@
+"""Calibration: numbers that are off everywhere are recovered within their intervals."""
+
+import numpy as np
+
+from hydrotele.machine_file import load_machine
+from hydrotele.prediction.calibration import calibration, numbers
+from hydrotele.prediction.evidence import Evidence
+from hydrotele.prediction.hypothesis import Guess
+from tests.prediction.test_filter import machine_data
+
+_KINDS = ("mass", "valve_gain", "valve_deadband", "viscous_friction", "internal_leakage", "area")
+_ROUNDS = 2  # of new gains: the first errors are large
+
+
+def test_numbers_off_everywhere_are_recovered_within_their_intervals():
+    """All numbers of some kinds on boom and stick, drawn from their priors; 12 s of data.
+
+    Of about 15 numbers none may be 4 standard deviations off (chance: 1 in 1000), and their mean
+    square must be that of a chi-square, which scatters by 0.37.
+    """
+    nominal = load_machine("cat215")
+    left_out = frozenset(
+        key for key in numbers(nominal)
+        if key.split(".")[0] not in _KINDS or key.split(".")[1] not in ("boom", "stick")
+    )  # fmt: skip
+    group = calibration(nominal, left_out)
+    assert 10 <= group.size <= 20
+    drawn = np.clip(np.random.default_rng(4).normal(size=group.size), group.low, group.high)
+    data, _ = machine_data(nominal, group.change(nominal, group.values(drawn)))
+    evidence = Evidence(data, data.fit, 2, 2e-3)
+    guess = Guess().plus(group, np.zeros(group.size))
+    try:
+        for _ in range(_ROUNDS):
+            evidence.set_base(guess)
+            fit = evidence.fit(guess, 0.0, steps=3)
+            guess = fit.guess
+    finally:
+        evidence.close()
+    spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+    off = (guess.deviation - drawn) / spread
+    assert np.all(np.abs(off) < 4.0), dict(zip(group.parameters, off.round(1), strict=True))
+    assert 0.2 < np.mean(off**2) < 2.5
+    # 12 s say much more of most numbers than a data sheet does
+    assert np.median(spread) < 0.3
+
+
+def test_the_machine_file_states_what_is_uncertain():
+    """By kind and place, by kind, or for all; 0 takes a number for exact."""
+    stated = {"default": 0.01, "mass": 0.03, "mass.stick": 0.2, "valve_gain": 0.0}
+    machine = load_machine("cat215").model_copy(update={"uncertainty": stated})
+    found = numbers(machine)
+    shares = {
+        key: number.parameter.scale / abs(number.parameter.nominal)
+        for key, number in found.items() if number.parameter.nominal
+    }  # fmt: skip
+    assert np.isclose(shares["mass.stick"], 0.2) and np.isclose(shares["mass.boom"], 0.03)
+    assert np.isclose(shares["valve_damping.boom"], 0.01)
+    assert not any(key.startswith("valve_gain.") for key in found)

@@ -1,0 +1,51 @@
+"""Unknown inputs: what the filter takes a force or a flow for is what a machine with it does."""
+
+import numpy as np
+import pytest
+
+from hydrotele.dynamics.integrate import advance
+from hydrotele.dynamics.model import model_space, reduced_model, state_names
+from hydrotele.machine_file import load_machine
+from hydrotele.prediction.inputs import Input, input_columns
+from hydrotele.prediction.track import track_run
+from hydrotele.terms.facts import Term
+from tests.prediction.test_filter import PERIOD, machine_data
+
+_STEPS = 20
+
+
+@pytest.fixture(scope="module")
+def track():
+    machine = load_machine("cat215")
+    data, _ = machine_data(machine, machine)
+    return track_run(machine, data, data.heldout, linearise=True)
+
+
+def row_later(machine, track, row):
+    model = reduced_model(machine, ())
+    z = track.states[row].copy()
+    trail = np.zeros((0, 0))
+    advance(model, model_space(model), z, track.run.command, row, PERIOD, _STEPS, trail)
+    return z
+
+
+@pytest.mark.parametrize(
+    ("balance", "size", "kind"),
+    [("force", 2.0e3, "rate"), ("flow_head", 1.0e-5, "pressure_head")],
+)
+def test_a_constant_input_moves_the_state_as_a_constant_term_does(track, balance, size, kind):
+    """Half of an input is carried through the row, half is not.
+
+    Over 20 ms the trapezoidal rule is off by (20 ms / 60 ms)^2 / 12 = 1 % for a motion at 2.5 Hz,
+    by some more for stiffer oil.
+    """
+    machine = load_machine("cat215")
+    term = Term(name="extra", axis="boom", balance=balance, law="constant",
+                parameters={"value": size})  # fmt: skip
+    changed = machine.model_copy(update={"terms": (term,)})
+    columns = input_columns(machine, track.states, track.flow, PERIOD, [Input(balance, "boom")])
+    own = [s for s, name in enumerate(state_names(machine)) if name.startswith(f"{kind}.")]
+    for row in (100, 250, 400):
+        moved = (row_later(changed, track, row) - row_later(machine, track, row))[own] / size
+        expected = columns[row, 0, own]
+        assert np.linalg.norm(moved - expected) < 0.06 * np.linalg.norm(moved)
