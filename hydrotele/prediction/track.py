@@ -167,7 +167,7 @@ def track_run(
     if columns is None:
         columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
     play = model.transmission[:, BACKLASH] > 0.0
-    if rest is None or len(rest) != len(play):
+    if rest is None or len(rest) != len(play) or not rest.any():
         rest = np.zeros(len(play))
         unknown = kept is None and bool(play.any())
     else:
