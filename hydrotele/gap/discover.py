@@ -25,8 +25,8 @@ from hydrotele.machine import Machine
 from hydrotele.prediction.evidence import Evidence, Judged, charge
 from hydrotele.prediction.hypothesis import Hypothesis
 from hydrotele.prediction.inputs import Input, input_sizes, input_units
-from hydrotele.prediction.linear import linear_run, smooth
-from hydrotele.prediction.track import STARTLE, Track, by_kind, state_drift
+from hydrotele.prediction.levels import smoothed, smoothed_inputs
+from hydrotele.prediction.track import Track
 from hydrotele.terms.facts import Term
 
 LEARNED = "learned"
@@ -174,19 +174,10 @@ def _drives_of(model, sp, states, position, velocity):
 
 def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
     machine = judged.guess.machine(nominal)
-    names, m = list(track.names), len(track.levels.inputs)
     size = track.states.shape[1]
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
-    told = smooth(
-        run, track.levels.noise**2, state_drift(names, track.levels, track.run.period), True
-    )
+    run, told = smoothed(track)
     states = track.states - run.correction[:, :size] + told.deviation[:, :size]
-    fading = np.diag(track.flow[0])[len(names) - m :] if m else np.zeros(0)
-    held, inputs = np.zeros(m), np.zeros((len(states), m))
-    for row in range(len(states)):  # what the track's own filter took the inputs to be
-        inputs[row] = held
-        held = fading * (held + run.correction[row, len(names) - m :])
-    inputs += told.deviation[:, len(names) - m :]
+    inputs = smoothed_inputs(track, (run, told))
     model = reduced_model(machine, ())
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
@@ -272,7 +263,7 @@ def _shapes(machine: Machine, i: Input, balance: str, seen: Sequence[_Seen]) -> 
             continue
         span = np.quantile(x, [0.02, 0.98])
         edges = np.quantile(x, np.linspace(0.02, 0.98, _KNOTS + 2)[1:-1])
-        even = np.linspace(*span, _KNOTS + 2)[1:-1]
+        even = np.linspace(span[0], span[1], _KNOTS + 2)[1:-1]
         knots = tuple(sorted({float(_number(k)) for k in 0.5 * (edges + even)}))
         factors = ["", sign, "velocity"]
         if variable == "velocity":
@@ -344,12 +335,12 @@ def _law(
             (("flow_head", -1.0), ("flow_rod", 1.0)) if balance == THROUGH else ((balance, 1.0),)
         )
         for side, sign in sides:
-            terms.append(Term(
-                name=name, axis=i.axis, balance=side, law="formula",
-                parameters={p: sign * value for p, value in found.items()}, domain=domain,
-                uncertainty=uncertainty,
-                description=f"learned from data: {balance} over {shape.variable}",
-            ))  # fmt: skip
+            terms.append(Term.model_validate({
+                "name": name, "axis": i.axis, "balance": side, "law": "formula",
+                "parameters": {p: sign * value for p, value in found.items()}, "domain": domain,
+                "uncertainty": uncertainty,
+                "description": f"learned from data: {balance} over {shape.variable}",
+            }))  # fmt: skip
         return nominal.model_copy(update={"terms": tuple(terms)})
 
     location = f"{i.axis}.{shape.variable.replace(' ', '')}"

@@ -7,13 +7,16 @@ in a few readings (`weights`).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hydrotele.effects import EFFECTS
+from hydrotele.gap.calibrating import calibrated, calibration_of, free_of_calibration, promoted
+from hydrotele.gap.pulses import timed
 from hydrotele.gap.screening import Screened, screen
-from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
-from hydrotele.prediction.evidence import Evidence, Fit, Judged, charge
+from hydrotele.prediction.calibration import CALIBRATION
+from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
 from hydrotele.prediction.levels import input_excess
 from hydrotele.prediction.track import COARSE
@@ -22,8 +25,9 @@ ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines 
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
+_SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
+_ROOM = 3.0  # times the room to a bound that an effect gets that stands there
 _STEPS = 3  # of Gauss-Newton for a candidate
-_MIDDLE = 2.0e-3  # s, step for the fits that choose between candidates
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
@@ -92,12 +96,14 @@ def search(
     tell("find noise levels of the given model", 0.0)
     base = now = evidence.set_base(Guess())
     fit, weak, first, refused, tried = None, None, (), 0, False
+    candidates = timed(candidates, base)
     rankings: dict[tuple[str, str], Sequence[Screened]] = {}
     worth = 0.0
     while refused < _REFUSED:
         done = 0.85 * (1.0 - 0.7 ** len(now.guess.parts)) + 0.05
         tell(f"try every effect ({_named_so_far(now.guess)} named so far)", done)
-        ranked = screen(evidence, now.guess, _free(candidates, now.guess))
+        open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
+        ranked = screen(evidence, now.guess, open_ones)
         first = first or tuple(ranked)
         best, worth = _best_single(evidence, now, ranked)
         if best is None and lacking(now, evidence) > LACKING and len(ranked) > 1:
@@ -119,14 +125,14 @@ def search(
                 refused += 1
                 continue
         if (
-            not _calibration_of(now.guess)
+            not calibration_of(now.guess)
             and lacking(grown, evidence) > LACKING
             and (best is None or not tried)
         ):
             tell("calibrate the uncertain numbers", done + 0.04)
             tried = True
             evidence.set_base(now)
-            other, gain = _calibrated(evidence, now)
+            other, gain = calibrated(evidence, now)
             if other and gain > max(worth, ENTER):
                 best = other
                 grown, settled = settle(evidence, other)
@@ -137,7 +143,8 @@ def search(
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = ranked
         now, fit = grown, settled
-        now, fit = _promoted(evidence, now, fit, candidates)
+        if own := promoted(evidence, now, candidates):
+            now, fit = settle(evidence, evidence.judged(own))
     tell("drop what is needless", 0.87)
     now, fit, without = _pruned(evidence, base, now, fit)
     tell("compare rivals", 0.9)
@@ -149,6 +156,22 @@ def search(
         rest = without[index]
         rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
     return Found(base, now, fit, first, tuple(charges), without, tuple(rivals), weak)
+
+
+def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:
+    """Candidates without those of balances of an axis in which nothing is lacking any more.
+
+    At first all are tried: an effect may show where unknown inputs are too faint to be found.
+    """
+    if not now.guess.parts:
+        return list(candidates)
+    axes = {i.axis for i in now.tracks[0].levels.inputs}
+    sound = set(evidence.data.axes) - axes
+    return [
+        c for c in candidates
+        if c.location.partition(".")[0] not in sound
+        or c.name not in EFFECTS or EFFECTS[c.name].law not in ("force", "flow", "valve")
+    ]  # fmt: skip
 
 
 def lacking(judged: Judged, evidence: Evidence) -> float:
@@ -183,21 +206,6 @@ def _named_so_far(guess: Guess) -> int:
     return sum(h.name != CALIBRATION for h, _ in guess.parts)
 
 
-def _calibration_of(guess: Guess) -> Hypothesis | None:
-    return next((h for h, _ in guess.parts if h.name == CALIBRATION), None)
-
-
-def _free(candidates: Sequence[Hypothesis], guess: Guess) -> list[Hypothesis]:
-    """Candidates that change no number that is calibrated already."""
-    group = _calibration_of(guess)
-    if group is None:
-        return list(candidates)
-    return [
-        c for c in candidates
-        if not any(f"{c.name}.{c.location}.{key}" in group.parameters for key in c.parameters)
-    ]  # fmt: skip
-
-
 def _best_single(
     evidence: Evidence, now: Judged, ranked: Sequence[Screened]
 ) -> tuple[Judged | None, float]:
@@ -206,11 +214,11 @@ def _best_single(
     short = [s for s in ranked[:_SHORT] if s.score > bar]
     if not short:
         return None, 0.0
-    evidence.base_slopes(_MIDDLE)
+    evidence.base_slopes(MIDDLE)
 
     def fitted(candidate: Screened) -> Fit:
         more = now.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, _MIDDLE)
+        step = evidence.step_of(more, MIDDLE)
         kept = evidence.base_slopes(step, parallel=False)
         before = _loss_of(evidence, now.guess, step)
         return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
@@ -259,9 +267,9 @@ def _best_pair(
         for index in pair:
             start = pool[index].start
             more = more.plus(pool[index].hypothesis, start)
-        kept = evidence.base_slopes(_MIDDLE, parallel=False)
-        before = _loss_of(evidence, now.guess, _MIDDLE)
-        found = evidence.fit(more, before, parallel=False, step=_MIDDLE, kept=kept)
+        kept = evidence.base_slopes(MIDDLE, parallel=False)
+        before = _loss_of(evidence, now.guess, MIDDLE)
+        found = evidence.fit(more, before, parallel=False, step=MIDDLE, kept=kept)
         sizes = sum(h.size for h, _ in more.parts[len(now.guess.parts) :])
         return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
                    found.information)  # fmt: skip
@@ -271,93 +279,42 @@ def _best_pair(
     return _best_of(evidence, now, fits)
 
 
-def _calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
-    """All uncertain numbers fitted together, judged, and the score of that."""
-    taken = {f"{h.name}.{h.location}.{key}" for h, _ in now.guess.parts for key in h.parameters}
-    group = calibration(evidence.data.machine, frozenset(taken))
-    if not group.parameters:
-        return None, 0.0
-    judged, gain, cost = now, 0.0, 0.0
-    guess = now.guess.plus(group, np.zeros(group.size))
-    for _ in range(3):
-        step = evidence.step_of(guess, _MIDDLE)
-        errors = evidence.errors(guess, step)
-        slopes = evidence.slopes(guess, errors, step=step)
-        fit = evidence.fit(guess, 0.0, step=step, kept=slopes, steps=3)
-        before, judged = judged.loss, evidence.judged(fit.guess)
-        guess, cost = fit.guess, charge(fit.information, group.size)
-        gain = now.loss - judged.loss - cost
-        if before - judged.loss < ENTER:
-            break
-        evidence.set_base(judged)
-    evidence.set_base(now)
-    return (judged, gain) if gain > ENTER else (None, 0.0)
-
-
-def _promoted(
-    evidence: Evidence, now: Judged, fit: Fit, candidates: Sequence[Hypothesis]
-) -> tuple[Judged, Fit]:
-    """Numbers that calibration moves beyond what is uncertain become effects of their own.
-
-    What the others move by is what uncertain means: the scale of all deviations, if it is larger
-    than the stated one, is taken for each.
-    """
-    place = next((i for i, (h, _) in enumerate(now.guess.parts) if h.name == CALIBRATION), -1)
-    if place < 0:
-        return now, fit
-    group, deviation = now.guess.parts[place]
-    table = numbers(evidence.data.machine)
-    keys = list(group.parameters)
-    usual = max(1.0, 1.4826 * float(np.median(np.abs(deviation))))
-    moved: dict[tuple[str, str], float] = {}
-    for key, d in zip(keys, deviation, strict=True):
-        effect = table[key].effect
-        if effect is None:
-            continue
-        known = next((c for c in candidates if c.key == effect[:2]), None)
-        if known is None or abs(d * table[key].parameter.scale) < known.parameters[effect[2]].least:
-            continue
-        ratio = usual * table[key].parameter.scale / known.parameters[effect[2]].scale
-        gain = (d / usual) ** 2 * (1.0 - min(ratio, 1.0) ** 2) + 2.0 * np.log(min(ratio, 1.0))
-        moved[effect[:2]] = moved.get(effect[:2], 0.0) + gain
-    effects = [key for key, gain in moved.items() if gain > ENTER]
-    if not effects:
-        return now, fit
-    parts, gone = list(now.guess.parts), set()
-    for name, location in effects:
-        known = next(c for c in candidates if c.key == (name, location))
-        start = []
-        for key, p in known.parameters.items():
-            full = f"{name}.{location}.{key}"
-            if full in keys:
-                gone.add(full)
-                value = p.nominal + deviation[keys.index(full)] * table[full].parameter.scale
-                start.append((value - p.nominal) / p.scale)
-            else:
-                start.append(0.0)
-        parts.append((known, np.clip(start, known.low, known.high)))
-    rest = calibration(evidence.data.machine, frozenset(set(table) - set(keys) | gone))
-    kept = np.array([d for key, d in zip(keys, deviation, strict=True) if key not in gone])
-    parts[place] = (rest, kept)
-    return settle(evidence, evidence.judged(Guess(tuple(parts))))
-
-
 def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
     """Fit with levels and gains computed anew until they no longer matter."""
     fit = None
-    for _ in range(3):
+    for _ in range(_SETTLES):
         evidence.set_base(judged)
-        kept = evidence.base_slopes() if _calibration_of(judged.guess) else None
-        fit = evidence.fit(judged.guess, 0.0, kept=kept)
+        kept = evidence.base_slopes(MIDDLE) if calibration_of(judged.guess) else None
+        fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if kept is not None else None)
         moved = fit.guess.deviation - judged.guess.deviation
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
         if np.all(np.abs(moved) < 0.3 * spread):
             break
-        judged = evidence.judged(fit.guess)
+        judged = evidence.judged(_widened(fit.guess))
     assert fit
     if fit.guess is not judged.guess:
         judged = evidence.set_base(evidence.judged(fit.guess))
     return judged, fit
+
+
+def _widened(guess: Guess) -> Guess:
+    """A guess in which effects that stand at a bound have three times as much room.
+
+    A bound at zero is physical and stays.
+    """
+    parts = []
+    for hypothesis, deviation in guess.parts:
+        table, values = dict(hypothesis.parameters), hypothesis.values(deviation)
+        for key, p in hypothesis.parameters.items():
+            if hypothesis.name == CALIBRATION:
+                continue
+            if values[key] >= p.high:
+                table[key] = replace(p, high=p.nominal + _ROOM * (p.high - p.nominal))
+            elif values[key] <= p.low and p.low != 0.0:
+                low = p.low / _ROOM if p.low > 0.0 else p.nominal - _ROOM * (p.nominal - p.low)
+                table[key] = replace(p, low=low)
+        parts.append((replace(hypothesis, parameters=table), deviation))
+    return Guess(tuple(parts))
 
 
 def worth_naming(guess: Guess, index: int, score: float) -> bool:
@@ -398,7 +355,7 @@ def _rests(
     """For each part the guess without it, fitted and judged (None for calibration); scores."""
     rests: list[Judged | None] = []
     scores: list[float] = []
-    slopes = evidence.base_slopes() if now.guess.parts else np.zeros((0, 0))
+    slopes = evidence.base_slopes(MIDDLE) if now.guess.parts else np.zeros((0, 0))
     sizes = np.cumsum([0, *(h.size for h, _ in now.guess.parts)])
     for index, (hypothesis, _) in enumerate(now.guess.parts):
         assert fit
@@ -409,7 +366,7 @@ def _rests(
         smaller = now.guess.without(index)
         kept = np.delete(slopes, np.s_[sizes[index] : sizes[index + 1]], axis=1)
         if smaller.parts:
-            smaller = evidence.fit(smaller, 0.0, kept=kept, steps=2).guess
+            smaller = evidence.fit(smaller, 0.0, kept=kept, steps=2, step=MIDDLE).guess
         rest = evidence.judged(smaller, base.tracks) if smaller.parts else base
         cost = charge(_last(fit.information, now.guess, index), hypothesis.size)
         score = rest.loss - now.loss - cost
@@ -445,17 +402,17 @@ def _rivals(
         Rivals, the most likely first.
     """
     taken = {h.key for h, _ in now.guess.parts}
-    free = {c.key for c in _free([s.hypothesis for s in ranking], now.guess)}
+    free = {c.key for c in free_of_calibration([s.hypothesis for s in ranking], now.guess)}
     pool = [s for s in ranking if s.hypothesis.key not in taken and s.score > 0.0
             and s.hypothesis.key in free][: 2 * _RIVALS]  # fmt: skip
     if not pool:
         return ()
     evidence.set_base(rest)
-    evidence.base_slopes(_MIDDLE)
+    evidence.base_slopes(MIDDLE)
 
     def fitted(candidate: Screened) -> Fit:
         more = rest.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, _MIDDLE)
+        step = evidence.step_of(more, MIDDLE)
         kept = evidence.base_slopes(step, parallel=False)
         before = _loss_of(evidence, rest.guess, step)
         return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
@@ -469,7 +426,10 @@ def _rivals(
             continue
         if judged.loss < now.loss + _HOPELESS:  # worth a second look at its own levels
             evidence.set_base(judged)
-            again = evidence.fit(judged.guess, 0.0, step=evidence.step_of(judged.guess, _MIDDLE))
+            step = evidence.step_of(judged.guess, MIDDLE)
+            again = evidence.fit(
+                judged.guess, 0.0, step=step, kept=evidence.base_slopes(step), steps=3
+            )
             better = evidence.judged(again.guess)
             judged = min(judged, better, key=lambda j: j.loss)
             evidence.set_base(rest)

@@ -81,7 +81,7 @@ def assemble(
     _write_actuators(root, machine)
     if machine.terms:
         table = terms_table(machine.terms, actuator_order(machine))
-        root.custom.add("numeric", name="hydrotele_terms", size=len(table), data=table)
+        add_element(root.custom, "numeric", name="hydrotele_terms", size=len(table), data=table)
     _write_scene(root, ground, looks)
     write_surroundings(root, machine, surroundings, looks)
     return root

@@ -12,7 +12,7 @@ from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.machine_file import load_machine
 from hydrotele.prediction.stretches import busiest
-from tools.real_machines import force_error, plain_valves, velocity_fit
+from tools.real_machines import PUSH, force_error, plain_valves, pushed, velocity_fit
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "real"
 pytestmark = pytest.mark.skipif(not REAL.is_dir(), reason="../shared/real is absent")
@@ -23,11 +23,11 @@ def test_emps_names_friction_that_depends_on_the_direction():
     data = load_dataset(REAL / "emps" / "main.parquet", machine)
     gap = find_gap(data)
     (effect,) = gap.effects
-    assert (gap.verdict, effect.name) == ("named", "friction_asymmetry")
+    assert effect.name == "friction_asymmetry" and effect.probability > 0.95
+    assert gap.verdict in ("named", "partly")  # a ripple of the drive remains
     # published: 166.7 and 240.4 N s/m, which differ by 0.181 of their mean
     found = effect.parameters["viscous_asymmetry"]
     assert found.low < (166.7 - 240.4) / (166.7 + 240.4) < found.high
-    assert gap.size.noise_floor is None  # the encoder's accuracy is not stated
     assert gap.size.after < 0.6 * gap.size.before
     # published 4.08 % before and 3.11 % after, all samples fitted; here none of these was
     assert force_error(machine, data.heldout, 20.0) > 3.5
@@ -41,8 +41,21 @@ def test_the_command_reads_a_record_whose_columns_only_the_machine_can_name(tmp_
     done = CliRunner().invoke(app, ["gap", *words, "--out", str(out)])
     assert done.exit_code == 0, done.output
     document = json.loads((out / "gap.json").read_text())
-    assert document["verdict"] == "named" and document["gap"]["noise_floor"] is None
-    assert "prediction error of a perfect model" not in (out / "report.html").read_text()
+    assert document["verdict"] in ("named", "partly")
+    assert [e["name"] for e in document["effects"]] == ["friction_asymmetry"]
+    assert document["noise"]["position.slide"]["stated"] is None
+
+
+def test_emps_locates_a_hidden_push_in_time_and_size():
+    data = pushed(load_dataset(REAL / "emps" / "main.parquet", load_machine("emps")), *PUSH)
+    found = {e.name: e for e in find_gap(data).effects}
+    push = found["force_pulse"]
+    assert push.probability > 0.95
+    size, start, duration = PUSH
+    # the friction of one direction that the model lacks, too, is 3 % of the push
+    assert push.parameters["size"].value == pytest.approx(size, rel=0.03)
+    assert push.parameters["start"].value == pytest.approx(start, abs=0.01)  # a row
+    assert push.parameters["duration"].value == pytest.approx(duration, abs=0.02)
 
 
 def test_ec20_names_delay_and_dead_band_of_a_valve_without_them():

@@ -1,0 +1,98 @@
+"""Calibration within the search: all uncertain numbers together, and those that are effects."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
+from hydrotele.prediction.evidence import MIDDLE, Evidence, Judged, charge
+from hydrotele.prediction.hypothesis import Guess, Hypothesis
+
+BEYOND = 15.0  # twice the log evidence that a number must bring to be an effect of its own
+_ROUNDS = 3  # of levels and fit
+_SETTLED = 15.0  # fall of the loss that is worth another round
+
+
+def calibration_of(guess: Guess) -> Hypothesis | None:
+    """The calibration in a guess, or None."""
+    return next((h for h, _ in guess.parts if h.name == CALIBRATION), None)
+
+
+def free_of_calibration(candidates: Sequence[Hypothesis], guess: Guess) -> list[Hypothesis]:
+    """Candidates that change no number that is calibrated already."""
+    group = calibration_of(guess)
+    if group is None:
+        return list(candidates)
+    return [
+        c for c in candidates
+        if not any(f"{c.name}.{c.location}.{key}" in group.parameters for key in c.parameters)
+    ]  # fmt: skip
+
+
+def calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
+    """All uncertain numbers fitted together, judged, and the score of that."""
+    taken = {f"{h.name}.{h.location}.{key}" for h, _ in now.guess.parts for key in h.parameters}
+    group = calibration(evidence.data.machine, frozenset(taken))
+    if not group.parameters:
+        return None, 0.0
+    judged, gain, cost = now, 0.0, 0.0
+    guess = now.guess.plus(group, np.zeros(group.size))
+    for _ in range(_ROUNDS):
+        step = evidence.step_of(guess, MIDDLE)
+        errors = evidence.errors(guess, step)
+        slopes = evidence.slopes(guess, errors, step=step)
+        fit = evidence.fit(guess, 0.0, step=step, kept=slopes, steps=3)
+        before, judged = judged.loss, evidence.judged(fit.guess)
+        guess, cost = fit.guess, charge(fit.information, group.size)
+        gain = now.loss - judged.loss - cost
+        if before - judged.loss < _SETTLED:
+            break
+        evidence.set_base(judged)
+    evidence.set_base(now)
+    return (judged, gain) if gain > 0.0 else (None, 0.0)
+
+
+def promoted(evidence: Evidence, now: Judged, candidates: Sequence[Hypothesis]) -> Guess | None:
+    """A guess in which numbers that calibration moves too far are effects; None if there is none.
+
+    What the others move by is what uncertain means: the scale of all deviations, if it is larger
+    than the stated one, is taken for each.
+    """
+    place = next((i for i, (h, _) in enumerate(now.guess.parts) if h.name == CALIBRATION), -1)
+    if place < 0:
+        return None
+    group, deviation = now.guess.parts[place]
+    table = numbers(evidence.data.machine)
+    keys = list(group.parameters)
+    usual = max(1.0, 1.4826 * float(np.median(np.abs(deviation))))
+    moved: dict[tuple[str, str], float] = {}
+    for key, d in zip(keys, deviation, strict=True):
+        effect = table[key].effect
+        if effect is None:
+            continue
+        known = next((c for c in candidates if c.key == effect[:2]), None)
+        if known is None or abs(d * table[key].parameter.scale) < known.parameters[effect[2]].least:
+            continue
+        ratio = usual * table[key].parameter.scale / known.parameters[effect[2]].scale
+        gain = (d / usual) ** 2 * (1.0 - min(ratio, 1.0) ** 2) + 2.0 * np.log(min(ratio, 1.0))
+        moved[effect[:2]] = moved.get(effect[:2], 0.0) + gain
+    effects = [key for key, gain in moved.items() if gain > BEYOND]
+    if not effects:
+        return None
+    parts, gone = list(now.guess.parts), set()
+    for name, location in effects:
+        known = next(c for c in candidates if c.key == (name, location))
+        start = []
+        for key, p in known.parameters.items():
+            full = f"{name}.{location}.{key}"
+            if full in keys:
+                gone.add(full)
+                value = p.nominal + deviation[keys.index(full)] * table[full].parameter.scale
+                start.append((value - p.nominal) / p.scale)
+            else:
+                start.append(0.0)
+        parts.append((known, np.clip(start, known.low, known.high)))
+    rest = calibration(evidence.data.machine, frozenset(set(table) - set(keys) | gone))
+    kept = np.array([d for key, d in zip(keys, deviation, strict=True) if key not in gone])
+    parts[place] = (rest, kept)
+    return Guess(tuple(parts))
