@@ -40,6 +40,7 @@ SURE = 0.95  # probability below which an effect is called ambiguous
 PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
 _MECHANISM, _STEEP = 0.35, 0.07  # see `_mechanism`
 _TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`
+_MINOR = 0.02  # share of the gap up to which a learned law is a detail
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
@@ -90,13 +91,14 @@ def find_gap(
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
     named = _named(found, spread, shares, rms(after[:1]), floor)
     learned = learned_laws(discovery, nominal, spread, shares)
-    verdict = _verdict(named, failed, None if judge.ripple else floor)
+    needed = any(law.share > _MINOR for law in learned)  # a law that has no known cause
+    verdict = _verdict(named, failed or needed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
-    lacks = _lacks(data.machine, found.judged)
+    lacks = _lacks(data.machine, discovery.judged)
     unknown = None
     if failed or learned:
-        unknown = describe(lacks, learned, improved)
+        unknown = describe(_lacks(data.machine, found.judged), learned, improved)
     laws, units = _laws(data, patched, judge.levels.noise)
     tell("done", 1.0)
     return Gap(

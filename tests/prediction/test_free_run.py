@@ -164,10 +164,7 @@ LAGGING = (("angle_lag", "boom", {"time_constant": 0.12}),)
 
 
 def test_sensors_with_a_first_order_lag_are_followed_from_any_row(tmp_path):
-    """The first rows of a window show what the sensor showed before.
-
-    A lag of 0.12 s forgotten at once would be off by the rate times the lag.
-    """
+    """A lag of 0.12 s that is forgotten at a window's start is off by rate times lag, 0.3 deg."""
     machine = load_machine("cat215")
     for name, place, parameters in LAGGING:
         machine = apply_effect(machine, name, place, parameters)
