@@ -50,7 +50,7 @@ def _displacement(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _leakage(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Of what makes the rated flow leak at the highest pressure: 10 % are usual, 1 % is worth it."""
+    """Of what makes the rated flow leak at the highest pressure: 10 % are usual, 1 % is seen."""
     pump = _pump(machine, location)
     whole = pump.rated_flow / machine.highest_pressure(location)
     high = pump.leakage + 0.5 * whole
