@@ -60,7 +60,7 @@ def start_state(
         if kind == "position":
             channel = f"{machine.position_kind(axis)}.{axis}" if axis in order else ""
             state[s] = shown.get(channel, machine.home.get(place, 0.0))
-        elif kind.startswith("pressure"):
+        elif kind in _BLIND:  # a load cylinder rests without pressure, and none shows it
             state[s] = shown.get(f"{kind}.{axis}", 3e6)
             if f"{kind}.{axis}" not in shown:
                 wide[s] = _BLIND[kind]
