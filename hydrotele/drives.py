@@ -210,6 +210,9 @@ class ElectricMotor(Facts):
     viscous: NonNegative = 0.0
 
 
+_USUAL_PRESSURE = 2.0e7  # Pa, that a pump's own circuit stands where no motor limits it
+
+
 class Accumulator(Facts):
     """A gas accumulator in the place of a tank, with the cylinder fully retracted.
 
@@ -244,6 +247,23 @@ class Pump(Facts):
     air_rod: NonNegative = 0.0
     accumulator: Accumulator
     motor: ElectricMotor | None = None
+
+    @property
+    def rated_flow(self) -> float:
+        """Flow at the rated speed [m^3/s]."""
+        return self.displacement * self.rated_speed
+
+    @property
+    def stall_pressure(self) -> float:
+        """Pressure difference that holds the motor at full duty [Pa]; 20 MPa without a motor.
+
+        `(k U / R - drag) / (D (1 + loss))`; gear pumps of any make stand 20 MPa.
+        """
+        motor = self.motor
+        if motor is None:
+            return _USUAL_PRESSURE
+        torque = motor.emf * motor.voltage / motor.resistance - motor.drag
+        return max(torque, 0.0) / (self.displacement * (1.0 + self.torque_loss))
 
 
 class LoadCylinder(Facts):
@@ -388,6 +408,13 @@ class Axis(Facts):
     def hydraulic(self) -> bool:
         """Whether the axis has chambers: behind a valve, or behind a pump of its own."""
         return self.valve is not None or self.pump is not None
+
+    @property
+    def rated_flow(self) -> float:
+        """Flow of the valve at its rated drop, or of the axis' own pump [m^3/s]."""
+        source = self.valve or self.pump
+        assert source is not None
+        return source.rated_flow
 
     @property
     def hydraulic_drive(self) -> Cylinder | Motor:

@@ -168,6 +168,22 @@ class Machine(Facts):
         """Axes with a valve."""
         return {name: axis for name, axis in self.axes.items() if axis.valve}
 
+    def highest_pressure(self, axis: str) -> float:
+        """What a hydraulic axis can be fed with [Pa]: the relief's setting, or its pump's stall."""
+        pump = self.axes[axis].pump
+        if pump:
+            return pump.stall_pressure
+        assert self.supply
+        return self.supply.relief_pressure
+
+    def return_pressure(self, axis: str) -> float:
+        """Pressure to which a hydraulic axis' oil returns [Pa]: tank or its pump's accumulator."""
+        pump = self.axes[axis].pump
+        if pump:
+            return pump.accumulator.pressure
+        assert self.supply
+        return self.supply.tank_pressure
+
     def link_of(self, joint: str) -> str:
         """Name of the link that a joint moves."""
         return next(n for n, li in self.links.items() if li.joint and li.joint.name == joint)

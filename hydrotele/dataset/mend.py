@@ -132,8 +132,7 @@ def _frozen(data: _Data, run: str, channel: str) -> list[stuck.Stretch]:
     if kind.startswith("pressure"):
         other = "pressure_rod" if kind == "pressure_head" else "pressure_head"
         partner = data.column(f"{other}.{axis}", run)
-        assert data.machine.supply
-        lowest = data.machine.supply.tank_pressure + _STARVED
+        lowest = data.machine.return_pressure(axis) + _STARVED
         if partner is None:
             return []
         return stuck.frozen_chamber(reading, partner, lowest, period)

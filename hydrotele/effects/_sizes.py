@@ -17,6 +17,11 @@ def valves(machine: Machine) -> tuple[str, ...]:
     return tuple(machine.valve_axes)
 
 
+def hydraulics(machine: Machine) -> tuple[str, ...]:
+    """Names of the axes with chambers: behind a valve, or behind a pump of their own."""
+    return tuple(machine.hydraulic_axes)
+
+
 def cylinders(machine: Machine) -> tuple[str, ...]:
     """Names of the axes with a cylinder."""
     return tuple(name for name, axis in machine.axes.items() if axis.cylinder)
@@ -49,22 +54,21 @@ def speed_unit(machine: Machine, axis: str) -> str:
 
 
 def largest_force(machine: Machine, axis: str) -> float:
-    """Force of a drive at the relief pressure, or at full command [N] or [N m]."""
+    """Force of a drive at the highest pressure, or at full command [N] or [N m]."""
     facts = machine.axes[axis]
     if facts.force:
         return abs(facts.force.gain) * facts.force.command_limit
-    assert machine.supply
-    return machine.supply.relief_pressure * facts.hydraulic_drive.areas[0]
+    return machine.highest_pressure(axis) * facts.hydraulic_drive.areas[0]
 
 
 def usual_speed(machine: Machine, axis: str) -> float:
-    """Speed of a drive at its valve's rated flow [m/s] or [rad/s].
+    """Speed of a drive at the rated flow of its valve or pump [m/s] or [rad/s].
 
     A force drive has no such rating: it is taken to pass its range in two seconds.
     """
     facts = machine.axes[axis]
-    if facts.valve:
-        return facts.valve.rated_flow / facts.hydraulic_drive.areas[0]
+    if facts.hydraulic:
+        return facts.rated_flow / facts.hydraulic_drive.areas[0]
     low, high = machine.joints[facts.joint].range or (-0.5, 0.5)
     return (high - low) / _FULL_TRAVEL
 

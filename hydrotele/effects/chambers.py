@@ -1,6 +1,6 @@
 """Chambers that leak or give more than in the model."""
 
-from hydrotele.effects._sizes import drive_kind, valves
+from hydrotele.effects._sizes import drive_kind, hydraulics, valves
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
 from hydrotele.machine import Machine
 
@@ -9,9 +9,7 @@ _SOFTEST = 1.0e7  # Pa, oil full of air: the lowest bulk modulus that a machine 
 
 def _leakage(machine: Machine, location: str) -> dict[str, Parameter]:
     """Fractions of what makes the rated flow leak at full pressure; a good seal lets 1 % pass."""
-    valve = machine.axes[location].valve
-    assert valve and machine.supply
-    whole = valve.rated_flow / machine.supply.relief_pressure
+    whole = machine.axes[location].rated_flow / machine.highest_pressure(location)
     present = machine.axes[location].hydraulic_drive.leakage
     high = present + 0.5 * whole
     return {"leakage": Parameter("m^3/(s Pa)", present, 0.0, high, 0.05 * whole, 0.005 * whole)}
@@ -38,7 +36,7 @@ def _set(field: str, parameter: str):
 
 
 def _everywhere(machine: Machine) -> tuple[str, ...]:
-    return ("all",) if machine.supply and machine.hydraulic_axes else ()
+    return ("all",) if machine.supply and machine.valve_axes else ()
 
 
 def _bulk_modulus(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -56,7 +54,7 @@ def _set_bulk_modulus(machine: Machine, location: str, values: Values) -> Machin
 
 EFFECTS = (
     Effect(
-        "internal_leakage", "another leakage between the chambers of a drive", "flow", valves,
+        "internal_leakage", "another leakage between the chambers of a drive", "flow", hydraulics,
         _leakage, _set("leakage", "leakage"),
     ),
     Effect(

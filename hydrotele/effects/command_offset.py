@@ -1,6 +1,5 @@
 """A command that arrives with an offset: a valve's or an amplifier's zero is off."""
 
-from hydrotele.effects._sizes import axes
 from hydrotele.effects._terms import term_number, with_terms
 from hydrotele.effects.effect import Effect, Parameter, Values
 from hydrotele.machine import Machine
@@ -25,4 +24,9 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
     return with_terms(machine, NAME, [term] if offset else [], [location])
 
 
-EFFECT = Effect(NAME, "commands that arrive with an offset", "valve", axes, _parameters, _apply)
+def _graded(machine: Machine) -> tuple[str, ...]:
+    """Axes whose zero can be off: at a pump drive's command 0 a switched valve is shut."""
+    return tuple(name for name, axis in machine.axes.items() if not axis.pump)
+
+
+EFFECT = Effect(NAME, "commands that arrive with an offset", "valve", _graded, _parameters, _apply)

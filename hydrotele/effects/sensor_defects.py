@@ -2,7 +2,7 @@
 
 import math
 
-from hydrotele.effects._sizes import axes, cylinders, valves
+from hydrotele.effects._sizes import axes, cylinders, hydraulics
 from hydrotele.effects.effect import Effect, Parameter, Values
 from hydrotele.machine import Machine
 from hydrotele.sensors import SensorError
@@ -98,9 +98,8 @@ def _transducer(location: str) -> str:
 
 def _pressure_offset(machine: Machine, location: str) -> dict[str, Parameter]:
     """Zero drift: a transducer's class is 0.5 % of its span, its repeatability under 0.1 %."""
-    assert machine.supply
     present = _error(machine, _transducer(location)).offset
-    span = machine.supply.relief_pressure
+    span = machine.highest_pressure(location.rpartition(".")[0])
     low, high = present - 0.05 * span, present + 0.05 * span
     return {"offset": Parameter("Pa", present, low, high, 0.005 * span, 20.0e3 / 28.0e6 * span)}
 
@@ -207,7 +206,7 @@ EFFECTS = (
         _pressure_offset, _set_pressure,
     ),
     Effect(
-        "pressure_delay", "pressure transducers of an axis that read late", "sensor", valves,
+        "pressure_delay", "pressure transducers of an axis that read late", "sensor", hydraulics,
         _pressure_delay, _set_pressure_delay,
     ),
     Effect(
@@ -216,7 +215,7 @@ EFFECTS = (
     ),
     Effect(
         "pressure_lag", "pressure transducers of an axis behind a first-order lag", "sensor",
-        valves, _pressure_lag, _set_pressure_lag,
+        hydraulics, _pressure_lag, _set_pressure_lag,
     ),
     Effect(
         "clock_offset", "a clock of the positions or of the pressures that is late", "sensor",

@@ -5,7 +5,7 @@ from hydrotele.machine import Machine
 
 
 def _place(machine: Machine) -> tuple[str, ...]:
-    return ("supply",) if machine.supply and machine.hydraulic_axes else ()
+    return ("supply",) if machine.supply and machine.valve_axes else ()
 
 
 def _pumping(machine: Machine) -> tuple[str, ...]:

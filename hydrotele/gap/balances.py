@@ -22,6 +22,8 @@ from hydrotele.gap.balance_signals import (
 )
 from hydrotele.gap.balance_timing import window_lags
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
+from hydrotele.hydraulics.pump import load_force, load_pressure_step
+from hydrotele.hydraulics.slots import PUMP
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.log import Log
 from hydrotele.machine import Machine
@@ -162,6 +164,8 @@ def _force(machine: Machine, signals: Signals) -> Found:
     motion = np.stack([part for part in parts if part is not None], axis=-1)
     space = model_space(model)
     needed = np.stack([load_forces(model, space, m.swapaxes(0, 1).copy()) for m in motion])
+    for name in known.keys() & machine.loads.keys():
+        known[name] = known[name] - _load(machine, name, motions[name], signals.period)
     for name, push in known.items():
         rotary = machine.axes[name].cylinder is None and machine.position_kind(name) == "angle"
         lacks = push - needed[:, :, order.index(name)]
@@ -185,6 +189,24 @@ def _push(machine: Machine, signals: Signals, name: str) -> np.ndarray | None:
     head, rod = (signals.smoothed[c][:, 0] for c in channels)
     area_head, area_rod = axis.hydraulic_drive.areas
     return area_head * head - area_rod * rod
+
+
+def _load(machine: Machine, name: str, motion: np.ndarray, period: float) -> np.ndarray:
+    """(d, n) force of the load cylinder against an axis' motion (d, 3, n), its friction included.
+
+    Its pressure follows from the travel alone; in the first row there is none.
+    """
+    user, load = actuator_numbers(machine)[name], machine.loads[name]
+    smooth = machine.axes[name].drive.friction.smoothing_velocity
+    forces = np.zeros((len(motion), motion.shape[2]))
+    for d, (_, velocity, _) in enumerate(motion):
+        pressure = 0.0
+        for row in range(1, len(velocity)):
+            pressure = load_pressure_step(user, PUMP, pressure, velocity[row], period)
+            forces[d, row] = load_force(user, PUMP, pressure)
+        way = np.tanh(velocity / smooth)
+        forces[d] += load.friction * forces[d] * way + load.return_force * np.minimum(way, 0.0)
+    return forces
 
 
 def _flow_and_timing(machine: Machine, signals: Signals) -> Found:

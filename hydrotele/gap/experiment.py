@@ -125,6 +125,17 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "spool_slew": ("steps",),
     "load_compensation": ("steps",),
     "pump_droop": ("surges",),
+    "pump_displacement": ("steps",),
+    "pump_leakage": ("holds", "steps"),
+    "pump_torque_loss": ("steps",),
+    "motor_constant": ("steps",),
+    "motor_inertia": ("steps",),
+    "motor_drag": ("steps",),
+    "motor_viscous_drag": ("steps",),
+    "line_compliance": ("stairs",),
+    "accumulator_pressure": ("poses",),
+    "load_relief": ("reversals",),
+    "load_friction": ("reversals",),
 }
 """Effect -> the motions that bring it out."""
 

@@ -104,6 +104,8 @@ def _free(
 def _speed(machine: Machine, name: str, at: float, width: float) -> float:
     """Speed of a joint [rad/s] or [m/s] that half the flow of its valve or of the pump gives."""
     axis = machine.axes[name]
+    if axis.pump:
+        return _SHARE * axis.pump.rated_flow / axis.hydraulic_drive.areas[0]
     if axis.valve is None or machine.supply is None:
         return width / _FORCE_PASS
     drop = 0.5 * (machine.supply.relief_pressure - machine.supply.tank_pressure)

@@ -39,7 +39,7 @@ from hydrotele.prediction.track import (
     track_run,
 )
 
-WHITE = ("rate", "drive_rate", "spool", "pressure_head", "pressure_rod")
+WHITE = ("rate", "drive_rate", "spool", "speed", "pressure_head", "pressure_rod")
 """Kinds of states to which white noise is added, too: ripple and what the rows are too slow for."""
 _MOST = 1.0e4  # times its floor that white noise can reach
 _RIPPLE = 10.0  # times its floor from which white noise counts as there
@@ -52,7 +52,7 @@ _ROWS = 3000  # of all runs together that tell the levels; more say the same aga
 _ITERATIONS = 12  # of a round: what is left of the way is small against a round's own linearisation
 _SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
 _LOOSE = {"rate": 0.02, "drive_rate": 0.02, "spool": 0.02, "pressure_head": 1e5,
-          "pressure_rod": 1e5}  # fmt: skip
+          "pressure_rod": 1e5, "speed": 2.0}  # fmt: skip
 # What 20 ms may add to a state at first, so that a model that lacks something follows the readings.
 
 

@@ -17,6 +17,7 @@ _LOOK = 0.1  # s whose mean starts the filter, or the first reading after it
 _WIDE = {
     "position": 0.02, "drive": 0.0, "rate": 0.05, "drive_rate": 0.0, "spool": 0.02,
     "spool_rate": 0.2, "pressure_head": 1e6, "pressure_rod": 1e6,
+    "speed": 1.0, "pressure_load": 1e5,
 }  # fmt: skip
 _SLIP = 0.01  # m/s or rad/s, rate at which a drive may leave its load
 _LOOSE = 0.02  # of the backlash, within which a drive's rest is known once it was looked for
@@ -59,7 +60,7 @@ def start_state(
         if kind == "position":
             channel = f"{machine.position_kind(axis)}.{axis}" if axis in order else ""
             state[s] = shown.get(channel, machine.home.get(place, 0.0))
-        elif kind.startswith("pressure"):
+        elif kind in _BLIND:  # a load cylinder rests without pressure, and none shows it
             state[s] = shown.get(f"{kind}.{axis}", 3e6)
             if f"{kind}.{axis}" not in shown:
                 wide[s] = _BLIND[kind]

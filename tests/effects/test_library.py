@@ -15,7 +15,7 @@ from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario
 
 MACHINES = [("cat215", "none"), ("cat215", "bucket"), ("cat215", "grapple"), ("rig", None),
-            ("ec20", None), ("emps", None), ("cat325", None)]  # fmt: skip
+            ("ec20", None), ("emps", None), ("cat325", None), ("eha", "load_30_bar")]  # fmt: skip
 LAWS = {"force", "flow", "valve", "supply", "geometry", "timing", "sensor"}
 ARM = {"swing", "boom", "stick"}
 # Names are fixed, because scripts read them; with them the places on the CAT 215 without a tool.
@@ -38,6 +38,12 @@ PLACES = {
     "angle_lag": ARM, "pressure_lag": ARM,
     "pressure_scale": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
     "clock_offset": {"positions", "pressures"},
+}  # fmt: skip
+PUMPED = {
+    "pump_displacement": {"piston"}, "pump_leakage": {"piston"}, "pump_torque_loss": {"piston"},
+    "motor_constant": {"piston"}, "motor_inertia": {"piston"}, "motor_drag": {"piston"},
+    "motor_viscous_drag": {"piston"}, "line_compliance": {"piston.head", "piston.rod"},
+    "accumulator_pressure": {"piston"}, "load_relief": {"piston"}, "load_friction": {"piston"},
 }  # fmt: skip
 machine_of = functools.cache(load_machine)
 CASES = [
@@ -65,9 +71,11 @@ def usual(machine, name, place, size=1.0):
 
 def test_names_and_places_are_those_agreed():
     machine = machine_of("cat215", "none")
-    assert {n: set(e.locations(machine)) for n, e in EFFECTS.items()} == PLACES
-    pumped = {"eha"}  # the sizes of effects go by valve and supply, which a pump drive has not
-    assert {m for m, _ in MACHINES} | pumped == set(shipped_machines())
+    found = {name: set(effect.locations(machine)) for name, effect in EFFECTS.items()}
+    assert {name: places for name, places in found.items() if places} == PLACES
+    pumped = machine_of("eha", "load_30_bar")
+    assert {n: set(EFFECTS[n].locations(pumped)) for n in set(found) - set(PLACES)} == PUMPED
+    assert {m for m, _ in MACHINES} == set(shipped_machines())
 
 
 @pytest.mark.parametrize(("machine", "tool", "name", "place"), CASES)
