@@ -93,8 +93,8 @@ def following_levels(data: Dataset) -> Levels:
 
     Stated noise is kept. Where none is stated, the readings' roughness tells it, and the state may
     drift as fast as the readings do: what matters here is where a free run starts, not how likely a
-    model is, and a model may be far off. Positions drift, too: oil in a closed valve is so stiff
-    that a rate alone would not move them.
+    model is, and a model may be far off. Of a hydraulic axis the position drifts and not the rate,
+    which oil in a closed valve would undo at once.
 
     Args:
         data: the dataset.
@@ -119,8 +119,10 @@ def following_levels(data: Dataset) -> Levels:
             drift[f"{signal.kind}.{signal.axis}"] = moves * period * per_time
         elif signal.axis in machine.axes and signal.kind == machine.position_kind(signal.axis):
             joint = machine.axes[signal.axis].joint
-            drift[f"position.{joint}"] = moves * period * per_time
-            drift[f"rate.{joint}"] = moves * share * per_time
+            if signal.axis in machine.hydraulic_axes:
+                drift[f"position.{joint}"] = moves * period * per_time
+            else:
+                drift[f"rate.{joint}"] = moves * share * per_time
     return Levels(noise, drift=drift)
 
 

@@ -18,7 +18,7 @@ STEP = (
     1.0e-3  # s: 2 ms leaves errors of 1000 in the loss where the pump is starved, 1 ms none of 100
 )
 COARSE = 4.0e-3  # s, for a first look at a candidate
-_TANGENT = 7.0e-3  # s, for the transition Jacobians: a covariance need not be exact
+_TANGENT = 4.0e-3  # s, for the transition Jacobians: a covariance need not be exact
 _STIFF = 1.0e-3  # s, where a transmission's spring is: with the oil it may ring at 150 Hz
 
 

@@ -34,7 +34,7 @@ def site(tmp_path_factory):
     (folder / "logs").mkdir()
     for k, name in enumerate(("fit_1", "fit_2", "test_1")):
         time = np.arange(600) / 50.0
-        volts = 4.0 * np.sin((3.0 + 0.3 * k) * time) + 2.0 * np.sin(1.3 * time + k)
+        volts = 2.0 * np.sin((4.0 + 0.3 * k) * time) + 0.15  # stays clear of the end stops
         pilot = {
             "kind": "table", "of": "command", "interpolate": "hold", "time": time.tolist(),
             "columns": {"slide": volts.tolist()},
