@@ -8,7 +8,7 @@
   actuators; named is the effect that moved furthest in units of its scale.
 - `sparse`: what a row changes beyond the model's prediction, regressed on physical terms by
   sequentially thresholded least squares (SINDy: Brunton, Proctor and Kutz 2016); the largest term
-  is named as the effect that has this form.
+  that is the form of an effect is named.
 - `network`: the same target, a multilayer perceptron (scikit-learn); it names nothing.
 
 All get the logs and the nominal machine only. Free runs are made by the independent machine in its
@@ -431,8 +431,10 @@ def sparse(problem: Problem) -> Answer:
                 kept = kept[large]
             weights[i, kept, k] = found / size[kept]
             explained = float(np.var(X[:, kept] @ found) / np.var(target))
-            term = _TERMS[kept[int(np.argmax(np.abs(found)))]]
-            told[i, k] = (explained, _MEANINGS.get(("force" if k == 0 else "flow", term)))
+            balance = "force" if k == 0 else "flow"
+            terms = [_TERMS[kept[j]] for j in np.argsort(-np.abs(found))]
+            meanings = [_MEANINGS[balance, t] for t in terms if (balance, t) in _MEANINGS]
+            told[i, k] = (explained, meanings[0] if meanings else None)
     machine = nominal_world(problem.facts)
 
     def correction(states: np.ndarray) -> np.ndarray:

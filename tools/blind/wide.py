@@ -69,8 +69,11 @@ def draw_unknown(
     told = {
         "name": "unknown_term",
         "acts_on": target,
-        "location": names[axis],
-        "variables": [f"{VARIABLES[k]}.{names[i]}" for k, i in zip(kinds, of, strict=True)],
+        "location": "supply" if target == "pump_flow" else names[axis],
+        "variables": [
+            VARIABLES[k] if VARIABLES[k] in ("supply", "time") else f"{VARIABLES[k]}.{names[i]}"
+            for k, i in zip(kinds, of, strict=True)
+        ],
         "gate": ["always", "switch", "play", "window"][gate],
         "parameters": {"size": size, "low": low, "high": high},
     }

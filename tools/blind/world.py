@@ -354,7 +354,7 @@ def opening(spool, deadband, soft, shape):
 
     Sharp `(|s| - db)/(1 - db)`; rounded the softplus of it over `soft`, less its value at rest.
 
-    >>> opening(0.52, 0.04, 0.0, 1.0)
+    >>> round(opening(0.52, 0.04, 0.0, 1.0), 9)
     0.5
     >>> 0.0 < opening(0.04, 0.04, 0.02, 1.0) < 0.02
     True
