@@ -56,7 +56,8 @@ def test_every_number_of_pump_motor_and_load_can_be_calibrated():
     keys = numbers(load_machine("eha", TOOL)).keys()
     assert {
         "area.piston.area_rod", "pump_displacement.piston.displacement",
-        "motor_constant.piston.emf", "motor_inertia.piston.inertia", "load_relief.piston.relief_pressure",
+        "motor_constant.piston.emf", "motor_inertia.piston.inertia",
+        "load_relief.piston.relief_pressure",
         "line_compliance.piston.head.air", "accumulator_pressure.piston.pressure",
     } <= keys  # fmt: skip
 
