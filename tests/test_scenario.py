@@ -292,7 +292,7 @@ REFUSED = {
     "name": ({"name": "A b"}, "name"),
     "no_pilot": ({"pilot": None}, "pilot: Field required"),
     "no_duration": ({"duration": None}, "duration: Field required"),
-    "machine": ({"machine": "cat216"}, "did you mean 'cat215'.*ec20, emps, rig"),
+    "machine": ({"machine": "cat216"}, "did you mean 'cat215'.*ec20, eha, emps, rig"),
     "machine_number": ({"machine": 3}, "machine: .*string"),
     "tool": ({"tool": "buckett"}, "did you mean 'bucket'.*grapple"),
     "sensors": ({"sensors": "perfect"}, "valid: ideal, khoshzaban1992"),

@@ -40,6 +40,11 @@ SURE = 0.95  # probability below which an effect is called ambiguous
 PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
 _MECHANISM, _STEEP = 0.35, 0.07  # see `_mechanism`
 _TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`
+_WORSE = 1.05  # times the given model's errors on the held-out run: no patch may do more
+_REJECTED = (
+    "What the fitted runs asked for makes the held-out run worse; it was taken back, and nothing is"
+    " named."
+)
 _MINOR = 0.02  # share of the gap up to which a learned law is a detail
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _NORMAL95 = 1.96
@@ -81,6 +86,11 @@ def find_gap(
         nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)
         before = judge.tracks(nominal, evidence.map)
         after = judge.tracks(patched, evidence.map) if discovery.judged.guess.parts else before
+        notes = []
+        if not rms(after[:1]) <= _WORSE * rms(before[:1]):
+            notes = [_REJECTED]
+            found, discovery = found.emptied(), Discovery(found.base, ())
+            patched, after = nominal, before
         tests, floor = judge.tests(evidence, discovery.judged, patched, after)
         evidence.set_base(discovery.judged)
         scatter = tests.get("constancy", {}).get("value", 1.0)
@@ -125,7 +135,7 @@ def find_gap(
         learned=learned,
         lacks=lacks,
         noise=_noise(data, judge.levels),
-        notes=(*data.notes, *_notes(found, data, judge.levels, floor)),
+        notes=(*data.notes, *notes, *_notes(found, data, judge.levels, floor)),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 

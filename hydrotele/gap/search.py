@@ -73,6 +73,10 @@ class Found:
     rivals: tuple[tuple[Rival, ...], ...]
     weak: Fit | None
 
+    def emptied(self) -> "Found":
+        """The same search that named nothing."""
+        return replace(self, judged=self.base, fit=None, charges=(), without=(), rivals=())
+
     @property
     def guess(self) -> Guess:
         """The named effects, and the calibration if there is one."""

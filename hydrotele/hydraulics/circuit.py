@@ -274,7 +274,7 @@ def step_circuit(
         dt: step, scalar [s].
         act_dot: (4 count,) written: mean rates over the step, in the unit of `act` per [s].
         scratch: (SCRATCH,) work space.
-        terms: (n,) table of the machine's terms, None for none.
+        terms: (n,) table of the machine's terms, None for none [SI].
         time: at the start of the step, scalar [s]; only terms see it.
 
     Returns:

@@ -12,6 +12,7 @@ from hydrotele.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry
 from hydrotele.kinematics.five_dof import FellerGeometry
 from hydrotele.kinematics.linkage import FourBar, TwoBar, two_bar_from_points
+from hydrotele.kinematics.triangle import LoopOpen
 from hydrotele.machine import Machine
 
 _PLAY = 2.0e-3  # m: joint ranges are given in whole degrees
@@ -129,9 +130,12 @@ def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
         linkage = axis_linkage(machine, name)
     except InputError:
         return None
-    if linkage.rate(limits[0]) * linkage.rate(limits[1]) <= 0.0:
+    try:
+        if linkage.rate(limits[0]) * linkage.rate(limits[1]) <= 0.0:
+            return None
+        first, second = (float(linkage.length(q)) - axis.cylinder.closed_length for q in limits)
+    except LoopOpen:  # it cannot go as far as its range
         return None
-    first, second = (float(linkage.length(q)) - axis.cylinder.closed_length for q in limits)
     return min(first, second), max(first, second)
 
 

@@ -30,6 +30,11 @@ class MadeUp:
             left = left - self.signatures[hypothesis.name](d)
         return left
 
+    def base_slopes_of(self, tracks):
+        """The one part of `test_what_is_there_may_follow_a_candidate`."""
+        del tracks
+        return -self.signatures["there"](1.0)[:, None]
+
     def step_of(self, guess, step):
         del guess
         return step

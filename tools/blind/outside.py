@@ -84,12 +84,6 @@ OUTSIDE: dict[str, OutsideEffect] = {
             "valve", _at(None, threshold=(0.015, 0.08)), outside_steps.sticking_spool,
         ),
         OutsideEffect(
-            "load_holding", "a counterbalance valve that chokes the loaded side's return oil until"
-            " the other side's pressure opens it",
-            "flow", _at(("boom", "stick"), opens=(2e6, 8e6), span=(1.5e6, 5e6)),
-            outside_steps.load_holding,
-        ),
-        OutsideEffect(
             "meter_out", "a spool whose return notches are smaller than its feed notches",
             "valve", _at(None, ratio=(0.4, 0.85)), outside_steps.meter_out,
         ),

@@ -72,21 +72,6 @@ def sticking_spool(model, i, machine, location, p):
     return step
 
 
-def load_holding(model, i, machine, location, p):
-    """Chokes the return of the loaded side (boom: head, else rod) by the other side's pressure."""
-    chambers = _Chambers(model, i)
-    loaded = 0 if location == "boom" else 1
-
-    def step(data):
-        side, flow = chambers.returning(data)
-        if side == loaded:
-            pilot = data.act[4 * i + 2 + (1 - loaded)]
-            open_part = min(1.0, max(0.0, (pilot - p["opens"]) / p["span"]))
-            chambers.add(data, side, (1.0 - max(open_part, 0.05)) * flow)
-
-    return step
-
-
 def meter_out(model, i, machine, location, p):
     """Only `ratio` of the return flow passes."""
     chambers = _Chambers(model, i)
