@@ -15,9 +15,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from eha_control import under_control
-from eha_fit import free_run
-from eha_runs import LOADS, differences, load_runs
 
 from hydrotele.dataset.load import Dataset, RunData, load_dataset
 from hydrotele.dynamics.model import state_names
@@ -166,6 +163,10 @@ _EHA_FIGURES = {
 
 def eha(folder: Path, _jobs: int) -> None:
     """RMS differences of every run of the electro-hydraulic actuator, beside the figures."""
+    from eha_control import under_control
+    from eha_fit import free_run
+    from eha_runs import LOADS, differences, load_runs
+
     print("EHA: RMS differences; position [mm], head and rod pressure [bar]")
     for run in load_runs(folder / "eha"):
         machine = load_machine("eha", LOADS[run.group])

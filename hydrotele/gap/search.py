@@ -27,6 +27,7 @@ _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an inte
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
 _SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
 _ROOM = 3.0  # times the room to a bound that an effect gets that stands there
+_EXCHANGES = 3  # rounds in which a better rival takes an effect's place
 _STEPS = 3  # of Gauss-Newton for a candidate
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
@@ -152,13 +153,24 @@ def search(
     tell("drop what is needless", 0.87)
     now, fit, without = _pruned(evidence, base, now, fit)
     tell("compare rivals", 0.9)
-    charges, rivals = [], []
-    for index, (hypothesis, _) in enumerate(now.guess.parts):
-        assert fit
-        charges.append(charge(_last(fit.information, now.guess, index), hypothesis.size))
-        ranked = rankings.get(hypothesis.key, first)
-        rest = without[index]
-        rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
+    for exchange in range(_EXCHANGES):
+        charges, rivals = [], []
+        for index, (hypothesis, _) in enumerate(now.guess.parts):
+            assert fit
+            charges.append(charge(_last(fit.information, now.guess, index), hypothesis.size))
+            ranked = rankings.get(hypothesis.key, first)
+            rest = without[index]
+            rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
+        better = [
+            rival.judged for own, others in zip(charges, rivals, strict=True) for rival in others
+            if rival.judged.loss + rival.charge < now.loss + own
+        ]  # fmt: skip
+        if not better or exchange == _EXCHANGES - 1:
+            break
+        now, fit = settle(evidence, min(better, key=lambda judged: judged.loss))
+        for hypothesis, _ in now.guess.parts:
+            rankings.setdefault(hypothesis.key, first)
+        now, fit, without = _pruned(evidence, base, now, fit)
     return Found(base, now, fit, first, tuple(charges), without, tuple(rivals), weak)
 
 

@@ -84,8 +84,4 @@ def _busiest_row(data: Dataset, run: RunData, rows: int) -> int:
 
 
 def _stretch(run: RunData, first: int, rows: int) -> RunData:
-    part = slice(first, first + rows)
-    return dataclasses.replace(
-        run, start=run.start + first * run.period, command=run.command[part],
-        command_known=run.command_known[part], reading=run.reading[part],
-    )  # fmt: skip
+    return run.part(first, first + rows)

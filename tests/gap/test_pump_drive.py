@@ -15,6 +15,7 @@ from hydrotele.gap.find import find_gap
 from hydrotele.log import save_log
 from hydrotele.machine_file import load_machine, save_machine
 from hydrotele.prediction.calibration import numbers
+from hydrotele.prediction.levels import rough_noise
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario
 
@@ -45,11 +46,13 @@ def test_the_force_of_the_load_cylinder_closes_the_balance(site):
     """Without it the head side's 18 bar on 19.6 cm^2, 3.6 kN while extending, would be missing."""
     machine = load_machine("eha", TOOL)
     data = load_dataset(site, machine)
-    with_load = run_balances(machine, data, data.heldout, data.noise)["force"]["piston"]
+    noise = rough_noise(data)
+    with_load = run_balances(machine, data, data.heldout, noise)["force"]["piston"]
     bare = changed(machine, "loads", {})
-    without = run_balances(bare, data, data.heldout, data.noise)["force"]["piston"]
+    without = run_balances(bare, data, data.heldout, noise)["force"]["piston"]
     assert without.rms > 1.0e3
-    assert with_load.rms < 0.3 * without.rms  # friction at rest, of any sign, is not in a balance
+    # friction at rest, of any sign and up to 1 kN here, is not in a balance
+    assert with_load.rms < 0.4 * without.rms
 
 
 def test_every_number_of_pump_motor_and_load_can_be_calibrated():

@@ -36,8 +36,8 @@ def row_later(machine, track, row):
 def test_a_constant_input_moves_the_state_as_a_constant_term_does(track, balance, size, kind):
     """Half of an input is carried through the row, half is not.
 
-    Over 20 ms the trapezoidal rule is off by (20 ms / 60 ms)^2 / 12 = 1 % for a motion at 2.5 Hz,
-    by some more for stiffer oil.
+    The boom's oil swings at 5 to 10 Hz, a third of a period within a row, where the trapezoidal
+    rule is off by up to a quarter. Inputs locate and weigh; laws are fitted inside the machine.
     """
     machine = load_machine("cat215")
     term = Term(name="extra", axis="boom", balance=balance, law="constant",
@@ -48,4 +48,4 @@ def test_a_constant_input_moves_the_state_as_a_constant_term_does(track, balance
     for row in (100, 250, 400):
         moved = (row_later(changed, track, row) - row_later(machine, track, row))[own] / size
         expected = columns[row, 0, own]
-        assert np.linalg.norm(moved - expected) < 0.06 * np.linalg.norm(moved)
+        assert np.linalg.norm(moved - expected) < 0.3 * np.linalg.norm(moved)
