@@ -27,6 +27,7 @@ from hydrotele.machine_file import load_machine
 from hydrotele.prediction.free_run import following_levels
 from hydrotele.prediction.stretches import busiest
 from hydrotele.prediction.track import track_run
+from hydrotele.terms.law import LAWS, VARIABLES, DriveState
 
 WINDOW, LEAD = 5.0, 0.5  # s; of each window the lead has readings, the rest none
 PUSH = (176.0, 7.3, 0.7)  # N, s, s: half of the drive's largest force
@@ -49,10 +50,30 @@ def force_error(machine: Machine, run: RunData, cutoff: float) -> float:
         + friction.viscous * (1.0 + friction.viscous_asymmetry * np.sign(v)) * v
         + friction.coulomb * (1.0 + friction.coulomb_asymmetry * np.sign(v)) * way
         + drive.offset
+        - _added(machine, run, motion.value, motion.rate)
     )
     inner = slice(_EDGE, -_EDGE)
     left = (force - modelled)[inner]
     return float(100.0 * np.linalg.norm(left) / np.linalg.norm(force[inner]))
+
+
+def _added(machine: Machine, run: RunData, position: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Forces (n,) that learned laws and other terms add to the drive along a motion [N]."""
+    total = np.zeros(len(rate))
+    for term in machine.terms:
+        law = LAWS[term.law]
+        given = law.translate(term.parameters) if law.translate else term.parameters
+        arguments = {k: np.array(v) if isinstance(v, list) else v for k, v in given.items()}
+        for row, (x, v) in enumerate(zip(position, rate, strict=True)):
+            command = float(run.command[row, 0])
+            force = machine.axes["slide"].force.gain * command
+            now = {"time": run.start + row * run.period, "position": x, "velocity": v,
+                   "command": command, "force": force}  # fmt: skip
+            for name, (low, high) in term.domain.items():
+                now[name] = min(max(now[name], low), high)
+            total[row] += law.function(DriveState(**{**dict.fromkeys(VARIABLES, 0.0), **now}),
+                                       **arguments)  # fmt: skip
+    return total
 
 
 def velocity_fit(machine: Machine, data: Dataset, cutoff: float) -> dict[str, float]:
