@@ -44,7 +44,8 @@ def test_drawn_sizes_are_plausible_and_never_tiny():
             assert abs(value - p.nominal) >= 0.999 * SMALLEST * p.least
             signs.add((planted.name, np.sign(value - p.nominal)))
     assert {("angle_offset", -1.0), ("angle_offset", 1.0)} <= signs
-    assert len(names) > 0.9 * len(EFFECTS)
+    here = [effect for effect in EFFECTS.values() if effect.locations(MACHINE)]
+    assert len(names) > 0.9 * len(here)
 
 
 def test_doubles_do_not_overwrite_each_other():
