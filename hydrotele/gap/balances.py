@@ -191,7 +191,7 @@ def _push(machine: Machine, signals: Signals, name: str) -> np.ndarray | None:
     return area_head * head - area_rod * rod
 
 
-def _load(machine: Machine, name: str, motion: np.ndarray, period: float) -> np.ndarray:
+def _load(machine: Machine, name: str, motion: np.ndarray | None, period: float) -> np.ndarray:
     """(d, n) force of the load cylinder against an axis' motion (d, 3, n), its friction included.
 
     Its pressure follows from the travel alone; in the first row there is none.
