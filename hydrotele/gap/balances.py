@@ -165,7 +165,9 @@ def _force(machine: Machine, signals: Signals) -> Found:
     space = model_space(model)
     needed = np.stack([load_forces(model, space, m.swapaxes(0, 1).copy()) for m in motion])
     for name in known.keys() & machine.loads.keys():
-        known[name] = known[name] - _load(machine, name, motions[name], signals.period)
+        own = motions[name]
+        if own is not None:
+            known[name] = known[name] - _load(machine, name, own, signals.period)
     for name, push in known.items():
         rotary = machine.axes[name].cylinder is None and machine.position_kind(name) == "angle"
         lacks = push - needed[:, :, order.index(name)]
@@ -191,7 +193,7 @@ def _push(machine: Machine, signals: Signals, name: str) -> np.ndarray | None:
     return area_head * head - area_rod * rod
 
 
-def _load(machine: Machine, name: str, motion: np.ndarray | None, period: float) -> np.ndarray:
+def _load(machine: Machine, name: str, motion: np.ndarray, period: float) -> np.ndarray:
     """(d, n) force of the load cylinder against an axis' motion (d, 3, n), its friction included.
 
     Its pressure follows from the travel alone; in the first row there is none.
