@@ -232,8 +232,8 @@ def _mechanism(part: float) -> float:
 
     `part` is the share of what the runs lacked without it that it takes away. A law of another
     form in the same balance is imitated by the wrong effect to some part only; the right effect in
-    another form leaves little. The line between them is where blind trials put it
-    (`docs/results/blind_trials`).
+    another form leaves little. The line between them is set by hand, from a handful of trials
+    (`docs/results/independent_trials.md`); no series has calibrated it.
     """
     return float(1.0 / (1.0 + np.exp(-(part - _MECHANISM) / _STEEP)))
 
