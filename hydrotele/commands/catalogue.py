@@ -90,18 +90,22 @@ def _sweeps() -> list[dict]:
 
 
 def _effects() -> list[dict]:
-    """Effects as they can sit on the CAT 215 with bucket, ranges at the last of the places."""
+    """Effects as they can sit on the first shipped machine that has a place for them, the CAT 215
+    with bucket before all others; ranges at the last of the places."""
     from hydrotele.effects import EFFECTS
 
-    machine = load_machine("cat215", "bucket")
+    names = [n for n in shipped_machines() if n != "cat215"]
+    machines = [load_machine("cat215", "bucket"), *map(load_machine, names)]
     rows = []
     for effect in EFFECTS.values():
+        machine = next((m for m in machines if effect.locations(m)), machines[0])
         places = effect.locations(machine)
-        numbers = effect.parameters(machine, places[-1])
+        numbers = effect.parameters(machine, places[-1]) if places else {}
         rows.append(
             {
                 "name": effect.name,
                 "what": effect.sentence,
+                "machine": machine.name if places else "",
                 "locations": list(places),
                 "parameters": {
                     n: {"unit": p.unit, "low": p.low, "high": p.high} for n, p in numbers.items()
