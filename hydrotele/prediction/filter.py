@@ -73,8 +73,8 @@ def _slopes(model, sp, z, nudge, slope, moved):
 @compiled
 def filter_run(
     model, sp, late, z, spread, command, known, reading, noise, drift, startle, period, steps,
-    coarse, nudge, own, slope, gain, width, fresh, columns, decay, whitened, predicted, corrected,
-    initial, flow,
+    coarse, nudge, own, slope, gain, width, fresh, given, columns, decay, whitened, predicted,
+    corrected, initial, flow,
 ):  # fmt: skip
     """Cross a run.
 
@@ -101,7 +101,8 @@ def filter_run(
             used.
         gain: see slope.
         width: see slope.
-        fresh: whether to compute gains; False keeps the given ones.
+        fresh: whether to compute gains; False keeps those in `gain`.
+        given: whether `flow` holds transition Jacobians already; only where `fresh`.
         columns: (n, m, nz - q - m) what each unknown input, of size 1, adds to the model's states
             over a row.
         decay: by which factor inputs fall over a row.
@@ -109,7 +110,7 @@ def filter_run(
         predicted: (n, c) written: readings predicted from the rows before.
         corrected: (n, nz - q - m) written: the model's states after the row's readings.
         initial: (nz, nz) written if `fresh`: covariance before the first row's readings.
-        flow: (n, nz, nz) written if `fresh`: d (state before the next row's readings) / d (state
+        flow: (n, nz, nz) written if `fresh` and not `given`: d (state before the next row's readings) / d (state
             after this row's), the latter along the first index; (0, nz, nz) keeps none.
 
     Returns:
@@ -158,11 +159,11 @@ def filter_run(
                 error -= hc[s] * delta[s]
             if fresh:
                 total = noise[c]
-                for s in range(full):
-                    pull[s] = 0.0
-                    for k in range(full):
-                        if hc[k] != 0.0:
-                            pull[s] += spread[s, k] * hc[k]
+                pull[:] = 0.0
+                for k in range(full):  # a reading depends on few states
+                    if hc[k] != 0.0:
+                        for s in range(full):
+                            pull[s] += spread[k, s] * hc[k]
                 for s in range(full):
                     total += hc[s] * pull[s]
                 width[row, c] = math.sqrt(total)
@@ -183,26 +184,32 @@ def filter_run(
         if row == rows - 1:
             break
         if fresh:
-            for s in range(full, -1, -1):  # the state itself is the last row
-                moves = s < size or s == full
-                for r in range(full):
-                    reached[s, r] = z[r] if moves else reached[full, r]
-                if s < size:
-                    reached[s, s] += nudge[s]
-                if moves:
-                    advance(model, sp, reached[s], command, row, period, coarse, rough)
-                    move_late(model, late, size, rough, period / coarse, reached[s])
-                elif begin <= s < full:
-                    for r in range(size):
-                        reached[s, r] += nudge[s] * columns[row, s - begin, r]
-                    reached[s, s] += decay * nudge[s]
-                else:
-                    nudge_late(late, s - size, nudge[s], reached[s, size:begin])
-            _carry(reached, nudge, spread, work, drift)
-            if len(flow) > 0:
+            if given:
+                reached[:full] = flow[row]
+            else:
+                for s in range(full, -1, -1):  # the state itself is the last row
+                    moves = s < size or s == full
+                    for r in range(full):
+                        reached[s, r] = z[r] if moves else reached[full, r]
+                    if s < size:
+                        reached[s, s] += nudge[s]
+                    if moves:
+                        advance(model, sp, reached[s], command, row, period, coarse, rough)
+                        move_late(model, late, size, rough, period / coarse, reached[s])
+                    elif begin <= s < full:
+                        for r in range(size):
+                            reached[s, r] += nudge[s] * columns[row, s - begin, r]
+                        reached[s, s] += decay * nudge[s]
+                    else:
+                        nudge_late(late, s - size, nudge[s], reached[s, size:begin])
                 for s in range(full):
                     for r in range(full):
-                        flow[row, s, r] = reached[s, r]
+                        reached[s, r] = (reached[s, r] - reached[full, r]) / nudge[s]
+                if len(flow) > 0:
+                    for s in range(full):
+                        for r in range(full):
+                            flow[row, s, r] = reached[s, r]
+            _carry(reached, spread, work, drift)
             if not known[row]:
                 for s in range(full):
                     spread[s, s] += startle[s]
@@ -247,23 +254,24 @@ def _among(numbers, number):
 
 
 @lean
-def _carry(columns, nudge, spread, work, drift):
-    """`P = F P F' + Q`, kept symmetric, with the states reached from nudged ones and, last, z."""
+def _carry(columns, spread, work, drift):
+    """`P = F P F' + Q`, kept symmetric; the rows of `columns` are F's columns."""
     size = len(drift)
-    for s in range(size):
-        for r in range(size):
-            columns[s, r] = (columns[s, r] - columns[size, r]) / nudge[s]
+    for a in range(size):  # work = F P, then P = work F'; the innermost index is contiguous
+        work[a] = 0.0
+    for k in range(size):
+        for a in range(size):
+            part = columns[k, a]
+            if part != 0.0:
+                for b in range(size):
+                    work[a, b] += part * spread[k, b]
     for a in range(size):
-        for b in range(size):
-            total = 0.0
-            for k in range(size):
-                total += columns[k, a] * spread[k, b]
-            work[a, b] = total
+        spread[a] = 0.0
+        for k in range(size):
+            part = work[a, k]
+            for b in range(a + 1):
+                spread[a, b] += part * columns[k, b]
     for a in range(size):
-        for b in range(a + 1):
-            total = 0.0
-            for k in range(size):
-                total += work[a, k] * columns[k, b]
-            spread[a, b] = total
-            spread[b, a] = total
+        for b in range(a):
+            spread[b, a] = spread[a, b]
         spread[a, a] += drift[a]

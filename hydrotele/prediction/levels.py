@@ -128,10 +128,10 @@ def find_levels(
         inputs = possible_inputs(machine)
         levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
         tracks = _crossed(data, machine, levels, tracks, each, step)
-    for _ in range(rounds):
+    for index in range(rounds):
         before = sum(track.loss for track in tracks) + levels.penalty
         levels = _pruned(_most_likely(data, machine, levels, prior, tracks, each), machine)
-        tracks = _crossed(data, machine, levels, tracks, each, step)
+        tracks = _crossed(data, machine, levels, tracks, each, step, bool(start) or index > 0)
         if sum(track.loss for track in tracks) + levels.penalty > before - _SETTLED:
             break
     return tracks
@@ -146,18 +146,38 @@ def _pruned(levels: Levels, machine: Machine) -> Levels:
 
 def _crossed(
     data: Dataset, machine: Machine, levels: Levels, near: Sequence[Track], each: Callable,
-    step: float,
+    step: float, same: bool = False,
 ) -> tuple[Track, ...]:  # fmt: skip
-    """Linearised tracks with some levels; what inputs do is taken from tracks nearby."""
+    """Linearised tracks with some levels; what inputs do is taken from tracks nearby.
+
+    Where these are of the same machine with these inputs or more, so are the transition Jacobians,
+    which cost most of a pass.
+    """
 
     def cross(index: int) -> Track:
-        run, columns = data.fit[index], None
-        if near and levels.inputs:
-            columns = columns_of(machine, near[index], levels.inputs)
+        run, columns, flow = data.fit[index], None, None
         rest = near[index].rest if near else None
-        return track_run(machine, data, run, None, step, levels, columns, True, rest)
+        if same:
+            columns, flow = _without_pruned(near[index], levels.inputs)
+        elif near and levels.inputs:
+            columns = columns_of(machine, near[index], levels.inputs)
+        return track_run(machine, data, run, None, step, levels, columns, True, rest, flow)
 
     return tuple(each(cross, range(len(data.fit))))
+
+
+def _without_pruned(track: Track, inputs: Sequence[Input]) -> tuple[np.ndarray, np.ndarray]:
+    """What inputs do, and transition Jacobians, of a track that may know more inputs."""
+    before = list(track.levels.inputs)
+    if len(before) == len(inputs):
+        return track.columns, track.flow
+    kept = [before.index(i) for i in inputs]
+    first = track.flow.shape[1] - len(before)
+    there = np.concatenate([np.arange(first), first + np.array(kept, dtype=int)])
+    return (
+        np.ascontiguousarray(track.columns[:, kept]),
+        np.ascontiguousarray(track.flow[:, there[:, None], there]),
+    )
 
 
 def columns_of(machine: Machine, near: Track, inputs: Sequence[Input]) -> np.ndarray:

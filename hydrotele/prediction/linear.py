@@ -92,11 +92,12 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
                 continue
             h = run.slope[row, c]
             total = noise[c]
-            for s in range(size):
-                y -= h[s] * d[s]
-                pull[s] = 0.0
-                for k in range(size):
-                    pull[s] += p[s, k] * h[k]
+            pull[:] = 0.0
+            for k in range(size):  # a reading depends on few states
+                if h[k] != 0.0:
+                    y -= h[k] * d[k]
+                    for s in range(size):
+                        pull[s] += p[k, s] * h[k]
             for s in range(size):
                 total += h[s] * pull[s]
             width[row, c] = np.sqrt(total)

@@ -18,7 +18,7 @@ STEP = (
     1.0e-3  # s: 2 ms leaves errors of 1000 in the loss where the pump is starved, 1 ms none of 100
 )
 COARSE = 4.0e-3  # s, for a first look at a candidate
-_TANGENT = 4.0e-3  # s, for the transition Jacobians: a covariance need not be exact
+_TANGENT = 5.0e-3  # s, for the transition Jacobians: a covariance need not be exact
 _STIFF = 1.0e-3  # s, where a transmission's spring is: with the oil it may ring at 150 Hz
 
 
@@ -143,7 +143,7 @@ def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
 def track_run(
     machine: Machine, data: Dataset, run: RunData, kept: Track | None = None,
     step: float = STEP, levels: Levels | None = None, columns: np.ndarray | None = None,
-    linearise: bool = False, rest: np.ndarray | None = None,
+    linearise: bool = False, rest: np.ndarray | None = None, flow: np.ndarray | None = None,
 ) -> Track:  # fmt: skip
     """Cross a run with a machine.
 
@@ -158,6 +158,8 @@ def track_run(
         linearise: whether to keep the transition Jacobians; only without `kept`.
         rest: (t,) where drives rest in their backlash, from a track of a machine like it; it is
             looked for where this is None or of another machine.
+        flow: (n, nz, nz) transition Jacobians of the same machine near by, used instead of new
+            ones, which cost most of a pass; only without `kept`.
 
     Returns:
         The track.
@@ -185,7 +187,8 @@ def track_run(
             lambda r: _cross(machine, model, data, first, None, step, r, levels, part, noise).loss,
             play,
         )
-    return _cross(machine, model, data, run, kept, step, rest, levels, columns, noise, linearise)
+    return _cross(machine, model, data, run, kept, step, rest, levels, columns, noise, linearise,
+                  flow)  # fmt: skip
 
 
 def _for_states(kept: Track, names: list[str]) -> np.ndarray:
@@ -203,7 +206,7 @@ def _for_states(kept: Track, names: list[str]) -> np.ndarray:
 def _cross(
     machine: Machine, model: Model, data: Dataset, run: RunData, kept: Track | None, step: float,
     rest: np.ndarray, levels: Levels, columns: np.ndarray, noise: np.ndarray,
-    linearise: bool = False,
+    linearise: bool = False, given: np.ndarray | None = None,
 ) -> Track:  # fmt: skip
     step, coarse = fine_enough(machine, step), fine_enough(machine, _TANGENT)
     space = model_space(model)
@@ -235,14 +238,16 @@ def _cross(
     state[:size], covariance[:size, :size] = start, spread
     at = np.arange(full - m, full)
     covariance[at, at] = levels.sizes**2
-    flow, initial = np.empty((rows if linearise else 0, full, full)), np.zeros((full, full))
+    initial = np.zeros((full, full))
+    flow = np.empty((rows if linearise else 0, full, full)) if given is None else given
     loss = filter_run(
         model, space, late, state, covariance, run.command, run.command_known, run.reading,
         noise**2, state_drift(names, levels, run.period),
         by_kind(names, STARTLE) ** 2, run.period,
         max(1, round(run.period / step)), max(1, round(run.period / coarse)),
         by_kind(names, _NUDGE), np.array([names.index(name) for name in known]), *gains,
-        kept is None, columns, decay(run.period), whitened, predicted, states, initial, flow,
+        kept is None, given is not None, columns, decay(run.period), whitened, predicted, states,
+        initial, flow,
     )  # fmt: skip
     return Track(
         run, levels, loss, whitened, predicted, states, gains, known, start, rest, columns,
