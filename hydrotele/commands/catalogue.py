@@ -90,8 +90,10 @@ def _sweeps() -> list[dict]:
 
 
 def _effects() -> list[dict]:
-    """Effects as they can sit on the first shipped machine that has a place for them, the CAT 215
-    with bucket before all others; ranges at the last of the places."""
+    """Effects at the first shipped machine that has a place for them; ranges at the last of these.
+
+    The CAT 215 with bucket comes before all others.
+    """
     from hydrotele.effects import EFFECTS
 
     names = [n for n in shipped_machines() if n != "cat215"]

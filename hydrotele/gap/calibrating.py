@@ -7,9 +7,10 @@ import numpy as np
 from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
+from hydrotele.prediction.track import COARSE
 
 BEYOND = 15.0  # twice the log evidence that a number must bring to be an effect of its own
-_ROUNDS = 3  # of levels and fit
+_ROUNDS = 2  # of levels and fit; `search.settle` does the rest
 _SETTLED = 15.0  # fall of the loss that is worth another round
 
 
@@ -39,8 +40,8 @@ def calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
     guess = now.guess.plus(group, np.zeros(group.size))
     for _ in range(_ROUNDS):
         step = evidence.step_of(guess, MIDDLE)
-        errors = evidence.errors(guess, step)
-        slopes = evidence.slopes(guess, errors, step=step)
+        coarse = evidence.step_of(guess, COARSE)
+        slopes = evidence.slopes(guess, evidence.errors(guess, coarse), step=coarse)
         fit = evidence.fit(guess, 0.0, step=step, kept=slopes, steps=3)
         before, judged = judged.loss, evidence.judged(fit.guess)
         guess, cost = fit.guess, charge(fit.information, group.size)

@@ -59,11 +59,15 @@ def screen(evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis]) -
 
 @dataclass(frozen=True)
 class _Ground:
-    """Where candidates start: errors (E,), slopes (E, P) and deviation (P,) of what is there."""
+    """Where candidates start: errors (E,), slopes (E, P) and deviation (P,) of what is there.
+
+    `matrix` is the (P, P) information of these slopes with the prior's.
+    """
 
     errors: np.ndarray
     slopes: np.ndarray
     present: np.ndarray
+    matrix: np.ndarray
 
 
 def _rank(
@@ -74,10 +78,12 @@ def _rank(
 
     present = guess.deviation
     slopes = evidence.base_slopes_of(tracks) if len(present) else None
+    matrix = np.zeros((0, 0)) if slopes is None else slopes.T @ slopes + np.eye(len(present))
 
     def ground_of(step: float) -> _Ground:
         errors = errors_of(guess, step)
-        return _Ground(errors, np.zeros((len(errors), 0)) if slopes is None else slopes, present)
+        there = np.zeros((len(errors), 0)) if slopes is None else slopes
+        return _Ground(errors, there, present, matrix)
 
     steps = {h.key: evidence.step_of(guess.plus(h, h.starts[-1]), COARSE) for h in candidates}
     unlike = sorted(set(steps.values()))
@@ -140,29 +146,24 @@ def _point(hypothesis: Hypothesis, ground: _Ground, d: np.ndarray, shift: np.nda
 def _without_present(ground: _Ground, errors: np.ndarray) -> float:
     """Least loss when what is there may follow."""
     pull = ground.slopes.T @ errors + ground.present
-    matrix = ground.slopes.T @ ground.slopes + np.eye(len(pull))
-    return float(errors @ errors - pull @ np.linalg.solve(matrix, pull))
+    return float(errors @ errors - pull @ np.linalg.solve(ground.matrix, pull))
 
 
 def _explained(ground: _Ground, along: np.ndarray) -> float:
     """Part of a signature's square that what is there could take over."""
     pull = ground.slopes.T @ along
-    matrix = ground.slopes.T @ ground.slopes + np.eye(len(pull))
-    return float(pull @ np.linalg.solve(matrix, pull))
+    return float(pull @ np.linalg.solve(ground.matrix, pull))
 
 
 def _line(hypothesis: Hypothesis, ground: _Ground, slopes: np.ndarray) -> Screened:
     """Best deviation inside the bounds, with straight signatures, what is there following."""
-    both = np.column_stack([ground.slopes, slopes])
-    matrix = both.T @ both + np.eye(both.shape[1])
-    right = both.T @ ground.errors + np.concatenate([ground.present, np.zeros(hypothesis.size)])
-    p = ground.slopes.shape[1]
-    if p:  # eliminate what is already there
-        inner = np.linalg.solve(matrix[:p, :p], np.column_stack([matrix[:p, p:], right[:p]]))
-        own = matrix[p:, p:] - matrix[p:, :p] @ inner[:, :-1]
-        pull = right[p:] - matrix[p:, :p] @ inner[:, -1]
-    else:
-        own, pull = matrix, right
+    own = slopes.T @ slopes + np.eye(hypothesis.size)
+    pull = slopes.T @ ground.errors
+    if len(ground.present):  # eliminate what is already there
+        cross = ground.slopes.T @ slopes
+        right = ground.slopes.T @ ground.errors + ground.present
+        inner = np.linalg.solve(ground.matrix, np.column_stack([cross, right]))
+        own, pull = own - cross.T @ inner[:, :-1], pull - cross.T @ inner[:, -1]
     d = np.clip(-np.linalg.solve(own, pull), hypothesis.low, hypothesis.high)
     for _ in range(20):  # coordinate descent in the box
         for k in range(len(d)):

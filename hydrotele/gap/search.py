@@ -22,17 +22,23 @@ from hydrotele.prediction.levels import input_excess
 from hydrotele.prediction.track import COARSE
 
 ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines stay below 14.7
+_TRACE = 2.0e-3  # of all that was gained: below it an effect is none where all numbers are off
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
 _SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
+_UNMOVED = 0.3  # standard deviations by which a number may still move
+_IDLE = 3.0  # fall of the loss that is not worth another round of a calibration
+_STALE = 200.0  # fall of the loss after which the slopes of a calibration are taken anew
 _ROOM = 3.0  # times the room to a bound that an effect gets that stands there
-_EXCHANGES = 3  # rounds in which a better rival takes an effect's place
+_BETTER = 6.0  # twice the log evidence by which a rival must be better to take a place
+_SECOND = 2  # rivals that are worth a second look
+_EXCHANGES = 2  # rounds in which a better rival takes an effect's place
 _STEPS = 3  # of Gauss-Newton for a candidate
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
-_RIVALS = 4  # candidates that are judged in the place of a named effect
+_RIVALS = 3  # candidates that are judged in the place of a named effect
 _HOPELESS = 500.0  # loss above the effect's after two steps, beyond which a rival is let go
 _WORTH = 0.1  # of the best screened score: below it a candidate is not fitted
 _PAIRED = 6  # candidates that are tried in pairs where no single one helps
@@ -104,29 +110,39 @@ def search(
     candidates = timed(candidates, base)
     rankings: dict[tuple[str, str], Sequence[Screened]] = {}
     worth = 0.0
+    ranked: Sequence[Screened] | None = None  # of the present guess
     while refused < _REFUSED:
         done = 0.85 * (1.0 - 0.7 ** len(now.guess.parts)) + 0.05
-        tell(f"try every effect ({_named_so_far(now.guess)} named so far)", done)
-        open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
-        ranked = screen(evidence, now.guess, open_ones)
-        first = first or tuple(ranked)
-        best, worth = _best_single(evidence, now, ranked)
-        if best is None and lacking(now, evidence) > LACKING and len(ranked) > 1:
-            best, worth = _best_pair(evidence, now, ranked)
+        if ranked is None:
+            tell(f"try every effect ({_named_so_far(now.guess)} named so far)", done)
+            open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
+            ranked = screen(evidence, now.guess, open_ones)
+            first = first or tuple(ranked)
+        bar = _bar(base, now)
+        options = _best_singles(evidence, now, ranked, bar)
+        if not options and lacking(now, evidence) > LACKING and len(ranked) > 1:
+            options = _best_pairs(evidence, now, ranked, bar)
+        small = []
+        while options and not worth_naming(options[0][0].guess, -1, options[0][1]):
+            judged, worth = options.pop(0)
+            weak = Fit(judged.guess, 0.0, worth, 0.0, np.eye(1))
+            small.append(judged.guess.parts[-1][0].key)
+        candidates = [c for c in candidates if c.key not in small]
+        ranked = [r for r in ranked if r.hypothesis.key not in small]
+        if small and not options:
+            refused += 1
+            continue
+        best, worth = options[0] if options else (None, 0.0)
         grown, settled = now, fit
         if best:
             added = best.guess.parts[-1][0]
-            if not worth_naming(best.guess, -1, worth):
-                weak = Fit(best.guess, 0.0, worth, 0.0, np.eye(1))
-                candidates = [c for c in candidates if c.key != added.key]
-                refused += 1
-                continue
             tell(f"fit {added.name.replace('_', ' ')}", done + 0.02)
             grown, settled = settle(evidence, best)
             worth = now.loss - grown.loss - settled.charge
-            if worth < ENTER or _strained(grown.guess, -1):
+            if worth < bar or _strained(grown.guess, -1):
                 evidence.set_base(now)
                 candidates = [c for c in candidates if c.key != added.key]
+                ranked = [r for r in ranked if r.hypothesis.key != added.key]
                 refused += 1
                 continue
         if (
@@ -138,7 +154,7 @@ def search(
             tried = True
             evidence.set_base(now)
             other, gain = calibrated(evidence, now)
-            if other and gain > max(worth, ENTER):
+            if other and gain > max(worth, bar):
                 best = other
                 grown, settled = settle(evidence, other)
             elif best:
@@ -147,7 +163,7 @@ def search(
             break
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = ranked
-        now, fit = grown, settled
+        now, fit, ranked = grown, settled, None
         if own := promoted(evidence, now, candidates):
             now, fit = settle(evidence, evidence.judged(own))
     tell("drop what is needless", 0.87)
@@ -163,7 +179,7 @@ def search(
             rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
         better = [
             rival.judged for own, others in zip(charges, rivals, strict=True) for rival in others
-            if rival.judged.loss + rival.charge < now.loss + own
+            if rival.judged.loss + rival.charge < now.loss + own - _BETTER
         ]  # fmt: skip
         if not better or exchange == _EXCHANGES - 1:
             break
@@ -222,44 +238,54 @@ def _named_so_far(guess: Guess) -> int:
     return sum(h.name != CALIBRATION for h, _ in guess.parts)
 
 
-def _best_single(
-    evidence: Evidence, now: Judged, ranked: Sequence[Screened]
-) -> tuple[Judged | None, float]:
-    """The best of the first few candidates, judged, and its score; None if none may enter."""
-    bar = max(0.5 * ENTER, _WORTH * ranked[0].score) if ranked else 0.0
+def _bar(base: Judged, now: Judged) -> float:
+    """What an effect must bring.
+
+    Where all numbers are off, so are some that are not among the calibrated ones; what they leave
+    looks like an effect that closes a trace of the gap.
+    """
+    if not calibration_of(now.guess):
+        return ENTER
+    return max(ENTER, _TRACE * (base.loss - now.loss))
+
+
+def _best_singles(
+    evidence: Evidence, now: Judged, ranked: Sequence[Screened], enter: float
+) -> list[tuple[Judged, float]]:
+    """The best of the first few candidates that bring enough, judged, and their scores."""
+    bar = max(0.5 * enter, _WORTH * ranked[0].score) if ranked else 0.0
     short = [s for s in ranked[:_SHORT] if s.score > bar]
     if not short:
-        return None, 0.0
-    evidence.base_slopes(MIDDLE)
+        return []
+    evidence.base_slopes(evidence.slope_step)
 
     def fitted(candidate: Screened) -> Fit:
         more = now.guess.plus(candidate.hypothesis, candidate.start)
         step = evidence.step_of(more, MIDDLE)
-        kept = evidence.base_slopes(step, parallel=False)
+        kept = evidence.base_slopes(evidence.slope_step, parallel=False)
         before = _loss_of(evidence, now.guess, step)
         return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
 
     fits = sorted(evidence.map(fitted, short), key=lambda fit: -fit.score)
-    inside = [fit for fit in fits if fit.score > ENTER and not _strained(fit.guess, -1)]
+    inside = [fit for fit in fits if fit.score > enter and not _strained(fit.guess, -1)]
     close = [f for f in (inside or fits)[:_JUDGED] if f.score > _NEAR * fits[0].score]
-    close = [f for f in close if f.score > 0.5 * ENTER]
-    return _best_of(evidence, now, close)
+    return _judged_best(evidence, now, [f for f in close if f.score > 0.5 * enter], enter)
 
 
-def _best_of(evidence: Evidence, now: Judged, fits: Sequence[Fit]) -> tuple[Judged | None, float]:
-    """The best of some fits with levels of their own, and its score."""
+def _judged_best(
+    evidence: Evidence, now: Judged, fits: Sequence[Fit], enter: float
+) -> list[tuple[Judged, float]]:
+    """Those fits that bring enough with levels of their own, and their scores, best first."""
     judged = [evidence.judged(fit.guess) for fit in fits]
     scores = [now.loss - j.loss - fit.charge for j, fit in zip(judged, fits, strict=True)]
-    if not scores or max(scores) < ENTER:
-        return None, 0.0
-    best = int(np.argmax(scores))
-    return judged[best], scores[best]
+    found = [(j, score) for j, score in zip(judged, scores, strict=True) if score >= enter]
+    return sorted(found, key=lambda pair: -pair[1])
 
 
-def _best_pair(
-    evidence: Evidence, now: Judged, ranked: Sequence[Screened]
-) -> tuple[Judged | None, float]:
-    """The best pair of effects where no single one helps, judged, and its score."""
+def _best_pairs(
+    evidence: Evidence, now: Judged, ranked: Sequence[Screened], enter: float
+) -> list[tuple[Judged, float]]:
+    """The best pairs of effects where no single one helps, judged, and their scores."""
     pool = list(ranked[:_PAIRED])
     step = max(evidence.step_of(now.guess.plus(s.hypothesis, s.start), COARSE) for s in pool)
     ground = evidence.errors(now.guess, step)
@@ -283,34 +309,39 @@ def _best_pair(
         for index in pair:
             start = pool[index].start
             more = more.plus(pool[index].hypothesis, start)
-        kept = evidence.base_slopes(MIDDLE, parallel=False)
+        kept = evidence.base_slopes(evidence.slope_step, parallel=False)
         before = _loss_of(evidence, now.guess, MIDDLE)
         found = evidence.fit(more, before, parallel=False, step=MIDDLE, kept=kept)
         sizes = sum(h.size for h, _ in more.parts[len(now.guess.parts) :])
         return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
                    found.information)  # fmt: skip
 
-    fits = [f for f in evidence.map(fitted, pairs) if f.score > ENTER
+    fits = [f for f in evidence.map(fitted, pairs) if f.score > enter
             and not _strained(f.guess, -1) and not _strained(f.guess, -2)]  # fmt: skip
-    return _best_of(evidence, now, fits)
+    return _judged_best(evidence, now, fits, enter)
 
 
 def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
     """Fit with levels and gains computed anew until they no longer matter."""
-    fit = None
+    fit, guess, kept = None, judged.guess, None
+    group = calibration_of(guess)
     for _ in range(_SETTLES):
         evidence.set_base(judged)
-        kept = evidence.base_slopes(MIDDLE) if calibration_of(judged.guess) else None
-        fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if kept is not None else None)
+        if group and kept is None:
+            kept = evidence.base_slopes(evidence.slope_step)
+        fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if group else None)
         moved = fit.guess.deviation - judged.guess.deviation
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
-        if np.all(np.abs(moved) < 0.3 * spread):
+        guess = _widened(fit.guess)
+        if np.all(np.abs(moved) < _UNMOVED * spread):
             break
-        judged = evidence.judged(_widened(fit.guess))
+        before, judged = judged, evidence.judged(guess, same=True)
+        fall = before.loss - judged.loss
+        if group and fall < _IDLE:
+            break
+        kept = kept if fall < _STALE else None
     assert fit
-    if fit.guess is not judged.guess:
-        judged = evidence.set_base(evidence.judged(fit.guess))
-    return judged, fit
+    return evidence.set_base(evidence.judged(guess)), fit
 
 
 def _widened(guess: Guess) -> Guess:
@@ -358,7 +389,7 @@ def _pruned(
     """Take out effects that the others have made needless; each effect's rest, judged."""
     while True:
         rests, scores = _rests(evidence, base, now, fit)
-        if len(scores) < 2 or min(scores) >= ENTER:
+        if len(scores) < 2 or min(scores) >= _bar(base, now):
             return now, fit, tuple(rests)
         worst = rests[int(np.argmin(scores))]
         assert worst
@@ -371,7 +402,7 @@ def _rests(
     """For each part the guess without it, fitted and judged (None for calibration); scores."""
     rests: list[Judged | None] = []
     scores: list[float] = []
-    slopes = evidence.base_slopes(MIDDLE) if now.guess.parts else np.zeros((0, 0))
+    slopes = evidence.base_slopes(evidence.slope_step) if now.guess.parts else np.zeros((0, 0))
     sizes = np.cumsum([0, *(h.size for h, _ in now.guess.parts)])
     for index, (hypothesis, _) in enumerate(now.guess.parts):
         assert fit
@@ -383,7 +414,7 @@ def _rests(
         kept = np.delete(slopes, np.s_[sizes[index] : sizes[index + 1]], axis=1)
         if smaller.parts:
             smaller = evidence.fit(smaller, 0.0, kept=kept, steps=2, step=MIDDLE).guess
-        rest = evidence.judged(smaller, base.tracks) if smaller.parts else base
+        rest = evidence.judged(smaller, reopened=True) if smaller.parts else base
         cost = charge(_last(fit.information, now.guess, index), hypothesis.size)
         score = rest.loss - now.loss - cost
         if not worth_naming(now.guess, index, score):
@@ -424,31 +455,28 @@ def _rivals(
     if not pool:
         return ()
     evidence.set_base(rest)
-    evidence.base_slopes(MIDDLE)
+    evidence.base_slopes(evidence.slope_step)
 
     def fitted(candidate: Screened) -> Fit:
         more = rest.guess.plus(candidate.hypothesis, candidate.start)
         step = evidence.step_of(more, MIDDLE)
-        kept = evidence.base_slopes(step, parallel=False)
+        kept = evidence.base_slopes(evidence.slope_step, parallel=False)
         before = _loss_of(evidence, rest.guess, step)
         return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
 
     fits = sorted(evidence.map(fitted, pool), key=lambda fit: -fit.score)
     plausible = [f for f in fits if f.score > 0.0 and not _strained(f.guess, -1)][:_RIVALS]
+    looked = [(evidence.judged(fit.guess), fit.charge) for fit in plausible]
+    looked = sorted((pair for pair in looked if np.isfinite(pair[0].loss)), key=lambda p: p[0].loss)
     found = []
-    for fit in plausible:
-        judged = evidence.judged(fit.guess)
-        if not np.isfinite(judged.loss):
-            continue
-        if judged.loss < now.loss + _HOPELESS:  # worth a second look at its own levels
+    for place, (judged, cost) in enumerate(looked):
+        if place < _SECOND and judged.loss < now.loss + _HOPELESS:  # a look at its own levels
             evidence.set_base(judged)
             step = evidence.step_of(judged.guess, MIDDLE)
-            again = evidence.fit(
-                judged.guess, 0.0, step=step, kept=evidence.base_slopes(step), steps=3
-            )
+            kept = evidence.base_slopes(evidence.slope_step)
+            again = evidence.fit(judged.guess, 0.0, step=step, kept=kept, steps=3)
             better = evidence.judged(again.guess)
             judged = min(judged, better, key=lambda j: j.loss)
-            evidence.set_base(rest)
-        found.append(Rival(judged.guess.parts[-1][0], judged, fit.charge))
+        found.append(Rival(judged.guess.parts[-1][0], judged, cost))
     evidence.set_base(now)
     return tuple(sorted(found, key=lambda r: r.judged.loss + r.charge))

@@ -16,11 +16,12 @@ from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.machine import Machine
 from hydrotele.prediction.hypothesis import Guess
 from hydrotele.prediction.levels import find_levels
-from hydrotele.prediction.track import STEP, Track, fine_enough, known_levels, track_run
+from hydrotele.prediction.track import COARSE, STEP, Track, fine_enough, known_levels, track_run
 
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
 _STEPS = 6
-MIDDLE = 2.0e-3  # s, step at which slopes of many numbers are taken
+MIDDLE = 2.0e-3  # s, step at which guesses are fitted
+_MANY = 10  # numbers of a base from which their slopes are taken at a coarser step
 BLOCK = 2.0  # s of a run that count as one witness: longer than what a model lacks remembers
 _ROUNDS = 2  # of linearisation for the levels of the first base; later ones start from near by
 _CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
@@ -99,15 +100,20 @@ class Evidence:
             self._pool.map(lambda run: track_run(machine, self.data, run, None, self.step), runs)
         )
 
-    def judged(self, guess: Guess, near: Sequence[Track] = ()) -> Judged:
-        """A guess with noise levels of its own, found from those of tracks nearby."""
+    def judged(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
+        """A guess with noise levels of its own, found from those of the base.
+
+        With `same`, the base is nearly the same machine: its Jacobians are used again, which is
+        enough on the way to a fit, not for comparing it. With `reopened`, unknown inputs that the
+        base has no need of are tried again: a guess with fewer parts may need them.
+        """
         machine = guess.machine(self.data.machine)
         if not self.lacking:
             tracks = self.track(machine)
         else:
-            near = near or self.tracks
+            rounds = 1 + reopened if self.tracks else _ROUNDS
             tracks = find_levels(
-                self.data, machine, near, self._pool.map, self.step, 1 if near else _ROUNDS
+                self.data, machine, self.tracks, self._pool.map, self.step, rounds, same, reopened
             )
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + _prior(guess))
@@ -192,6 +198,11 @@ class Evidence:
         found = self.map(column, columns) if parallel else [column(i) for i in columns]
         return np.column_stack(found) if found else np.zeros((len(errors), 0))
 
+    @property
+    def slope_step(self) -> float:
+        """Largest step for slopes of the base's numbers [s]: coarser where they are many."""
+        return COARSE if len(self._base.deviation) > _MANY else MIDDLE
+
     def base_slopes(self, step: float | None = None, parallel: bool = True) -> np.ndarray:
         """(E, P) slopes of the base, kept until there is another base."""
         step = step or self.step
@@ -202,7 +213,7 @@ class Evidence:
 
     def base_slopes_of(self, tracks: Sequence[Track]) -> np.ndarray:
         """(E, P) slopes of the base in some of its tracks, or in the first rows of them."""
-        whole, parts, at = self.base_slopes(MIDDLE), {}, 0
+        whole, parts, at = self.base_slopes(self.slope_step), {}, 0
         for track in self.tracks:
             parts[track.run.name] = whole[at : at + track.whitened.size]
             at += track.whitened.size

@@ -110,8 +110,9 @@ def filter_run(
         predicted: (n, c) written: readings predicted from the rows before.
         corrected: (n, nz - q - m) written: the model's states after the row's readings.
         initial: (nz, nz) written if `fresh`: covariance before the first row's readings.
-        flow: (n, nz, nz) written if `fresh` and not `given`: d (state before the next row's readings) / d (state
-            after this row's), the latter along the first index; (0, nz, nz) keeps none.
+        flow: (n, nz, nz) written if `fresh` and not `given`: d (state before the next row's
+            readings) / d (state after this row's), the latter along the first index; (0, nz, nz)
+            keeps none.
 
     Returns:
         -2 log likelihood without its constant; infinite if the states broke down.

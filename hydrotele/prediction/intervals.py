@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.prediction.evidence import MIDDLE, Evidence
+from hydrotele.prediction.evidence import Evidence
 from hydrotele.prediction.hypothesis import Guess
 
 _FEW = 10  # numbers up to which slopes are taken at the finest step
@@ -30,7 +30,7 @@ def spreads(evidence: Evidence, guess: Guess, scatter: float = 1.0) -> np.ndarra
     if few:
         slopes = evidence.slopes(guess, evidence.errors(guess, step), step=step)
     else:
-        slopes = evidence.base_slopes(MIDDLE)
+        slopes = evidence.base_slopes(evidence.slope_step)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])
     covariance = np.linalg.inv(information)
     shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))

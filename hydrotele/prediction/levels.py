@@ -101,7 +101,8 @@ def noise_prior(data: Dataset) -> Prior:
 
 def find_levels(
     data: Dataset, machine: Machine, start: Sequence[Track] = (), each: Callable = map,
-    step: float = STEP, rounds: int = 3,
+    step: float = STEP, rounds: int = 3, same: bool = False,
+    reopened: bool = False,
 ) -> tuple[Track, ...]:  # fmt: skip
     """Levels of the largest posterior probability, given a machine.
 
@@ -112,15 +113,17 @@ def find_levels(
             input is tried.
         each: such as `map`, perhaps on several workers.
         step: largest step of the integrator [s].
-        rounds: how often the runs are linearised anew.
+        rounds: how often levels are found, each time about the tracks of the time before.
+        same: whether `start` is of nearly the same machine, so that its Jacobians will do.
+        reopened: whether inputs that `start` lacks are tried again.
 
     Returns:
         Tracks of the fit runs with these levels, linearised.
     """
     prior = noise_prior(data)
     if start:
-        levels = start[0].levels
-        tracks = _crossed(data, machine, levels, start, each, step)
+        levels = _reopened(start[0].levels, machine) if reopened else start[0].levels
+        tracks = _crossed(data, machine, levels, start, each, step, same)
     else:
         noise = np.clip(prior.noise, prior.low, prior.high)
         rough = Levels(noise, drift=_LOOSE)
@@ -135,6 +138,15 @@ def find_levels(
         if sum(track.loss for track in tracks) + levels.penalty > before - _SETTLED:
             break
     return tracks
+
+
+def _reopened(levels: Levels, machine: Machine) -> Levels:
+    """Levels with every possible input, those that were none at a small size."""
+    inputs = possible_inputs(machine)
+    known = dict(zip(levels.inputs, levels.sizes, strict=True))
+    small = 10.0 * LEAST * input_sizes(machine, inputs)
+    sizes = [max(known.get(i, 0.0), s) for i, s in zip(inputs, small, strict=True)]
+    return dataclasses.replace(levels, inputs=inputs, sizes=np.array(sizes))
 
 
 def _pruned(levels: Levels, machine: Machine) -> Levels:

@@ -239,6 +239,8 @@ def _cross(
     at = np.arange(full - m, full)
     covariance[at, at] = levels.sizes**2
     initial = np.zeros((full, full))
+    if given is not None and given.shape[1] != full:  # another number of readings on their way
+        given = None
     flow = np.empty((rows if linearise else 0, full, full)) if given is None else given
     loss = filter_run(
         model, space, late, state, covariance, run.command, run.command_known, run.reading,
