@@ -25,7 +25,7 @@ from hydrotele.gap.result import (
     Prediction,
     Verdict,
 )
-from hydrotele.gap.search import Found, lacking, search, weights
+from hydrotele.gap.search import Found, chances, lacking, search
 from hydrotele.machine import Machine
 from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import Evidence, Judged
@@ -274,15 +274,12 @@ def _estimates(hypothesis: Hypothesis, deviation: np.ndarray, spread: np.ndarray
 def _chances(found: Found, index: int, rest: Judged) -> tuple[float, tuple[Alternative, ...]]:
     """Probability of an effect against its rivals and against none, and those of the rivals."""
     rivals = [r for r in found.rivals[index] if np.isfinite(r.judged.loss)]
-    chances = weights(
-        [found.judged.blocks(), rest.blocks(), *(r.judged.blocks() for r in rivals)],
-        [found.charges[index], 0.0, *(r.charge for r in rivals)],
-    )
+    table = chances(found.judged, found.charges[index], rest, rivals)
     others = [
         Alternative(r.hypothesis.name, r.hypothesis.location, float(chance))
-        for r, chance in zip(rivals, chances[2:], strict=True) if chance >= _WORTH_TELLING
+        for r, chance in zip(rivals, table[2:], strict=True) if chance >= _WORTH_TELLING
     ]  # fmt: skip
-    return float(chances[0]), tuple(others)
+    return float(table[0]), tuple(others)
 
 
 def _prediction(track: Track, data: Dataset) -> Prediction:

@@ -31,7 +31,7 @@ _UNMOVED = 0.3  # standard deviations by which a number may still move
 _IDLE = 3.0  # fall of the loss that is not worth another round of a calibration
 _STALE = 200.0  # fall of the loss after which the slopes of a calibration are taken anew
 _ROOM = 3.0  # times the room to a bound that an effect gets that stands there
-_BETTER = 6.0  # twice the log evidence by which a rival must be better to take a place
+_PLAINER = 0.2  # of an effect's probability from which a rival with fewer numbers takes its place
 _SECOND = 2  # rivals that are worth a second look
 _EXCHANGES = 2  # rounds in which a better rival takes an effect's place
 _STEPS = 3  # of Gauss-Newton for a candidate
@@ -178,8 +178,9 @@ def search(
             rest = without[index]
             rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
         better = [
-            rival.judged for own, others in zip(charges, rivals, strict=True) for rival in others
-            if rival.judged.loss + rival.charge < now.loss + own - _BETTER
+            candidate for (hypothesis, _), own, rest, others
+            in zip(now.guess.parts, charges, without, rivals, strict=True)
+            if rest and (candidate := _better(now, hypothesis.size, own, rest, others))
         ]  # fmt: skip
         if not better or exchange == _EXCHANGES - 1:
             break
@@ -232,6 +233,33 @@ def weights(blocks: Sequence[np.ndarray], charges: Sequence[float], seed: int = 
     totals = draws @ (table - table.min(axis=0)).T + np.asarray(charges)
     chances = np.exp(-0.5 * (totals - totals.min(axis=1, keepdims=True)))
     return (chances / chances.sum(axis=1, keepdims=True)).mean(axis=0)
+
+
+def chances(now: Judged, cost: float, rest: Judged, rivals: Sequence[Rival]) -> np.ndarray:
+    """(2 + R,) probabilities of an effect, of none, and of its rivals.
+
+    Args:
+        now: with the effect.
+        cost: what its parameters are charged.
+        rest: without it.
+        rivals: R others in its place.
+    """
+    return weights(
+        [now.blocks(), rest.blocks(), *(r.judged.blocks() for r in rivals)],
+        [cost, 0.0, *(r.charge for r in rivals)],
+    )
+
+
+def _better(
+    now: Judged, size: int, cost: float, rest: Judged, rivals: Sequence[Rival]
+) -> Judged | None:
+    """The rival that should take an effect's place: likelier, or nearly as likely and plainer."""
+    table = chances(now, cost, rest, rivals)
+    found = [
+        (chance, rival.judged) for chance, rival in zip(table[2:], rivals, strict=True)
+        if chance > (_PLAINER if rival.hypothesis.size < size else 1.0) * table[0]
+    ]  # fmt: skip
+    return max(found, key=lambda pair: pair[0])[1] if found else None
 
 
 def _named_so_far(guess: Guess) -> int:

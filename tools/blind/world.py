@@ -718,7 +718,7 @@ def simulate(machine, start, commands, closed, reference, ahead, arm, gains, noi
     u, terms, memory = np.zeros(n), np.zeros((6, n)), np.zeros(2)
     readings, clean = np.zeros((rows, c)), np.zeros((rows, c))
     history = np.zeros((rows * steps + 1, c))
-    now, lagged, load = np.zeros(c), np.zeros(c), np.zeros(n)
+    now, before, lagged, load = np.zeros(c), np.zeros(c), np.zeros(c), np.zeros(n)
     first_head = c - 1 - 2 * n
     for row in range(rows):
         if restart > 0 and row % restart == 0:
@@ -731,8 +731,11 @@ def simulate(machine, start, commands, closed, reference, ahead, arm, gains, noi
             for j in range(c):
                 if at == 0 or sensors.lag[j] == 0.0 or renewed:
                     lagged[j] = now[j]
-                else:
-                    lagged[j] += (now[j] - lagged[j]) * (1.0 - math.exp(-dt / sensors.lag[j]))
+                else:  # exact where the true value runs straight from step to step
+                    behind = sensors.lag[j] * (now[j] - before[j]) / dt
+                    fade = math.exp(-dt / sensors.lag[j])
+                    lagged[j] = now[j] - behind + (lagged[j] - before[j] + behind) * fade
+                before[j] = now[j]
                 history[at, j] = lagged[j]
             if step == 0:
                 for j in range(c):
