@@ -32,14 +32,14 @@ _IDLE = 3.0  # fall of the loss that is not worth another round of a calibration
 _STALE = 200.0  # fall of the loss after which the slopes of a calibration are taken anew
 _ROOM = 3.0  # times the room to a bound that an effect gets that stands there
 _PLAINER = 0.2  # of an effect's probability from which a rival with fewer numbers takes its place
-_SECOND = 2  # rivals that are worth a second look
-_EXCHANGES = 2  # rounds in which a better rival takes an effect's place
+_SECOND = 2  # rivals that are settled like the effect itself
 _STEPS = 3  # of Gauss-Newton for a candidate
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
 _RIVALS = 3  # candidates that are judged in the place of a named effect
-_HOPELESS = 500.0  # loss above the effect's after two steps, beyond which a rival is let go
+_HOPELESS = 500.0  # loss above the effect's beyond which a rival is let go; or this share of what
+_FAR = 0.5  # the effect brings
 _WORTH = 0.1  # of the best screened score: below it a candidate is not fitted
 _PAIRED = 6  # candidates that are tried in pairs where no single one helps
 _REFUSED = 3  # effects that may turn out to be none before a search ends
@@ -49,11 +49,19 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Rival:
-    """Another effect in the place of a named one: its guess judged, and its charge."""
+    """Another effect in the place of a named one.
+
+    Attributes:
+        hypothesis: the effect.
+        judged: the guess with it, judged.
+        charge: what its parameters cost.
+        fit: its last fit; None where it was not settled, for it is far behind.
+    """
 
     hypothesis: Hypothesis
     judged: Judged
     charge: float
+    fit: Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -169,25 +177,24 @@ def search(
     tell("drop what is needless", 0.87)
     now, fit, without = _pruned(evidence, base, now, fit)
     tell("compare rivals", 0.9)
-    for exchange in range(_EXCHANGES):
-        charges, rivals = [], []
-        for index, (hypothesis, _) in enumerate(now.guess.parts):
-            assert fit
-            charges.append(charge(_last(fit.information, now.guess, index), hypothesis.size))
-            ranked = rankings.get(hypothesis.key, first)
-            rest = without[index]
-            rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
-        better = [
-            candidate for (hypothesis, _), own, rest, others
-            in zip(now.guess.parts, charges, without, rivals, strict=True)
-            if rest and (candidate := _better(now, hypothesis.size, own, rest, others))
-        ]  # fmt: skip
-        if not better or exchange == _EXCHANGES - 1:
+    charges, rivals = [], []
+    for index, (hypothesis, _) in enumerate(now.guess.parts):
+        assert fit
+        charges.append(charge(_last(fit.information, now.guess, index), hypothesis.size))
+        ranked, rest = rankings.get(hypothesis.key, first), without[index]
+        rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
+    for index, rest in enumerate(without):
+        if rest and (rival := _better(now, index, charges[index], rest, rivals[index])):
+            assert rival.fit
+            old = Rival(now.guess.parts[index][0], now, charges[index], fit)
+            others = (r for r in rivals[index] if r is not rival)
+            now, fit, charges[index] = rival.judged, rival.fit, rival.charge
+            rivals[index] = (old, *others)
+            # a rival comes last in its guess
+            order = [*(i for i in range(len(without)) if i != index), index]
+            without = tuple(without[i] for i in order)
+            charges, rivals = [charges[i] for i in order], [rivals[i] for i in order]
             break
-        now, fit = settle(evidence, min(better, key=lambda judged: judged.loss))
-        for hypothesis, _ in now.guess.parts:
-            rankings.setdefault(hypothesis.key, first)
-        now, fit, without = _pruned(evidence, base, now, fit)
     return Found(base, now, fit, first, tuple(charges), without, tuple(rivals), weak)
 
 
@@ -251,13 +258,14 @@ def chances(now: Judged, cost: float, rest: Judged, rivals: Sequence[Rival]) -> 
 
 
 def _better(
-    now: Judged, size: int, cost: float, rest: Judged, rivals: Sequence[Rival]
-) -> Judged | None:
+    now: Judged, index: int, cost: float, rest: Judged, rivals: Sequence[Rival]
+) -> Rival | None:
     """The rival that should take an effect's place: likelier, or nearly as likely and plainer."""
+    size = now.guess.parts[index][0].size
     table = chances(now, cost, rest, rivals)
     found = [
-        (chance, rival.judged) for chance, rival in zip(table[2:], rivals, strict=True)
-        if chance > (_PLAINER if rival.hypothesis.size < size else 1.0) * table[0]
+        (chance, rival) for chance, rival in zip(table[2:], rivals, strict=True)
+        if rival.fit and chance > (_PLAINER if rival.hypothesis.size < size else 1.0) * table[0]
     ]  # fmt: skip
     return max(found, key=lambda pair: pair[0])[1] if found else None
 
@@ -497,14 +505,12 @@ def _rivals(
     looked = [(evidence.judged(fit.guess), fit.charge) for fit in plausible]
     looked = sorted((pair for pair in looked if np.isfinite(pair[0].loss)), key=lambda p: p[0].loss)
     found = []
+    hopeless = now.loss + max(_HOPELESS, _FAR * (rest.loss - now.loss))
     for place, (judged, cost) in enumerate(looked):
-        if place < _SECOND and judged.loss < now.loss + _HOPELESS:  # a look at its own levels
-            evidence.set_base(judged)
-            step = evidence.step_of(judged.guess, MIDDLE)
-            kept = evidence.base_slopes(evidence.slope_step)
-            again = evidence.fit(judged.guess, 0.0, step=step, kept=kept, steps=3)
-            better = evidence.judged(again.guess)
-            judged = min(judged, better, key=lambda j: j.loss)
-        found.append(Rival(judged.guess.parts[-1][0], judged, cost))
+        fit = None
+        if place < _SECOND and judged.loss < hopeless:
+            judged, fit = settle(evidence, judged)
+            cost = charge(fit.information, judged.guess.parts[-1][0].size)
+        found.append(Rival(judged.guess.parts[-1][0], judged, cost, fit))
     evidence.set_base(now)
     return tuple(sorted(found, key=lambda r: r.judged.loss + r.charge))
