@@ -131,13 +131,21 @@ def find_levels(
         inputs = possible_inputs(machine)
         levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
         tracks = _crossed(data, machine, levels, tracks, each, step)
+    best = tracks
     for index in range(rounds):
-        before = sum(track.loss for track in tracks) + levels.penalty
+        before = _whole(tracks)
         levels = _pruned(_most_likely(data, machine, levels, prior, tracks, each), machine)
         tracks = _crossed(data, machine, levels, tracks, each, step, bool(start) or index > 0)
-        if sum(track.loss for track in tracks) + levels.penalty > before - _SETTLED:
+        if _whole(tracks) < _whole(best):  # where a filter hardly follows, its linear form misleads
+            best = tracks
+        if _whole(tracks) > before - _SETTLED:
             break
-    return tracks
+    return best
+
+
+def _whole(tracks: Sequence[Track]) -> float:
+    """-2 log likelihood of tracks times the prior of their levels; without constants."""
+    return sum(track.loss for track in tracks) + tracks[0].levels.penalty
 
 
 def _reopened(levels: Levels, machine: Machine) -> Levels:
