@@ -8,6 +8,7 @@ import numpy as np
 
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
+from hydrotele.hydraulics.parameters import longest_step
 from hydrotele.machine import Machine
 from hydrotele.prediction.filter import Gains, filter_run
 from hydrotele.prediction.inputs import Input, decay, input_drift
@@ -110,9 +111,14 @@ def by_kind(names: list[str], table: Mapping[str, float]) -> np.ndarray:
 
 
 def fine_enough(machine: Machine, step: float) -> float:
-    """A step [s], made smaller where a machine needs it."""
+    """A step [s], made smaller where a machine needs it.
+
+    A pump's own circuit is stiff, and its piston light: with stiff lines they ring at 200 Hz and
+    more, which steps of some milliseconds make unstable.
+    """
     springs = any(axis.transmission for axis in machine.axes.values())
-    return min(step, _STIFF) if springs else step
+    rigid = [longest_step(machine, name) for name, axis in machine.axes.items() if axis.pump]
+    return min(step, _STIFF if springs else step, *rigid)
 
 
 def first_rows(track: Track, rows: int) -> Track:
