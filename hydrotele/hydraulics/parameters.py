@@ -65,8 +65,8 @@ def longest_step(machine: Machine, name: str) -> float:
     Source: stability limit of Verlet's method, h < 2 / omega, halved.
 
     >>> from hydrotele.machine_file import load_machine
-    >>> longest_step(load_machine("eha"), "piston")
-    0.004
+    >>> longest_step(load_machine("eha", "load_30_bar"), "piston")
+    0.002
     """
     numbers = actuator_numbers(machine)[name]
     block, stroke = numbers[PUMP:], numbers[Slot.STROKE]
