@@ -35,6 +35,7 @@ from hydrotele.prediction.track import (
     Levels,
     Track,
     by_kind,
+    row_noise,
     state_drift,
     track_run,
 )
@@ -218,14 +219,14 @@ def _most_likely(
 
         def one(pair: tuple) -> tuple[float, np.ndarray, np.ndarray]:
             run: RunData = pair[1]
-            drift = state_drift(names, now, run.period)
-            found = smooth(pair[0], now.noise**2, drift)
-            return found.loss, found.noise_slope, drift * found.drift_slope
+            drift, noise = state_drift(names, now, run.period), row_noise(now, run) ** 2
+            found = smooth(pair[0], noise, drift)
+            return found.loss, noise * found.noise_slope, drift * found.drift_slope
 
         total = 0.0
         for value, per_noise, per_drift in each(one, runs):
             total += value
-            slope[:c] += 2.0 * now.noise**2 * per_noise
+            slope[:c] += 2.0 * per_noise
             slope[c:w] += 2.0 * per_drift[first:]
             slope[w:] += 2.0 * per_drift[places]
         off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
@@ -285,7 +286,7 @@ def smoothed(track: Track) -> tuple[LinearRun, Smoothed]:
     names = list(track.names)
     run = linear_run(track, by_kind(names, STARTLE) ** 2)
     drift = state_drift(names, track.levels, track.run.period)
-    return run, smooth(run, track.levels.noise**2, drift, True)
+    return run, smooth(run, row_noise(track.levels, track.run) ** 2, drift, True)
 
 
 def undisturbed_loss(track: Track) -> float:
@@ -296,7 +297,8 @@ def undisturbed_loss(track: Track) -> float:
     initial = run.initial.copy()
     first = len(names) - m
     drift[first:], initial[first:] = 0.0, 0.0
-    width = smooth(run._replace(initial=initial), track.levels.noise**2, drift).width
+    noise = row_noise(track.levels, track.run) ** 2
+    width = smooth(run._replace(initial=initial), noise, drift).width
     there = np.isfinite(track.whitened)
     return float(np.sum(1.0 + 2.0 * np.log(width[there])))
 
@@ -315,7 +317,7 @@ def input_excess(track: Track) -> float:
     names, m = list(track.names), len(track.levels.inputs)
     run = linear_run(track, by_kind(names, STARTLE) ** 2)
     drift = state_drift(names, track.levels, track.run.period)
-    noise = track.levels.noise**2
+    noise = row_noise(track.levels, track.run) ** 2
     loss = smooth(run, noise, drift).loss
     drift[len(names) - m :] = 0.0
     initial = run.initial.copy()

@@ -28,7 +28,7 @@ class Levels:
     """How large everything is that a model does not predict.
 
     Attributes:
-        noise: (c,) standard deviation of a reading [channel's unit].
+        noise: (c,) standard deviation of a logged reading [channel's unit], see `row_noise`.
         inputs: the m unknown inputs.
         sizes: (m,) their stationary standard deviations [N], [N m], [m^3/s] or [1].
         drift: kind of state -> standard deviation of what 20 ms add to it, where that is not the
@@ -138,6 +138,11 @@ def known_levels(data: Dataset) -> bool:
     return bool(np.all(np.isfinite(data.noise)))
 
 
+def row_noise(levels: Levels, run: RunData) -> np.ndarray:
+    """(c,) standard deviation of a reading of a run, which may be a mean of logged ones."""
+    return levels.noise if run.behind is None else levels.noise / np.sqrt(run.behind)
+
+
 def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
     """(nz,) variance that a row adds to the states of a track by these names."""
     drift = period / DRIFT_TIME * by_kind(names, {**DRIFT, **levels.drift}) ** 2
@@ -173,7 +178,7 @@ def track_run(
     if kept is not None:
         levels, columns = kept.levels, _for_states(kept, names)
     levels = levels or Levels(data.noise)
-    noise = levels.noise if run.behind is None else levels.noise / np.sqrt(run.behind)
+    noise = row_noise(levels, run)
     if columns is None:
         columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
     play = model.transmission[:, BACKLASH] > 0.0
