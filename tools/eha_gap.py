@@ -25,7 +25,11 @@ from hydrotele.machine_file import load_machine
 _UNCERTAINTY = {
     "area.piston.area_rod": 0.1, "pump_displacement": 0.05, "pump_leakage": 0.5,
     "motor_constant": 0.2, "motor_inertia": 0.5, "accumulator_pressure": 0.2, "load_relief": 0.2,
-    "load_friction": 0.5, "mass": 0.5,
+    "mass": 0.5, "viscous_friction": 30.0,
+    # what no data sheet has: relative to what is typical of a drive of this size
+    "coulomb_friction": 1.0, "stribeck_friction": 1.0, "load_friction": 1.0,
+    "pump_torque_loss": 1.0, "motor_drag": 1.0, "motor_viscous_drag": 1.0, "line_compliance": 2.0,
+    "pressure_offset": 1.0,
 }  # fmt: skip
 
 
