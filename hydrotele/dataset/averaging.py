@@ -16,6 +16,7 @@ def averaged(rows: Rows, fastest: float = FASTEST) -> tuple[Rows, np.ndarray, in
     Commands are means over the new row, which they are held for. Readings are means over the
     logged rows about the new row's time, as many before as after, so that nothing is shifted; a
     mean over a row damps what lies above half the new rate and would be seen at another frequency.
+    Readings that repeat, as those of an encoder at rest, count once: their error is the same.
 
     Args:
         rows: the run.
@@ -39,15 +40,18 @@ def averaged(rows: Rows, fastest: float = FASTEST) -> tuple[Rows, np.ndarray, in
     half = len(weights) // 2
     gap = np.full((half, rows.reading.shape[1]), np.nan)
     padded = np.concatenate([gap, rows.reading, gap])
-    total, weight, square = np.zeros((3, whole, rows.reading.shape[1]))
+    total, weight, square, unlike = np.zeros((4, whole, rows.reading.shape[1]))
+    last = np.full(total.shape, np.nan)
     for shift, share in enumerate(weights):
         reading = padded[shift : shift + whole * count : count]
         there = np.isfinite(reading)
         total += share * np.where(there, reading, 0.0)
         weight += share * there
         square += share**2 * there
-    with np.errstate(invalid="ignore"):
-        reading, behind = total / weight, weight**2 / square  # NaN where nothing was read
+        unlike += there & (reading != last)
+        last = np.where(there, reading, last)
+    with np.errstate(invalid="ignore"):  # NaN where nothing was read
+        reading, behind = total / weight, np.minimum(weight**2 / square, unlike)
     read = np.isfinite(behind).any(axis=0)
     ones[read] = np.nanmedian(behind[:, read], axis=0)
     return Rows(

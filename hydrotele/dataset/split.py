@@ -15,6 +15,8 @@ _SHORTEST_PIECE = 10.0  # [s] of a piece of a single run, if it is to be fitted 
 _PIECES = 3
 _SHARE = 0.15, 0.6  # of a run that was cut, which a piece that judges the others should have
 _FIT = 0.75  # of a single run
+_QUIET = 0.1  # of the commands' changes: less of them in the last quarter judges nothing
+_LEAST_FIT = 0.5  # of a single run
 _HELD_OUT = ("test", "heldout", "validation")
 
 
@@ -58,7 +60,8 @@ def split(
     runs: Mapping[str, Rows], origin: Mapping[str, str], heldout: str | None
 ) -> tuple[Split, tuple[str, ...]]:
     """Hold one run out: the one named, else the first of the runs `test*`, `heldout*`,
-    `validation*`, else the last by name. A single run is fitted on its first three quarters.
+    `validation*`, else the last by name. A single run is fitted on its first three quarters, or
+    less where the machine rests after them.
 
     Args:
         runs: name of run or of piece -> rows, at least one.
@@ -119,10 +122,24 @@ def _split_in_time(name: str, rows: Rows) -> Split:
             f"is the only run and {total:.3g} s long; its last quarter is held out, which asks for"
             f" {least:.3g} s or more: log longer, or a second run",
         )
-    count = int(np.clip(_FIT * total // _SHORTEST_PIECE, 1, _PIECES))
-    edges = np.linspace(0, round(_FIT * n), count + 1).astype(int)
+    last = _fit_rows(rows)
+    count = int(np.clip(last * rows.period // _SHORTEST_PIECE, 1, _PIECES))
+    edges = np.linspace(0, last, count + 1).astype(int)
     fit = tuple(
         Part(f"{name}_{i + 1}", name, cut(rows, a, b))
         for i, (a, b) in enumerate(zip(edges, edges[1:], strict=False))
     )
     return Split(fit, Part(f"{name}_heldout", name, cut(rows, edges[-1], n)))
+
+
+def _fit_rows(rows: Rows) -> int:
+    """Rows of a single run to fit on: three quarters, or less where the machine rests after them.
+
+    A model of a machine at rest is right whatever its numbers. Then a quarter of the commands'
+    changes is held out, and half of the run at most.
+    """
+    n = len(rows.command)
+    passed = np.cumsum(np.abs(np.diff(rows.command, axis=0, prepend=rows.command[:1])).sum(axis=1))
+    if passed[-1] == 0.0 or passed[-1] - passed[round(_FIT * n) - 1] >= _QUIET * passed[-1]:
+        return round(_FIT * n)
+    return max(int(np.searchsorted(passed, _FIT * passed[-1])), round(_LEAST_FIT * n))

@@ -130,13 +130,12 @@ def accelerate(model, sp, z, dt):
         for f in range(n):
             v += sp.row[i, f] * z[first + f]
         own = v if gear < 0 else z[first + n + gear]
-        act = z[2 * first + 4 * i :]
-        push, damping = force_after_friction(user, u, push, act, own, dt)
-        slope = half * damping
+        act, more, steep = z[2 * first + 4 * i :], 0.0, 0.0
         if len(model.terms) > 0:
             more, steep = term_force(model, sp, z, i, own)
-            push += more
-            slope -= half * steep
+        push, damping = force_after_friction(user, u, push, more, act, own, dt)
+        push += more
+        slope = half * (damping - steep)
         if gear >= 0:
             damping = model.transmission[gear, GEAR_DAMPING]
             free = 0.5 * model.transmission[gear, BACKLASH]

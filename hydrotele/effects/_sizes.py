@@ -4,6 +4,7 @@ import numpy as np
 
 from hydrotele.machine import Machine
 
+_IN_LINE = 1.0e-3  # of its length, by which a cylinder may lie off the slide that it pushes
 _FULL_TRAVEL = 2.0  # s that a force-driven slide takes through its range: no flow rating says it
 
 
@@ -25,6 +26,29 @@ def hydraulics(machine: Machine) -> tuple[str, ...]:
 def cylinders(machine: Machine) -> tuple[str, ...]:
     """Names of the axes with a cylinder."""
     return tuple(name for name, axis in machine.axes.items() if axis.cylinder)
+
+
+def linkages(machine: Machine) -> tuple[str, ...]:
+    """Names of the axes whose cylinder does not lie along the slide that it pushes.
+
+    Along a slide a length is a position, and where the pins sit across it changes nothing.
+    """
+    return tuple(name for name in cylinders(machine) if not _along_slide(machine, name))
+
+
+def _along_slide(machine: Machine, axis: str) -> bool:
+    facts = machine.axes[axis]
+    joint, cylinder = machine.joints[facts.joint], facts.cylinder
+    name = machine.link_of(facts.joint)
+    link = machine.links[name]
+    if joint.type != "slide" or not cylinder:
+        return False
+    if (cylinder.base_pin.link, cylinder.rod_pin.link) != (link.parent, name):
+        return False
+    rod_pin = np.array(link.position) + cylinder.rod_pin.position
+    line = rod_pin - np.array(cylinder.base_pin.position)
+    across = np.linalg.norm(np.cross(line, joint.axis)) / np.linalg.norm(joint.axis)
+    return bool(across < _IN_LINE * np.linalg.norm(line))
 
 
 def hinges(machine: Machine) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.effects._sizes import cylinders
+from hydrotele.effects._sizes import linkages
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
 from hydrotele.machine import Machine
 
@@ -33,6 +33,6 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
 
 
 EFFECT = Effect(
-    "pin_offset", "the base pin of a cylinder sits elsewhere", "geometry", cylinders, _parameters,
+    "pin_offset", "the base pin of a cylinder sits elsewhere", "geometry", linkages, _parameters,
     _apply,
 )  # fmt: skip

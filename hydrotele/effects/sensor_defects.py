@@ -2,7 +2,7 @@
 
 import math
 
-from hydrotele.effects._sizes import axes, cylinders, hydraulics
+from hydrotele.effects._sizes import axes, hydraulics, linkages
 from hydrotele.effects.effect import Effect, Parameter, Values
 from hydrotele.machine import Machine
 from hydrotele.sensors import SensorError
@@ -198,7 +198,7 @@ EFFECTS = (
         _set_angle("time_constant", "time_constant"),
     ),
     Effect(
-        "length_offset", "a cylinder's length sensor with an offset", "sensor", cylinders,
+        "length_offset", "a cylinder's length sensor with an offset", "sensor", linkages,
         _length_offset, _set_length,
     ),
     Effect(

@@ -17,8 +17,8 @@ _MOST_LACKS = 3  # that are said
 _ALIKE = 0.9  # share of a law's square that a simple form must have to be said to resemble it
 _LAW_OF = {"force": "force", "flow_head": "flow", "flow_rod": "flow", THROUGH: "flow",
            "command": "valve"}  # fmt: skip
-_UNITS = {"time": "s", "spool": "1", "command": "1", "pressure_head": "Pa", "pressure_rod": "Pa",
-          "pressure_supply": "Pa"}  # fmt: skip
+_UNITS = {"time": "s", "spool": "1", "pump_speed": "rad/s", "command": "1",
+          "pressure_head": "Pa", "pressure_rod": "Pa", "pressure_supply": "Pa"}  # fmt: skip
 
 
 def learned_laws(

@@ -41,11 +41,14 @@ _KEEP = 6.0  # fall of BIC that a kink must bring
 _STEP = 2.0e-3  # s, for the fits
 _VARIABLES: Mapping[str, tuple[str, ...]] = {
     "force": ("velocity", "position", "command", "force", "time"),
-    "flow_head": ("pressure_head - pressure_rod", "pressure_head", "spool", "velocity", "position"),
-    "flow_rod": ("pressure_head - pressure_rod", "pressure_rod", "spool", "velocity", "position"),
-    THROUGH: ("pressure_head - pressure_rod", "position", "spool", "velocity", "time"),
+    "flow_head": ("pressure_head - pressure_rod", "pressure_head", "spool", "pump_speed",
+                  "velocity", "position"),
+    "flow_rod": ("pressure_head - pressure_rod", "pressure_rod", "spool", "pump_speed", "velocity",
+                 "position"),
+    THROUGH: ("pressure_head - pressure_rod", "position", "spool", "pump_speed", "velocity",
+              "time"),
     "command": ("command", "spool", "velocity", "position", "force", "time"),
-}
+}  # fmt: skip
 
 
 class Shape(NamedTuple):
@@ -192,8 +195,9 @@ def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
         if facts.hydraulic:
             head, rod = states[:, first + 4 * i + 2], states[:, first + 4 * i + 3]
             areas = facts.hydraulic_drive.areas
-            own |= {"spool": states[:, first + 4 * i], "pressure_head": head, "pressure_rod": rod,
+            own |= {"pressure_head": head, "pressure_rod": rod,
                     "force": areas[0] * head - areas[1] * rod}  # fmt: skip
+            own["pump_speed" if facts.pump else "spool"] = states[:, first + 4 * i]
         elif facts.force:
             own["force"] = facts.force.gain * own["command"]
         values[axis] = own

@@ -37,8 +37,9 @@ _LACKS = {
 }
 _VARIABLES = {
     "time": "time", "position": "position", "velocity": "velocity", "command": "command",
-    "spool": "spool position", "force": "load", "pressure_head": "head side pressure",
-    "pressure_rod": "rod side pressure", "pressure_supply": "supply pressure",
+    "spool": "spool position", "pump_speed": "pump speed", "force": "load",
+    "pressure_head": "head side pressure", "pressure_rod": "rod side pressure",
+    "pressure_supply": "supply pressure",
     "pressure_head - pressure_rod": "pressure difference between head and rod side",
 }  # fmt: skip
 _TOLD = 3  # calibrated numbers that the verdict tells

@@ -113,7 +113,7 @@ def pumped_volumes(user, u, x):
 
 
 @compiled
-def pumped_rates(user, u, speed, p_head, p_rod, x, v):
+def pumped_rates(user, u, speed, p_head, p_rod, x, v, added):
     """`circuit.pressure_rates` of an axis with a pump of its own.
 
     Args:
@@ -124,6 +124,7 @@ def pumped_rates(user, u, speed, p_head, p_rod, x, v):
         p_rod: scalar [Pa].
         x: piston displacement, scalar [m].
         v: piston velocity, scalar [m/s].
+        added: as of `pump.pump_pressure_rates` [m^3/s], [m^3/(s Pa)].
 
     Returns:
         (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]).
@@ -133,7 +134,7 @@ def pumped_rates(user, u, speed, p_head, p_rod, x, v):
     volumes, area_head, area_rod = pumped_volumes(user, u, x), user[u + _AH], user[u + _AR]
     return pump_pressure_rates(
         user, u + PUMP, speed, p_head, p_rod, volumes, (area_head * v, area_rod * v),
-        user[u + _LEAK],
+        user[u + _LEAK], added,
     )  # fmt: skip
 
 
@@ -164,13 +165,15 @@ def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
 
 
 @compiled
-def force_after_friction(user, u, push, act, velocity, dt):
+def force_after_friction(user, u, push, other, act, velocity, dt):
     """Force of an actuator after its friction, and the damping that this adds to an implicit step.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
         u: place of this actuator in `user`.
         push: force before friction, scalar [N] or [N m]; not read with a pump of its own.
+        other: what else acts on the drive, which friction resists, too, where it holds, as that of
+            a pump drive does, scalar [N] or [N m]; it is not in the result.
         act: activations from those of this actuator on; read only with a pump of its own.
         velocity: of the drive, scalar [m/s] or [rad/s].
         dt: step over which friction acts, scalar [s].
@@ -182,6 +185,6 @@ def force_after_friction(user, u, push, act, velocity, dt):
     Source: nominal model, "Piston force".
     """
     if user[u + _KIND] == _PUMPED:
-        return pumped_force(user, u, act[1], act[2], act[3], velocity, 0.0, dt), 0.0
+        return pumped_force(user, u, act[1], act[2], act[3], velocity, other, dt), 0.0
     slope = actuator_friction_slope(user, u, velocity)
     return push - actuator_friction(user, u, velocity), slope

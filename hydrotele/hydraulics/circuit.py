@@ -22,7 +22,12 @@ from hydrotele.hydraulics.actuator import (
     pumped_volumes,
 )
 from hydrotele.hydraulics.laws import port_flow, spool_step
-from hydrotele.hydraulics.pump import load_pressure_step, pump_flows, pump_speed_step
+from hydrotele.hydraulics.pump import (
+    load_pressure_step,
+    pump_flows,
+    pump_speed_step,
+    switched_speed,
+)
 from hydrotele.hydraulics.slots import PUMP, SLOTS, Kind, Slot
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows, inlet_flow, inlet_gain
 from hydrotele.terms.law import DriveState
@@ -213,7 +218,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     Source: nominal model, "Chambers".
     """
     if user[u + _KIND] == _PUMPED:
-        return pumped_rates(user, u, opening, p_head, p_rod, x, v)
+        return pumped_rates(user, u, opening, p_head, p_rod, x, v, added)
     q_head, q_rod, slope_head, slope_rod = chamber_flows(user, u, opening, p_supply, p_head, p_rod)
     leak = user[u + _LEAK] * (p_head - p_rod)
     port, relief_gain = user[u + _PORT], user[u + _KR]
@@ -300,6 +305,8 @@ def step_circuit(
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         x, v = length[first + i] - dt * velocity[first + i], velocity[first + i]
+        if user[u + _KIND] == _PUMPED:
+            scratch[a + 3] = switched_speed(act[a], act_dot[a])
         more = _NO_FLOWS
         if terms is not None:
             if len(terms) > 0:

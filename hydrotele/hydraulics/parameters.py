@@ -48,6 +48,42 @@ def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
     return table
 
 
+def longest_step(machine: Machine, name: str) -> float:
+    """Longest step that follows the piston of an axis with a pump of its own.
+
+    `k h^2 <= m + b h`: a radian per step of the piston on its oil, or as much of the way back to
+    its balance where friction damps it; k is the oil's stiffness where it is largest, without air,
+    and the load cylinder's. Powers of two, so that a number that is varied seldom changes it.
+
+    Args:
+        machine: the machine.
+        name: the axis.
+
+    Returns:
+        Step [s], a power of two times 1 ms.
+
+    Source: stability limit of Verlet's method, h < 2 / omega, halved.
+
+    >>> from hydrotele.machine_file import load_machine
+    >>> longest_step(load_machine("eha", "load_30_bar"), "piston")
+    0.002
+    """
+    numbers = actuator_numbers(machine)[name]
+    block, stroke = numbers[PUMP:], numbers[Slot.STROKE]
+    stiffness = np.zeros(2)  # at either end of the stroke
+    for area, volume, soft, travel in (
+        (Slot.AREA_HEAD, Slot.VOLUME_HEAD, PumpSlot.COMPLIANCE_HEAD, np.array([0.0, stroke])),
+        (Slot.AREA_ROD, Slot.VOLUME_ROD, PumpSlot.COMPLIANCE_ROD, np.array([stroke, 0.0])),
+    ):
+        oil = (numbers[volume] + numbers[area] * travel) / block[PumpSlot.BULK_MODULUS]
+        stiffness += numbers[area] ** 2 / (oil + block[soft])
+    k = float(stiffness.max())
+    k += block[PumpSlot.LOAD_STIFFNESS] if block[PumpSlot.LOAD_AREA] > 0.0 else 0.0
+    mass, damping = block[PumpSlot.MOVING_MASS], numbers[Slot.VISCOUS]
+    longest = (damping + math.sqrt(damping**2 + 4.0 * k * mass)) / (2.0 * k)
+    return 1.0e-3 * 2.0 ** math.floor(math.log2(longest / 1.0e-3))
+
+
 def _write_friction(numbers: np.ndarray, axis: Axis) -> None:
     friction = axis.drive.friction
     numbers[Slot.COULOMB] = friction.coulomb

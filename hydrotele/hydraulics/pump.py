@@ -83,6 +83,30 @@ def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
 
 
 @compiled
+def switched_speed(speed, after):
+    """Speed of a pump at the start of a step, with the side that the valve has over the step.
+
+    The relays switch at the start, the pump keeps turning: only the sign changes, and a pump whose
+    valve is shut over the step moves no oil.
+
+    Args:
+        speed: at the start, with the sign of the side until then, scalar [rad/s].
+        after: at the end, as `pump_speed_step` returns it, scalar [rad/s].
+
+    Returns:
+        Signed speed, scalar [rad/s].
+
+    Source: switched valve without travel of its own.
+
+    >>> switched_speed(40.0, -39.0), switched_speed(40.0, 0.0)
+    (-40.0, 0.0)
+    """
+    if after == 0.0:
+        return 0.0
+    return math.copysign(max(abs(speed), STALLED), after)
+
+
+@compiled
 def accumulator_pressure(pressure, gas_volume, taken):
     """Pressure of the accumulator after oil has left it, with the gas at constant temperature.
 
@@ -162,10 +186,10 @@ def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
 
 
 @compiled
-def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage):
+def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, added):
     """Pressure rates of both chambers of a pump drive and their slopes with their own pressure.
 
-    `C_A p_A' = q_A - A_h v - q_l`, `C_B p_B' = q_B + A_r v + q_l`.
+    `C_A p_A' = q_A - A_h v - q_l + a_A`, `C_B p_B' = q_B + A_r v + q_l + a_B`.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
@@ -176,6 +200,8 @@ def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage):
         volumes: (V_A, V_B, oil taken from the accumulator) [m^3].
         swept: (A_h v, A_r v) [m^3/s].
         leakage: of the piston, scalar [m^3/(s Pa)].
+        added: flows a_A, a_B of the machine's terms [m^3/s] and their slopes with these chambers'
+            pressures [m^3/(s Pa)], see `terms.table.added_flows`.
 
     Returns:
         (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]).
@@ -188,10 +214,10 @@ def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage):
     head = oil_compliance(volumes[0], beta, user[p + _SOFT_HEAD], user[p + _AIR_HEAD], p_head)
     rod = oil_compliance(volumes[1], beta, user[p + _SOFT_ROD], user[p + _AIR_ROD], p_rod)
     return (
-        (q_head - swept[0] - leak) / head,
-        (q_rod + swept[1] + leak) / rod,
-        (slope_head - leakage) / head,
-        (slope_rod - leakage) / rod,
+        (q_head - swept[0] - leak + added[0]) / head,
+        (q_rod + swept[1] + leak + added[1]) / rod,
+        (slope_head - leakage + added[2]) / head,
+        (slope_rod - leakage + added[3]) / rod,
     )
 
 

@@ -3,7 +3,9 @@
 A real machine is off everywhere: masses, areas, frictions, valve gains are known to some per cent.
 Each is a number with a prior, a normal distribution about the given value; `uncertainty` of the
 machine file states its relative standard deviation by kind (`mass: 0.03`), by kind and place
-(`mass.boom: 0.1`) or for all (`default: 0.05`). An effect is what remains after that.
+(`mass.boom: 0.1`) or for all (`default: 0.05`). A number of any effect that it names is uncertain;
+one that is 0, as losses are that a data sheet leaves out, counts relative to the effect's typical
+size. An effect is what remains after that.
 """
 
 from collections.abc import Callable, Mapping
@@ -78,7 +80,12 @@ def _share(machine: Machine, kind: str, place: str) -> float:
     for key in (f"{kind}.{place}", kind, "default"):
         if key in stated:
             return stated[key]
-    return UNCERTAINTY[kind]
+    return UNCERTAINTY.get(kind, 0.0)
+
+
+def _states(machine: Machine, kind: str) -> bool:
+    """Whether a machine file names the uncertainty of a kind of number."""
+    return any(key.partition(".")[0] == kind for key in machine.uncertainty)
 
 
 def _narrow(p: Parameter, scale: float) -> Parameter:
@@ -89,12 +96,15 @@ def _narrow(p: Parameter, scale: float) -> Parameter:
 def _of_effects(machine: Machine) -> list[Number]:
     found = []
     for name, effect in EFFECTS.items():
-        if name not in UNCERTAINTY:
+        stated = _states(machine, name)
+        if name not in UNCERTAINTY and not stated:
             continue
         for location in effect.locations(machine):
             share = _share(machine, name, location)
             for key, p in effect.parameters(machine, location).items():
                 size = abs(p.nominal)
+                if stated and size == 0.0:
+                    size = p.scale
                 if name in _LENGTHS:
                     size = (p.high - p.low) / (0.6 if name == "com_offset" else 0.1)
                     size = size if name != "link_length" else 0.5 * size

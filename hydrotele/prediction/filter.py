@@ -19,7 +19,11 @@ from hydrotele.dynamics.integrate import (
     supply_of,
 )
 from hydrotele.dynamics.mechanism import JOINT
+from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
+from hydrotele.hydraulics.pump import STALLED
 from hydrotele.prediction.late import begin_late, move_late, nudge_late, spread_late
+
+_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
 class Gains(NamedTuple):
@@ -230,6 +234,9 @@ def _correct(model, sp, z, own, delta):
     if len(own) == len(z):
         for s in range(len(z)):
             z[s] += delta[s]
+        for i in range(model.hydraulic):
+            if model.user[i * SLOTS + _KIND] == _PUMPED:
+                _keep_side(z, 2 * (n + t) + 4 * i, delta[2 * (n + t) + 4 * i])
         return
     for sign in (-1.0, 1.0):
         place(model, sp, z)
@@ -243,6 +250,20 @@ def _correct(model, sp, z, own, delta):
         if sign < 0.0:
             for s in range(len(own)):
                 z[own[s]] += delta[s]
+
+
+@lean
+def _keep_side(z, at, moved):
+    """Undo what readings cannot say of a pump drive: that its relays switched, or its load pulls.
+
+    The commands alone tell the side of the valve, and whether it is shut.
+    """
+    before = z[at] - moved
+    if before == 0.0:
+        z[at] = 0.0
+    elif z[at] * before <= 0.0:
+        z[at] = math.copysign(STALLED, before)
+    z[at + 1] = max(0.0, z[at + 1])
 
 
 @lean

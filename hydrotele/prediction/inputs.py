@@ -13,14 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.compiled import compiled
-from hydrotele.dynamics.integrate import accelerate, place
+from hydrotele.dynamics.integrate import accelerate, advance, place
 from hydrotele.dynamics.linear import solve
 from hydrotele.dynamics.model import X, model_space, reduced_model
-from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.effects.effect import changed
+from hydrotele.hydraulics.parameters import actuator_order, longest_step
 from hydrotele.machine import Machine
+from hydrotele.terms.facts import Term
 
 MEMORY = 0.3  # s, correlation time: longer than a valve's lag, shorter than a motion
 _USUAL_PRESSURE = 2.0e7  # Pa, of a pump's own circuit that states no relief setting
+_TRIED = 1.0e-4  # of its largest size, by which an input of a pump drive is tried
+_ROWS_STEP = 4.0e-3  # s, for what inputs do in a row
 BALANCES = ("force", "flow_head", "flow_rod", "command")
 
 
@@ -104,9 +108,49 @@ def _drive_responses(model, sp, states, position, response):
             response[row, i] = column
 
 
-def input_columns(
-    machine: Machine, states: np.ndarray, flow: np.ndarray, period: float, inputs: Sequence[Input]
+@compiled
+def _rows_later(model, sp, states, command, period, steps, later):
+    """States (n, nz) a row after given ones, without readings."""
+    trail = np.zeros((0, 0))
+    for row in range(len(states)):
+        later[row] = states[row]
+        advance(model, sp, later[row], command, row, period, steps, trail)
+
+
+def _pumped_column(
+    machine: Machine, states: np.ndarray, command: np.ndarray, period: float, i: Input
 ) -> np.ndarray:
+    """(n, nz) change of the states per unit of an input of a pump drive, by difference.
+
+    Its oil and friction are faster than a row, so that no rule at the row's ends tells the change.
+    Where dry friction holds, a force moves nothing until it breaks away; as what holds is itself
+    uncertain, a force counts as on a piston that slides.
+    """
+    size = _TRIED * float(input_sizes(machine, [i])[0])
+    if i.balance == "force":
+        for part in ("coulomb", "stribeck_extra"):
+            machine = changed(machine, f"axes.{i.axis}.cylinder.friction.{part}", 0.0)
+        if i.axis in machine.loads:
+            bare = machine.loads[i.axis].model_copy(update={"friction": 0.0, "return_force": 0.0})
+            machine = machine.model_copy(update={"loads": {**machine.loads, i.axis: bare}})
+    term = Term.model_validate({
+        "name": "unknown", "axis": i.axis, "balance": i.balance, "law": "constant",
+        "parameters": {"value": size},
+    })  # fmt: skip
+    more = machine.model_copy(update={"terms": (*machine.terms, term)})
+    steps = max(1, math.ceil(period / min(_ROWS_STEP, longest_step(machine, i.axis))))
+    ends = []
+    for one in (machine, more):
+        model, later = reduced_model(one, ()), np.empty(states.shape)
+        _rows_later(model, model_space(model), states, command, period, steps, later)
+        ends.append(later)
+    return (ends[1] - ends[0]) / size
+
+
+def input_columns(
+    machine: Machine, states: np.ndarray, flow: np.ndarray, period: float, inputs: Sequence[Input],
+    command: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """Change of the model's states over each row per unit of each input.
 
     Args:
@@ -115,10 +159,11 @@ def input_columns(
         flow: (n, >= nz, >= nz) their transition Jacobians as of `filter.filter_run`.
         period: time between rows [s].
         inputs: m unknown inputs.
+        command: (n, nu) commands.
 
     Returns:
         (n, m, nz) changes [state's unit per input's unit], by the trapezoidal rule: half of what
-        acts in a row is carried along by the row's transition.
+        acts in a row is carried along by the row's transition. Those of pump drives by difference.
     """
     model = reduced_model(machine, ())
     order = actuator_order(machine)
@@ -131,6 +176,8 @@ def input_columns(
     for m, (balance, axis) in enumerate(inputs):
         i = order.index(axis)
         facts = machine.axes[axis]
+        if facts.pump:
+            continue
         if balance == "force":
             columns[:, m, rates : 2 * rates] = response[:, i]
         elif balance == "command":
@@ -141,14 +188,15 @@ def input_columns(
             drive = facts.hydraulic_drive
             volume = np.maximum(drive.volumes(position[:, i])[side - 2], drive.dead_volume)
             oil = drive.hose_compliance
-            if facts.pump:
-                oil += volume / facts.pump.bulk_modulus
-                oil += facts.pump.compliance_head if side == 2 else facts.pump.compliance_rod
-            elif machine.supply:
+            if machine.supply:
                 oil += volume / machine.supply.bulk_modulus
             columns[:, m, first + 4 * i + side] = 1.0 / oil
     carried = np.einsum("rms,rsk->rmk", columns, flow[:, :size, :size])
-    return 0.5 * period * (columns + carried)
+    columns = 0.5 * period * (columns + carried)
+    for m, i in enumerate(inputs):
+        if machine.axes[i.axis].pump:
+            columns[:, m] = _pumped_column(machine, states, command, period, i)
+    return columns
 
 
 def decay(period: float) -> float:

@@ -35,12 +35,17 @@ from hydrotele.prediction.track import (
     Levels,
     Track,
     by_kind,
+    row_noise,
     state_drift,
     track_run,
 )
 
 WHITE = ("rate", "drive_rate", "spool", "speed", "pressure_head", "pressure_rod")
-"""Kinds of states to which white noise is added, too: ripple and what the rows are too slow for."""
+"""Kinds of states to which white noise is added, too: ripple and what the rows are too slow for.
+
+Where friction holds a drive fast, as that of a pump drive does, nothing but its position itself can
+say that it moved all the same: see `_white_states`.
+"""
 _MOST = 1.0e4  # times its floor that white noise can reach
 _RIPPLE = 10.0  # times its floor from which white noise counts as there
 LEAST = 1.0e-4  # of an input's largest size: below it an input is none
@@ -53,26 +58,35 @@ _ITERATIONS = 12  # of a round: what is left of the way is small against a round
 _SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
 _LOOSE = {"rate": 0.02, "drive_rate": 0.02, "spool": 0.02, "pressure_head": 1e5,
           "pressure_rod": 1e5, "speed": 2.0}  # fmt: skip
+_LOOSE_POSITION = 1e-4
 # What 20 ms may add to a state at first, so that a model that lacks something follows the readings.
 
 
 def rough_noise(data: Dataset) -> np.ndarray:
-    """(c,) noise of a reading, from third differences of the runs [channel's unit].
+    """(c,) noise of one logged reading, from third differences of the runs [channel's unit].
 
     They take out what moves slowly against the rows; what moves faster makes it too large. Never
     less than a converter's step over sqrt(12).
     """
-    sensors = data.machine.sensors.get(data.sensors) if data.sensors else None
     found = np.zeros(len(data.channels))
     for c, channel in enumerate(data.channels):
-        values = np.concatenate([np.diff(run.reading[:, c], n=3) for run in data.fit])
+        values = np.concatenate([
+            np.diff(run.reading[:, c], n=3) * (1.0 if run.behind is None else run.behind[c] ** 0.5)
+            for run in data.fit
+        ])  # fmt: skip
         values = values[np.isfinite(values)]
         spread = 1.4826 * np.median(np.abs(values)) if len(values) else 0.0
         if spread == 0.0 and len(values):  # more than half of the readings repeat
             spread = float(np.std(values))
-        step = converter(channel_sensor(data.machine, sensors, channel), channel).step
-        found[c] = max(spread / np.sqrt(20.0), step / np.sqrt(12.0), 1e-12)
+        found[c] = max(spread / np.sqrt(20.0), _rounding(data, channel), 1e-12)
     return found
+
+
+def _rounding(data: Dataset, channel: str) -> float:
+    """Standard deviation of a converter's rounding [channel's unit]."""
+    sensors = data.machine.sensors.get(data.sensors) if data.sensors else None
+    step = converter(channel_sensor(data.machine, sensors, channel), channel).step
+    return step / 12.0**0.5
 
 
 class Prior(NamedTuple):
@@ -96,7 +110,9 @@ def noise_prior(data: Dataset) -> Prior:
     rough, stated = rough_noise(data), np.isfinite(data.noise)
     noise = np.where(stated, data.noise, rough)
     width = np.where(stated, _STATED, 2.0 * _STATED)
-    return Prior(noise, width, _QUIETER * np.minimum(noise, rough), _NOISIER * rough)
+    rounding = np.array([_rounding(data, channel) for channel in data.channels])
+    low = np.maximum(_QUIETER * np.minimum(noise, rough), rounding)  # an encoder's error at rest
+    return Prior(noise, width, low, _NOISIER * rough)
 
 
 def find_levels(
@@ -126,7 +142,8 @@ def find_levels(
         tracks = _crossed(data, machine, levels, start, each, step, same)
     else:
         noise = np.clip(prior.noise, prior.low, prior.high)
-        rough = Levels(noise, drift=_LOOSE)
+        held = [n for n in _white_states(machine, state_names(machine)) if n.startswith("position")]
+        rough = Levels(noise, drift={**_LOOSE, **dict.fromkeys(held, _LOOSE_POSITION)})
         tracks = _crossed(data, machine, rough, (), each, step)
         inputs = possible_inputs(machine)
         levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
@@ -204,7 +221,9 @@ def columns_of(machine: Machine, near: Track, inputs: Sequence[Input]) -> np.nda
     """(n, m, nz) what inputs do in a machine, from a linearised track of one like it."""
     names, before = state_names(machine), list(near.names[: near.states.shape[1]])
     if names == before:
-        return input_columns(machine, near.states, near.flow, near.run.period, inputs)
+        return input_columns(
+            machine, near.states, near.flow, near.run.period, inputs, near.run.command
+        )
     there = [before.index(n) for n in names if n in before]
     here = [s for s, n in enumerate(names) if n in before]
     states = np.zeros((len(near.states), len(names)))
@@ -213,7 +232,7 @@ def columns_of(machine: Machine, near: Track, inputs: Sequence[Input]) -> np.nda
     flow[np.ix_(range(len(states)), here, here)] = near.flow[
         np.ix_(range(len(states)), there, there)
     ]
-    return input_columns(machine, states, flow, near.run.period, inputs)
+    return input_columns(machine, states, flow, near.run.period, inputs, near.run.command)
 
 
 def _most_likely(
@@ -222,7 +241,7 @@ def _most_likely(
 ) -> Levels:  # fmt: skip
     """Levels of the largest posterior probability in the linearised runs."""
     names, c, m = list(tracks[0].names), len(data.channels), len(levels.inputs)
-    white = [n for n in names if n.partition(".")[0] in WHITE]
+    white = _white_states(machine, names)
     places, floor = [names.index(n) for n in white], by_kind(white, DRIFT)
     w = c + m
     rows = max(_ROWS // len(tracks), _ROWS // 8)
@@ -240,14 +259,14 @@ def _most_likely(
 
         def one(pair: tuple) -> tuple[float, np.ndarray, np.ndarray]:
             run: RunData = pair[1]
-            drift = state_drift(names, now, run.period)
-            found = smooth(pair[0], now.noise**2, drift)
-            return found.loss, found.noise_slope, drift * found.drift_slope
+            drift, noise = state_drift(names, now, run.period), row_noise(now, run) ** 2
+            found = smooth(pair[0], noise, drift)
+            return found.loss, noise * found.noise_slope, drift * found.drift_slope
 
         total = 0.0
         for value, per_noise, per_drift in each(one, runs):
             total += value
-            slope[:c] += 2.0 * now.noise**2 * per_noise
+            slope[:c] += 2.0 * per_noise
             slope[c:w] += 2.0 * per_drift[first:]
             slope[w:] += 2.0 * per_drift[places]
         off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
@@ -269,6 +288,12 @@ def _most_likely(
     x = found.x
     off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
     return dataclasses.replace(of(x), penalty=float(off @ off + lack @ lack))
+
+
+def _white_states(machine: Machine, names: Sequence[str]) -> list[str]:
+    """States of a track to which white noise is added."""
+    held = {f"position.{a.joint}" for a in machine.axes.values() if a.pump}
+    return [n for n in names if n.partition(".")[0] in WHITE or n in held]
 
 
 def _part(track: Track, names: list[str], rows: int) -> LinearRun:
@@ -301,7 +326,7 @@ def smoothed(track: Track) -> tuple[LinearRun, Smoothed]:
     names = list(track.names)
     run = linear_run(track, by_kind(names, STARTLE) ** 2)
     drift = state_drift(names, track.levels, track.run.period)
-    return run, smooth(run, track.levels.noise**2, drift, True)
+    return run, smooth(run, row_noise(track.levels, track.run) ** 2, drift, True)
 
 
 def undisturbed_loss(track: Track) -> float:
@@ -312,7 +337,8 @@ def undisturbed_loss(track: Track) -> float:
     initial = run.initial.copy()
     first = len(names) - m
     drift[first:], initial[first:] = 0.0, 0.0
-    width = smooth(run._replace(initial=initial), track.levels.noise**2, drift).width
+    noise = row_noise(track.levels, track.run) ** 2
+    width = smooth(run._replace(initial=initial), noise, drift).width
     there = np.isfinite(track.whitened)
     return float(np.sum(1.0 + 2.0 * np.log(width[there])))
 
@@ -331,7 +357,7 @@ def input_excess(track: Track) -> float:
     names, m = list(track.names), len(track.levels.inputs)
     run = linear_run(track, by_kind(names, STARTLE) ** 2)
     drift = state_drift(names, track.levels, track.run.period)
-    noise = track.levels.noise**2
+    noise = row_noise(track.levels, track.run) ** 2
     loss = smooth(run, noise, drift).loss
     drift[len(names) - m :] = 0.0
     initial = run.initial.copy()

@@ -8,6 +8,7 @@ import numpy as np
 
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
+from hydrotele.hydraulics.parameters import longest_step
 from hydrotele.machine import Machine
 from hydrotele.prediction.filter import Gains, filter_run
 from hydrotele.prediction.inputs import Input, decay, input_drift
@@ -27,7 +28,7 @@ class Levels:
     """How large everything is that a model does not predict.
 
     Attributes:
-        noise: (c,) standard deviation of a reading [channel's unit].
+        noise: (c,) standard deviation of a logged reading [channel's unit], see `row_noise`.
         inputs: the m unknown inputs.
         sizes: (m,) their stationary standard deviations [N], [N m], [m^3/s] or [1].
         drift: kind of state -> standard deviation of what 20 ms add to it, where that is not the
@@ -110,9 +111,14 @@ def by_kind(names: list[str], table: Mapping[str, float]) -> np.ndarray:
 
 
 def fine_enough(machine: Machine, step: float) -> float:
-    """A step [s], made smaller where a machine needs it."""
+    """A step [s], made smaller where a machine needs it.
+
+    A pump's own circuit is stiff, and its piston light: with stiff lines they ring at 200 Hz and
+    more, which steps of some milliseconds make unstable.
+    """
     springs = any(axis.transmission for axis in machine.axes.values())
-    return min(step, _STIFF) if springs else step
+    rigid = [longest_step(machine, name) for name, axis in machine.axes.items() if axis.pump]
+    return min(step, _STIFF if springs else step, *rigid)
 
 
 def first_rows(track: Track, rows: int) -> Track:
@@ -130,6 +136,11 @@ def first_rows(track: Track, rows: int) -> Track:
 def known_levels(data: Dataset) -> bool:
     """Whether the machine states the accuracy of every channel."""
     return bool(np.all(np.isfinite(data.noise)))
+
+
+def row_noise(levels: Levels, run: RunData) -> np.ndarray:
+    """(c,) standard deviation of a reading of a run, which may be a mean of logged ones."""
+    return levels.noise if run.behind is None else levels.noise / np.sqrt(run.behind)
 
 
 def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
@@ -169,7 +180,7 @@ def track_run(
     if kept is not None:
         levels, columns = kept.levels, _for_states(kept, names)
     levels = levels or Levels(data.noise)
-    noise = levels.noise if run.behind is None else levels.noise / np.sqrt(run.behind)
+    noise = row_noise(levels, run)
     if columns is None:
         columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
     play = model.transmission[:, BACKLASH] > 0.0

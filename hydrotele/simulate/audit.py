@@ -10,7 +10,7 @@ from mujoco import rollout
 
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import port_flow
-from hydrotele.hydraulics.pump import oil_compliance
+from hydrotele.hydraulics.pump import oil_compliance, switched_speed
 from hydrotele.simulate.closure import pin_count
 from hydrotele.simulate.drive_side import drive_and_load_dofs
 from hydrotele.simulate.plant import Plant
@@ -81,7 +81,8 @@ def _hydraulic_balance(plant, x, v, act, more, dt):
 def _volume_errors(plant, i, table, act, x, v, more, dt):
     axis = plant.machine.axes[plant.axes[i]]
     if axis.pump:
-        yield from _pumped_volume_errors(axis, i, table, act, x, v, dt)
+        began = _flows_after_switching(plant, i, act, x, v)
+        yield from _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt)
         return
     valve, supply = axis.valve, plant.machine.supply
     drive = axis.hydraulic_drive
@@ -107,21 +108,30 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
         yield abs(entered - compressed) / max(through, 1e-12)
 
 
-def _pumped_volume_errors(axis, i, table, act, x, v, dt):
+def _flows_after_switching(plant, i, act, x, v):
+    """Table of `state_flows` at the start of every step, once the valve of axis i has switched."""
+    switched, a = act.copy(), ACTIVATIONS * i
+    switched[:-1, a] = [
+        switched_speed(speed, after) for speed, after in zip(act[:-1, a], act[1:, a], strict=True)
+    ]
+    return state_flows(plant.model.actuator_user.ravel(), plant.hydraulic, switched, x, v)
+
+
+def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
     """As `_volume_errors`, of an axis with a pump of its own, whose oil carries air."""
     cylinder, pump = axis.cylinder, axis.pump
     p_head, p_rod = act[:, ACTIVATIONS * i + 2], act[:, ACTIVATIONS * i + 3]
     leak = cylinder.leakage * (p_head - p_rod)
     head, rod = cylinder.volumes(x[:, i])
     sides = (
-        (p_head, table[:, 1 + 3 * i] - leak, cylinder.area_head * v[:, i], head,
+        (p_head, 1, more[:, i, 1] - leak, cylinder.area_head * v[:, i], head,
          pump.compliance_head, pump.air_head),
-        (p_rod, table[:, 2 + 3 * i] + leak, -cylinder.area_rod * v[:, i], rod,
+        (p_rod, 2, more[:, i, 2] + leak, -cylinder.area_rod * v[:, i], rod,
          pump.compliance_rod, pump.air_rod),
     )  # fmt: skip
-    for pressure, inflow, swept, volume, walls, air in sides:
-        net = inflow - swept
-        entered = np.sum(0.5 * dt * (net[1:] + net[:-1]))
+    for pressure, column, besides, swept, volume, walls, air in sides:
+        inflow, first = (t[:, column + 3 * i] + besides for t in (table, began))
+        entered = np.sum(0.5 * dt * ((inflow - swept)[1:] + (first - swept)[:-1]))
         soft = np.array([
             oil_compliance(each, pump.bulk_modulus, walls, air, p)
             for each, p in zip(volume, pressure, strict=True)

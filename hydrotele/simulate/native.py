@@ -188,7 +188,7 @@ def _compile_callbacks():
         at_velocity = carray(pointer(d + d_velocity), (1,), np.int64)[0]
         velocity = carray(pointer(at_velocity), (nu,), np.float64)[i]
         dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
-        drive = 0.0
+        drive, p_load, p_head, p_rod = 0.0, 0.0, 0.0, 0.0
         if user[u + _KIND] == _FORCE:  # MuJoCo's own gain gives the drive force
             drive = -user[u + _OFFSET]
         else:
@@ -198,15 +198,10 @@ def _compile_callbacks():
             at_act_dot = carray(pointer(d + d_act_dot), (1,), np.int64)[0]
             act = carray(pointer(at_act + start), (4,), np.float64)
             rate = carray(pointer(at_act_dot + start), (4,), np.float64)
-            if user[u + _KIND] == _PUMPED:  # with its friction already
-                drive = pumped_force(
-                    user, u, act[1] + dt * rate[1], act[2] + dt * rate[2], act[3] + dt * rate[3],
-                    velocity, 0.0, dt,
-                )  # fmt: skip
-            else:
-                drive = user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
-                drive -= user[u + _AREA_ROD] * (act[3] + dt * rate[3])
-        terms, steep = floats(m, 0), 0.0
+            p_load = act[1] + dt * rate[1]
+            p_head, p_rod = act[2] + dt * rate[2], act[3] + dt * rate[3]
+            drive = user[u + _AREA_HEAD] * p_head - user[u + _AREA_ROD] * p_rod
+        terms, more, steep = floats(m, 0), 0.0, 0.0
         if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
             terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
         gain = _gain(m, i, m_gainprm) if user[u + _KIND] == _FORCE else 0.0
@@ -220,9 +215,9 @@ def _compile_callbacks():
                 extra, slope = added_with_slope(terms, COMMAND, i, s)
                 more += gain * extra
                 steep += gain * slope
-            drive += more
-        if user[u + _KIND] == _PUMPED:
-            return drive
+        if user[u + _KIND] == _PUMPED:  # friction that holds resists the terms, too
+            return more + pumped_force(user, u, p_load, p_head, p_rod, velocity, more, dt)
+        drive += more
         if user[u + _INERTIA] == 0.0:
             return drive - actuator_friction(user, u, velocity)
         push = drive + _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)

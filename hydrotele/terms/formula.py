@@ -107,7 +107,7 @@ def _variable(text: str, node: ast.expr) -> int:
     name = node.id if isinstance(node, ast.Name) else ast.unparse(node)
     if name not in VARIABLES:
         raise _wrong(text, f"{name!r} is no variable; {suggest(name, VARIABLES)}")
-    return VARIABLES.index(name)
+    return VARIABLES[name]
 
 
 def _number(text: str, node: ast.expr) -> float:

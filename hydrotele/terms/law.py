@@ -30,8 +30,10 @@ class DriveState(NamedTuple):
         time: since the run's beginning [s].
         position: piston displacement or motor angle [m] or [rad].
         velocity: of the piston or motor [m/s] or [rad/s].
-        spool: spool position [1]; 0 without a valve, as all that follow up to the supply.
-        spool_rate: its rate [1/s].
+        spool: spool position [1]; 0 without a valve, as all that follow up to the supply. Of a
+            drive with a pump of its own the pump's speed [rad/s]; files call it `pump_speed`.
+        spool_rate: its rate [1/s]. Of a drive with a pump of its own the pressure in its load
+            cylinder [Pa]; files call it `pressure_load`.
         pressure_head: of the head-side chamber, or port A of a motor [Pa].
         pressure_rod: of the rod-side chamber, or port B [Pa].
         pressure_supply: at the valves' inlet [Pa].
@@ -51,7 +53,9 @@ class DriveState(NamedTuple):
     force: float
 
 
-VARIABLES = DriveState._fields
+VARIABLES = {name: index for index, name in enumerate(DriveState._fields)}
+"""Variable of the state, as files name it -> its index."""
+VARIABLES |= {"pump_speed": VARIABLES["spool"], "pressure_load": VARIABLES["spool_rate"]}
 
 
 class Variable(int):
@@ -129,7 +133,7 @@ def _values(law: str, name: str, kind: type, value: Any) -> list[float]:
     if kind is Variable:
         if value not in VARIABLES:
             raise ValueError(f"{where}: {value!r} is no variable; {suggest(value, VARIABLES)}")
-        return [float(VARIABLES.index(value))]
+        return [float(VARIABLES[value])]
     try:
         flat = np.asarray(value, float)
     except (TypeError, ValueError):

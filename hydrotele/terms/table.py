@@ -77,7 +77,7 @@ def _callable_from_c(law: Law):
         else:
             arguments.append(f"int(p[{places}])" if kind is Variable else f"p[{places}]")
             places += 1
-    state = ", ".join(f"s[{k}]" for k in range(len(VARIABLES)))
+    state = ", ".join(f"s[{k}]" for k in range(len(DriveState._fields)))
     text = (
         "def call(parameters, s):\n"
         "    p = carray(parameters, (int(parameters[0]),))\n"
@@ -122,7 +122,7 @@ def terms_table(terms: Sequence[Term], order: Sequence[str]) -> np.ndarray:
     for term in terms:
         place = law_place(term.law)
         numbers = LAWS[term.law].numbers(term.parameters)
-        ranges = [x for name, ends in term.domain.items() for x in (VARIABLES.index(name), *ends)]
+        ranges = [x for name, ends in term.domain.items() for x in (VARIABLES[name], *ends)]
         at = first + len(back)
         rows += [
             order.index(term.axis), BALANCES.index(term.balance), place, checksum(term.law), at,

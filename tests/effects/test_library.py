@@ -75,6 +75,9 @@ def test_names_and_places_are_those_agreed():
     assert {name: places for name, places in found.items() if places} == PLACES
     pumped = machine_of("eha", "load_30_bar")
     assert {n: set(EFFECTS[n].locations(pumped)) for n in set(found) - set(PLACES)} == PUMPED
+    # its length is its position, and where its pins sit across the slide changes nothing
+    for geometric in ("pin_offset", "length_offset"):
+        assert not EFFECTS[geometric].locations(pumped)
     assert {m for m, _ in MACHINES} == set(shipped_machines())
 
 

@@ -1,7 +1,10 @@
 """Calibration: numbers that are off everywhere are recovered within their intervals."""
 
 import numpy as np
+import pytest
 
+from hydrotele.effects import EFFECTS
+from hydrotele.effects.effect import changed
 from hydrotele.machine_file import load_machine
 from hydrotele.prediction.calibration import calibration, numbers
 from hydrotele.prediction.evidence import Evidence
@@ -56,3 +59,19 @@ def test_the_machine_file_states_what_is_uncertain():
     assert np.isclose(shares["mass.stick"], 0.2) and np.isclose(shares["mass.boom"], 0.03)
     assert np.isclose(shares["valve_damping.boom"], 0.01)
     assert not any(key.startswith("valve_gain.") for key in found)
+
+
+def test_a_loss_that_a_data_sheet_leaves_out_is_uncertain_if_the_file_says_so():
+    """A number that is 0 has no relative size: its effect's typical size takes the place."""
+    machine = changed(load_machine("eha"), "axes.piston.pump.motor.drag", 0.0)
+    silent = numbers(changed(machine, "uncertainty", {}))
+    assert "motor_drag.piston.drag" not in silent
+    assert "pressure_offset.piston.rod.offset" not in silent
+    stated = numbers(changed(machine, "uncertainty", {"motor_drag": 2.0, "pressure_offset": 1.0}))
+    typical = EFFECTS["motor_drag"].parameters(machine, "piston")["drag"].scale
+    assert stated["motor_drag.piston.drag"].parameter.scale == 2.0 * typical
+    assert stated["motor_drag.piston.drag"].parameter.low == 0.0  # drag drives nothing
+    offset = stated["pressure_offset.piston.rod.offset"].parameter
+    assert offset.scale == pytest.approx(abs(offset.nominal))  # not 0 in this machine: relative
+    dragged = stated["motor_drag.piston.drag"].change(machine, 0.4)
+    assert dragged.axes["piston"].pump.motor.drag == 0.4
