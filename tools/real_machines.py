@@ -52,13 +52,19 @@ def force_error(machine: Machine, run: RunData, cutoff: float) -> float:
     return float(100.0 * np.linalg.norm(left) / np.linalg.norm(force[inner]))
 
 
+def read_throughout(run: RunData) -> RunData:
+    """A run from the first row in which all channels are read to the last one."""
+    known = np.flatnonzero(np.isfinite(run.reading).all(axis=1))
+    return run.part(known[0], known[-1] + 1)
+
+
 def velocity_fit(machine: Machine, data: Dataset, cutoff: float) -> dict[str, float]:
     """Fit of the velocities in the held-out run, where the model has had no reading [%].
 
     100 % less the size of the difference over that of the velocity itself about its mean; both
     velocities pass the same zero-phase filter.
     """
-    run = data.heldout
+    run = read_throughout(data.heldout)
     rows, lead = round(WINDOW / run.period), round(LEAD / run.period)
     hidden = np.arange(len(run.reading)) % rows >= lead
     reading = np.where(hidden[:, None], np.nan, run.reading)
