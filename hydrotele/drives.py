@@ -191,6 +191,80 @@ class Valve(Facts):
         return self.compensated_drop or self.rated_pressure_drop
 
 
+class ElectricMotor(Facts):
+    """A brushed DC motor on a bridge, and what keeps it and its pump from turning.
+
+    `voltage` [V] of the bridge at full duty, `resistance` [ohm], `emf` [V s/rad] which is also its
+    torque per current [N m/A], `inertia` [kg m^2] of rotor and pump; drag torques [N m]: `drag`
+    always, `breakaway` more at rest, gone with `breakaway_speed` [rad/s], and `viscous`
+    [N m s/rad].
+    """
+
+    voltage: Positive
+    resistance: Positive
+    emf: Positive
+    inertia: Positive
+    drag: NonNegative = 0.0
+    breakaway: NonNegative = 0.0
+    breakaway_speed: Positive = 10.0
+    viscous: NonNegative = 0.0
+
+
+class Accumulator(Facts):
+    """A gas accumulator in the place of a tank, with the cylinder fully retracted.
+
+    `pressure` [Pa] above the atmosphere's, `gas_volume` [m^3] at that pressure, and the resistance
+    of its line [Pa s/m^3] while the cylinder extends and retracts.
+    """
+
+    pressure: Positive
+    gas_volume: Positive
+    line_extending: Positive
+    line_retracting: Positive
+
+
+class Pump(Facts):
+    """A pump of the axis' own, driven in one direction; a switched valve picks the side.
+
+    The command is the duty of the motor with the sign of the side, or, without a `motor`, the speed
+    over `rated_speed` [rad/s]. `displacement` [m^3/rad], `leakage` [m^3/(s Pa)] back to the line
+    that it draws from, `torque_loss` [1] as a part of displacement times pressure. Of the oil
+    between pump and piston: `bulk_modulus` [Pa] without air, `compliance_head` and `compliance_rod`
+    [m^3/Pa] of hoses and walls, `air_head` and `air_rod` [m^3] at the atmosphere's pressure.
+    """
+
+    displacement: Positive
+    leakage: NonNegative = 0.0
+    torque_loss: NonNegative = 0.0
+    rated_speed: Positive
+    bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
+    compliance_head: NonNegative = 0.0
+    compliance_rod: NonNegative = 0.0
+    air_head: NonNegative = 0.0
+    air_rod: NonNegative = 0.0
+    accumulator: Accumulator
+    motor: ElectricMotor | None = None
+
+
+class LoadCylinder(Facts):
+    """A cylinder that resists extension: its oil leaves over a relief valve.
+
+    `area` [m^2]; `relief_pressure` [Pa], and how much it rises with the flow, `override`
+    [Pa s/m^3]; `stiffness` [N/m] of its oil; `void` [m] of the travel in which the oil does not
+    yet fill the chamber, with air at `void_pressure` [Pa] in it. Its packings rub with `friction`
+    [1] of its force; `return_force` [N] resists on the way back besides.
+    """
+
+    area: Positive
+    relief_pressure: NonNegative
+    override: NonNegative = 0.0
+    stiffness: Positive
+    void: NonNegative = 0.0
+    void_pressure: Positive = 2.0e4
+    friction: NonNegative = 0.0
+    return_force: NonNegative = 0.0
+
+
 class Counterbalance(Facts):
     """A load-holding valve at a chamber: oil leaves only when p + pilot_ratio p_pilot > setting.
 
@@ -256,6 +330,7 @@ class Axis(Facts):
     motor: Motor | None = None
     force: ForceDrive | None = None
     valve: Valve | None = None
+    pump: Pump | None = None
     four_bar: FourBar | None = None
     command_delay: NonNegative = 0.0
     command_unit: str = "1"
@@ -269,8 +344,14 @@ class Axis(Facts):
         drives = [d for d in ("cylinder", "motor", "force") if getattr(self, d) is not None]
         if len(drives) != 1:
             raise ValueError(f"needs exactly one of cylinder, motor, force; has {drives or 'none'}")
-        if (self.force is None) == (self.valve is None):
-            raise ValueError("a cylinder or motor needs a valve; a plain force drive has none")
+        fed = (self.valve is not None) + (self.pump is not None)
+        if fed != (self.force is None):
+            raise ValueError(
+                "a cylinder or motor needs a valve or a pump of its own; a plain force drive has"
+                " none"
+            )
+        if self.pump:
+            self._check_pumped()
         if self.force and self.load_holding != LoadHolding():
             raise ValueError("a plain force drive has no oil for load_holding valves to hold")
         if self.command_range[0] == self.command_range[1]:
@@ -290,10 +371,23 @@ class Axis(Facts):
             raise ValueError("a four_bar linkage is moved by a cylinder")
         return self
 
+    def _check_pumped(self) -> None:
+        if self.cylinder is None or self.four_bar or self.transmission:
+            raise ValueError("a pump drives a cylinder without four_bar and transmission")
+        if self.load_holding != LoadHolding():
+            raise ValueError("load_holding valves stand behind a valve, not behind a pump")
+        if self.cylinder.hose_compliance:
+            raise ValueError(
+                "give pump.compliance_head and pump.compliance_rod instead of"
+                " cylinder.hose_compliance"
+            )
+        if self.end_stop is None:
+            raise ValueError("an axis with a pump states its end_stop: no relief pressure says it")
+
     @property
     def hydraulic(self) -> bool:
-        """Whether the axis has a valve and chambers."""
-        return self.valve is not None
+        """Whether the axis has chambers: behind a valve, or behind a pump of its own."""
+        return self.valve is not None or self.pump is not None
 
     @property
     def hydraulic_drive(self) -> Cylinder | Motor:

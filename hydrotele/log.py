@@ -133,8 +133,9 @@ def load_log(
     Args:
         path: the file.
         aliases: the file's own column name -> channel name, with a minus before it where the sign
-            is the other way round, or `none` for a column to leave out; names that the file lacks
-            are ignored, and so are all of them for logs that hydrotele wrote.
+            is the other way round, `a * b` stands for the product of two columns without unit, and
+            `none` for a column to leave out; names that the file lacks are ignored, and so are all
+            of them for logs that hydrotele wrote.
         required: channels that must be there, after renaming.
         minimum_rows: fewer rows are refused.
         maximum_dropped: fraction of the samples [1] that may be missing or come off time by more
@@ -164,6 +165,14 @@ def load_log(
 
 
 def _renamed(table: Table, aliases: Mapping[str, str]) -> Table:
+    for product, channel in aliases.items():
+        factors = product.split(" * ")
+        if len(factors) == 2 and set(factors) <= set(table.names):
+            a, b = (table.values[table.names.index(name)] for name in factors)
+            table = table._replace(
+                names=[*table.names, channel], values=[*table.values, a * b],
+                units=[*table.units, "1"],
+            )  # fmt: skip
     names = [aliases.get(name, name) for name in table.names]
     kept = [place for place, name in enumerate(names) if name != LEFT_OUT]
     signs = [-1.0 if names[place].startswith("-") else 1.0 for place in kept]

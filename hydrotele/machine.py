@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from hydrotele.datafile import Facts, Name, NonNegative, Positive, Vector, suggest
-from hydrotele.drives import Axis, EndStop, Pin
+from hydrotele.drives import Axis, EndStop, LoadCylinder, Pin
 from hydrotele.sensors import SensorError, SensorSet
 from hydrotele.terms.facts import Term
 
@@ -143,6 +143,7 @@ class Machine(Facts):
     axes: dict[Name, Axis]
     closures: dict[Name, Closure] = {}
     supply: Supply | None = None
+    loads: dict[Name, LoadCylinder] = {}
     sensors: dict[Name, SensorSet] = {}
     sensor_errors: dict[str, SensorError] = {}
     home: dict[Name, float] = {}
@@ -159,8 +160,13 @@ class Machine(Facts):
 
     @property
     def hydraulic_axes(self) -> dict[str, Axis]:
-        """Axes with a valve."""
+        """Axes with a valve, or with a pump of their own."""
         return {name: axis for name, axis in self.axes.items() if axis.hydraulic}
+
+    @property
+    def valve_axes(self) -> dict[str, Axis]:
+        """Axes with a valve."""
+        return {name: axis for name, axis in self.axes.items() if axis.valve}
 
     def link_of(self, joint: str) -> str:
         """Name of the link that a joint moves."""
@@ -198,7 +204,7 @@ class Machine(Facts):
         names += [f"length.{name}" for name, axis in self.axes.items() if axis.cylinder]
         for side in ("head", "rod"):
             names += [f"pressure_{side}.{axis}" for axis in self.hydraulic_axes]
-        return (*names, "pressure_supply") if self.hydraulic_axes else tuple(names)
+        return (*names, "pressure_supply") if self.valve_axes else tuple(names)
 
     @model_validator(mode="after")
     def _check(self):
@@ -238,7 +244,12 @@ class Machine(Facts):
         for name, sensors in self.sensors.items():
             for channel in sensors.channels:
                 _expect(channel, self.sensed_channels, f"sensors.{name}.channels")
-        if self.hydraulic_axes and self.supply is None:
+        for name, axis in self.axes.items():
+            if axis.pump and self.joints[axis.joint].type != "slide":
+                raise ValueError(f"axes.{name}.pump: its cylinder lies along a slide joint")
+        for name in self.loads:
+            _expect(name, [n for n, a in self.axes.items() if a.pump], "loads")
+        if self.valve_axes and self.supply is None:
             raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
         if len(self.hydraulic_axes) > 8:
             raise ValueError("at most 8 valves can share one supply")

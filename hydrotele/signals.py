@@ -65,12 +65,17 @@ MEASURED: Mapping[str, Kind] = {
     "pressure_head": Kind(("Pa",), "head side chamber, or port A of a motor"),
     "pressure_rod": Kind(("Pa",), "rod side chamber, or port B of a motor"),
     "pressure_supply": Kind(("Pa",), "pump or supply pressure", "none"),
+    "speed": Kind(("rad/s",), "speed of a pump, with the sign of the side that it feeds"),
+    "speed_reference": Kind(("rad/s",), "pump speed that the controller was asked for"),
+    "current": Kind(("A", "1"), "motor current, or the count of a converter without calibration"),
 }
 
 TRUTH: Mapping[str, Kind] = {
     **{k: MEASURED[k] for k in ("angle", "position", "length", "velocity", "torque")},
     **{k: MEASURED[k] for k in ("pressure_head", "pressure_rod", "pressure_supply")},
     "acceleration": Kind(("rad/s^2", "m/s^2"), "joint acceleration"),
+    "speed": MEASURED["speed"],
+    "pressure_load": Kind(("Pa",), "pressure in the load cylinder of an axis"),
     "spool": Kind(("1",), "spool position over its stroke"),
     "spool_rate": Kind(("1/s",), "spool speed over the spool's stroke"),
     "flow_head": Kind(("m^3/s",), "valve flow into the head side chamber"),
@@ -158,6 +163,8 @@ def magnitude_limits(name: str, unit: str, *, stated: bool = True) -> Limits:
     """
     if unit == "1" and name.startswith("command."):
         return _COMMAND_LIMITS
+    if name.startswith(("speed.", "speed_reference.", "truth.speed.")):
+        return _NO_LIMITS  # a pump turns faster than any joint
     return _LIMITS.get(unit, (_NO_LIMITS, _NO_LIMITS))[0 if stated else 1]
 
 

@@ -1,11 +1,12 @@
 """The workflow on the public records of two real machines, with figures that others can check.
 
-    python tools/real_machines.py ../shared/real [--only emps] [--jobs 2]
+    python tools/real_machines.py ../shared/real [--only emps eha] [--jobs 2]
 
 EMPS, from the published model with symmetric friction: names what lacks, and the relative error of
 the force on the samples that were not fitted. Volvo EC20, from a valve without delay and dead band:
 names what lacks, and the fit of the velocities over 5 s without readings, on the stretch that was
-not fitted.
+not fitted. Electro-hydraulic actuator: free runs by pump speed and by duty, and runs of the MuJoCo
+plant under the published controller, against the figures in the folder's README.
 """
 
 import argparse
@@ -14,6 +15,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from eha_control import under_control
+from eha_fit import free_run
+from eha_runs import LOADS, differences, load_runs
 
 from hydrotele.dataset.load import Dataset, RunData, load_dataset
 from hydrotele.dynamics.model import state_names
@@ -23,7 +27,7 @@ from hydrotele.gap.result import Gap
 from hydrotele.identify.zero_phase import zero_phase
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
-from hydrotele.prediction.levels import find_levels
+from hydrotele.prediction.free_run import following_levels
 from hydrotele.prediction.stretches import busiest
 from hydrotele.prediction.track import track_run
 
@@ -68,7 +72,8 @@ def velocity_fit(machine: Machine, data: Dataset, cutoff: float) -> dict[str, fl
     rows, lead = round(WINDOW / run.period), round(LEAD / run.period)
     hidden = np.arange(len(run.reading)) % rows >= lead
     reading = np.where(hidden[:, None], np.nan, run.reading)
-    states = track_run(machine, data, dataclasses.replace(run, reading=reading)).states
+    hiding = dataclasses.replace(run, reading=reading)
+    states = track_run(machine, data, hiding, levels=following_levels(data)).states
     names, fits = state_names(machine), {}
     for column, channel in enumerate(data.channels):
         axis = channel.partition(".")[2]
@@ -118,19 +123,51 @@ def ec20(folder: Path, jobs: int) -> None:
     machine = data.machine
     gap = find_gap(data, lambda text, _: print(f"  {text}", file=sys.stderr), jobs=jobs)
     print(f"EC20: {gap.verdict}: {named(gap)}  ({gap.seconds:.0f} s)")
-    judged = find_levels(busiest(data))
+    judged = busiest(data)
     before, after = (velocity_fit(m, judged, 2.0) for m in (machine, gap.patched))
     for axis, fit in before.items():
         print(f"  velocity fit, held out, {axis}: {fit:.1f} -> {after[axis]:.1f} %")
 
 
-STUDIES = {"emps": emps, "ec20": ec20}
+# Run -> the authors' position RMS under control [mm]; then open loop as the folder's README has it:
+# position [mm], head and rod pressure [bar].
+_EHA_FIGURES = {
+    "1_1": (0.32, 1.5, 1.3, 1.8),
+    "1_4": (0.38, 1.1, 1.3, 2.0),
+    "2_2": (0.38, 1.0, 2.3, 2.0),
+    "3_1": (0.40, 1.4, 3.4, 2.0),
+    "3_3": (0.45, 1.2, 4.0, 2.2),
+    "4_2": (0.53, 2.1, 5.5, 1.8),
+    "4_4": (0.56, 1.8, 5.8, 1.7),
+    "5_3": (1.34, 2.0, 6.7, 5.7),
+}
+
+
+def eha(folder: Path, _jobs: int) -> None:
+    """RMS differences of every run of the electro-hydraulic actuator, beside the figures."""
+    print("EHA: RMS differences; position [mm], head and rod pressure [bar]")
+    for run in load_runs(folder / "eha"):
+        machine = load_machine("eha", LOADS[run.group])
+        authors, *simple = _EHA_FIGURES.get(run.name, (np.nan,) * 4)
+        ways = {
+            "under its controller": under_control(machine, run),
+            "pump speed and valve in": free_run(machine, run, by_speed=True),
+            "duty and valve in": free_run(machine, run, by_speed=False),
+        }
+        for way, simulated in ways.items():
+            figures = [authors, np.nan, np.nan] if way.startswith("under") else simple
+            pairs = zip(differences(run, simulated), figures, strict=True)
+            text = "  ".join(f"{here:5.2f} (figure {figure:4.2f})" for here, figure in pairs)
+            print(f"  {run.name} {way:24} {text}".replace("(figure  nan)", " " * 13), flush=True)
+
+
+STUDIES = {"emps": emps, "ec20": ec20, "eha": eha}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folder", type=Path, help="with emps/ and volvo_ec20/")
+    parser.add_argument("folder", type=Path, help="with emps/, volvo_ec20/ and eha/")
     parser.add_argument("--only", choices=STUDIES, nargs="+", default=list(STUDIES))
     parser.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args()

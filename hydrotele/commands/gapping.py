@@ -21,7 +21,10 @@ from hydrotele.gap.words import effect_title, headline, verdict_words
 from hydrotele.output import check_target, whole_folder
 from hydrotele.simulate.native import stop_profiling_clock
 
-_COLOURS = {"named": "blue", "no_gap": "green", "ambiguous": "yellow", "unknown": "red"}
+_COLOURS = {
+    "named": "blue", "partly": "magenta", "no_gap": "green", "ambiguous": "yellow",
+    "unknown": "red",
+}  # fmt: skip
 _COLUMNS = ("effect", "parameter", "model had", "found", "95 % interval", "unit")
 
 

@@ -10,8 +10,8 @@ FASTEST = 1000.0  # [Hz] oil and valves are slow above some 300 Hz, and filters 
 _SLACK = 0.1  # of a row: 1.05 kHz passes for 1 kHz
 
 
-def averaged(rows: Rows) -> tuple[Rows, np.ndarray, int]:
-    """A run at no more than about 1 kHz, each row the mean of several logged ones.
+def averaged(rows: Rows, fastest: float = FASTEST) -> tuple[Rows, np.ndarray, int]:
+    """A run at no more than a rate, each row the mean of several logged ones.
 
     Commands are means over the new row, which they are held for. Readings are means over the
     logged rows about the new row's time, as many before as after, so that nothing is shifted; a
@@ -19,11 +19,12 @@ def averaged(rows: Rows) -> tuple[Rows, np.ndarray, int]:
 
     Args:
         rows: the run.
+        fastest: the rate [Hz].
 
     Returns:
         (the run, (c,) logged readings behind one of its readings, logged rows per row).
     """
-    count = math.ceil(1.0 / (FASTEST * rows.period) - _SLACK)
+    count = math.ceil(1.0 / (fastest * rows.period) - _SLACK)
     ones = np.ones(rows.reading.shape[1])
     if count < 2:
         return rows, ones, 1

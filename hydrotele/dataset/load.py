@@ -1,7 +1,7 @@
 """Logs of one machine, made ready for learning: one clock, one set of channels, gaps marked."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -76,8 +76,6 @@ class Dataset:
         heldout: the run to judge on.
         notes: what was left out or mended, one sentence each.
         sensors: name of the machine's sensors, or None if their noise is unknown.
-        drift: state or kind of state -> standard deviation that a row may add to it, where it was
-            found from the data; others as `prediction.track` has them.
     """
 
     machine: Machine
@@ -88,7 +86,6 @@ class Dataset:
     heldout: RunData
     notes: tuple[str, ...]
     sensors: str | None = None
-    drift: Mapping[str, float] = field(default_factory=dict)
 
     def noise_of(self, run: RunData) -> np.ndarray:
         """Standard deviations (c,) of one reading of a run [SI], less where readings are means."""

@@ -31,7 +31,8 @@ def limits(machine: Machine, channel: str) -> tuple[float, float]:
     """
     kind, _, axis = channel.partition(".")
     if kind.startswith("pressure"):
-        assert machine.supply
+        if machine.supply is None:  # pumps of their own, without a stated limit
+            return _VACUUM, math.inf
         reliefs = [a.valve.port_relief for a in machine.hydraulic_axes.values() if a.valve]
         return _VACUUM, _PRESSURE_PLAY * max(machine.supply.relief_pressure, *reliefs)
     if kind == "length":

@@ -30,9 +30,8 @@ from hydrotele.dynamics.transducers import follow_trail, show_late
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
-    actuator_friction,
-    actuator_friction_slope,
     actuator_stop,
+    force_after_friction,
     step_circuit,
 )
 
@@ -131,8 +130,9 @@ def accelerate(model, sp, z, dt):
         for f in range(n):
             v += sp.row[i, f] * z[first + f]
         own = v if gear < 0 else z[first + n + gear]
-        push -= actuator_friction(user, u, own)
-        slope = half * actuator_friction_slope(user, u, own)
+        act = z[2 * first + 4 * i :]
+        push, damping = force_after_friction(user, u, push, act, own, dt)
+        slope = half * damping
         if len(model.terms) > 0:
             more, steep = term_force(model, sp, z, i, own)
             push += more

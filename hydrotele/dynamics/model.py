@@ -92,7 +92,7 @@ def predicted_channels(machine: Machine) -> tuple[str, ...]:
     names = [f"{machine.position_kind(a)}.{a}" for a in order]
     names += [f"length.{a}" for a in order if machine.axes[a].cylinder]
     names += [f"pressure_{side}.{a}" for a in valves for side in ("head", "rod")]
-    return (*names, "pressure_supply") if valves else tuple(names)
+    return (*names, "pressure_supply") if machine.valve_axes else tuple(names)
 
 
 def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
@@ -156,5 +156,7 @@ def state_names(machine: Machine) -> list[str]:
     gears = [n for n in actuator_order(machine) if machine.axes[n].transmission]
     out = [f"position.{n}" for n in free] + [f"drive.{n}" for n in gears]
     out += [f"rate.{n}" for n in free] + [f"drive_rate.{n}" for n in gears]
-    kinds = ("spool", "spool_rate", "pressure_head", "pressure_rod")
-    return out + [f"{k}.{n}" for n in machine.hydraulic_axes for k in kinds]
+    for name, axis in machine.hydraulic_axes.items():
+        kinds = ("speed", "pressure_load") if axis.pump else ("spool", "spool_rate")
+        out += [f"{k}.{name}" for k in (*kinds, "pressure_head", "pressure_rod")]
+    return out

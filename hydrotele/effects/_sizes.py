@@ -14,7 +14,7 @@ def axes(machine: Machine) -> tuple[str, ...]:
 
 def valves(machine: Machine) -> tuple[str, ...]:
     """Names of the axes with a valve."""
-    return tuple(machine.hydraulic_axes)
+    return tuple(machine.valve_axes)
 
 
 def cylinders(machine: Machine) -> tuple[str, ...]:

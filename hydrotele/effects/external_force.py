@@ -15,7 +15,7 @@ def _force(machine: Machine, location: str) -> dict[str, Parameter]:
     """Fractions of the drive's largest force; least is a thousandth, as of friction."""
     present = term_number(machine, CONSTANT, location, "force", "value", 0.0)
     whole = largest_force(machine, location)
-    sizes = present - 0.3 * whole, present + 0.3 * whole, 0.02 * whole, 0.001 * whole
+    sizes = present - whole, present + whole, 0.02 * whole, 0.001 * whole
     return {"force": Parameter(force_unit(machine, location), present, *sizes)}
 
 
@@ -39,7 +39,7 @@ def _pulse(machine: Machine, location: str) -> dict[str, Parameter]:
     start, duration = present("start", _BEGIN), present("duration", _LENGTH)
     return {
         "size": Parameter(
-            force_unit(machine, location), size, size - 0.5 * whole, size + 0.5 * whole,
+            force_unit(machine, location), size, size - 2.0 * whole, size + 2.0 * whole,
             0.03 * whole, 0.003 * whole,
         ),
         "start": Parameter("s", start, 0.0, 36000.0, 20.0, 0.05),

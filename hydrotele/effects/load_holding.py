@@ -6,7 +6,7 @@ from hydrotele.machine import Machine
 
 
 def _sides(machine: Machine) -> tuple[str, ...]:
-    return tuple(f"{axis}.{side}" for axis in machine.hydraulic_axes for side in ("head", "rod"))
+    return tuple(f"{axis}.{side}" for axis in machine.valve_axes for side in ("head", "rod"))
 
 
 def _present(machine: Machine, location: str) -> Counterbalance | None:

@@ -4,30 +4,31 @@ import numpy as np
 
 from hydrotele.compiled import compiled
 from hydrotele.dynamics.forces import gather_forces
-from hydrotele.dynamics.integrate import place
+from hydrotele.dynamics.integrate import load_position, place
 from hydrotele.dynamics.mechanism import BAR, DAMPING
+from hydrotele.dynamics.model import X
 from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_BIAS, LENGTH_ROW, RATE
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
     actuator_friction,
+    actuator_stop,
+    axis_opening,
     chamber_flows,
-    supply_pressure,
+    circuit_supply,
+    open_ports,
 )
-from hydrotele.hydraulics.laws import port_flow, valve_opening
+from hydrotele.hydraulics.laws import port_flow
 
 _AH, _AR, _LEAK = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.LEAKAGE)
 _PORT, _KR = int(Slot.PORT_RELIEF), int(Slot.RELIEF_GAIN)
 _TANK, _KM = int(Slot.TANK_PRESSURE), int(Slot.MAKEUP_GAIN)
-_BETA, _HOSE, _DB, _K = (
-    int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE), int(Slot.DEADBAND), int(Slot.FLOW_GAIN)
-)  # fmt: skip
-_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
+_BETA, _HOSE = int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE)
 
 
 @compiled
 def load_forces(model, space, motion):
-    """Force of every drive that a motion needs, its own friction included.
+    """Force of every drive that a motion needs, its own friction included, less its end stops'.
 
     `J' F = N' (M (N q'' + c) + h + D q')`, where N maps independent to tree rates, c is what the
     closures add, D the dampers of the joints and J the drives' Jacobian; a transmission counts as
@@ -66,6 +67,8 @@ def load_forces(model, space, motion):
             if bar >= 0:
                 change += m.bar[bar, LENGTH_BIAS] + np.sum(m.bar[bar, LENGTH_ROW:] * m.joint[DRIFT])
             forces[k, i] += actuator_friction(model.user, i * SLOTS, velocity)
+            at = space.drive[X, i] if model.gear[i] < 0 else load_position(model, space, i)
+            forces[k, i] -= actuator_stop(model.user, i * SLOTS, at, velocity)[0]
             if model.gear[i] >= 0:
                 forces[k, i] += model.transmission[model.gear[i], 0] * change
     return forces
@@ -93,7 +96,7 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
     tank, hose, beta = user[_TANK], user[_HOSE], user[_BETA]
     for k in range(len(spool)):
         p_head, p_rod = head[0, k], rod[0, k]
-        opening = valve_opening(spool[k], user[_DB])
+        opening = axis_opening(user, 0, spool[k])
         q_head, q_rod, _, _ = chamber_flows(user, 0, opening, supply[k], p_head, p_rod)
         r_head, _ = port_flow(p_head, user[_PORT], user[_KR], tank, user[_KM])
         r_rod, _ = port_flow(p_rod, user[_PORT], user[_KR], tank, user[_KM])
@@ -120,11 +123,11 @@ def supply_pressures(user, spools, pressures):
     Source: nominal model, "Supply".
     """
     count, rows = spools.shape
-    ports, out = np.zeros(4 * count), np.empty(rows)
+    ports, act, out = np.zeros(4 * count), np.zeros(4 * count), np.empty(rows)
     for k in range(rows):
         for i in range(count):
-            opening = valve_opening(spools[i, k], user[i * SLOTS + _DB])
-            ports[4 * i] = user[i * SLOTS + _K] * abs(opening)
-            ports[4 * i + 1] = pressures[i, 0 if opening > 0.0 else 1, k]
-        out[k] = supply_pressure(ports, count, user[_D], user[_RELIEF], user[_PUMP])
+            act[4 * i] = spools[i, k]
+            act[4 * i + 2], act[4 * i + 3] = pressures[i, 0, k], pressures[i, 1, k]
+        open_ports(user, act, act, ports, 0, count, 0.0, act)
+        out[k] = circuit_supply(user, 0, count, ports)
     return out

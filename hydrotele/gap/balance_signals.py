@@ -47,13 +47,16 @@ class Signals:
         return all(channel in self.smoothed for channel in channels)
 
 
-def read_signals(machine: Machine, log: Log, sensors: str | None) -> Signals:
+def read_signals(
+    machine: Machine, log: Log, sensors: str | None, noise: Mapping[str, float] | None = None
+) -> Signals:
     """Signals of a log.
 
     Args:
         machine: the machine, whose sensor errors are taken out of the readings.
         log: the run; rows may be missing.
         sensors: name of the machine's sensors; None to find the noise from the data.
+        noise: channel -> standard deviation of one reading, in place of the sensors'.
 
     Returns:
         The signals of all channels that have enough samples.
@@ -65,7 +68,8 @@ def read_signals(machine: Machine, log: Log, sensors: str | None) -> Signals:
     rows = int(clock.tick[-1]) + 1
     time = clock.start + clock.period * np.arange(rows)
     stated = None if sensors is None else sensor_set(machine, sensors)
-    command, reading, noise, smoothed = {}, {}, {}, {}
+    command, reading, found, smoothed = {}, {}, {}, {}
+    told = noise or {}
     for k, (name, values) in enumerate(log.columns.items()):
         channel = parse_channel(name)
         if channel.truth or (channel.axis and channel.axis not in machine.axes):
@@ -79,15 +83,16 @@ def read_signals(machine: Machine, log: Log, sensors: str | None) -> Signals:
         error = machine.sensor_errors.get(name, SensorError())
         on_clock = _corrected(on_clock, error, clock.period)
         known = on_clock[np.isfinite(on_clock)]
-        sigma = noise_rms(machine, stated, name) / error.scale or None
+        sigma = told.get(name) or noise_rms(machine, stated, name)
+        sigma = sigma / error.scale or None
         if len(known) < _LEAST or (sigma is None and np.ptp(known) == 0.0):
             continue
         motion = smoothing.smooth(on_clock[:, None], clock.period, sigma)
         best = np.stack([motion.value, motion.rate, motion.acceleration])[None, :, :, 0]
         draws = smoothing.error_draws(motion, DRAWS, k)[..., 0]
-        reading[name], noise[name] = on_clock, float(motion.noise[0])
+        reading[name], found[name] = on_clock, float(motion.noise[0])
         smoothed[name] = np.concatenate([best, best + draws])
-    return Signals(time, clock.period, command, reading, noise, smoothed)
+    return Signals(time, clock.period, command, reading, found, smoothed)
 
 
 def joint_motion(machine: Machine, signals: Signals, axis: str) -> np.ndarray | None:
@@ -142,8 +147,9 @@ def spool_positions(machine: Machine, signals: Signals, axis: str) -> np.ndarray
         for i in range(parts):
             target = arriving(command, row, i * part, (i + 1) * part, signals.period, delay)
             position, rate = spool_step(
-                position, rate, target, valve.bandwidth, valve.damping, part
-            )
+                position, rate, target, valve.bandwidth, valve.damping, part,
+                valve.slew_limit or 0.0,
+            )  # fmt: skip
     return spool
 
 
@@ -154,7 +160,8 @@ def _last_known(values: np.ndarray) -> np.ndarray:
 
 def _corrected(values: np.ndarray, error: SensorError, period: float) -> np.ndarray:
     values = (values - error.offset) / error.scale
-    if error.delay == 0.0:
+    if not error.late:
         return values
-    rows, lag = np.arange(len(values)), error.delay / period
+    # a first-order lag delays motions slower than itself by its time constant
+    rows, lag = np.arange(len(values)), (error.delay + error.time_constant) / period
     return np.interp(rows + lag, rows, values, right=np.nan)

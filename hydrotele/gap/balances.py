@@ -4,12 +4,13 @@ A balance is computed from smoothed signals, without any simulation of the machi
 what the sensors' noise, and what smoothing takes from the signals, would make of it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.mechanism import JOINT
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.gap.balance_laws import chamber_residuals, load_forces, supply_pressures
@@ -24,6 +25,7 @@ from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.log import Log
 from hydrotele.machine import Machine
+from hydrotele.signals import usual_unit
 
 # Hz: below the 2.5 Hz at which an excavator rings on its oil and accelerations drown in the noise
 BAND = 1.5
@@ -53,7 +55,42 @@ class Balance:
     normalised_rms: float
 
 
-def balances(machine: Machine, log: Log, sensors: str | None) -> dict[str, dict[str, Balance]]:
+def run_balances(
+    machine: Machine, data: Dataset, run: RunData, noise: np.ndarray
+) -> dict[str, dict[str, Balance]]:
+    """Balances of a run as a dataset has it: mended, and without rows that may not be used.
+
+    Args:
+        machine: the model.
+        data: the dataset, for axes, channels and sensors.
+        run: one of its runs.
+        noise: (c,) standard deviation of one logged reading [channel's unit].
+
+    Returns:
+        As `balances`; residuals are NaN in rows that a mask leaves out.
+    """
+    columns = {f"command.{axis}": v for axis, v in zip(data.axes, run.command.T, strict=True)}
+    columns |= dict(zip(data.channels, run.reading.T, strict=True))
+    time = run.start + run.period * np.arange(len(run.command))
+    log = Log(time, columns, {c: usual_unit(c, columns) for c in columns}, source=run.name)
+    each = noise if run.behind is None else noise / np.sqrt(run.behind)
+    known = dict(zip(data.channels, each.tolist(), strict=True))
+    found = balances(machine, log, data.sensors, known)
+    if run.valid is None or run.valid.all():
+        return found
+
+    def masked(balance: Balance) -> Balance:
+        row = np.clip(np.round((balance.time - run.start) / run.period), 0, len(time) - 1)
+        assert run.valid is not None
+        residual = np.where(run.valid[row.astype(int)], balance.residual, np.nan)
+        return _balance(balance.time, residual, balance.noise, balance.unit)
+
+    return {law: {p: masked(b) for p, b in places.items()} for law, places in found.items()}
+
+
+def balances(
+    machine: Machine, log: Log, sensors: str | None, noise: Mapping[str, float] | None = None
+) -> dict[str, dict[str, Balance]]:
     """Balances of all laws that a log's channels allow.
 
     `closure`: measured cylinder length minus that from the measured angle. `force`: force of the
@@ -66,6 +103,7 @@ def balances(machine: Machine, log: Log, sensors: str | None) -> dict[str, dict[
         machine: the model.
         log: one run of the machine.
         sensors: name of the machine's sensors; None to find their noise from the data.
+        noise: channel -> standard deviation of one reading, in place of the sensors'.
 
     Returns:
         Law -> axis (or "supply") -> Balance; what lacks a channel is absent.
@@ -73,7 +111,7 @@ def balances(machine: Machine, log: Log, sensors: str | None) -> dict[str, dict[
     Raises:
         InputError: the time stamps follow no clock, or the machine has no such sensors.
     """
-    signals = read_signals(machine, log, sensors)
+    signals = read_signals(machine, log, sensors, noise)
     found: dict[str, dict[str, Balance]] = {}
     for law in (_closure, _force, _flow_and_timing, _supply):
         for name, place, balance in law(machine, signals):
@@ -154,7 +192,9 @@ def _flow_and_timing(machine: Machine, signals: Signals) -> Found:
     for name, axis in machine.hydraulic_axes.items():
         channels = f"pressure_head.{name}", f"pressure_rod.{name}", "pressure_supply"
         motion = joint_motion(machine, signals, name)
-        if motion is None or name not in signals.command or not signals.has(*channels):
+        if axis.valve is None or motion is None or name not in signals.command:
+            continue
+        if not signals.has(*channels):
             continue
         head, rod, supply = (signals.smoothed[c] for c in channels)
         linkage, spool = axis_linkage(machine, name), spool_positions(machine, signals, name)
@@ -181,7 +221,7 @@ def _flow_and_timing(machine: Machine, signals: Signals) -> Found:
 
 
 def _supply(machine: Machine, signals: Signals) -> Found:
-    names = list(machine.hydraulic_axes)
+    names = [name for name, axis in machine.hydraulic_axes.items() if axis.valve]
     chambers = [f"pressure_{side}.{name}" for name in names for side in ("head", "rod")]
     commanded = all(name in signals.command for name in names)
     if not (names and commanded and signals.has("pressure_supply", *chambers)):

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from hydrotele.gap.residuals import ALLOWED
+from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import Evidence
 from hydrotele.prediction.hypothesis import Guess
 
@@ -39,18 +40,30 @@ def _spread(evidence: Evidence, guess: Guess) -> tuple[float, str]:
     table = [_pull(evidence, guess, index) for index in range(len(evidence.tracks))]
     gains = [_gain(g, information) for g, information in table]
     whole, _ = _gain(np.sum([g for g, _ in table], axis=0), np.sum([i for _, i in table], axis=0))
-    freedom = sum(rank for _, rank in gains) - len(guess.deviation)
+    freedom = sum(rank for _, rank in gains) - len(guess.deviation) + len(_calibrated(guess))
     value = (sum(gain for gain, _ in gains) - whole) / freedom if freedom > 0 else 0.0
     worst = int(np.argmax([gain for gain, _ in gains]))
     return float(value), evidence.tracks[worst].run.name
+
+
+def _calibrated(guess: Guess) -> set[int]:
+    """Places of numbers that belong to a calibration: they may take up what runs differ by."""
+    found, first = set(), 0
+    for hypothesis, deviation in guess.parts:
+        if hypothesis.name == CALIBRATION:
+            found |= set(range(first, first + len(deviation)))
+        first += len(deviation)
+    return found
 
 
 def _pull(evidence: Evidence, guess: Guess, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Gradient (P,) and information (P, P) of one run."""
     tracks = (evidence.tracks[index],)
     errors = evidence.errors(guess, tracks=tracks)
-    columns = []
+    columns, left_out = [], _calibrated(guess)
     for place, nudge in enumerate(guess.nudges()):
+        if place in left_out:
+            continue
         moved = guess.deviation
         moved[place] += nudge
         columns.append((evidence.errors(guess.at(moved), tracks=tracks) - errors) / nudge)

@@ -19,15 +19,14 @@ from hydrotele.compiled import compiled
 from hydrotele.dynamics.integrate import place
 from hydrotele.dynamics.model import X, model_space, reduced_model
 from hydrotele.effects import Parameter
-from hydrotele.gap.result import Lack, LearnedLaw, Prediction, Unknown
 from hydrotele.gap.search import ENTER, lacking
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
 from hydrotele.prediction.evidence import Evidence, Judged, charge
 from hydrotele.prediction.hypothesis import Hypothesis
 from hydrotele.prediction.inputs import Input, input_sizes, input_units
-from hydrotele.prediction.linear import linear_run, smooth
-from hydrotele.prediction.track import STARTLE, Track, by_kind, state_drift
+from hydrotele.prediction.levels import smoothed, smoothed_inputs
+from hydrotele.prediction.track import Track
 from hydrotele.terms.facts import Term
 
 LEARNED = "learned"
@@ -40,9 +39,6 @@ _TRIED = 3  # laws that are fitted inside the machine for a balance
 _LEAST_R2 = 0.1  # of an input, predicted for runs that were not fitted, for a law to be tried
 _KEEP = 6.0  # fall of BIC that a kink must bring
 _STEP = 2.0e-3  # s, for the fits
-_WINDOW = 1.0  # s, of the windows in which a lack shows
-_SHOWS, _MOST_WINDOWS = 0.4, 5
-_ALIKE = 0.9  # share of a law's square that a simple form must have to be said to resemble it
 _VARIABLES: Mapping[str, tuple[str, ...]] = {
     "force": ("velocity", "position", "command", "force", "time"),
     "flow_head": ("pressure_head - pressure_rod", "pressure_head", "spool", "velocity", "position"),
@@ -50,9 +46,6 @@ _VARIABLES: Mapping[str, tuple[str, ...]] = {
     THROUGH: ("pressure_head - pressure_rod", "position", "spool", "velocity", "time"),
     "command": ("command", "spool", "velocity", "position", "force", "time"),
 }
-_UNITS = {"time": "s", "position": "m", "velocity": "m/s", "spool": "1", "command": "1",
-          "force": "N", "pressure_head": "Pa", "pressure_rod": "Pa",
-          "pressure_supply": "Pa"}  # fmt: skip
 
 
 class Shape(NamedTuple):
@@ -123,20 +116,6 @@ class Discovery:
     judged: Judged
     laws: tuple[Learned, ...]
 
-    def described(
-        self, machine: Machine, spread: np.ndarray, shares: Mapping[tuple[str, str], float]
-    ) -> tuple[LearnedLaw, ...]:
-        """The laws in words and numbers, with standard deviations from (P,) those of the guess."""
-        found, first = [], 0
-        laws = {law.hypothesis.key: law for law in self.laws}
-        for hypothesis, deviation in self.judged.guess.parts:
-            own = spread[first : first + hypothesis.size]
-            first += hypothesis.size
-            if hypothesis.key in laws:
-                law = laws[hypothesis.key]
-                found.append(_described(machine, law, deviation, own, shares[hypothesis.key]))
-        return tuple(found)
-
 
 def discover(evidence: Evidence, judged: Judged) -> Discovery:
     """Learn laws of what a guess lacks, one after the other.
@@ -195,19 +174,10 @@ def _drives_of(model, sp, states, position, velocity):
 
 def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
     machine = judged.guess.machine(nominal)
-    names, m = list(track.names), len(track.levels.inputs)
     size = track.states.shape[1]
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
-    told = smooth(
-        run, track.levels.noise**2, state_drift(names, track.levels, track.run.period), True
-    )
+    run, told = smoothed(track)
     states = track.states - run.correction[:, :size] + told.deviation[:, :size]
-    fading = np.diag(track.flow[0])[len(names) - m :] if m else np.zeros(0)
-    held, inputs = np.zeros(m), np.zeros((len(states), m))
-    for row in range(len(states)):  # what the track's own filter took the inputs to be
-        inputs[row] = held
-        held = fading * (held + run.correction[row, len(names) - m :])
-    inputs += told.deviation[:, len(names) - m :]
+    inputs = smoothed_inputs(track, (run, told))
     model = reduced_model(machine, ())
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
@@ -400,155 +370,3 @@ def _sparse(a: np.ndarray, b: np.ndarray, shape: Shape) -> list[bool]:
             break
         keep[worst], now = False, tried[worst]
     return keep
-
-
-def _described(
-    machine: Machine, law: Learned, deviation: np.ndarray, spread: np.ndarray, share: float
-) -> LearnedLaw:
-    hypothesis, shape = law.hypothesis, law.shape
-    scales = np.array([p.scale for p in hypothesis.parameters.values()])
-    coefficients = deviation * scales
-    a, _, b = shape.variable.partition(" - ")
-    x = law.seen[a] - law.seen[b] if b else law.seen[a]
-    points = np.unique(np.quantile(x[np.isfinite(x)], np.linspace(0.01, 0.99, 41)))
-    probe = {name: np.full(len(points), float(np.median(v))) for name, v in law.seen.items()}
-    probe[a] = points + probe[b] if b else points
-    if shape.factor:
-        probe["velocity"] = np.full(len(points), 1.0 if shape.factor == "velocity" else 1e3)
-        if a == "velocity":
-            probe["velocity"] = points
-    columns = shape.columns(probe, law.smoothing)
-    values = columns @ coefficients
-    error = np.sqrt((columns**2) @ (spread * scales) ** 2)
-    (unit,) = input_units(machine, [Input("flow_head" if law.balance == THROUGH else law.balance,
-                                          law.axis)])  # fmt: skip
-    along = shape.columns(law.seen, law.smoothing) @ coefficients
-    resembles = _resembles(law, along)
-    formula = " + ".join(
-        f"{c:.3g} {p}" if p != "1" else f"{c:.3g}"
-        for p, c in zip(shape.products, coefficients, strict=True)
-    ).replace("+ -", "- ")
-    what = {
-        "force": "A force on the drive", "flow_head": "A flow into the head side",
-        "flow_rod": "A flow into the rod side", THROUGH: "A flow from the head to the rod side",
-        "command": "An addition to the command",
-    }[law.balance]  # fmt: skip
-    with_what = {"": "", "velocity": ", times the speed"}.get(
-        shape.factor, ", with the sign of the motion"
-    )
-    size = float(np.sqrt(np.mean(along**2)))
-    text = (
-        f"{what} of the {law.axis}, {size:.3g} {unit} in size (RMS), that depends on"
-        f" {_words(shape.variable)}{with_what}."
-    )
-    if resembles:
-        text += f" It resembles {resembles.replace('_', ' ')}."
-    return LearnedLaw(
-        law.balance, law.axis, formula, text, resembles, shape.variable, tuple(points.tolist()),
-        tuple(values.tolist()), tuple(error.tolist()),
-        unit + (" s/m" if shape.factor == "velocity" else ""), _UNITS[a], share,
-    )  # fmt: skip
-
-
-def _words(variable: str) -> str:
-    text = variable.replace("pressure_head - pressure_rod", "the pressure across the piston")
-    names = {"pressure_head": "the head-side pressure", "pressure_rod": "the rod-side pressure",
-             "pressure_supply": "the supply pressure", "force": "the load",
-             "velocity": "the speed", "position": "the position", "command": "the command",
-             "spool": "the spool", "time": "the time"}  # fmt: skip
-    return names.get(text, text)
-
-
-def _resembles(law: Learned, along: np.ndarray) -> str:
-    """The library's effect whose form has nearly all of the law's square, or empty."""
-    s = law.seen
-    v = s["velocity"]
-    way = np.tanh(v / law.smoothing)
-    forms: dict[str, np.ndarray] = {}
-    if law.balance == "force":
-        forms = {"coulomb_friction": way, "viscous_friction": v, "speed_dependent_force": v * abs(v),
-                 "external_force": np.ones_like(v)}  # fmt: skip
-        if "force" in s:
-            forms["load_dependent_friction"] = abs(s["force"]) * way
-    elif law.balance in (THROUGH, "flow_head", "flow_rod") and "pressure_head" in s:
-        drop = s["pressure_head"] - s["pressure_rod"]
-        forms = {"internal_leakage": drop, "orifice_leakage": np.sign(drop) * np.sqrt(abs(drop))}
-    elif law.balance == "command":
-        u = s["command"]
-        forms = {"command_offset": np.ones_like(u), "valve_deadband": np.tanh(u / 0.02),
-                 "valve_gain": u}  # fmt: skip
-    whole = float(along @ along)
-    best, most = "", _ALIKE
-    for name, form in forms.items():
-        share = float(along @ form) ** 2 / (float(form @ form) * whole + 1e-300)
-        if share > most:
-            best, most = name, share
-    return best
-
-
-_LAW_OF = {"force": "force", "flow_head": "flow", "flow_rod": "flow", THROUGH: "flow",
-           "command": "valve"}  # fmt: skip
-
-
-def describe(
-    lacks: Sequence[Lack], learned: Sequence[LearnedLaw], after: Sequence[Prediction]
-) -> Unknown:
-    """Describe what no effect of the library explains.
-
-    Args:
-        lacks: what the named effects leave, by balance.
-        learned: laws that were found for it.
-        after: one-step predictions of the patched machine, the held-out run first.
-
-    Returns:
-        The law that fails, the channel that shows it most, and words.
-    """
-    channel = _worst_channel(after)
-    law, depends, words, term = "sensor", (), [], None
-    if lacks:
-        first = lacks[0]
-        law = _LAW_OF[first.balance]
-        words += [f"{_lack_words(lack)}." for lack in lacks[:3]]
-    if learned:
-        law, term = _LAW_OF[learned[0].balance], learned[0].formula
-        depends = tuple(
-            f"{part}.{learned[0].axis}" for part in learned[0].variable.split(" - ")
-            if part != "time"
-        )  # fmt: skip
-        words += [one.description for one in learned]
-    if not words:
-        words = [f"The readings of {channel} differ from the model by more than their noise, and no"
-                 " balance of forces or flows explains it: the sensor or the geometry."]  # fmt: skip
-    return Unknown(law, channel, depends, " ".join(words), term, _windows(after[0], channel))
-
-
-def _lack_words(lack: Lack) -> str:
-    what = {"force": "force on the drive", "flow_head": "flow into the head side",
-            "flow_rod": "flow into the rod side", "command": "command"}[lack.balance]  # fmt: skip
-    return f"The {lack.axis} lacks a {what} of {lack.size:.3g} {lack.unit} (standard deviation)"
-
-
-def _worst_channel(after: Sequence[Prediction]) -> str:
-    size = np.nanmean(np.concatenate([p.whitened**2 for p in after]), axis=0)
-    return after[0].channels[int(np.nanargmax(size))]
-
-
-def _windows(prediction: Prediction, channel: str) -> tuple[tuple[float, float], ...]:
-    """Up to five windows of a second or more in which a channel's errors are large."""
-    loud = prediction.whitened[:, prediction.channels.index(channel)] ** 2
-    period = float(np.median(np.diff(prediction.time)))
-    length = max(1, round(_WINDOW / period))
-    count = len(loud) // length
-    if count < 2:
-        return ()
-    blocks = loud[: count * length].reshape(count, length)
-    there = np.isfinite(blocks)
-    level = np.where(there, blocks, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
-    level[0] = 0.0
-    high = level > max(2.0, 1.0 + _SHOWS * (np.quantile(level, 0.95) - 1.0))
-    edges = np.flatnonzero(np.diff(np.r_[0, high.astype(int), 0]))
-    spans = [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-    spans = sorted(spans, key=lambda s: -level[s[0] : s[1]].sum())[:_MOST_WINDOWS]
-    start = float(prediction.time[0])
-    times = [(start + a * _WINDOW, start + b * _WINDOW) for a, b in sorted(spans)]
-    return tuple((round(a, 2), round(b, 2)) for a, b in times)

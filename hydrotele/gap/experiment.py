@@ -108,6 +108,23 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "relief_pressure": ("surges",),
     "pressure_offset": ("poses", "reversals"),
     "pressure_scale": ("poses", "reversals"),
+    "external_force": ("poses", "reversals"),
+    "load_dependent_friction": ("poses", "reversals"),
+    "force_pulse": ("reversals",),
+    "speed_dependent_force": ("reversals",),
+    "warming": ("reversals",),
+    "position_dependent_friction": ("sweeps", "reversals"),
+    "end_stop_stiffness": ("sweeps",),
+    "orifice_leakage": ("holds",),
+    "load_holding": ("holds",),
+    "command_offset": ("steps",),
+    "valve_gain_direction": ("steps",),
+    "valve_deadband_direction": ("steps",),
+    "flow_curve": ("steps",),
+    "metering_edges": ("steps",),
+    "spool_slew": ("steps",),
+    "load_compensation": ("steps",),
+    "pump_droop": ("surges",),
 }
 """Effect -> the motions that bring it out."""
 

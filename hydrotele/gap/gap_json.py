@@ -1,5 +1,6 @@
 """`gap.json`: what scripts read of a Gap. Its keys are fixed."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -15,12 +16,29 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         gap: what the search yields.
 
     Returns:
-        Keys `verdict`, `effects`, `unknown`, `gap`, `next_experiment`, `laws` (law -> `unit` and
-        `places`, place -> RMS `before`, `after` and `noise`), `seconds`.
+        `verdict`: named, partly, ambiguous, unknown or no_gap.
+        `effects`: named effects, see `effect_document`; `share` is the part of the held-out run's
+        gap that comes back without the effect.
+        `calibration`: uncertain number -> `value`, `nominal`, `unit`, `ci95`.
+        `learned`: laws learned from the data: `balance` (force, flow_head, flow_rod, flow_through,
+        command), `axis`, `variable`, `formula` in SI, `points` [`variable_unit`], `values` there
+        and their standard deviations `spread` [`unit`], `resembles` (a library effect or null),
+        `share`, `description`.
+        `unknown`: what no effect explains, or null: `law`, `channel`, `depends_on`, `windows`
+        [s], `description`.
+        `lacks`: what the patched machine still lacks: `balance`, `axis`, standard deviation `size`
+        [`unit`], `part` of the largest that makes sense.
+        `noise`: channel -> `found` and `stated` standard deviation of a reading [SI].
+        `gap`: RMS prediction errors `before` and `after`, and `noise_floor`, of the held-out run.
+        `tests`: residual test -> `value`, `limit`, `passed`.
+        `laws`: balance -> `unit` and `places`, place -> RMS `before`, `after` and `noise`.
+        `next_experiment`: `reason` and `scenario`, or null. `notes`: on the data. `seconds`.
     """
     unknown = gap.unknown and {
         "law": gap.unknown.law,
+        "channel": gap.unknown.channel,
         "depends_on": list(gap.unknown.depends_on),
+        "windows": [list(window) for window in gap.unknown.windows],
         "description": gap.unknown.description,
     }
     size = gap.size
@@ -31,15 +49,29 @@ def gap_document(gap: Gap) -> dict[str, Any]:
     return finite({
         "verdict": gap.verdict,
         "effects": [effect_document(effect) for effect in gap.effects],
+        "calibration": {
+            key: {"value": e.value, "nominal": e.nominal, "unit": e.unit, "ci95": [e.low, e.high]}
+            for key, e in gap.calibration.items()
+        },
+        "learned": [
+            {**dataclasses.asdict(law), "resembles": law.resembles or None} for law in gap.learned
+        ],
         "unknown": unknown,
+        "lacks": [dataclasses.asdict(lack) for lack in gap.lacks],
+        "noise": {
+            channel: {"found": found, "stated": stated}
+            for channel, (found, stated) in gap.noise.items()
+        },
         "gap": {
             "metric": size.metric,
             "before": size.before,
             "after": size.after,
             "noise_floor": size.noise_floor,
         },
-        "next_experiment": gap.next_experiment,
+        "tests": gap.tests,
         "laws": laws,
+        "next_experiment": gap.next_experiment,
+        "notes": list(gap.notes),
         "seconds": gap.seconds,
     })  # fmt: skip
 
@@ -50,6 +82,7 @@ def effect_document(effect: NamedEffect) -> dict[str, Any]:
         "name": effect.name,
         "location": effect.location,
         "probability": effect.probability,
+        "share": effect.share,
         "parameters": {
             name: {"value": e.value, "unit": e.unit, "ci95": [e.low, e.high]}
             for name, e in effect.parameters.items()

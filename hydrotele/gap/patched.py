@@ -5,24 +5,25 @@ from pathlib import Path
 import yaml
 
 from hydrotele.gap.customary import said
-from hydrotele.gap.gap_json import effect_document, finite
-from hydrotele.gap.result import Gap
-from hydrotele.gap.words import effect_title
+from hydrotele.gap.gap_json import effect_document, finite, gap_document
+from hydrotele.gap.result import Estimate, Gap
+from hydrotele.gap.words import effect_title, learned_title, number_title
 from hydrotele.machine_file import MACHINE_FILE, save_machine
 
 EFFECTS_FILE = "effects.yaml"
 
 
 def has_patch(gap: Gap) -> bool:
-    """Whether there is something to patch: an effect was named, for certain or as the best."""
-    return gap.verdict != "no_gap" and bool(gap.effects)
+    """Whether anything was changed: effects named, numbers calibrated, laws learned."""
+    return bool(gap.effects or gap.calibration or gap.learned)
 
 
 def write_patch(gap: Gap, folder: Path) -> None:
     """Write the patched machine, which `load_machine(folder)` reads, and what was changed.
 
     `machine.yaml` is the complete machine; its head says in comments what the effects are.
-    `effects.yaml` has their values, units and 95 % intervals, and the values of the given model.
+    `effects.yaml` has their values, units and 95 % intervals, and the values of the given model;
+    so it has the calibrated numbers and the learned laws.
 
     Args:
         gap: what the search yields.
@@ -43,6 +44,8 @@ def write_patch(gap: Gap, folder: Path) -> None:
         for name, estimate in effect.parameters.items():
             document["parameters"][name]["nominal"] = estimate.nominal
         record["effects"].append(document)
+    document = gap_document(gap)
+    record |= {"calibration": document["calibration"], "learned": document["learned"]}
     text = yaml.safe_dump(finite(record), sort_keys=False, default_flow_style=None)
     (folder / EFFECTS_FILE).write_text(text, encoding="utf-8")
 
@@ -52,8 +55,14 @@ def _head(gap: Gap) -> list[str]:
     for effect in gap.effects:
         lines.append(f"- {effect_title(effect)}, probability {effect.probability:.3f}")
         for name, estimate in effect.parameters.items():
-            s = said(estimate, name)
-            lines.append(
-                f"    {name}: {s.value} {s.unit} (95 %: {s.low} .. {s.high}), was {s.nominal}"
-            )
+            lines.append(f"    {name}: {_found(estimate, name)}")
+    for key, estimate in gap.calibration.items():
+        lines.append(f"- calibrated {number_title(key)}: {_found(estimate, key)}")
+    for law in gap.learned:
+        lines.append(f"- learned {learned_title(law)} (see terms): {law.formula} [{law.unit}]")
     return [*lines, f"Values, units and intervals for programs are in {EFFECTS_FILE}."]
+
+
+def _found(estimate: Estimate, name: str) -> str:
+    s = said(estimate, name)
+    return f"{s.value} {s.unit} (95 %: {s.low} .. {s.high}), was {s.nominal}"

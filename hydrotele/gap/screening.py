@@ -72,14 +72,12 @@ def _rank(
     def errors_of(moved: Guess, step: float) -> np.ndarray:
         return evidence.errors(moved, step, tracks)
 
+    present = guess.deviation
+    slopes = evidence.base_slopes_of(tracks) if len(present) else None
+
     def ground_of(step: float) -> _Ground:
-        errors, now, nudges = errors_of(guess, step), guess.deviation, guess.nudges(WIDE)
-        slopes = np.zeros((len(errors), len(now)))
-        for i, nudge in enumerate(nudges):
-            moved = now.copy()
-            moved[i] += nudge
-            slopes[:, i] = (errors_of(guess.at(moved), step) - errors) / nudge
-        return _Ground(errors, slopes, now)
+        errors = errors_of(guess, step)
+        return _Ground(errors, np.zeros((len(errors), 0)) if slopes is None else slopes, present)
 
     steps = {h.key: evidence.step_of(guess.plus(h, h.starts[-1]), COARSE) for h in candidates}
     unlike = sorted(set(steps.values()))
@@ -94,7 +92,9 @@ def _rank(
 
         rated = []
         for start in hypothesis.starts:
-            if np.any(start):
+            if np.any(start) and hypothesis.size > 1:
+                rated.append(_point(hypothesis, ground, start, shift_to(start)))
+            elif np.any(start):
                 line = _line(hypothesis, ground, (shift_to(start) / start[0])[:, None])
                 rated.append(Screened(hypothesis, line.score, line.gain, start))
             else:

@@ -7,23 +7,25 @@ in a few readings (`weights`).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hydrotele.gap.screening import Screened, screen
 from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
-from hydrotele.prediction.evidence import Evidence, Fit, Judged, charge
+from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
-from hydrotele.prediction.levels import input_excess
+from hydrotele.prediction.inputs import Input
+from hydrotele.prediction.levels import input_excess, smoothed_inputs
 from hydrotele.prediction.track import COARSE
 
 ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines stay below 14.7
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
+_SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
+_ROOM = 3.0  # times the room to a bound that an effect gets that stands there
 _STEPS = 3  # of Gauss-Newton for a candidate
-_MIDDLE = 2.0e-3  # s, step for the fits that choose between candidates
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
@@ -92,6 +94,7 @@ def search(
     tell("find noise levels of the given model", 0.0)
     base = now = evidence.set_base(Guess())
     fit, weak, first, refused, tried = None, None, (), 0, False
+    candidates = _timed(candidates, base)
     rankings: dict[tuple[str, str], Sequence[Screened]] = {}
     worth = 0.0
     while refused < _REFUSED:
@@ -151,6 +154,50 @@ def search(
     return Found(base, now, fit, first, tuple(charges), without, tuple(rivals), weak)
 
 
+def _timed(candidates: Sequence[Hypothesis], base: Judged) -> list[Hypothesis]:
+    """Candidates of which those that act for a while only begin when the unknown inputs say so."""
+    inputs = base.tracks[0].levels.inputs
+    series = None
+    found = []
+    for candidate in candidates:
+        acts = Input("force", candidate.location)
+        if not {"size", "start", "duration"} <= candidate.parameters.keys() or acts not in inputs:
+            found.append(candidate)
+            continue
+        if series is None:
+            series = [smoothed_inputs(t) for t in base.tracks]
+        place = inputs.index(acts)
+        spans = [
+            _loudest(u[:, place], t.run.period) for u, t in zip(series, base.tracks, strict=True)
+        ]
+        best = int(np.argmax([span[0] for span in spans]))
+        _, size, first, rows = spans[best]
+        run, table = base.tracks[best].run, dict(candidate.parameters)
+        table["size"] = replace(table["size"], starts=(size,))
+        for key, value in (
+            ("start", run.start + first * run.period),
+            ("duration", rows * run.period),
+        ):
+            table[key] = replace(table[key], nominal=value)
+        found.append(replace(candidate, parameters=table))
+    return found
+
+
+def _loudest(u: np.ndarray, period: float) -> tuple[float, float, int, int]:
+    """The span of a series (n,) whose mean stands out most: its score, mean, first row, rows."""
+    total = np.concatenate([[0.0], np.cumsum(u - np.median(u))])
+    best = (0.0, 0.0, 0, 1)
+    rows = max(2, round(0.1 / period))
+    while rows < 0.7 * len(u):
+        sums = total[rows:] - total[:-rows]
+        at = int(np.argmax(np.abs(sums)))
+        score = float(sums[at] ** 2 / rows)
+        if score > best[0]:
+            best = score, float(sums[at] / rows), at, rows
+        rows = max(rows + 1, int(1.3 * rows))
+    return best
+
+
 def lacking(judged: Judged, evidence: Evidence) -> float:
     """Twice the log likelihood that the unknown inputs of a guess bring."""
     return sum(evidence.map(input_excess, judged.tracks))
@@ -206,11 +253,11 @@ def _best_single(
     short = [s for s in ranked[:_SHORT] if s.score > bar]
     if not short:
         return None, 0.0
-    evidence.base_slopes(_MIDDLE)
+    evidence.base_slopes(MIDDLE)
 
     def fitted(candidate: Screened) -> Fit:
         more = now.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, _MIDDLE)
+        step = evidence.step_of(more, MIDDLE)
         kept = evidence.base_slopes(step, parallel=False)
         before = _loss_of(evidence, now.guess, step)
         return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
@@ -259,9 +306,9 @@ def _best_pair(
         for index in pair:
             start = pool[index].start
             more = more.plus(pool[index].hypothesis, start)
-        kept = evidence.base_slopes(_MIDDLE, parallel=False)
-        before = _loss_of(evidence, now.guess, _MIDDLE)
-        found = evidence.fit(more, before, parallel=False, step=_MIDDLE, kept=kept)
+        kept = evidence.base_slopes(MIDDLE, parallel=False)
+        before = _loss_of(evidence, now.guess, MIDDLE)
+        found = evidence.fit(more, before, parallel=False, step=MIDDLE, kept=kept)
         sizes = sum(h.size for h, _ in more.parts[len(now.guess.parts) :])
         return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
                    found.information)  # fmt: skip
@@ -280,7 +327,7 @@ def _calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
     judged, gain, cost = now, 0.0, 0.0
     guess = now.guess.plus(group, np.zeros(group.size))
     for _ in range(3):
-        step = evidence.step_of(guess, _MIDDLE)
+        step = evidence.step_of(guess, MIDDLE)
         errors = evidence.errors(guess, step)
         slopes = evidence.slopes(guess, errors, step=step)
         fit = evidence.fit(guess, 0.0, step=step, kept=slopes, steps=3)
@@ -345,19 +392,39 @@ def _promoted(
 def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
     """Fit with levels and gains computed anew until they no longer matter."""
     fit = None
-    for _ in range(3):
+    for _ in range(_SETTLES):
         evidence.set_base(judged)
-        kept = evidence.base_slopes() if _calibration_of(judged.guess) else None
-        fit = evidence.fit(judged.guess, 0.0, kept=kept)
+        kept = evidence.base_slopes(MIDDLE) if _calibration_of(judged.guess) else None
+        fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if kept is not None else None)
         moved = fit.guess.deviation - judged.guess.deviation
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
         if np.all(np.abs(moved) < 0.3 * spread):
             break
-        judged = evidence.judged(fit.guess)
+        judged = evidence.judged(_widened(fit.guess))
     assert fit
     if fit.guess is not judged.guess:
         judged = evidence.set_base(evidence.judged(fit.guess))
     return judged, fit
+
+
+def _widened(guess: Guess) -> Guess:
+    """A guess in which effects that stand at a bound have three times as much room.
+
+    A bound at zero is physical and stays.
+    """
+    parts = []
+    for hypothesis, deviation in guess.parts:
+        table, values = dict(hypothesis.parameters), hypothesis.values(deviation)
+        for key, p in hypothesis.parameters.items():
+            if hypothesis.name == CALIBRATION:
+                continue
+            if values[key] >= p.high:
+                table[key] = replace(p, high=p.nominal + _ROOM * (p.high - p.nominal))
+            elif values[key] <= p.low and p.low != 0.0:
+                low = p.low / _ROOM if p.low > 0.0 else p.nominal - _ROOM * (p.nominal - p.low)
+                table[key] = replace(p, low=low)
+        parts.append((replace(hypothesis, parameters=table), deviation))
+    return Guess(tuple(parts))
 
 
 def worth_naming(guess: Guess, index: int, score: float) -> bool:
@@ -398,7 +465,7 @@ def _rests(
     """For each part the guess without it, fitted and judged (None for calibration); scores."""
     rests: list[Judged | None] = []
     scores: list[float] = []
-    slopes = evidence.base_slopes() if now.guess.parts else np.zeros((0, 0))
+    slopes = evidence.base_slopes(MIDDLE) if now.guess.parts else np.zeros((0, 0))
     sizes = np.cumsum([0, *(h.size for h, _ in now.guess.parts)])
     for index, (hypothesis, _) in enumerate(now.guess.parts):
         assert fit
@@ -409,7 +476,7 @@ def _rests(
         smaller = now.guess.without(index)
         kept = np.delete(slopes, np.s_[sizes[index] : sizes[index + 1]], axis=1)
         if smaller.parts:
-            smaller = evidence.fit(smaller, 0.0, kept=kept, steps=2).guess
+            smaller = evidence.fit(smaller, 0.0, kept=kept, steps=2, step=MIDDLE).guess
         rest = evidence.judged(smaller, base.tracks) if smaller.parts else base
         cost = charge(_last(fit.information, now.guess, index), hypothesis.size)
         score = rest.loss - now.loss - cost
@@ -451,11 +518,11 @@ def _rivals(
     if not pool:
         return ()
     evidence.set_base(rest)
-    evidence.base_slopes(_MIDDLE)
+    evidence.base_slopes(MIDDLE)
 
     def fitted(candidate: Screened) -> Fit:
         more = rest.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, _MIDDLE)
+        step = evidence.step_of(more, MIDDLE)
         kept = evidence.base_slopes(step, parallel=False)
         before = _loss_of(evidence, rest.guess, step)
         return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
@@ -469,7 +536,10 @@ def _rivals(
             continue
         if judged.loss < now.loss + _HOPELESS:  # worth a second look at its own levels
             evidence.set_base(judged)
-            again = evidence.fit(judged.guess, 0.0, step=evidence.step_of(judged.guess, _MIDDLE))
+            step = evidence.step_of(judged.guess, MIDDLE)
+            again = evidence.fit(
+                judged.guess, 0.0, step=step, kept=evidence.base_slopes(step), steps=3
+            )
             better = evidence.judged(again.guess)
             judged = min(judged, better, key=lambda j: j.loss)
             evidence.set_base(rest)

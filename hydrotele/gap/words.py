@@ -3,8 +3,17 @@
 import math
 
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.customary import said
-from hydrotele.gap.result import Alternative, Candidate, Estimate, Gap, GapSize, NamedEffect
+from hydrotele.gap.customary import amount, said
+from hydrotele.gap.result import (
+    Alternative,
+    Candidate,
+    Estimate,
+    Gap,
+    GapSize,
+    Lack,
+    LearnedLaw,
+    NamedEffect,
+)
 
 _PLACES = {"tool": "at the tool", "base": "of the base", "all": "of all axes"}
 _SIDES = {"head": "head side", "rod": "rod side"}
@@ -19,6 +28,20 @@ _QUANTITIES = {
     "pressure_rod": "rod side pressure",
     "pressure_supply": "supply pressure",
 }
+_LACKS = {
+    "force": "a force on the {axis} drive",
+    "flow_head": "an oil flow into the {axis} head side",
+    "flow_rod": "an oil flow into the {axis} rod side",
+    "flow_through": "an oil flow from the {axis} head side to its rod side",
+    "command": "a signal added to the {axis} command",
+}
+_VARIABLES = {
+    "time": "time", "position": "position", "velocity": "velocity", "command": "command",
+    "spool": "spool position", "force": "load", "pressure_head": "head side pressure",
+    "pressure_rod": "rod side pressure", "pressure_supply": "supply pressure",
+    "pressure_head - pressure_rod": "pressure difference between head and rod side",
+}  # fmt: skip
+_TOLD = 3  # calibrated numbers that the verdict tells
 _SLIGHT = 0.1  # of the noise: a gap below it hardly shows in single predictions
 
 _LAWS = {
@@ -49,6 +72,69 @@ def channel_words(channel: str) -> str:
     """
     kind, _, axis = channel.partition(".")
     return f"{axis} {_QUANTITIES.get(kind, kind.replace('_', ' '))}".strip()
+
+
+def variable_words(variable: str) -> str:
+    """A variable of a learned law in plain words."""
+    return _VARIABLES.get(variable, variable.replace("_", " "))
+
+
+def learned_words(
+    balance: str, axis: str, variable: str, factor: str, size: float, unit: str, resembles: str
+) -> str:
+    """What a learned law does, in a sentence or two.
+
+    >>> learned_words("force", "boom", "position", "velocity", 9e3, "N", "")
+    'A force on the boom drive, 9 kN RMS, that varies with position and grows with the velocity.'
+    """
+    how = f"that varies with the {variable_words(variable)}"
+    how = how.replace("the position", "position").replace("the time", "time")
+    if factor == "velocity":
+        how += " and grows with the velocity"
+    elif factor:
+        how += " and changes sign with the motion"
+    text = f"{_capital(_LACKS[balance].format(axis=axis))}, {amount(size, unit)} RMS, {how}."
+    return f"{text} It resembles {resembles.replace('_', ' ')}." if resembles else text
+
+
+def learned_title(law: LearnedLaw) -> str:
+    """On what a learned law acts and on what it depends, in a few words."""
+    what = _LACKS[law.balance].format(axis=law.axis).partition(" ")[2]
+    return _capital(f"{what} over {variable_words(law.variable)}")
+
+
+def lack_words(lack: Lack) -> str:
+    """What a model lacks in one balance.
+
+    >>> lack_words(Lack("flow_head", "boom", 2e-4, "m^3/s", 0.05))
+    'The model lacks an oil flow into the boom head side of 12 L/min (standard deviation).'
+    """
+    what = _LACKS[lack.balance].format(axis=lack.axis)
+    return f"The model lacks {what} of {amount(lack.size, lack.unit)} (standard deviation)."
+
+
+def number_title(key: str) -> str:
+    """A calibrated number in plain words.
+
+    >>> number_title("valve_gain.boom.ratio"), number_title("area.boom.area_head")
+    ('valve gain of the boom: ratio', 'area of the boom: head')
+    """
+    kind, place, *rest = key.split(".")
+    where = _PLACES.get(place, f"of the {place.replace('_', ' ')}")
+    what = " ".join(rest).removeprefix(f"{kind}_").replace("_", " ")
+    title = f"{kind.replace('_', ' ')} {where}"
+    return f"{title}: {what}" if what and what != kind.replace("_", " ") else title
+
+
+def most_moved(gap: Gap) -> list[str]:
+    """Keys of the calibrated numbers, those whose interval lies farthest from the given first."""
+
+    def moved(key: str) -> float:
+        e = gap.calibration[key]
+        half = 0.5 * (e.high - e.low)
+        return abs(e.value - e.nominal) / half if half > 0 else 0.0
+
+    return sorted(gap.calibration, key=moved, reverse=True)
 
 
 def effect_title(effect: NamedEffect | Alternative | Candidate) -> str:
@@ -91,6 +177,15 @@ def chance_words(probability: float) -> str:
     return "under 0.1 %" if probability < 0.001 else f"{100 * probability:.3g} %"
 
 
+def share_words(share: float) -> str:
+    """A share of the gap in percent, `-` where it is not known.
+
+    >>> share_words(0.634), share_words(math.nan)
+    ('63 %', '-')
+    """
+    return f"{100 * share:.0f} %" if math.isfinite(share) else "-"
+
+
 def gap_closed(size: GapSize) -> float:
     """Part of the gap that the patch closes, at most 1; NaN where none is known above the noise."""
     if size.noise_floor is None:
@@ -102,7 +197,10 @@ def gap_closed(size: GapSize) -> float:
 def headline(gap: Gap) -> str:
     """The verdict in one line."""
     if gap.verdict == "no_gap":
-        return "Model and machine agree"
+        within = " within the uncertainty of its numbers" if gap.calibration else ""
+        return f"Model and machine agree{within}"
+    if gap.verdict == "partly":
+        return _capital("; ".join([*map(_brief, gap.effects), "the rest has no known cause"]))
     if gap.verdict == "unknown" or not gap.effects:
         known = " and ".join(effect_title(effect) for effect in gap.effects)
         also = f", besides {known}" if known else ""
@@ -120,17 +218,22 @@ def headline(gap: Gap) -> str:
 def verdict_words(gap: Gap) -> tuple[str, ...]:
     """The verdict in a few sentences, one text per thought."""
     if gap.verdict == "no_gap":
-        return (_agreement(gap),)
+        rest = _calibrated(gap) or ("Nothing in the model needs to change.",)
+        return (_agreement(gap), *rest)
     if gap.verdict == "unknown":
-        return (*_unknown(gap), *map(_effect, gap.effects), *_shrinking(gap), *_experiment(gap))
+        return (
+            *_unknown(gap), *_effects(gap), *_calibrated(gap), *_shrinking(gap), *_experiment(gap)
+        )  # fmt: skip
     count = len(gap.effects)
     where = _COUNTS[count] if count < len(_COUNTS) else f"{count} places"
     first = f"The machine differs from its model in {where}."
     if gap.verdict == "ambiguous":
         first = f"{first[:-1]}, but these data do not settle which effect it is."
-    rivals = _rivals(gap) if gap.verdict == "ambiguous" else ()
-    rest = (*_shrinking(gap), *rivals, *_leftover(gap), *_experiment(gap))
-    return (first, *map(_effect, gap.effects), *rest)
+    if gap.verdict == "partly":
+        first = f"{first[:-1]} that can be named, and in a way that no known effect explains."
+    rivals = _rivals(gap) if gap.verdict in ("ambiguous", "partly") else ()
+    rest = (*_calibrated(gap), *_shrinking(gap), *rivals, *_leftover(gap), *_experiment(gap))
+    return (first, *_effects(gap), *rest)
 
 
 def failed_tests(gap: Gap) -> list[str]:
@@ -150,27 +253,55 @@ def _brief(effect: NamedEffect) -> str:
     return f"{effect_title(effect)}: {facts}" if facts else effect_title(effect)
 
 
-def _effect(effect: NamedEffect) -> str:
+def _effects(gap: Gap) -> tuple[str, ...]:
+    return tuple(_effect(effect, _run(gap)) for effect in gap.effects)
+
+
+def _effect(effect: NamedEffect, run: str) -> str:
     facts = ", ".join(parameter_words(n, e) for n, e in effect.parameters.items())
     known = EFFECTS.get(effect.name)
     what = f"{effect_title(effect)} ({known.sentence})" if known else effect_title(effect)
-    return _capital(f"{what}: {facts}. Probability {chance_words(effect.probability)}.")
+    text = _capital(f"{what}: {facts}. Probability {chance_words(effect.probability)}.")
+    if math.isfinite(effect.share):
+        text += f" Without it {share_words(effect.share)} of the gap on {run} comes back."
+    return text
+
+
+def _calibrated(gap: Gap) -> tuple[str, ...]:
+    if not gap.calibration:
+        return ()
+    told = [
+        f"{number_title(key)} {s.value} {s.unit} (model {s.nominal})"
+        for key in most_moved(gap)[:_TOLD]
+        for s in [said(gap.calibration[key], key.rpartition(".")[2])]
+    ]
+    count = len(gap.calibration)
+    many = f"{count} uncertain numbers were" if count > 1 else "One uncertain number was"
+    most = f"most moved: {', '.join(told)}"
+    return (f"{many} calibrated within what the machine file allows; {most}.",)
 
 
 def _agreement(gap: Gap) -> str:
     size = gap.size
+    if gap.calibration:
+        return (
+            "There is no gap but for numbers that are known to a few per cent only. With these"
+            f" calibrated, the model's predictions on {_run(gap)}, which was not fitted, are off by"
+            f" {_times(size.after, size)} instead of {size.before:.2f}."
+        )
     return (
         f"There is no gap: on {_run(gap)}, which was not fitted, the model's predictions are off"
-        f" by {_times(size.before, size)}. Nothing in the model needs to change."
+        f" by {_times(size.before, size)}."
     )
 
 
 def _shrinking(gap: Gap) -> tuple[str, ...]:
     size, closed = gap.size, gap_closed(gap.size)
-    if not gap.effects:
+    parts = len(gap.effects) + len(gap.learned) + bool(gap.calibration)
+    if not parts:
         return ()
     text = (
-        f"With {'it' if len(gap.effects) == 1 else 'them'} in the model, the prediction errors on"
+        f"With {'it' if parts == 1 else 'all of this'} in the model, the prediction errors on"
         f" {_run(gap)}, which was not fitted, go from {size.before:.2f} to"
         f" {_times(size.after, size)}"
     )
@@ -183,7 +314,7 @@ def _shrinking(gap: Gap) -> tuple[str, ...]:
 
 def _times(value: float, size: GapSize) -> str:
     if size.noise_floor is None:
-        return f"{value:.2f} times what the given model's were on the fitted runs"
+        return f"{value:.2f} times the sensors' noise"
     return (
         f"{value:.2f} times what the sensors alone explain (a perfect model has"
         f" {size.noise_floor:.2f})"
@@ -207,29 +338,38 @@ def _rivals(gap: Gap) -> tuple[str, ...]:
 
 def _leftover(gap: Gap) -> tuple[str, ...]:
     failed = failed_tests(gap)
+    located = _located(gap) if gap.unknown else ()
     if not failed:
-        return ()
+        return located
     tests = "test" if len(failed) == 1 else "tests"
-    return (
-        f"Not everything is explained: what is left fails the {tests} {_listed(failed, 'and')}.",
-    )
+    left = f"Not everything is explained: what is left fails the {tests} {_listed(failed, 'and')}."
+    return (left, *located)
 
 
 def _unknown(gap: Gap) -> tuple[str, ...]:
-    unknown, size = gap.unknown, gap.size
+    size = gap.size
     first = (
         "Model and machine disagree, and no effect that this program knows explains it: on"
         f" {_run(gap)} the predictions are off by {_times(size.before, size)}."
     )
+    return (first, *_located(gap))
+
+
+def _located(gap: Gap) -> tuple[str, ...]:
+    """Where the unexplained part sits, and which laws were learned of it."""
+    unknown = gap.unknown
     if unknown is None:
-        return (first,)
+        return ()
     where = (
         f"What fails is {law_words(unknown.law)}, seen most in the {channel_words(unknown.channel)}"
     )
     if unknown.depends_on:
         on = _listed([channel_words(name) for name in unknown.depends_on], "and")
         where += f"; it changes with the {on}"
-    return (first, f"{where}.", unknown.description)
+    count = len(gap.learned)
+    many = "One law was" if count == 1 else f"{count} laws were"
+    learned = f"{many} learned from the data for it and written into the patched machine."
+    return (f"{where}.", unknown.description, *([learned] if gap.learned else []))
 
 
 def _experiment(gap: Gap) -> tuple[str, ...]:

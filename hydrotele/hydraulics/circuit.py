@@ -3,7 +3,8 @@
 Pure functions on flat arrays laid out as MuJoCo keeps them, so that the native callbacks, the
 tests and an estimator run the same code. Axis `i` reads its numbers at `user[i * SLOTS + Slot]` and
 its activations `spool, spool_rate, p_head, p_rod` at `act[4 i ...]`, counted from the first
-hydraulic axis.
+hydraulic axis. An axis with a pump of its own (`Kind.PUMPED`, see `pump`) has the speed of its pump
+and the pressure of its load cylinder in the places of spool and spool rate.
 """
 
 import math
@@ -11,14 +12,18 @@ import math
 import numpy as np
 
 from hydrotele.compiled import compiled
-from hydrotele.hydraulics.laws import (
-    friction,
-    friction_slope,
-    port_flow,
-    spool_step,
-    stop_force,
+from hydrotele.hydraulics.actuator import (
+    actuator_friction,
+    actuator_friction_slope,
+    actuator_stop,
+    force_after_friction,
+    pumped_force,
+    pumped_rates,
+    pumped_volumes,
 )
-from hydrotele.hydraulics.slots import SLOTS, Kind, Slot
+from hydrotele.hydraulics.laws import port_flow, spool_step
+from hydrotele.hydraulics.pump import load_pressure_step, pump_flows, pump_speed_step
+from hydrotele.hydraulics.slots import PUMP, SLOTS, Kind, Slot
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows, inlet_flow, inlet_gain
 from hydrotele.terms.law import DriveState
 from hydrotele.terms.table import added_flows
@@ -26,8 +31,8 @@ from hydrotele.terms.table import added_flows
 __all__ = [
     "ACTIVATIONS", "MAX_AXES", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
     "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_state", "chamber_flows",
-    "circuit_scratch", "circuit_supply", "open_ports", "pressure_rates", "step_circuit",
-    "supply_pressure",
+    "circuit_scratch", "circuit_supply", "force_after_friction", "open_ports", "pressure_rates",
+    "pumped_force", "step_circuit", "supply_pressure",
 ]  # fmt: skip
 
 ACTIVATIONS = 4
@@ -50,12 +55,8 @@ _KR, _KM = int(Slot.RELIEF_GAIN), int(Slot.MAKEUP_GAIN)
 _BETA, _TANK = int(Slot.BULK_MODULUS), int(Slot.TANK_PRESSURE)
 _RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 _MARGIN, _DROOP = int(Slot.LOAD_SENSING_MARGIN), int(Slot.PUMP_DROOP)
-_FC, _FS = int(Slot.COULOMB), int(Slot.STRIBECK)
-_VS, _B = int(Slot.STRIBECK_VELOCITY), int(Slot.VISCOUS)
-_V0, _AC = int(Slot.COULOMB_VELOCITY), int(Slot.COULOMB_ASYMMETRY)
-_AV, _HOSE = int(Slot.VISCOUS_ASYMMETRY), int(Slot.HOSE_COMPLIANCE)
-_LOW, _HIGH = int(Slot.STOP_LOW), int(Slot.STOP_HIGH)
-_HARD, _SOFT = int(Slot.STOP_STIFFNESS), int(Slot.STOP_DAMPING)
+_HOSE = int(Slot.HOSE_COMPLIANCE)
+_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
 @compiled
@@ -143,6 +144,9 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
     """
     for i in range(count):
         u = (first + i) * SLOTS
+        if user[u + _KIND] == _PUMPED:  # draws nothing from the supply
+            ports[4 * i], ports[4 * i + 3] = 0.0, spool[4 * i]
+            continue
         opening = axis_opening(user, u, spool[4 * i])
         ports[4 * i] = inlet_gain(user, u, opening)
         ports[4 * i + 2], ports[4 * i + 3] = user[u + _DROP], opening
@@ -192,7 +196,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     Args:
         user: (nu * SLOTS,) actuator numbers.
         u: place of this axis in `user`.
-        opening: o, scalar [1].
+        opening: o, scalar [1]; of an axis with a pump of its own the speed of it [rad/s].
         p_supply: scalar [Pa].
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
@@ -208,6 +212,8 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
 
     Source: nominal model, "Chambers".
     """
+    if user[u + _KIND] == _PUMPED:
+        return pumped_rates(user, u, opening, p_head, p_rod, x, v)
     q_head, q_rod, slope_head, slope_rod = chamber_flows(user, u, opening, p_supply, p_head, p_rod)
     leak = user[u + _LEAK] * (p_head - p_rod)
     port, relief_gain = user[u + _PORT], user[u + _KR]
@@ -280,6 +286,12 @@ def step_circuit(
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         bounded = min(1.0, max(-1.0, command[first + i]))
+        if user[u + _KIND] == _PUMPED:
+            act_dot[a] = pump_speed_step(
+                user, u + PUMP, act[a], bounded, act[a + 2], act[a + 3], dt
+            )
+            act_dot[a + 1] = load_pressure_step(user, u + PUMP, act[a + 1], velocity[first + i], dt)
+            continue
         act_dot[a], act_dot[a + 1] = spool_step(
             act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]
         )
@@ -327,75 +339,6 @@ def step_circuit(
 
 
 @compiled
-def actuator_friction(user, u, velocity):
-    """Friction of one actuator at a velocity.
-
-    Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
-        velocity: scalar [m/s] or [rad/s].
-
-    Returns:
-        Friction force, scalar [N] or [N m], with the sign of the velocity.
-
-    Source: nominal model, "Piston force".
-    """
-    return friction(
-        velocity,
-        user[u + _FC],
-        user[u + _FS],
-        user[u + _VS],
-        user[u + _B],
-        user[u + _V0],
-        user[u + _AC],
-        user[u + _AV],
-    )
-
-
-@compiled
-def actuator_friction_slope(user, u, velocity):
-    """Slope of `actuator_friction` with respect to the velocity.
-
-    Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
-        velocity: scalar [m/s] or [rad/s].
-
-    Returns:
-        dF_f/dv, scalar [N s/m] or [N m s/rad].
-
-    Source: derivative of the nominal model's "Piston force".
-    """
-    return friction_slope(
-        velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _B], user[u + _V0],
-        user[u + _AC], user[u + _AV],
-    )  # fmt: skip
-
-
-@compiled
-def actuator_stop(user, u, position, velocity):
-    """Force of the ends of an actuator's travel, and its slopes.
-
-    Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
-        position: of the load side, scalar [m] or [rad].
-        velocity: of the load side, scalar [m/s] or [rad/s].
-
-    Returns:
-        (force towards the inside [N] or [N m], its stiffness [N/m] or [N m/rad], its damping
-        [N s/m] or [N m s/rad]); all 0 inside.
-
-    Source: `laws.stop_force`.
-    """
-    if user[u + _HARD] == 0.0:
-        return 0.0, 0.0, 0.0
-    return stop_force(
-        position, velocity, user[u + _LOW], user[u + _HIGH], user[u + _HARD], user[u + _SOFT]
-    )
-
-
-@compiled
 def axis_state(user, i, supply, act, x, v):
     """Flows and force of one axis in a state, for logs and balances.
 
@@ -413,6 +356,10 @@ def axis_state(user, i, supply, act, x, v):
     Source: nominal model, "Orifice" and "Piston force".
     """
     u = i * SLOTS
+    if user[u + _KIND] == _PUMPED:
+        taken = pumped_volumes(user, u, x)[2]
+        q_head, q_rod, _, _ = pump_flows(user, u + PUMP, act[0], act[2], act[3], taken)
+        return q_head, q_rod, pumped_force(user, u, act[1], act[2], act[3], v, 0.0, 0.0)
     opening = axis_opening(user, u, act[0])
     q_head, q_rod, _, _ = chamber_flows(user, u, opening, supply, act[2], act[3])
     force = user[u + _AH] * act[2] - user[u + _AR] * act[3] - actuator_friction(user, u, v)

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from hydrotele.drives import Axis, Counterbalance, FlowCurve, Valve
-from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS, SLOTS, Kind, Slot
+from hydrotele.drives import Axis, Counterbalance, FlowCurve, LoadCylinder, Pump, Valve
+from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS, PUMP, SLOTS, Kind, PumpSlot, Slot
 from hydrotele.kinematics.from_machine import drive_travel
 from hydrotele.machine import Machine, Supply
 
@@ -13,7 +13,7 @@ MARKER = 215325.0  # CAT 215, CAT 325: no other model writes this into actuator_
 
 
 def actuator_order(machine: Machine) -> list[str]:
-    """Axis names in actuator order: the valve-controlled ones first, as they share the supply."""
+    """Axis names in actuator order: the hydraulic ones first, as they share the supply."""
     return [*machine.hydraulic_axes, *(n for n, a in machine.axes.items() if not a.hydraulic)]
 
 
@@ -37,7 +37,9 @@ def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
         _write_end_stop(numbers, machine, name)
         if axis.transmission:
             numbers[Slot.DRIVE_INERTIA] = axis.transmission.inertia
-        if axis.hydraulic and machine.supply:
+        if axis.pump:
+            _write_pumped(numbers, machine, name)
+        elif axis.hydraulic and machine.supply:
             _write_hydraulics(numbers, axis, machine.supply)
         else:
             numbers[Slot.KIND] = Kind.FORCE
@@ -84,6 +86,49 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     numbers[Slot.PUMP_DROOP] = supply.pump_droop
     if supply.kind == "load_sensing":
         numbers[Slot.LOAD_SENSING_MARGIN] = supply.load_sensing_margin
+
+
+def _write_pumped(numbers: np.ndarray, machine: Machine, name: str) -> None:
+    axis = machine.axes[name]
+    cylinder, pump = axis.cylinder, axis.pump
+    assert cylinder and pump
+    numbers[Slot.KIND] = Kind.PUMPED
+    numbers[Slot.STROKE] = cylinder.stroke
+    numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = cylinder.areas
+    numbers[Slot.VOLUME_HEAD] = numbers[Slot.VOLUME_ROD] = cylinder.dead_volume
+    numbers[Slot.LEAKAGE] = cylinder.leakage
+    numbers[Slot.ORIFICE_SMOOTHING] = Valve.model_fields["smoothing"].default
+    moved = machine.links[machine.link_of(axis.joint)].mass + cylinder.rod.mass
+    _write_pump(numbers[PUMP:], pump, moved)
+    if name in machine.loads:
+        _write_load(numbers[PUMP:], machine.loads[name])
+
+
+def _write_pump(block: np.ndarray, pump: Pump, moved: float) -> None:
+    gas, motor = pump.accumulator, pump.motor
+    block[PumpSlot.DISPLACEMENT], block[PumpSlot.LEAKAGE] = pump.displacement, pump.leakage
+    block[PumpSlot.RATED_SPEED], block[PumpSlot.TORQUE_LOSS] = pump.rated_speed, pump.torque_loss
+    block[PumpSlot.BULK_MODULUS], block[PumpSlot.MOVING_MASS] = pump.bulk_modulus, moved
+    block[PumpSlot.COMPLIANCE_HEAD] = pump.compliance_head
+    block[PumpSlot.COMPLIANCE_ROD] = pump.compliance_rod
+    block[PumpSlot.AIR_HEAD], block[PumpSlot.AIR_ROD] = pump.air_head, pump.air_rod
+    block[PumpSlot.ACCUMULATOR_PRESSURE], block[PumpSlot.GAS_VOLUME] = gas.pressure, gas.gas_volume
+    block[PumpSlot.LINE_EXTENDING] = gas.line_extending
+    block[PumpSlot.LINE_RETRACTING] = gas.line_retracting
+    if motor is None:
+        return
+    block[PumpSlot.VOLTAGE], block[PumpSlot.RESISTANCE] = motor.voltage, motor.resistance
+    block[PumpSlot.EMF], block[PumpSlot.INERTIA] = motor.emf, motor.inertia
+    block[PumpSlot.DRAG], block[PumpSlot.BREAKAWAY] = motor.drag, motor.breakaway
+    block[PumpSlot.BREAKAWAY_SPEED] = motor.breakaway_speed
+    block[PumpSlot.VISCOUS_DRAG] = motor.viscous
+
+
+def _write_load(block: np.ndarray, load: LoadCylinder) -> None:
+    block[PumpSlot.LOAD_AREA], block[PumpSlot.LOAD_RELIEF] = load.area, load.relief_pressure
+    block[PumpSlot.LOAD_OVERRIDE], block[PumpSlot.LOAD_STIFFNESS] = load.override, load.stiffness
+    block[PumpSlot.LOAD_VOID], block[PumpSlot.LOAD_VOID_PRESSURE] = load.void, load.void_pressure
+    block[PumpSlot.LOAD_FRICTION], block[PumpSlot.LOAD_RETURN] = load.friction, load.return_force
 
 
 def _write_valve(numbers: np.ndarray, valve: Valve) -> None:

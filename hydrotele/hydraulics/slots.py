@@ -72,12 +72,54 @@ class Slot(enum.IntEnum):
 
 
 CURVE = 1 + 2 * CURVE_KNOTS  # numbers of one flow curve
-SLOTS = Slot.CURVES + 2 * CURVE
+
+
+class PumpSlot(enum.IntEnum):
+    """Places of a pump drive's numbers in its block, all SI."""
+
+    DISPLACEMENT = 0
+    LEAKAGE = 1
+    RATED_SPEED = 2
+    BULK_MODULUS = 3
+    COMPLIANCE_HEAD = 4
+    COMPLIANCE_ROD = 5
+    AIR_HEAD = 6
+    AIR_ROD = 7
+    ACCUMULATOR_PRESSURE = 8
+    GAS_VOLUME = 9
+    LINE_EXTENDING = 10
+    LINE_RETRACTING = 11
+    VOLTAGE = 12
+    RESISTANCE = 13
+    EMF = 14
+    INERTIA = 15
+    DRAG = 16
+    BREAKAWAY = 17
+    BREAKAWAY_SPEED = 18
+    VISCOUS_DRAG = 19
+    TORQUE_LOSS = 20
+    MOVING_MASS = 21
+    LOAD_AREA = 22
+    LOAD_RELIEF = 23
+    LOAD_OVERRIDE = 24
+    LOAD_STIFFNESS = 25
+    LOAD_VOID = 26
+    LOAD_VOID_PRESSURE = 27
+    LOAD_FRICTION = 28
+    LOAD_RETURN = 29
+
+
+PUMP = Slot.CURVES + 2 * CURVE  # first place of the pump drive's block
+SLOTS = PUMP + len(PumpSlot)
 
 
 class Kind(enum.IntEnum):
-    """What an actuator is: a cylinder, a rotary motor or a plain force drive with friction."""
+    """What an actuator is: a cylinder, a rotary motor or a plain force drive with friction.
+
+    PUMPED is a cylinder with a pump of its own in the place of a valve.
+    """
 
     CYLINDER = 1
     MOTOR = 2
     FORCE = 3
+    PUMPED = 4

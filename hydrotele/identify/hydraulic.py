@@ -13,16 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.dataset.load import Dataset, RunData
+from hydrotele.dataset.load import Dataset
 from hydrotele.effects import EFFECTS
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.prediction.evidence import Evidence, Fit
 from hydrotele.prediction.hypothesis import Guess, hypotheses
 from hydrotele.prediction.intervals import spreads
-from hydrotele.prediction.levels import find_levels, known_levels
 from hydrotele.prediction.stretches import busiest
-from hydrotele.prediction.track import track_run
+from hydrotele.prediction.track import Levels, known_levels, track_run
 
 HYDRAULIC = (
     "valve_gain", "valve_deadband", "spool_lag", "internal_leakage", "bulk_modulus",
@@ -77,7 +76,8 @@ class Hydraulics:
         numbers: the identified numbers.
         machine: the machine that has those which the data tell.
         before: RMS of the held-out run's whitened one-step prediction errors with the machine that
-            the search started from [1]; where the sensors state no noise it is 1 by construction.
+            the search started from [1], by the noise of the readings that the sensors state or,
+            where they state none, that was found with the identified machine.
         after: the same with the identified machine.
         status: `ok`, or what is wrong and what to do about it.
         seconds: that it took.
@@ -115,25 +115,24 @@ def identify_hydraulics(
     if not parts:
         raise InputError(_WHERE, f"{dataset.machine.name} has no valves")
     data = busiest(dataset, _MOST)
-    if not known_levels(data):
-        data = find_levels(data)
     guess = Guess(tuple((h, np.zeros(h.size)) for h in parts))
     evidence = Evidence(data, data.fit, jobs)
     try:
         fit, settled = _fitted(evidence, guess, say)
         evidence.set_base(fit.guess)
         say("intervals", 0.9)
-        std = spreads(evidence, fit)
+        std = spreads(evidence, fit.guess)
+        levels = Levels(evidence.tracks[0].levels.noise)
     finally:
         evidence.close()
     numbers = _numbers(fit.guess, std)
     machine = _machine(dataset.machine, numbers)
-    sizes = [_size(m, data, data.heldout) for m in (dataset.machine, machine)]
+    sizes = [_size(m, data, levels) for m in (dataset.machine, machine)]
     status = "ok" if settled else (
         "not settled: the given numbers are far off, or the model lacks something; start again"
         " from the identified machine, or look with `hydrotele gap`"
     )  # fmt: skip
-    if settled and np.isfinite(dataset.noise).all() and sizes[1] > 1.5:
+    if settled and known_levels(dataset) and sizes[1] > 1.5:
         status = (
             f"on the held-out run prediction errors are {sizes[1]:.2g} times what the sensors"
             " explain: the model lacks something; look for it with `hydrotele gap`"
@@ -182,7 +181,8 @@ def _machine(machine: Machine, numbers: tuple[HydraulicNumber, ...]) -> Machine:
     return machine
 
 
-def _size(machine: Machine, data: Dataset, run: RunData) -> float:
-    """RMS of whitened prediction errors along a run."""
-    whitened = track_run(machine, dataclasses.replace(data, machine=machine), run).whitened
+def _size(machine: Machine, data: Dataset, levels: Levels) -> float:
+    """RMS of whitened prediction errors along the held-out run."""
+    data = dataclasses.replace(data, machine=machine)
+    whitened = track_run(machine, data, data.heldout, levels=levels).whitened
     return float(np.sqrt(np.nanmean(whitened**2)))

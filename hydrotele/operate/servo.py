@@ -59,6 +59,8 @@ def servo_numbers(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: flo
             flow_gain = axis.valve.rated_flow / math.sqrt(axis.valve.rated_pressure_drop)
             facts = [_MOTOR_OR_CYLINDER, head, rod, flow_gain, axis.valve.deadband]
             rows.append([*facts, machine.supply.tank_pressure, 1.0, 0.0, *gains])
+        elif axis.pump:  # takes commands only, see `drive_references`
+            rows.append([_FORCE, 0, 0, 0, 0, 0, 1.0, 1.0, *gains])
         else:
             assert axis.force
             rows.append([_FORCE, 0, 0, 0, 0, 0, axis.force.command_limit, axis.force.gain, *gains])
@@ -91,6 +93,9 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
 
     Returns:
         The references.
+
+    Raises:
+        InputError: the plan moves an axis with a pump of its own.
     """
     velocity, arm = np.zeros_like(plan.reference), np.ones_like(plan.reference)
     head, rod = np.ones_like(plan.reference), np.ones_like(plan.reference)
@@ -98,6 +103,9 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
     for column, name in enumerate(plan.axes):
         if not plan.closed[column]:
             continue
+        if machine.axes[name].pump:
+            message = f"{name} has a pump of its own, which the servo does not move"
+            raise InputError("pilot", f"{message}: give its commands (kind: table, of: command)")
         linkage = axis_linkage(machine, name)
         arm[:, column] = linkage.rate(plan.reference[:, column])
         speed = arm[:, column] * plan.rate[:, column]

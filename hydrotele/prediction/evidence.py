@@ -20,6 +20,7 @@ from hydrotele.prediction.track import STEP, Track, fine_enough, known_levels, t
 
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
 _STEPS = 6
+MIDDLE = 2.0e-3  # s, step at which slopes of many numbers are taken
 BLOCK = 2.0  # s of a run that count as one witness: longer than what a model lacks remembers
 _ROUNDS = 2  # of linearisation for the levels of the first base; later ones start from near by
 _CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
@@ -198,6 +199,14 @@ class Evidence:
             errors = self.errors(self._base, step)
             self._slopes[step] = self.slopes(self._base, errors, parallel, step)
         return self._slopes[step]
+
+    def base_slopes_of(self, tracks: Sequence[Track]) -> np.ndarray:
+        """(E, P) slopes of the base in some of its tracks, or in the first rows of them."""
+        whole, parts, at = self.base_slopes(MIDDLE), {}, 0
+        for track in self.tracks:
+            parts[track.run.name] = whole[at : at + track.whitened.size]
+            at += track.whitened.size
+        return np.concatenate([parts[t.run.name][: t.whitened.size] for t in tracks])
 
     def fit(
         self, guess: Guess, before: float, parallel: bool = True, steps: int = _STEPS,

@@ -16,6 +16,7 @@ from hydrotele.compiled import compiled
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import advance, read_channels
 from hydrotele.dynamics.model import Model, model_space, reduced_model
+from hydrotele.dynamics.transducers import follow_trail
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.prediction.track import DRIFT_TIME, STEP, Levels, fine_enough, track_run
@@ -146,7 +147,8 @@ def machine_runner(machine: Machine, data: Dataset, step: float = STEP) -> Prepa
     def prepare(run: RunData) -> Runner:
         track = track_run(machine, data, run, step=step, levels=levels)
         steps = max(1, round(run.period / fine_enough(machine, step)))
-        before = _shown(model, track.states) if np.any(model.lag > 0.0) else None
+        late = np.any(model.lag > 0.0) or np.any(model.time_constant > 0.0)
+        before = _shown(model, track.states, run.period) if late else None
 
         def free(starts: np.ndarray, count: int) -> np.ndarray:
             out = np.full((len(starts), count, len(data.channels)), np.nan)
@@ -289,19 +291,20 @@ def _median(values: np.ndarray) -> float:
     return float(np.sort(known)[(len(known) - 1) // 2]) if len(known) else math.nan
 
 
-def _shown(model: Model, states: np.ndarray) -> np.ndarray:
-    """(n, c) what sensors without lag, scale and offset would show of the states."""
+def _shown(model: Model, states: np.ndarray, period: float) -> np.ndarray:
+    """(n, c) what sensors without delay, scale and offset would show of the states."""
     ideal = model._replace(scale=np.ones(len(model.lag)), offset=np.zeros(len(model.lag)))
     shown = np.zeros((len(states), len(model.lag)))
-    _read_rows(ideal, model_space(model), states, shown)
+    _read_rows(ideal, model_space(model), states, period, shown)
     return shown
 
 
 @compiled
-def _read_rows(model, sp, states, out):
+def _read_rows(model, sp, states, period, out):
     nothing = np.zeros((0, out.shape[1]))
     for row in range(len(states)):
         read_channels(model, sp, states[row], row, 1, 1.0, nothing, out[row])
+    follow_trail(model, out, period, out[0].copy())
 
 
 @compiled
@@ -316,8 +319,8 @@ def _run_from(model, sp, z, command, first, period, steps, before, out):
         first: the row.
         period: scalar [s].
         steps: steps per row.
-        before: (n, c) what the sensors without lag show of the states of the whole run; (1, c)
-            where no sensor lags.
+        before: (n, c) what the sensors without delay show of the states of the whole run; (1, c)
+            where no sensor is late.
         out: (k, c) written: what the sensors show in the rows after the first [channel's unit].
     """
     h, longest = period / steps, 0.0
@@ -330,7 +333,10 @@ def _run_from(model, sp, z, command, first, period, steps, before, out):
             for c in range(len(model.lag)):
                 here, there = before[first - past + row, c], before[first - past + row + 1, c]
                 trail[row * steps + step, c] = here + (there - here) * step / steps
+    shown = before[min(first, len(before) - 1)].copy()
     for k in range(len(out)):
         row = past + k
-        advance(model, sp, z, command, first + k, period, steps, trail[row * steps :])
+        ahead = trail[row * steps : (row + 1) * steps + 1]
+        advance(model, sp, z, command, first + k, period, steps, ahead)
+        follow_trail(model, ahead, h, shown)
         read_channels(model, sp, z, row + 1, steps, h, trail, out[k])

@@ -59,11 +59,15 @@ class Hypothesis:
         tables = [p.starts for p in self.parameters.values()]
         if not any(tables):
             return [np.zeros(self.size)]
-        slope = [np.zeros(self.size)] if EFFECTS[self.name].law in _SMOOTH else []
-        only = [(p, s) for p, s in zip(self.parameters.values(), tables, strict=True) if s]
+        known = EFFECTS.get(self.name)
+        slope = [np.zeros(self.size)] if known and known.law in _SMOOTH else []
         return slope + [
-            np.array([(value - p.nominal) / p.scale for p, _ in only]) for value in only[0][1]
-        ]
+            np.array([
+                (p.starts[k] - p.nominal) / p.scale if k < len(p.starts) else 0.0
+                for p in self.parameters.values()
+            ])
+            for k in range(max(map(len, tables)))
+        ]  # fmt: skip
 
     @property
     def key(self) -> tuple[str, str]:

@@ -20,6 +20,7 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
 
 MEMORY = 0.3  # s, correlation time: longer than a valve's lag, shorter than a motion
+_USUAL_PRESSURE = 2.0e7  # Pa, of a pump's own circuit that states no relief setting
 BALANCES = ("force", "flow_head", "flow_rod", "command")
 
 
@@ -46,8 +47,9 @@ def possible_inputs(machine: Machine, axes: Sequence[str] = ()) -> tuple[Input, 
     for axis in actuator_order(machine):
         if axes and axis not in axes:
             continue
-        for balance in BALANCES if machine.axes[axis].hydraulic else BALANCES[:1]:
-            found.append(Input(balance, axis))
+        facts = machine.axes[axis]
+        count = 4 if facts.valve else 3 if facts.pump else 1
+        found += [Input(balance, axis) for balance in BALANCES[:count]]
     return tuple(found)
 
 
@@ -59,13 +61,16 @@ def input_sizes(machine: Machine, inputs: Sequence[Input]) -> np.ndarray:
         if balance == "command":
             sizes.append(0.5)
         elif balance != "force":
-            assert facts.valve
-            sizes.append(facts.valve.rated_flow)
+            pump = facts.pump
+            sizes.append(
+                facts.valve.rated_flow if facts.valve
+                else pump.displacement * pump.rated_speed if pump else math.nan
+            )  # fmt: skip
         elif facts.force:
             sizes.append(abs(facts.force.gain) * facts.force.command_limit)
         else:
-            assert machine.supply
-            sizes.append(machine.supply.relief_pressure * facts.hydraulic_drive.areas[0])
+            pressure = machine.supply.relief_pressure if machine.supply else _USUAL_PRESSURE
+            sizes.append(pressure * facts.hydraulic_drive.areas[0])
     return np.array(sizes)
 
 
@@ -132,11 +137,15 @@ def input_columns(
             assert facts.valve
             columns[:, m, first + 4 * i + 1] = facts.valve.bandwidth**2
         else:
-            assert machine.supply
             side = 2 if balance == "flow_head" else 3
             drive = facts.hydraulic_drive
             volume = np.maximum(drive.volumes(position[:, i])[side - 2], drive.dead_volume)
-            oil = volume / machine.supply.bulk_modulus + drive.hose_compliance
+            oil = drive.hose_compliance
+            if facts.pump:
+                oil += volume / facts.pump.bulk_modulus
+                oil += facts.pump.compliance_head if side == 2 else facts.pump.compliance_rod
+            elif machine.supply:
+                oil += volume / machine.supply.bulk_modulus
             columns[:, m, first + 4 * i + side] = 1.0 / oil
     carried = np.einsum("rms,rsk->rmk", columns, flow[:, :size, :size])
     return 0.5 * period * (columns + carried)

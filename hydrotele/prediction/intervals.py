@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from hydrotele.prediction.evidence import Evidence
+from hydrotele.prediction.evidence import MIDDLE, Evidence
 from hydrotele.prediction.hypothesis import Guess
 
+_FEW = 10  # numbers up to which slopes are taken at the finest step
 _CHANCE = 3.0  # chi-square per degree of freedom that two degrees exceed in 5 % of all cases
 
 
@@ -25,8 +26,11 @@ def spreads(evidence: Evidence, guess: Guess, scatter: float = 1.0) -> np.ndarra
         (P,) standard deviations, in typical deviations.
     """
     step = evidence.step_of(guess, evidence.step)
-    errors = evidence.errors(guess, step)
-    slopes = evidence.slopes(guess, errors, step=step)
+    few = len(guess.deviation) <= _FEW
+    if few:
+        slopes = evidence.slopes(guess, evidence.errors(guess, step), step=step)
+    else:
+        slopes = evidence.base_slopes(MIDDLE)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])
     covariance = np.linalg.inv(information)
     shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))

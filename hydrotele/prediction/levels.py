@@ -21,13 +21,15 @@ from hydrotele.machine import Machine
 from hydrotele.noise import channel_sensor, converter
 from hydrotele.prediction.inputs import (
     Input,
+    decay,
     input_columns,
     input_sizes,
     possible_inputs,
 )
-from hydrotele.prediction.linear import LinearRun, linear_run, smooth
+from hydrotele.prediction.linear import LinearRun, Smoothed, linear_run, smooth
 from hydrotele.prediction.stretches import busiest_rows
 from hydrotele.prediction.track import (
+    DRIFT,
     STARTLE,
     STEP,
     Levels,
@@ -37,6 +39,10 @@ from hydrotele.prediction.track import (
     track_run,
 )
 
+WHITE = ("rate", "drive_rate", "spool", "pressure_head", "pressure_rod")
+"""Kinds of states to which white noise is added, too: ripple and what the rows are too slow for."""
+_MOST = 1.0e4  # times its floor that white noise can reach
+_RIPPLE = 10.0  # times its floor from which white noise counts as there
 LEAST = 1.0e-4  # of an input's largest size: below it an input is none
 _STATED = 0.5  # prior standard deviation of log(noise / stated): a data sheet is good to a factor
 _LACK = 4.0  # prior standard deviation of log(size / least): says next to nothing
@@ -175,6 +181,9 @@ def _most_likely(
 ) -> Levels:  # fmt: skip
     """Levels of the largest posterior probability in the linearised runs."""
     names, c, m = list(tracks[0].names), len(data.channels), len(levels.inputs)
+    white = [n for n in names if n.partition(".")[0] in WHITE]
+    places, floor = [names.index(n) for n in white], by_kind(white, DRIFT)
+    w = c + m
     rows = max(_ROWS // len(tracks), _ROWS // 8)
     runs = [(_part(track, names, rows), track.run) for track in tracks]
     weight = sum(len(t.run.command) for t in tracks) / sum(len(r.error) for r, _ in runs)
@@ -182,7 +191,8 @@ def _most_likely(
     first = len(names) - m
 
     def of(x: np.ndarray) -> Levels:
-        return dataclasses.replace(levels, noise=np.exp(x[:c]), sizes=np.exp(x[c:]), drift={})
+        drift = dict(zip(white, np.exp(x[w:]), strict=True))
+        return dataclasses.replace(levels, noise=np.exp(x[:c]), sizes=np.exp(x[c:w]), drift=drift)
 
     def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
         now, slope = of(x), np.zeros(len(x))
@@ -191,21 +201,25 @@ def _most_likely(
             run: RunData = pair[1]
             drift = state_drift(names, now, run.period)
             found = smooth(pair[0], now.noise**2, drift)
-            return found.loss, found.noise_slope, (drift * found.drift_slope)[first:]
+            return found.loss, found.noise_slope, drift * found.drift_slope
 
         total = 0.0
         for value, per_noise, per_drift in each(one, runs):
             total += value
             slope[:c] += 2.0 * now.noise**2 * per_noise
-            slope[c:] += 2.0 * per_drift
+            slope[c:w] += 2.0 * per_drift[first:]
+            slope[w:] += 2.0 * per_drift[places]
         off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
         slope[:c] += 2.0 * off / prior.width / weight
         slope[c:] += 2.0 * lack / _LACK / weight
         return total + float(off @ off + lack @ lack) / weight, slope
 
-    low = np.log(np.concatenate([prior.low, LEAST * largest]))
-    high = np.log(np.concatenate([prior.high, largest]))
-    start = np.log(np.concatenate([levels.noise, np.maximum(levels.sizes, 3 * LEAST * largest)]))
+    low = np.log(np.concatenate([prior.low, LEAST * largest, floor]))
+    high = np.log(np.concatenate([prior.high, largest, _MOST * floor]))
+    began = np.array([levels.drift.get(n, 0.0) for n in white])
+    start = np.log(np.concatenate([
+        levels.noise, np.maximum(levels.sizes, 3 * LEAST * largest), np.maximum(began, 1.5 * floor),
+    ]))  # fmt: skip
     found = minimize(
         loss, np.clip(start, low, high), jac=True, method="L-BFGS-B",
         bounds=list(zip(low, high, strict=True)),
@@ -219,6 +233,54 @@ def _most_likely(
 def _part(track: Track, names: list[str], rows: int) -> LinearRun:
     """The stretch of a run in which the commands change most, linearised."""
     return linear_run(track, by_kind(names, STARTLE) ** 2, busiest_rows(track.run, rows))
+
+
+def smoothed_inputs(track: Track, answer: tuple[LinearRun, Smoothed] | None = None) -> np.ndarray:
+    """Unknown inputs of a track as the smoother tells them.
+
+    Args:
+        track: with m inputs.
+        answer: of `smoothed`, where it is there already.
+
+    Returns:
+        (n, m) inputs [N], [N m], [m^3/s] or [1].
+    """
+    run, told = answer or smoothed(track)
+    m, size = len(track.levels.inputs), run.slope.shape[2]
+    fade, held = decay(track.run.period), np.zeros(m)
+    found = np.zeros((len(run.error), m))
+    for row in range(len(found)):  # what the track's own filter took them to be
+        found[row] = held
+        held = fade * (held + run.correction[row, size - m :])
+    return found + told.deviation[:, size - m :]
+
+
+def smoothed(track: Track) -> tuple[LinearRun, Smoothed]:
+    """A track's linear run, and what its smoother says of it, states included."""
+    names = list(track.names)
+    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    drift = state_drift(names, track.levels, track.run.period)
+    return run, smooth(run, track.levels.noise**2, drift, True)
+
+
+def undisturbed_loss(track: Track) -> float:
+    """-2 log likelihood to expect of a track whose unknown inputs were nothing, noise as found."""
+    names, m = list(track.names), len(track.levels.inputs)
+    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    drift = state_drift(names, track.levels, track.run.period)
+    initial = run.initial.copy()
+    first = len(names) - m
+    drift[first:], initial[first:] = 0.0, 0.0
+    width = smooth(run._replace(initial=initial), track.levels.noise**2, drift).width
+    there = np.isfinite(track.whitened)
+    return float(np.sum(1.0 + 2.0 * np.log(width[there])))
+
+
+def rippled(levels: Levels) -> bool:
+    """Whether white process noise is more than what an integrator leaves."""
+    return any(
+        size > _RIPPLE * DRIFT[name.partition(".")[0]] for name, size in levels.drift.items()
+    )
 
 
 def input_excess(track: Track) -> float:

@@ -1,11 +1,15 @@
-"""Long records, cut to their busiest stretches: the rest says the same again, at the same cost."""
+"""Long or fast records, cut to their busiest stretches and averaged to a rate that says as much."""
 
 import dataclasses
 
 import numpy as np
 
+from hydrotele.dataset.averaging import averaged
 from hydrotele.dataset.load import Dataset, RunData
+from hydrotele.dataset.rows import Rows
 
+_RATE, _PER_CYCLE = 100.0, 6.0  # Hz; rows per cycle of the fastest valve
+_SHORT = 2.0  # s, of a run that is kept as it is
 MOST_SECONDS = 720.0  # of all fitted runs together: eighteen runs of a usual length
 
 
@@ -33,6 +37,32 @@ def busiest(data: Dataset, most: float = MOST_SECONDS) -> Dataset:
         end = cut.start + rows * run.period
         notes.append(f"{run.name} is long: it is fitted from {cut.start:.0f} to {end:.0f} s only.")
     return dataclasses.replace(data, fit=tuple(runs), notes=(*data.notes, *notes))
+
+
+def thinned(data: Dataset) -> Dataset:
+    """A dataset at no higher rate than its machine's valves answer, each row a mean of several.
+
+    From one millisecond to the next a model and its readings can hardly disagree; what says
+    whether a machine has a mass, a friction or a leak takes longer than a valve's own lag.
+    """
+    bandwidths = [a.valve.bandwidth / (2.0 * np.pi) for a in data.machine.axes.values() if a.valve]
+    rate = max(_RATE, _PER_CYCLE * max(bandwidths, default=0.0))
+
+    def thin(run: RunData) -> RunData:
+        if run.period * rate > 0.75 or len(run.command) * run.period < _SHORT:
+            return run
+        valid = np.ones(len(run.command), bool) if run.valid is None else run.valid
+        rows, behind, _ = averaged(
+            Rows(run.start, run.period, run.command, run.command_known, run.reading, valid), rate
+        )
+        behind = behind * (1.0 if run.behind is None else run.behind)
+        return dataclasses.replace(
+            run, period=rows.period, command=rows.command, command_known=rows.known,
+            reading=rows.reading, valid=rows.valid, behind=behind,
+        )  # fmt: skip
+
+    fit = tuple(map(thin, data.fit))
+    return dataclasses.replace(data, fit=fit, heldout=thin(data.heldout))
 
 
 def busiest_rows(run: RunData, rows: int) -> slice:

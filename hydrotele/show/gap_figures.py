@@ -4,8 +4,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hydrotele.gap.result import Prediction
-from hydrotele.gap.words import channel_words
+from hydrotele.gap.customary import customary
+from hydrotele.gap.result import LearnedLaw, Prediction
+from hydrotele.gap.words import channel_words, variable_words
 from hydrotele.show.channels import padded_range, shown_unit
 from hydrotele.show.gap_windows import windowed
 from hydrotele.show.report_figure import drawing, png
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MEASURED, NOMINAL, PATCHED = "#262b33", "#e07b00", "#1769aa"
+_ADDED = {"force": "force", "command": "command"} | dict.fromkeys(
+    ("flow_head", "flow_rod", "flow_through"), "flow"
+)
 _ZOOM = 2.0  # s
 _LOUDEST = 6.0  # times noise, where the colours of the heat map end at the latest
 
@@ -95,6 +99,29 @@ def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: b
         places[0, 1].set_title(f"worst window, {low:.1f} to {high:.1f} s")
         places[1, 0].set_ylabel(f"reading -\nprediction\n[{unit}]")
         figure.align_ylabels()
+        return png(figure)
+
+
+def draw_law(law: LearnedLaw) -> bytes:
+    """A learned law over its variable, with a band of two standard deviations.
+
+    Args:
+        law: the law.
+
+    Returns:
+        A PNG.
+    """
+    points, values, spread = (np.array(v) for v in (law.points, law.values, law.spread))
+    along, per_point = customary(law.variable_unit, float(np.max(np.abs(points))))
+    unit, per_value = customary(law.unit, float(np.max(np.abs(values))))
+    with drawing(2.6) as figure:
+        axes = figure.subplots()
+        low, high = per_value * (values - 2.0 * spread), per_value * (values + 2.0 * spread)
+        axes.fill_between(per_point * points, low, high, color=PATCHED, alpha=0.2, lw=0)
+        axes.plot(per_point * points, per_value * values, color=PATCHED, lw=1.6)
+        axes.axhline(0.0, color="0.6", lw=0.8)
+        axes.set_xlabel(f"{variable_words(law.variable)} [{along}]")
+        axes.set_ylabel(f"added {_ADDED[law.balance]} [{unit}]")
         return png(figure)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from hydrotele.dataset.load import RunData
 from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Gap, Prediction
-from hydrotele.gap.words import channel_words, headline, verdict_words
+from hydrotele.gap.words import channel_words, headline, learned_title, verdict_words
 from hydrotele.log import Log
 from hydrotele.output import replacing
 from hydrotele.show.channels import shown_unit
@@ -162,5 +162,6 @@ def _style(colour: tuple[int, int, int], name: str, width: float):
 def _about(gap: Gap):
     import rerun as rr
 
-    lines = [f"# {headline(gap)}", *verdict_words(gap), "", *(f"- {note}" for note in gap.notes)]
+    laws = [f"- {learned_title(law)}: `{law.formula}` [{law.unit}]" for law in gap.learned]
+    lines = [f"# {headline(gap)}", *verdict_words(gap), *laws, *(f"- {n}" for n in gap.notes)]
     return rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN)

@@ -17,10 +17,20 @@ from hydrotele.gap.words import (
     gap_closed,
     headline,
     law_words,
+    learned_title,
+    share_words,
     verdict_words,
 )
-from hydrotele.show.gap_figures import draw_heat_map, draw_overlay
-from hydrotele.show.gap_tables import channel_table, law_table, ranking_table, test_table
+from hydrotele.show.gap_figures import draw_heat_map, draw_law, draw_overlay
+from hydrotele.show.gap_tables import (
+    calibration_table,
+    channel_table,
+    lack_table,
+    law_table,
+    noise_table,
+    ranking_table,
+    test_table,
+)
 from hydrotele.show.gap_windows import most_changed
 from hydrotele.show.report_html import Markup, interval, page, picture, section, table, tag, text
 from hydrotele.show.report_style import STYLE
@@ -31,6 +41,7 @@ _CHIPS = {
     "no_gap": "No gap",
     "ambiguous": "Ambiguous",
     "unknown": "Unknown effect",
+    "partly": "Partly named",
 }
 
 
@@ -45,6 +56,8 @@ def write_report(gap: Gap, path: str | Path) -> None:
     sections = [
         _header(gap),
         _found(gap),
+        _calibrated(gap),
+        _learned(gap),
         _unknown(gap),
         _proof(gap),
         _where(gap),
@@ -92,12 +105,45 @@ def _found(gap: Gap) -> Markup:
             what = tag("b", effect_title(effect))
             rows.append((
                 what, name.replace("_", " "), s.nominal, s.value, f"{s.low} to {s.high}", s.unit,
-                interval(estimate), chance_words(effect.probability),
+                interval(estimate), chance_words(effect.probability), share_words(effect.share),
             ))  # fmt: skip
     head = ("effect", "parameter", "model had", "found", "95 % interval", "unit",
-            "model and found, to scale", "probability")  # fmt: skip
-    why = "Values that the fit runs ask for. The interval holds the true value in 95 of 100 cases."
-    return section("What was found", why, table(head, rows, numbers="  nnn  n"))
+            "model and found, to scale", "probability", "share of the gap")  # fmt: skip
+    why = (
+        "Values that the fit runs ask for. The interval holds the true value in 95 of 100 cases;"
+        " the share is what comes back on the held-out run without the effect."
+    )
+    return section("What was found", why, table(head, rows, numbers="  nnn  nn"))
+
+
+def _calibrated(gap: Gap) -> Markup:
+    if not gap.calibration:
+        return Markup("")
+    why = (
+        "Numbers that the machine file states with an uncertainty, fitted together with it as their"
+        " prior. They are in the patched model; those that moved most, by their intervals, first."
+    )
+    return section("Numbers that were calibrated", why, calibration_table(gap))
+
+
+def _learned(gap: Gap) -> Markup:
+    if not gap.learned:
+        return Markup("")
+    why = (
+        "No known effect explains these; their form was taken from the data. They are terms of the"
+        " patched model, which every simulator calculates. The band is two standard deviations."
+    )
+    parts = []
+    for law in gap.learned:
+        share = f" It closes {share_words(law.share)} of the gap on the held-out run."
+        parts += [
+            tag("h3", learned_title(law)),
+            tag("p", law.description + (share if math.isfinite(law.share) else "")),
+            tag("figure", picture(draw_law(law), learned_title(law))),
+            tag("p", f"In SI units [{law.unit}]:", class_="key"),
+            tag("pre", law.formula),
+        ]
+    return section("Laws learned from the data", why, *parts)
 
 
 def _unknown(gap: Gap) -> Markup:
@@ -110,13 +156,13 @@ def _unknown(gap: Gap) -> Markup:
         ("seen most in", channel_words(unknown.channel)),
         ("changes with", ", ".join(map(channel_words, unknown.depends_on)) or "-"),
         ("shows most at", windows or "-"),
-        ("term that holds up on data not fitted", unknown.term or "-"),
     ]
     why = "None of the known effects removes this; here is what can be said of it."
     rows = [(tag("b", name), value) for name, value in facts]
-    return section(
-        "What is not explained", why, tag("p", unknown.description), table(("", ""), rows)
-    )
+    parts = [tag("p", unknown.description), table(("", ""), rows)]
+    if gap.lacks:
+        parts += [tag("h3", "What the patched model still lacks"), lack_table(gap)]
+    return section("What is not explained", why, *parts)
 
 
 def _proof(gap: Gap) -> Markup:
@@ -169,7 +215,8 @@ def _rest(gap: Gap) -> Markup:
     if not gap.tests:
         return Markup("")
     why = "What is left after the last model must look like sensor noise in every respect."
-    return section("Is anything left?", why, test_table(gap.tests))
+    noise = [tag("h3", "Noise of the readings"), noise_table(gap)] if gap.noise else []
+    return section("Is anything left?", why, test_table(gap.tests), *noise)
 
 
 def _next(gap: Gap) -> Markup:

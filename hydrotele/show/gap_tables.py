@@ -7,11 +7,19 @@ from typing import Any
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.customary import amount
+from hydrotele.gap.customary import amount, said
 from hydrotele.gap.result import Candidate, Gap, Prediction
-from hydrotele.gap.words import channel_words, effect_title, law_words
+from hydrotele.gap.words import (
+    channel_words,
+    effect_title,
+    lack_words,
+    law_words,
+    most_moved,
+    number_title,
+)
 from hydrotele.show.gap_windows import channel_rms
-from hydrotele.show.report_html import Cell, Markup, bar, dumbbell, table, tag
+from hydrotele.show.report_html import Cell, Markup, bar, dumbbell, interval, table, tag
+from hydrotele.signals import usual_unit
 
 _CANDIDATES = 12
 _LOUDEST = 10.0  # times noise, where the colour of a cell is darkest
@@ -78,6 +86,40 @@ def _heat(ratio: float) -> str:
     low, high = (stops[0], stops[1]) if part < 0.5 else (stops[1], stops[2])
     mix = 2 * part if part < 0.5 else 2 * part - 1
     return "#" + "".join(f"{round(a + mix * (b - a)):02x}" for a, b in zip(low, high, strict=True))
+
+
+def calibration_table(gap: Gap) -> Markup:
+    """Calibrated numbers with their intervals, those that moved most first."""
+    rows = []
+    for key in most_moved(gap):
+        estimate = gap.calibration[key]
+        s = said(estimate, key)
+        rows.append((number_title(key), s.nominal, s.value, f"{s.low} to {s.high}", s.unit,
+                     interval(estimate)))  # fmt: skip
+    head = ("number", "model had", "found", "95 % interval", "unit", "model and found, to scale")
+    return table(head, rows, numbers=" nnn")
+
+
+def lack_table(gap: Gap) -> Markup:
+    """Unknown forces, flows and commands that remain, the largest first."""
+    rows = [
+        (lack_words(lack), f"{100 * lack.part:.2g} %", bar(lack.part / gap.lacks[0].part))
+        for lack in gap.lacks if lack.part > 0
+    ]  # fmt: skip
+    head = ("", "of full force, rated flow or full command", "")
+    return table(head, rows, numbers=" n ")
+
+
+def noise_table(gap: Gap) -> Markup:
+    """Standard deviation of a reading per channel: found, and stated by the machine."""
+    rows = []
+    for channel, (found, stated) in gap.noise.items():
+        unit = usual_unit(channel)
+        known = math.isfinite(stated)
+        ratio = f"{found / stated:.2f}" if known and stated > 0 else "-"
+        rows.append((channel_words(channel), amount(found, unit),
+                     amount(stated, unit) if known else "not stated", ratio))  # fmt: skip
+    return table(("channel", "found", "stated", "found / stated"), rows, numbers=" nnn")
 
 
 def ranking_table(gap: Gap) -> Markup:

@@ -2,7 +2,8 @@
 
 STYLE = """
 :root { --ink: #1d232b; --soft: #5c6672; --line: #dfe3e8; --pale: #f5f7f9;
-  --before: #e07b00; --after: #1769aa; --good: #23794a; --bad: #b5281c; --unsure: #9a6700; }
+  --before: #e07b00; --after: #1769aa; --good: #23794a; --bad: #b5281c; --unsure: #9a6700;
+  --partly: #7b4aa3; }
 * { box-sizing: border-box; }
 html { -webkit-print-color-adjust: exact; print-color-adjust: exact; }
 body { margin: 0; background: #fff; color: var(--ink); font: 15px/1.55 "Segoe UI", "Helvetica Neue",
@@ -18,6 +19,7 @@ p { margin: 6px 0; max-width: 82ch; }
 .chip { display: inline-block; border-radius: 4px; padding: 3px 11px; color: #fff; font-size: 13px;
   font-weight: 650; letter-spacing: .02em; margin-bottom: 12px; }
 .chip.named { background: var(--after); } .chip.no_gap { background: var(--good); }
+.chip.partly { background: var(--partly); }
 .chip.ambiguous { background: var(--unsure); } .chip.unknown { background: var(--bad); }
 .verdict p { font-size: 16px; }
 .figures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 14px; margin: 26px 0 0; }

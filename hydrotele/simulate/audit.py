@@ -10,6 +10,7 @@ from mujoco import rollout
 
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import port_flow
+from hydrotele.hydraulics.pump import oil_compliance
 from hydrotele.simulate.closure import pin_count
 from hydrotele.simulate.drive_side import drive_and_load_dofs
 from hydrotele.simulate.plant import Plant
@@ -79,6 +80,9 @@ def _hydraulic_balance(plant, x, v, act, more, dt):
 
 def _volume_errors(plant, i, table, act, x, v, more, dt):
     axis = plant.machine.axes[plant.axes[i]]
+    if axis.pump:
+        yield from _pumped_volume_errors(axis, i, table, act, x, v, dt)
+        return
     valve, supply = axis.valve, plant.machine.supply
     drive = axis.hydraulic_drive
     head, rod = drive.areas
@@ -100,6 +104,30 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
         soft = middle / supply.bulk_modulus + drive.hose_compliance
         compressed = np.sum(soft * np.diff(pressure))
         through = np.sum(np.abs(inflow) + np.abs(port) + np.abs(swept)) * dt
+        yield abs(entered - compressed) / max(through, 1e-12)
+
+
+def _pumped_volume_errors(axis, i, table, act, x, v, dt):
+    """As `_volume_errors`, of an axis with a pump of its own, whose oil carries air."""
+    cylinder, pump = axis.cylinder, axis.pump
+    p_head, p_rod = act[:, ACTIVATIONS * i + 2], act[:, ACTIVATIONS * i + 3]
+    leak = cylinder.leakage * (p_head - p_rod)
+    head, rod = cylinder.volumes(x[:, i])
+    sides = (
+        (p_head, table[:, 1 + 3 * i] - leak, cylinder.area_head * v[:, i], head,
+         pump.compliance_head, pump.air_head),
+        (p_rod, table[:, 2 + 3 * i] + leak, -cylinder.area_rod * v[:, i], rod,
+         pump.compliance_rod, pump.air_rod),
+    )  # fmt: skip
+    for pressure, inflow, swept, volume, walls, air in sides:
+        net = inflow - swept
+        entered = np.sum(0.5 * dt * (net[1:] + net[:-1]))
+        soft = np.array([
+            oil_compliance(each, pump.bulk_modulus, walls, air, p)
+            for each, p in zip(volume, pressure, strict=True)
+        ])  # fmt: skip
+        compressed = np.sum(0.5 * (soft[1:] + soft[:-1]) * np.diff(pressure))
+        through = np.sum(np.abs(inflow) + np.abs(swept)) * dt
         yield abs(entered - compressed) / max(through, 1e-12)
 
 

@@ -174,7 +174,7 @@ def feedback(
     names = [f"{plant.machine.position_kind(a)}.{a}" for a in plant.axes]
     for axis in plant.axes[: plant.hydraulic]:
         names += [f"pressure_head.{axis}", f"pressure_rod.{axis}"]
-    if plant.hydraulic:
+    if plant.machine.valve_axes:
         names.append("pressure_supply")
     kinds = {name: channel_sensor(plant.machine, sensors, name) for name in names}
     count = -(-ticks // every)

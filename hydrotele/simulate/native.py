@@ -24,11 +24,13 @@ from hydrotele.compiled import callback, compiled
 from hydrotele.hydraulics.circuit import (
     SCRATCH,
     SLOTS,
+    Kind,
     Slot,
     actuator_friction,
+    circuit_supply,
     open_ports,
+    pumped_force,
     step_circuit,
-    supply_pressure,
 )
 from hydrotele.hydraulics.drive_side import settled_friction
 from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state
@@ -42,7 +44,7 @@ from hydrotele.terms.table import MARKER as TERMS
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
 _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _OFFSET, _INERTIA = int(Slot.OFFSET), int(Slot.DRIVE_INERTIA)
-_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
+_FORCE, _PUMPED = float(Kind.FORCE), float(Kind.PUMPED)
 _GAINS = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
 
@@ -109,7 +111,7 @@ def _state(d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, vel
         for k in range(4 * count):
             act[k] = start[k] + dt * rate[k]
         open_ports(user, act, act, scratch, 0, count, 0.0, act)
-        supply = supply_pressure(scratch, count, user[_D], user[_RELIEF], user[_PUMP])
+        supply = circuit_supply(user, 0, count, scratch)
     return drive_state(user, i, count, act, supply, time, x, velocity, command, gain)
 
 
@@ -187,7 +189,7 @@ def _compile_callbacks():
         velocity = carray(pointer(at_velocity), (nu,), np.float64)[i]
         dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
         drive = 0.0
-        if user[u + _KIND] > 2.0:  # Kind.FORCE: MuJoCo's own gain gives the drive force
+        if user[u + _KIND] == _FORCE:  # MuJoCo's own gain gives the drive force
             drive = -user[u + _OFFSET]
         else:
             at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
@@ -196,12 +198,18 @@ def _compile_callbacks():
             at_act_dot = carray(pointer(d + d_act_dot), (1,), np.int64)[0]
             act = carray(pointer(at_act + start), (4,), np.float64)
             rate = carray(pointer(at_act_dot + start), (4,), np.float64)
-            drive = user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
-            drive -= user[u + _AREA_ROD] * (act[3] + dt * rate[3])
+            if user[u + _KIND] == _PUMPED:  # with its friction already
+                drive = pumped_force(
+                    user, u, act[1] + dt * rate[1], act[2] + dt * rate[2], act[3] + dt * rate[3],
+                    velocity, 0.0, dt,
+                )  # fmt: skip
+            else:
+                drive = user[u + _AREA_HEAD] * (act[2] + dt * rate[2])
+                drive -= user[u + _AREA_ROD] * (act[3] + dt * rate[3])
         terms, steep = floats(m, 0), 0.0
         if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
             terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
-        gain = _gain(m, i, m_gainprm) if user[u + _KIND] > 2.0 else 0.0
+        gain = _gain(m, i, m_gainprm) if user[u + _KIND] == _FORCE else 0.0
         if len(terms) > 0:
             s = _state(
                 d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, velocity, nu,
@@ -213,6 +221,8 @@ def _compile_callbacks():
                 more += gain * extra
                 steep += gain * slope
             drive += more
+        if user[u + _KIND] == _PUMPED:
+            return drive
         if user[u + _INERTIA] == 0.0:
             return drive - actuator_friction(user, u, velocity)
         push = drive + _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)

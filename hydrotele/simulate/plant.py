@@ -144,8 +144,9 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
         joints: joint name -> angle [rad] or position [m]; others at home.
 
     Returns:
-        A new MjData. The unloaded chamber of each axis is at REST_PRESSURE, the other one carries
-        the static load, and transmissions are wound up by it.
+        A new MjData. The unloaded chamber of each axis is at REST_PRESSURE (at the accumulator's
+        behind a pump of its own), the other one carries the static load, and transmissions are
+        wound up by it.
 
     Raises:
         InputError: the linkages do not close there.
@@ -156,10 +157,12 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
     wind_up(plant.machine, plant.model, data, dict(zip(plant.axes, forces, strict=True)))
     forces = forces - terms_at_rest(plant.machine, data, plant.drive_qpos, forces)
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
-        head, rod = plant.machine.axes[name].hydraulic_drive.areas
-        p_head, p_rod = (forces[i] + rod * REST_PRESSURE) / head, REST_PRESSURE
-        if p_head < REST_PRESSURE:
-            p_head, p_rod = REST_PRESSURE, (head * REST_PRESSURE - forces[i]) / rod
+        axis = plant.machine.axes[name]
+        head, rod = axis.hydraulic_drive.areas
+        rest = axis.pump.accumulator.pressure if axis.pump else REST_PRESSURE
+        p_head, p_rod = (forces[i] + rod * rest) / head, rest
+        if p_head < rest:
+            p_head, p_rod = rest, (head * rest - forces[i]) / rod
         data.act[ACTIVATIONS * i + 2 : ACTIVATIONS * i + 4] = p_head, p_rod
     for i in range(plant.hydraulic, len(plant.axes)):
         drive = plant.machine.axes[plant.axes[i]].force

@@ -18,6 +18,8 @@ from hydrotele.simulate.record import Record
 from hydrotele.simulate.surroundings import thing_joints
 from hydrotele.simulate.term_readout import added_by_terms
 
+_SPOOL = ("spool", "1"), ("spool_rate", "1/s")
+
 
 @compiled
 def state_supply(user, count, act, scratch):
@@ -191,22 +193,27 @@ def _put_hydraulics(plant: Plant, record: Record, put) -> None:
     x, v = drive_motion(plant, record.qpos, record.qvel)
     user = plant.model.actuator_user.ravel()
     table = state_flows(user, count, np.ascontiguousarray(record.act), x, v)
-    put("pressure_supply", table[:, 0], "Pa")
+    if plant.machine.valve_axes:
+        put("pressure_supply", table[:, 0], "Pa")
     more = added_by_terms(plant.machine, record.time, record.act, x, v, record.command)
     total = np.zeros(len(record.time))
     for i, name in enumerate(plant.axes[:count]):
-        cylinder = plant.machine.axes[name].cylinder
-        put(f"truth.spool.{name}", record.act[:, ACTIVATIONS * i], "1")
-        put(f"truth.spool_rate.{name}", record.act[:, ACTIVATIONS * i + 1], "1/s")
+        cylinder, pumped = plant.machine.axes[name].cylinder, plant.machine.axes[name].pump
+        kinds = (("speed", "rad/s"), ("pressure_load", "Pa")) if pumped else _SPOOL
+        for place, (kind, unit) in enumerate(kinds):
+            put(f"truth.{kind}.{name}", record.act[:, ACTIVATIONS * i + place], unit)
         put(f"truth.flow_head.{name}", table[:, 1 + 3 * i], "m^3/s")
         put(f"truth.flow_rod.{name}", table[:, 2 + 3 * i], "m^3/s")
         force = table[:, 3 + 3 * i] + more[:, i, 0]
         put(f"truth.force.{name}", force, "N" if cylinder else "N m")
         if cylinder:
             put(f"truth.piston_velocity.{name}", v[:, i], "m/s")
+        if pumped:  # feeds itself
+            continue
         fed_head = record.act[:, ACTIVATIONS * i] > 0.0
         total += np.where(fed_head, table[:, 1 + 3 * i], table[:, 2 + 3 * i])
-    put("truth.flow_supply", total, "m^3/s")
+    if plant.machine.valve_axes:
+        put("truth.flow_supply", total, "m^3/s")
 
 
 def drive_motion(plant: Plant, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

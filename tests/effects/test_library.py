@@ -66,7 +66,8 @@ def usual(machine, name, place, size=1.0):
 def test_names_and_places_are_those_agreed():
     machine = machine_of("cat215", "none")
     assert {n: set(e.locations(machine)) for n, e in EFFECTS.items()} == PLACES
-    assert {m for m, _ in MACHINES} == set(shipped_machines())
+    pumped = {"eha"}  # the sizes of effects go by valve and supply, which a pump drive has not
+    assert {m for m, _ in MACHINES} | pumped == set(shipped_machines())
 
 
 @pytest.mark.parametrize(("machine", "tool", "name", "place"), CASES)

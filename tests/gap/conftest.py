@@ -13,6 +13,8 @@ from hydrotele.gap.result import (
     Estimate,
     Gap,
     GapSize,
+    Lack,
+    LearnedLaw,
     NamedEffect,
     Prediction,
     Unknown,
@@ -20,6 +22,7 @@ from hydrotele.gap.result import (
 from hydrotele.log import Log
 from hydrotele.machine_file import load_machine
 from hydrotele.signals import usual_unit
+from hydrotele.terms.facts import Term
 
 NOISE = {"angle": 1.0e-3, "length": 1.2e-3, "pressure_head": 1e5, "pressure_rod": 1e5}
 _PERIOD, _ROWS, _LOUD = 0.02, 400, slice(150, 230)
@@ -82,8 +85,43 @@ def patched_machine(machine):
 
 
 _PAYLOAD = NamedEffect(
-    "payload", "tool", 0.9997, {"mass": Estimate(251.3, "kg", 247.9, 254.6, 0.0)}
+    "payload", "tool", 0.9997, {"mass": Estimate(251.3, "kg", 247.9, 254.6, 0.0)}, share=0.63
 )
+_KNOT = 0.55  # m, where the learned law begins
+_PER_METRE = 3.0e5  # N/m, its slope from there
+
+
+def with_learned_law(machine):
+    """A machine with a law learned from data, and with calibrated numbers."""
+    for name, location, values in (
+        ("payload", "tool", {"mass": 251.3}),
+        ("valve_gain", "boom", {"ratio": 1.04}),
+    ):
+        machine = apply_effect(machine, name, location, values)
+    law = Term(
+        name="learned_force", axis="boom", balance="force", law="formula",
+        parameters={f"above(position, {_KNOT})": -_PER_METRE}, domain={"position": (0.3, 0.7)},
+        uncertainty=400.0, description="learned from data: force over position",
+    )  # fmt: skip
+    return machine.model_copy(update={"terms": (*machine.terms, law)})
+
+
+_POINTS = np.linspace(0.3, 0.7, 41)
+_LAW = LearnedLaw(
+    "force", "boom", f"-3e+05 above(position, {_KNOT})",
+    "A force on the boom drive, 12 kN RMS, that varies with position.", "", "position",
+    tuple(_POINTS.tolist()), tuple((-_PER_METRE * np.maximum(0.0, _POINTS - _KNOT)).tolist()),
+    (400.0,) * 41, "N", "m", 0.31,
+)  # fmt: skip
+_CALIBRATION = {
+    "valve_gain.boom.ratio": Estimate(1.04, "1", 1.035, 1.045, 1.0),
+    "mass.stick": Estimate(612.0, "kg", 590.0, 634.0, 610.0),
+}
+_NOISE = {
+    "angle.boom": (1.2e-3, 1.0e-3),
+    "length.boom": (1.2e-3, float("nan")),
+}
+_LACKS = (Lack("force", "boom", 2100.0, "N", 0.012), Lack("command", "stick", 0.002, "1", 0.004))
 _OFFSET = NamedEffect(
     "length_offset", "boom", 0.62, {"offset": Estimate(-0.0061, "m", -0.0066, -0.0056, 0.0)},
     (Alternative("pin_offset", "boom", 0.37),),
@@ -123,13 +161,21 @@ _EXPERIMENT = {
 _UNKNOWN = Unknown(
     "force", "pressure_head.boom", ("length.boom",),
     "A force of 9 kN against the motion where the piston is near 0.55 m.",
-    "9000 exp(-((x - 0.55)/0.05)^2/2) sign(v)", ((3.0, 4.6),),
+    "9000 above(position, 0.55) * sign(velocity, 0.01)", ((3.0, 4.6),),
 )  # fmt: skip
 _CASES = {
     "named": {"effects": (_PAYLOAD,)},
     "no_gap": {},
     "unknown": {"unknown": _UNKNOWN},
     "ambiguous": {"effects": (_OFFSET,), "next_experiment": _EXPERIMENT},
+    "partly": {
+        "effects": (_PAYLOAD,),
+        "unknown": _UNKNOWN,
+        "calibration": _CALIBRATION,
+        "learned": (_LAW,),
+        "lacks": _LACKS,
+        "noise": _NOISE,
+    },
 }
 
 
@@ -137,6 +183,7 @@ def made_up_gap(verdict: str, log: Log | None = None, loud: slice = _LOUD) -> Ga
     """A Gap of each verdict on a log."""
     log = log or made_up_log()
     machine = load_machine("cat215", tool="none")
+    patch = with_learned_law if verdict == "partly" else patched_machine
     facts = _CASES[verdict]
     named = bool(facts.get("effects"))
     before = predictions(log, 0.0 if verdict == "no_gap" else 6.0, loud)
@@ -144,7 +191,7 @@ def made_up_gap(verdict: str, log: Log | None = None, loud: slice = _LOUD) -> Ga
     rms = [float(np.sqrt(np.nanmean(p.whitened**2))) for p in (before, after)]
     return dataclasses.replace(
         Gap(
-            machine=machine, patched=patched_machine(machine) if named else machine,
+            machine=machine, patched=patch(machine) if named else machine,
             verdict=verdict, effects=(), unknown=None, size=GapSize(*rms, 1.0), ranking=_RANKING,
             before=(before,), after=(after,), laws=_LAWS,
             law_units={"force": "N m", "flow": "m^3/s", "supply": "Pa"}, tests=_TESTS,

@@ -89,6 +89,22 @@ def test_the_patched_machine_runs_and_is_replayed(site, searching):
     assert other["pressure_head.boom"]["rms"] > 5 * channels["pressure_head.boom"]["rms"]
 
 
+def test_a_machine_with_a_learned_law_runs_and_is_replayed(site, searching):
+    searching("partly")
+    code, out, _ = invoke("gap", "--data", "site", "--no-recording")
+    assert code == 0 and "the rest has no known cause" in " ".join(out.split())
+    patched = "gap_site/patched/"
+    assert load_machine(site / patched).terms[0].name == "learned_force"
+    short = ("--set", "duration=0.5", "--set", "tool=none", "--no-review")
+    code, _, err = invoke("run", "steps", "--machine", patched, *short, "--out", "again")
+    assert code == 0, err
+    code, out, err = invoke(
+        "replay", "again/measured.parquet", "--machine", patched, "--json", "--out", "replayed"
+    )
+    assert code == 0, err
+    assert json.loads(out)["channels"]["angle.boom"]["rms"] < 0.01  # as without a law, see above
+
+
 def test_json_is_gap_json_and_nothing_else(site, searching):
     searching("ambiguous")
     code, out, _ = invoke("gap", "--data", "site", "--no-recording", "--json", "--out", "here")

@@ -40,7 +40,26 @@ def test_effects_for_programs(patched):
 
 
 def test_only_what_was_named_is_patched(gap_of):
-    wanted = {"named": True, "ambiguous": True, "no_gap": False, "unknown": False}
+    wanted = {
+        "named": True, "ambiguous": True, "partly": True, "no_gap": False, "unknown": False,
+    }  # fmt: skip
     assert {verdict: has_patch(gap_of(verdict)) for verdict in wanted} == wanted
-    both = dataclasses.replace(gap_of("unknown"), effects=gap_of("named").effects)
-    assert has_patch(both)
+    for part in ("effects", "calibration", "learned"):
+        assert has_patch(
+            dataclasses.replace(gap_of("unknown"), **{part: getattr(gap_of("partly"), part)})
+        )
+
+
+def test_calibrated_numbers_and_learned_laws_come_back(tmp_path, gap_of):
+    gap = gap_of("partly")
+    write_patch(gap, tmp_path)
+    found = load_machine(tmp_path)
+    assert found.terms == gap.patched.terms and len(found.terms) == 1
+    assert found.axes["boom"].valve == gap.patched.axes["boom"].valve
+    assert found.axes["boom"].valve != gap.machine.axes["boom"].valve
+    head = [t for t in (tmp_path / "machine.yaml").read_text().splitlines() if t.startswith("#")]
+    assert any("calibrated valve gain of the boom" in line and "104.0" in line for line in head)
+    assert any("learned Force on the boom drive over position" in line for line in head)
+    record = yaml.safe_load((tmp_path / "effects.yaml").read_text())
+    assert record["calibration"]["mass.stick"]["nominal"] == 610.0
+    assert record["learned"][0]["formula"] == "-3e+05 above(position, 0.55)"

@@ -1,42 +1,41 @@
-"""Rivals of a named effect: what seems better must settle better."""
-
-from types import SimpleNamespace
+"""Probabilities of explanations: better in a few places only is not surely better."""
 
 import numpy as np
 import pytest
 
-from hydrotele.gap import search
-from hydrotele.machine_file import load_machine
-from hydrotele.prediction.evidence import Fit
-from hydrotele.prediction.hypothesis import Guess, hypotheses
+from hydrotele.gap.search import weights
+
+_STRETCHES = 80
 
 
-@pytest.fixture
-def parts():
-    return hypotheses(load_machine("cat215"), ("valve_deadband", "command_delay"))
+def test_better_everywhere_is_sure():
+    """Better by 1 in each of 80 stretches, 80 in all; a draw of the stretches hardly matters."""
+    base = np.full(_STRETCHES, 100.0)
+    assert weights([base - 1.0, base], [10.0, 0.0])[0] > 0.999
 
 
-def fit_of(hypothesis, gain):
-    guess = Guess(((hypothesis, np.full(hypothesis.size, 50.0)),))
-    return Fit(guess, 0.0, gain, 2.0, np.eye(hypothesis.size))
+def test_better_in_two_stretches_only_is_not_sure():
+    """The same 80 in two stretches: a draw leaves both out with probability e^-2 = 0.14 or so."""
+    better = np.full(_STRETCHES, 100.0)
+    better[[10, 50]] -= 40.0
+    chances = weights([better, np.full(_STRETCHES, 100.0)], [10.0, 0.0])
+    assert 0.6 < chances[0] < 0.99
+    plain = 1.0 / (1.0 + np.exp(-0.5 * (80.0 - 10.0)))
+    assert plain > 0.999999  # what the likelihood alone would say
 
 
-@pytest.mark.parametrize("settled, wins", [(5.0, True), (-7.0, False), (-np.inf, False)])
-def test_a_rival_counts_by_what_it_settles_at(monkeypatch, parts, settled, wins):
-    """With kept gains the rival seems better by 40; with its own it is so by `settled`."""
-    own, rival = fit_of(parts[0], 100.0), fit_of(parts[1], 140.0)
-    flattered = fit_of(parts[0], 170.0)  # what was beaten, seen from the winner
-    bases = []
-    evidence = SimpleNamespace(set_base=bases.append)
-    monkeypatch.setattr(
-        search, "compare", lambda *_: (rival, (flattered,)) if bases else (own, (rival,))
-    )
-    monkeypatch.setattr(
-        search, "_settled_gain",
-        lambda _, guess, other: (bases.append(other), (other, rival, settled))[1],
-    )  # fmt: skip
-    guess, _, first, others = search._weighed(evidence, own.guess, own, 0, ())
-    assert (guess.parts[0][0] is parts[1]) == wins == (first is rival)
-    assert others[0].score == first.score - abs(settled)
-    if not wins:
-        assert bases[-1] is own.guess  # the evidence stands as before
+def test_charges_count_and_chances_sum_to_one():
+    """With the same likelihood everywhere only the charge tells: odds exp(charge / 2)."""
+    same = np.full(_STRETCHES, 3.0)
+    chances = weights([same, same, same], [0.0, 2.0, 4.0])
+    assert chances.sum() == pytest.approx(1.0)
+    assert chances[1] / chances[0] == pytest.approx(np.exp(-1.0), rel=1e-9)  # rounding
+    assert chances[2] / chances[0] == pytest.approx(np.exp(-2.0), rel=1e-9)
+
+
+def test_a_constant_in_all_changes_nothing():
+    rng = np.random.default_rng(2)
+    table = rng.normal(size=(3, _STRETCHES))
+    own = weights(list(table), [0.0, 1.0, 2.0])
+    moved = weights(list(table + rng.normal(size=_STRETCHES)), [0.0, 1.0, 2.0])
+    np.testing.assert_allclose(moved, own, rtol=1e-9)  # rounding

@@ -48,6 +48,25 @@ def test_an_ambiguity_names_both_and_the_experiment(gap_of):
         assert piece in words
 
 
+def test_a_partly_named_gap_says_what_is_named_learned_and_left(gap_of):
+    gap = gap_of("partly")
+    assert headline(gap) == "Payload at the tool: mass 251.3 kg; the rest has no known cause"
+    words = text_of(gap)
+    for piece in (
+        "one place that can be named", "Without it 63 % of the gap on run test_1 comes back",
+        "2 uncertain numbers were calibrated", "valve gain of the boom: ratio 104.00 % (model 100)",
+        "What fails is the balance of forces", "One law was learned", "With all of this",
+    ):  # fmt: skip
+        assert piece in words, piece
+
+
+def test_numbers_off_alone_are_no_gap_but_said(gap_of):
+    gap = dataclasses.replace(gap_of("no_gap"), calibration=gap_of("partly").calibration)
+    assert headline(gap) == "Model and machine agree within the uncertainty of its numbers"
+    words = text_of(gap)
+    assert "2 uncertain numbers were calibrated" in words and "Nothing in the model" not in words
+
+
 def test_failed_tests_are_not_kept_quiet(gap_of):
     tests = {"window means": {"value": 9.0, "limit": 4.0, "passed": False}}
     gap = dataclasses.replace(gap_of("named"), tests=tests)

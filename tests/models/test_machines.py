@@ -52,7 +52,7 @@ def test_steps_under_noise_without_warning(plant):
     assert no_warnings(data)
     assert opening < PIN
     assert np.all(np.isfinite(data.qpos)) and np.all(np.isfinite(data.act))
-    assert np.abs(data.qpos - start)[plant.qpos].max() > 0.01  # it did move
+    assert np.abs(data.qpos - start)[plant.qpos].max() > 1.0e-3  # it did move; a pump drive is slow
 
 
 def test_rests_in_equilibrium(plant):

@@ -10,7 +10,8 @@ import math
 import numpy as np
 
 from hydrotele.hydraulics.circuit import Slot, circuit_scratch
-from hydrotele.hydraulics.laws import orifice, valve_opening
+from hydrotele.hydraulics.laws import orifice
+from hydrotele.hydraulics.valve import axis_opening
 from hydrotele.simulate.readout import state_supply
 
 _ATMOSPHERE = 1.013e5  # Pa
@@ -185,10 +186,11 @@ class _Chambers:
     def returning(self, data) -> tuple[int, float]:
         """Side that drains to tank (0 head, 1 rod) and its flow out [m^3/s]."""
         user = self.user
-        opening = valve_opening(data.act[4 * self.i], user[Slot.DEADBAND])
+        opening = axis_opening(user, 0, data.act[4 * self.i])
         side = 1 if opening > 0.0 else 0
+        edge = user[Slot.METERING_BT if opening > 0.0 else Slot.METERING_AT]
         drop = data.act[4 * self.i + 2 + side] - user[Slot.TANK_PRESSURE]
-        gain = user[Slot.FLOW_GAIN] * abs(opening)
+        gain = user[Slot.FLOW_GAIN] * edge * abs(opening)
         return side, max(0.0, orifice(drop, gain, user[Slot.ORIFICE_SMOOTHING])[0])
 
     def add(self, data, side: int, flow: float) -> None:
