@@ -30,7 +30,7 @@ from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.prediction.free_run import _run_from, _shown, following_levels
 from hydrotele.prediction.hypothesis import Guess
-from hydrotele.prediction.track import Levels, Track, fine_enough, track_run
+from hydrotele.prediction.track import Levels, fine_enough, track_run
 
 WINDOW = 5.0  # s: shorter windows weigh the start, longer ones what no model can know
 LEAD = 2.0  # s of readings before a window that tell its start
@@ -40,6 +40,7 @@ _STILL = 0.01  # of a channel's range: a window in which all channels move less 
 _STEPS = (2.0e-2, 1.0e-2, 4.0e-3, 2.0e-3, 1.0e-3)  # s of the integrator, the largest that does
 _ROUGHNESS = 0.02  # of the errors, that a larger step may add
 _NUDGE = 0.05  # typical deviations, for slopes: windows with friction are not smooth below
+_ROUND = 5  # steps between new starts
 _FALL = 1.0  # of the loss, -2 log likelihood: less than one is no better model
 _SMALLEST_SCALE = 1.0e-9  # of errors, against a division by nothing [channel's unit]
 _FAR = 1.0e9  # error of a run that left all numbers behind [channel's unit]
@@ -81,7 +82,7 @@ class FreeRunFit:
         scale: (c,) of the errors, as of the robust loss [channel's unit].
         information: (P, P) curvature of half the loss in deviations, the prior's unit included.
         loss: as fitted, with the last scales.
-        iterations: Gauss-Newton steps taken.
+        iterations: damped Gauss-Newton steps taken.
         converged: whether the loss no longer fell; if not, allow more iterations.
         windows: number of windows.
         step: of the integrator [s].
@@ -107,7 +108,7 @@ class FreeRunFit:
 
 def fit_free_runs(
     data: Dataset, guess: Guess, seconds: float = WINDOW, most: int = MOST_WINDOWS,
-    max_iterations: int = 20, jobs: int = 2, say: Callable[[str], None] = lambda text: None,
+    max_iterations: int = 25, jobs: int = 2, say: Callable[[str], None] = lambda text: None,
 ) -> FreeRunFit:  # fmt: skip
     """Fit a guess's deviations to free runs through windows of the fit runs.
 
@@ -193,34 +194,28 @@ class _Problem:
     pool: ThreadPoolExecutor
     step: float = _STEPS[-1]
 
-    def leads(self, machine: Machine, kept: Sequence[Track] | None = None) -> list[Track]:
-        """Tracks of the readings before every window; with those of a machine near by, its gains.
+    def leads(self, machine: Machine) -> list[np.ndarray]:
+        """(lead + 1, nz) states before every window, the last of them its start."""
 
-        Args:
-            machine: the machine.
-            kept: tracks whose gains are kept; they are computed anew without.
-        """
-        tracks: Sequence[Track | None] = kept or [None] * len(self.windows)
-
-        def lead(window: Window, near: Track | None) -> Track:
+        def lead(window: Window) -> np.ndarray:
             part = window.run.part(window.first - _rows(window, LEAD), window.first + 1)
-            return track_run(machine, self.data, part, near, self.step, self.levels)
+            return track_run(machine, self.data, part, step=self.step, levels=self.levels).states
 
-        return [lead(window, near) for window, near in zip(self.windows, tracks, strict=True)]
+        return list(self.pool.map(lead, self.windows))
 
-    def errors(self, machine: Machine, leads: Sequence[Track]) -> np.ndarray:
+    def errors(self, machine: Machine, leads: Sequence[np.ndarray]) -> np.ndarray:
         """(r, c) errors in all rows of all windows, NaN without a reading [channel's unit]."""
         model = reduced_model(machine, self.data.channels)
-        late, out = bool(np.any(model.lag > 0.0)), []
-        for window, track in zip(self.windows, leads, strict=True):
-            measured, run, states = window.measured, window.run, track.states
+        late, out = bool(np.any(model.lag > 0.0) or np.any(model.time_constant > 0.0)), []
+        for window, states in zip(self.windows, leads, strict=True):
+            measured, run = window.measured, window.run
             lead, period = len(states) - 1, run.period
             made = np.full(measured.shape, np.nan)
             if np.isfinite(states[-1]).all():
                 space, begin = model_space(model), window.first - lead
                 space.time[1] = run.start + begin * period
                 command = run.command[begin : window.first + window.count + 1]
-                before = _shown(model, states) if late else np.zeros((1, len(model.lag)))
+                before = _shown(model, states, period) if late else np.zeros((1, len(model.lag)))
                 steps = max(1, round(period / fine_enough(machine, self.step)))
                 start = states[-1].copy()
                 _run_from(model, space, start, command, lead, period, steps, before, made)
@@ -245,37 +240,27 @@ class _Point:
 
     guess: Guess
     machine: Machine
-    leads: list[Track]
+    leads: list[np.ndarray]
     errors: np.ndarray
 
 
 def _fit(
     problem: _Problem, guess: Guess, max_iterations: int, say: Callable[[str], None]
 ) -> FreeRunFit:
-    """Damped Gauss-Newton steps until the loss no longer falls."""
+    """Rounds of steps with kept starts, until a round with new starts is no better."""
     weights = problem.weights()
     now = first = _point(problem, guess)
-    scale, (damping, factor, most) = _scales(now.errors, weights), _DAMPING
-    loss, information, taken, converged = np.inf, np.eye(len(guess.deviation)), 0, False
+    scale = _scales(now.errors, weights)
+    taken, converged = 0, False
     while not converged and taken < max_iterations:
-        loss = _loss(now, weights, scale)
-        slope, information = _normal_equations(problem, now, weights, scale)
-        better = None
-        while better is None and damping < most:
-            damped = information + damping * np.diag(np.diag(information))
-            step = np.linalg.solve(damped, -slope)
-            tried = _point(problem, now.guess.at(now.guess.deviation + step))
-            if _loss(tried, weights, scale) < loss:
-                better = tried
-                damping /= factor
-            else:
-                damping *= factor
-        taken += 1
-        fall = loss - _loss(better, weights, scale) if better else 0.0
-        converged = fall < _FALL
-        if better:
-            now, scale = better, _scales(better.errors, weights)
-        say(f"free-run fit, step {taken}: loss {loss:.1f} falls by {fall:.1f}")
+        tried, steps = _descend(problem, now, weights, scale, min(_ROUND, max_iterations - taken))
+        taken += steps
+        fresh = _point(problem, tried.guess)
+        before, after = (_loss(point, weights, scale) for point in (now, fresh))
+        converged = before - after < _FALL
+        if after < before:
+            now, scale = fresh, _scales(fresh.errors, weights)
+        say(f"free-run fit, {taken} steps: loss falls from {before:.1f} to {after:.1f}")
     _, information = _normal_equations(problem, now, weights, scale)
     return FreeRunFit(
         guess=now.guess, machine=now.machine, before=_rms(first.errors), after=_rms(now.errors),
@@ -284,9 +269,32 @@ def _fit(
     )  # fmt: skip
 
 
-def _point(problem: _Problem, guess: Guess) -> _Point:
+def _descend(
+    problem: _Problem, now: _Point, weights: np.ndarray, scale: np.ndarray, most: int
+) -> tuple[_Point, int]:
+    """At most so many damped Gauss-Newton steps with the starts of a point; (point, steps)."""
+    damping, factor, largest = _DAMPING
+    loss = _loss(now, weights, scale)
+    for taken in range(1, most + 1):
+        slope, information = _normal_equations(problem, now, weights, scale)
+        fall = 0.0
+        while fall <= 0.0 and damping < largest:
+            damped = information + damping * np.diag(np.diag(information))
+            step = np.linalg.solve(damped, -slope)
+            tried = _point(problem, now.guess.at(now.guess.deviation + step), now.leads)
+            fall = loss - _loss(tried, weights, scale)
+            damping = damping / factor if fall > 0.0 else damping * factor
+        if fall > 0.0:
+            now, loss = tried, loss - fall
+        if fall < _FALL:
+            return now, taken
+    return now, most
+
+
+def _point(problem: _Problem, guess: Guess, leads: list[np.ndarray] | None = None) -> _Point:
+    """A guess with its errors; from given starts, else from those that its own filter finds."""
     machine = guess.machine(problem.data.machine)
-    leads = problem.leads(machine)
+    leads = leads or problem.leads(machine)
     return _Point(guess, machine, leads, problem.errors(machine, leads))
 
 
@@ -301,7 +309,7 @@ def _normal_equations(
         moved = deviation.copy()
         moved[p] += nudges[p]
         machine = now.guess.at(moved).machine(problem.data.machine)
-        errors = problem.errors(machine, problem.leads(machine, now.leads))
+        errors = problem.errors(machine, now.leads)
         return ((errors - now.errors) / (nudges[p] * scale))[known]
 
     columns = np.column_stack(list(problem.pool.map(column, range(len(deviation)))))
