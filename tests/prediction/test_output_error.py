@@ -1,4 +1,4 @@
-"""Fits to free runs: what the plant was given comes out, tables never fall, linkages still close."""
+"""Fits to free runs: what was planted comes out, tables never fall, linkages still close."""
 
 import numpy as np
 import pytest
@@ -96,11 +96,17 @@ def planted(tmp_path_factory):
         {"name": "command_delay", "location": "boom", "parameters": {"delay": 0.12}},
         {"name": "valve_deadband", "location": "boom", "parameters": {"deadband": 0.30}},
     ]
+    time = np.arange(0.0, 20.0, 0.1)
     for seed in (1, 2, 3):
+        rng = np.random.default_rng(seed)
+        held = np.repeat(rng.uniform(-0.8, 0.8, (1 + len(time) // 8, 2)), 8, axis=0)[: len(time)]
         scenario = Scenario(
             name=f"run{seed}", machine="ec20", control_rate=50, log_rate=50, duration=20.0,
             ground=False, seed=seed, sensors="record", effects=effects,
-            pilot={"kind": "multisine", "amplitude": 0.7},
+            pilot={
+                "kind": "table", "of": "command", "interpolate": "hold", "time": time.tolist(),
+                "columns": {"boom": held[:, 0].tolist(), "stick": held[:, 1].tolist()},
+            },
         )  # fmt: skip
         save_log(run_scenario(scenario).measured, folder / f"run{seed}.parquet")
     return load_dataset(folder, load_machine("ec20"))
