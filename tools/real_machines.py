@@ -12,6 +12,7 @@ plant under the published controller, against the figures in the folder's README
 import argparse
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +25,23 @@ from hydrotele.gap.result import Gap
 from hydrotele.identify.zero_phase import zero_phase
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine
-from hydrotele.prediction.free_run import following_levels
-from hydrotele.prediction.stretches import busiest
+from hydrotele.prediction.baselines import fit_baseline
+from hydrotele.prediction.free_run import (
+    Prepare,
+    following_levels,
+    free_run_errors,
+    machine_runner,
+)
+from hydrotele.prediction.open_numbers import open_numbers
+from hydrotele.prediction.output_error import fit_free_runs
+from hydrotele.prediction.stretches import busiest, busiest_rows
 from hydrotele.prediction.track import track_run
 from hydrotele.terms.law import LAWS, VARIABLES, DriveState
 
 WINDOW, LEAD = 5.0, 0.5  # s; of each window the lead has readings, the rest none
 PUSH = (176.0, 7.3, 0.7)  # N, s, s: half of the drive's largest force
 ENCODER = 5.0e-6  # m, an accuracy that the record's makers do not state
+_MINUTE = 60.0  # s
 _EDGE = 100  # rows that the filters' ends spoil
 
 
@@ -76,13 +86,19 @@ def _added(machine: Machine, run: RunData, position: np.ndarray, rate: np.ndarra
     return total
 
 
+def read_throughout(run: RunData) -> RunData:
+    """A run from the first row in which all channels are read to the last one."""
+    known = np.flatnonzero(np.isfinite(run.reading).all(axis=1))
+    return run.part(known[0], known[-1] + 1)
+
+
 def velocity_fit(machine: Machine, data: Dataset, cutoff: float) -> dict[str, float]:
     """Fit of the velocities in the held-out run, where the model has had no reading [%].
 
     100 % less the size of the difference over that of the velocity itself about its mean; both
     velocities pass the same zero-phase filter.
     """
-    run = data.heldout
+    run = read_throughout(data.heldout)
     rows, lead = round(WINDOW / run.period), round(LEAD / run.period)
     hidden = np.arange(len(run.reading)) % rows >= lead
     reading = np.where(hidden[:, None], np.nan, run.reading)
@@ -156,8 +172,67 @@ def plain_valves(record: Path) -> Dataset:
     return load_dataset(record, machine)
 
 
+def joined(runs: Sequence[RunData]) -> RunData:
+    """Pieces of one record as one run again."""
+    tables = {
+        name: np.concatenate([getattr(run, name) for run in runs])
+        for name in ("command", "command_known", "reading")
+    }
+    valid = None
+    if any(run.valid is not None for run in runs):
+        valid = np.concatenate([
+            np.ones(len(run.reading), bool) if run.valid is None else run.valid for run in runs
+        ])  # fmt: skip
+    return dataclasses.replace(runs[0], **tables, valid=valid)
+
+
+def ec20_splits(data: Dataset) -> dict[str, Dataset]:
+    """The EC20's record, fitted on one part and judged on another, and on a minute of it."""
+    quarters = [*data.fit, data.heldout]
+    parts = {
+        "first half -> second": (quarters[:2], quarters[2:]),
+        "second half -> first": (quarters[2:], quarters[:2]),
+        "first 75 % -> last 25 %": (quarters[:3], quarters[3:]),
+    }
+    splits = {
+        name: dataclasses.replace(data, fit=(joined(fit),), heldout=joined(held))
+        for name, (fit, held) in parts.items()
+    }
+    whole = splits["first 75 % -> last 25 %"]
+    run = whole.fit[0]
+    rows = busiest_rows(run, round(_MINUTE / run.period))
+    minute = run.part(rows.start, rows.stop)
+    return splits | {"busiest 60 s -> last 25 %": dataclasses.replace(whole, fit=(minute,))}
+
+
+def free_run_words(prepare: Prepare, run: RunData) -> str:
+    """RMS errors of the angles over 5, 10 and 30 s, boom / stick [deg]."""
+    errors = free_run_errors(prepare(run), run, (5.0, 10.0, 30.0), to_end=False)
+    return "  ".join(
+        f"{seconds} s " + " / ".join(f"{np.degrees(x):5.2f}" for x in horizon.rms)
+        for seconds, horizon in errors.horizons.items()
+    )
+
+
+def ec20_free_runs(data: Dataset, jobs: int) -> None:
+    """The shipped machine, fitted to free runs, beside black boxes that saw the same or more."""
+    for name, split in ec20_splits(data).items():
+        print(f"EC20, {name}: RMS angle error, boom / stick [deg]", flush=True)
+        fit = fit_free_runs(split, open_numbers(data.machine), jobs=jobs)
+        for which, machine in (("as shipped", data.machine), ("fitted", fit.machine)):
+            fits = velocity_fit(machine, split, 2.0)
+            words = free_run_words(machine_runner(machine, split), split.heldout)
+            speeds = " / ".join(f"{fits[axis]:.1f}" for axis in ("boom", "stick"))
+            print(f"  {which:12} {words}  velocity fit {speeds} %", flush=True)
+        for baseline in ("table", "arx", "mlp"):
+            words = free_run_words(fit_baseline(baseline, split), split.heldout)
+            print(f"  {baseline:12} {words}", flush=True)
+
+
 def ec20(folder: Path, jobs: int) -> None:
-    """Name what a valve without delay and dead band lacks."""
+    """Fit the shipped machine to free runs; name what a valve without delay and dead band lacks."""
+    record = folder / "volvo_ec20" / "long.parquet"
+    ec20_free_runs(load_dataset(record, load_machine("ec20")), jobs)
     data = plain_valves(folder / "volvo_ec20" / "long.parquet")
     machine = data.machine
     gap = find_gap(data, lambda text, _: print(f"  {text}", file=sys.stderr), jobs=jobs)

@@ -1,0 +1,359 @@
+"""A machine's numbers from free runs: output-error fits over windows of some seconds.
+
+One-step errors judge what a model says of the next reading. Where angles are all that is read, and
+often, the next one is nearly the last one whatever the model is, and small errors of the speed,
+which a user sees after five seconds, hardly count. So the model runs freely through many windows,
+each started from the filter's state, and its deviations d are those of the least loss
+
+    sum over windows and channels of  w rho(e / s) + d'd,   rho(z) = 2 (sqrt(1 + z^2) - 1),
+
+with a unit normal as prior of d and a scale s of each channel's errors, which is found on the way.
+The loss is robust because digging, stalls and end stops are in no model: they shall not bend it. An
+error integrates what the speed lacks, so neighbouring rows say the same thing again: w counts them
+as one value per second.
+
+Source: Ljung 1999, *System Identification*, 7.3 (output error, simulation focus) and 15.2 (robust
+norms); Bock 1987 (multiple shooting: windows keep the error of the start from growing); Gauss-
+Newton steps damped as of Levenberg and Marquardt (Nocedal and Wright 2006, 10.3).
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.dataset.load import Dataset, RunData
+from hydrotele.dynamics.model import model_space, reduced_model
+from hydrotele.errors import InputError
+from hydrotele.machine import Machine
+from hydrotele.prediction.free_run import _run_from, _shown, following_levels
+from hydrotele.prediction.hypothesis import Guess
+from hydrotele.prediction.track import Levels, fine_enough, track_run
+
+WINDOW = 5.0  # s: shorter windows weigh the start, longer ones what no model can know
+LEAD = 2.0  # s of readings before a window that tell its start
+MOST_WINDOWS = 120  # in all: 600 s, of which each says as much of a machine as the next
+_REMEMBERED = 1.0  # s of a window in which errors say one thing
+_STILL = 0.01  # of a channel's range: a window in which all channels move less says nothing
+_STEPS = (2.0e-2, 1.0e-2, 4.0e-3, 2.0e-3, 1.0e-3)  # s of the integrator, the largest that does
+_ROUGHNESS = 0.02  # of the errors, that a larger step may add
+_NUDGE = 0.05  # typical deviations, for slopes: windows with friction are not smooth below
+_ROUND = 5  # steps between new starts
+_FALL = 1.0  # of the loss, -2 log likelihood: less than one is no better model
+_SMALLEST_SCALE = 1.0e-9  # of errors, against a division by nothing [channel's unit]
+_FAR = 1.0e9  # error of a run that left all numbers behind [channel's unit]
+_LOOKS = 8  # windows that choose the integrator's step
+_DAMPING = 1.0e-2, 4.0, 1.0e6  # at first, factor, and where no step helps
+
+
+class Window(NamedTuple):
+    """A stretch of a run through which the model runs freely.
+
+    Attributes:
+        run: the whole run, whose commands are on their way when the window begins.
+        first: row of the start.
+        count: rows after it.
+    """
+
+    run: RunData
+    first: int
+    count: int
+
+    @property
+    def measured(self) -> np.ndarray:
+        """(count, c) readings, NaN where there is none to hold the model against."""
+        rows = slice(self.first + 1, self.first + 1 + self.count)
+        reading = self.run.reading[rows]
+        valid = self.run.valid
+        return reading if valid is None else np.where(valid[rows, None], reading, np.nan)
+
+
+@dataclass(frozen=True)
+class FreeRunFit:
+    """A guess fitted to free runs.
+
+    Attributes:
+        guess: the guess.
+        machine: the machine that has it.
+        before: (c,) RMS error of the windows before the fit [channel's unit].
+        after: (c,) and after it.
+        scale: (c,) of the errors, as of the robust loss [channel's unit].
+        information: (P, P) curvature of half the loss in deviations, the prior's unit included.
+        loss: as fitted, with the last scales.
+        iterations: damped Gauss-Newton steps taken.
+        converged: whether the loss no longer fell; if not, allow more iterations.
+        windows: number of windows.
+        step: of the integrator [s].
+    """
+
+    guess: Guess
+    machine: Machine
+    before: np.ndarray
+    after: np.ndarray
+    scale: np.ndarray
+    information: np.ndarray
+    loss: float
+    iterations: int
+    converged: bool
+    windows: int
+    step: float
+
+    @property
+    def deviation_sd(self) -> np.ndarray:
+        """(P,) standard deviations of the deviations; 1 is the prior's own."""
+        return np.sqrt(np.diag(np.linalg.inv(self.information)))
+
+
+def fit_free_runs(
+    data: Dataset, guess: Guess, seconds: float = WINDOW, most: int = MOST_WINDOWS,
+    max_iterations: int = 25, jobs: int = 2, say: Callable[[str], None] = lambda text: None,
+) -> FreeRunFit:  # fmt: skip
+    """Fit a guess's deviations to free runs through windows of the fit runs.
+
+    Args:
+        data: the dataset; its machine is the nominal one, `heldout` is not seen.
+        guess: hypotheses with the deviations to begin at.
+        seconds: length of the windows [s].
+        most: number of windows, spread evenly over those in which anything moves.
+        max_iterations: Gauss-Newton steps.
+        jobs: worker threads.
+        say: told of every step.
+
+    Returns:
+        The fit.
+
+    Raises:
+        InputError: the guess has no parameters, or no window fits into the runs.
+    """
+    if not len(guess.deviation):
+        raise InputError("the guess", "has no parameters to fit: add a hypothesis or numbers")
+    windows = free_run_windows(data.fit, seconds, most)
+    with ThreadPoolExecutor(jobs) as pool:
+        problem = _Problem(data, windows, following_levels(data), pool)
+        problem = replace(problem, step=_large_step(problem, guess))
+        return _fit(problem, guess, max_iterations, say)
+
+
+def free_run_windows(
+    runs: Sequence[RunData], seconds: float = WINDOW, most: int = MOST_WINDOWS
+) -> list[Window]:
+    """Windows side by side through all runs, without those in which nothing moves.
+
+    Args:
+        runs: the runs.
+        seconds: length [s].
+        most: number of windows; if there are more, these are spread evenly over them.
+
+    Returns:
+        The windows.
+
+    Raises:
+        InputError: there is none.
+    """
+    readings = np.concatenate([run.reading for run in runs])
+    still = _STILL * (np.nanmax(readings, axis=0) - np.nanmin(readings, axis=0))
+    found = []
+    for run in runs:
+        count, lead = round(seconds / run.period), round(LEAD / run.period)
+        for first in range(lead, len(run.reading) - count, max(1, count)):
+            window = Window(run, first, count)
+            measured = window.measured
+            known = np.isfinite(measured).any(axis=0)
+            moved = np.zeros(len(still))
+            moved[known] = np.nanmax(measured[:, known], axis=0)
+            moved[known] -= np.nanmin(measured[:, known], axis=0)
+            if np.any(moved > still):
+                found.append(window)
+    if not found:
+        raise InputError(
+            "the runs to fit",
+            f"have no {LEAD + seconds:g} s in which anything moves: give longer runs, or a shorter"
+            " window",
+        )
+    every = np.linspace(0, len(found) - 1, min(most, len(found)))
+    return [found[k] for k in np.round(every).astype(int)]
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """What a fit is held against.
+
+    Attributes:
+        data: the dataset.
+        windows: the windows.
+        levels: noise levels of the filter that tells their starts.
+        pool: the workers.
+        step: largest step of the integrator [s].
+    """
+
+    data: Dataset
+    windows: list[Window]
+    levels: Levels
+    pool: ThreadPoolExecutor
+    step: float = _STEPS[-1]
+
+    def leads(self, machine: Machine) -> list[np.ndarray]:
+        """(lead + 1, nz) states before every window, the last of them its start."""
+
+        def lead(window: Window) -> np.ndarray:
+            part = window.run.part(window.first - _rows(window, LEAD), window.first + 1)
+            return track_run(machine, self.data, part, step=self.step, levels=self.levels).states
+
+        return list(self.pool.map(lead, self.windows))
+
+    def errors(self, machine: Machine, leads: Sequence[np.ndarray]) -> np.ndarray:
+        """(r, c) errors in all rows of all windows, NaN without a reading [channel's unit]."""
+        model = reduced_model(machine, self.data.channels)
+        late, out = bool(np.any(model.lag > 0.0) or np.any(model.time_constant > 0.0)), []
+        for window, states in zip(self.windows, leads, strict=True):
+            measured, run = window.measured, window.run
+            lead, period = len(states) - 1, run.period
+            made = np.full(measured.shape, np.nan)
+            if np.isfinite(states[-1]).all():
+                space, begin = model_space(model), window.first - lead
+                space.time[1] = run.start + begin * period
+                command = run.command[begin : window.first + window.count + 1]
+                before = _shown(model, states, period) if late else np.zeros((1, len(model.lag)))
+                steps = max(1, round(period / fine_enough(machine, self.step)))
+                start = states[-1].copy()
+                _run_from(model, space, start, command, lead, period, steps, before, made)
+            with np.errstate(over="ignore", invalid="ignore"):
+                error = np.where(np.isfinite(made), made - measured, np.inf)
+            out.append(np.where(np.isnan(measured), np.nan, np.clip(error, -_FAR, _FAR)))
+        return np.concatenate(out)
+
+    def weights(self) -> np.ndarray:
+        """(r, c) share of every row of an independent value; 0 without a reading."""
+        out = []
+        for window in self.windows:
+            known = np.isfinite(window.measured)
+            values = window.count * window.run.period / _REMEMBERED
+            out.append(known * values / np.maximum(known.sum(axis=0), 1))
+        return np.concatenate(out)
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A guess and the errors of its free runs."""
+
+    guess: Guess
+    machine: Machine
+    leads: list[np.ndarray]
+    errors: np.ndarray
+
+
+def _fit(
+    problem: _Problem, guess: Guess, max_iterations: int, say: Callable[[str], None]
+) -> FreeRunFit:
+    """Rounds of steps with kept starts, until a round with new starts is no better."""
+    weights = problem.weights()
+    now = first = _point(problem, guess)
+    scale = _scales(now.errors, weights)
+    taken, converged = 0, False
+    while not converged and taken < max_iterations:
+        tried, steps = _descend(problem, now, weights, scale, min(_ROUND, max_iterations - taken))
+        taken += steps
+        fresh = _point(problem, tried.guess)
+        before, after = (_loss(point, weights, scale) for point in (now, fresh))
+        converged = before - after < _FALL
+        if after < before:
+            now, scale = fresh, _scales(fresh.errors, weights)
+        say(f"free-run fit, {taken} steps: loss falls from {before:.1f} to {after:.1f}")
+    _, information = _normal_equations(problem, now, weights, scale)
+    return FreeRunFit(
+        guess=now.guess, machine=now.machine, before=_rms(first.errors), after=_rms(now.errors),
+        scale=scale, information=information, loss=_loss(now, weights, scale), iterations=taken,
+        converged=converged, windows=len(problem.windows), step=problem.step,
+    )  # fmt: skip
+
+
+def _descend(
+    problem: _Problem, now: _Point, weights: np.ndarray, scale: np.ndarray, most: int
+) -> tuple[_Point, int]:
+    """At most so many damped Gauss-Newton steps with the starts of a point; (point, steps)."""
+    damping, factor, largest = _DAMPING
+    loss = _loss(now, weights, scale)
+    for taken in range(1, most + 1):
+        slope, information = _normal_equations(problem, now, weights, scale)
+        fall = 0.0
+        while fall <= 0.0 and damping < largest:
+            damped = information + damping * np.diag(np.diag(information))
+            step = np.linalg.solve(damped, -slope)
+            tried = _point(problem, now.guess.at(now.guess.deviation + step), now.leads)
+            fall = loss - _loss(tried, weights, scale)
+            damping = damping / factor if fall > 0.0 else damping * factor
+        if fall > 0.0:
+            now, loss = tried, loss - fall
+        if fall < _FALL:
+            return now, taken
+    return now, most
+
+
+def _point(problem: _Problem, guess: Guess, leads: list[np.ndarray] | None = None) -> _Point:
+    """A guess with its errors; from given starts, else from those that its own filter finds."""
+    machine = guess.machine(problem.data.machine)
+    leads = leads or problem.leads(machine)
+    return _Point(guess, machine, leads, problem.errors(machine, leads))
+
+
+def _normal_equations(
+    problem: _Problem, now: _Point, weights: np.ndarray, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slope (P,) and Gauss-Newton curvature (P, P) of half the loss in the deviations."""
+    deviation, known = now.guess.deviation, weights > 0.0
+    nudges = now.guess.nudges(_NUDGE)
+
+    def column(p: int) -> np.ndarray:
+        moved = deviation.copy()
+        moved[p] += nudges[p]
+        machine = now.guess.at(moved).machine(problem.data.machine)
+        errors = problem.errors(machine, now.leads)
+        return ((errors - now.errors) / (nudges[p] * scale))[known]
+
+    columns = np.column_stack(list(problem.pool.map(column, range(len(deviation)))))
+    z = (now.errors / scale)[known]
+    bent = weights[known] / np.sqrt(1.0 + z**2)
+    weighted = columns * bent[:, None]
+    return weighted.T @ z + deviation, columns.T @ weighted + np.eye(len(deviation))
+
+
+def _loss(point: _Point, weights: np.ndarray, scale: np.ndarray) -> float:
+    """Robust loss of the errors, plus the prior's."""
+    known = weights > 0.0
+    z = (point.errors / scale)[known]
+    rho = 2.0 * (np.sqrt(1.0 + z**2) - 1.0)
+    return float(weights[known] @ rho + point.guess.deviation @ point.guess.deviation)
+
+
+def _scales(errors: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(c,) scale of every channel's errors, 1.48 times their median size, as of a normal one."""
+    found = np.ones(errors.shape[1])
+    for c, column in enumerate(errors.T):
+        known = column[weights[:, c] > 0.0]
+        if len(known):
+            found[c] = max(1.4826 * float(np.median(np.abs(known))), _SMALLEST_SCALE)
+    return found
+
+
+def _rms(errors: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.nanmean(errors**2, axis=0))
+
+
+def _rows(window: Window, seconds: float) -> int:
+    return round(seconds / window.run.period)
+
+
+def _large_step(problem: _Problem, guess: Guess) -> float:
+    """The largest step of the integrator that adds little to the errors [s]."""
+    every = max(1, len(problem.windows) // _LOOKS)
+    part = replace(problem, windows=problem.windows[::every], step=_STEPS[-1])
+    machine = guess.machine(problem.data.machine)
+    leads = part.leads(machine)
+    exact = part.errors(machine, leads)
+    for step in _STEPS[:-1]:
+        errors = replace(part, step=step).errors(machine, leads)
+        if np.all(_rms(errors - exact) <= _ROUGHNESS * _rms(exact)):
+            return step
+    return _STEPS[-1]
