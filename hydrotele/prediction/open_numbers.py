@@ -26,11 +26,26 @@ UNCERTAINTY = {
 }  # fmt: skip
 """Prior standard deviations: of logarithms [1], of the delay [s]."""
 
+LOG = "log"
+"""Unit of a parameter that is the logarithm of a ratio to the machine as it is."""
+
 _DIRECTIONS = ("positive", "negative")
 _LOWEST, _HIGHEST = -5.0, 2.5  # logarithms of a table's steps: from closed to 12 times as steep
 _EVEN = 1.0e-3  # least step of a table, in openings: a flat one could not be scaled up
 _LONGEST_DELAY = 0.5  # s
 _CLEARANCE = 0.02  # m, by which a closed cylinder is longer than its stroke
+
+
+def states_open_numbers(machine: Machine) -> bool:
+    """Whether a machine file says how uncertain its flow tables or linkages are.
+
+    Args:
+        machine: the machine.
+
+    Returns:
+        True with a key `flow_table` or `linkage`, for all axes or one, in its `uncertainty`.
+    """
+    return any(key.partition(".")[0] in ("flow_table", "linkage") for key in machine.uncertainty)
 
 
 def open_numbers(machine: Machine) -> Guess:
@@ -68,7 +83,7 @@ def flow_table(machine: Machine, axis: str) -> Hypothesis:
         The hypothesis, of 14 parameters.
     """
     scale = _share(machine, "flow_table", axis)
-    step = Parameter("1", 0.0, _LOWEST, _HIGHEST, scale, 0.1 * scale)
+    step = Parameter(LOG, 0.0, _LOWEST, _HIGHEST, scale, 0.1 * scale)
     keys = [f"{way}_{k}" for way in _DIRECTIONS for k in range(1, len(TRAVEL))]
 
     def change(nominal: Machine, values: Mapping[str, float]) -> Machine:
@@ -100,10 +115,21 @@ def stretched(present: Metering, logs: np.ndarray) -> FlowCurve:
     >>> [round(opening, 3) for opening in curve.opening]
     [0.0, 0.001, 0.002, 0.102, 0.202, 0.352, 0.502, 0.702]
     """
-    old = present.curve or FlowCurve(travel=(0.0, 1.0), opening=(0.0, 1.0))
-    steps = np.maximum(np.diff(np.interp(TRAVEL, old.travel, old.opening)), _EVEN)
-    opening = np.concatenate([[0.0], np.cumsum(steps * np.exp(logs))])
+    opening = np.concatenate([[0.0], np.cumsum(table_steps(present) * np.exp(logs))])
     return FlowCurve(travel=TRAVEL, opening=tuple(float(o) for o in opening))
+
+
+def table_steps(present: Metering) -> np.ndarray:
+    """Steps of a direction's opening between the knots of `TRAVEL`.
+
+    Args:
+        present: the direction; straight without a curve.
+
+    Returns:
+        (7,) steps, none of them less than a thousandth [1].
+    """
+    old = present.curve or FlowCurve(travel=(0.0, 1.0), opening=(0.0, 1.0))
+    return np.maximum(np.diff(np.interp(TRAVEL, old.travel, old.opening)), _EVEN)
 
 
 def timing(machine: Machine, axis: str) -> Hypothesis:
@@ -207,7 +233,7 @@ def supply_limits(machine: Machine) -> Hypothesis:
 
 
 def _log(scale: float, most: float) -> Parameter:
-    return Parameter("1", 0.0, -most, most, scale, 0.1 * scale)
+    return Parameter(LOG, 0.0, -most, most, scale, 0.1 * scale)
 
 
 def _share(machine: Machine, kind: str, place: str) -> float:

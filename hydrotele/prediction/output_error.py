@@ -34,14 +34,16 @@ from hydrotele.prediction.track import Levels, fine_enough, track_run
 
 WINDOW = 5.0  # s: shorter windows weigh the start, longer ones what no model can know
 LEAD = 2.0  # s of readings before a window that tell its start
-MOST_WINDOWS = 120  # in all: 600 s, of which each says as much of a machine as the next
+MOST_WINDOWS = 160  # in all: 800 s, of which each says as much of a machine as the next
 _REMEMBERED = 1.0  # s of a window in which errors say one thing
 _STILL = 0.01  # of a channel's range: a window in which all channels move less says nothing
-_STEPS = (2.0e-2, 1.0e-2, 4.0e-3, 2.0e-3, 1.0e-3)  # s of the integrator, the largest that does
+_STEPS = (1.0e-2, 4.0e-3, 2.0e-3, 1.0e-3)  # s of the integrator, the largest that does
 _ROUGHNESS = 0.02  # of the errors, that a larger step may add
 _NUDGE = 0.05  # typical deviations, for slopes: windows with friction are not smooth below
 _ROUND = 5  # steps between new starts
-_FALL = 1.0  # of the loss, -2 log likelihood: less than one is no better model
+_FALL = 0.003  # of the loss, that another round must promise: less is no better model
+_FIRST_LOOK = 4  # windows of which the first rounds see one
+_UNSEEN = 8  # windows of which one is kept from the fit, to judge it
 _SMALLEST_SCALE = 1.0e-9  # of errors, against a division by nothing [channel's unit]
 _FAR = 1.0e9  # error of a run that left all numbers behind [channel's unit]
 _LOOKS = 8  # windows that choose the integrator's step
@@ -86,6 +88,8 @@ class FreeRunFit:
         converged: whether the loss no longer fell; if not, allow more iterations.
         windows: number of windows.
         step: of the integrator [s].
+        unseen: (2, c) median over windows kept from the fit of their RMS error, before and after
+            it; NaN where there are too few windows to keep one [channel's unit].
     """
 
     guess: Guess
@@ -99,6 +103,7 @@ class FreeRunFit:
     converged: bool
     windows: int
     step: float
+    unseen: np.ndarray
 
     @property
     def deviation_sd(self) -> np.ndarray:
@@ -130,10 +135,22 @@ def fit_free_runs(
     if not len(guess.deviation):
         raise InputError("the guess", "has no parameters to fit: add a hypothesis or numbers")
     windows = free_run_windows(data.fit, seconds, most)
+    kept = [k % _UNSEEN == _UNSEEN // 2 for k in range(len(windows))]
+    seen = [window for window, away in zip(windows, kept, strict=True) if not away]
+    away = [window for window, away in zip(windows, kept, strict=True) if away]
     with ThreadPoolExecutor(jobs) as pool:
-        problem = _Problem(data, windows, following_levels(data), pool)
+        problem = _Problem(data, seen, following_levels(data), pool)
         problem = replace(problem, step=_large_step(problem, guess))
-        return _fit(problem, guess, max_iterations, say)
+        rough = _fit(replace(problem, windows=seen[::_FIRST_LOOK]), guess, max_iterations, say)
+        fit = _fit(problem, rough.guess, max_iterations, say)
+        judge = replace(problem, windows=away)
+        unseen = np.full((2, len(data.channels)), np.nan)
+        if away:
+            unseen = np.array([
+                _scales(_point(judge, which).errors, away) for which in (guess, fit.guess)
+            ])  # fmt: skip
+        before = _rms(_point(problem, guess).errors)
+        return replace(fit, before=before, unseen=unseen)
 
 
 def free_run_windows(
@@ -250,22 +267,24 @@ def _fit(
     """Rounds of steps with kept starts, until a round with new starts is no better."""
     weights = problem.weights()
     now = first = _point(problem, guess)
-    scale = _scales(now.errors, weights)
+    scale = _scales(now.errors, problem.windows)
     taken, converged = 0, False
     while not converged and taken < max_iterations:
         tried, steps = _descend(problem, now, weights, scale, min(_ROUND, max_iterations - taken))
         taken += steps
         fresh = _point(problem, tried.guess)
         before, after = (_loss(point, weights, scale) for point in (now, fresh))
-        converged = before - after < _FALL
+        converged = before - after < _FALL * before
         if after < before:
-            now, scale = fresh, _scales(fresh.errors, weights)
-        say(f"free-run fit, {taken} steps: loss falls from {before:.1f} to {after:.1f}")
+            now, scale = fresh, _scales(fresh.errors, problem.windows)
+        count = len(problem.windows)
+        say(f"free runs through {count} windows: loss falls from {before:.1f} to {after:.1f}")
     _, information = _normal_equations(problem, now, weights, scale)
     return FreeRunFit(
         guess=now.guess, machine=now.machine, before=_rms(first.errors), after=_rms(now.errors),
         scale=scale, information=information, loss=_loss(now, weights, scale), iterations=taken,
         converged=converged, windows=len(problem.windows), step=problem.step,
+        unseen=np.full((2, len(scale)), np.nan),
     )  # fmt: skip
 
 
@@ -286,7 +305,7 @@ def _descend(
             damping = damping / factor if fall > 0.0 else damping * factor
         if fall > 0.0:
             now, loss = tried, loss - fall
-        if fall < _FALL:
+        if fall < _FALL * loss:
             return now, taken
     return now, most
 
@@ -327,18 +346,22 @@ def _loss(point: _Point, weights: np.ndarray, scale: np.ndarray) -> float:
     return float(weights[known] @ rho + point.guess.deviation @ point.guess.deviation)
 
 
-def _scales(errors: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(c,) scale of every channel's errors, 1.48 times their median size, as of a normal one."""
-    found = np.ones(errors.shape[1])
-    for c, column in enumerate(errors.T):
-        known = column[weights[:, c] > 0.0]
-        if len(known):
-            found[c] = max(1.4826 * float(np.median(np.abs(known))), _SMALLEST_SCALE)
-    return found
+def _scales(errors: np.ndarray, windows: Sequence[Window]) -> np.ndarray:
+    """(c,) scale of every channel's errors: the median over the windows of their RMS error."""
+    ends = np.cumsum([window.count for window in windows])[:-1]
+    each = np.array([_rms(part) for part in np.split(errors, ends)])
+    return np.array([
+        max(float(np.median(column[np.isfinite(column)])), _SMALLEST_SCALE)
+        if np.isfinite(column).any() else 1.0
+        for column in each.T
+    ])  # fmt: skip
 
 
 def _rms(errors: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.nanmean(errors**2, axis=0))
+    """(c,) RMS of (r, c) errors; NaN without any."""
+    known = np.isfinite(errors)
+    total = np.sum(np.where(known, errors, 0.0) ** 2, axis=0)
+    return np.sqrt(total / np.where(known.any(axis=0), known.sum(axis=0), np.nan))
 
 
 def _rows(window: Window, seconds: float) -> int:

@@ -1,0 +1,125 @@
+"""Numbers that only free runs tell, calibrated before the search for effects.
+
+A machine file that is an estimate says so: `uncertainty: {flow_table: 1.0, linkage: 0.15}`. What a
+valve lets through at which command then weighs more than any effect of the library, and where no
+pressure is read, one-step predictions hardly feel it. So these numbers are fitted to free runs
+first, and an effect is what remains after that. The fit is kept only if stretches of the fit runs
+that it has not seen are predicted better.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.dataset.load import Dataset
+from hydrotele.gap.result import Estimate
+from hydrotele.machine import Machine
+from hydrotele.prediction.open_numbers import (
+    LOG,
+    TRAVEL,
+    open_numbers,
+    states_open_numbers,
+    table_steps,
+)
+from hydrotele.prediction.output_error import WINDOW, FreeRunFit, fit_free_runs
+from hydrotele.prediction.stretches import thinned
+
+_NORMAL95 = 1.96
+_FLOW_TABLE, _DIRECTIONS = "flow_table", ("positive", "negative")
+
+
+@dataclass(frozen=True)
+class FreeCalibration:
+    """A machine calibrated by free runs.
+
+    Attributes:
+        machine: with the numbers found.
+        numbers: such as `linkage.stick.base` or `flow_table.boom.positive_50`, the opening at 50 %
+            travel beyond the dead band; ratios to the given machine where no unit fits.
+        note: one sentence on what the unseen stretches say.
+    """
+
+    machine: Machine
+    numbers: dict[str, Estimate]
+    note: str
+
+
+def calibrate_freely(
+    data: Dataset, jobs: int, tell: Callable[[str], None] = lambda text: None
+) -> FreeCalibration | None:
+    """Calibrate what a machine file leaves open, if it does.
+
+    Args:
+        data: the dataset; `heldout` is not seen.
+        jobs: threads.
+        tell: told of every round.
+
+    Returns:
+        The calibration; None where the machine states no such uncertainty, a pressure is read, or
+        unseen stretches are predicted no better.
+    """
+    pressures = any(channel.startswith("pressure") for channel in data.channels)
+    if pressures or not states_open_numbers(data.machine):
+        return None
+    fit = fit_free_runs(thinned(data), open_numbers(data.machine), jobs=jobs, say=tell)
+    before, after = fit.unseen
+    if not np.mean(np.log(after / before)) < 0.0:
+        return None
+    closer = ", ".join(
+        f"{channel} {100.0 * (1.0 - b / a):.0f} %"
+        for channel, a, b in zip(data.channels, before, after, strict=True)
+    )
+    note = (
+        "What the machine file leaves open was calibrated by free runs first; on stretches of the"
+        f" fit runs that were not fitted, errors over {WINDOW:g} s became smaller by: {closer}."
+    )
+    return FreeCalibration(fit.machine, _numbers(data.machine, fit), note)
+
+
+def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
+    """All numbers of a fit with their intervals."""
+    covariance, first, found = np.linalg.inv(fit.information), 0, {}
+    for hypothesis, deviation in fit.guess.parts:
+        own = slice(first, first + hypothesis.size)
+        first += hypothesis.size
+        values = np.array(list(hypothesis.values(deviation).values()))
+        scale = np.array([p.scale for p in hypothesis.parameters.values()])
+        spread = covariance[own, own] * np.outer(scale, scale)
+        if hypothesis.name == _FLOW_TABLE:
+            found |= _openings(nominal, hypothesis.location, values, spread)
+            continue
+        reach = _NORMAL95 * np.sqrt(np.diag(spread))
+        for (key, p), value, own_reach in zip(
+            hypothesis.parameters.items(), values, reach, strict=True
+        ):
+            given = (value, max(p.low, value - own_reach), min(p.high, value + own_reach))
+            unit, numbers = p.unit, (*given, p.nominal)
+            if p.unit == LOG:
+                unit, numbers = "1", tuple(float(np.exp(x)) for x in numbers)
+            mid, low, high, was = map(float, numbers)
+            found[f"{hypothesis.name}.{hypothesis.location}.{key}"] = Estimate(
+                mid, unit, low, high, was
+            )
+    return found
+
+
+def _openings(
+    nominal: Machine, axis: str, logs: np.ndarray, spread: np.ndarray
+) -> dict[str, Estimate]:
+    """Openings of a flow table at its knots, intervals to first order in its steps' logarithms."""
+    valve, found = nominal.axes[axis].valve, {}
+    assert valve
+    count = len(TRAVEL) - 1
+    for d, way in enumerate(_DIRECTIONS):
+        own = slice(d * count, (d + 1) * count)
+        steps = table_steps(getattr(valve, way))
+        grown = steps * np.exp(logs[own])
+        slope = np.tril(np.tile(grown, (count, 1)))
+        reach = _NORMAL95 * np.sqrt(np.diag(slope @ spread[own, own] @ slope.T))
+        for k in range(count):
+            value = float(grown[: k + 1].sum())
+            low, high = max(0.0, value - float(reach[k])), value + float(reach[k])
+            key = f"{_FLOW_TABLE}.{axis}.{way}_{round(100 * TRAVEL[k + 1])}"
+            found[key] = Estimate(value, "1", low, high, float(steps[: k + 1].sum()))
+    return found
