@@ -39,6 +39,7 @@ WINDOW, LEAD = 5.0, 0.5  # s; of each window the lead has readings, the rest non
 PUSH = (176.0, 7.3, 0.7)  # N, s, s: half of the drive's largest force
 ENCODER = 5.0e-6  # m, an accuracy that the record's makers do not state
 _MINUTE = 60.0  # s
+FIRST_THREE_QUARTERS = "first 75 % -> last 25 %"
 _GAP = 0.1  # s without readings that may be bridged: the logger repeats them
 _EDGE = 100  # rows that the filters' ends spoil
 
@@ -176,13 +177,13 @@ def ec20_splits(data: Dataset) -> dict[str, Dataset]:
     parts = {
         "first half -> second": (quarters[:2], quarters[2:]),
         "second half -> first": (quarters[2:], quarters[:2]),
-        "first 75 % -> last 25 %": (quarters[:3], quarters[3:]),
+        FIRST_THREE_QUARTERS: (quarters[:3], quarters[3:]),
     }
     splits = {
         name: dataclasses.replace(data, fit=(joined(fit),), heldout=joined(held))
         for name, (fit, held) in parts.items()
     }
-    whole = splits["first 75 % -> last 25 %"]
+    whole = splits[FIRST_THREE_QUARTERS]
     run = whole.fit[0]
     rows = busiest_rows(run, round(_MINUTE / run.period))
     minute = run.part(rows.start, rows.stop)

@@ -16,6 +16,7 @@ from hydrotele.dataset.load import Dataset
 from hydrotele.gap.result import Estimate
 from hydrotele.machine import Machine
 from hydrotele.prediction.open_numbers import (
+    DIRECTIONS,
     LOG,
     TRAVEL,
     open_numbers,
@@ -26,7 +27,7 @@ from hydrotele.prediction.output_error import WINDOW, FreeRunFit, fit_free_runs
 from hydrotele.prediction.stretches import thinned
 
 _NORMAL95 = 1.96
-_FLOW_TABLE, _DIRECTIONS = "flow_table", ("positive", "negative")
+_FLOW_TABLE = "flow_table"
 
 
 @dataclass(frozen=True)
@@ -87,12 +88,14 @@ def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
         scale = np.array([p.scale for p in hypothesis.parameters.values()])
         spread = covariance[own, own] * np.outer(scale, scale)
         if hypothesis.name == _FLOW_TABLE:
-            found |= _openings(nominal, hypothesis.location, values, spread)
-            continue
+            keys = list(hypothesis.parameters)
+            found |= _openings(nominal, hypothesis.location, keys, values, spread)
         reach = _NORMAL95 * np.sqrt(np.diag(spread))
         for (key, p), value, own_reach in zip(
             hypothesis.parameters.items(), values, reach, strict=True
         ):
+            if hypothesis.name == _FLOW_TABLE and p.unit == LOG:
+                continue
             given = (value, max(p.low, value - own_reach), min(p.high, value + own_reach))
             unit, numbers = p.unit, (*given, p.nominal)
             if p.unit == LOG:
@@ -105,21 +108,24 @@ def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
 
 
 def _openings(
-    nominal: Machine, axis: str, logs: np.ndarray, spread: np.ndarray
+    nominal: Machine, axis: str, keys: list[str], values: np.ndarray, spread: np.ndarray
 ) -> dict[str, Estimate]:
-    """Openings of a flow table at its knots, intervals to first order in its steps' logarithms."""
+    """Openings of a flow table at its knots, intervals to first order in its logarithms."""
     valve, found = nominal.axes[axis].valve, {}
     assert valve
     count = len(TRAVEL) - 1
-    for d, way in enumerate(_DIRECTIONS):
-        own = slice(d * count, (d + 1) * count)
+    for way in DIRECTIONS:
+        own = [keys.index(f"gain_{way}"), *(keys.index(f"{way}_{k + 1}") for k in range(count))]
+        gain, *logs = values[own]
         steps = table_steps(getattr(valve, way))
-        grown = steps * np.exp(logs[own])
-        slope = np.tril(np.tile(grown, (count, 1)))
-        reach = _NORMAL95 * np.sqrt(np.diag(slope @ spread[own, own] @ slope.T))
-        for k in range(count):
-            value = float(grown[: k + 1].sum())
-            low, high = max(0.0, value - float(reach[k])), value + float(reach[k])
-            key = f"{_FLOW_TABLE}.{axis}.{way}_{round(100 * TRAVEL[k + 1])}"
-            found[key] = Estimate(value, "1", low, high, float(steps[: k + 1].sum()))
+        grown = steps * np.exp(gain + np.array(logs))
+        openings = np.cumsum(grown)
+        slope = np.column_stack([openings, np.tril(np.tile(grown, (count, 1)))])
+        reach = _NORMAL95 * np.sqrt(np.diag(slope @ spread[np.ix_(own, own)] @ slope.T))
+        for travel, value, own_reach, was in zip(
+            TRAVEL[1:], openings, reach, np.cumsum(steps), strict=True
+        ):
+            low, high = max(0.0, float(value - own_reach)), float(value + own_reach)
+            key = f"{_FLOW_TABLE}.{axis}.{way}_{round(100 * travel)}"
+            found[key] = Estimate(float(value), "1", low, high, float(was))
     return found

@@ -17,7 +17,7 @@ from hydrotele.kinematics.from_machine import range_at_drive
 from hydrotele.machine import Machine
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
 
-TRAVEL = (0.0, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0)
+TRAVEL = (0.0, 0.15, 0.3, 0.5, 0.75, 1.0)
 """Knots of a flow table in travel beyond the dead band [1], closest where valves begin to open."""
 
 UNCERTAINTY = {
@@ -29,8 +29,10 @@ UNCERTAINTY = {
 LOG = "log"
 """Unit of a parameter that is the logarithm of a ratio to the machine as it is."""
 
-_DIRECTIONS = ("positive", "negative")
+DIRECTIONS = ("positive", "negative")
 _LOWEST, _HIGHEST = -5.0, 2.5  # logarithms of a table's steps: from closed to 12 times as steep
+_SHAPE, _DEADBAND = 0.5, 0.15  # standard deviations of steps and dead bands, per one of the gain
+_WIDEST = 0.6  # dead band [1]
 _EVEN = 1.0e-3  # least step of a table, in openings: a flat one could not be scaled up
 _LONGEST_DELAY = 0.5  # s
 _CLEARANCE = 0.02  # m, by which a closed cylinder is longer than its stroke
@@ -70,10 +72,12 @@ def open_numbers(machine: Machine) -> Guess:
 
 
 def flow_table(machine: Machine, axis: str) -> Hypothesis:
-    """Flow over command of both directions, a monotone table each.
+    """Flow over command of both directions: a dead band, a gain and a monotone table each.
 
-    The opening at knot k is the sum of the steps up to it; the parameters are the logarithms of
-    the steps' ratios to the present ones, so that no table ever falls. They hold the gain, too.
+    The opening at knot k is the gain times the sum of the steps up to it; the parameters are the
+    logarithms of the ratios to the present ones, so that no table ever falls. Gain and dead band
+    are in the steps, too; as numbers of their own they say that a table is moved and stretched as a
+    whole rather than bent, which a minute of data needs to be told.
 
     Args:
         machine: the nominal machine.
@@ -83,20 +87,31 @@ def flow_table(machine: Machine, axis: str) -> Hypothesis:
         The hypothesis, of 14 parameters.
     """
     scale = _share(machine, "flow_table", axis)
-    step = Parameter(LOG, 0.0, _LOWEST, _HIGHEST, scale, 0.1 * scale)
-    keys = [f"{way}_{k}" for way in _DIRECTIONS for k in range(1, len(TRAVEL))]
+    valve = machine.axes[axis].valve
+    assert valve
+    shape, band = _SHAPE * scale, _DEADBAND * scale
+    parameters = {}
+    for way, present in zip(DIRECTIONS, valve.deadbands, strict=True):
+        most = max(_WIDEST, present)
+        parameters[f"deadband_{way}"] = Parameter("1", present, 0.0, most, band, 0.1 * band)
+        parameters[f"gain_{way}"] = Parameter(LOG, 0.0, _LOWEST, _HIGHEST, scale, 0.1 * scale)
+        step = Parameter(LOG, 0.0, _LOWEST, _HIGHEST, shape, 0.1 * shape)
+        parameters |= {f"{way}_{k}": step for k in range(1, len(TRAVEL))}
 
     def change(nominal: Machine, values: Mapping[str, float]) -> Machine:
         valve = nominal.axes[axis].valve
         assert valve
-        for way in _DIRECTIONS:
-            logs = [values[f"{way}_{k}"] for k in range(1, len(TRAVEL))]
-            if any(logs):
-                curve = stretched(getattr(valve, way), np.array(logs))
-                nominal = changed(nominal, f"axes.{axis}.valve.{way}.curve", curve)
+        for way, present in zip(DIRECTIONS, valve.deadbands, strict=True):
+            path = f"axes.{axis}.valve.{way}"
+            steps = [values[f"{way}_{k}"] for k in range(1, len(TRAVEL))]
+            logs = values[f"gain_{way}"] + np.array(steps)
+            if np.any(logs):
+                nominal = changed(nominal, f"{path}.curve", stretched(getattr(valve, way), logs))
+            if values[f"deadband_{way}"] != present:
+                nominal = changed(nominal, f"{path}.deadband", values[f"deadband_{way}"])
         return nominal
 
-    return Hypothesis("flow_table", axis, dict.fromkeys(keys, step), change)
+    return Hypothesis("flow_table", axis, parameters, change)
 
 
 def stretched(present: Metering, logs: np.ndarray) -> FlowCurve:
@@ -104,16 +119,16 @@ def stretched(present: Metering, logs: np.ndarray) -> FlowCurve:
 
     Args:
         present: the direction; straight without a curve.
-        logs: (7,) logarithms of the steps' ratios [1].
+        logs: (5,) logarithms of the steps' ratios [1].
 
     Returns:
         The curve.
 
     Source: a sum of positive steps never falls.
 
-    >>> curve = stretched(Metering(), np.array([-5.0, -5.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    >>> curve = stretched(Metering(), np.array([-5.0, -5.0, 0.0, 0.0, 0.0]))
     >>> [round(opening, 3) for opening in curve.opening]
-    [0.0, 0.001, 0.002, 0.102, 0.202, 0.352, 0.502, 0.702]
+    [0.0, 0.001, 0.002, 0.202, 0.452, 0.702]
     """
     opening = np.concatenate([[0.0], np.cumsum(table_steps(present) * np.exp(logs))])
     return FlowCurve(travel=TRAVEL, opening=tuple(float(o) for o in opening))
@@ -126,7 +141,7 @@ def table_steps(present: Metering) -> np.ndarray:
         present: the direction; straight without a curve.
 
     Returns:
-        (7,) steps, none of them less than a thousandth [1].
+        (5,) steps, none of them less than a thousandth [1].
     """
     old = present.curve or FlowCurve(travel=(0.0, 1.0), opening=(0.0, 1.0))
     return np.maximum(np.diff(np.interp(TRAVEL, old.travel, old.opening)), _EVEN)

@@ -34,15 +34,15 @@ from hydrotele.prediction.track import Levels, fine_enough, track_run
 
 WINDOW = 5.0  # s: shorter windows weigh the start, longer ones what no model can know
 LEAD = 2.0  # s of readings before a window that tell its start
-MOST_WINDOWS = 160  # in all: 800 s, of which each says as much of a machine as the next
-_REMEMBERED = 1.0  # s of a window in which errors say one thing
+MOST_WINDOWS = 240  # in all: 1200 s; an hour's digging differs from the next one's
+_REMEMBERED = 2.5  # s of a window in which errors say one thing
 _STILL = 0.01  # of a channel's range: a window in which all channels move less says nothing
 _STEPS = (1.0e-2, 4.0e-3, 2.0e-3, 1.0e-3)  # s of the integrator, the largest that does
 _ROUGHNESS = 0.02  # of the errors, that a larger step may add
 _NUDGE = 0.05  # typical deviations, for slopes: windows with friction are not smooth below
 _ROUND = 5  # steps between new starts
 _FALL = 0.003  # of the loss, that another round must promise: less is no better model
-_FIRST_LOOK = 4  # windows of which the first rounds see one
+_LOOKS_AT, _FEWEST = (16, 4, 1), 12  # one window out of so many, round by round; at least so many
 _UNSEEN = 8  # windows of which one is kept from the fit, to judge it
 _SMALLEST_SCALE = 1.0e-9  # of errors, against a division by nothing [channel's unit]
 _FAR = 1.0e9  # error of a run that left all numbers behind [channel's unit]
@@ -113,7 +113,7 @@ class FreeRunFit:
 
 def fit_free_runs(
     data: Dataset, guess: Guess, seconds: float = WINDOW, most: int = MOST_WINDOWS,
-    max_iterations: int = 25, jobs: int = 2, say: Callable[[str], None] = lambda text: None,
+    max_iterations: int = 10, jobs: int = 2, say: Callable[[str], None] = lambda text: None,
 ) -> FreeRunFit:  # fmt: skip
     """Fit a guess's deviations to free runs through windows of the fit runs.
 
@@ -122,7 +122,7 @@ def fit_free_runs(
         guess: hypotheses with the deviations to begin at.
         seconds: length of the windows [s].
         most: number of windows, spread evenly over those in which anything moves.
-        max_iterations: Gauss-Newton steps.
+        max_iterations: Gauss-Newton steps, at every number of windows.
         jobs: worker threads.
         say: told of every step.
 
@@ -141,8 +141,12 @@ def fit_free_runs(
     with ThreadPoolExecutor(jobs) as pool:
         problem = _Problem(data, seen, following_levels(data), pool)
         problem = replace(problem, step=_large_step(problem, guess))
-        rough = _fit(replace(problem, windows=seen[::_FIRST_LOOK]), guess, max_iterations, say)
-        fit = _fit(problem, rough.guess, max_iterations, say)
+        fit = None
+        for every in sorted({max(1, min(k, len(seen) // _FEWEST)) for k in _LOOKS_AT})[::-1]:
+            begin = fit.guess if fit else guess
+            part = replace(problem, windows=seen[::every])
+            fit = _fit(part, begin, max_iterations, say)
+        assert fit
         judge = replace(problem, windows=away)
         unseen = np.full((2, len(data.channels)), np.nan)
         if away:
@@ -347,11 +351,11 @@ def _loss(point: _Point, weights: np.ndarray, scale: np.ndarray) -> float:
 
 
 def _scales(errors: np.ndarray, windows: Sequence[Window]) -> np.ndarray:
-    """(c,) scale of every channel's errors: the median over the windows of their RMS error."""
+    """(c,) scale of every channel's errors: the mean over the windows of their RMS error."""
     ends = np.cumsum([window.count for window in windows])[:-1]
     each = np.array([_rms(part) for part in np.split(errors, ends)])
     return np.array([
-        max(float(np.median(column[np.isfinite(column)])), _SMALLEST_SCALE)
+        max(float(np.mean(column[np.isfinite(column)])), _SMALLEST_SCALE)
         if np.isfinite(column).any() else 1.0
         for column in each.T
     ])  # fmt: skip
