@@ -3,8 +3,8 @@
 A machine file that is an estimate says so: `uncertainty: {flow_table: 1.0, linkage: 0.15}`. What a
 valve lets through at which command then weighs more than any effect of the library, and where no
 pressure is read, one-step predictions hardly feel it. So these numbers are fitted to free runs
-first, and an effect is what remains after that. The fit is kept only if stretches of the fit runs
-that it has not seen are predicted better.
+first, and an effect is what remains after that. The fit is kept only if it predicts stretches of
+the fit runs better that are left out of it one by one.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ class FreeCalibration:
         machine: with the numbers found.
         numbers: such as `linkage.stick.base` or `flow_table.boom.positive_50`, the opening at 50 %
             travel beyond the dead band; ratios to the given machine where no unit fits.
-        note: one sentence on what the unseen stretches say.
+        note: one sentence on what stretches that were left out say.
     """
 
     machine: Machine
@@ -58,13 +58,13 @@ def calibrate_freely(
 
     Returns:
         The calibration; None where the machine states no such uncertainty, a pressure is read, or
-        unseen stretches are predicted no better.
+        stretches that are left out are predicted no better.
     """
     pressures = any(channel.startswith("pressure") for channel in data.channels)
     if pressures or not states_open_numbers(data.machine):
         return None
     fit = fit_free_runs(thinned(data), open_numbers(data.machine), jobs=jobs, say=tell)
-    before, after = fit.unseen
+    before, after = fit.left_out
     if not np.mean(np.log(after / before)) < 0.0:
         return None
     closer = ", ".join(
@@ -72,8 +72,8 @@ def calibrate_freely(
         for channel, a, b in zip(data.channels, before, after, strict=True)
     )
     note = (
-        "What the machine file leaves open was calibrated by free runs first; on stretches of the"
-        f" fit runs that were not fitted, errors over {WINDOW:g} s became smaller by: {closer}."
+        "What the machine file leaves open was calibrated by free runs first; stretches of"
+        f" {WINDOW:g} s, left out of the fit one by one, are predicted closer by: {closer}."
     )
     return FreeCalibration(fit.machine, _numbers(data.machine, fit), note)
 
@@ -90,20 +90,18 @@ def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
         if hypothesis.name == _FLOW_TABLE:
             keys = list(hypothesis.parameters)
             found |= _openings(nominal, hypothesis.location, keys, values, spread)
-        reach = _NORMAL95 * np.sqrt(np.diag(spread))
-        for (key, p), value, own_reach in zip(
-            hypothesis.parameters.items(), values, reach, strict=True
-        ):
+        for k, (key, p) in enumerate(hypothesis.parameters.items()):
             if hypothesis.name == _FLOW_TABLE and p.unit == LOG:
                 continue
-            given = (value, max(p.low, value - own_reach), min(p.high, value + own_reach))
-            unit, numbers = p.unit, (*given, p.nominal)
+            reach = _NORMAL95 * np.sqrt(spread[k, k])
+            numbers = np.array([values[k], values[k] - reach, values[k] + reach, p.nominal])
+            numbers = np.clip(numbers, p.low, p.high)
             if p.unit == LOG:
-                unit, numbers = "1", tuple(float(np.exp(x)) for x in numbers)
-            mid, low, high, was = map(float, numbers)
-            found[f"{hypothesis.name}.{hypothesis.location}.{key}"] = Estimate(
-                mid, unit, low, high, was
-            )
+                numbers = np.exp(numbers)
+            value, low, high, was = map(float, numbers)
+            unit = "1" if p.unit == LOG else p.unit
+            place = f"{hypothesis.name}.{hypothesis.location}.{key}"
+            found[place] = Estimate(value, unit, low, high, was)
     return found
 
 

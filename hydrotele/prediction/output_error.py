@@ -43,7 +43,6 @@ _NUDGE = 0.05  # typical deviations, for slopes: windows with friction are not s
 _ROUND = 5  # steps between new starts
 _FALL = 0.003  # of the loss, that another round must promise: less is no better model
 _LOOKS_AT, _FEWEST = (16, 4, 1), 12  # one window out of so many, round by round; at least so many
-_UNSEEN = 8  # windows of which one is kept from the fit, to judge it
 _SMALLEST_SCALE = 1.0e-9  # of errors, against a division by nothing [channel's unit]
 _FAR = 1.0e9  # error of a run that left all numbers behind [channel's unit]
 _LOOKS = 8  # windows that choose the integrator's step
@@ -88,8 +87,8 @@ class FreeRunFit:
         converged: whether the loss no longer fell; if not, allow more iterations.
         windows: number of windows.
         step: of the integrator [s].
-        unseen: (2, c) median over windows kept from the fit of their RMS error, before and after
-            it; NaN where there are too few windows to keep one [channel's unit].
+        left_out: (2, c) mean over the windows of their RMS error, before the fit and as it would be
+            of a fit without the window [channel's unit].
     """
 
     guess: Guess
@@ -103,7 +102,7 @@ class FreeRunFit:
     converged: bool
     windows: int
     step: float
-    unseen: np.ndarray
+    left_out: np.ndarray
 
     @property
     def deviation_sd(self) -> np.ndarray:
@@ -135,26 +134,30 @@ def fit_free_runs(
     if not len(guess.deviation):
         raise InputError("the guess", "has no parameters to fit: add a hypothesis or numbers")
     windows = free_run_windows(data.fit, seconds, most)
-    kept = [k % _UNSEEN == _UNSEEN // 2 for k in range(len(windows))]
-    seen = [window for window, away in zip(windows, kept, strict=True) if not away]
-    away = [window for window, away in zip(windows, kept, strict=True) if away]
+    fewer = sorted({max(1, min(k, len(windows) // _FEWEST)) for k in _LOOKS_AT}, reverse=True)
     with ThreadPoolExecutor(jobs) as pool:
-        problem = _Problem(data, seen, following_levels(data), pool)
+        problem = _Problem(data, windows, following_levels(data), pool)
         problem = replace(problem, step=_large_step(problem, guess))
-        fit = None
-        for every in sorted({max(1, min(k, len(seen) // _FEWEST)) for k in _LOOKS_AT})[::-1]:
-            begin = fit.guess if fit else guess
-            part = replace(problem, windows=seen[::every])
-            fit = _fit(part, begin, max_iterations, say)
-        assert fit
-        judge = replace(problem, windows=away)
-        unseen = np.full((2, len(data.channels)), np.nan)
-        if away:
-            unseen = np.array([
-                _scales(_point(judge, which).errors, away) for which in (guess, fit.guess)
-            ])  # fmt: skip
-        before = _rms(_point(problem, guess).errors)
-        return replace(fit, before=before, unseen=unseen)
+        first = now = _point(problem, guess)
+        taken, converged = 0, False
+        for every in fewer:
+            part = replace(problem, windows=windows[::every])
+            begin = _point(part, now.guess)
+            now, steps, converged = _fit(part, begin, max_iterations, say)
+            taken += steps
+        scale, weights = _scales(now.errors, windows), problem.weights()
+        columns = _columns(problem, now, scale)
+        return FreeRunFit(
+            guess=now.guess, machine=now.machine,
+            before=_rms(first.errors), after=_rms(now.errors), scale=scale,
+            information=_normal_equations(now, columns, weights, scale)[1],
+            loss=_loss(now, weights, scale), iterations=taken, converged=converged,
+            windows=len(windows), step=problem.step,
+            left_out=np.array([
+                _scales(first.errors, windows),
+                _scales(_left_out(now, columns, weights, scale, windows), windows),
+            ]),
+        )  # fmt: skip
 
 
 def free_run_windows(
@@ -266,11 +269,14 @@ class _Point:
 
 
 def _fit(
-    problem: _Problem, guess: Guess, max_iterations: int, say: Callable[[str], None]
-) -> FreeRunFit:
-    """Rounds of steps with kept starts, until a round with new starts is no better."""
+    problem: _Problem, now: _Point, max_iterations: int, say: Callable[[str], None]
+) -> tuple[_Point, int, bool]:
+    """Rounds of steps with kept starts, until a round with new starts is no better.
+
+    Returns:
+        (point, steps taken, whether the loss no longer fell).
+    """
     weights = problem.weights()
-    now = first = _point(problem, guess)
     scale = _scales(now.errors, problem.windows)
     taken, converged = 0, False
     while not converged and taken < max_iterations:
@@ -283,13 +289,7 @@ def _fit(
             now, scale = fresh, _scales(fresh.errors, problem.windows)
         count = len(problem.windows)
         say(f"free runs through {count} windows: loss falls from {before:.1f} to {after:.1f}")
-    _, information = _normal_equations(problem, now, weights, scale)
-    return FreeRunFit(
-        guess=now.guess, machine=now.machine, before=_rms(first.errors), after=_rms(now.errors),
-        scale=scale, information=information, loss=_loss(now, weights, scale), iterations=taken,
-        converged=converged, windows=len(problem.windows), step=problem.step,
-        unseen=np.full((2, len(scale)), np.nan),
-    )  # fmt: skip
+    return now, taken, converged
 
 
 def _descend(
@@ -299,7 +299,7 @@ def _descend(
     damping, factor, largest = _DAMPING
     loss = _loss(now, weights, scale)
     for taken in range(1, most + 1):
-        slope, information = _normal_equations(problem, now, weights, scale)
+        slope, information = _normal_equations(now, _columns(problem, now, scale), weights, scale)
         fall = 0.0
         while fall <= 0.0 and damping < largest:
             damped = information + damping * np.diag(np.diag(information))
@@ -321,25 +321,58 @@ def _point(problem: _Problem, guess: Guess, leads: list[np.ndarray] | None = Non
     return _Point(guess, machine, leads, problem.errors(machine, leads))
 
 
-def _normal_equations(
-    problem: _Problem, now: _Point, weights: np.ndarray, scale: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Slope (P,) and Gauss-Newton curvature (P, P) of half the loss in the deviations."""
-    deviation, known = now.guess.deviation, weights > 0.0
-    nudges = now.guess.nudges(_NUDGE)
+def _columns(problem: _Problem, now: _Point, scale: np.ndarray) -> np.ndarray:
+    """(r, c, P) slopes of the scaled errors in the deviations, 0 without a reading."""
+    deviation, nudges = now.guess.deviation, now.guess.nudges(_NUDGE)
 
     def column(p: int) -> np.ndarray:
         moved = deviation.copy()
         moved[p] += nudges[p]
         machine = now.guess.at(moved).machine(problem.data.machine)
-        errors = problem.errors(machine, now.leads)
-        return ((errors - now.errors) / (nudges[p] * scale))[known]
+        slope = (problem.errors(machine, now.leads) - now.errors) / (nudges[p] * scale)
+        return np.where(np.isnan(now.errors), 0.0, slope)
 
-    columns = np.column_stack(list(problem.pool.map(column, range(len(deviation)))))
-    z = (now.errors / scale)[known]
-    bent = weights[known] / np.sqrt(1.0 + z**2)
-    weighted = columns * bent[:, None]
-    return weighted.T @ z + deviation, columns.T @ weighted + np.eye(len(deviation))
+    return np.stack(list(problem.pool.map(column, range(len(deviation)))), axis=2)
+
+
+def _normal_equations(
+    now: _Point, columns: np.ndarray, weights: np.ndarray, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slope (P,) and Gauss-Newton curvature (P, P) of half the loss in the deviations."""
+    slope, curvature = _half_loss(now.errors / scale, columns, weights)
+    return slope + now.guess.deviation, curvature + np.eye(len(slope))
+
+
+def _half_loss(
+    z: np.ndarray, columns: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slope (P,) and curvature (P, P) of half the loss of scaled errors (r, c), without prior."""
+    known = weights > 0.0
+    there = columns[known]
+    bent = weights[known] / np.sqrt(1.0 + z[known] ** 2)
+    weighted = there * bent[:, None]
+    return weighted.T @ z[known], there.T @ weighted
+
+
+def _left_out(
+    now: _Point, columns: np.ndarray, weights: np.ndarray, scale: np.ndarray,
+    windows: Sequence[Window],
+) -> np.ndarray:  # fmt: skip
+    """(r, c) errors of every window as of a fit without it [channel's unit].
+
+    At the least loss, leaving out a window's slope g and curvature H_w moves the deviations by
+    `(H - H_w)^-1 g`, to first order.
+
+    Source: leave-one-out by one Newton step, Rad and Maleki 2020, J. R. Stat. Soc. B 82(4).
+    """
+    _, whole = _normal_equations(now, columns, weights, scale)
+    errors, end = now.errors.copy(), 0
+    for window in windows:
+        rows = slice(end, end + window.count)
+        end += window.count
+        slope, own = _half_loss(now.errors[rows] / scale, columns[rows], weights[rows])
+        errors[rows] += scale * (columns[rows] @ np.linalg.solve(whole - own, slope))
+    return errors
 
 
 def _loss(point: _Point, weights: np.ndarray, scale: np.ndarray) -> float:

@@ -73,7 +73,7 @@ def test_a_minute_of_the_ec20_is_worth_more_than_a_table_of_all():
     splits = ec20_splits(data)
     minute, whole = (splits[name] for name in ("busiest 60 s -> last 25 %", FIRST_THREE_QUARTERS))
     fit = fit_free_runs(minute, open_numbers(data.machine))
-    assert np.all(fit.unseen[1] < fit.unseen[0])  # on stretches of the minute that were kept back
+    assert np.all(fit.left_out[1] < fit.left_out[0])
     found = {
         name: free_run_errors(prepare(whole.heldout), whole.heldout, (10.0, 30.0), to_end=False)
         for name, prepare in {
