@@ -121,11 +121,11 @@ def test_a_planted_delay_and_dead_band_come_out_of_angles_alone(planted):
     machine = planted.machine
     parts = (timing(machine, "boom"), flow_table(machine, "boom"))
     guess = Guess(tuple((part, np.zeros(part.size)) for part in parts))
-    fit = fit_free_runs(planted, guess, most=12)
+    fit = fit_free_runs(planted, guess, most=12, max_iterations=30)
     assert fit.converged and np.all(fit.deviation_sd < 1.0 + 1e-9)
     boom = fit.machine.axes["boom"]
     assert boom.command_delay == pytest.approx(0.12, abs=0.02)
-    for way in (boom.valve.positive, boom.valve.negative):
-        assert way.curve
-        assert np.interp(0.15, way.curve.travel, way.curve.opening) < 0.015
+    for way, deadband in zip(("positive", "negative"), boom.valve.deadbands, strict=True):
+        curve, travel = getattr(boom.valve, way).curve, (0.2 - deadband) / (1.0 - deadband)
+        assert np.interp(travel, curve.travel, curve.opening) < 0.015
     assert fit.after[0] < 0.3 * fit.before[0]
