@@ -13,6 +13,7 @@ from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, discover
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.floor import perfect_tracks
+from hydrotele.gap.free_calibration import calibrate_freely
 from hydrotele.gap.residuals import residual_tests, rms
 from hydrotele.gap.result import (
     Alternative,
@@ -72,6 +73,11 @@ def find_gap(
     """
     begin = time.perf_counter()
     tell = progress or (lambda text, share: None)
+    given, notes = data.machine, []
+    opened = None if effects else calibrate_freely(data, jobs, lambda text: tell(text, 0.0))
+    if opened:
+        data = dataclasses.replace(data, machine=opened.machine)
+        notes.append(opened.note)
     candidates = hypotheses(data.machine, effects)
     data = thinned(busiest(data))
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
@@ -86,11 +92,12 @@ def find_gap(
         nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)
         before = judge.tracks(nominal, evidence.map)
         after = judge.tracks(patched, evidence.map) if discovery.judged.guess.parts else before
-        notes = []
         if not rms(after[:1]) <= _WORSE * rms(before[:1]):
-            notes = [_REJECTED]
+            notes.append(_REJECTED)
             found, discovery = found.emptied(), Discovery(found.base, ())
             patched, after = nominal, before
+        if opened:
+            before = judge.tracks(given, evidence.map)
         tests, floor = judge.tests(evidence, discovery.judged, patched, after)
         evidence.set_base(discovery.judged)
         scatter = tests.get("constancy", {}).get("value", 1.0)
@@ -109,10 +116,11 @@ def find_gap(
     unknown = None
     if failed or learned:
         unknown = describe(_lacks(data.machine, found.judged), learned, improved)
-    laws, units = _laws(data, patched, judge.levels.noise)
+    laws, units = _laws(dataclasses.replace(data, machine=given), patched, judge.levels.noise)
     tell("done", 1.0)
+    calibration = _calibration(discovery.judged.guess, spread)
     return Gap(
-        machine=nominal,
+        machine=given,
         patched=patched,
         verdict=verdict,
         effects=named,
@@ -130,8 +138,8 @@ def find_gap(
         laws=laws,
         law_units=units,
         tests=tests,
-        next_experiment=_experiment(nominal, verdict, named, unknown),
-        calibration=_calibration(discovery.judged.guess, spread),
+        next_experiment=_experiment(given, verdict, named, unknown),
+        calibration=calibration | (opened.numbers if opened else {}),
         learned=learned,
         lacks=lacks,
         noise=_noise(data, judge.levels),

@@ -1,0 +1,129 @@
+"""Numbers that only free runs tell, calibrated before the search for effects.
+
+A machine file that is an estimate says so: `uncertainty: {flow_table: 1.0, linkage: 0.15}`. What a
+valve lets through at which command then weighs more than any effect of the library, and where no
+pressure is read, one-step predictions hardly feel it. So these numbers are fitted to free runs
+first, and an effect is what remains after that. The fit is kept only if it predicts stretches of
+the fit runs better that are left out of it one by one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.dataset.load import Dataset
+from hydrotele.gap.result import Estimate
+from hydrotele.machine import Machine
+from hydrotele.prediction.open_numbers import (
+    DIRECTIONS,
+    LOG,
+    TRAVEL,
+    open_numbers,
+    states_open_numbers,
+    table_steps,
+)
+from hydrotele.prediction.output_error import WINDOW, FreeRunFit, fit_free_runs
+from hydrotele.prediction.stretches import thinned
+
+_NORMAL95 = 1.96
+_FLOW_TABLE = "flow_table"
+
+
+@dataclass(frozen=True)
+class FreeCalibration:
+    """A machine calibrated by free runs.
+
+    Attributes:
+        machine: with the numbers found.
+        numbers: such as `linkage.stick.base` or `flow_table.boom.positive_50`, the opening at 50 %
+            travel beyond the dead band; ratios to the given machine where no unit fits.
+        note: one sentence on what stretches that were left out say.
+    """
+
+    machine: Machine
+    numbers: dict[str, Estimate]
+    note: str
+
+
+def calibrate_freely(
+    data: Dataset, jobs: int, tell: Callable[[str], None] = lambda text: None
+) -> FreeCalibration | None:
+    """Calibrate what a machine file leaves open, if it does.
+
+    Args:
+        data: the dataset; `heldout` is not seen.
+        jobs: threads.
+        tell: told of every round.
+
+    Returns:
+        The calibration; None where the machine states no such uncertainty, a pressure is read, or
+        stretches that are left out are predicted no better.
+    """
+    pressures = any(channel.startswith("pressure") for channel in data.channels)
+    if pressures or not states_open_numbers(data.machine):
+        return None
+    fit = fit_free_runs(thinned(data), open_numbers(data.machine), jobs=jobs, say=tell)
+    before, after = fit.left_out
+    if not np.mean(np.log(after / before)) < 0.0:
+        return None
+    closer = ", ".join(
+        f"{channel} {100.0 * (1.0 - b / a):.0f} %"
+        for channel, a, b in zip(data.channels, before, after, strict=True)
+    )
+    note = (
+        "What the machine file leaves open was calibrated by free runs first; stretches of"
+        f" {WINDOW:g} s, left out of the fit one by one, are predicted closer by: {closer}."
+    )
+    return FreeCalibration(fit.machine, _numbers(data.machine, fit), note)
+
+
+def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
+    """All numbers of a fit with their intervals."""
+    covariance, first, found = np.linalg.inv(fit.information), 0, {}
+    for hypothesis, deviation in fit.guess.parts:
+        own = slice(first, first + hypothesis.size)
+        first += hypothesis.size
+        values = np.array(list(hypothesis.values(deviation).values()))
+        scale = np.array([p.scale for p in hypothesis.parameters.values()])
+        spread = covariance[own, own] * np.outer(scale, scale)
+        if hypothesis.name == _FLOW_TABLE:
+            keys = list(hypothesis.parameters)
+            found |= _openings(nominal, hypothesis.location, keys, values, spread)
+        for k, (key, p) in enumerate(hypothesis.parameters.items()):
+            if hypothesis.name == _FLOW_TABLE and p.unit == LOG:
+                continue
+            reach = _NORMAL95 * np.sqrt(spread[k, k])
+            numbers = np.array([values[k], values[k] - reach, values[k] + reach, p.nominal])
+            numbers = np.clip(numbers, p.low, p.high)
+            if p.unit == LOG:
+                numbers = np.exp(numbers)
+            value, low, high, was = map(float, numbers)
+            unit = "1" if p.unit == LOG else p.unit
+            place = f"{hypothesis.name}.{hypothesis.location}.{key}"
+            found[place] = Estimate(value, unit, low, high, was)
+    return found
+
+
+def _openings(
+    nominal: Machine, axis: str, keys: list[str], values: np.ndarray, spread: np.ndarray
+) -> dict[str, Estimate]:
+    """Openings of a flow table at its knots, intervals to first order in its logarithms."""
+    valve, found = nominal.axes[axis].valve, {}
+    assert valve
+    count = len(TRAVEL) - 1
+    for way in DIRECTIONS:
+        own = [keys.index(f"gain_{way}"), *(keys.index(f"{way}_{k + 1}") for k in range(count))]
+        gain, *logs = values[own]
+        steps = table_steps(getattr(valve, way))
+        grown = steps * np.exp(gain + np.array(logs))
+        openings = np.cumsum(grown)
+        slope = np.column_stack([openings, np.tril(np.tile(grown, (count, 1)))])
+        reach = _NORMAL95 * np.sqrt(np.diag(slope @ spread[np.ix_(own, own)] @ slope.T))
+        for travel, value, own_reach, was in zip(
+            TRAVEL[1:], openings, reach, np.cumsum(steps), strict=True
+        ):
+            low, high = max(0.0, float(value - own_reach)), float(value + own_reach)
+            key = f"{_FLOW_TABLE}.{axis}.{way}_{round(100 * travel)}"
+            found[key] = Estimate(float(value), "1", low, high, float(was))
+    return found
