@@ -5,6 +5,10 @@ valve lets through at which command then weighs more than any effect of the libr
 pressure is read, one-step predictions hardly feel it. So these numbers are fitted to free runs
 first, and an effect is what remains after that. The fit is kept only if it predicts stretches of
 the fit runs better that are left out of it one by one.
+
+A drive with a pump of its own is told by free runs, too, pressures or not: what its motor, its oil
+and its friction do lasts longer than a reading, and where a pump stalls or a piston sticks, one-
+step predictions say nothing. All numbers that its machine file calls uncertain are fitted then.
 """
 
 from collections.abc import Callable
@@ -12,9 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.dataset.load import Dataset
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.gap.result import Estimate
 from hydrotele.machine import Machine
+from hydrotele.prediction.calibration import CALIBRATION, calibration
+from hydrotele.prediction.hypothesis import Guess
 from hydrotele.prediction.open_numbers import (
     DIRECTIONS,
     LOG,
@@ -23,11 +29,19 @@ from hydrotele.prediction.open_numbers import (
     states_open_numbers,
     table_steps,
 )
-from hydrotele.prediction.output_error import WINDOW, FreeRunFit, fit_free_runs
+from hydrotele.prediction.output_error import (
+    LEAD,
+    REMEMBERED,
+    WINDOW,
+    FreeRunFit,
+    fit_free_runs,
+)
 from hydrotele.prediction.stretches import thinned
 
 _NORMAL95 = 1.96
 _FLOW_TABLE = "flow_table"
+_PUMP_WINDOW = 2.5  # s of a pump drive: a move of a stroke of some centimetres
+_PUMP_REMEMBERED = 0.1  # s: the lag of its motor, see `output_error`
 
 
 @dataclass(frozen=True)
@@ -57,13 +71,16 @@ def calibrate_freely(
         tell: told of every round.
 
     Returns:
-        The calibration; None where the machine states no such uncertainty, a pressure is read, or
+        The calibration; None where the machine states no such uncertainty, a pressure of a valve
+        drive is read, runs are too short, or
         stretches that are left out are predicted no better.
     """
-    pressures = any(channel.startswith("pressure") for channel in data.channels)
-    if pressures or not states_open_numbers(data.machine):
+    guess, seconds, remembered = _open(data), WINDOW, REMEMBERED
+    if any(axis.pump for axis in data.machine.axes.values()):
+        seconds, remembered = _PUMP_WINDOW, _PUMP_REMEMBERED
+    if guess is None or all(_seconds(run) < LEAD + 2.0 * seconds for run in data.fit):
         return None
-    fit = fit_free_runs(thinned(data), open_numbers(data.machine), jobs=jobs, say=tell)
+    fit = fit_free_runs(thinned(data), guess, seconds, jobs=jobs, say=tell, remembered=remembered)
     before, after = fit.left_out
     if not np.mean(np.log(after / before)) < 0.0:
         return None
@@ -73,9 +90,23 @@ def calibrate_freely(
     )
     note = (
         "What the machine file leaves open was calibrated by free runs first; stretches of"
-        f" {WINDOW:g} s, left out of the fit one by one, are predicted closer by: {closer}."
+        f" {seconds:g} s, left out of the fit one by one, are predicted closer by: {closer}."
     )
     return FreeCalibration(fit.machine, _numbers(data.machine, fit), note)
+
+
+def _seconds(run: RunData) -> float:
+    return len(run.command) * run.period
+
+
+def _open(data: Dataset) -> Guess | None:
+    """What is left open, at nominal; None if nothing is."""
+    machine = data.machine
+    if machine.uncertainty and any(axis.pump for axis in machine.axes.values()):
+        group = calibration(machine)
+        return Guess(((group, np.zeros(group.size)),))
+    pressures = any(channel.startswith("pressure") for channel in data.channels)
+    return None if pressures or not states_open_numbers(machine) else open_numbers(machine)
 
 
 def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
@@ -101,6 +132,7 @@ def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
             value, low, high, was = map(float, numbers)
             unit = "1" if p.unit == LOG else p.unit
             place = f"{hypothesis.name}.{hypothesis.location}.{key}"
+            place = key if hypothesis.name == CALIBRATION else place
             found[place] = Estimate(value, unit, low, high, was)
     return found
 

@@ -35,7 +35,7 @@ from hydrotele.prediction.track import Levels, fine_enough, track_run
 WINDOW = 5.0  # s: shorter windows weigh the start, longer ones what no model can know
 LEAD = 2.0  # s of readings before a window that tell its start
 MOST_WINDOWS = 240  # in all: 1200 s; an hour's digging differs from the next one's
-_REMEMBERED = 2.5  # s of a window in which errors say one thing
+REMEMBERED = 2.5  # s of a window in which errors say one thing
 _STILL = 0.01  # of a channel's range: a window in which all channels move less says nothing
 _STEPS = (1.0e-2, 4.0e-3, 2.0e-3, 1.0e-3)  # s of the integrator, the largest that does
 _ROUGHNESS = 0.02  # of the errors, that a larger step may add
@@ -113,6 +113,7 @@ class FreeRunFit:
 def fit_free_runs(
     data: Dataset, guess: Guess, seconds: float = WINDOW, most: int = MOST_WINDOWS,
     max_iterations: int = 10, jobs: int = 2, say: Callable[[str], None] = lambda text: None,
+    remembered: float = REMEMBERED,
 ) -> FreeRunFit:  # fmt: skip
     """Fit a guess's deviations to free runs through windows of the fit runs.
 
@@ -124,6 +125,7 @@ def fit_free_runs(
         max_iterations: Gauss-Newton steps, at every number of windows.
         jobs: worker threads.
         say: told of every step.
+        remembered: time in which errors say one thing [s]: shorter where what drives them is.
 
     Returns:
         The fit.
@@ -136,7 +138,7 @@ def fit_free_runs(
     windows = free_run_windows(data.fit, seconds, most)
     fewer = sorted({max(1, min(k, len(windows) // _FEWEST)) for k in _LOOKS_AT}, reverse=True)
     with ThreadPoolExecutor(jobs) as pool:
-        problem = _Problem(data, windows, following_levels(data), pool)
+        problem = _Problem(data, windows, following_levels(data), pool, remembered=remembered)
         problem = replace(problem, step=_large_step(problem, guess))
         first = now = _point(problem, guess)
         taken, converged = 0, False
@@ -210,6 +212,7 @@ class _Problem:
         levels: noise levels of the filter that tells their starts.
         pool: the workers.
         step: largest step of the integrator [s].
+        remembered: time of a window in which errors say one thing [s].
     """
 
     data: Dataset
@@ -217,6 +220,7 @@ class _Problem:
     levels: Levels
     pool: ThreadPoolExecutor
     step: float = _STEPS[-1]
+    remembered: float = REMEMBERED
 
     def leads(self, machine: Machine) -> list[np.ndarray]:
         """(lead + 1, nz) states before every window, the last of them its start."""
@@ -253,7 +257,7 @@ class _Problem:
         out = []
         for window in self.windows:
             known = np.isfinite(window.measured)
-            values = window.count * window.run.period / _REMEMBERED
+            values = window.count * window.run.period / self.remembered
             out.append(known * values / np.maximum(known.sum(axis=0), 1))
         return np.concatenate(out)
 

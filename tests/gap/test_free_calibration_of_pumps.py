@@ -1,0 +1,57 @@
+"""A pump drive whose data sheet is wrong in several places, calibrated by its free runs."""
+
+import numpy as np
+
+from hydrotele.dataset.load import Dataset, RunData
+from hydrotele.effects.effect import changed
+from hydrotele.gap.free_calibration import calibrate_freely
+from hydrotele.log import Log
+from hydrotele.machine_file import load_machine
+from tests.prediction.test_pump_drive import CHANNELS, NOISE, PERIOD, simulated
+
+DUTY = np.repeat(
+    [0.0, 0.7, 0.0, -0.5, 0.0, 0.5, 0.8, -0.6, 0.0], [220, 150, 50, 100, 50, 80, 60, 150, 40]
+)
+WRONG = {  # path -> factor: what the data sheet says over what is right
+    "axes.piston.cylinder.area_rod": 1.12, "axes.piston.pump.motor.emf": 1.2,
+    "axes.piston.pump.motor.inertia": 2.0,
+}  # fmt: skip
+
+
+def dataset(machine, truth):
+    shown, _ = simulated(truth, 10, DUTY[:, None])
+    reading = shown + np.random.default_rng(8).normal(size=shown.shape) * NOISE
+    run = RunData("made", 0.0, PERIOD, DUTY[:, None], np.ones(len(DUTY), bool), reading,
+                  Log(time=PERIOD * np.arange(len(DUTY)), columns={}, units={}))  # fmt: skip
+    return Dataset(machine, ("piston",), CHANNELS, NOISE, (run,), run, ())
+
+
+def value(machine, path):
+    for part in path.split("."):
+        machine = machine[part] if isinstance(machine, dict) else getattr(machine, part)
+    return machine
+
+
+def test_wrong_figures_of_a_data_sheet_are_found():
+    """Each within a third of what it was off by, of 9 s of motion; the rest stays uncertain."""
+    truth = changed(load_machine("eha", "load_30_bar"), "sensor_errors", {})
+    sheet = truth
+    for path, factor in WRONG.items():
+        sheet = changed(sheet, path, factor * value(truth, path))
+    share = {"area.piston.area_rod": 0.1, "motor_constant": 0.2, "motor_inertia": 0.5}
+    found = calibrate_freely(dataset(changed(sheet, "uncertainty", share), truth), 1)
+    assert found
+    for path in WRONG:
+        right, stated = value(truth, path), value(sheet, path)
+        assert abs(value(found.machine, path) - right) < 0.34 * abs(stated - right), path
+    assert "area.piston.area_rod" in found.numbers
+    assert calibrate_freely(dataset(changed(sheet, "uncertainty", {}), truth), 1) is None
+
+
+def test_runs_that_are_too_short_are_left_to_the_search():
+    truth = load_machine("eha", "load_30_bar")
+    short = dataset(truth, truth)
+    part = short.fit[0].part(0, 400)
+    assert calibrate_freely(Dataset(truth, ("piston",), CHANNELS, NOISE, (part,), part, ()), 1) is (
+        None
+    )
