@@ -33,7 +33,7 @@ from hydrotele.prediction.free_run import (
 from hydrotele.prediction.open_numbers import open_numbers
 from hydrotele.prediction.output_error import fit_free_runs
 from hydrotele.prediction.stretches import busiest_rows
-from hydrotele.terms.law import LAWS, VARIABLES, DriveState
+from hydrotele.terms.law import LAWS, DriveState
 
 WINDOW, LEAD = 5.0, 0.5  # s; of each window the lead has readings, the rest none
 PUSH = (176.0, 7.3, 0.7)  # N, s, s: half of the drive's largest force
@@ -80,8 +80,8 @@ def _added(machine: Machine, run: RunData, position: np.ndarray, rate: np.ndarra
                    "command": command, "force": force}  # fmt: skip
             for name, (low, high) in term.domain.items():
                 now[name] = min(max(now[name], low), high)
-            total[row] += law.function(DriveState(**{**dict.fromkeys(VARIABLES, 0.0), **now}),
-                                       **arguments)  # fmt: skip
+            state = DriveState(**{**dict.fromkeys(DriveState._fields, 0.0), **now})
+            total[row] += law.function(state, **arguments)
     return total
 
 

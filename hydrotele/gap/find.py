@@ -26,7 +26,8 @@ from hydrotele.gap.result import (
     Prediction,
     Verdict,
 )
-from hydrotele.gap.search import Found, chances, lacking, search
+from hydrotele.gap.rivals import chances
+from hydrotele.gap.search import Found, lacking, search
 from hydrotele.machine import Machine
 from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import Evidence, Judged

@@ -14,7 +14,9 @@ import numpy as np
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.calibrating import calibrated, calibration_of, free_of_calibration, promoted
 from hydrotele.gap.pulses import timed
+from hydrotele.gap.rivals import Rival, better, find_rivals
 from hydrotele.gap.screening import Screened, screen
+from hydrotele.gap.settling import STEPS, loss_of, settle, strained
 from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
@@ -26,42 +28,13 @@ _TRACE = 2.0e-3  # of all that was gained: below it an effect is none where all 
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
-_SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
-_UNMOVED = 0.3  # standard deviations by which a number may still move
-_IDLE = 3.0  # fall of the loss that is not worth another round of a calibration
-_STALE = 200.0  # fall of the loss after which the slopes of a calibration are taken anew
-_ROOM = 3.0  # times the room to a bound that an effect gets that stands there
-_PLAINER = 0.2  # of an effect's probability from which a rival with fewer numbers takes its place
-_SECOND = 2  # rivals that are settled like the effect itself
-_STEPS = 3  # of Gauss-Newton for a candidate
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
-_RIVALS = 3  # candidates that are judged in the place of a named effect
-_HOPELESS = 500.0  # loss above the effect's beyond which a rival is let go; or this share of what
-_FAR = 0.5  # the effect brings
 _WORTH = 0.1  # of the best screened score: below it a candidate is not fitted
 _PAIRED = 6  # candidates that are tried in pairs where no single one helps
 _REFUSED = 3  # effects that may turn out to be none before a search ends
-_DRAWS = 4000  # of the Bayesian bootstrap
 Progress = Callable[[str, float], None]
-
-
-@dataclass(frozen=True)
-class Rival:
-    """Another effect in the place of a named one.
-
-    Attributes:
-        hypothesis: the effect.
-        judged: the guess with it, judged.
-        charge: what its parameters cost.
-        fit: its last fit; None where it was not settled, for it is far behind.
-    """
-
-    hypothesis: Hypothesis
-    judged: Judged
-    charge: float
-    fit: Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -147,7 +120,7 @@ def search(
             tell(f"fit {added.name.replace('_', ' ')}", done + 0.02)
             grown, settled = settle(evidence, best)
             worth = now.loss - grown.loss - settled.charge
-            if worth < bar or _strained(grown.guess, -1):
+            if worth < bar or strained(grown.guess, -1):
                 evidence.set_base(now)
                 candidates = [c for c in candidates if c.key != added.key]
                 ranked = [r for r in ranked if r.hypothesis.key != added.key]
@@ -182,9 +155,9 @@ def search(
         assert fit
         charges.append(charge(_last(fit.information, now.guess, index), hypothesis.size))
         ranked, rest = rankings.get(hypothesis.key, first), without[index]
-        rivals.append(_rivals(evidence, now, index, ranked, rest) if rest else ())
+        rivals.append(find_rivals(evidence, now, index, ranked, rest) if rest else ())
     for index, rest in enumerate(without):
-        if rest and (rival := _better(now, index, charges[index], rest, rivals[index])):
+        if rest and (rival := better(now, index, charges[index], rest, rivals[index])):
             assert rival.fit
             old = Rival(now.guess.parts[index][0], now, charges[index], fit)
             others = (r for r in rivals[index] if r is not rival)
@@ -219,57 +192,6 @@ def lacking(judged: Judged, evidence: Evidence) -> float:
     return sum(evidence.map(input_excess, judged.tracks))
 
 
-def weights(blocks: Sequence[np.ndarray], charges: Sequence[float], seed: int = 0) -> np.ndarray:
-    """(K,) probabilities of K guesses from the blocks of their runs.
-
-    Stretches of the runs are drawn anew with weights of their own (Bayesian bootstrap), so that a
-    guess that is better in a few places only is not preferred for sure (pseudo-BMA+ of Yao et al.
-    2018, Bayesian Analysis 13(3), section 3.4, with the likelihood of one-step predictions).
-
-    Args:
-        blocks: K arrays (B,) of -2 log likelihood.
-        charges: what each guess's parameters cost, in the same unit.
-        seed: of the draws.
-
-    Returns:
-        Probabilities that sum to 1.
-    """
-    table = np.stack(list(blocks))
-    count = table.shape[1]
-    draws = count * np.random.default_rng(seed).dirichlet(np.ones(count), _DRAWS)
-    totals = draws @ (table - table.min(axis=0)).T + np.asarray(charges)
-    chances = np.exp(-0.5 * (totals - totals.min(axis=1, keepdims=True)))
-    return (chances / chances.sum(axis=1, keepdims=True)).mean(axis=0)
-
-
-def chances(now: Judged, cost: float, rest: Judged, rivals: Sequence[Rival]) -> np.ndarray:
-    """(2 + R,) probabilities of an effect, of none, and of its rivals.
-
-    Args:
-        now: with the effect.
-        cost: what its parameters are charged.
-        rest: without it.
-        rivals: R others in its place.
-    """
-    return weights(
-        [now.blocks(), rest.blocks(), *(r.judged.blocks() for r in rivals)],
-        [cost, 0.0, *(r.charge for r in rivals)],
-    )
-
-
-def _better(
-    now: Judged, index: int, cost: float, rest: Judged, rivals: Sequence[Rival]
-) -> Rival | None:
-    """The rival that should take an effect's place: likelier, or nearly as likely and plainer."""
-    size = now.guess.parts[index][0].size
-    table = chances(now, cost, rest, rivals)
-    found = [
-        (chance, rival) for chance, rival in zip(table[2:], rivals, strict=True)
-        if rival.fit and chance > (_PLAINER if rival.hypothesis.size < size else 1.0) * table[0]
-    ]  # fmt: skip
-    return max(found, key=lambda pair: pair[0])[1] if found else None
-
-
 def _named_so_far(guess: Guess) -> int:
     return sum(h.name != CALIBRATION for h, _ in guess.parts)
 
@@ -299,11 +221,11 @@ def _best_singles(
         more = now.guess.plus(candidate.hypothesis, candidate.start)
         step = evidence.step_of(more, MIDDLE)
         kept = evidence.base_slopes(evidence.slope_step, parallel=False)
-        before = _loss_of(evidence, now.guess, step)
-        return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
+        before = loss_of(evidence, now.guess, step)
+        return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=STEPS)
 
     fits = sorted(evidence.map(fitted, short), key=lambda fit: -fit.score)
-    inside = [fit for fit in fits if fit.score > enter and not _strained(fit.guess, -1)]
+    inside = [fit for fit in fits if fit.score > enter and not strained(fit.guess, -1)]
     close = [f for f in (inside or fits)[:_JUDGED] if f.score > _NEAR * fits[0].score]
     return _judged_best(evidence, now, [f for f in close if f.score > 0.5 * enter], enter)
 
@@ -346,77 +268,21 @@ def _best_pairs(
             start = pool[index].start
             more = more.plus(pool[index].hypothesis, start)
         kept = evidence.base_slopes(evidence.slope_step, parallel=False)
-        before = _loss_of(evidence, now.guess, MIDDLE)
+        before = loss_of(evidence, now.guess, MIDDLE)
         found = evidence.fit(more, before, parallel=False, step=MIDDLE, kept=kept)
         sizes = sum(h.size for h, _ in more.parts[len(now.guess.parts) :])
         return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
                    found.information)  # fmt: skip
 
     fits = [f for f in evidence.map(fitted, pairs) if f.score > enter
-            and not _strained(f.guess, -1) and not _strained(f.guess, -2)]  # fmt: skip
+            and not strained(f.guess, -1) and not strained(f.guess, -2)]  # fmt: skip
     return _judged_best(evidence, now, fits, enter)
-
-
-def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
-    """Fit with levels and gains computed anew until they no longer matter."""
-    fit, guess, kept = None, judged.guess, None
-    group = calibration_of(guess)
-    for _ in range(_SETTLES):
-        evidence.set_base(judged)
-        if group and kept is None:
-            kept = evidence.base_slopes(evidence.slope_step)
-        fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if group else None)
-        moved = fit.guess.deviation - judged.guess.deviation
-        spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
-        guess = _widened(fit.guess)
-        if np.all(np.abs(moved) < _UNMOVED * spread):
-            break
-        before, judged = judged, evidence.judged(guess, same=True)
-        fall = before.loss - judged.loss
-        if group and fall < _IDLE:
-            break
-        kept = kept if fall < _STALE else None
-    assert fit
-    return evidence.set_base(evidence.judged(guess)), fit
-
-
-def _widened(guess: Guess) -> Guess:
-    """A guess in which effects that stand at a bound have three times as much room.
-
-    A bound at zero is physical and stays.
-    """
-    parts = []
-    for hypothesis, deviation in guess.parts:
-        table, values = dict(hypothesis.parameters), hypothesis.values(deviation)
-        for key, p in hypothesis.parameters.items():
-            if hypothesis.name == CALIBRATION:
-                continue
-            if values[key] >= p.high:
-                table[key] = replace(p, high=p.nominal + _ROOM * (p.high - p.nominal))
-            elif values[key] <= p.low and p.low != 0.0:
-                low = p.low / _ROOM if p.low > 0.0 else p.nominal - _ROOM * (p.nominal - p.low)
-                table[key] = replace(p, low=low)
-        parts.append((replace(hypothesis, parameters=table), deviation))
-    return Guess(tuple(parts))
 
 
 def worth_naming(guess: Guess, index: int, score: float) -> bool:
     """Whether an effect is as large as its least size in any parameter, or beyond doubt."""
     hypothesis, deviation = guess.parts[index]
     return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
-
-
-def _strained(guess: Guess, index: int) -> bool:
-    """Whether a part stands at the edge of what is physically plausible."""
-    h, d = guess.parts[index]
-    if h.name == CALIBRATION:
-        return False
-    return bool(np.any(((d <= h.low) | (d >= h.high)) & (np.abs(d) > h.least)))
-
-
-def _loss_of(evidence: Evidence, guess: Guess, step: float) -> float:
-    errors = evidence.errors(guess, step)
-    return float(errors @ errors + guess.deviation @ guess.deviation)
 
 
 def _pruned(
@@ -467,50 +333,3 @@ def _last(information: np.ndarray, guess: Guess, index: int) -> np.ndarray:
     own = list(range(first, first + sizes[index]))
     order = [i for i in range(len(information)) if i not in own] + own
     return information[np.ix_(order, order)]
-
-
-def _rivals(
-    evidence: Evidence, now: Judged, index: int, ranking: Sequence[Screened], rest: Judged
-) -> tuple[Rival, ...]:
-    """What else could stand in the place of an effect, fitted and judged.
-
-    Args:
-        evidence: with the guess as base.
-        now: all effects.
-        index: the one to replace.
-        ranking: the screening in which the effect was found.
-        rest: the guess without it.
-
-    Returns:
-        Rivals, the most likely first.
-    """
-    taken = {h.key for h, _ in now.guess.parts}
-    free = {c.key for c in free_of_calibration([s.hypothesis for s in ranking], now.guess)}
-    pool = [s for s in ranking if s.hypothesis.key not in taken and s.score > 0.0
-            and s.hypothesis.key in free][: 2 * _RIVALS]  # fmt: skip
-    if not pool:
-        return ()
-    evidence.set_base(rest)
-    evidence.base_slopes(evidence.slope_step)
-
-    def fitted(candidate: Screened) -> Fit:
-        more = rest.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, MIDDLE)
-        kept = evidence.base_slopes(evidence.slope_step, parallel=False)
-        before = _loss_of(evidence, rest.guess, step)
-        return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
-
-    fits = sorted(evidence.map(fitted, pool), key=lambda fit: -fit.score)
-    plausible = [f for f in fits if f.score > 0.0 and not _strained(f.guess, -1)][:_RIVALS]
-    looked = [(evidence.judged(fit.guess), fit.charge) for fit in plausible]
-    looked = sorted((pair for pair in looked if np.isfinite(pair[0].loss)), key=lambda p: p[0].loss)
-    found = []
-    hopeless = now.loss + max(_HOPELESS, _FAR * (rest.loss - now.loss))
-    for place, (judged, cost) in enumerate(looked):
-        fit = None
-        if place < _SECOND and judged.loss < hopeless:
-            judged, fit = settle(evidence, judged)
-            cost = charge(fit.information, judged.guess.parts[-1][0].size)
-        found.append(Rival(judged.guess.parts[-1][0], judged, cost, fit))
-    evidence.set_base(now)
-    return tuple(sorted(found, key=lambda r: r.judged.loss + r.charge))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.gap.search import weights
+from hydrotele.gap.rivals import weights
 
 _STRETCHES = 80
 

@@ -200,6 +200,6 @@ def test_formulas_have_as_many_numbers_as_they_say():
     numbers = formula_arguments({"1": 1.0, "velocity * sin(position - velocity, 2)": 2.0})
     assert numbers["numbers"] == [
         2, 1.0, 0, 2.0, 2,
-        0, VARIABLES.index("velocity"), -1, 0.0, 0.0, 1,
-        8, VARIABLES.index("position"), VARIABLES.index("velocity"), 2.0, 0.0, 1,
+        0, VARIABLES["velocity"], -1, 0.0, 0.0, 1,
+        8, VARIABLES["position"], VARIABLES["velocity"], 2.0, 0.0, 1,
     ]  # fmt: skip

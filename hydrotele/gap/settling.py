@@ -1,0 +1,74 @@
+"""Fits whose noise levels follow: an effect's numbers and what a model lacks, found in turn."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hydrotele.gap.calibrating import calibration_of
+from hydrotele.prediction.calibration import CALIBRATION
+from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged
+from hydrotele.prediction.hypothesis import Guess
+
+STEPS = 3  # of Gauss-Newton for a candidate
+_SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
+_UNMOVED = 0.3  # standard deviations by which a number may still move
+_IDLE = 3.0  # fall of the loss that is not worth another round of a calibration
+_STALE = 200.0  # fall of the loss after which the slopes of a calibration are taken anew
+_ROOM = 3.0  # times the room to a bound that an effect gets that stands there
+
+
+def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
+    """Fit with levels and gains computed anew until they no longer matter."""
+    fit, guess, kept = None, judged.guess, None
+    group = calibration_of(guess)
+    for _ in range(_SETTLES):
+        evidence.set_base(judged)
+        if group and kept is None:
+            kept = evidence.base_slopes(evidence.slope_step)
+        fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if group else None)
+        moved = fit.guess.deviation - judged.guess.deviation
+        spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+        guess = _widened(fit.guess)
+        if np.all(np.abs(moved) < _UNMOVED * spread):
+            break
+        before, judged = judged, evidence.judged(guess, same=True)
+        fall = before.loss - judged.loss
+        if group and fall < _IDLE:
+            break
+        kept = kept if fall < _STALE else None
+    assert fit
+    return evidence.set_base(evidence.judged(guess)), fit
+
+
+def _widened(guess: Guess) -> Guess:
+    """A guess in which effects that stand at a bound have three times as much room.
+
+    A bound at zero is physical and stays.
+    """
+    parts = []
+    for hypothesis, deviation in guess.parts:
+        table, values = dict(hypothesis.parameters), hypothesis.values(deviation)
+        for key, p in hypothesis.parameters.items():
+            if hypothesis.name == CALIBRATION:
+                continue
+            if values[key] >= p.high:
+                table[key] = replace(p, high=p.nominal + _ROOM * (p.high - p.nominal))
+            elif values[key] <= p.low and p.low != 0.0:
+                low = p.low / _ROOM if p.low > 0.0 else p.nominal - _ROOM * (p.nominal - p.low)
+                table[key] = replace(p, low=low)
+        parts.append((replace(hypothesis, parameters=table), deviation))
+    return Guess(tuple(parts))
+
+
+def strained(guess: Guess, index: int) -> bool:
+    """Whether a part stands at the edge of what is physically plausible."""
+    h, d = guess.parts[index]
+    if h.name == CALIBRATION:
+        return False
+    return bool(np.any(((d <= h.low) | (d >= h.high)) & (np.abs(d) > h.least)))
+
+
+def loss_of(evidence: Evidence, guess: Guess, step: float) -> float:
+    """Loss of a guess with the base's gains: its errors' squares, and the prior's part."""
+    errors = evidence.errors(guess, step)
+    return float(errors @ errors + guess.deviation @ guess.deviation)
