@@ -9,13 +9,14 @@ from hydrotele.gap.calibrating import free_of_calibration
 from hydrotele.gap.screening import Screened
 from hydrotele.gap.settling import STEPS, loss_of, settle, strained
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
-from hydrotele.prediction.hypothesis import Hypothesis
+from hydrotele.prediction.hypothesis import Guess, Hypothesis
 
 _PLAINER = 0.2  # of an effect's probability from which a rival with fewer numbers takes its place
 _SECOND = 2  # rivals that are settled like the effect itself
 _RIVALS = 3  # candidates that are judged in the place of a named effect
 _HOPELESS = 500.0  # loss above the effect's beyond which a rival is let go; or this share of what
 _FAR = 0.5  # the effect brings
+_SAME = 0.1  # squares of whitened errors by which two guesses differ that say the same
 _DRAWS = 4000  # of the Bayesian bootstrap
 
 
@@ -72,6 +73,31 @@ def chances(now: Judged, cost: float, rest: Judged, rivals: Sequence[Rival]) -> 
         [now.blocks(), rest.blocks(), *(r.judged.blocks() for r in rivals)],
         [cost, 0.0, *(r.charge for r in rivals)],
     )
+
+
+def is_case_of(evidence: Evidence, guess: Guess, index: int, other: Hypothesis) -> bool:
+    """Whether an effect with one number is a case of another, all of whose numbers are then equal.
+
+    A dead band is a case of dead bands by direction: the other says the same, and is no rival.
+
+    Args:
+        evidence: with the guess as its base.
+        guess: all effects.
+        index: of the effect.
+        other: the other one.
+    """
+    hypothesis, deviation = guess.parts[index]
+    if hypothesis.size != 1 or other.size < 2 or other.location != hypothesis.location:
+        return False
+    (own,), (value,) = hypothesis.parameters.values(), hypothesis.values(deviation).values()
+    numbers = other.parameters.values()
+    if any(p.unit != own.unit or not p.low <= value <= p.high for p in numbers):
+        return False
+    equal = np.array([(value - p.nominal) / p.scale for p in numbers])
+    instead = Guess(tuple((other, equal) if i == index else p for i, p in enumerate(guess.parts)))
+    first = evidence.tracks[:1]
+    change = evidence.errors(instead, MIDDLE, first) - evidence.errors(guess, MIDDLE, first)
+    return float(change @ change) < _SAME
 
 
 def better(

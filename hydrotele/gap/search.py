@@ -14,7 +14,7 @@ import numpy as np
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.calibrating import calibrated, calibration_of, free_of_calibration, promoted
 from hydrotele.gap.pulses import timed
-from hydrotele.gap.rivals import Rival, better, find_rivals
+from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of
 from hydrotele.gap.screening import Screened, screen
 from hydrotele.gap.settling import STEPS, loss_of, settle, strained
 from hydrotele.prediction.calibration import CALIBRATION
@@ -168,6 +168,10 @@ def search(
             without = tuple(without[i] for i in order)
             charges, rivals = [charges[i] for i in order], [rivals[i] for i in order]
             break
+    for index, others in enumerate(rivals):
+        rivals[index] = tuple(
+            r for r in others if not is_case_of(evidence, now.guess, index, r.hypothesis)
+        )
     return Found(base, now, fit, first, tuple(charges), without, tuple(rivals), weak)
 
 
