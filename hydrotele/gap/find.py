@@ -39,6 +39,7 @@ from hydrotele.prediction.stretches import busiest, thinned
 from hydrotele.prediction.track import STEP, Levels, Track, known_levels, track_run
 
 SURE = 0.95  # probability below which an effect is called ambiguous
+LIKELY = 0.5  # probability above which an effect may explain a part: likelier than all else
 PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
 _MECHANISM, _STEEP = 0.35, 0.07  # see `_mechanism`
 _TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`
@@ -232,8 +233,8 @@ def _verdict(named: Sequence[NamedEffect], failed: bool, floor: float | None) ->
         return "unknown" if failed or floor is None else "no_gap"
     if not failed:
         return "named" if len(sure) == len(named) else "ambiguous"
-    closed = sum(effect.share for effect in sure)
-    return "partly" if sure and closed >= PARTLY else "unknown"
+    closed = sum(effect.share for effect in named if effect.probability > LIKELY)
+    return "partly" if closed >= PARTLY else "unknown"
 
 
 def _mechanism(part: float) -> float:
