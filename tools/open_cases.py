@@ -28,27 +28,35 @@ NAMES = {
     "more internal leakage": "internal_leakage",
     "extra payload mass": "payload",
     "resolver offset (measured = true + offset)": "angle_offset",
-    # called out of the library by the answers, which are older than the effect
-    "position-dependent friction (scored bore zone): extra F exp(-((x - x0)/w)^2/2), Coulomb-like": "position_dependent_friction",
 }
+_SCORED = "position-dependent friction (scored bore zone)"
+# which the answers, older than the effect, call out of the library
 PLACES = {
     "all axes": "all", "stick valve": "stick", "boom head side": "boom.head",
     "boom cylinder (A to B)": "boom", "stick angle": "stick", "stick cylinder": "stick",
 }  # fmt: skip
 
 
+def _name(described: str) -> str:
+    """The library's name of an effect as an answer describes it; empty if it has none."""
+    if described.startswith(_SCORED):
+        return "position_dependent_friction"
+    return NAMES.get(described, "")
+
+
 def expected(answer: dict) -> tuple[str, list[tuple[str, str, float, float]]]:
     """Verdict and (name, location, value, factor to SI) of the effects of an answer."""
     if answer["category"] == "clean":
         return "no_gap", []
-    if not all(effect["effect"] in NAMES for effect in answer["effects"]):
+    names = [_name(effect["effect"]) for effect in answer["effects"]]
+    if not all(names):
         return "unknown", []
     effects = []
-    for effect in answer["effects"]:
+    for name, effect in zip(names, answer["effects"], strict=True):
         place = effect["location"]
         place = "tool" if place.startswith("stick tip") else PLACES.get(place, place)
         factor = 0.017453292519943295 if effect["unit"] == "deg" else 1.0
-        effects.append((NAMES[effect["effect"]], place, effect["value"] * factor, factor))
+        effects.append((name, place, effect["value"] * factor, factor))
     return "named", effects
 
 
