@@ -7,7 +7,7 @@ import numpy as np
 
 from hydrotele.gap.calibrating import free_of_calibration
 from hydrotele.gap.screening import Screened
-from hydrotele.gap.settling import STEPS, loss_of, settle, strained
+from hydrotele.gap.settling import fitted, settle, strained
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
 
@@ -135,16 +135,7 @@ def find_rivals(
     if not pool:
         return ()
     evidence.set_base(rest)
-    evidence.base_slopes(evidence.slope_step)
-
-    def fitted(candidate: Screened) -> Fit:
-        more = rest.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, MIDDLE)
-        kept = evidence.base_slopes(evidence.slope_step, parallel=False)
-        before = loss_of(evidence, rest.guess, step)
-        return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=STEPS)
-
-    fits = sorted(evidence.map(fitted, pool), key=lambda fit: -fit.score)
+    fits = fitted(evidence, rest, pool)
     plausible = [f for f in fits if f.score > 0.0 and not strained(f.guess, -1)][:_RIVALS]
     looked = [(evidence.judged(fit.guess), fit.charge) for fit in plausible]
     looked = sorted((pair for pair in looked if np.isfinite(pair[0].loss)), key=lambda p: p[0].loss)

@@ -16,7 +16,7 @@ from hydrotele.gap.calibrating import calibrated, calibration_of, free_of_calibr
 from hydrotele.gap.pulses import timed
 from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of
 from hydrotele.gap.screening import Screened, screen
-from hydrotele.gap.settling import STEPS, loss_of, settle, strained
+from hydrotele.gap.settling import fitted, loss_of, settle, strained
 from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
@@ -219,16 +219,7 @@ def _best_singles(
     short = [s for s in ranked[:_SHORT] if s.score > bar]
     if not short:
         return []
-    evidence.base_slopes(evidence.slope_step)
-
-    def fitted(candidate: Screened) -> Fit:
-        more = now.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, MIDDLE)
-        kept = evidence.base_slopes(evidence.slope_step, parallel=False)
-        before = loss_of(evidence, now.guess, step)
-        return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=STEPS)
-
-    fits = sorted(evidence.map(fitted, short), key=lambda fit: -fit.score)
+    fits = fitted(evidence, now, short)
     inside = [fit for fit in fits if fit.score > enter and not strained(fit.guess, -1)]
     close = [f for f in (inside or fits)[:_JUDGED] if f.score > _NEAR * fits[0].score]
     return _judged_best(evidence, now, [f for f in close if f.score > 0.5 * enter], enter)
@@ -266,7 +257,7 @@ def _best_pairs(
             gains[a, b] = float(ground @ ground - left @ left - move @ move)
     pairs = sorted(gains, key=gains.__getitem__, reverse=True)[:2]
 
-    def fitted(pair: tuple[int, int]) -> Fit:
+    def fit_pair(pair: tuple[int, int]) -> Fit:
         more = now.guess
         for index in pair:
             start = pool[index].start
@@ -278,7 +269,7 @@ def _best_pairs(
         return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
                    found.information)  # fmt: skip
 
-    fits = [f for f in evidence.map(fitted, pairs) if f.score > enter
+    fits = [f for f in evidence.map(fit_pair, pairs) if f.score > enter
             and not strained(f.guess, -1) and not strained(f.guess, -2)]  # fmt: skip
     return _judged_best(evidence, now, fits, enter)
 

@@ -1,20 +1,36 @@
 """Fits whose noise levels follow: an effect's numbers and what a model lacks, found in turn."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hydrotele.gap.calibrating import calibration_of
+from hydrotele.gap.screening import Screened
 from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged
 from hydrotele.prediction.hypothesis import Guess
 
-STEPS = 3  # of Gauss-Newton for a candidate
+_STEPS = 3  # of Gauss-Newton for a candidate
 _SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
 _UNMOVED = 0.3  # standard deviations by which a number may still move
 _IDLE = 3.0  # fall of the loss that is not worth another round of a calibration
 _STALE = 200.0  # fall of the loss after which the slopes of a calibration are taken anew
 _ROOM = 3.0  # times the room to a bound that an effect gets that stands there
+
+
+def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fit]:
+    """Each of some candidates fitted beside a guess, which is the base; the best score first."""
+    evidence.base_slopes(evidence.slope_step)
+
+    def fit(candidate: Screened) -> Fit:
+        more = now.guess.plus(candidate.hypothesis, candidate.start)
+        step = evidence.step_of(more, MIDDLE)
+        kept = evidence.base_slopes(evidence.slope_step, parallel=False)
+        before = loss_of(evidence, now.guess, step)
+        return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
+
+    return sorted(evidence.map(fit, pool), key=lambda found: -found.score)
 
 
 def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
