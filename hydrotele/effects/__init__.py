@@ -91,7 +91,7 @@ def apply_effect(
         machine: the machine without it.
         name: name of the effect.
         location: where; may be left empty where there is only one place.
-        parameters: parameter name -> value in the effect's unit.
+        parameters: parameter name -> value in the effect's unit; optional ones may be left out.
 
     Returns:
         The changed machine.
@@ -111,8 +111,9 @@ def apply_effect(
         message = f"cannot sit at {location!r}; {suggest(location, places)}"
         raise InputError(f"effect {name}", message)
     known = effect.parameters(machine, location)
-    for key in sorted(parameters.keys() ^ known.keys()):
-        names = ", ".join(known)
+    needed = {key for key, p in known.items() if not p.optional}
+    for key in sorted((needed - parameters.keys()) | (parameters.keys() - known.keys())):
+        names = ", ".join(f"{k} (may be left out)" if p.optional else k for k, p in known.items())
         raise InputError(f"effect {name}", f"needs exactly the parameters {names}: {key!r}")
     for key, value in parameters.items():
         limits = known[key]

@@ -23,6 +23,8 @@ class Parameter:
         least: deviation below which the effect is not worth naming.
         starts: values from which a search starts where the effect vanishes at nominal, or where
             its slope there tells little; empty where nominal is a good start.
+        optional: whether it may be left out where the effect is planted, and is so where it is
+            looked for among others: it then keeps its nominal value.
     """
 
     unit: str
@@ -32,6 +34,7 @@ class Parameter:
     scale: float
     least: float
     starts: tuple[float, ...] = ()
+    optional: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

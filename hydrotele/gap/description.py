@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from hydrotele.gap.discover import THROUGH, Discovery, Learned
+from hydrotele.gap.discover import Discovery, Learned
+from hydrotele.gap.law_shapes import THROUGH
 from hydrotele.gap.result import Lack, LearnedLaw, Prediction, Unknown
 from hydrotele.gap.words import lack_words, learned_words
 from hydrotele.machine import Machine
@@ -50,7 +51,7 @@ def learned_laws(
 def _learned_law(
     machine: Machine, law: Learned, deviation: np.ndarray, spread: np.ndarray, share: float
 ) -> LearnedLaw:
-    """A law along its variable, with the other variables at their medians.
+    """A law along its (first) variable, with the other variables at their medians.
 
     A law that goes with the sign of the motion is shown for positive motion, one in proportion to
     the speed per unit of speed.
@@ -66,6 +67,10 @@ def _learned_law(
     if shape.factor:
         fast = 1e3  # sign(velocity) is 1 there
         probe["velocity"] = np.full(len(points), 1.0 if shape.factor == "velocity" else fast)
+    if shape.other:  # at the median of the second variable
+        c, _, e = shape.other.partition(" - ")
+        across = law.seen[c] - law.seen[e] if e else law.seen[c]
+        probe[c] = np.full(len(points), float(np.median(across))) + (probe[e] if e else 0.0)
     columns = shape.columns(probe, law.smoothing)
     error = np.sqrt((columns**2) @ (spread * scales) ** 2)
     along = shape.columns(law.seen, law.smoothing) @ coefficients
@@ -80,10 +85,12 @@ def _learned_law(
     size = float(np.sqrt(np.mean(along**2)))
     return LearnedLaw(
         law.balance, law.axis, formula,
-        learned_words(law.balance, law.axis, shape.variable, shape.factor, size, unit, resembles),
+        learned_words(
+            law.balance, law.axis, shape.variable, shape.factor, size, unit, resembles, shape.other
+        ),
         resembles, shape.variable, tuple(points.tolist()), tuple((columns @ coefficients).tolist()),
         tuple(error.tolist()), _per_speed(unit, length) if shape.factor == "velocity" else unit,
-        _unit_of(a, unit, length), share,
+        _unit_of(a, unit, length), share, shape.other,
     )  # fmt: skip
 
 
@@ -158,13 +165,18 @@ def describe(
         law, term = _LAW_OF[learned[0].balance], learned[0].formula
         depends = tuple(
             "time" if part == "time" else f"{part}.{learned[0].axis}"
-            for part in learned[0].variable.split(" - ")
+            for part in _variables(learned[0])
         )
         words += [one.description for one in learned]
     if not words:
         words = ["No balance of forces or flows explains it: look at this sensor, its mounting and"
                  " the geometry of the linkage."]  # fmt: skip
     return Unknown(law, channel, depends, " ".join(words), term, _windows(after[0], channel))
+
+
+def _variables(law: LearnedLaw) -> list[str]:
+    both = (law.variable, law.other) if law.other else (law.variable,)
+    return [part for variable in both for part in variable.split(" - ")]
 
 
 def _worst_channel(after: Sequence[Prediction]) -> str:

@@ -1,14 +1,13 @@
 """Laws of what no effect explains: located, estimated, fitted, and written into the machine.
 
 The filter's unknown inputs (`prediction.inputs`) say which balance lacks something, where and when;
-a smoother reads them back. Each is regressed on physical variables of its drive: piecewise linear
-in one of them, alone or with the sign of the motion or in proportion to the speed. What predicts
-runs that it was not fitted to is fitted once more, inside the machine, to the readings themselves,
-and kept if it is worth its parameters. It is a term of the patched machine (`hydrotele.terms`),
-which every simulator calculates.
+in their places laws of physical variables of the drive are tried (`law_shapes`): piecewise linear
+in one of them, alone or with the sign of the motion or in proportion to the speed, or in two of
+them. What predicts runs that it was not fitted to best (`law_regression`) is fitted once more,
+inside the machine, and kept if it is worth its parameters. It is a term of the patched machine
+(`hydrotele.terms`), which every simulator calculates.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -19,76 +18,27 @@ from hydrotele.compiled import compiled
 from hydrotele.dynamics.integrate import place
 from hydrotele.dynamics.model import X, model_space, reduced_model
 from hydrotele.effects import Parameter
+from hydrotele.gap.law_regression import Regression, regression
+from hydrotele.gap.law_shapes import THROUGH, Shape, possible_shapes
 from hydrotele.gap.search import ENTER, lacking
+from hydrotele.gap.settling import loss_of
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
-from hydrotele.prediction.evidence import Evidence, Judged, charge
+from hydrotele.prediction.evidence import Evidence, Judged
 from hydrotele.prediction.hypothesis import Hypothesis
 from hydrotele.prediction.inputs import Input, input_sizes, input_units
-from hydrotele.prediction.levels import smoothed, smoothed_inputs
+from hydrotele.prediction.levels import smoothed
 from hydrotele.prediction.track import Track
 from hydrotele.terms.facts import Term
 
 LEARNED = "learned"
 """First part of the name of a hypothesis that holds a learned law."""
-THROUGH = "flow_through"
-"""Balance of a flow from the head side to the rod side."""
 _MOST = 3  # laws that are learned one after the other
-_KNOTS = 5  # inner kinks of a law
-_TRIED = 3  # laws that are fitted inside the machine for a balance
-_LEAST_R2 = 0.1  # of an input, predicted for runs that were not fitted, for a law to be tried
-_KEEP = 6.0  # fall of BIC that a kink must bring
+_LARGEST = 4  # unknown inputs in whose places laws are looked for
+_TRIED = 2  # laws that are fitted inside the machine, of all that the regression finds
+_STEPS = 3  # of Gauss-Newton for each
+_DETAIL = 0.05  # of what all laws brought: one that brings less is the last
 _STEP = 2.0e-3  # s, for the fits
-_VARIABLES: Mapping[str, tuple[str, ...]] = {
-    "force": ("velocity", "position", "command", "force", "time"),
-    "flow_head": ("pressure_head - pressure_rod", "pressure_head", "spool", "pump_speed",
-                  "velocity", "position"),
-    "flow_rod": ("pressure_head - pressure_rod", "pressure_rod", "spool", "pump_speed", "velocity",
-                 "position"),
-    THROUGH: ("pressure_head - pressure_rod", "position", "spool", "pump_speed", "velocity",
-              "time"),
-    "command": ("command", "spool", "velocity", "position", "force", "time"),
-}  # fmt: skip
-
-
-class Shape(NamedTuple):
-    """A form that a law can have: a piecewise linear function of a variable times a factor.
-
-    Attributes:
-        variable: a variable of `DriveState`, or a difference of two.
-        factor: what it is multiplied by: empty, `sign(velocity, v0)` or `velocity`.
-        knots: where it kinks.
-    """
-
-    variable: str
-    factor: str
-    knots: tuple[float, ...]
-
-    @property
-    def products(self) -> list[str]:
-        """The products of basic functions, one per coefficient, as `terms.formula` reads them."""
-        line = f"({self.variable})" if " - " in self.variable else self.variable
-        found = ["1", line]
-        found += [f"above({self.variable}, {_number(k)})" for k in self.knots]
-        if not self.factor:
-            return found
-        return [self.factor if p == "1" else f"{p} * {self.factor}" for p in found]
-
-    def columns(self, values: Mapping[str, np.ndarray], smoothing: float) -> np.ndarray:
-        """(n, K) the products along data."""
-        a, _, b = self.variable.partition(" - ")
-        x = values[a] - values[b] if b else values[a]
-        found = [np.ones_like(x), x, *(np.maximum(0.0, x - k) for k in self.knots)]
-        factor = np.ones_like(x)
-        if self.factor.startswith("sign"):
-            factor = np.tanh(values["velocity"] / smoothing)
-        elif self.factor:
-            factor = values[self.factor]
-        return np.column_stack(found) * factor[:, None]
-
-
-def _number(value: float) -> str:
-    return f"{value:.6g}"
 
 
 @dataclass(frozen=True)
@@ -131,34 +81,45 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
         The guess with the laws that are worth their parameters.
     """
     laws: list[Learned] = []
-    best: tuple[Judged, Learned] | None
+    begin = judged.loss
     for _ in range(_MOST):
         evidence.set_base(judged)
         seen = [_see(evidence.data.machine, judged, track) for track in judged.tracks]
-        best = None
-        for law, start in _candidates(evidence.data.machine, judged, seen, laws):
-            guess = judged.guess.plus(law.hypothesis, start)
-            kept = evidence.base_slopes(_STEP)
-            fit = evidence.fit(guess, 0.0, step=_STEP, kept=kept, steps=3)
-            now = evidence.judged(fit.guess)
-            score = judged.loss - now.loss - charge(fit.information, law.hypothesis.size)
-            if score > ENTER and (best is None or now.loss < best[0].loss):
-                best = now, law
-        if best is None:
+        found = _best_law(evidence, judged, _candidates(evidence, judged, seen, laws))
+        if found is None:
             break
-        judged, law = best
+        fall = judged.loss - found[0].loss
+        judged, law = found
         laws.append(law)
-        if lacking(judged, evidence) < ENTER:
+        if fall < _DETAIL * (begin - judged.loss) or lacking(judged, evidence) < ENTER:
             break
     return Discovery(judged, tuple(laws))
 
 
+def _best_law(
+    evidence: Evidence, judged: Judged, candidates: Sequence[tuple[Learned, np.ndarray]]
+) -> tuple[Judged, Learned] | None:
+    """The candidate that fits the readings best and is worth its parameters, judged."""
+    kept = evidence.base_slopes(_STEP)
+    before = loss_of(evidence, judged.guess, _STEP)
+    fits = []
+    for law, start in candidates:
+        guess = judged.guess.plus(law.hypothesis, start)
+        fits.append((evidence.fit(guess, before, step=_STEP, kept=kept, steps=_STEPS), law))
+    for fit, law in sorted(fits, key=lambda pair: -pair[0].score):
+        if fit.score <= 0.0:
+            break
+        now = evidence.judged(fit.guess)
+        if judged.loss - now.loss - fit.charge > ENTER:
+            return now, law
+    return None
+
+
 class _Seen(NamedTuple):
-    """A run by what its smoother says: variables of every axis, and inputs with what is known."""
+    """A run by what its smoother says: variables of every axis, and the rows that are known."""
 
     values: dict[str, dict[str, np.ndarray]]
-    inputs: dict[Input, np.ndarray]
-    known: dict[Input, np.ndarray]
+    known: np.ndarray
 
 
 @compiled
@@ -180,7 +141,6 @@ def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
     size = track.states.shape[1]
     run, told = smoothed(track)
     states = track.states - run.correction[:, :size] + told.deviation[:, :size]
-    inputs = smoothed_inputs(track, (run, told))
     model = reduced_model(machine, ())
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
@@ -201,139 +161,77 @@ def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
         elif facts.force:
             own["force"] = facts.force.gain * own["command"]
         values[axis] = own
-    known = {}
-    settle = min(round(0.5 / track.run.period), len(states) // 4)
-    for k, i in enumerate(track.levels.inputs):
-        flag = np.ones(len(states), bool)
-        flag[:settle] = False
-        if track.run.valid is not None:
-            flag &= track.run.valid
-        known[i] = flag & np.isfinite(states).all(axis=1)
-        inputs[~known[i], k] = 0.0
-    return _Seen(values, {i: inputs[:, k] for k, i in enumerate(track.levels.inputs)}, known)
+    known = np.isfinite(states).all(axis=1)
+    known[: min(round(0.5 / track.run.period), len(states) // 4)] = False
+    if track.run.valid is not None:
+        known &= track.run.valid
+    return _Seen(values, known)
 
 
 def _candidates(
-    machine: Machine, judged: Judged, seen: Sequence[_Seen], laws: Sequence[Learned]
+    evidence: Evidence, judged: Judged, seen: Sequence[_Seen], laws: Sequence[Learned]
 ) -> list[tuple[Learned, np.ndarray]]:
     """Laws worth a fit, with the deviations from which to fit them, for the largest lacks."""
-    levels = judged.tracks[0].levels
-    largest = input_sizes(machine, levels.inputs)
-    order = np.argsort(-levels.sizes / largest)
-    taken = {(law.balance, law.axis, law.shape.variable, law.shape.factor) for law in laws}
-    rated = []
-    for k in order[:4]:
+    machine, levels = evidence.data.machine, judged.tracks[0].levels
+    order = np.argsort(-levels.sizes / input_sizes(machine, levels.inputs))
+    taken = {(law.balance, law.axis, law.shape.kind) for law in laws}
+    cases = []
+    for k in order[:_LARGEST]:
         i = levels.inputs[int(k)]
-        targets: dict[str, list[np.ndarray]] = {i.balance: [s.inputs[i][s.known[i]] for s in seen]}
-        other = Input("flow_rod", i.axis)
-        if i.balance == "flow_head" and other in levels.inputs:
-            targets[THROUGH] = [0.5 * (s.inputs[other] - s.inputs[i])[s.known[i]] for s in seen]
-        for balance, target in targets.items():
-            power = sum(float(t @ t) for t in target)
-            if power == 0.0:
-                continue
-            part = float((levels.sizes / largest)[k])
-            for shape in _shapes(machine, i, balance, seen):
-                if (balance, i.axis, shape.variable, shape.factor) in taken:
-                    continue
-                columns = [
-                    shape.columns({n: v[s.known[i]] for n, v in s.values[i.axis].items()},
-                                  _smoothing(machine, i.axis))
-                    for s in seen
-                ]  # fmt: skip
-                share = _predicted_share(columns, target)
-                if share > _LEAST_R2:
-                    rated.append((share * part, balance, i, shape, columns, target))
-    rated.sort(key=lambda entry: -entry[0])
-    return [_law(machine, balance, i, shape, columns, target, seen)
-            for _, balance, i, shape, columns, target in rated[:_TRIED]]  # fmt: skip
+        balances = [i.balance]
+        if i.balance == "flow_head" and Input("flow_rod", i.axis) in levels.inputs:
+            balances.append(THROUGH)
+        speed = _smoothing(machine, i.axis)
+        for balance in balances:
+            values = [s.values[i.axis] for s in seen]
+            cases += [
+                (i, balance, shape) for shape in possible_shapes(balance, values, speed)
+                if (balance, i.axis, shape.kind) not in taken
+            ]  # fmt: skip
+
+    def look(case: tuple[Input, str, Shape]) -> Regression:
+        i, balance, shape = case
+        size = float(levels.sizes[levels.inputs.index(i)])
+        parts = []
+        for track, s in zip(judged.tracks, seen, strict=True):
+            column = track.columns[:, levels.inputs.index(i)]
+            if balance == THROUGH:
+                column = track.columns[:, levels.inputs.index(Input("flow_rod", i.axis))] - column
+            products = shape.columns(s.values[i.axis], _smoothing(machine, i.axis))
+            parts.append((track, column, np.where(s.known[:, None], products, 0.0)))
+        return regression(parts, size)
+
+    looked = list(zip(cases, evidence.map(look, cases), strict=True))
+    looked = [pair for pair in looked if pair[1].predicted > ENTER]
+    looked.sort(key=lambda pair: -pair[1].predicted)
+    return [_law(machine, case, found, seen) for case, found in looked[:_TRIED]]
 
 
 def _smoothing(machine: Machine, axis: str) -> float:
     return machine.axes[axis].drive.friction.smoothing_velocity
 
 
-def _shapes(machine: Machine, i: Input, balance: str, seen: Sequence[_Seen]) -> list[Shape]:
-    found = []
-    values = [s.values[i.axis] for s in seen]
-    sign = f"sign(velocity, {_number(_smoothing(machine, i.axis))})"
-    for variable in _VARIABLES[balance]:
-        a, _, b = variable.partition(" - ")
-        if a not in values[0] or (b and b not in values[0]):
-            continue
-        x = np.concatenate([v[a] - v[b] if b else v[a] for v in values])
-        x = x[np.isfinite(x)]
-        if len(x) < 10 * _KNOTS or np.ptp(x) == 0.0:
-            continue
-        span = np.quantile(x, [0.02, 0.98])
-        edges = np.quantile(x, np.linspace(0.02, 0.98, _KNOTS + 2)[1:-1])
-        even = np.linspace(span[0], span[1], _KNOTS + 2)[1:-1]
-        knots = tuple(sorted({float(_number(k)) for k in 0.5 * (edges + even)}))
-        factors = ["", sign, "velocity"]
-        if variable == "velocity":
-            factors = [""]
-            knots = tuple(sorted({*knots, 0.0}))
-        if balance == "command":
-            factors = [""]
-        found += [Shape(variable, factor, knots) for factor in factors]
-    return found
-
-
-def _predicted_share(columns: Sequence[np.ndarray], target: Sequence[np.ndarray]) -> float:
-    """Share of the target's square that a fit to the other runs predicts, over all runs.
-
-    A single run is taken in four parts.
-    """
-    if len(columns) == 1:
-        cuts = np.array_split(np.arange(len(target[0])), 4)
-        columns, target = [columns[0][c] for c in cuts], [target[0][c] for c in cuts]
-    whole = left = 0.0
-    for out in range(len(columns)):
-        a = np.concatenate([c for k, c in enumerate(columns) if k != out])
-        b = np.concatenate([t for k, t in enumerate(target) if k != out])
-        coefficients = _ridge(a, b)
-        miss = target[out] - columns[out] @ coefficients
-        whole += float(target[out] @ target[out])
-        left += float(miss @ miss)
-    return 1.0 - left / whole if whole > 0 else 0.0
-
-
-def _ridge(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    size = np.sqrt((a**2).mean(axis=0)) + 1e-300
-    scaled = a / size
-    normal = scaled.T @ scaled + 1e-4 * len(b) * np.eye(a.shape[1])
-    return np.linalg.solve(normal, scaled.T @ b) / size
-
-
 def _law(
-    machine: Machine, balance: str, i: Input, shape: Shape, columns: Sequence[np.ndarray],
-    target: Sequence[np.ndarray], seen: Sequence[_Seen],
-) -> tuple[Learned, np.ndarray]:  # fmt: skip
-    """A sparse law with the coefficients of the regression as start."""
-    a, b = np.concatenate(columns), np.concatenate(target)
-    keep = _sparse(a, b, shape)
-    shape = shape._replace(
-        knots=tuple(k for k, kept in zip(shape.knots, keep, strict=True) if kept)
-    )
-    a = a[:, [True, True, *keep]]
-    coefficients = _ridge(a, b)
-    rms = np.sqrt((a**2).mean(axis=0)) + 1e-300
-    scales = np.maximum(3.0 * np.abs(coefficients), float(np.std(b)) / rms)
+    machine: Machine, case: tuple[Input, str, Shape], found: Regression, seen: Sequence[_Seen]
+) -> tuple[Learned, np.ndarray]:
+    """A law of the products that are worth it, with the regression's coefficients as start."""
+    i, balance, shape = case
+    shape = shape._replace(chosen=found.chosen)
     (unit,) = input_units(machine, [i])
     parameters = {
         product: Parameter(f"{unit} / [{product}]" if product != "1" else unit, 0.0, -50.0 * s,
                            50.0 * s, float(s), 0.0)
-        for product, s in zip(shape.products, scales, strict=True)
+        for product, s in zip(shape.products, found.scale, strict=True)
     }  # fmt: skip
     values = [s.values[i.axis] for s in seen]
-    variables = [v for v in shape.variable.split(" - ")]
     everywhere = {v: np.concatenate([x[v] for x in values]) for v in values[0]}
-    domain = {v: (float(everywhere[v].min()), float(everywhere[v].max())) for v in variables
-              if np.ptp(everywhere[v]) > 0.0}  # fmt: skip
-    uncertainty = float(np.std(b - a @ coefficients))
-    name = f"{LEARNED}_{balance}"
+    domain = {v: (float(everywhere[v].min()), float(everywhere[v].max()))
+              for v in shape.variables if np.ptp(everywhere[v]) > 0.0}  # fmt: skip
+    name, over = f"{LEARNED}_{balance}", shape.variable
+    if shape.other:
+        over += f", {shape.other}"
 
-    def change(nominal: Machine, found: Mapping[str, float]) -> Machine:
+    def change(nominal: Machine, coefficients: Mapping[str, float]) -> Machine:
         terms = list(nominal.terms)
         sides = (
             (("flow_head", -1.0), ("flow_rod", 1.0)) if balance == THROUGH else ((balance, 1.0),)
@@ -341,36 +239,13 @@ def _law(
         for side, sign in sides:
             terms.append(Term.model_validate({
                 "name": name, "axis": i.axis, "balance": side, "law": "formula",
-                "parameters": {p: sign * value for p, value in found.items()}, "domain": domain,
-                "uncertainty": uncertainty,
-                "description": f"learned from data: {balance} over {shape.variable}",
+                "parameters": {p: sign * value for p, value in coefficients.items()},
+                "domain": domain, "uncertainty": found.left,
+                "description": f"learned from data: {balance} over {over}",
             }))  # fmt: skip
         return nominal.model_copy(update={"terms": tuple(terms)})
 
-    location = f"{i.axis}.{shape.variable.replace(' ', '')}"
+    location = f"{i.axis}.{over.replace(' ', '')}"
     hypothesis = Hypothesis(name, location, parameters, change)
     law = Learned(hypothesis, balance, i.axis, shape, _smoothing(machine, i.axis), everywhere)
-    return law, coefficients / scales
-
-
-def _sparse(a: np.ndarray, b: np.ndarray, shape: Shape) -> list[bool]:
-    """Which kinks are worth a coefficient, by BIC with one witness per twenty rows."""
-    keep = [True] * len(shape.knots)
-    witnesses = max(len(b) / 20.0, 10.0)
-
-    def loss(chosen: Sequence[bool]) -> float:
-        part = a[:, [True, True, *chosen]]
-        miss = b - part @ _ridge(part, b)
-        return witnesses * math.log(float(miss @ miss) + 1e-300)
-
-    now = loss(keep)
-    while sum(keep) > 1:
-        tried = {}
-        for k in np.flatnonzero(keep):
-            fewer = [x and j != k for j, x in enumerate(keep)]
-            tried[int(k)] = loss(fewer)
-        worst = min(tried, key=tried.__getitem__)
-        if tried[worst] > now + _KEEP:
-            break
-        keep[worst], now = False, tried[worst]
-    return keep
+    return law, found.deviation

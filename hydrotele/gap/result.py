@@ -70,6 +70,7 @@ class LearnedLaw:
         unit: of the values.
         variable_unit: of the points.
         share: of the gap on the held-out run that it closes.
+        other: a second variable on which it depends, at its median in `values`; or empty.
     """
 
     balance: str
@@ -84,6 +85,7 @@ class LearnedLaw:
     unit: str
     variable_unit: str
     share: float = math.nan
+    other: str = ""
 
 
 @dataclass(frozen=True)

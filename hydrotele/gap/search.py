@@ -14,6 +14,7 @@ import numpy as np
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.calibrating import calibrated, calibration_of, free_of_calibration, promoted
 from hydrotele.gap.pulses import timed
+from hydrotele.gap.rattling import rattling
 from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of
 from hydrotele.gap.screening import Screened, screen
 from hydrotele.gap.settling import fitted, loss_of, settle, strained
@@ -89,6 +90,7 @@ def search(
     base = now = evidence.set_base(Guess())
     fit, weak, first, refused, tried = None, None, (), 0, False
     candidates = timed(candidates, base)
+    teeth = rattling(evidence, base, candidates)
     rankings: dict[tuple[str, str], Sequence[Screened]] = {}
     worth = 0.0
     ranked: Sequence[Screened] | None = None  # of the present guess
@@ -103,6 +105,9 @@ def search(
         options = _best_singles(evidence, now, ranked, bar)
         if not options and lacking(now, evidence) > LACKING and len(ranked) > 1:
             options = _best_pairs(evidence, now, ranked, bar)
+        if teeth and not now.guess.parts:
+            gain = base.loss - teeth.loss
+            options = sorted([(teeth, gain), *options], key=lambda pair: -pair[1])
         small = []
         while options and not worth_naming(options[0][0].guess, -1, options[0][1]):
             judged, worth = options.pop(0)

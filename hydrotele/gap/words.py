@@ -81,14 +81,17 @@ def variable_words(variable: str) -> str:
 
 
 def learned_words(
-    balance: str, axis: str, variable: str, factor: str, size: float, unit: str, resembles: str
-) -> str:
+    balance: str, axis: str, variable: str, factor: str, size: float, unit: str, resembles: str,
+    other: str = "",
+) -> str:  # fmt: skip
     """What a learned law does, in a sentence or two.
 
     >>> learned_words("force", "boom", "position", "velocity", 9e3, "N", "")
     'A force on the boom drive, 9 kN RMS, that varies with position and grows with the velocity.'
     """
     how = f"that varies with the {variable_words(variable)}"
+    if other:
+        how += f" and the {variable_words(other)}"
     how = how.replace("the position", "position").replace("the time", "time")
     if factor == "velocity":
         how += " and grows with the velocity"
@@ -101,7 +104,8 @@ def learned_words(
 def learned_title(law: LearnedLaw) -> str:
     """On what a learned law acts and on what it depends, in a few words."""
     what = _LACKS[law.balance].format(axis=law.axis).partition(" ")[2]
-    return _capital(f"{what} over {variable_words(law.variable)}")
+    where = f", at the median {variable_words(law.other)}" if law.other else ""
+    return _capital(f"{what} over {variable_words(law.variable)}{where}")
 
 
 def lack_words(lack: Lack) -> str:

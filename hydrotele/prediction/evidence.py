@@ -16,7 +16,15 @@ from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.machine import Machine
 from hydrotele.prediction.hypothesis import Guess
 from hydrotele.prediction.levels import find_levels
-from hydrotele.prediction.track import COARSE, STEP, Track, fine_enough, known_levels, track_run
+from hydrotele.prediction.track import (
+    COARSE,
+    STEP,
+    Levels,
+    Track,
+    fine_enough,
+    known_levels,
+    track_run,
+)
 
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
 _STEPS = 6
@@ -115,6 +123,20 @@ class Evidence:
             tracks = find_levels(
                 self.data, machine, self.tracks, self._pool.map, self.step, rounds, same, reopened
             )
+        loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
+        return Judged(guess, tracks, loss + _prior(guess))
+
+    def judged_from(self, guess: Guess, levels: Levels) -> Judged:
+        """A guess with noise levels found from given ones instead of from those of the base.
+
+        What the base needs where it does not follow the readings at all may hide what a guess does.
+        """
+        machine = guess.machine(self.data.machine)
+        tracks = self.map(
+            lambda run: track_run(machine, self.data, run, None, self.step, levels, None, True),
+            self.runs,
+        )
+        tracks = find_levels(self.data, machine, tracks, self.map, self.step, _ROUNDS)
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + _prior(guess))
 

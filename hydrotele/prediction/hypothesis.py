@@ -100,14 +100,15 @@ def hypotheses(machine: Machine, names: Sequence[str] = ()) -> list[Hypothesis]:
         names: effects to restrict them to; all if empty.
 
     Returns:
-        One per effect and location that has parameters.
+        One per effect and location that has parameters, without those that are optional.
     """
     found = []
     for effect in EFFECTS.values():
         if names and effect.name not in names:
             continue
         for location in effect.locations(machine):
-            parameters = effect.parameters(machine, location)
+            table = effect.parameters(machine, location)
+            parameters = {key: p for key, p in table.items() if not p.optional}
             if parameters:
                 found.append(Hypothesis(effect.name, location, parameters))
     return found

@@ -52,7 +52,9 @@ LEAST = 1.0e-4  # of an input's largest size: below it an input is none
 _STATED = 0.5  # prior standard deviation of log(noise / stated): a data sheet is good to a factor
 _LACK = 4.0  # prior standard deviation of log(size / least): says next to nothing
 _NOISIER = 1.25  # times the rough noise that a channel's noise can be: what is slow is no noise
-_QUIETER = 0.3  # times the stated or the rough noise, whichever is smaller
+_QUIETER = 0.7  # times the stated or the rough noise, whichever is smaller: readings that scatter
+# less than they do are no sensor, but a lack that is faster than the unknown inputs
+_QUIETER_UNSTATED = 0.3  # times the rough noise, where fast motion may be most of it
 _ROWS = 3000  # of all runs together that tell the levels; more say the same again
 _ITERATIONS = 12  # of a round: what is left of the way is small against a round's own linearisation
 _SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
@@ -111,7 +113,8 @@ def noise_prior(data: Dataset) -> Prior:
     noise = np.where(stated, data.noise, rough)
     width = np.where(stated, _STATED, 2.0 * _STATED)
     rounding = np.array([_rounding(data, channel) for channel in data.channels])
-    low = np.maximum(_QUIETER * np.minimum(noise, rough), rounding)  # an encoder's error at rest
+    quieter = np.where(stated, _QUIETER, _QUIETER_UNSTATED)
+    low = np.maximum(quieter * np.minimum(noise, rough), rounding)  # an encoder's error at rest
     return Prior(noise, width, low, _NOISIER * rough)
 
 
@@ -345,9 +348,12 @@ def undisturbed_loss(track: Track) -> float:
 
 def rippled(levels: Levels) -> bool:
     """Whether white process noise is more than what an integrator leaves."""
-    return any(
-        size > _RIPPLE * DRIFT[name.partition(".")[0]] for name, size in levels.drift.items()
-    )
+    return any(rippled_at(levels, name) for name in levels.drift)
+
+
+def rippled_at(levels: Levels, state: str) -> bool:
+    """Whether a state's white process noise, as of `rate.swing`, is more than an integrator's."""
+    return levels.drift.get(state, 0.0) > _RIPPLE * DRIFT[state.partition(".")[0]]
 
 
 def input_excess(track: Track) -> float:

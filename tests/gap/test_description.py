@@ -7,7 +7,8 @@ import pytest
 
 from hydrotele.effects import Parameter
 from hydrotele.gap.description import describe, learned_laws
-from hydrotele.gap.discover import Discovery, Learned, Shape
+from hydrotele.gap.discover import Discovery, Learned
+from hydrotele.gap.law_shapes import Shape
 from hydrotele.gap.result import Lack, Prediction
 from hydrotele.machine_file import load_machine
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
