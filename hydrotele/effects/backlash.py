@@ -56,9 +56,7 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
     damping = drive.damping
     if (inertia, ratio) != (drive.inertia, _ratio(drive)):
         damping = 2.0 * ratio * math.sqrt(stiffness * inertia)
-    transmission = Transmission(
-        inertia=inertia, stiffness=stiffness, damping=damping, backlash=gap
-    )
+    transmission = Transmission(inertia=inertia, stiffness=stiffness, damping=damping, backlash=gap)
     return with_transmission(machine, location, transmission)
 
 

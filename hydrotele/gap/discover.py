@@ -15,8 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.compiled import compiled
+from hydrotele.dataset.load import RunData
 from hydrotele.dynamics.integrate import place
 from hydrotele.dynamics.model import X, model_space, reduced_model
+from hydrotele.dynamics.supply import supply_of
 from hydrotele.effects import Parameter
 from hydrotele.gap.law_regression import Regression, regression
 from hydrotele.gap.law_shapes import THROUGH, Shape, possible_shapes
@@ -25,6 +27,7 @@ from hydrotele.gap.settling import loss_of
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
 from hydrotele.prediction.evidence import Evidence, Judged
+from hydrotele.prediction.free_run import free_run_errors, machine_runner
 from hydrotele.prediction.hypothesis import Hypothesis
 from hydrotele.prediction.inputs import Input, input_sizes, input_units
 from hydrotele.prediction.levels import smoothed
@@ -38,6 +41,7 @@ _LARGEST = 4  # unknown inputs in whose places laws are looked for
 _TRIED = 2  # laws that are fitted inside the machine, of all that the regression finds
 _STEPS = 3  # of Gauss-Newton for each
 _DETAIL = 0.05  # of what all laws brought: one that brings less is the last
+_AHEAD = 5.0  # s, of free runs that a law must make better
 _STEP = 2.0e-3  # s, for the fits
 
 
@@ -81,14 +85,14 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
         The guess with the laws that are worth their parameters.
     """
     laws: list[Learned] = []
-    begin = judged.loss
+    begin, ahead = judged.loss, _open_loop(evidence, judged)
     for _ in range(_MOST):
         evidence.set_base(judged)
         seen = [_see(evidence.data.machine, judged, track) for track in judged.tracks]
         found = _best_law(evidence, judged, _candidates(evidence, judged, seen, laws))
-        if found is None:
+        if found is None or not (now := _open_loop(evidence, found[0])) < ahead:
             break
-        fall = judged.loss - found[0].loss
+        ahead, fall = now, judged.loss - found[0].loss
         judged, law = found
         laws.append(law)
         if fall < _DETAIL * (begin - judged.loss) or lacking(judged, evidence) < ENTER:
@@ -115,6 +119,23 @@ def _best_law(
     return None
 
 
+def _open_loop(evidence: Evidence, judged: Judged) -> float:
+    """RMS error of free runs through the fit runs over all channels, in units of their noise.
+
+    A law is to make simulations better, not only predictions from one reading to the next.
+    """
+    noise = judged.tracks[0].levels.noise
+    prepare = machine_runner(judged.guess.machine(evidence.data.machine), evidence.data, _STEP)
+
+    def sizes(run: RunData) -> np.ndarray:
+        errors = free_run_errors(prepare(run), run, (_AHEAD,), to_end=False)
+        return np.array([horizon.rms / noise for horizon in errors.horizons.values()])
+
+    found = np.concatenate([part.ravel() for part in evidence.map(sizes, evidence.runs)])
+    found = found[~np.isnan(found)]
+    return float(np.sqrt(np.mean(found**2))) if len(found) else 0.0
+
+
 class _Seen(NamedTuple):
     """A run by what its smoother says: variables of every axis, and the rows that are known."""
 
@@ -123,8 +144,8 @@ class _Seen(NamedTuple):
 
 
 @compiled
-def _drives_of(model, sp, states, position, velocity):
-    """Positions and velocities (n, nu) of the drives along states (n, nz)."""
+def _drives_of(model, sp, states, position, velocity, supply):
+    """Positions and velocities (n, nu) of the drives, supply (n,), along states (n, nz)."""
     n, t = len(model.mech.free), len(model.transmission)
     for row in range(len(states)):
         place(model, sp, states[row])
@@ -134,6 +155,8 @@ def _drives_of(model, sp, states, position, velocity):
             for f in range(n):
                 total += sp.row[i, f] * states[row, n + t + f]
             velocity[row, i] = total
+        if model.hydraulic > 0:
+            supply[row] = supply_of(model, sp, states[row])
 
 
 def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
@@ -144,7 +167,8 @@ def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
     model = reduced_model(machine, ())
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
-    _drives_of(model, model_space(model), np.ascontiguousarray(states), position, velocity)
+    supply = np.zeros(len(states))
+    _drives_of(model, model_space(model), np.ascontiguousarray(states), position, velocity, supply)
     first = 2 * (len(model.mech.free) + len(model.transmission))
     clock = track.run.start + track.run.period * np.arange(len(states))
     values = {}
@@ -158,6 +182,8 @@ def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
             own |= {"pressure_head": head, "pressure_rod": rod,
                     "force": areas[0] * head - areas[1] * rod}  # fmt: skip
             own["pump_speed" if facts.pump else "spool"] = states[:, first + 4 * i]
+            if facts.valve:
+                own["pressure_supply"] = supply
         elif facts.force:
             own["force"] = facts.force.gain * own["command"]
         values[axis] = own

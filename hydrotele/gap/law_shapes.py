@@ -10,15 +10,17 @@ THROUGH = "flow_through"
 """Balance of a flow from the head side to the rod side."""
 _KNOTS = 5  # inner kinks of a law of one variable
 _PAIR_KNOTS = 2  # of each variable of a law of two
+_TIMES = 7  # of the time in a law of two variables: what acts for a while begins and ends somewhere
 _DROP = "pressure_head - pressure_rod"
 _VARIABLES: Mapping[str, tuple[str, ...]] = {
     "force": ("velocity", "position", "command", "force", "time"),
     "flow_head": (_DROP, "pressure_head", "pressure_rod", "spool", "pump_speed", "velocity",
-                  "position"),
+                  "position", "pressure_supply", "time"),
     "flow_rod": (_DROP, "pressure_rod", "pressure_head", "spool", "pump_speed", "velocity",
-                 "position"),
+                 "position", "pressure_supply", "time"),
     THROUGH: (_DROP, "position", "spool", "pump_speed", "velocity", "time"),
-    "command": ("command", "spool", "velocity", "position", "force", "time"),
+    "command": ("command", "spool", "velocity", "position", "force",
+                "pressure_supply", "time"),
 }  # fmt: skip
 
 
@@ -126,7 +128,8 @@ def possible_shapes(
             ("",) if variable == "velocity" or balance == "command" else ("", sign, "velocity")
         )
         found += [Shape(variable, factor, knots) for factor in factors]
-        single[variable] = tuple(sorted({*_knots(x, _PAIR_KNOTS), *at_rest}))
+        count = _TIMES if variable == "time" else _PAIR_KNOTS
+        single[variable] = tuple(sorted({*_knots(x, count), *at_rest}))
     for a, b in itertools.combinations(single, 2):
         if not set(a.split(" - ")) & set(b.split(" - ")):
             found.append(Shape(a, "", single[a], b, single[b]))

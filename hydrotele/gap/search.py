@@ -29,6 +29,7 @@ _TRACE = 2.0e-3  # of all that was gained: below it an effect is none where all 
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
+_TOLD = 9.0  # square of an effect's deviation over its uncertainty: three standard deviations
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
@@ -125,7 +126,7 @@ def search(
             tell(f"fit {added.name.replace('_', ' ')}", done + 0.02)
             grown, settled = settle(evidence, best)
             worth = now.loss - grown.loss - settled.charge
-            if worth < bar or strained(grown.guess, -1):
+            if worth < bar or strained(grown.guess, -1) or not told(grown.guess, settled):
                 evidence.set_base(now)
                 candidates = [c for c in candidates if c.key != added.key]
                 ranked = [r for r in ranked if r.hypothesis.key != added.key]
@@ -283,6 +284,16 @@ def worth_naming(guess: Guess, index: int, score: float) -> bool:
     """Whether an effect is as large as its least size in any parameter, or beyond doubt."""
     hypothesis, deviation = guess.parts[index]
     return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
+
+
+def told(guess: Guess, fit: Fit) -> bool:
+    """Whether the last effect's numbers differ from the model's by more than they are uncertain.
+
+    Where a likelihood is full of dents, as with teeth, it may fall by chance with a number moved.
+    """
+    hypothesis, deviation = guess.parts[-1]
+    covariance = np.linalg.inv(fit.information)[-hypothesis.size :, -hypothesis.size :]
+    return float(deviation @ np.linalg.solve(covariance, deviation)) > _TOLD
 
 
 def _pruned(

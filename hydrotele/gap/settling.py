@@ -16,6 +16,7 @@ _SETTLES = 6  # rounds of levels and fit: what inputs took at first is given bac
 _UNMOVED = 0.3  # standard deviations by which a number may still move
 _IDLE = 3.0  # fall of the loss that is not worth another round of a calibration
 _STALE = 200.0  # fall of the loss after which the slopes of a calibration are taken anew
+_WORSE = 100.0  # rise of the loss with levels found anew after which a step is taken back
 _ROOM = 3.0  # times the room to a bound that an effect gets that stands there
 
 
@@ -28,7 +29,15 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
         step = evidence.step_of(more, MIDDLE)
         kept = evidence.base_slopes(evidence.slope_step, parallel=False)
         before = loss_of(evidence, now.guess, step)
-        return evidence.fit(more, before, parallel=False, step=step, kept=kept, steps=_STEPS)
+
+        def climb(start: Guess) -> Fit:
+            return evidence.fit(start, before, parallel=False, step=step, kept=kept, steps=_STEPS)
+
+        found = climb(more)
+        wider = _widened(found.guess)
+        if found.score > 0.0 and wider.parts[-1][0] != found.guess.parts[-1][0]:
+            found = climb(wider)  # else what is larger than usual is taken for something else
+        return found
 
     return sorted(evidence.map(fit, pool), key=lambda found: -found.score)
 
@@ -49,6 +58,10 @@ def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
             break
         before, judged = judged, evidence.judged(guess, same=True)
         fall = before.loss - judged.loss
+        if not fall > -_WORSE:  # a likelihood full of dents, as that of teeth, misleads its slopes
+            guess = before.guess
+            evidence.set_base(before)
+            break
         if group and fall < _IDLE:
             break
         kept = kept if fall < _STALE else None
@@ -72,7 +85,9 @@ def _widened(guess: Guess) -> Guess:
             elif values[key] <= p.low and p.low != 0.0:
                 low = p.low / _ROOM if p.low > 0.0 else p.nominal - _ROOM * (p.nominal - p.low)
                 table[key] = replace(p, low=low)
-        parts.append((replace(hypothesis, parameters=table), deviation))
+        if table != hypothesis.parameters:
+            hypothesis = replace(hypothesis, parameters=table)
+        parts.append((hypothesis, deviation))
     return Guess(tuple(parts))
 
 
