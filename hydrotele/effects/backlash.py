@@ -31,7 +31,7 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
             "kg m^2", inertia, 0.1 * inertia, 5.0 * inertia, inertia, inertia, optional=True
         ),
         "damping_ratio": Parameter(
-            "1", ratio, min(1e-3, ratio), max(2.0, ratio), 0.3, 1.0, optional=True
+            "1", ratio, min(1e-3, ratio), max(2.0, ratio), 0.3, 0.3, optional=True
         ),
     }
 
