@@ -78,9 +78,7 @@ def test_answers_of_the_errors_are_those_of_a_simulated_term():
     term = Term(name="extra", axis="boom", balance=flow.balance, law="constant",
                 parameters={"value": size})  # fmt: skip
     changed = machine.model_copy(update={"terms": (term,)})
-    with_it, without = (
-        track_run(m, data, track.run, track).whitened for m in (changed, machine)
-    )
+    with_it, without = (track_run(m, data, track.run, track).whitened for m in (changed, machine))
     column = columns_of(machine, track, [flow])[:, 0]
     told = size * error_responses(track, column, np.ones((len(track.states), 1)))[..., 0]
     told = told[1:]  # the first row is not changed
