@@ -19,7 +19,9 @@ class Friction(Facts):
     """Friction numbers of `hydraulics.friction`: [N] or [N m], velocities [m/s] or [rad/s].
 
     An asymmetry a makes the dry or the viscous part (1 + a) times as large in the positive
-    direction and (1 - a) times in the negative one.
+    direction and (1 - a) times in the negative one. With a `presliding_stiffness` [N/m] or
+    [N m/rad] the dry part is a spring below breakaway (`hydraulics.presliding`), whose damper is
+    `presliding_damping` [N s/m] or [N m s/rad], and `smoothing_velocity` smooths it no longer.
     """
 
     coulomb: NonNegative = 0.0
@@ -29,6 +31,19 @@ class Friction(Facts):
     smoothing_velocity: Positive = 0.005
     coulomb_asymmetry: Annotated[float, Field(gt=-1, lt=1)] = 0.0
     viscous_asymmetry: Annotated[float, Field(gt=-1, lt=1)] = 0.0
+    presliding_stiffness: NonNegative = 0.0
+    presliding_damping: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.presliding_damping and not self.presliding_stiffness:
+            raise ValueError("presliding_damping needs a presliding_stiffness")
+        return self
+
+    @property
+    def presliding(self) -> bool:
+        """Whether the dry part has bristles: a stiffness, and a force to break away from."""
+        return self.presliding_stiffness > 0.0 and self.coulomb + self.stribeck_extra > 0.0
 
 
 class Bar(Facts):
@@ -400,6 +415,11 @@ class Axis(Facts):
             raise ValueError(
                 "give pump.compliance_head and pump.compliance_rod instead of"
                 " cylinder.hose_compliance"
+            )
+        if self.cylinder.friction.presliding_stiffness:
+            raise ValueError(
+                "the friction of an axis with a pump of its own holds a piston rigidly: leave out"
+                " cylinder.friction.presliding_stiffness"
             )
         if self.end_stop is None:
             raise ValueError("an axis with a pump states its end_stop: no relief pressure says it")

@@ -74,6 +74,8 @@ class Supply(Facts):
     valve. `load_sensing`: it holds the highest load pressure plus `load_sensing_margin`, as far as
     `pump_flow` and `relief_pressure` allow. `constant_pressure`: it holds `relief_pressure`
     whatever is drawn. `pump_droop` [m^3/(s Pa)] is by how much its flow falls with its pressure.
+    With a `time_constant` [s] the pump's displacement follows what the valves draw with a
+    first-order lag, as a swash plate does; 0: at once.
     """
 
     kind: Literal["constant_flow", "load_sensing", "constant_pressure"] = "constant_flow"
@@ -82,6 +84,7 @@ class Supply(Facts):
     pump_flow: Positive = UNLIMITED_FLOW
     pump_droop: NonNegative = 0.0
     load_sensing_margin: Positive = 2.0e6
+    time_constant: NonNegative = 0.0
     bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
 
     @model_validator(mode="after")
@@ -91,6 +94,11 @@ class Supply(Facts):
                 raise ValueError(
                     "a constant_pressure supply has no pump_flow and no pump_droop: leave them out,"
                     " or choose kind constant_flow or load_sensing"
+                )
+            if self.time_constant:
+                raise ValueError(
+                    "a constant_pressure supply gives any flow at once: leave out time_constant, or"
+                    " choose kind constant_flow or load_sensing"
                 )
         elif self.pump_flow >= UNLIMITED_FLOW:
             raise ValueError(f"pump_flow is missing; a {self.kind} supply needs it")

@@ -261,4 +261,14 @@ def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
         **{key: act[:, column].tolist() for column, key in enumerate(keys)},
         "joints": {n: float(record.qpos[0, plant.model.joint(n).qposadr[0]]) for n in free},
         **(drives if flexible else {}),
+        **_remembered(plant, record),
     }
+
+
+def _remembered(plant: Plant, record: Record) -> dict[str, dict[str, float]]:
+    """What bristles and a slow pump remember at a record's start, by kind and owner."""
+    found: dict[str, dict[str, float]] = {}
+    for name, place in plant.memory.items():
+        kind, _, owner = name.partition(".")
+        found.setdefault(kind, {})[owner] = float(record.act[0, place])
+    return found

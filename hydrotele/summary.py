@@ -57,7 +57,8 @@ def _doubts(plant: Plant, record: Record) -> list[str]:
     """Sentences about states that no machine can have."""
     if not plant.hydraulic:
         return []
-    pressures = record.act.reshape(len(record.time), -1, ACTIVATIONS)[:, : plant.hydraulic, 2:]
+    act = record.act[:, : ACTIVATIONS * plant.hydraulic]
+    pressures = act.reshape(len(record.time), -1, ACTIVATIONS)[:, :, 2:]
     lowest = pressures.min(initial=0.0)
     if lowest < _VACUUM:
         return [f"a chamber falls to {lowest / 1e6:.1f} MPa, which oil cannot: check the machine"]

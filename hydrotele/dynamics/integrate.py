@@ -16,6 +16,7 @@ from hydrotele.dynamics.model import (
     GEAR_DAMPING,
     GEAR_INERTIA,
     GIVEN,
+    INERTIA,
     LENGTH,
     POSITION,
     STIFFNESS,
@@ -34,8 +35,10 @@ from hydrotele.hydraulics.circuit import (
     force_after_friction,
     step_circuit,
 )
+from hydrotele.hydraulics.presliding import bristle_friction, bristle_rate
 
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
+_BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 
 
 @lean
@@ -101,7 +104,8 @@ def accelerate(model, sp, z, dt):
     """Linearly implicit acceleration over a kick; leaves the mechanism where `place` put it.
 
     `a = (M + dt/2 D + dt^2/4 K)^-1 (sum J' F - h)` with the slope D of friction and dampers and the
-    stiffness K of end stops, which is of second order and stable however steep these are.
+    stiffness K of end stops and of friction's bristles, which is of second order and stable however
+    steep these are.
 
     Args:
         model: Model.
@@ -133,9 +137,19 @@ def accelerate(model, sp, z, dt):
         act, more, steep = z[2 * first + 4 * i :], 0.0, 0.0
         if len(model.terms) > 0:
             more, steep = term_force(model, sp, z, i, own)
-        push, damping = force_after_friction(user, u, push, more, act, own, dt)
-        push += more
-        slope = half * (damping - steep)
+        slope, plain = 0.0, True
+        if model.memory is not None:
+            if user[u + _BRISTLE_STIFFNESS] > 0.0:
+                plain, moved = False, _inertia(model, sp, i)
+                sp.drive[INERTIA, i] = moved
+                share = z[2 * first + int(user[u + _BRISTLE])]
+                rubbing, damping, stiff = bristle_friction(user, u, share, own, moved, dt)
+                push += more - rubbing
+                slope = half * (damping + half * stiff - steep)
+        if plain:
+            push, damping = force_after_friction(user, u, push, more, act, own, dt)
+            push += more
+            slope = half * (damping - steep)
         if gear >= 0:
             damping = model.transmission[gear, GEAR_DAMPING]
             free = 0.5 * model.transmission[gear, BACKLASH]
@@ -158,6 +172,19 @@ def accelerate(model, sp, z, dt):
                 sp.mass[f, g] += slope * sp.row[i, f] * sp.row[i, g]
     factorise(sp.mass)
     solve(sp.mass, sp.force)
+
+
+@lean
+def _inertia(model, sp, i):
+    """Inertia that a drive moves while the others rest, scalar [kg] or [kg m^2]."""
+    if model.gear[i] >= 0:
+        return model.transmission[model.gear[i], GEAR_INERTIA]
+    least = math.inf
+    for f in range(len(model.mech.free)):
+        lever = sp.row[i, f]
+        if lever != 0.0:
+            least = min(least, sp.mass[f, f] / (lever * lever))
+    return least
 
 
 @lean
@@ -268,6 +295,8 @@ def advance(model, sp, z, command, row, period, steps, trail):
         place(model, sp, z)
         for i in range(nu):
             drive[V, i] = (drive[X, i] - drive[V, i]) / h
+        if model.memory is not None:
+            _bend(model.user, act, drive, h, sp.act_dot)
         if count > 0:
             if len(model.terms) > 0:
                 add_commands(model, sp, act, h)
@@ -275,9 +304,12 @@ def advance(model, sp, z, command, row, period, steps, trail):
             first = np.int64(0)  # numba compiles a function anew for a written number
             step_circuit(
                 model.user, first, count, act, drive[given], drive[X], drive[V], h, sp.act_dot,
-                sp.scratch, model.terms, sp.time[0],
+                sp.scratch, model.terms, sp.time[0], model.memory,
             )  # fmt: skip
             for k in range(4 * count):
+                act[k] += h * sp.act_dot[k]
+        if model.memory is not None:
+            for k in range(4 * count, len(sp.act_dot)):
                 act[k] += h * sp.act_dot[k]
         sp.time[0] = sp.time[1] + row * period + (step + 1) * h
         kick = h if step < steps - 1 else 0.5 * h
@@ -286,6 +318,16 @@ def advance(model, sp, z, command, row, period, steps, trail):
             z[total + f] += kick * sp.force[f]
         if len(trail) > 0:
             write_trail(model, sp, z, trail[step + 1])
+
+
+@lean
+def _bend(user, act, drive, h, act_dot):
+    """Rates of all bristles over a step in which the drives' velocities are held."""
+    for i in range(drive.shape[1]):
+        u = i * SLOTS
+        if user[u + _BRISTLE_STIFFNESS] > 0.0:
+            at = int(user[u + _BRISTLE])
+            act_dot[at] = bristle_rate(user, u, act[at], drive[V, i], drive[INERTIA, i], h)
 
 
 @lean

@@ -7,7 +7,7 @@ import numpy as np
 from hydrotele.dynamics.mechanism import Mechanism, coordinate_names, mechanism
 from hydrotele.dynamics.motion import Motion, motion_space
 from hydrotele.hydraulics.circuit import SCRATCH
-from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
+from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
 from hydrotele.machine import Machine
 from hydrotele.sensors import SensorError
 from hydrotele.signals import parse_channel
@@ -19,13 +19,14 @@ _KINDS = {
     "pressure_rod": ROD, "pressure_supply": SUPPLY,
 }  # fmt: skip
 GEAR_INERTIA, STIFFNESS, GEAR_DAMPING, BACKLASH = range(4)  # columns of `transmission`
-X, V, COMMAND, GIVEN = range(4)  # rows of `Space.drive`
+X, V, COMMAND, GIVEN, INERTIA = range(5)  # rows of `Space.drive`
 
 
 class Model(NamedTuple):
     """Numbers of the reduced model; n independent coordinates, t transmissions, h valves.
 
-    A state is `(n positions, t drive positions, n rates, t drive rates, 4 h activations)`.
+    A state is `(n positions, t drive positions, n rates, t drive rates, 4 h activations)` and what
+    bristles and a slow pump remember, see `parameters.memory_names`.
 
     Attributes:
         mech: the mechanism.
@@ -42,6 +43,8 @@ class Model(NamedTuple):
         lag: (c,) sensor delays [s].
         terms: (k,) table of the machine's terms, see `terms.table`.
         time_constant: (c,) time constants of the sensors' first-order lags [s].
+        memory: number of states that follow the activations; None, and not 0, where there are none:
+            the compiled functions are then those of a model that knows no memory.
     """
 
     mech: Mechanism
@@ -58,6 +61,7 @@ class Model(NamedTuple):
     lag: np.ndarray
     terms: np.ndarray
     time_constant: np.ndarray
+    memory: int | None
 
 
 class Space(NamedTuple):
@@ -65,12 +69,13 @@ class Space(NamedTuple):
 
     Attributes:
         motion: work space of the mechanism.
-        drive: (4, nu) of every drive: position X [m] or [rad], velocity V, COMMAND that arrived,
-            and that with its terms as GIVEN to the valve.
+        drive: (5, nu) of every drive: position X [m] or [rad], velocity V, COMMAND that arrived,
+            that with its terms as GIVEN to the valve, and where it has bristles the INERTIA that it
+            moves [kg] or [kg m^2], of which other drives at rest are part.
         row: (nu, n) d(load-side drive velocity) / d(independent rates).
         mass: (n + t, n + t) mass matrix, then its factor.
         force: (n + t,) forces, then acceleration.
-        act_dot: (4 h,) rates of the activations.
+        act_dot: (4 h + memory,) rates of the activations and of what is remembered.
         scratch: (SCRATCH,) work space of the circuit.
         time: (2,) now, and of the run's first row; only terms see it [s].
     """
@@ -131,22 +136,24 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         lag=np.array([e.delay for e in errors], float),
         terms=terms_table(machine.terms, order),
         time_constant=np.array([e.time_constant for e in errors], float),
+        memory=len(memory_names(machine)) or None,
     )
 
 
 def model_space(model: Model) -> Space:
     """Fresh work space for a model."""
-    nu, n, size = len(model.gear), len(model.mech.free), state_size(model)
-    total = (size - 4 * model.hydraulic) // 2
+    nu, n, acts = len(model.gear), len(model.mech.free), 4 * model.hydraulic + (model.memory or 0)
+    total = n + len(model.transmission)
     return Space(
-        motion_space(model.mech), np.zeros((4, nu)), np.zeros((nu, n)), np.zeros((total, total)),
-        np.zeros(total), np.zeros(4 * model.hydraulic), np.zeros(SCRATCH), np.zeros(2),
+        motion_space(model.mech), np.zeros((5, nu)), np.zeros((nu, n)), np.zeros((total, total)),
+        np.zeros(total), np.zeros(acts), np.zeros(SCRATCH), np.zeros(2),
     )  # fmt: skip
 
 
 def state_size(model: Model) -> int:
     """Number of states."""
-    return 2 * (len(model.mech.free) + len(model.transmission)) + 4 * model.hydraulic
+    moving = 2 * (len(model.mech.free) + len(model.transmission))
+    return moving + 4 * model.hydraulic + (model.memory or 0)
 
 
 def state_names(machine: Machine) -> list[str]:
@@ -159,4 +166,4 @@ def state_names(machine: Machine) -> list[str]:
     for name, axis in machine.hydraulic_axes.items():
         kinds = ("speed", "pressure_load") if axis.pump else ("spool", "spool_rate")
         out += [f"{k}.{name}" for k in (*kinds, "pressure_head", "pressure_rod")]
-    return out
+    return out + memory_names(machine)

@@ -2,7 +2,7 @@
 
 from hydrotele.compiled import lean
 from hydrotele.dynamics.model import COMMAND, GIVEN, V, X
-from hydrotele.hydraulics.circuit import circuit_supply, open_ports
+from hydrotele.hydraulics.circuit import circuit_supply, delivered_share, open_ports
 from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state
 from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
@@ -18,7 +18,9 @@ def supply_of(model, sp, z):
     user, count = model.user, model.hydraulic
     act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
     open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
-    return circuit_supply(user, 0, count, sp.scratch)
+    if model.memory is None:
+        return circuit_supply(user, 0, count, sp.scratch)
+    return circuit_supply(user, 0, count, sp.scratch, delivered_share(user, 0, act))
 
 
 @lean
@@ -57,7 +59,7 @@ def add_commands(model, sp, act, h):
     Args:
         model: Model.
         sp: Space with positions at the end of the step, velocities over it, time at its start.
-        act: (4 h,) activations at the start of the step.
+        act: (>= 4 h,) activations at the start of the step.
         h: step, scalar [s].
 
     Returns:

@@ -1,4 +1,4 @@
-"""A pump or a main relief valve with other limits, or another droop, than in the model."""
+"""A pump or a main relief valve with other limits, droop or response than in the model."""
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
 from hydrotele.machine import Machine
@@ -34,6 +34,14 @@ def _set_droop(machine: Machine, location: str, values: Values) -> Machine:
     return changed(machine, "supply.pump_droop", values["droop"])
 
 
+def _lag(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Swash plates take 50 to 300 ms; least is what a fast one takes, 20 ms."""
+    assert machine.supply
+    present = machine.supply.time_constant
+    high = max(1.0, present)
+    return {"time_constant": Parameter("s", present, 0.0, high, 0.1, 0.02, starts=(0.05, 0.2))}
+
+
 def _relief(machine: Machine, location: str) -> dict[str, Parameter]:
     """Set by hand to a few per cent; 0.3 % is a gauge's finest mark."""
     assert machine.supply
@@ -53,6 +61,10 @@ EFFECTS = (
     Effect(
         "pump_droop", "a pump whose flow falls with its pressure", "supply", _pumping, _droop,
         _set_droop,
+    ),
+    Effect(
+        "pump_lag", "a pump whose flow follows what is drawn after a time", "supply", _pumping,
+        _lag, _set,
     ),
     Effect(
         "relief_pressure", "another setting of the main relief valve", "supply", _place, _relief,

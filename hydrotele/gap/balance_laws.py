@@ -16,7 +16,10 @@ from hydrotele.hydraulics.circuit import (
     axis_opening,
     chamber_flows,
     circuit_supply,
+    delivered_share,
     open_ports,
+    pump_response,
+    wanted_share,
 )
 from hydrotele.hydraulics.laws import port_flow
 
@@ -24,6 +27,7 @@ _AH, _AR, _LEAK = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.LEAKAGE)
 _PORT, _KR = int(Slot.PORT_RELIEF), int(Slot.RELIEF_GAIN)
 _TANK, _KM = int(Slot.TANK_PRESSURE), int(Slot.MAKEUP_GAIN)
 _BETA, _HOSE = int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE)
+_LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 
 
 @compiled
@@ -109,13 +113,15 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
 
 
 @compiled
-def supply_pressures(user, spools, pressures):
+def supply_pressures(user, spools, pressures, period):
     """Supply pressure from spools and chamber pressures.
 
     Args:
         user: (h * SLOTS,) numbers of the h valves.
         spools: (h, n) [1].
         pressures: (h, 2, n) head and rod pressures [Pa].
+        period: between rows, scalar [s]. A pump with a time constant begins settled and follows
+            from row to row.
 
     Returns:
         (n,) [Pa].
@@ -123,11 +129,15 @@ def supply_pressures(user, spools, pressures):
     Source: nominal model, "Supply".
     """
     count, rows = spools.shape
-    ports, act, out = np.zeros(4 * count), np.zeros(4 * count), np.empty(rows)
+    at = int(user[_DELIVERY])
+    ports, act, out = np.zeros(4 * count), np.zeros(max(4 * count, at + 1)), np.empty(rows)
     for k in range(rows):
         for i in range(count):
             act[4 * i] = spools[i, k]
             act[4 * i + 2], act[4 * i + 3] = pressures[i, 0, k], pressures[i, 1, k]
         open_ports(user, act, act, ports, 0, count, 0.0, act)
-        out[k] = circuit_supply(user, 0, count, ports)
+        if user[_LAG] > 0.0:
+            wanted = wanted_share(user, 0, count, ports)
+            act[at] = wanted if k == 0 else pump_response(user, 0, wanted, act[at], period)
+        out[k] = circuit_supply(user, 0, count, ports, delivered_share(user, 0, act))
     return out

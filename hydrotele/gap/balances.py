@@ -255,7 +255,10 @@ def _supply(machine: Machine, signals: Signals) -> Found:
     spools = np.stack([spool_positions(machine, signals, name) for name in names])
     table = np.stack([signals.smoothed[c][:, 0] for c in chambers], axis=1)
     expected = np.stack(
-        [supply_pressures(user, spools, p.reshape(len(names), 2, -1)) for p in table]
+        [
+            supply_pressures(user, spools, p.reshape(len(names), 2, -1), signals.period)
+            for p in table
+        ]
     )
     residual = signals.smoothed["pressure_supply"][:, 0] - expected
     yield _SUPPLY, _SUPPLY, _balance(signals.time, *_in_band(residual, signals.period), "Pa")

@@ -125,6 +125,8 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "spool_slew": ("steps",),
     "load_compensation": ("steps",),
     "pump_droop": ("surges",),
+    "pump_lag": ("surges",),
+    "presliding": ("reversals", "steps"),
     "pump_displacement": ("steps",),
     "pump_leakage": ("holds", "steps"),
     "pump_torque_loss": ("steps",),

@@ -3,8 +3,9 @@
 Pure functions on flat arrays laid out as MuJoCo keeps them, so that the native callbacks, the
 tests and an estimator run the same code. Axis `i` reads its numbers at `user[i * SLOTS + Slot]` and
 its activations `spool, spool_rate, p_head, p_rod` at `act[4 i ...]`, counted from the first
-hydraulic axis. An axis with a pump of its own (`Kind.PUMPED`, see `pump`) has the speed of its pump
-and the pressure of its load cylinder in the places of spool and spool rate.
+hydraulic axis; what bristles and a slow pump remember comes after all of these. An axis with a pump
+of its own (`Kind.PUMPED`, see `pump`) has the speed of its pump and the pressure of its load
+cylinder in the places of spool and spool rate.
 """
 
 import math
@@ -22,6 +23,7 @@ from hydrotele.hydraulics.actuator import (
     pumped_volumes,
 )
 from hydrotele.hydraulics.laws import port_flow, spool_step
+from hydrotele.hydraulics.presliding import bristle_friction
 from hydrotele.hydraulics.pump import (
     load_pressure_step,
     pump_flows,
@@ -36,8 +38,8 @@ from hydrotele.terms.table import added_flows
 __all__ = [
     "ACTIVATIONS", "MAX_AXES", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
     "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_state", "chamber_flows",
-    "circuit_scratch", "circuit_supply", "force_after_friction", "open_ports", "pressure_rates",
-    "pumped_force", "step_circuit", "supply_pressure",
+    "circuit_scratch", "circuit_supply", "delivered_share", "force_after_friction", "open_ports",
+    "pressure_rates", "pumped_force", "step_circuit", "supply_pressure", "wanted_share",
 ]  # fmt: skip
 
 ACTIVATIONS = 4
@@ -61,6 +63,9 @@ _BETA, _TANK = int(Slot.BULK_MODULUS), int(Slot.TANK_PRESSURE)
 _RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 _MARGIN, _DROOP = int(Slot.LOAD_SENSING_MARGIN), int(Slot.PUMP_DROOP)
 _HOSE = int(Slot.HOSE_COMPLIANCE)
+_LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
+_BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
+_LEAST_SHARE = 1.0e-6  # of a pump's flow that it always gives, so that its pressure is determined
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
@@ -162,7 +167,77 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
 
 
 @compiled
-def circuit_supply(user, first, count, ports):
+def delivered_share(user, first, act):
+    """Share of its largest flow that the pump is set to: 1 where it follows at once.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        act: (>= 4 count + MEMORY,) activations, whose DELIVERY is read where there is a lag [1].
+
+    Returns:
+        Share, scalar [1].
+
+    Source: `wanted_share`.
+    """
+    s = first * SLOTS
+    if user[s + _LAG] == 0.0:
+        return 1.0
+    return min(1.0, max(_LEAST_SHARE, act[int(user[s + _DELIVERY])]))
+
+
+@compiled
+def pump_response(user, first, wanted, share, dt):
+    """Share of its largest flow that the pump is set to after a time, by the exact exponential.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        wanted: as of `wanted_share`, held, scalar [1].
+        share: at the start, scalar [1].
+        dt: scalar [s].
+
+    Returns:
+        Share, scalar [1]: 1 where the pump follows at once.
+
+    Source: `wanted_share`.
+    """
+    lag = user[first * SLOTS + _LAG]
+    return wanted + (share - wanted) * math.exp(-dt / lag) if lag > 0.0 else 1.0
+
+
+@compiled
+def wanted_share(user, first, count, ports):
+    """Share of its largest flow that the valves draw from a pump that follows at once.
+
+    `q = (sum_i q_i + c_p p_s) / Q_pump` at the pressure p_s of such a pump. One with a time
+    constant T has `T q' = q_wanted - q` and gives q Q_pump at most: while it swashes out the
+    pressure falls to where the valves draw no more; while it swashes back, what is too much goes
+    over the relief or unloading valve.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+
+    Returns:
+        q, scalar [1], 0 .. 1.
+
+    Source: nominal model, "Supply"; first-order swash plate: Merritt 1967, sec. 8-6.
+    """
+    s = first * SLOTS
+    supply = circuit_supply(user, first, count, ports)
+    drawn = user[s + _DROOP] * supply
+    for i in range(count):
+        drop = supply - ports[4 * i + 1]
+        if drop > 0.0 and ports[4 * i] > 0.0:
+            drawn += inlet_flow(drop, ports[4 * i], user[s + _D], ports[4 * i + 2])[0]
+    return min(1.0, drawn / user[s + _PUMP])
+
+
+@compiled
+def circuit_supply(user, first, count, ports, share=1.0):
     """Supply pressure of a circuit: what pump and relief give, or what load sensing asks for.
 
     A load-sensing pump holds `max p_i + margin` over the open valves (tank pressure counts as a
@@ -173,6 +248,7 @@ def circuit_supply(user, first, count, ports):
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        share: of its largest flow that the pump is set to, scalar [1], > 0.
 
     Returns:
         p_s, scalar [Pa].
@@ -187,7 +263,8 @@ def circuit_supply(user, first, count, ports):
             if ports[4 * i] > 0.0:
                 load = max(load, ports[4 * i + 1])
         most = min(most, load + user[s + _MARGIN])
-    return supply_pressure(ports, count, user[s + _D], most, user[s + _PUMP], user[s + _DROOP])
+    flow = user[s + _PUMP] * share
+    return supply_pressure(ports, count, user[s + _D], most, flow, user[s + _DROOP])
 
 
 @compiled
@@ -259,28 +336,34 @@ def _flows_of_terms(terms, i, user, time, x, v, spool, rate, p_head, p_rod, supp
 
 @compiled
 def step_circuit(
-    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms=None, time=0.0
-):
+    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms=None, time=0.0,
+    memory=None,
+):  # fmt: skip
     """Advance spools and chamber pressures of all axes that share a supply by one step.
 
     Spools follow their exact exponential; pressures take one step of the L-stable second-order
     Rosenbrock method ROS2 with a diagonal Jacobian, with piston velocities held over the step. The
-    supply pressure is solved in both stages.
+    supply pressure is solved in both stages. A pump with a time constant follows the mean of what
+    the valves draw at both ends of the step, by its exact exponential.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators, <= MAX_AXES.
-        act: (4 count,) spool [1], spool rate [1/s] and pressures [Pa] at the start of the step.
+        act: (>= 4 count,) spool [1], spool rate [1/s] and pressures [Pa] at the start of the step,
+            then what is remembered, see `parameters.memory_names`.
         command: (nu,) valve commands, clipped here to [-1, 1] [1].
         length: (nu,) piston displacements x at the end of the step, where MuJoCo's leapfrog has
             them [m] (joint angle for a motor).
         velocity: (nu,) piston velocities [m/s] or [rad/s].
         dt: step, scalar [s].
-        act_dot: (4 count,) written: mean rates over the step, in the unit of `act` per [s].
+        act_dot: (>= 4 count,) written: mean rates over the step, in the unit of `act` per [s]; of
+            what is remembered, the pump's alone.
         scratch: (SCRATCH,) work space.
         terms: (n,) table of the machine's terms, None for none [SI].
         time: at the start of the step, scalar [s]; only terms see it.
+        memory: number of states that follow the activations, scalar [1]; None leaves them out, and
+            the time that it takes to ask for them.
 
     Returns:
         (supply pressure at the start of the step [Pa], at its end [Pa]).
@@ -301,7 +384,14 @@ def step_circuit(
             act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]
         )
     open_ports(user, act, act, scratch, first, count, 0.0, act_dot)
-    p_start = circuit_supply(user, first, count, scratch)
+    share, begun = 1.0, 0.0
+    if memory is None:
+        p_start = circuit_supply(user, first, count, scratch)
+    else:
+        share = delivered_share(user, first, act)
+        p_start = circuit_supply(user, first, count, scratch, share)
+        begun = wanted_share(user, first, count, scratch)
+        share = pump_response(user, first, begun, share, dt)
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         x, v = length[first + i] - dt * velocity[first + i], velocity[first + i]
@@ -321,7 +411,14 @@ def step_circuit(
         scratch[f], scratch[f + 1] = 1.0 / (1.0 - gamma_h * j_head), 1.0 / (1.0 - gamma_h * j_rod)
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
     open_ports(user, act, act_dot, scratch, first, count, dt, act_dot)
-    p_end = circuit_supply(user, first, count, scratch)
+    if memory is None:
+        p_end = circuit_supply(user, first, count, scratch)
+    else:
+        p_end = circuit_supply(user, first, count, scratch, share)
+        if user[first * SLOTS + _LAG] > 0.0:
+            at = int(user[first * SLOTS + _DELIVERY])
+            wanted = 0.5 * (begun + wanted_share(user, first, count, scratch))
+            act_dot[at] = (pump_response(user, first, wanted, act[at], dt) - act[at]) / dt
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         k_head, k_rod = act_dot[a + 2], act_dot[a + 3]
@@ -346,7 +443,7 @@ def step_circuit(
 
 
 @compiled
-def axis_state(user, i, supply, act, x, v):
+def axis_state(user, i, supply, act, x, v, share=0.0):
     """Flows and force of one axis in a state, for logs and balances.
 
     Args:
@@ -356,6 +453,7 @@ def axis_state(user, i, supply, act, x, v):
         act: (4,) spool [1], spool rate [1/s], p_head, p_rod [Pa].
         x: piston displacement, scalar [m].
         v: piston velocity, scalar [m/s] or [rad/s].
+        share: of the breakaway force that the bristles of its friction carry, scalar [1].
 
     Returns:
         (q_head, q_rod [m^3/s], force or torque after friction [N] or [N m]).
@@ -369,8 +467,10 @@ def axis_state(user, i, supply, act, x, v):
         return q_head, q_rod, pumped_force(user, u, act[1], act[2], act[3], v, 0.0, 0.0)
     opening = axis_opening(user, u, act[0])
     q_head, q_rod, _, _ = chamber_flows(user, u, opening, supply, act[2], act[3])
-    force = user[u + _AH] * act[2] - user[u + _AR] * act[3] - actuator_friction(user, u, v)
-    return q_head, q_rod, force
+    force = user[u + _AH] * act[2] - user[u + _AR] * act[3]
+    if user[u + _BRISTLE_STIFFNESS] > 0.0:
+        return q_head, q_rod, force - bristle_friction(user, u, share, v, 0.0, 0.0)[0]
+    return q_head, q_rod, force - actuator_friction(user, u, v)
 
 
 def circuit_scratch() -> np.ndarray:

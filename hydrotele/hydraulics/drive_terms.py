@@ -1,7 +1,13 @@
 """What the terms of a machine see and add: the state of a drive, and commands with their terms."""
 
 from hydrotele.compiled import compiled
-from hydrotele.hydraulics.circuit import SLOTS, Slot, open_ports, supply_pressure
+from hydrotele.hydraulics.circuit import (
+    SLOTS,
+    Slot,
+    delivered_share,
+    open_ports,
+    supply_pressure,
+)
 from hydrotele.terms.law import DriveState
 from hydrotele.terms.table import COMMAND, added
 
@@ -49,7 +55,7 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
         user: (nu * SLOTS,) actuator numbers.
         terms: (n,) table of terms.
         count: number of hydraulic axes, which come first.
-        act: (4 count,) activations at the start of the step.
+        act: (>= 4 count,) activations at the start of the step.
         command: (>= count,) commands that arrive [1].
         length: (>= count,) drive positions at the end of the step [m] or [rad].
         velocity: (>= count,) drive velocities [m/s] or [rad/s].
@@ -62,7 +68,8 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
         Nothing.
     """
     open_ports(user, act, act, scratch, 0, count, 0.0, act)
-    supply = supply_pressure(scratch, count, user[_D], user[_RELIEF], user[_PUMP])
+    flow = user[_PUMP] * delivered_share(user, 0, act)
+    supply = supply_pressure(scratch, count, user[_D], user[_RELIEF], flow)
     middle = time + 0.5 * dt
     for i in range(count):
         x = length[i] - 0.5 * dt * velocity[i]

@@ -9,12 +9,28 @@ from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS, PUMP, SLOTS, Kind, Pu
 from hydrotele.kinematics.from_machine import drive_travel
 from hydrotele.machine import Machine, Supply
 
+DELIVERY = "delivery.supply"
 MARKER = 215325.0  # CAT 215, CAT 325: no other model writes this into actuator_user[0]
 
 
 def actuator_order(machine: Machine) -> list[str]:
     """Axis names in actuator order: the hydraulic ones first, as they share the supply."""
     return [*machine.hydraulic_axes, *(n for n, a in machine.axes.items() if not a.hydraulic)]
+
+
+def memory_names(machine: Machine) -> list[str]:
+    """Names of the states that follow the activations of the hydraulic axes, in their order.
+
+    `bristle.<axis>` of every hydraulic axis with presliding friction, `delivery.supply` of a pump
+    with a time constant, then `bristle.<axis>` of the force drives. None in most machines.
+    """
+    supply, rubbing = machine.supply, [
+        n for n in actuator_order(machine) if machine.axes[n].drive.friction.presliding
+    ]  # fmt: skip
+    names = [f"bristle.{n}" for n in rubbing if machine.axes[n].hydraulic]
+    if supply and supply.time_constant and machine.valve_axes:
+        names.append(DELIVERY)
+    return names + [f"bristle.{n}" for n in rubbing if not machine.axes[n].hydraulic]
 
 
 def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
@@ -27,12 +43,22 @@ def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
         Axis name -> (SLOTS,) numbers in SI, placed as `circuit.Slot` says.
     """
     count = len(machine.hydraulic_axes)
+    memory = {name: 4 * count + k for k, name in enumerate(memory_names(machine))}
+    shared = sum(name == DELIVERY or name[8:] in machine.hydraulic_axes for name in memory)
     table = {}
     for name in actuator_order(machine):
         numbers = np.zeros(SLOTS)
         axis = machine.axes[name]
         numbers[Slot.MARKER] = MARKER
         numbers[Slot.COUNT] = count if axis.hydraulic else 0
+        numbers[Slot.MEMORY] = shared if axis.hydraulic else 0
+        if f"bristle.{name}" in memory:
+            numbers[Slot.BRISTLE_STIFFNESS] = axis.drive.friction.presliding_stiffness
+            numbers[Slot.BRISTLE_DAMPING] = axis.drive.friction.presliding_damping
+            numbers[Slot.BRISTLE] = memory[f"bristle.{name}"]
+        if DELIVERY in memory and axis.valve and machine.supply:
+            numbers[Slot.PUMP_TIME_CONSTANT] = machine.supply.time_constant
+            numbers[Slot.DELIVERY] = memory[DELIVERY]
         _write_friction(numbers, axis)
         _write_end_stop(numbers, machine, name)
         if axis.transmission:

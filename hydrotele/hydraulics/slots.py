@@ -8,7 +8,9 @@ CURVE_KNOTS = 8  # at most, of a valve's flow curve in one direction
 class Slot(enum.IntEnum):
     """Places of an actuator's numbers in `actuator_user`, all SI; a new number is a new line.
 
-    Beyond the plain valve and drive, 0 switches a law off (a metering ratio of 1 does). CURVES, the
+    Beyond the plain valve and drive, 0 switches a law off (a metering ratio of 1 does). BRISTLE and
+    DELIVERY are places among the activations, counted from the first hydraulic axis, and MEMORY is
+    how many of them follow those of the hydraulic axes (see `parameters.memory_names`). CURVES, the
     last, begins two flow curves, of the positive and of the negative direction: number
     of knots (0: straight), CURVE_KNOTS travels and CURVE_KNOTS openings each.
     """
@@ -68,6 +70,13 @@ class Slot(enum.IntEnum):
     STOP_HIGH = enum.auto()
     STOP_STIFFNESS = enum.auto()
     STOP_DAMPING = enum.auto()
+    BRISTLE_STIFFNESS = enum.auto()
+    BRISTLE_DAMPING = enum.auto()
+    BRISTLE_INERTIA = enum.auto()
+    BRISTLE = enum.auto()
+    PUMP_TIME_CONSTANT = enum.auto()
+    DELIVERY = enum.auto()
+    MEMORY = enum.auto()
     CURVES = enum.auto()
 
 

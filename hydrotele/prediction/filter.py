@@ -24,6 +24,8 @@ from hydrotele.hydraulics.pump import STALLED
 from hydrotele.prediction.late import begin_late, move_late, nudge_late, spread_late
 
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
+_BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
+_ASYMMETRY, _DELIVERY = int(Slot.COULOMB_ASYMMETRY), int(Slot.DELIVERY)
 
 
 class Gains(NamedTuple):
@@ -63,7 +65,7 @@ def _slopes(model, sp, z, nudge, slope, moved):
         if model.kind[c] != 4:
             continue
         for s in range(first, len(z)):
-            if (s - first) % 4 == 1:
+            if s < first + 4 * model.hydraulic and (s - first) % 4 == 1:
                 continue
             for r in range(len(z)):
                 moved[r] = z[r]
@@ -237,6 +239,8 @@ def _correct(model, sp, z, own, delta):
         for i in range(model.hydraulic):
             if model.user[i * SLOTS + _KIND] == _PUMPED:
                 _keep_side(z, 2 * (n + t) + 4 * i, delta[2 * (n + t) + 4 * i])
+        if model.memory is not None:
+            _bound_memory(model, z)
         return
     for sign in (-1.0, 1.0):
         place(model, sp, z)
@@ -250,6 +254,22 @@ def _correct(model, sp, z, own, delta):
         if sign < 0.0:
             for s in range(len(own)):
                 z[own[s]] += delta[s]
+    if model.memory is not None:
+        _bound_memory(model, z)
+
+
+@lean
+def _bound_memory(model, z):
+    """Keep bristles within their breakaway force, and a pump between no flow and all of it."""
+    act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
+    for i in range(len(model.gear)):
+        u = i * SLOTS
+        if model.user[u + _BRISTLE_STIFFNESS] > 0.0:
+            at, unequal = int(model.user[u + _BRISTLE]), model.user[u + _ASYMMETRY]
+            act[at] = min(1.0 + unequal, max(unequal - 1.0, act[at]))
+    if model.hydraulic > 0 and model.user[_DELIVERY] > 0.0:
+        at = int(model.user[_DELIVERY])
+        act[at] = min(1.0, max(0.0, act[at]))
 
 
 @lean

@@ -101,7 +101,7 @@ def verify_layout() -> None:
     in_model, in_data = field_offsets("mjModel"), field_offsets("mjData")
     wrong = [
         name
-        for name in (*_ARRAYS, "actuator_biastype", "actuator_dyntype")
+        for name in (*_ARRAYS, "actuator_biastype", "actuator_dyntype", "actuator_ctrlrange")
         if _read(model._address + in_model[name], np.int64) != getattr(model, name).ctypes.data
     ]
     wrong += [

@@ -14,7 +14,7 @@ import numpy as np
 from hydrotele.datafile import Vector
 from hydrotele.drives import Axis, Cylinder, Pin
 from hydrotele.errors import InputError
-from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS
+from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS, Slot
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
 from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
 from hydrotele.machine import Link, Machine
@@ -223,12 +223,16 @@ def _write_actuators(root, machine: Machine) -> None:
             joint=drive_joint(machine, name),
         )  # fmt: skip
         if axis.hydraulic:
-            actuator.dyntype, actuator.actdim = "user", ACTIVATIONS
+            last = name == list(machine.hydraulic_axes)[-1]  # it owns what all remember
+            remembered = int(numbers[Slot.MEMORY]) if last else 0
+            actuator.dyntype, actuator.actdim = "user", ACTIVATIONS + remembered
             actuator.gainprm = (0.0,)
             actuator.ctrlrange = (-1.0, 1.0)
         elif axis.force:
             actuator.gainprm = (axis.force.gain,)
             actuator.ctrlrange = (-axis.force.command_limit, axis.force.command_limit)
+            if axis.force.friction.presliding:
+                actuator.dyntype, actuator.actdim, actuator.actearly = "user", 2, True
 
 
 def _write_scene(root, ground: bool, looks: bool) -> None:

@@ -2,7 +2,9 @@
 
 Every hydraulic actuator has four activations and carries its numbers in `actuator_user`
 (`circuit.Slot`). The last one advances all of them, because they share the supply (MuJoCo clears an
-actuator's rates just before it calls back for it); the force is that of the pressures at the end of
+actuator's rates just before it calls back for it), and owns what the bristles of all and a slow
+pump remember; a force drive with bristles has two activations of its own, these and, as MuJoCo
+gives force from the last activation, its command. The force is that of the pressures at the end of
 the step, as `actearly` does, or explicit stepping would add negative damping. The callbacks touch
 nothing but the mjModel and mjData that they are given, so they are thread-safe, and a model can be
 randomised through `actuator_user`. Actuators without the marker are left alone. The terms of a
@@ -16,6 +18,7 @@ import functools
 
 import mujoco
 import numpy as np
+from llvmlite import binding
 from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -28,6 +31,7 @@ from hydrotele.hydraulics.circuit import (
     Slot,
     actuator_friction,
     circuit_supply,
+    delivered_share,
     open_ports,
     pumped_force,
     step_circuit,
@@ -35,6 +39,11 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.hydraulics.drive_side import settled_friction
 from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state
 from hydrotele.hydraulics.parameters import MARKER
+from hydrotele.hydraulics.presliding import (
+    bristle_friction,
+    bristle_rate,
+    settled_bristle_friction,
+)
 from hydrotele.simulate.layout import field_offsets, option_offset, verify_layout
 from hydrotele.simulate.library import mujoco_library
 from hydrotele.simulate.pointers import floats, pointer
@@ -44,9 +53,17 @@ from hydrotele.terms.table import MARKER as TERMS
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
 _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _OFFSET, _INERTIA = int(Slot.OFFSET), int(Slot.DRIVE_INERTIA)
+_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
+_FELT, _MEMORY = int(Slot.BRISTLE_INERTIA), int(Slot.MEMORY)
 _FORCE, _PUMPED = float(Kind.FORCE), float(Kind.PUMPED)
 _GAINS = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
+# Drives with bristles or a slow pump are handed on, so that others pay no more than a comparison.
+_ADVANCE_REMEMBERING = types.ExternalFunction("hydrotele_advance_remembering", _SIGNATURE)
+_FORCE_REMEMBERING = types.ExternalFunction("hydrotele_force_remembering", _SIGNATURE)
+
+
+_kept: list = []  # the callbacks at the addresses of these symbols
 
 
 @intrinsic
@@ -105,20 +122,55 @@ def _state(d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, vel
     command = floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu)[i]
     time, supply = floats(d + d_time, 1)[0], 0.0
     if count > 0:
-        start = floats(carray(pointer(d + d_act), (1,), np.int64)[0], 4 * count)
-        rate = floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0], 4 * count)
+        size = 4 * count + int(user[_MEMORY])
+        start = floats(carray(pointer(d + d_act), (1,), np.int64)[0], size)
+        rate = floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0], size)
         act = scratch[SCRATCH:]
-        for k in range(4 * count):
+        for k in range(size):
             act[k] = start[k] + dt * rate[k]
         open_ports(user, act, act, scratch, 0, count, 0.0, act)
-        supply = circuit_supply(user, 0, count, scratch)
+        supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
     return drive_state(user, i, count, act, supply, time, x, velocity, command, gain)
+
+
+@compiled
+def _advance_force_drive(user, u, act, rate, velocity, command, low, high, dt):
+    """Rates of the two activations of a force drive with bristles; the second is the command."""
+    rate[0] = bristle_rate(user, u, act[0], velocity, user[u + _FELT], dt)
+    rate[1] = (min(high, max(low, command)) - act[1]) / dt
+
+
+@compiled
+def _advance_with_memory(
+    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time
+):
+    """`step_circuit` of axes that have bristles or a slow pump, and the bristles' rates."""
+    step_circuit(
+        user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time,
+        len(act) - 4 * count,
+    )  # fmt: skip
+    for i in range(first, first + count):
+        u = i * SLOTS
+        if user[u + _STIFFNESS] > 0.0:
+            at = int(user[u + _BRISTLE])
+            act_dot[at] = bristle_rate(user, u, act[at], velocity[i], user[u + _FELT], dt)
 
 
 @functools.cache
 def _compile_callbacks():
     """Compile (or load from the cache) the dynamics and bias callbacks for this MuJoCo."""
     verify_layout()
+    remembering = _callbacks(True)
+    for symbol, function in zip(
+        (_ADVANCE_REMEMBERING.symbol, _FORCE_REMEMBERING.symbol), remembering, strict=True
+    ):
+        binding.add_symbol(symbol, function.address)
+        _kept.append(function)
+    return _callbacks(False)
+
+
+def _callbacks(remembers):
+    """The callbacks of drives with bristles or a slow pump, or those of all drives."""
     model_at, data_at = field_offsets("mjModel"), field_offsets("mjData")
     m_user, m_actadr = model_at["actuator_user"], model_at["actuator_actadr"]
     m_nuser, m_timestep = model_at["nuser_actuator"], option_offset("timestep")
@@ -130,6 +182,7 @@ def _compile_callbacks():
     )
     m_nnumeric, m_at = model_at["nnumeric"], model_at["numeric_adr"]
     m_size, m_data = model_at["numeric_size"], model_at["numeric_data"]
+    m_range = model_at["actuator_ctrlrange"]
     d_passive, d_time = data_at["qfrc_passive"], data_at["time"]
     d_ctrl, d_act, d_act_dot = data_at["ctrl"], data_at["act"], data_at["act_dot"]
     d_length, d_velocity = data_at["actuator_length"], data_at["actuator_velocity"]
@@ -145,7 +198,27 @@ def _compile_callbacks():
             return 0.0
         first, count = int(user[i * SLOTS + _FIRST]), int(user[i * SLOTS + _COUNT])
         if i != first + count - 1:
+            if user[i * SLOTS + _KIND] != _FORCE or user[i * SLOTS + _STIFFNESS] == 0.0:
+                return 0.0
+            if not remembers:
+                return _ADVANCE_REMEMBERING(m, d, i)
+            else:
+                at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
+                start = 8 * np.int64(carray(pointer(at_actadr), (nu,), np.int32)[i])
+                at_range = carray(pointer(m + m_range), (1,), np.int64)[0]
+                ends = floats(at_range + 16 * i, 2)
+                _advance_force_drive(
+                    user, i * SLOTS,
+                    floats(carray(pointer(d + d_act), (1,), np.int64)[0] + start, 2),
+                    floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0] + start, 2),
+                    floats(carray(pointer(d + d_velocity), (1,), np.int64)[0], nu)[i],
+                    floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu)[i],
+                    ends[0], ends[1], floats(m + m_timestep, 1)[0],
+                )  # fmt: skip
             return 0.0
+        if not remembers:
+            if user[first * SLOTS + _MEMORY] > 0.0:
+                return _ADVANCE_REMEMBERING(m, d, i)
         at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
         start = 8 * carray(pointer(at_actadr), (nu,), np.int32)[first]
         at_act = carray(pointer(d + d_act), (1,), np.int64)[0]
@@ -153,7 +226,11 @@ def _compile_callbacks():
         at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
         at_length = carray(pointer(d + d_length), (1,), np.int64)[0]
         at_velocity = carray(pointer(d + d_velocity), (1,), np.int64)[0]
-        act = carray(pointer(at_act + start), (4 * count,), np.float64)
+        size = 4 * count
+        if remembers:
+            size += int(user[first * SLOTS + _MEMORY])
+        act = carray(pointer(at_act + start), (size,), np.float64)
+        act_dot = carray(pointer(at_act_dot + start), (size,), np.float64)
         command = carray(pointer(at_ctrl), (nu,), np.float64)
         length = carray(pointer(at_length), (nu,), np.float64)
         velocity = carray(pointer(at_velocity), (nu,), np.float64)
@@ -169,10 +246,16 @@ def _compile_callbacks():
                 user, terms, count, act, command, length, velocity, dt, time, scratch, given
             )
             command = given
-        step_circuit(
-            user, first, count, act, command, length, velocity, dt,
-            carray(pointer(at_act_dot + start), (4 * count,), np.float64), scratch, terms, time,
-        )  # fmt: skip
+        if not remembers:
+            step_circuit(
+                user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms,
+                time, None,
+            )  # fmt: skip
+        else:
+            _advance_with_memory(
+                user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms,
+                time,
+            )  # fmt: skip
         return 0.0
 
     @callback(_SIGNATURE)
@@ -185,6 +268,9 @@ def _compile_callbacks():
         u = i * SLOTS
         if user[u] != MARKER:
             return 0.0
+        if not remembers:
+            if user[u + _STIFFNESS] > 0.0:
+                return _FORCE_REMEMBERING(m, d, i)
         at_velocity = carray(pointer(d + d_velocity), (1,), np.int64)[0]
         velocity = carray(pointer(at_velocity), (nu,), np.float64)[i]
         dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
@@ -218,15 +304,30 @@ def _compile_callbacks():
         if user[u + _KIND] == _PUMPED:  # friction that holds resists the terms, too
             return more + pumped_force(user, u, p_load, p_head, p_rod, velocity, more, dt)
         drive += more
-        if user[u + _INERTIA] == 0.0:
-            return drive - actuator_friction(user, u, velocity)
+        if not remembers:
+            if user[u + _INERTIA] == 0.0:
+                return drive - actuator_friction(user, u, velocity)
+        else:
+            force_drive = user[u + _KIND] == _FORCE
+            at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
+            owner = i if force_drive else np.int64(user[u + _FIRST])
+            place = np.int64(carray(pointer(at_actadr), (nu,), np.int32)[owner])
+            place += 0 if force_drive else np.int64(user[u + _BRISTLE])
+            share = floats(carray(pointer(d + d_act), (1,), np.int64)[0] + 8 * place, 1)[0]
+            rising = floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0] + 8 * place, 1)[0]
+            share += dt * rising
+            if user[u + _INERTIA] == 0.0:
+                return drive - bristle_friction(user, u, share, velocity, user[u + _FELT], dt)[0]
         push = drive + _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)
         if gain != 0.0:
             at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
             push += gain * carray(pointer(at_ctrl), (nu,), np.float64)[i]
         damping = max(0.0, -steep)  # of the terms, implicit as friction is: the drive side is light
         inertia = user[u + _INERTIA] + dt * damping
-        rubbing = settled_friction(user, u, velocity, push, inertia, dt)
+        if not remembers:
+            rubbing = settled_friction(user, u, velocity, push, inertia, dt)
+        else:
+            rubbing = settled_bristle_friction(user, u, share, velocity, push, inertia, dt)
         return drive - damping * (dt / inertia) * (push - rubbing) - rubbing
 
     return advance, force

@@ -9,8 +9,9 @@ import numpy as np
 
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS
-from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.hydraulics.parameters import actuator_order, memory_names
 from hydrotele.machine import Machine
+from hydrotele.simulate.bristles import set_bristles, write_bristles
 from hydrotele.simulate.closure import (
     close_loops,
     holding_forces,
@@ -44,6 +45,7 @@ class Plant:
         drive_dof: (nu,) the same in `qvel`.
         rod_qpos: (nu,) place of the piston displacement in `qpos`, -1 without cylinder.
         hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i+3.
+        memory: name of every other state, as `parameters.memory_names` has them -> its activation.
     """
 
     machine: Machine
@@ -57,6 +59,7 @@ class Plant:
     drive_dof: np.ndarray
     rod_qpos: np.ndarray
     hydraulic: int
+    memory: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
     def mjcf(self) -> str:
@@ -65,6 +68,7 @@ class Plant:
             self.machine, self.model.opt.timestep, self.ground, surroundings=self.surroundings
         )
         write_stops(root, self.machine, self.model)
+        write_bristles(root, self.machine, self.model)
         home = rest_state(self)
         pressures = {"act": home.act} if self.model.na else {}
         add_element(root.keyframe, "key", name="home", qpos=home.qpos, **pressures)
@@ -106,6 +110,7 @@ def build_plant(
     except ValueError as error:
         raise InputError(f"machine {machine.name}", f"does not compile: {error}") from None
     set_stops(machine, model)
+    set_bristles(machine, model)
     if not _can_touch(model):  # then looking for contacts is a tenth of a step, for nothing
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     axes = tuple(actuator_order(machine))
@@ -125,7 +130,18 @@ def build_plant(
         drive_dof=np.array([joint.dofadr[0] for joint in drives], dtype=int),
         rod_qpos=np.where(piston, places, -1),
         hydraulic=len(machine.hydraulic_axes),
+        memory=_memory(machine, model),
     )
+
+
+def _memory(machine: Machine, model: mujoco.MjModel) -> dict[str, int]:
+    """Activations of what `memory_names` lists; a force drive's bristles have one of their own."""
+    places, first = {}, ACTIVATIONS * len(machine.hydraulic_axes)
+    for k, name in enumerate(memory_names(machine)):
+        axis = machine.axes.get(name.partition(".")[2]) if name.startswith("bristle.") else None
+        force = axis is not None and axis.force is not None
+        places[name] = int(model.actuator(name[8:]).actadr[0]) if force else first + k
+    return places
 
 
 def _can_touch(model: mujoco.MjModel) -> bool:
@@ -178,7 +194,9 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
         plant: the plant.
         state: `order` (axis names) and, in that order, `angle` [rad] or [m], `velocity`, `spool`,
             `spool_rate`, `pressure_head`, `pressure_rod`; any but `order` and `angle` may lack and
-            is then that of rest. `joints` (name -> value) may give undriven joints, `drive` and
+            is then that of rest. `bristle` (axis -> part of the breakaway force that the bristles
+            of its friction carry) and `delivery` (`supply` -> part of its flow that a slow pump is
+            set to) are 0 at rest. `joints` (name -> value) may give undriven joints, `drive` and
             `drive_velocity` (axis -> value) the drive sides of transmissions.
 
     Returns:
@@ -204,4 +222,7 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
             i = plant.axes.index(name)
             if i < plant.hydraulic:
                 data.act[ACTIVATIONS * i + column] = value
+    for name, place in plant.memory.items():
+        kind, _, owner = name.partition(".")
+        data.act[place] = state.get(kind, {}).get(owner, 0.0)
     return data

@@ -7,9 +7,12 @@ from hydrotele.compiled import compiled
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS,
     SCRATCH,
+    SLOTS,
+    Slot,
     axis_state,
     circuit_scratch,
     circuit_supply,
+    delivered_share,
     open_ports,
 )
 from hydrotele.simulate.closure import following_joints
@@ -18,6 +21,7 @@ from hydrotele.simulate.record import Record
 from hydrotele.simulate.surroundings import thing_joints
 from hydrotele.simulate.term_readout import added_by_terms
 
+_BRISTLE, _STIFFNESS = int(Slot.BRISTLE), int(Slot.BRISTLE_STIFFNESS)
 _SPOOL = ("spool", "1"), ("spool_rate", "1/s")
 
 
@@ -28,7 +32,7 @@ def state_supply(user, count, act, scratch):
     Args:
         user: (nu * SLOTS,) actuator numbers.
         count: number of hydraulic axes, which come first.
-        act: (4 count,) activations.
+        act: (>= 4 count,) activations, and what a slow pump remembers.
         scratch: (SCRATCH,) work space.
 
     Returns:
@@ -37,7 +41,7 @@ def state_supply(user, count, act, scratch):
     Source: nominal model, "Supply".
     """
     open_ports(user, act, act, scratch, 0, count, 0.0, act)
-    return circuit_supply(user, 0, count, scratch)
+    return circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
 
 
 @compiled
@@ -47,7 +51,7 @@ def state_flows(user, count, act, x, v):
     Args:
         user: (nu * SLOTS,) actuator numbers.
         count: number of hydraulic axes.
-        act: (n, 4 count) activations.
+        act: (n, >= 4 count) activations.
         x: (n, nu) drive positions [m] or [rad].
         v: (n, nu) drive velocities [m/s] or [rad/s].
 
@@ -62,8 +66,11 @@ def state_flows(user, count, act, x, v):
         supply = state_supply(user, count, act[row], scratch)
         out[row, 0] = supply
         for i in range(count):
+            share = 0.0
+            if user[i * SLOTS + _STIFFNESS] > 0.0:
+                share = act[row, int(user[i * SLOTS + _BRISTLE])]
             q_head, q_rod, force = axis_state(
-                user, i, supply, act[row, 4 * i : 4 * i + 4], x[row, i], v[row, i]
+                user, i, supply, act[row, 4 * i : 4 * i + 4], x[row, i], v[row, i], share
             )
             out[row, 1 + 3 * i], out[row, 2 + 3 * i], out[row, 3 + 3 * i] = q_head, q_rod, force
     return out
@@ -154,6 +161,9 @@ def _hidden(plant: Plant, record: Record):
         if name not in driven and name not in following_joints(machine):
             kind, unit = ("angle", "rad") if joint.type == "hinge" else ("position", "m")
             put(f"truth.{kind}.{name}", record.qpos[:, model.joint(name).qposadr[0]], unit)
+    for name, place in plant.memory.items():
+        shown = "delivery" if name.startswith("delivery") else name
+        put(f"truth.{shown}", record.act[:, place], "1")
     _put_things(plant, record, put)
     _put_hydraulics(plant, record, put)
     for k, letter in enumerate("xyz"):

@@ -4,9 +4,16 @@ import mujoco
 import numpy as np
 
 from hydrotele.compiled import compiled
-from hydrotele.hydraulics.circuit import ACTIVATIONS, SCRATCH, Slot, open_ports, supply_pressure
+from hydrotele.hydraulics.circuit import (
+    ACTIVATIONS,
+    SCRATCH,
+    Slot,
+    delivered_share,
+    open_ports,
+    supply_pressure,
+)
 from hydrotele.hydraulics.drive_terms import drive_state
-from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
+from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
 from hydrotele.machine import Machine
 from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added, terms_table
 
@@ -22,7 +29,7 @@ def added_by_terms(
     Args:
         machine: the machine.
         time: (n,) [s].
-        act: (n, 4 count) activations.
+        act: (n, >= 4 count) activations.
         x: (n, nu) drive positions [m] or [rad].
         v: (n, nu) drive velocities [m/s] or [rad/s].
         command: (n, nu) commands as they arrive [1] or [V].
@@ -54,7 +61,8 @@ def _evaluate(user, terms, count, gain, time, act, x, v, command, out):
         supply = 0.0
         if count > 0:
             open_ports(user, act[row], act[row], scratch, 0, count, 0.0, act[row])
-            supply = supply_pressure(scratch, count, user[_D], user[_RELIEF], user[_PUMP])
+            flow = user[_PUMP] * delivered_share(user, 0, act[row])
+            supply = supply_pressure(scratch, count, user[_D], user[_RELIEF], flow)
         for i in range(len(gain)):
             s = drive_state(
                 user, i, count, act[row], supply, time[row], x[row, i], v[row, i], command[row, i],
@@ -84,7 +92,7 @@ def terms_at_rest(
     """
     if not machine.terms:
         return np.zeros(len(forces))
-    act = np.zeros((1, ACTIVATIONS * len(machine.hydraulic_axes)))
+    act = np.zeros((1, ACTIVATIONS * len(machine.hydraulic_axes) + len(memory_names(machine))))
     for i, axis in enumerate(machine.hydraulic_axes.values()):
         act[0, ACTIVATIONS * i + 2] = forces[i] / axis.hydraulic_drive.areas[0]
     still = np.zeros((1, len(forces)))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from hydrotele.compiled import compiled
-from hydrotele.hydraulics.circuit import ACTIVATIONS, SCRATCH, SLOTS
+from hydrotele.hydraulics.circuit import SCRATCH, SLOTS
 from hydrotele.simulate.pointers import floats
 from hydrotele.simulate.readout import state_supply
 from hydrotele.simulate.sensors import convert
@@ -40,8 +40,7 @@ def _sensed(f, e, w, out):
     if f.hydraulic > 0:
         scratch = np.empty(SCRATCH)
         user = floats(f.users + 8 * e.variant * k * SLOTS, k * SLOTS)
-        act = w.act[: ACTIVATIONS * f.hydraulic]
-        out[k + 2 * f.hydraulic] = state_supply(user, f.hydraulic, act, scratch)
+        out[k + 2 * f.hydraulic] = state_supply(user, f.hydraulic, w.act, scratch)
 
 
 @compiled

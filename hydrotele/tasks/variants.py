@@ -159,8 +159,9 @@ def _differing(plants: list[Plant], also: tuple[str, ...]) -> dict[str, np.ndarr
         if values[0].dtype != np.float64:
             raise _structure(name)
         fields[name] = np.array([np.asarray(_of(p.model, name)).ravel() for p in plants])
-    if any(plant.model.nv != first.nv for plant in distinct):
-        raise _structure("nv")
+    for size in ("nv", "na"):
+        if any(getattr(plant.model, size) != getattr(first, size) for plant in distinct):
+            raise _structure(size)
     return fields
 
 

@@ -60,6 +60,15 @@ CASES = {
     ),
     "load_holding": (("load_holding", "boom.head", {"setting": 40e6}),),
     "pump_droop": (("pump_droop", "supply", {"droop": 7e-11}),),
+    "presliding": (
+        ("presliding", "swing", {"compliance": 5e-7}),
+        ("presliding", "boom", {"compliance": 1e-7}),
+    ),
+    "presliding on a flexible drive": (
+        ("joint_flexibility", "boom", {"compliance": 2e-8}),
+        ("presliding", "boom", {"compliance": 1e-7}),
+    ),
+    "pump_lag": (("pump_lag", "supply", {"time_constant": 0.15}),),
 }
 
 
@@ -99,7 +108,7 @@ def begin(machine, model, z, state):
     for s, name in enumerate(state_names(machine)):
         kind, _, where = name.partition(".")
         axis = joints.get(where, where)
-        if kind in ("drive", "drive_rate"):
+        if kind in ("drive", "drive_rate", "bristle", "delivery"):
             z[s] = state[kind.replace("rate", "velocity")][axis]
         else:
             z[s] = state[renamed.get(kind, kind)][state["order"].index(axis)]

@@ -35,6 +35,7 @@ PLACES = {
     "metering_edges": ARM, "flow_curve": ARM, "spool_slew": ARM, "load_compensation": ARM,
     "load_holding": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
     "pump_droop": {"supply"}, "end_stop_stiffness": {"boom", "stick"},
+    "pump_lag": {"supply"}, "presliding": ARM,
     "angle_lag": ARM, "pressure_lag": ARM,
     "pressure_scale": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
     "clock_offset": {"positions", "pressures"},
