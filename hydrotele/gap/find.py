@@ -92,14 +92,15 @@ def find_gap(
         tell("judge on the held-out run", 0.96)
         judge = _Judge(data, discovery.judged)
         nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)
-        before = judge.tracks(nominal, evidence.map)
-        after = judge.tracks(patched, evidence.map) if discovery.judged.guess.parts else before
+        machines = [nominal, *([patched] if patched is not nominal else [])]
+        before, *others = judge.tracks(machines + ([given] if opened else []), evidence.map)
+        asked = others.pop() if opened else before
+        after = others[0] if others else before
         if not rms(after[:1]) <= _WORSE * rms(before[:1]):
             notes.append(_REJECTED)
             found, discovery = found.emptied(), Discovery(found.base, ())
             patched, after = nominal, before
-        if opened:
-            before = judge.tracks(given, evidence.map)
+        before = asked
         tests, floor = judge.tests(evidence, discovery.judged, patched, after)
         evidence.set_base(discovery.judged)
         scatter = tests.get("constancy", {}).get("value", 1.0)
@@ -160,13 +161,15 @@ class _Judge:
         self.runs = (data.heldout, *data.fit)
 
     def tracks(
-        self, machine: Machine, each: Callable, runs: Sequence | None = None
-    ) -> tuple[Track, ...]:
-        """Tracks of the held-out run and the fit runs, or of some runs."""
-        return tuple(each(
-            lambda run: track_run(machine, self.data, run, levels=self.levels),
-            self.runs if runs is None else runs,
+        self, machines: Sequence[Machine], each: Callable, runs: Sequence | None = None
+    ) -> list[tuple[Track, ...]]:
+        """Per machine the tracks of the held-out run and the fit runs, or of some runs."""
+        runs = self.runs if runs is None else runs
+        pairs = [(machine, run) for run in runs for machine in machines]  # the longest run first
+        found = list(each(
+            lambda pair: track_run(pair[0], self.data, pair[1], levels=self.levels), pairs,
         ))  # fmt: skip
+        return [tuple(found[k :: len(machines)]) for k in range(len(machines))]
 
     def tests(
         self, evidence: Evidence, judged: Judged, machine: Machine, tracks: Sequence[Track]
@@ -178,7 +181,7 @@ class _Judge:
         the rows are too slow for) it is that noise that the floor counts, by definition 1.
         """
         noisy = dataclasses.replace(self.data, noise=self.levels.noise)
-        perfect = perfect_tracks(machine, noisy, tracks)
+        perfect = () if self.ripple else perfect_tracks(machine, noisy, tracks)
         floor = 1.0 if self.ripple else rms(perfect[:1])
         holds = np.isfinite(floor) and _FLOOR[0] < floor < _FLOOR[1]
         clean = holds and not self.ripple
@@ -207,7 +210,8 @@ class _Judge:
             machine = guess.machine(self.data.machine)
             once = {"start", "duration"} <= hypothesis.parameters.keys()  # not in every run
             runs = self.runs if once else self.runs[:1]
-            size = rms(self.tracks(machine, map, runs)) ** 2
+            (without,) = self.tracks([machine], map, runs)
+            size = rms(without) ** 2
             then, now = (rms(t if once else t[:1]) ** 2 for t in (before, after))
             whole = then - (floor or 1.0) ** 2
             back = size - now

@@ -10,7 +10,7 @@ from hydrotele.dataset.rows import Rows
 
 _RATE, _PER_CYCLE = 100.0, 6.0  # Hz; rows per cycle of the fastest valve
 _SHORT = 2.0  # s, of a run that is kept as it is
-MOST_SECONDS = 200.0  # of all fitted runs together: five runs of a usual length
+MOST_SECONDS = 150.0  # of all fitted runs together: four runs of a usual length
 
 
 def busiest(data: Dataset, most: float = MOST_SECONDS) -> Dataset:
