@@ -244,7 +244,7 @@ def _law(
 ) -> tuple[Learned, np.ndarray]:
     """A law of the products that are worth it, with the regression's coefficients as start."""
     i, balance, shape = case
-    shape = shape._replace(chosen=found.chosen)
+    shape = shape.with_products(found.chosen)
     (unit,) = input_units(machine, [i])
     parameters = {
         product: Parameter(f"{unit} / [{product}]" if product != "1" else unit, 0.0, -50.0 * s,

@@ -64,6 +64,17 @@ class Shape(NamedTuple):
             found = [_times(p, q) for p in found for q in _hinges(self.other, self.other_knots)]
         return [found[k] for k in self.chosen] if self.chosen else found
 
+    def with_products(self, chosen: Sequence[int]) -> "Shape":
+        """With some of the products, and without a variable that none of these has."""
+        if self.other:
+            count = 2 + len(self.other_knots)
+            first, second = zip(*(divmod(k, count) for k in chosen), strict=True)
+            if not any(second):
+                return Shape(self.variable, self.factor, self.knots, chosen=first)
+            if not any(first) and not self.factor:
+                return Shape(self.other, "", self.other_knots, chosen=second)
+        return self._replace(chosen=tuple(chosen))
+
     def columns(self, values: Mapping[str, np.ndarray], smoothing: float) -> np.ndarray:
         """(n, K) the products along data."""
         found = _hinge_columns(self.variable, self.knots, values)

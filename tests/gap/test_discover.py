@@ -100,11 +100,21 @@ def test_products_of_two_variables_are_bilinear_between_their_kinks():
     ]  # fmt: skip
     expected = [[1, 2e6, 0.1, 2e5, 0, 0], [1, 4e6, 0.5, 2e6, 0.2, 8e5]]
     np.testing.assert_allclose(shape.columns(values, 0.01), expected)
-    some = shape._replace(chosen=(1, 3))
+    some = shape.with_products((1, 3))
     assert some.products == [shape.products[1], shape.products[3]]
     np.testing.assert_allclose(some.columns(values, 0.01), np.array(expected)[:, [1, 3]])
     Term(name="law", axis="slide", balance="force", law="formula",
          parameters=dict.fromkeys(shape.products, 1.0))  # fmt: skip
+
+
+def test_a_variable_without_products_is_none_of_the_laws():
+    shape = Shape("position", "", (0.3,), "velocity", (0.0,))
+    assert shape.with_products((3, 6)) == Shape("position", "", (0.3,), chosen=(1, 2))
+    assert shape.with_products((1, 2)) == Shape("velocity", "", (0.0,), chosen=(1, 2))
+    assert shape.with_products((1, 4)).kind == ("position", "", "velocity")
+    for chosen in ((3, 6), (1, 2), (1, 4)):
+        expected = [shape.products[k] for k in chosen]
+        assert shape.with_products(chosen).products == expected
 
 
 def test_every_form_of_a_balance_can_be_written_as_a_term():
