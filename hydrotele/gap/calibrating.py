@@ -10,6 +10,7 @@ from hydrotele.prediction.hypothesis import Guess, Hypothesis
 from hydrotele.prediction.track import COARSE
 
 BEYOND = 15.0  # twice the log evidence that a number must bring to be an effect of its own
+_RIGHT = 0.2  # of the stated uncertainty, by which numbers move that are right
 _ROUNDS = 2  # of levels and fit; `search.settle` does the rest
 _SETTLED = 15.0  # fall of the loss that is worth another round
 
@@ -57,7 +58,8 @@ def promoted(evidence: Evidence, now: Judged, candidates: Sequence[Hypothesis]) 
     """A guess in which numbers that calibration moves too far are effects; None if there is none.
 
     What the others move by is what uncertain means: the scale of all deviations, if it is larger
-    than the stated one, is taken for each.
+    than the stated one, is taken for each. Where nearly all others are right, one that is not is an
+    effect, stated uncertainty or not.
     """
     place = next((i for i, (h, _) in enumerate(now.guess.parts) if h.name == CALIBRATION), -1)
     if place < 0:
@@ -65,7 +67,8 @@ def promoted(evidence: Evidence, now: Judged, candidates: Sequence[Hypothesis]) 
     group, deviation = now.guess.parts[place]
     table = numbers(evidence.data.machine)
     keys = list(group.parameters)
-    usual = max(1.0, 1.4826 * float(np.median(np.abs(deviation))))
+    usual = 1.4826 * float(np.median(np.abs(deviation)))
+    usual = _RIGHT if usual < _RIGHT else max(1.0, usual)
     moved: dict[tuple[str, str], float] = {}
     for key, d in zip(keys, deviation, strict=True):
         effect = table[key].effect
