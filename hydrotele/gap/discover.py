@@ -41,9 +41,7 @@ _LARGEST = 4  # unknown inputs in whose places laws are looked for
 _TRIED = 2  # laws that are fitted inside the machine, of all that the regression finds
 _STEPS = 3  # of Gauss-Newton for each
 _DETAIL = 0.05  # of what all laws brought: one that brings less is the last
-_AHEAD = (
-    1.0  # s, of free runs that a law must make better: longer ones drift off a drive without load
-)
+_AHEAD = 1.0  # s, of free runs that a law must make better; longer ones drift without readings
 _STEP = 2.0e-3  # s, for the fits
 
 
@@ -232,7 +230,9 @@ def _candidates(
     looked = list(zip(cases, evidence.map(look, cases), strict=True))
     looked = [pair for pair in looked if pair[1].predicted > ENTER]
     looked.sort(key=lambda pair: -pair[1].predicted)
-    return [_law(machine, case, found, seen) for case, found in looked[:_TRIED]]
+    found = [_law(machine, case, answer, seen) for case, answer in looked[: 2 * _TRIED]]
+    known = {law.hypothesis.key for law in laws}  # what the chosen products leave may be known
+    return [pair for pair in found if pair[0].hypothesis.key not in known][:_TRIED]
 
 
 def _smoothing(machine: Machine, axis: str) -> float:
@@ -255,9 +255,7 @@ def _law(
     everywhere = {v: np.concatenate([x[v] for x in values]) for v in values[0]}
     domain = {v: (float(everywhere[v].min()), float(everywhere[v].max()))
               for v in shape.variables if np.ptp(everywhere[v]) > 0.0}  # fmt: skip
-    name, over = f"{LEARNED}_{balance}", shape.variable
-    if shape.other:
-        over += f", {shape.other}"
+    name = f"{LEARNED}_{balance}"
 
     def change(nominal: Machine, coefficients: Mapping[str, float]) -> Machine:
         terms = list(nominal.terms)
@@ -269,11 +267,10 @@ def _law(
                 "name": name, "axis": i.axis, "balance": side, "law": "formula",
                 "parameters": {p: sign * value for p, value in coefficients.items()},
                 "domain": domain, "uncertainty": found.left,
-                "description": f"learned from data: {balance} over {over}",
+                "description": f"learned from data: {balance} over {shape.name}",
             }))  # fmt: skip
         return nominal.model_copy(update={"terms": tuple(terms)})
 
-    location = f"{i.axis}.{over.replace(' ', '')}"
-    hypothesis = Hypothesis(name, location, parameters, change)
+    hypothesis = Hypothesis(name, f"{i.axis}.{shape.name}", parameters, change)
     law = Learned(hypothesis, balance, i.axis, shape, _smoothing(machine, i.axis), everywhere)
     return law, found.deviation

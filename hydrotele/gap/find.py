@@ -165,7 +165,7 @@ class _Judge:
     ) -> list[tuple[Track, ...]]:
         """Per machine the tracks of the held-out run and the fit runs, or of some runs."""
         runs = self.runs if runs is None else runs
-        pairs = [(machine, run) for run in runs for machine in machines]  # the longest run first
+        pairs = [(machine, run) for run in runs for machine in machines]
         found = list(each(
             lambda pair: track_run(pair[0], self.data, pair[1], levels=self.levels), pairs,
         ))  # fmt: skip

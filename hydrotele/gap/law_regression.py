@@ -58,20 +58,28 @@ def regression(parts: Sequence[tuple[Track, np.ndarray, np.ndarray]], size: floa
         answers += zip(*(np.array_split(table, cuts) for table in there), strict=True)
     curvature = np.array([s.T @ s for s, _ in answers])
     slope = np.array([s.T @ e for s, e in answers])
-    chosen = _chosen(curvature.sum(axis=0), slope.sum(axis=0))
+    predicted = sum(_predicted(curvature, slope, out) for out in range(len(curvature)))
+    curvature, slope = curvature.sum(axis=0), slope.sum(axis=0)
+    chosen = _chosen(curvature, slope)
     if not chosen:
         return Regression(0.0, (), np.zeros(0), np.zeros(0), size)
     own = np.array(chosen)
-    curvature, slope = curvature[:, own[:, None], own], slope[:, own]
-    predicted = 0.0
-    for out in range(len(curvature)):
-        x = _solved(curvature.sum(axis=0) - curvature[out], slope.sum(axis=0) - slope[out])
-        predicted -= float(2.0 * slope[out] @ x + x @ curvature[out] @ x)
-    x = _solved(curvature.sum(axis=0), slope.sum(axis=0))
+    x = _solved(curvature[own[:, None], own], slope[own])
     taken = float(np.mean((products[:, own] @ (x * scale[own])) ** 2))
     left = float(np.sqrt(max(size**2 - taken, 0.0)))
     scale = scale[own] * np.maximum(1.0, 3.0 * np.abs(x))
     return Regression(predicted, chosen, scale, x / np.maximum(1.0, 3.0 * np.abs(x)), left)
+
+
+def _predicted(curvature: np.ndarray, slope: np.ndarray, out: int) -> float:
+    """Fall of the loss of a part that neither the choice of products nor their fit has seen."""
+    others = curvature.sum(axis=0) - curvature[out], slope.sum(axis=0) - slope[out]
+    chosen = _chosen(*others)
+    if not chosen:
+        return 0.0
+    own = np.array(chosen)
+    x = _solved(others[0][own[:, None], own], others[1][own])
+    return -float(2.0 * slope[out, own] @ x + x @ curvature[out][own[:, None], own] @ x)
 
 
 def _solved(curvature: np.ndarray, slope: np.ndarray) -> np.ndarray:

@@ -50,6 +50,16 @@ class Shape(NamedTuple):
         return self.variable, self.factor, self.other
 
     @property
+    def name(self) -> str:
+        """On what it depends, without blanks: such as `position*velocity` or `spool,time`."""
+        text = self.variable
+        if self.factor:
+            text += "*sign(velocity)" if self.factor.startswith("sign") else f"*{self.factor}"
+        if self.other:
+            text += f",{self.other}"
+        return text.replace(" ", "")
+
+    @property
     def variables(self) -> list[str]:
         """The variables of the drive's state on which it depends, without that of the factor."""
         return [v for part in (self.variable, self.other) if part for v in part.split(" - ")]

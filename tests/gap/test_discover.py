@@ -125,6 +125,7 @@ def test_every_form_of_a_balance_can_be_written_as_a_term():
     for balance in ("force", "flow_head", "flow_rod", "flow_through", "command"):
         shapes = possible_shapes(balance, values, 0.01)
         assert len({shape.kind for shape in shapes}) == len(shapes) > 10
+        assert len({shape.name for shape in shapes}) == len(shapes)  # two laws of one place
         for shape in shapes:
             Term(name="law", axis="slide", balance="force", law="formula",
                  parameters=dict.fromkeys(shape.products, 1.0))  # fmt: skip
