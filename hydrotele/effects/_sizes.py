@@ -36,6 +36,13 @@ def linkages(machine: Machine) -> tuple[str, ...]:
     return tuple(name for name in cylinders(machine) if not _along_slide(machine, name))
 
 
+def across(machine: Machine, axis: str) -> str:
+    """The two directions across an axis' joint, in which pins may sit elsewhere: such as `xz`."""
+    joint = machine.joints[machine.axes[axis].joint]
+    way = joint.axis if joint.type == "hinge" else (0.0, 1.0, 0.0)
+    return "xyz".replace("xyz"[int(np.argmax(np.abs(way)))], "")
+
+
 def _along_slide(machine: Machine, axis: str) -> bool:
     facts = machine.axes[axis]
     joint, cylinder = machine.joints[facts.joint], facts.cylinder

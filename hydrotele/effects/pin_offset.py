@@ -1,8 +1,6 @@
 """A cylinder whose base pin sits elsewhere than in the model."""
 
-import numpy as np
-
-from hydrotele.effects._sizes import linkages
+from hydrotele.effects._sizes import across, linkages
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
 from hydrotele.machine import Machine
 
@@ -13,14 +11,7 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     assert cylinder
     size = cylinder.closed_length
     offset = Parameter("m", 0.0, -0.05 * size, 0.05 * size, 0.005 * size, 0.001 * size)
-    return dict.fromkeys(_across(machine, location), offset)
-
-
-def _across(machine: Machine, location: str) -> str:
-    """The two directions across the pin, along which its linkage still closes."""
-    joint = machine.joints[machine.axes[location].joint]
-    axis = joint.axis if joint.type == "hinge" else (0.0, 1.0, 0.0)
-    return "xyz".replace("xyz"[int(np.argmax(np.abs(axis)))], "")
+    return dict.fromkeys(across(machine, location), offset)
 
 
 def _apply(machine: Machine, location: str, values: Values) -> Machine:

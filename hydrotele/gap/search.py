@@ -17,7 +17,7 @@ from hydrotele.gap.pulses import timed
 from hydrotele.gap.rattling import rattling
 from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of
 from hydrotele.gap.screening import Screened, screen
-from hydrotele.gap.settling import fitted, loss_of, settle, strained
+from hydrotele.gap.settling import fitted, loss_of, settle, strained, widened
 from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
@@ -89,7 +89,7 @@ def search(
     tell = progress or (lambda text, share: None)
     tell("find noise levels of the given model", 0.0)
     base = now = evidence.set_base(Guess())
-    fit, weak, first, refused, tried = None, None, (), 0, False
+    fit, weak, first, refused, tried, roomy = None, None, (), 0, False, False
     candidates = timed(candidates, base)
     teeth = rattling(evidence, base, candidates)
     rankings: dict[tuple[str, str], Sequence[Screened]] = {}
@@ -147,7 +147,12 @@ def search(
             elif best:
                 evidence.set_base(grown)
         if best is None:
-            break
+            wider = widened(now.guess, calibration=True)
+            if roomy or wider.hypotheses == now.guess.hypotheses:
+                break
+            tell("calibrate with more room", done + 0.04)
+            (now, fit), ranked, roomy = settle(evidence, evidence.judged(wider)), None, True
+            continue
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = ranked
         now, fit, ranked = grown, settled, None

@@ -34,7 +34,7 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
             return evidence.fit(start, before, parallel=False, step=step, kept=kept, steps=_STEPS)
 
         found = climb(more)
-        wider = _widened(found.guess)
+        wider = widened(found.guess)
         if found.score > 0.0 and wider.parts[-1][0] != found.guess.parts[-1][0]:
             found = climb(wider)  # else what is larger than usual is taken for something else
         return found
@@ -53,7 +53,7 @@ def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
         fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if group else None)
         moved = fit.guess.deviation - judged.guess.deviation
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
-        guess = _widened(fit.guess)
+        guess = widened(fit.guess)
         if np.all(np.abs(moved) < _UNMOVED * spread):
             break
         before, judged = judged, evidence.judged(guess, same=True)
@@ -69,16 +69,17 @@ def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
     return evidence.set_base(evidence.judged(guess)), fit
 
 
-def _widened(guess: Guess) -> Guess:
+def widened(guess: Guess, calibration: bool = False) -> Guess:
     """A guess in which effects that stand at a bound have three times as much room.
 
-    A bound at zero is physical and stays.
+    A bound at zero is physical and stays. So do those of calibrated numbers unless asked for: what
+    a number takes beyond them may be an effect that is not tried yet.
     """
     parts = []
     for hypothesis, deviation in guess.parts:
         table, values = dict(hypothesis.parameters), hypothesis.values(deviation)
         for key, p in hypothesis.parameters.items():
-            if hypothesis.name == CALIBRATION:
+            if (hypothesis.name == CALIBRATION) != calibration:
                 continue
             if values[key] >= p.high:
                 table[key] = replace(p, high=p.nominal + _ROOM * (p.high - p.nominal))

@@ -44,7 +44,7 @@ __all__ = [
 
 ACTIVATIONS = 4
 MAX_AXES = 8
-SCRATCH = 8 * MAX_AXES  # ports, then the factors of the pressures
+SCRATCH = 8 * MAX_AXES  # ports, then the factors of the pressures and how the supply couples them
 _FACTORS = 4 * MAX_AXES
 
 _ROS2 = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approximate Jacobian
@@ -268,6 +268,66 @@ def circuit_supply(user, first, count, ports, share=1.0):
 
 
 @compiled
+def supply_coupling(user, first, count, ports, supply, out):
+    """How the supply pressure follows the chambers that it feeds.
+
+    `dp_s/dp_i` is `g_i / (sum_j g_j + c_p)` where the pump's flow is short, 1 for the largest load
+    where load sensing holds its margin, 0 at the relief setting; g_i is the slope of an inlet's
+    flow with its drop.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        supply: p_s, as of `circuit_supply`, scalar [Pa].
+        out: (>= 4 count,) written at places 2 and 3 of every axis: g_i [m^3/(s Pa)] and dp_s/dp_i
+            [1].
+
+    Returns:
+        Whether any dp_s/dp_i is not 0, scalar [1].
+
+    Source: implicit function theorem on "Supply" of the nominal model.
+    """
+    s, total, leader = first * SLOTS, user[first * SLOTS + _DROOP], -1
+    most, load = user[s + _RELIEF], user[s + _TANK]
+    for i in range(count):
+        out[4 * i + 2], out[4 * i + 3] = 0.0, 0.0
+        drop = supply - ports[4 * i + 1]
+        if ports[4 * i] > 0.0:
+            if ports[4 * i + 1] > load:
+                load, leader = ports[4 * i + 1], i
+            if drop > 0.0:
+                out[4 * i + 2] = inlet_flow(drop, ports[4 * i], user[s + _D], ports[4 * i + 2])[1]
+                total += out[4 * i + 2]
+    if user[s + _MARGIN] > 0.0 and load + user[s + _MARGIN] < most:
+        if supply >= load + user[s + _MARGIN]:
+            if leader >= 0:
+                out[4 * leader + 3] = 1.0
+            return leader >= 0
+    elif supply >= most:
+        return False
+    if total <= 0.0:
+        return False
+    for i in range(count):
+        out[4 * i + 3] = out[4 * i + 2] / total
+    return True
+
+
+@compiled
+def _chamber_stiffness(user, u, x):
+    """Pressure per volume of both chambers, oil and hose [Pa/m^3]."""
+    beta = user[u + _BETA]
+    volume_head, volume_rod = user[u + _VH], user[u + _VR]
+    if user[u + 1] == 1.0:  # Kind.CYLINDER
+        inside = min(max(x, 0.0), user[u + _STROKE])
+        volume_head += user[u + _AH] * inside
+        volume_rod += user[u + _AR] * (user[u + _STROKE] - inside)
+    hose = beta * user[u + _HOSE]
+    return beta / (volume_head + hose), beta / (volume_rod + hose)
+
+
+@compiled
 def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added):
     """Pressure rates of both chambers and their slopes with respect to their own pressure.
 
@@ -302,17 +362,9 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     tank, makeup_gain = user[u + _TANK], user[u + _KM]
     r_head, k_head = port_flow(p_head, port, relief_gain, tank, makeup_gain)
     r_rod, k_rod = port_flow(p_rod, port, relief_gain, tank, makeup_gain)
-    beta = user[u + _BETA]
-    swept_head, swept_rod = user[u + _AH], user[u + _AR]
-    volume_head, volume_rod = user[u + _VH], user[u + _VR]
-    if user[u + 1] == 1.0:  # Kind.CYLINDER
-        inside = min(max(x, 0.0), user[u + _STROKE])
-        volume_head += swept_head * inside
-        volume_rod += swept_rod * (user[u + _STROKE] - inside)
-    hose = beta * user[u + _HOSE]
-    head, rod = beta / (volume_head + hose), beta / (volume_rod + hose)
-    rate_head = head * (q_head - swept_head * v - leak + r_head + added[0])
-    rate_rod = rod * (q_rod + swept_rod * v + leak + r_rod + added[1])
+    head, rod = _chamber_stiffness(user, u, x)
+    rate_head = head * (q_head - user[u + _AH] * v - leak + r_head + added[0])
+    rate_rod = rod * (q_rod + user[u + _AR] * v + leak + r_rod + added[1])
     if k_head == 0.0:
         _, k_head = port_flow(p_head + ahead * rate_head, port, relief_gain, tank, makeup_gain)
     if k_rod == 0.0:
@@ -342,8 +394,9 @@ def step_circuit(
     """Advance spools and chamber pressures of all axes that share a supply by one step.
 
     Spools follow their exact exponential; pressures take one step of the L-stable second-order
-    Rosenbrock method ROS2 with a diagonal Jacobian, with piston velocities held over the step. The
-    supply pressure is solved in both stages. A pump with a time constant follows the mean of what
+    Rosenbrock method ROS2, with piston velocities held over the step. Its Jacobian is diagonal but
+    for the supply, by which all fed chambers act on each other (`supply_coupling`, solved by the
+    Sherman-Morrison formula). The supply pressure is solved in both stages. A pump with a time constant follows the mean of what
     the valves draw at both ends of the step, by its exact exponential.
 
     Args:
@@ -410,6 +463,10 @@ def step_circuit(
         f = _FACTORS + a
         scratch[f], scratch[f + 1] = 1.0 / (1.0 - gamma_h * j_head), 1.0 / (1.0 - gamma_h * j_rod)
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
+    coupled = supply_coupling(user, first, count, scratch, p_start, scratch[_FACTORS:])
+    if coupled:
+        _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch)
+        _couple(count, act_dot, scratch)
     open_ports(user, act, act_dot, scratch, first, count, dt, act_dot)
     if memory is None:
         p_end = circuit_supply(user, first, count, scratch)
@@ -435,11 +492,57 @@ def step_circuit(
             user, u, scratch[a + 3], p_end, p_head, p_rod, x, v, 0.0, more,
         )  # fmt: skip
         f = _FACTORS + a
-        act_dot[a + 2] = 1.5 * k_head + 0.5 * scratch[f] * (head - 2.0 * k_head)
-        act_dot[a + 3] = 1.5 * k_rod + 0.5 * scratch[f + 1] * (rod - 2.0 * k_rod)
+        act_dot[a + 2] = scratch[f] * (head - 2.0 * k_head)
+        act_dot[a + 3] = scratch[f + 1] * (rod - 2.0 * k_rod)
+        scratch[a], scratch[a + 1] = k_head, k_rod
         act_dot[a] = (act_dot[a] - act[a]) / dt
         act_dot[a + 1] = (act_dot[a + 1] - act[a + 1]) / dt
+    if coupled:
+        _couple(count, act_dot, scratch)
+    for a in range(0, 4 * count, 4):
+        act_dot[a + 2] = 1.5 * scratch[a] + 0.5 * act_dot[a + 2]
+        act_dot[a + 3] = 1.5 * scratch[a + 1] + 0.5 * act_dot[a + 3]
     return p_start, p_end
+
+
+@compiled
+def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
+    """What a supply pressure of 1 Pa more adds to the stage rates of the fed chambers.
+
+    Of `(I - gamma h (D + b w^T)) k = r` with D diagonal, b the rates per supply pressure and
+    w = dp_s/dp, writes `gamma h b / (1 - gamma h D)` over the common divisor
+    `1 - gamma h w^T b / (1 - gamma h D)` at place 2 of every axis' factors, negative where the rod
+    side is fed.
+    """
+    divisor = 1.0
+    for i in range(count):
+        f = _FACTORS + 4 * i
+        if scratch[f + 2] == 0.0:
+            continue
+        head, rod = _chamber_stiffness(
+            user, (first + i) * SLOTS, length[first + i] - dt * velocity[first + i]
+        )
+        own = gamma_h * scratch[f + 2]
+        own *= head * scratch[f] if scratch[4 * i + 3] > 0.0 else rod * scratch[f + 1]
+        divisor -= scratch[f + 3] * own
+        scratch[f + 2] = own if scratch[4 * i + 3] > 0.0 else -own
+    for f in range(_FACTORS, _FACTORS + 4 * count, 4):
+        scratch[f + 2] /= divisor
+
+
+@compiled
+def _couple(count, rate, scratch):
+    """Add what the supply carries from chamber to chamber to rates of independent ones."""
+    pull = 0.0
+    for a in range(0, 4 * count, 4):
+        f = _FACTORS + a
+        pull += scratch[f + 3] * rate[a + 2 if scratch[f + 2] > 0.0 else a + 3]
+    for a in range(0, 4 * count, 4):
+        f = _FACTORS + a
+        if scratch[f + 2] > 0.0:
+            rate[a + 2] += scratch[f + 2] * pull
+        else:
+            rate[a + 3] -= scratch[f + 2] * pull
 
 
 @compiled

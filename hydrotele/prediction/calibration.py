@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from hydrotele.effects import EFFECTS, Effect, Parameter
+from hydrotele.effects._sizes import across, linkages
 from hydrotele.effects.effect import changed
 from hydrotele.machine import Machine
 from hydrotele.prediction.hypothesis import Hypothesis
@@ -28,12 +29,13 @@ UNCERTAINTY: dict[str, float] = {
     "internal_leakage": 0.2, "valve_gain": 0.05, "valve_deadband": 0.1, "spool_lag": 0.1,
     "bulk_modulus": 0.1, "pump_flow_limit": 0.05, "relief_pressure": 0.03, "drive_gain": 0.02,
     "valve_damping": 0.1, "pump_displacement": 0.02, "pump_leakage": 0.3, "pump_torque_loss": 0.1,
-    "motor_constant": 0.05, "motor_inertia": 0.1, "motor_drag": 0.1, "motor_viscous_drag": 0.1,
+    "tank_pressure": 0.2, "motor_constant": 0.05, "motor_inertia": 0.1, "motor_drag": 0.1, "motor_viscous_drag": 0.1,
     "line_compliance": 0.2, "accumulator_pressure": 0.05, "load_relief": 0.03,
     "load_friction": 0.1,
 }  # fmt: skip
 _LENGTHS = ("com_offset", "link_length", "pin_offset")  # relative to the size that they refer to
 _WIDEST = 6.0  # standard deviations to which a number may go; beyond, it is an effect
+_PLAIN = 3.0  # the same of a number that is none of an effect: what it takes at six is another's
 
 
 @dataclass(frozen=True)
@@ -88,8 +90,8 @@ def _states(machine: Machine, kind: str) -> bool:
     return any(key.partition(".")[0] == kind for key in machine.uncertainty)
 
 
-def _narrow(p: Parameter, scale: float) -> Parameter:
-    low, high = p.nominal - _WIDEST * scale, p.nominal + _WIDEST * scale
+def _narrow(p: Parameter, scale: float, widest: float = _WIDEST) -> Parameter:
+    low, high = p.nominal - widest * scale, p.nominal + widest * scale
     return replace(p, low=max(p.low, low), high=min(p.high, high), scale=scale, starts=())
 
 
@@ -129,9 +131,12 @@ def _of_facts(machine: Machine) -> list[Number]:
             places.append(("mass", name, f"links.{name}.mass", "kg", link.mass))
     for name, axis in machine.axes.items():
         if axis.cylinder:
+            path = f"axes.{name}.cylinder"
             for side in ("area_head", "area_rod"):
-                path = f"axes.{name}.cylinder.{side}"
-                places.append(("area", f"{name}.{side}", path, "m^2", getattr(axis.cylinder, side)))
+                size = getattr(axis.cylinder, side)
+                places.append(("area", f"{name}.{side}", f"{path}.{side}", "m^2", size))
+            for part, bar in (("tube", axis.cylinder.tube), ("rod", axis.cylinder.rod)):
+                places.append(("mass", f"{name}.{part}", f"{path}.{part}.mass", "kg", bar.mass))
         if axis.motor:
             path = f"axes.{name}.motor.displacement"
             size = axis.motor.displacement
@@ -147,16 +152,52 @@ def _of_facts(machine: Machine) -> list[Number]:
         if axis.force:
             path = f"axes.{name}.force.gain"
             places.append(("drive_gain", name, path, "N", axis.force.gain))
-    found = []
+    if machine.supply:
+        value = machine.supply.tank_pressure
+        places.append(("tank_pressure", "supply", "supply.tank_pressure", "Pa", value))
+    found = _of_rods(machine)
     for kind, place, path, unit, value in places:
         share = _share(machine, kind, place)
-        if share <= 0.0:
+        if share <= 0.0 or value == 0.0:
             continue
         p = Parameter(unit, value, 0.2 * value, 5.0 * value, share * abs(value), 0.0)
         if value < 0.0:
             p = replace(p, low=5.0 * value, high=0.2 * value)
-        found.append(Number(f"{kind}.{place}", _narrow(p, p.scale), None, partial(_set, path)))
+        p = _narrow(p, p.scale, _PLAIN)
+        found.append(Number(f"{kind}.{place}", p, None, partial(_set, path)))
     return found
+
+
+def _of_rods(machine: Machine) -> list[Number]:
+    """Where rods end: their pins, and the closed lengths that their extensions count from."""
+    found = []
+    for name in linkages(machine):
+        cylinder = machine.axes[name].cylinder
+        assert cylinder
+        size, share = cylinder.closed_length, _share(machine, "pin_offset", name)
+        if share <= 0.0:
+            continue
+        path = f"axes.{name}.cylinder"
+        p = Parameter("m", size, 0.8 * size, 1.2 * size, share * size, 0.0)
+        change = partial(_set, f"{path}.closed_length")
+        found.append(Number(f"closed_length.{name}", _narrow(p, p.scale, _PLAIN), None, change))
+        pin = cylinder.rod_pin.position
+        for way in across(machine, name):
+            at = pin["xyz".index(way)]
+            p = Parameter("m", at, at - 0.1 * size, at + 0.1 * size, share * size, 0.0)
+            change = partial(_set_rod_pin, name, "xyz".index(way))
+            p = _narrow(p, p.scale, _PLAIN)
+            found.append(Number(f"rod_pin.{name}.{way}", p, None, change))
+    return found
+
+
+def _set_rod_pin(axis: str, index: int, machine: Machine, value: float) -> Machine:
+    """One coordinate of a rod's pin; the others stay."""
+    cylinder = machine.axes[axis].cylinder
+    assert cylinder
+    place = list(cylinder.rod_pin.position)
+    place[index] = value
+    return changed(machine, f"axes.{axis}.cylinder.rod_pin.position", tuple(place))
 
 
 def _set(path: str, machine: Machine, value: float) -> Machine:

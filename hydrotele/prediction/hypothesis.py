@@ -125,6 +125,11 @@ class Guess:
         """(P,) all deviations, in order."""
         return np.concatenate([d for _, d in self.parts]) if self.parts else np.zeros(0)
 
+    @property
+    def hypotheses(self) -> list[Hypothesis]:
+        """What is taken together."""
+        return [hypothesis for hypothesis, _ in self.parts]
+
     def at(self, deviation: np.ndarray) -> "Guess":
         """The same hypotheses at other deviations (P,), kept inside their bounds."""
         parts, first = [], 0
