@@ -396,8 +396,9 @@ def step_circuit(
     Spools follow their exact exponential; pressures take one step of the L-stable second-order
     Rosenbrock method ROS2, with piston velocities held over the step. Its Jacobian is diagonal but
     for the supply, by which all fed chambers act on each other (`supply_coupling`, solved by the
-    Sherman-Morrison formula). The supply pressure is solved in both stages. A pump with a time constant follows the mean of what
-    the valves draw at both ends of the step, by its exact exponential.
+    Sherman-Morrison formula). The supply pressure is solved in both stages. A pump with a time
+    constant follows the mean of what the valves draw at both ends of the step, by its exact
+    exponential.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
