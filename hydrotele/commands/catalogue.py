@@ -110,7 +110,8 @@ def _effects() -> list[dict]:
                 "machine": machine.name if places else "",
                 "locations": list(places),
                 "parameters": {
-                    n: {"unit": p.unit, "low": p.low, "high": p.high} for n, p in numbers.items()
+                    n: {"unit": p.unit, "low": p.low, "high": p.high, "optional": p.optional}
+                    for n, p in numbers.items()
                 },
             }
         )

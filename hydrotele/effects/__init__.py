@@ -114,7 +114,8 @@ def apply_effect(
     needed = {key for key, p in known.items() if not p.optional}
     for key in sorted((needed - parameters.keys()) | (parameters.keys() - known.keys())):
         names = ", ".join(f"{k} (may be left out)" if p.optional else k for k, p in known.items())
-        raise InputError(f"effect {name}", f"needs exactly the parameters {names}: {key!r}")
+        what = "is missing" if key in known else "is none of them"
+        raise InputError(f"effect {name}", f"has the parameters {names}; {key!r} {what}")
     for key, value in parameters.items():
         limits = known[key]
         if math.isnan(value) or not limits.low <= value <= limits.high:

@@ -5,12 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
-from hydrotele.prediction.evidence import MIDDLE, Evidence, Judged, charge
+from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
 from hydrotele.prediction.track import COARSE
 
 BEYOND = 15.0  # twice the log evidence that a number must bring to be an effect of its own
 _RIGHT = 0.2  # of the stated uncertainty, by which numbers move that are right
+_INFORMED = 0.5  # of the stated uncertainty is left of a number that the runs tell
+_SEVERAL = 8  # of them say what is usual
 _ROUNDS = 2  # of levels and fit; `search.settle` does the rest
 _SETTLED = 15.0  # fall of the loss that is worth another round
 
@@ -54,12 +56,36 @@ def calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
     return (judged, gain) if gain > 0.0 else (None, 0.0)
 
 
-def promoted(evidence: Evidence, now: Judged, candidates: Sequence[Hypothesis]) -> Guess | None:
+def _usual(deviation: np.ndarray, spread: np.ndarray) -> float:
+    """By how much numbers deviate, in stated uncertainties, as those that the runs tell do.
+
+    Never less than stated, but where nearly all of at least a few are right.
+
+    >>> import numpy as np
+    >>> _usual(np.full(20, 0.7), np.full(20, 0.1)), _usual(np.full(20, 2.0), np.full(20, 0.1)) > 2.9
+    (1.0, True)
+    >>> _usual(np.full(20, 0.05), np.full(20, 0.1)), _usual(np.full(20, 0.05), np.ones(20))
+    (0.2, 1.0)
+    """
+    told = np.abs(deviation[spread < _INFORMED])
+    usual = 1.4826 * float(np.median(told)) if len(told) >= _SEVERAL else 1.0
+    between = (usual - _RIGHT) / _RIGHT  # the rule fades out, it does not flip
+    return max(usual, float(np.clip(_RIGHT + (1.0 - _RIGHT) * between, _RIGHT, 1.0)))
+
+
+def promoted(
+    evidence: Evidence, now: Judged, fit: Fit, candidates: Sequence[Hypothesis]
+) -> Guess | None:
     """A guess in which numbers that calibration moves too far are effects; None if there is none.
 
-    What the others move by is what uncertain means: the scale of all deviations, if it is larger
-    than the stated one, is taken for each. Where nearly all others are right, one that is not is an
-    effect, stated uncertainty or not.
+    What the others move by is what uncertain means (`_usual`). Where nearly all others are right,
+    one that is not is an effect, stated uncertainty or not.
+
+    Args:
+        evidence: the runs.
+        now: a guess, judged.
+        fit: that led to it.
+        candidates: the hypotheses.
     """
     place = next((i for i, (h, _) in enumerate(now.guess.parts) if h.name == CALIBRATION), -1)
     if place < 0:
@@ -67,8 +93,9 @@ def promoted(evidence: Evidence, now: Judged, candidates: Sequence[Hypothesis]) 
     group, deviation = now.guess.parts[place]
     table = numbers(evidence.data.machine)
     keys = list(group.parameters)
-    usual = 1.4826 * float(np.median(np.abs(deviation)))
-    usual = _RIGHT if usual < _RIGHT else max(1.0, usual)
+    first = sum(h.size for h, _ in now.guess.parts[:place])
+    spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))[first : first + group.size]
+    usual = _usual(deviation, spread)
     moved: dict[tuple[str, str], float] = {}
     for key, d in zip(keys, deviation, strict=True):
         effect = table[key].effect

@@ -10,6 +10,7 @@ inside the machine, and kept if it is worth its parameters. It is a term of the 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, count
 from typing import NamedTuple
 
 import numpy as np
@@ -85,12 +86,16 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
         The guess with the laws that are worth their parameters.
     """
     laws: list[Learned] = []
-    begin, ahead = judged.loss, _open_loop(evidence, judged)
+    noise = judged.tracks[0].levels.noise  # the same for all laws: each finds other levels
+    begin, ahead = judged.loss, _open_loop(evidence, judged, noise)
     for _ in range(_MOST):
         evidence.set_base(judged)
         seen = [_see(evidence.data.machine, judged, track) for track in judged.tracks]
         found = _best_law(evidence, judged, _candidates(evidence, judged, seen, laws))
-        if found is None or not (now := _open_loop(evidence, found[0])) < ahead:
+        if found is None:
+            break
+        now = _open_loop(evidence, found[0], noise)
+        if not (now < ahead or np.isnan(now)):
             break
         ahead, fall = now, judged.loss - found[0].loss
         judged, law = found
@@ -119,21 +124,22 @@ def _best_law(
     return None
 
 
-def _open_loop(evidence: Evidence, judged: Judged) -> float:
-    """RMS error of free runs through the fit runs over all channels, in units of their noise.
+def _open_loop(evidence: Evidence, judged: Judged, noise: np.ndarray) -> float:
+    """RMS error of free runs through the fit runs over all channels, in units of a noise (c,).
 
-    A law is to make simulations better, not only predictions from one reading to the next.
+    A law is to make simulations better, not only predictions from one reading to the next. Of each
+    channel the median window counts, as one that diverges says nothing of the others. NaN where all
+    runs are shorter than a window.
     """
-    noise = judged.tracks[0].levels.noise
     prepare = machine_runner(judged.guess.machine(evidence.data.machine), evidence.data, _STEP)
 
     def sizes(run: RunData) -> np.ndarray:
         errors = free_run_errors(prepare(run), run, (_AHEAD,), to_end=False)
-        return np.array([horizon.rms / noise for horizon in errors.horizons.values()])
+        return np.array([horizon.median / noise for horizon in errors.horizons.values()])
 
     found = np.concatenate([part.ravel() for part in evidence.map(sizes, evidence.runs)])
     found = found[~np.isnan(found)]
-    return float(np.sqrt(np.mean(found**2))) if len(found) else 0.0
+    return float(np.sqrt(np.mean(found**2))) if len(found) else np.nan
 
 
 class _Seen(NamedTuple):
@@ -230,9 +236,15 @@ def _candidates(
     looked = list(zip(cases, evidence.map(look, cases), strict=True))
     looked = [pair for pair in looked if pair[1].predicted > ENTER]
     looked.sort(key=lambda pair: -pair[1].predicted)
-    found = [_law(machine, case, answer, seen) for case, answer in looked[: 2 * _TRIED]]
-    known = {law.hypothesis.key for law in laws}  # what the chosen products leave may be known
-    return [pair for pair in found if pair[0].hypothesis.key not in known][:_TRIED]
+    known, found = {law.hypothesis.key for law in laws}, []
+    for case, answer in looked:  # what the chosen products leave may be known already
+        law, start = _law(machine, case, answer, seen)
+        if law.hypothesis.key not in known:
+            known.add(law.hypothesis.key)
+            found.append((law, start))
+        if len(found) == _TRIED:
+            break
+    return found
 
 
 def _smoothing(machine: Machine, axis: str) -> float:
@@ -262,9 +274,11 @@ def _law(
         sides = (
             (("flow_head", -1.0), ("flow_rod", 1.0)) if balance == THROUGH else ((balance, 1.0),)
         )
+        taken = {term.name for term in terms if term.axis == i.axis}
+        own = next(n for n in chain([name], (f"{name}_{k}" for k in count(2))) if n not in taken)
         for side, sign in sides:
             terms.append(Term.model_validate({
-                "name": name, "axis": i.axis, "balance": side, "law": "formula",
+                "name": own, "axis": i.axis, "balance": side, "law": "formula",
                 "parameters": {p: sign * value for p, value in coefficients.items()},
                 "domain": domain, "uncertainty": found.left,
                 "description": f"learned from data: {balance} over {shape.name}",

@@ -25,7 +25,6 @@ from hydrotele.prediction.levels import input_excess
 from hydrotele.prediction.track import COARSE
 
 ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines stay below 14.7
-_TRACE = 2.0e-3  # of all that was gained: below it an effect is none where all numbers are off
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
@@ -102,13 +101,13 @@ def search(
             open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
             ranked = screen(evidence, now.guess, open_ones)
             first = first or tuple(ranked)
-        bar = _bar(base, now)
-        options = _best_singles(evidence, now, ranked, bar)
+        options = _best_singles(evidence, now, ranked)
         if not options and lacking(now, evidence) > LACKING and len(ranked) > 1:
-            options = _best_pairs(evidence, now, ranked, bar)
-        if teeth and not now.guess.parts:
-            gain = base.loss - teeth.loss
-            options = sorted([(teeth, gain), *options], key=lambda pair: -pair[1])
+            options = _best_pairs(evidence, now, ranked)
+        if teeth and not now.guess.parts:  # once: what is refused does not come back
+            options.append((teeth, base.loss - teeth.loss - ENTER))
+            options.sort(key=lambda pair: -pair[1])
+            teeth = None
         small = []
         while options and not worth_naming(options[0][0].guess, -1, options[0][1]):
             judged, worth = options.pop(0)
@@ -126,7 +125,7 @@ def search(
             tell(f"fit {added.name.replace('_', ' ')}", done + 0.02)
             grown, settled = settle(evidence, best)
             worth = now.loss - grown.loss - settled.charge
-            if worth < bar or strained(grown.guess, -1) or not told(grown.guess, settled):
+            if worth < ENTER or strained(grown.guess, -1) or not told(grown.guess, settled):
                 evidence.set_base(now)
                 candidates = [c for c in candidates if c.key != added.key]
                 ranked = [r for r in ranked if r.hypothesis.key != added.key]
@@ -141,7 +140,7 @@ def search(
             tried = True
             evidence.set_base(now)
             other, gain = calibrated(evidence, now)
-            if other and gain > max(worth, bar):
+            if other and gain > max(worth, ENTER):
                 best = other
                 grown, settled = settle(evidence, other)
             elif best:
@@ -156,7 +155,7 @@ def search(
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = ranked
         now, fit, ranked = grown, settled, None
-        if own := promoted(evidence, now, candidates):
+        if fit and (own := promoted(evidence, now, fit, candidates)):
             now, fit = settle(evidence, evidence.judged(own))
     tell("drop what is needless", 0.87)
     now, fit, without = _pruned(evidence, base, now, fit)
@@ -179,6 +178,7 @@ def search(
             without = tuple(without[i] for i in order)
             charges, rivals = [charges[i] for i in order], [rivals[i] for i in order]
             break
+    evidence.set_base(now)
     for index, others in enumerate(rivals):
         rivals[index] = tuple(
             r for r in others if not is_case_of(evidence, now.guess, index, r.hypothesis)
@@ -211,43 +211,32 @@ def _named_so_far(guess: Guess) -> int:
     return sum(h.name != CALIBRATION for h, _ in guess.parts)
 
 
-def _bar(base: Judged, now: Judged) -> float:
-    """What an effect must bring.
-
-    Where all numbers are off, so are some that are not among the calibrated ones; what they leave
-    looks like an effect that closes a trace of the gap.
-    """
-    if not calibration_of(now.guess):
-        return ENTER
-    return max(ENTER, _TRACE * (base.loss - now.loss))
-
-
 def _best_singles(
-    evidence: Evidence, now: Judged, ranked: Sequence[Screened], enter: float
+    evidence: Evidence, now: Judged, ranked: Sequence[Screened]
 ) -> list[tuple[Judged, float]]:
     """The best of the first few candidates that bring enough, judged, and their scores."""
-    bar = max(0.5 * enter, _WORTH * ranked[0].score) if ranked else 0.0
+    bar = max(0.5 * ENTER, _WORTH * ranked[0].score) if ranked else 0.0
     short = [s for s in ranked[:_SHORT] if s.score > bar]
     if not short:
         return []
     fits = fitted(evidence, now, short)
-    inside = [fit for fit in fits if fit.score > enter and not strained(fit.guess, -1)]
+    inside = [fit for fit in fits if fit.score > ENTER and not strained(fit.guess, -1)]
     close = [f for f in (inside or fits)[:_JUDGED] if f.score > _NEAR * fits[0].score]
-    return _judged_best(evidence, now, [f for f in close if f.score > 0.5 * enter], enter)
+    return _judged_best(evidence, now, [f for f in close if f.score > 0.5 * ENTER])
 
 
 def _judged_best(
-    evidence: Evidence, now: Judged, fits: Sequence[Fit], enter: float
+    evidence: Evidence, now: Judged, fits: Sequence[Fit]
 ) -> list[tuple[Judged, float]]:
     """Those fits that bring enough with levels of their own, and their scores, best first."""
     judged = [evidence.judged(fit.guess) for fit in fits]
     scores = [now.loss - j.loss - fit.charge for j, fit in zip(judged, fits, strict=True)]
-    found = [(j, score) for j, score in zip(judged, scores, strict=True) if score >= enter]
+    found = [(j, score) for j, score in zip(judged, scores, strict=True) if score >= ENTER]
     return sorted(found, key=lambda pair: -pair[1])
 
 
 def _best_pairs(
-    evidence: Evidence, now: Judged, ranked: Sequence[Screened], enter: float
+    evidence: Evidence, now: Judged, ranked: Sequence[Screened]
 ) -> list[tuple[Judged, float]]:
     """The best pairs of effects where no single one helps, judged, and their scores."""
     pool = list(ranked[:_PAIRED])
@@ -280,9 +269,9 @@ def _best_pairs(
         return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
                    found.information)  # fmt: skip
 
-    fits = [f for f in evidence.map(fit_pair, pairs) if f.score > enter
+    fits = [f for f in evidence.map(fit_pair, pairs) if f.score > ENTER
             and not strained(f.guess, -1) and not strained(f.guess, -2)]  # fmt: skip
-    return _judged_best(evidence, now, fits, enter)
+    return _judged_best(evidence, now, fits)
 
 
 def worth_naming(guess: Guess, index: int, score: float) -> bool:
@@ -307,7 +296,7 @@ def _pruned(
     """Take out effects that the others have made needless; each effect's rest, judged."""
     while True:
         rests, scores = _rests(evidence, base, now, fit)
-        if len(scores) < 2 or min(scores) >= _bar(base, now):
+        if len(scores) < 2 or min(scores) >= ENTER:
             return now, fit, tuple(rests)
         worst = rests[int(np.argmin(scores))]
         assert worst

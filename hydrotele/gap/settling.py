@@ -44,12 +44,13 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
 
 def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
     """Fit with levels and gains computed anew until they no longer matter."""
-    fit, guess, kept = None, judged.guess, None
+    fit, last, guess, kept = None, None, judged.guess, None
     group = calibration_of(guess)
     for _ in range(_SETTLES):
         evidence.set_base(judged)
         if group and kept is None:
             kept = evidence.base_slopes(evidence.slope_step)
+        last = fit
         fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if group else None)
         moved = fit.guess.deviation - judged.guess.deviation
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
@@ -59,7 +60,7 @@ def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
         before, judged = judged, evidence.judged(guess, same=True)
         fall = before.loss - judged.loss
         if not fall > -_WORSE:  # a likelihood full of dents, as that of teeth, misleads its slopes
-            guess = before.guess
+            guess, fit = before.guess, last or fit
             evidence.set_base(before)
             break
         if group and fall < _IDLE:

@@ -1,18 +1,11 @@
 """What the terms of a machine see and add: the state of a drive, and commands with their terms."""
 
 from hydrotele.compiled import compiled
-from hydrotele.hydraulics.circuit import (
-    SLOTS,
-    Slot,
-    delivered_share,
-    open_ports,
-    supply_pressure,
-)
+from hydrotele.hydraulics.circuit import SLOTS, Slot, circuit_supply, delivered_share, open_ports
 from hydrotele.terms.law import DriveState
 from hydrotele.terms.table import COMMAND, added
 
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
-_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 
 
 @compiled
@@ -68,8 +61,7 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
         Nothing.
     """
     open_ports(user, act, act, scratch, 0, count, 0.0, act)
-    flow = user[_PUMP] * delivered_share(user, 0, act)
-    supply = supply_pressure(scratch, count, user[_D], user[_RELIEF], flow)
+    supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
     middle = time + 0.5 * dt
     for i in range(count):
         x = length[i] - 0.5 * dt * velocity[i]

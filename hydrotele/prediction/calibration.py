@@ -104,6 +104,8 @@ def _of_effects(machine: Machine) -> list[Number]:
         for location in effect.locations(machine):
             share = _share(machine, name, location)
             for key, p in effect.parameters(machine, location).items():
+                if p.optional:
+                    continue
                 size = abs(p.nominal)
                 if stated and size == 0.0:
                     size = p.scale

@@ -8,8 +8,14 @@ from scipy.optimize import fminbound
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import load_position, place
 from hydrotele.dynamics.model import Model, model_space
-from hydrotele.hydraulics.circuit import SLOTS, Slot
-from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.hydraulics.circuit import (
+    SLOTS,
+    Slot,
+    circuit_scratch,
+    open_ports,
+    wanted_share,
+)
+from hydrotele.hydraulics.parameters import DELIVERY, actuator_order
 from hydrotele.machine import Machine
 
 _LATEST = 1.0  # s after which a channel's first reading says nothing of the start
@@ -23,6 +29,7 @@ _SLIP = 0.01  # m/s or rad/s, rate at which a drive may leave its load
 _LOOSE = 0.02  # of the backlash, within which a drive's rest is known once it was looked for
 _ROUGH = 1e5  # Pa, of a pressure's mean over the first rows
 _GRID, _FINE = 7, 0.01  # rests that are tried at first, and how fine they are at last
+_MOVED = {"spool": 1.0, "spool_rate": 25.0}  # per command at the start, what it may be off by
 _BLIND = {"pressure_head": 5e6, "pressure_rod": 5e6}
 
 
@@ -60,13 +67,27 @@ def start_state(
         if kind == "position":
             channel = f"{machine.position_kind(axis)}.{axis}" if axis in order else ""
             state[s] = shown.get(channel, machine.home.get(place, 0.0))
+        elif kind in _MOVED:  # the command has been there for long, or has just come
+            given = float(np.clip(run.command[0, order.index(axis)], -1.0, 1.0))
+            state[s] = given if kind == "spool" else 0.0
+            wide[s] = np.hypot(wide[s], _MOVED[kind] * given)
         elif kind in _BLIND:  # a load cylinder rests without pressure, and none shows it
             state[s] = shown.get(f"{kind}.{axis}", 3e6)
             if f"{kind}.{axis}" not in shown:
                 wide[s] = _BLIND[kind]
+    if DELIVERY in names:
+        state[names.index(DELIVERY)] = _drawn(model, state)
     spread = np.diag(wide**2)
     _place_drives(model, state, spread, np.zeros(len(model.transmission)) if rest is None else rest)
     return state, spread
+
+
+def _drawn(model: Model, state: np.ndarray) -> float:
+    """Share of its flow that a pump gives whose valves have stood where they stand."""
+    act = state[2 * (len(model.mech.free) + len(model.transmission)) :]
+    ports = circuit_scratch()
+    open_ports(model.user, act, act, ports, 0, model.hydraulic, 0.0, act)
+    return wanted_share(model.user, 0, model.hydraulic, ports)
 
 
 def _first_rows(run: RunData, c: int) -> int:

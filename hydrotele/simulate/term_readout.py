@@ -7,17 +7,14 @@ from hydrotele.compiled import compiled
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS,
     SCRATCH,
-    Slot,
+    circuit_supply,
     delivered_share,
     open_ports,
-    supply_pressure,
 )
 from hydrotele.hydraulics.drive_terms import drive_state
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
 from hydrotele.machine import Machine
 from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added, terms_table
-
-_D, _RELIEF, _PUMP = int(Slot.ORIFICE_SMOOTHING), int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 
 
 def added_by_terms(
@@ -61,8 +58,8 @@ def _evaluate(user, terms, count, gain, time, act, x, v, command, out):
         supply = 0.0
         if count > 0:
             open_ports(user, act[row], act[row], scratch, 0, count, 0.0, act[row])
-            flow = user[_PUMP] * delivered_share(user, 0, act[row])
-            supply = supply_pressure(scratch, count, user[_D], user[_RELIEF], flow)
+            share = delivered_share(user, 0, act[row])
+            supply = circuit_supply(user, 0, count, scratch, share)
         for i in range(len(gain)):
             s = drive_state(
                 user, i, count, act[row], supply, time[row], x[row, i], v[row, i], command[row, i],

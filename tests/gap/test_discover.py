@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from hydrotele.dataset.load import load_dataset
+from hydrotele.gap.discover import _law, _Seen
 from hydrotele.gap.find import find_gap
+from hydrotele.gap.law_regression import Regression
 from hydrotele.gap.law_shapes import Shape, possible_shapes
 from hydrotele.log import save_log
 from hydrotele.machine_file import load_machine, save_machine
@@ -85,6 +87,22 @@ def test_answers_of_the_errors_are_those_of_a_simulated_term():
     off = np.linalg.norm((with_it - without)[1:] - told, axis=1) / np.linalg.norm(told, axis=1)
     # Where a check valve or friction switches within a row, the linear answer is another one.
     assert np.median(off) < 0.1
+
+
+def test_two_laws_of_one_balance_are_written_and_read(tmp_path):
+    """A machine that learned twice, or learns again after it was patched, is still a machine."""
+    rig, case = load_machine("rig"), Input("flow_head", "slide")
+    seen = _Seen({"slide": {"position": np.array([0.0, 0.4]), "velocity": np.array([-1.0, 1.0])}},
+                 np.ones(2, bool))  # fmt: skip
+    found = Regression(1.0, (1,), np.ones(1), np.ones(1), 0.1)
+    patched = rig
+    for variable in ("position", "velocity", "position"):
+        shape = Shape(variable, "", (0.1,), "", ())
+        for balance in ("flow_head", "flow_through"):
+            law, start = _law(patched, (case, balance, shape), found, [seen])
+            patched = law.hypothesis.machine(patched, start)
+    save_machine(patched, tmp_path / "machine.yaml")
+    assert len(load_machine(str(tmp_path / "machine.yaml")).terms) == 9  # through is on both sides
 
 
 def test_products_of_two_variables_are_bilinear_between_their_kinks():

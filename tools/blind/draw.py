@@ -55,7 +55,7 @@ def draw_effect(machine: Machine, rng: np.random.Generator) -> Planted:
     effect = EFFECTS[str(rng.choice(sorted(n for n in EFFECTS if EFFECTS[n].locations(machine))))]
     location = str(rng.choice(effect.locations(machine)))
     parameters = effect.parameters(machine, location)
-    values = {name: draw_value(p, rng) for name, p in parameters.items()}
+    values = {name: draw_value(p, rng) for name, p in parameters.items() if not p.optional}
     return Planted(effect.name, location, values)
 
 
