@@ -41,10 +41,13 @@ def calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
         return None, 0.0
     judged, gain, cost = now, 0.0, 0.0
     guess = now.guess.plus(group, np.zeros(group.size))
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS):
         step = evidence.step_of(guess, MIDDLE)
         coarse = evidence.step_of(guess, COARSE)
-        slopes = evidence.slopes(guess, evidence.errors(guess, coarse), step=coarse)
+        if turn:
+            slopes = evidence.base_slopes(coarse)
+        else:
+            slopes = evidence.slopes(guess, evidence.errors(guess, coarse), step=coarse)
         fit = evidence.fit(guess, 0.0, step=step, kept=slopes, steps=3)
         before, judged = judged.loss, evidence.judged(fit.guess)
         guess, cost = fit.guess, charge(fit.information, group.size)

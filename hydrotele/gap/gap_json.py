@@ -21,8 +21,8 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         gap that comes back without the effect.
         `calibration`: uncertain number -> `value`, `nominal`, `unit`, `ci95`.
         `learned`: laws learned from the data: `balance` (force, flow_head, flow_rod, flow_through,
-        command), `axis`, `variable`, `other` (a second variable, or empty), `formula` in SI, `points`
-        [`variable_unit`], `values` there and their standard deviations `spread` [`unit`],
+        command), `axis`, `variable`, `other` (a second variable, or empty), `formula` in SI,
+        `points` [`variable_unit`], `values` there and their standard deviations `spread` [`unit`],
         `resembles` (a library effect or null), `share`, `description`.
         `unknown`: what no effect explains, or null: `law`, `channel`, `depends_on`, `windows`
         [s], `description`.

@@ -17,7 +17,7 @@ from hydrotele.gap.pulses import timed
 from hydrotele.gap.rattling import rattling
 from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of
 from hydrotele.gap.screening import Screened, screen
-from hydrotele.gap.settling import fitted, loss_of, settle, strained, widened
+from hydrotele.gap.settling import fitted, loss_of, polished, settle, strained, widened
 from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
@@ -178,7 +178,10 @@ def search(
             without = tuple(without[i] for i in order)
             charges, rivals = [charges[i] for i in order], [rivals[i] for i in order]
             break
-    evidence.set_base(now)
+    if calibration_of(now.guess):
+        now, fit = polished(evidence, now)
+    else:
+        evidence.set_base(now)
     for index, others in enumerate(rivals):
         rivals[index] = tuple(
             r for r in others if not is_case_of(evidence, now.guess, index, r.hypothesis)

@@ -32,6 +32,7 @@ MIDDLE = 2.0e-3  # s, step at which guesses are fitted
 _MANY = 10  # numbers of a base from which their slopes are taken at a coarser step
 BLOCK = 2.0  # s of a run that count as one witness: longer than what a model lacks remembers
 _ROUNDS = 2  # of linearisation for the levels of the first base; later ones start from near by
+_MOVE = 1.0  # of the errors, by which they are moved for the slopes of many numbers
 _CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
 
 
@@ -96,6 +97,7 @@ class Evidence:
         self.tracks: tuple[Track, ...] = ()
         self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
         self._slopes = dict[float, np.ndarray]()
+        self._directions: tuple[list[str], np.ndarray] | None = None
 
     def close(self) -> None:
         """End the workers."""
@@ -226,12 +228,43 @@ class Evidence:
         return COARSE if len(self._base.deviation) > _MANY else MIDDLE
 
     def base_slopes(self, step: float | None = None, parallel: bool = True) -> np.ndarray:
-        """(E, P) slopes of the base, kept until there is another base."""
+        """(E, P) slopes of the base, kept until there is another base.
+
+        Many numbers together may hardly show, as a scale of all areas, flows and masses, although
+        each alone does; the differences of the single slopes are then their errors. So slopes are
+        taken a second time along the principal directions of the first ones (or of those of the
+        base before, if it has the same numbers).
+        """
         step = step or self.step
         if step not in self._slopes:
-            errors = self.errors(self._base, step)
-            self._slopes[step] = self.slopes(self._base, errors, parallel, step)
+            errors, names = self.errors(self._base, step), self._base.names
+            if len(names) <= _MANY:
+                self._slopes[step] = self.slopes(self._base, errors, parallel, step)
+                return self._slopes[step]
+            if self._directions is None or self._directions[0] != names:
+                rough = self.slopes(self._base, errors, parallel, step)
+                self._directions = names, rough.T @ rough + np.eye(len(names))
+            found = self._along(self._directions[1], errors, parallel, step)
+            self._directions = names, found.T @ found + np.eye(len(names))
+            self._slopes[step] = found
         return self._slopes[step]
+
+    def _along(
+        self, information: np.ndarray, errors: np.ndarray, parallel: bool, step: float
+    ) -> np.ndarray:
+        """(E, P) slopes of the base from differences along the directions of an information."""
+        base, sizes, ways = self._base, *np.linalg.eigh(information)
+        here = base.deviation
+        moves = (_MOVE / np.sqrt(sizes)) * ways
+        for way in moves.T:  # to the side where bounds leave more room
+            ahead, back = (base.at(here + s * way).deviation - here for s in (1.0, -1.0))
+            way[:] = ahead if ahead @ ahead >= back @ back else back
+
+        def change(way: np.ndarray) -> np.ndarray:
+            return self.errors(base.at(here + way), step) - errors
+
+        changes = self.map(change, moves.T) if parallel else [change(way) for way in moves.T]
+        return np.linalg.lstsq(moves.T, np.array(changes), rcond=1e-12)[0].T
 
     def base_slopes_of(self, tracks: Sequence[Track]) -> np.ndarray:
         """(E, P) slopes of the base in some of its tracks, or in the first rows of them."""

@@ -130,6 +130,11 @@ class Guess:
         """What is taken together."""
         return [hypothesis for hypothesis, _ in self.parts]
 
+    @property
+    def names(self) -> list[str]:
+        """(P,) names of all numbers, in order."""
+        return [f"{h.name}.{h.location}.{key}" for h in self.hypotheses for key in h.parameters]
+
     def at(self, deviation: np.ndarray) -> "Guess":
         """The same hypotheses at other deviations (P,), kept inside their bounds."""
         parts, first = [], 0
