@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from hydrotele.hydraulics import circuit, valve
+from hydrotele.hydraulics import circuit, supply, valve
 from hydrotele.hydraulics import laws as hydraulics
 from hydrotele.hydraulics.laws import (
     friction,
@@ -36,7 +36,9 @@ def laws(module):
     }
 
 
-LAWS = {f"{m.__name__}.{n}": f for m in (hydraulics, valve, circuit) for n, f in laws(m).items()}
+LAWS = {
+    f"{m.__name__}.{n}": f for m in (hydraulics, valve, supply, circuit) for n, f in laws(m).items()
+}
 
 
 def section(text, title):
@@ -60,8 +62,9 @@ def test_docstring_names_every_argument_with_its_unit(name):
 def test_doctests_run():
     examples = failures = 0
     for name, law in LAWS.items():
-        for test in doctest.DocTestFinder().find(law.py_func, name, globs=dict(vars(hydraulics))):
-            test.globs.update(vars(circuit))
+        for test in doctest.DocTestFinder().find(
+            law.py_func, name, globs=dict(law.py_func.__globals__)
+        ):
             result = doctest.DocTestRunner().run(test)
             examples, failures = examples + result.attempted, failures + result.failed
     assert failures == 0

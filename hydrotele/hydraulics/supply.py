@@ -1,0 +1,266 @@
+"""The supply that valves share: its pressure from what they draw, and a pump that follows late.
+
+Flat arrays are laid out as in `circuit`; `ports` holds four numbers per axis, see `open_ports`.
+"""
+
+import math
+
+from hydrotele.compiled import compiled
+from hydrotele.hydraulics.slots import SLOTS, Kind, Slot
+from hydrotele.hydraulics.valve import axis_opening, inlet_flow, inlet_gain
+
+_NEWTON_STEPS = 60
+_FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the flow balance of 1e-6 that is promised
+_LEAST_SHARE = 1.0e-6  # of a pump's flow that it always gives, so that its pressure is determined
+
+_D, _TANK = int(Slot.ORIFICE_SMOOTHING), int(Slot.TANK_PRESSURE)
+_RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
+_MARGIN, _DROOP = int(Slot.LOAD_SENSING_MARGIN), int(Slot.PUMP_DROOP)
+_DROP = int(Slot.COMPENSATED_DROP)
+_LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
+_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
+
+
+@compiled
+def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0):
+    """Largest pressure up to the relief setting at which the valves draw no more than the pump.
+
+    Solves `sum_i k_i g(min(p_s - p_i, d_i)) = Q_pump - c_p p_s` over the valves whose load check is
+    open, by Newton's method in `sqrt(p_s - min p_i)` inside a bracket, which is halved where Newton
+    fails.
+
+    Args:
+        ports: (>= 4 count,) per axis `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa], the drop `d_i` that
+            its compensator holds [Pa], 0 without one, and a place that is not read.
+        count: number of axes.
+        smoothing: orifice smoothing d, scalar [Pa].
+        relief: relief setting, scalar [Pa].
+        pump_flow: Q_pump, scalar [m^3/s].
+        droop: c_p, by which the pump's flow falls with its pressure, scalar [m^3/(s Pa)].
+
+    Returns:
+        p_s, scalar [Pa].
+
+    Source: nominal model, "Supply"; droop: leakage proportional to the pressure (Merritt 1967).
+
+    >>> import numpy as np
+    >>> one_valve = np.array([2.0e-6, 5.0e6, 0.0, 0.0])
+    >>> round(supply_pressure(one_valve, 1, 5.0e4, 28.0e6, 5.0e-3) / 1e6, 3)
+    11.25
+    """
+    low, high, p, last = relief, relief, relief, math.inf
+    for i in range(count):
+        if ports[4 * i] > 0.0:
+            low = min(low, ports[4 * i + 1])
+    floor = low
+    for _ in range(_NEWTON_STEPS):
+        demand, slope = 0.0, 0.0
+        for i in range(count):
+            drop = p - ports[4 * i + 1]
+            if drop > 0.0 and ports[4 * i] > 0.0:
+                flow, gain = inlet_flow(drop, ports[4 * i], smoothing, ports[4 * i + 2])
+                demand += flow
+                slope += gain
+        excess = demand - pump_flow
+        if droop > 0.0:
+            excess += droop * p
+            slope += droop
+        if excess > 0.0:
+            high = p
+        elif p == relief:
+            return relief
+        else:
+            low = p
+        if abs(excess) <= _FLOW_TOLERANCE * pump_flow or high - low <= 1.0e-15 * relief:
+            return p
+        root = math.sqrt(p - floor) if p > floor else 0.0
+        guess = -1.0
+        if slope > 0.0 and root > 0.0 and abs(excess) < 0.5 * last:  # else Newton may cycle
+            root -= excess / (2.0 * slope * root)
+            if root > 0.0:
+                guess = floor + root * root
+        last = abs(excess)
+        p = guess if low < guess < high else 0.5 * (low + high)
+    return p
+
+
+@compiled
+def open_ports(user, act, spool, ports, first, count, ahead, rate):
+    """Flow gain and supply-side pressure of every axis, for `supply_pressure`.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        act: (4 count,) activations; pressures [Pa].
+        spool: (4 count,) array whose every fourth entry is the spool position to use [1].
+        ports: (>= 4 count,) written: `k_i` [m^3/(s sqrt(Pa))], `p_i` and `d_i` [Pa], opening
+            [1].
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        ahead: time to look ahead with `rate`, scalar [s].
+        rate: (4 count,) array with pressure rates at places 2 and 3 of every axis [Pa/s].
+
+    Returns:
+        Nothing; `ports` is filled.
+
+    Source: nominal model, "Orifice".
+    """
+    for i in range(count):
+        u = (first + i) * SLOTS
+        if user[u + _KIND] == _PUMPED:  # draws nothing from the supply
+            ports[4 * i], ports[4 * i + 3] = 0.0, spool[4 * i]
+            continue
+        opening = axis_opening(user, u, spool[4 * i])
+        ports[4 * i] = inlet_gain(user, u, opening)
+        ports[4 * i + 2], ports[4 * i + 3] = user[u + _DROP], opening
+        side = 2 if opening > 0.0 else 3
+        ports[4 * i + 1] = act[4 * i + side]
+        if ahead != 0.0:
+            ports[4 * i + 1] += ahead * rate[4 * i + side]
+
+
+@compiled
+def delivered_share(user, first, act):
+    """Share of its largest flow that the pump is set to: 1 where it follows at once.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        act: (>= 4 count + MEMORY,) activations, whose DELIVERY is read where there is a lag [1].
+
+    Returns:
+        Share, scalar [1].
+
+    Source: `wanted_share`.
+    """
+    s = first * SLOTS
+    if user[s + _LAG] == 0.0:
+        return 1.0
+    return min(1.0, max(_LEAST_SHARE, act[int(user[s + _DELIVERY])]))
+
+
+@compiled
+def pump_response(user, first, wanted, share, dt):
+    """Share of its largest flow that the pump is set to after a time, by the exact exponential.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        wanted: as of `wanted_share`, held, scalar [1].
+        share: at the start, scalar [1].
+        dt: scalar [s].
+
+    Returns:
+        Share, scalar [1]: 1 where the pump follows at once.
+
+    Source: `wanted_share`.
+    """
+    lag = user[first * SLOTS + _LAG]
+    return wanted + (share - wanted) * math.exp(-dt / lag) if lag > 0.0 else 1.0
+
+
+@compiled
+def wanted_share(user, first, count, ports):
+    """Share of its largest flow that the valves draw from a pump that follows at once.
+
+    `q = (sum_i q_i + c_p p_s) / Q_pump` at the pressure p_s of such a pump. One with a time
+    constant T has `T q' = q_wanted - q` and gives q Q_pump at most: while it swashes out the
+    pressure falls to where the valves draw no more; while it swashes back, what is too much goes
+    over the relief or unloading valve.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+
+    Returns:
+        q, scalar [1], 0 .. 1.
+
+    Source: nominal model, "Supply"; first-order swash plate: Merritt 1967, sec. 8-6.
+    """
+    s = first * SLOTS
+    supply = circuit_supply(user, first, count, ports)
+    drawn = user[s + _DROOP] * supply
+    for i in range(count):
+        drop = supply - ports[4 * i + 1]
+        if drop > 0.0 and ports[4 * i] > 0.0:
+            drawn += inlet_flow(drop, ports[4 * i], user[s + _D], ports[4 * i + 2])[0]
+    return min(1.0, drawn / user[s + _PUMP])
+
+
+@compiled
+def circuit_supply(user, first, count, ports, share=1.0):
+    """Supply pressure of a circuit: what pump and relief give, or what load sensing asks for.
+
+    A load-sensing pump holds `max p_i + margin` over the open valves (tank pressure counts as a
+    load), as far as relief setting and flow allow.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        share: of its largest flow that the pump is set to, scalar [1], > 0.
+
+    Returns:
+        p_s, scalar [Pa].
+
+    Source: nominal model, "Supply".
+    """
+    s = first * SLOTS
+    most = user[s + _RELIEF]
+    if user[s + _MARGIN] > 0.0:
+        load = user[s + _TANK]
+        for i in range(count):
+            if ports[4 * i] > 0.0:
+                load = max(load, ports[4 * i + 1])
+        most = min(most, load + user[s + _MARGIN])
+    flow = user[s + _PUMP] * share
+    return supply_pressure(ports, count, user[s + _D], most, flow, user[s + _DROOP])
+
+
+@compiled
+def supply_coupling(user, first, count, ports, supply, out):
+    """How the supply pressure follows the chambers that it feeds.
+
+    `dp_s/dp_i` is `g_i / (sum_j g_j + c_p)` where the pump's flow is short, 1 for the largest load
+    where load sensing holds its margin, 0 at the relief setting; g_i is the slope of an inlet's
+    flow with its drop.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        supply: p_s, as of `circuit_supply`, scalar [Pa].
+        out: (>= 4 count,) written at places 2 and 3 of every axis: g_i [m^3/(s Pa)] and dp_s/dp_i
+            [1].
+
+    Returns:
+        Whether any dp_s/dp_i is not 0, scalar [1].
+
+    Source: implicit function theorem on "Supply" of the nominal model.
+    """
+    s, total, leader = first * SLOTS, user[first * SLOTS + _DROOP], -1
+    most, load = user[s + _RELIEF], user[s + _TANK]
+    for i in range(count):
+        out[4 * i + 2], out[4 * i + 3] = 0.0, 0.0
+        drop = supply - ports[4 * i + 1]
+        if ports[4 * i] > 0.0:
+            if ports[4 * i + 1] > load:
+                load, leader = ports[4 * i + 1], i
+            if drop > 0.0:
+                out[4 * i + 2] = inlet_flow(drop, ports[4 * i], user[s + _D], ports[4 * i + 2])[1]
+                total += out[4 * i + 2]
+    if user[s + _MARGIN] > 0.0 and load + user[s + _MARGIN] < most:
+        if supply >= load + user[s + _MARGIN]:
+            if leader >= 0:
+                out[4 * leader + 3] = 1.0
+            return leader >= 0
+    elif supply >= most:
+        return False
+    if total <= 0.0:
+        return False
+    for i in range(count):
+        out[4 * i + 3] = out[4 * i + 2] / total
+    return True
