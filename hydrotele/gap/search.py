@@ -125,7 +125,8 @@ def search(
             tell(f"fit {added.name.replace('_', ' ')}", done + 0.02)
             grown, settled = settle(evidence, best)
             worth = now.loss - grown.loss - settled.charge
-            if worth < ENTER or strained(grown.guess, -1) or not told(grown.guess, settled):
+            last = len(grown.guess.parts) - 1
+            if worth < ENTER or strained(grown.guess, -1) or not told(grown.guess, settled, last):
                 evidence.set_base(now)
                 candidates = [c for c in candidates if c.key != added.key]
                 ranked = [r for r in ranked if r.hypothesis.key != added.key]
@@ -241,7 +242,10 @@ def _judged_best(
 def _best_pairs(
     evidence: Evidence, now: Judged, ranked: Sequence[Screened]
 ) -> list[tuple[Judged, float]]:
-    """The best pairs of effects where no single one helps, judged, and their scores."""
+    """The best pairs where no single effect helps by its signature, judged, and their scores.
+
+    A single one that does all that a pair does is tried alone: signatures may have been too small.
+    """
     pool = list(ranked[:_PAIRED])
     step = max(evidence.step_of(now.guess.plus(s.hypothesis, s.start), COARSE) for s in pool)
     ground = evidence.errors(now.guess, step)
@@ -253,14 +257,16 @@ def _best_pairs(
     shifts = evidence.map(shift, pool)
     gains = {}
     for a in range(len(pool)):
-        for b in range(a):
-            columns = np.column_stack([shifts[a], shifts[b]])
-            move = np.linalg.solve(columns.T @ columns + np.eye(2), -columns.T @ ground)
+        for some in [(a,), *((a, b) for b in range(a))]:
+            columns = np.column_stack([shifts[k] for k in some])
+            size = len(some)
+            move = np.linalg.solve(columns.T @ columns + np.eye(size), -columns.T @ ground)
             left = ground + columns @ move
-            gains[a, b] = float(ground @ ground - left @ left - move @ move)
+            gain = float(ground @ ground - left @ left - move @ move)
+            gains[some] = gain - ENTER * size
     pairs = sorted(gains, key=gains.__getitem__, reverse=True)[:2]
 
-    def fit_pair(pair: tuple[int, int]) -> Fit:
+    def fit_pair(pair: tuple[int, ...]) -> Fit:
         more = now.guess
         for index in pair:
             start = pool[index].start
@@ -272,8 +278,11 @@ def _best_pairs(
         return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
                    found.information)  # fmt: skip
 
-    fits = [f for f in evidence.map(fit_pair, pairs) if f.score > ENTER
-            and not strained(f.guess, -1) and not strained(f.guess, -2)]  # fmt: skip
+    first = len(now.guess.parts)
+    fits = [
+        fit for fit in evidence.map(fit_pair, pairs) if fit.score > ENTER
+        and not any(strained(fit.guess, k) for k in range(first, len(fit.guess.parts)))
+    ]  # fmt: skip
     return _judged_best(evidence, now, fits)
 
 
@@ -283,13 +292,15 @@ def worth_naming(guess: Guess, index: int, score: float) -> bool:
     return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
 
 
-def told(guess: Guess, fit: Fit) -> bool:
-    """Whether the last effect's numbers differ from the model's by more than they are uncertain.
+def told(guess: Guess, fit: Fit, index: int) -> bool:
+    """Whether an effect's numbers differ from the model's by more than they are uncertain.
 
     Where a likelihood is full of dents, as with teeth, it may fall by chance with a number moved.
     """
-    hypothesis, deviation = guess.parts[-1]
-    covariance = np.linalg.inv(fit.information)[-hypothesis.size :, -hypothesis.size :]
+    hypothesis, deviation = guess.parts[index]
+    first = sum(h.size for h in guess.hypotheses[:index])
+    own = slice(first, first + hypothesis.size)
+    covariance = np.linalg.inv(fit.information)[own, own]
     return float(deviation @ np.linalg.solve(covariance, deviation)) > _TOLD
 
 
@@ -327,7 +338,7 @@ def _rests(
         rest = evidence.judged(smaller, reopened=True) if smaller.parts else base
         cost = charge(_last(fit.information, now.guess, index), hypothesis.size)
         score = rest.loss - now.loss - cost
-        if not worth_naming(now.guess, index, score):
+        if not (worth_naming(now.guess, index, score) and told(now.guess, fit, index)):
             score = min(score, 0.0)
         rests.append(rest)
         scores.append(score)
