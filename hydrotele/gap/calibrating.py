@@ -78,8 +78,8 @@ def _usual(deviation: np.ndarray, spread: np.ndarray) -> float:
 
 def promoted(
     evidence: Evidence, now: Judged, fit: Fit, candidates: Sequence[Hypothesis]
-) -> Guess | None:
-    """A guess in which numbers that calibration moves too far are effects; None if there is none.
+) -> tuple[Guess, float] | None:
+    """A guess in which the number that is moved furthest beyond the usual is an effect.
 
     What the others move by is what uncertain means (`_usual`). Where nearly all others are right,
     one that is not is an effect, stated uncertainty or not.
@@ -89,6 +89,9 @@ def promoted(
         now: a guess, judged.
         fit: that led to it.
         candidates: the hypotheses.
+
+    Returns:
+        The guess, and twice the log evidence that this brings; None if no number is.
     """
     place = next((i for i, (h, _) in enumerate(now.guess.parts) if h.name == CALIBRATION), -1)
     if place < 0:
@@ -110,23 +113,22 @@ def promoted(
         ratio = usual * table[key].parameter.scale / known.parameters[effect[2]].scale
         gain = (d / usual) ** 2 * (1.0 - min(ratio, 1.0) ** 2) + 2.0 * np.log(min(ratio, 1.0))
         moved[effect[:2]] = moved.get(effect[:2], 0.0) + gain
-    effects = [key for key, gain in moved.items() if gain > BEYOND]
-    if not effects:
+    effect = max(moved, key=moved.__getitem__, default=None)
+    if effect is None or moved[effect] <= BEYOND:
         return None
     parts, gone = list(now.guess.parts), set()
-    for name, location in effects:
-        known = next(c for c in candidates if c.key == (name, location))
-        start = []
-        for key, p in known.parameters.items():
-            full = f"{name}.{location}.{key}"
-            if full in keys:
-                gone.add(full)
-                value = p.nominal + deviation[keys.index(full)] * table[full].parameter.scale
-                start.append((value - p.nominal) / p.scale)
-            else:
-                start.append(0.0)
-        parts.append((known, np.clip(start, known.low, known.high)))
+    known = next(c for c in candidates if c.key == effect)
+    start = []
+    for key, p in known.parameters.items():
+        full = f"{known.name}.{known.location}.{key}"
+        if full in keys:
+            gone.add(full)
+            value = p.nominal + deviation[keys.index(full)] * table[full].parameter.scale
+            start.append((value - p.nominal) / p.scale)
+        else:
+            start.append(0.0)
+    parts.append((known, np.clip(start, known.low, known.high)))
     rest = calibration(evidence.data.machine, frozenset(set(table) - set(keys) | gone))
     kept = np.array([d for key, d in zip(keys, deviation, strict=True) if key not in gone])
     parts[place] = (rest, kept)
-    return Guess(tuple(parts))
+    return Guess(tuple(parts)), moved[effect]

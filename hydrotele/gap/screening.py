@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from hydrotele.prediction.evidence import Evidence
 from hydrotele.prediction.hypothesis import WIDE, Guess, Hypothesis
@@ -11,6 +12,7 @@ from hydrotele.prediction.track import COARSE, Track, first_rows
 
 _FEW = 16  # candidates that are tried on all runs
 _GLANCE = 20.0  # s of the run that fits worst on which all are tried
+_ROOM = 1e-9  # deviations, between bounds that are one
 _BENT = 0.5  # sides of nominal that differ by this share of their squares are no straight line
 
 
@@ -61,13 +63,16 @@ def screen(evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis]) -
 class _Ground:
     """Where candidates start: errors (E,), slopes (E, P) and deviation (P,) of what is there.
 
-    `matrix` is the (P, P) information of these slopes with the prior's.
+    `matrix` is the (P, P) information of these slopes with the prior's, `low` and `high` (P,) are
+    the bounds of the deviation.
     """
 
     errors: np.ndarray
     slopes: np.ndarray
     present: np.ndarray
     matrix: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
 
 def _rank(
@@ -79,11 +84,13 @@ def _rank(
     present = guess.deviation
     slopes = evidence.base_slopes_of(tracks) if len(present) else None
     matrix = np.zeros((0, 0)) if slopes is None else slopes.T @ slopes + np.eye(len(present))
+    low = np.concatenate([np.zeros(0), *(h.low for h in guess.hypotheses)])
+    high = np.concatenate([np.zeros(0), *(h.high for h in guess.hypotheses)])
 
     def ground_of(step: float) -> _Ground:
         errors = errors_of(guess, step)
         there = np.zeros((len(errors), 0)) if slopes is None else slopes
-        return _Ground(errors, there, present, matrix)
+        return _Ground(errors, there, present, matrix, low, high)
 
     steps = {h.key: evidence.step_of(guess.plus(h, h.starts[-1]), COARSE) for h in candidates}
     unlike = sorted(set(steps.values()))
@@ -144,9 +151,22 @@ def _point(hypothesis: Hypothesis, ground: _Ground, d: np.ndarray, shift: np.nda
 
 
 def _without_present(ground: _Ground, errors: np.ndarray) -> float:
-    """Least loss when what is there may follow."""
+    """Least loss when what is there may follow, within its bounds."""
     pull = ground.slopes.T @ errors + ground.present
-    return float(errors @ errors - pull @ np.linalg.solve(ground.matrix, pull))
+    fall = _least(ground.matrix, pull, ground.low - ground.present, ground.high - ground.present)[1]
+    return float(errors @ errors + fall)
+
+
+def _least(
+    matrix: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Least `x' A x + 2 b' x` within bounds on x, which hold 0: (x, that)."""
+    x = -np.linalg.solve(matrix, pull)
+    if np.any((x < low) | (x > high)):
+        root = np.linalg.cholesky(matrix).T
+        low, high = np.minimum(low, -_ROOM), np.maximum(high, _ROOM)
+        x = lsq_linear(root, -np.linalg.solve(root.T, pull), (low, high), method="bvls").x
+    return x, float(x @ matrix @ x + 2.0 * pull @ x)
 
 
 def _explained(ground: _Ground, along: np.ndarray) -> float:
@@ -158,17 +178,16 @@ def _explained(ground: _Ground, along: np.ndarray) -> float:
 def _line(hypothesis: Hypothesis, ground: _Ground, slopes: np.ndarray) -> Screened:
     """Best deviation inside the bounds, with straight signatures, what is there following."""
     own = slopes.T @ slopes + np.eye(hypothesis.size)
-    pull = slopes.T @ ground.errors
-    if len(ground.present):  # eliminate what is already there
-        cross = ground.slopes.T @ slopes
-        right = ground.slopes.T @ ground.errors + ground.present
-        inner = np.linalg.solve(ground.matrix, np.column_stack([cross, right]))
-        own, pull = own - cross.T @ inner[:, :-1], pull - cross.T @ inner[:, -1]
-    d = np.clip(-np.linalg.solve(own, pull), hypothesis.low, hypothesis.high)
-    for _ in range(20):  # coordinate descent in the box
-        for k in range(len(d)):
-            rest = pull[k] + own[k] @ d - own[k, k] * d[k]
-            d[k] = np.clip(-rest / own[k, k], hypothesis.low[k], hypothesis.high[k])
-    gain = float(-(d @ own @ d + 2.0 * pull @ d))
-    cost = float(np.linalg.slogdet(own)[1])
-    return Screened(hypothesis, gain - cost, gain, d)
+    cross = ground.slopes.T @ slopes
+    whole = np.block([[ground.matrix, cross], [cross.T, own]])
+    pull = np.concatenate([ground.slopes.T @ ground.errors + ground.present,
+                           slopes.T @ ground.errors])  # fmt: skip
+    low = np.concatenate([ground.low - ground.present, hypothesis.low])
+    high = np.concatenate([ground.high - ground.present, hypothesis.high])
+    x, fall = _least(whole, pull, low, high)
+    there = len(ground.present)
+    gain = _without_present(ground, ground.errors) - float(ground.errors @ ground.errors) - fall
+    cost = float(np.linalg.slogdet(whole)[1])
+    if there:
+        cost -= float(np.linalg.slogdet(ground.matrix)[1])
+    return Screened(hypothesis, gain - cost, gain, x[there:])

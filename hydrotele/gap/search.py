@@ -104,9 +104,12 @@ def search(
         options = _best_singles(evidence, now, ranked)
         if not options and lacking(now, evidence) > LACKING and len(ranked) > 1:
             options = _best_pairs(evidence, now, ranked)
+        moved = promoted(evidence, now, fit, candidates) if fit else None
+        if moved:
+            options = sorted([*options, (evidence.judged(moved[0]), moved[1])], key=_score)
         if teeth and not now.guess.parts:  # once: what is refused does not come back
             options.append((teeth, base.loss - teeth.loss - ENTER))
-            options.sort(key=lambda pair: -pair[1])
+            options.sort(key=_score)
             teeth = None
         small = []
         while options and not worth_naming(options[0][0].guess, -1, options[0][1]):
@@ -126,6 +129,8 @@ def search(
             grown, settled = settle(evidence, best)
             worth = now.loss - grown.loss - settled.charge
             last = len(grown.guess.parts) - 1
+            if moved and best.guess.hypotheses == moved[0].hypotheses:
+                worth = max(worth, moved[1])  # what the number cost is paid already
             if worth < ENTER or strained(grown.guess, -1) or not told(grown.guess, settled, last):
                 evidence.set_base(now)
                 candidates = [c for c in candidates if c.key != added.key]
@@ -156,24 +161,28 @@ def search(
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = ranked
         now, fit, ranked = grown, settled, None
-        if fit and (own := promoted(evidence, now, fit, candidates)):
-            now, fit = settle(evidence, evidence.judged(own))
-    tell("drop what is needless", 0.87)
-    now, fit, without = _pruned(evidence, base, now, fit)
-    tell("compare rivals", 0.9)
-    charges, rivals = [], []
-    for index, (hypothesis, _) in enumerate(now.guess.parts):
-        assert fit
-        charges.append(charge(_last(fit.information, now.guess, index), hypothesis.size))
-        ranked, rest = rankings.get(hypothesis.key, first), without[index]
-        rivals.append(find_rivals(evidence, now, index, ranked, rest) if rest else ())
+    needless: Guess | None = Guess()
+    while needless is not None:
+        tell("drop what is needless", 0.87)
+        now, fit, without = _pruned(evidence, base, now, fit)
+        tell("compare rivals", 0.9)
+        charges, rivals = [], []
+        for index, (hypothesis, _) in enumerate(now.guess.parts):
+            assert fit
+            charges.append(charge(_last(fit.information, now.guess, index), hypothesis.size))
+            ranked, rest = rankings.get(hypothesis.key, first), without[index]
+            rivals.append(find_rivals(evidence, now, index, ranked, rest) if rest else ())
+        needless = _without_needless(now, charges, rivals)
+        if needless is not None:
+            now, fit = settle(evidence, evidence.judged(needless))
+    rivals = [[r for r in others if not _idle(r)] for others in rivals]
     for index, rest in enumerate(without):
         if rest and (rival := better(now, index, charges[index], rest, rivals[index])):
             assert rival.fit
             old = Rival(now.guess.parts[index][0], now, charges[index], fit)
             others = (r for r in rivals[index] if r is not rival)
             now, fit, charges[index] = rival.judged, rival.fit, rival.charge
-            rivals[index] = (old, *others)
+            rivals[index] = [old, *others]
             # a rival comes last in its guess
             order = [*(i for i in range(len(without)) if i != index), index]
             without = tuple(without[i] for i in order)
@@ -184,10 +193,11 @@ def search(
     else:
         evidence.set_base(now)
     for index, others in enumerate(rivals):
-        rivals[index] = tuple(
+        rivals[index] = [
             r for r in others if not is_case_of(evidence, now.guess, index, r.hypothesis)
-        )
-    return Found(base, now, fit, first, tuple(charges), without, tuple(rivals), weak)
+        ]
+    told_of = tuple(map(tuple, rivals))
+    return Found(base, now, fit, first, tuple(charges), without, told_of, weak)
 
 
 def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:
@@ -209,6 +219,11 @@ def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -
 def lacking(judged: Judged, evidence: Evidence) -> float:
     """Twice the log likelihood that the unknown inputs of a guess bring."""
     return sum(evidence.map(input_excess, judged.tracks))
+
+
+def _score(option: tuple[Judged, float]) -> float:
+    """Order of options, best first."""
+    return -option[1]
 
 
 def _named_so_far(guess: Guess) -> int:
@@ -236,7 +251,7 @@ def _judged_best(
     judged = [evidence.judged(fit.guess) for fit in fits]
     scores = [now.loss - j.loss - fit.charge for j, fit in zip(judged, fits, strict=True)]
     found = [(j, score) for j, score in zip(judged, scores, strict=True) if score >= ENTER]
-    return sorted(found, key=lambda pair: -pair[1])
+    return sorted(found, key=_score)
 
 
 def _best_pairs(
@@ -302,6 +317,23 @@ def told(guess: Guess, fit: Fit, index: int) -> bool:
     own = slice(first, first + hypothesis.size)
     covariance = np.linalg.inv(fit.information)[own, own]
     return float(deviation @ np.linalg.solve(covariance, deviation)) > _TOLD
+
+
+def _idle(rival: Rival) -> bool:
+    """Whether a rival does nothing: what is there without it was settled."""
+    guess = rival.judged.guess
+    return rival.fit is not None and not told(guess, rival.fit, len(guess.parts) - 1)
+
+
+def _without_needless(
+    now: Judged, charges: Sequence[float], rivals: Sequence[Sequence[Rival]]
+) -> Guess | None:
+    """The guess without an effect of which a rival that does nothing can take the place."""
+    for cost, others in zip(charges, rivals, strict=True):
+        for rival in others:
+            if _idle(rival) and rival.judged.loss - now.loss - cost < ENTER:
+                return rival.judged.guess.without(len(rival.judged.guess.parts) - 1)
+    return None
 
 
 def _pruned(

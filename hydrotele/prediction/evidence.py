@@ -263,7 +263,7 @@ class Evidence:
         def change(way: np.ndarray) -> np.ndarray:
             return self.errors(base.at(here + way), step) - errors
 
-        changes = self.map(change, moves.T) if parallel else [change(way) for way in moves.T]
+        changes = self.map(change, list(moves.T)) if parallel else [change(way) for way in moves.T]
         return np.linalg.lstsq(moves.T, np.array(changes), rcond=1e-12)[0].T
 
     def base_slopes_of(self, tracks: Sequence[Track]) -> np.ndarray:
