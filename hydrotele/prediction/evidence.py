@@ -32,6 +32,8 @@ MIDDLE = 2.0e-3  # s, step at which guesses are fitted
 _MANY = 10  # numbers of a base from which their slopes are taken at a coarser step
 BLOCK = 2.0  # s of a run that count as one witness: longer than what a model lacks remembers
 _ROUNDS = 2  # of linearisation for the levels of the first base; later ones start from near by
+_NEW = 6  # numbers more than the base before had, for whose directions its own ones do
+_UNKNOWN = 2500.0  # information of a new one, until it is known: it shows by its fiftieth
 _MOVE = 1.0  # of the errors, by which they are moved for the slopes of many numbers
 _CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
 
@@ -97,7 +99,7 @@ class Evidence:
         self.tracks: tuple[Track, ...] = ()
         self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
         self._slopes = dict[float, np.ndarray]()
-        self._directions: tuple[list[str], np.ndarray] | None = None
+        self._information = list[str](), np.zeros((0, 0))
 
     def close(self) -> None:
         """End the workers."""
@@ -232,8 +234,8 @@ class Evidence:
 
         Many numbers together may hardly show, as a scale of all areas, flows and masses, although
         each alone does; the differences of the single slopes are then their errors. So slopes are
-        taken a second time along the principal directions of the first ones (or of those of the
-        base before, if it has the same numbers).
+        taken a second time along the principal directions of the first ones, or of those of the
+        base before, if it had nearly the same numbers.
         """
         step = step or self.step
         if step not in self._slopes:
@@ -241,13 +243,25 @@ class Evidence:
             if len(names) <= _MANY:
                 self._slopes[step] = self.slopes(self._base, errors, parallel, step)
                 return self._slopes[step]
-            if self._directions is None or self._directions[0] != names:
+            information = self._known_information(names)
+            if information is None:
                 rough = self.slopes(self._base, errors, parallel, step)
-                self._directions = names, rough.T @ rough + np.eye(len(names))
-            found = self._along(self._directions[1], errors, parallel, step)
-            self._directions = names, found.T @ found + np.eye(len(names))
+                information = rough.T @ rough + np.eye(len(names))
+            found = self._along(information, errors, parallel, step)
+            self._information = names, found.T @ found + np.eye(len(names))
             self._slopes[step] = found
         return self._slopes[step]
+
+    def _known_information(self, names: list[str]) -> np.ndarray | None:
+        """(P, P) information of numbers by the base before; None if it had too few of them."""
+        known, information = self._information
+        there = [known.index(name) for name in names if name in known]
+        if len(names) - len(there) > _NEW:
+            return None
+        own = [k for k, name in enumerate(names) if name in known]
+        found = np.diag(np.full(len(names), _UNKNOWN))
+        found[np.ix_(own, own)] = information[np.ix_(there, there)]
+        return found
 
     def _along(
         self, information: np.ndarray, errors: np.ndarray, parallel: bool, step: float
@@ -264,7 +278,7 @@ class Evidence:
             return self.errors(base.at(here + way), step) - errors
 
         changes = self.map(change, list(moves.T)) if parallel else [change(way) for way in moves.T]
-        return np.linalg.lstsq(moves.T, np.array(changes), rcond=1e-12)[0].T
+        return (np.linalg.pinv(moves.T) @ np.array(changes)).T
 
     def base_slopes_of(self, tracks: Sequence[Track]) -> np.ndarray:
         """(E, P) slopes of the base in some of its tracks, or in the first rows of them."""
