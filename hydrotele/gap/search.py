@@ -18,6 +18,7 @@ from hydrotele.gap.rattling import rattling
 from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of
 from hydrotele.gap.screening import Screened, screen
 from hydrotele.gap.settling import fitted, loss_of, polished, settle, strained, widened
+from hydrotele.gap.without_inputs import WithoutInputs, without_inputs
 from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
@@ -28,6 +29,7 @@ ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines 
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
+_LITTLE = 0.01  # of what the given machine lacks: an effect that leaves less is tried at once
 _TOLD = 9.0  # square of an effect's deviation over its uncertainty: three standard deviations
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
@@ -90,34 +92,35 @@ def search(
     base = now = evidence.set_base(Guess())
     fit, weak, first, refused, tried, roomy = None, None, (), 0, False, False
     candidates = timed(candidates, base)
-    teeth = rattling(evidence, base, candidates)
+    tell("try every effect as if nothing unknown acted", 0.03)
+    bold, early = _early_options(evidence, base, candidates)
     rankings: dict[tuple[str, str], Sequence[Screened]] = {}
     worth = 0.0
     ranked: Sequence[Screened] | None = None  # of the present guess
     while refused < _REFUSED:
         done = 0.85 * (1.0 - 0.7 ** len(now.guess.parts)) + 0.05
-        if ranked is None:
-            tell(f"try every effect ({_named_so_far(now.guess)} named so far)", done)
-            open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
-            ranked = screen(evidence, now.guess, open_ones)
-            first = first or tuple(ranked)
-        options = _best_singles(evidence, now, ranked)
-        if not options and lacking(now, evidence) > LACKING and len(ranked) > 1:
-            options = _best_pairs(evidence, now, ranked)
+        if early and lacking(early[0][0], evidence) < _LITTLE * lacking(base, evidence):
+            options, first = early, bold.ranking
+        else:
+            if ranked is None:
+                tell(f"try every effect ({_named_so_far(now.guess)} named so far)", done)
+                open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
+                ranked = screen(evidence, now.guess, open_ones)
+                first = first or tuple(ranked)
+            options = sorted([*_best_singles(evidence, now, ranked), *early], key=_score)
+            if not options and lacking(now, evidence) > LACKING and len(ranked) > 1:
+                options = _best_pairs(evidence, now, ranked)
+        early = []  # once: what is refused does not come back
         moved = promoted(evidence, now, fit, candidates) if fit else None
         if moved:
             options = sorted([*options, (evidence.judged(moved[0]), moved[1])], key=_score)
-        if teeth and not now.guess.parts:  # once: what is refused does not come back
-            options.append((teeth, base.loss - teeth.loss - ENTER))
-            options.sort(key=_score)
-            teeth = None
         small = []
         while options and not worth_naming(options[0][0].guess, -1, options[0][1]):
             judged, worth = options.pop(0)
             weak = Fit(judged.guess, 0.0, worth, 0.0, np.eye(1))
             small.append(judged.guess.parts[-1][0].key)
         candidates = [c for c in candidates if c.key not in small]
-        ranked = [r for r in ranked if r.hypothesis.key not in small]
+        ranked = _others(ranked, small)
         if small and not options:
             refused += 1
             continue
@@ -134,7 +137,7 @@ def search(
             if worth < ENTER or strained(grown.guess, -1) or not told(grown.guess, settled, last):
                 evidence.set_base(now)
                 candidates = [c for c in candidates if c.key != added.key]
-                ranked = [r for r in ranked if r.hypothesis.key != added.key]
+                ranked = _others(ranked, [added.key])
                 refused += 1
                 continue
         if (
@@ -159,7 +162,7 @@ def search(
             (now, fit), ranked, roomy = settle(evidence, evidence.judged(wider)), None, True
             continue
         for part in grown.guess.parts[len(now.guess.parts) :]:
-            rankings[part[0].key] = ranked
+            rankings[part[0].key] = first if ranked is None else ranked
         now, fit, ranked = grown, settled, None
     needless: Guess | None = Guess()
     while needless is not None:
@@ -219,6 +222,26 @@ def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -
 def lacking(judged: Judged, evidence: Evidence) -> float:
     """Twice the log likelihood that the unknown inputs of a guess bring."""
     return sum(evidence.map(input_excess, judged.tracks))
+
+
+def _early_options(
+    evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis]
+) -> tuple[WithoutInputs, list[tuple[Judged, float]]]:
+    """What stands out as long as nothing unknown is let act, and teeth; best first."""
+    bold = without_inputs(evidence, base, candidates)
+    options = [option for option in bold.options if option[1] > ENTER]
+    if teeth := rattling(evidence, base, candidates):
+        options.append((teeth, base.loss - teeth.loss - ENTER))
+    return bold, sorted(options, key=_score)
+
+
+def _others(
+    ranked: Sequence[Screened] | None, keys: Sequence[tuple[str, str]]
+) -> Sequence[Screened] | None:
+    """A ranking without some candidates."""
+    if ranked is None:
+        return None
+    return [r for r in ranked if r.hypothesis.key not in keys]
 
 
 def _score(option: tuple[Judged, float]) -> float:
