@@ -85,8 +85,9 @@ def test_a_scale_of_all_areas_flows_and_masses_does_not_show():
     are not among the numbers, break the scale a little.
     """
     scaled = (
-        "area", "displacement", "valve_gain", "pump_flow_limit", "mass", "dead_volume", "inertia_error",
-        "coulomb_friction", "viscous_friction", "stribeck_friction", "internal_leakage",
+        "area", "displacement", "valve_gain", "pump_flow_limit", "mass", "dead_volume",
+        "inertia_error", "coulomb_friction", "viscous_friction", "stribeck_friction",
+        "internal_leakage",
     )  # fmt: skip
     nominal = load_machine("cat215")
     group = calibration(nominal)
