@@ -55,6 +55,7 @@ def start_state(
     joints = {machine.axes[a].joint: a for a in order}
     state = np.zeros(len(names))
     wide = np.array([_WIDE[name.partition(".")[0]] for name in names])
+    cut = run.start > run.log.time[0] + 0.5 * run.period  # out of a record, in motion
     shown = {}
     for c, name in enumerate(data.channels):
         head = run.reading[: _first_rows(run, c), c]
@@ -67,7 +68,7 @@ def start_state(
         if kind == "position":
             channel = f"{machine.position_kind(axis)}.{axis}" if axis in order else ""
             state[s] = shown.get(channel, machine.home.get(place, 0.0))
-        elif kind in _MOVED:  # the command has been there for long, or has just come
+        elif kind in _MOVED and cut:  # the command has been there for long, or has just come
             given = float(np.clip(run.command[0, order.index(axis)], -1.0, 1.0))
             state[s] = given if kind == "spool" else 0.0
             wide[s] = np.hypot(wide[s], _MOVED[kind] * given)
