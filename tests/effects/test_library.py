@@ -132,9 +132,9 @@ def test_limits_belong_to_the_range(machine, tool, name, place):
         ("valve_gain", "bom", {"ratio": 1}, "'bom'; did you mean 'boom'"),
         ("valve_gain", "", {"ratio": 1}, "cannot sit at ''; valid: boom, bucket, stick, swing"),
         ("payload", "boom", {"mass": 1}, "cannot sit at 'boom'; valid: tool"),
-        ("payload", "", {}, "exactly the parameters mass"),
-        ("payload", "", {"mass": 1, "colour": 2}, "exactly the parameters mass: 'colour'"),
-        ("base_tilt", "", {"roll": 0.1}, "exactly the parameters roll, pitch: 'pitch'"),
+        ("payload", "", {}, "has the parameters mass; 'mass' is missing"),
+        ("payload", "", {"mass": 1, "colour": 2}, "has the parameters mass; 'colour' is none"),
+        ("base_tilt", "", {"roll": 0.1}, "has the parameters roll, pitch; 'pitch' is missing"),
         ("pressure_offset", "boom", {"offset": 1.0}, "valid: .*boom.head, boom.rod"),
     ],
 )
