@@ -305,7 +305,8 @@ REFUSED = {
         {"effects": [{"name": "valve_gain", "parameters": {"ratio": 1}}]}, "valid: boom, stick",
     ),
     "effect_parameter": (
-        {"effects": [{"name": "payload", "parameters": {"mas": 3}}]}, "has the parameters mass; .mas. is none",
+        {"effects": [{"name": "payload", "parameters": {"mas": 3}}]},
+        "has the parameters mass; .mas. is none",
     ),
     "effect_out_of_range": (
         {"effects": [{"name": "payload", "parameters": {"mass": -3}}]}, "-3.* is outside 0",
