@@ -35,8 +35,7 @@ def free_of_calibration(candidates: Sequence[Hypothesis], guess: Guess) -> list[
 
 def calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
     """All uncertain numbers fitted together, judged, and the score of that."""
-    taken = {f"{h.name}.{h.location}.{key}" for h, _ in now.guess.parts for key in h.parameters}
-    group = calibration(evidence.data.machine, frozenset(taken))
+    group = calibration(evidence.data.machine, frozenset(now.guess.names))
     if not group.parameters:
         return None, 0.0
     judged, gain, cost = now, 0.0, 0.0

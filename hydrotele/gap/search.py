@@ -199,8 +199,8 @@ def search(
         rivals[index] = [
             r for r in others if not is_case_of(evidence, now.guess, index, r.hypothesis)
         ]
-    told_of = tuple(map(tuple, rivals))
-    return Found(base, now, fit, first, tuple(charges), without, told_of, weak)
+    compared = tuple(map(tuple, rivals))
+    return Found(base, now, fit, first, tuple(charges), without, compared, weak)
 
 
 def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:

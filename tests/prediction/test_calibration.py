@@ -105,4 +105,4 @@ def test_a_scale_of_all_areas_flows_and_masses_does_not_show():
     ])  # fmt: skip
     alone = np.linalg.norm(slopes * percent, axis=0)
     assert alone.max() > 20.0
-    assert np.linalg.norm(slopes @ percent) < 2.0
+    assert np.linalg.norm(slopes @ percent) < 0.4  # 1.7 by single slopes, 0.08 here
