@@ -64,7 +64,7 @@ def _usual(deviation: np.ndarray, spread: np.ndarray) -> float:
     Never less than stated, but where nearly all of at least a few are right.
 
     >>> import numpy as np
-    >>> _usual(np.full(20, 0.7), np.full(20, 0.1)), _usual(np.full(20, 2.0), np.full(20, 0.1)) > 2.9
+    >>> _usual(np.full(20, 0.5), np.full(20, 0.1)), _usual(np.full(20, 2.0), np.full(20, 0.1)) > 2.9
     (1.0, True)
     >>> _usual(np.full(20, 0.05), np.full(20, 0.1)), _usual(np.full(20, 0.05), np.ones(20))
     (0.2, 1.0)
