@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from hydrotele.dataset.load import Dataset
+from hydrotele.effects.effect import changed
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.constancy import constancy
 from hydrotele.gap.description import describe, learned_laws
@@ -45,7 +46,7 @@ _MECHANISM, _STEEP = 0.35, 0.07  # see `_mechanism`
 _TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`
 _WORSE = 1.05  # times the given model's errors on the held-out run: no patch may do more
 _REJECTED = (
-    "What the fitted runs asked for makes the held-out run worse; it was taken back, and nothing is"
+    "What the fitted runs asked for makes {} held-out run worse; it was taken back, and nothing is"
     " named."
 )
 _MINOR = 0.02  # share of the gap up to which a learned law is a detail
@@ -96,8 +97,9 @@ def find_gap(
         before, *others = judge.tracks(machines + ([given] if opened else []), evidence.map)
         asked = others.pop() if opened else before
         after = others[0] if others else before
-        if not rms(after[:1]) <= _WORSE * rms(before[:1]):
-            notes.append(_REJECTED)
+        undone = opened is not None and opened.undone_by(data, patched, jobs)
+        if undone or not rms(after[:1]) <= _WORSE * rms(before[:1]):
+            notes.append(_REJECTED.format("free runs of the" if undone else "the"))
             found, discovery = found.emptied(), Discovery(found.base, ())
             patched, after = nominal, before
         before = asked
@@ -109,7 +111,7 @@ def find_gap(
     finally:
         evidence.close()
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
-    named = _named(found, spread, shares, rms(after[:1]), floor)
+    named = _named(found, discovery.judged.guess, spread, shares)
     learned = learned_laws(discovery, nominal, spread, shares)
     needed = any(law.share > _MINOR for law in learned)  # a law that has no known cause
     verdict = _verdict(named, failed or needed, None if judge.ripple else floor)
@@ -122,6 +124,8 @@ def find_gap(
     laws, units = _laws(dataclasses.replace(data, machine=given), patched, judge.levels.noise)
     tell("done", 1.0)
     calibration = _calibration(discovery.judged.guess, spread)
+    if opened:  # what free runs left uncertain was the search's prior, not the machine's
+        patched = changed(patched, "uncertainty", given.uncertainty)
     return Gap(
         machine=given,
         patched=patched,
@@ -142,7 +146,7 @@ def find_gap(
         law_units=units,
         tests=tests,
         next_experiment=_experiment(given, verdict, named, unknown),
-        calibration=calibration | (opened.numbers if opened else {}),
+        calibration=_all_calibrated(opened.numbers if opened else {}, calibration, named),
         learned=learned,
         lacks=lacks,
         noise=_noise(data, judge.levels),
@@ -253,11 +257,12 @@ def _mechanism(part: float) -> float:
 
 
 def _named(
-    found: Found, spread: np.ndarray, shares: Mapping, after: float, floor: float | None
+    found: Found, last: Guess, spread: np.ndarray, shares: Mapping
 ) -> tuple[NamedEffect, ...]:
+    """Effects of a search, with their numbers in the last guess, which may have learned laws."""
     effects, first = [], 0
     ideal = min(sum(map(undisturbed_loss, found.judged.tracks)), found.judged.loss)
-    for index, (hypothesis, deviation) in enumerate(found.guess.parts):
+    for index, (hypothesis, deviation) in enumerate(last.parts[: len(found.guess.parts)]):
         own = spread[first : first + hypothesis.size]
         first += hypothesis.size
         rest = found.without[index]
@@ -320,6 +325,16 @@ def _calibration(guess: Guess, spread: np.ndarray) -> dict[str, Estimate]:
             return _estimates(hypothesis, deviation, spread[first : first + hypothesis.size])
         first += hypothesis.size
     return {}
+
+
+def _all_calibrated(
+    freely: dict[str, Estimate], later: dict[str, Estimate], named: Sequence[NamedEffect]
+) -> dict[str, Estimate]:
+    """Numbers of free runs and of the search, as the patched machine has them, once each."""
+    gone = {f"{e.name}.{e.location}.{key}" for e in named for key in e.parameters}
+    first = {key: dataclasses.replace(e, nominal=freely[key].nominal) for key, e in later.items()
+             if key in freely}  # fmt: skip
+    return {k: e for k, e in (later | freely | first).items() if k not in gone}
 
 
 def _noise(data: Dataset, levels: Levels) -> dict[str, tuple[float, float]]:

@@ -12,14 +12,17 @@ step predictions say nothing. All numbers that its machine file calls uncertain 
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from hydrotele.dataset.load import Dataset, RunData
+from hydrotele.effects.effect import changed
 from hydrotele.gap.result import Estimate
 from hydrotele.machine import Machine
-from hydrotele.prediction.calibration import CALIBRATION, calibration
+from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
+from hydrotele.prediction.free_run import free_run_errors, machine_runner
 from hydrotele.prediction.hypothesis import Guess
 from hydrotele.prediction.open_numbers import (
     DIRECTIONS,
@@ -39,6 +42,7 @@ from hydrotele.prediction.output_error import (
 from hydrotele.prediction.stretches import thinned
 
 _NORMAL95 = 1.96
+_WORSE = 1.05  # times the errors of free runs: less is no loss
 _FLOW_TABLE = "flow_table"
 _PUMP_WINDOW = 2.5  # s of a pump drive: a move of a stroke of some centimetres
 _PUMP_REMEMBERED = 0.1  # s: the lag of its motor, see `output_error`
@@ -49,15 +53,34 @@ class FreeCalibration:
     """A machine calibrated by free runs.
 
     Attributes:
-        machine: with the numbers found.
+        machine: with the numbers found, each as uncertain as free runs leave it.
         numbers: such as `linkage.stick.base` or `flow_table.boom.positive_50`, the opening at 50 %
             travel beyond the dead band; ratios to the given machine where no unit fits.
         note: one sentence on what stretches that were left out say.
+        seconds: length of the free runs [s].
     """
 
     machine: Machine
     numbers: dict[str, Estimate]
     note: str
+    seconds: float
+
+    def undone_by(self, data: Dataset, machine: Machine, jobs: int) -> bool:
+        """Whether another machine predicts free runs of the held-out run worse than this one.
+
+        Worse is a larger median over the windows, in the geometric mean over the channels. What
+        free runs have told must not be lost to one-step errors, which a drift may absorb.
+        """
+
+        def medians(some: Machine) -> np.ndarray:
+            runner = machine_runner(some, data)(data.heldout)
+            errors = free_run_errors(runner, data.heldout, (self.seconds,), to_end=False)
+            return np.array([horizon.median for horizon in errors.horizons.values()])
+
+        with ThreadPoolExecutor(jobs) as pool:
+            own, other = pool.map(medians, (self.machine, machine))
+        ratio = other / own
+        return bool(np.any(ratio > 0.0) and not np.nanmean(np.log(ratio)) <= np.log(_WORSE))
 
 
 def calibrate_freely(
@@ -92,7 +115,7 @@ def calibrate_freely(
         "What the machine file leaves open was calibrated by free runs first; stretches of"
         f" {seconds:g} s, left out of the fit one by one, are predicted closer by: {closer}."
     )
-    return FreeCalibration(fit.machine, _numbers(data.machine, fit), note)
+    return FreeCalibration(_told(data.machine, fit), _numbers(data.machine, fit), note, seconds)
 
 
 def _seconds(run: RunData) -> float:
@@ -109,9 +132,26 @@ def _open(data: Dataset) -> Guess | None:
     return None if pressures or not states_open_numbers(machine) else open_numbers(machine)
 
 
+def _told(nominal: Machine, fit: FreeRunFit) -> Machine:
+    """The fitted machine, whose numbers are as uncertain as the fit leaves them.
+
+    Else one-step predictions, which know little of a number that free runs tell, take it back.
+    """
+    stated, place = dict(nominal.uncertainty), fit.guess.names
+    sd = dict(zip(place, fit.deviation_sd, strict=True))
+    first = f"{CALIBRATION}.all."
+    known, found = numbers(nominal), numbers(fit.machine)
+    for name in place:
+        key = name.removeprefix(first)
+        if name.startswith(first) and key in found:
+            ratio = known[key].parameter.scale / found[key].parameter.scale
+            stated[key] = found[key].share * ratio * min(float(sd[name]), 1.0)
+    return changed(fit.machine, "uncertainty", stated)
+
+
 def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
     """All numbers of a fit with their intervals."""
-    covariance, first, found = np.linalg.inv(fit.information), 0, {}
+    covariance, first, found = fit.covariance, 0, {}
     for hypothesis, deviation in fit.guess.parts:
         own = slice(first, first + hypothesis.size)
         first += hypothesis.size

@@ -3,9 +3,10 @@
 A real machine is off everywhere: masses, areas, frictions, valve gains are known to some per cent.
 Each is a number with a prior, a normal distribution about the given value; `uncertainty` of the
 machine file states its relative standard deviation by kind (`mass: 0.03`), by kind and place
-(`mass.boom: 0.1`) or for all (`default: 0.05`). A number of any effect that it names is uncertain;
-one that is 0, as losses are that a data sheet leaves out, counts relative to the effect's typical
-size. An effect is what remains after that.
+(`mass.boom: 0.1`), by kind, place and parameter (`motor_drag.piston.breakaway: 0.5`) or for all
+(`default: 0.05`). A number of any effect that it names is uncertain; one that is 0, as losses are
+that a data sheet leaves out, counts relative to the effect's typical size. An effect is what
+remains after that.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,6 +45,7 @@ class Number:
 
     Attributes:
         key: kind, place and parameter, such as `valve_gain.boom.ratio`.
+        share: its relative standard deviation.
         parameter: its nominal value, range, and prior as `scale`.
         effect: the library's effect (name, location, parameter) that changes the same number, or
             None.
@@ -51,6 +53,7 @@ class Number:
     """
 
     key: str
+    share: float
     parameter: Parameter
     effect: tuple[str, str, str] | None
     change: Callable[[Machine, float], Machine]
@@ -77,9 +80,10 @@ def calibration(machine: Machine, without: frozenset[str] = frozenset()) -> Hypo
     return Hypothesis(CALIBRATION, "all", parameters, change)
 
 
-def _share(machine: Machine, kind: str, place: str) -> float:
+def _share(machine: Machine, kind: str, place: str, own: str = "") -> float:
+    """Relative standard deviation stated for a number itself, its place, its kind, or all."""
     stated = machine.uncertainty
-    for key in (f"{kind}.{place}", kind, "default"):
+    for key in (own, f"{kind}.{place}", kind, "default"):
         if key in stated:
             return stated[key]
     return UNCERTAINTY.get(kind, 0.0)
@@ -102,8 +106,8 @@ def _of_effects(machine: Machine) -> list[Number]:
         if name not in UNCERTAINTY and not stated:
             continue
         for location in effect.locations(machine):
-            share = _share(machine, name, location)
             for key, p in effect.parameters(machine, location).items():
+                share = _share(machine, name, location, f"{name}.{location}.{key}")
                 if p.optional:
                     continue
                 size = abs(p.nominal)
@@ -114,7 +118,7 @@ def _of_effects(machine: Machine) -> list[Number]:
                     size = size if name != "link_length" else 0.5 * size
                 if size > 0.0 and share > 0.0:
                     found.append(Number(
-                        f"{name}.{location}.{key}", _narrow(p, share * size),
+                        f"{name}.{location}.{key}", share, _narrow(p, share * size),
                         (name, location, key), partial(_apply, effect, location, key),
                     ))  # fmt: skip
     return found
@@ -166,7 +170,7 @@ def _of_facts(machine: Machine) -> list[Number]:
         if value < 0.0:
             p = replace(p, low=5.0 * value, high=0.2 * value)
         p = _narrow(p, p.scale, _PLAIN)
-        found.append(Number(f"{kind}.{place}", p, None, partial(_set, path)))
+        found.append(Number(f"{kind}.{place}", share, p, None, partial(_set, path)))
     return found
 
 
@@ -176,20 +180,21 @@ def _of_rods(machine: Machine) -> list[Number]:
     for name in linkages(machine):
         cylinder = machine.axes[name].cylinder
         assert cylinder
-        size, share = cylinder.closed_length, _share(machine, "pin_offset", name)
-        if share <= 0.0:
-            continue
-        path = f"axes.{name}.cylinder"
-        p = Parameter("m", size, 0.8 * size, 1.2 * size, share * size, 0.0)
-        change = partial(_set, f"{path}.closed_length")
-        found.append(Number(f"closed_length.{name}", _narrow(p, p.scale, _PLAIN), None, change))
-        pin = cylinder.rod_pin.position
+        size, pin = cylinder.closed_length, cylinder.rod_pin.position
+        places: list[tuple[str, float, float, Callable]] = [(
+            f"closed_length.{name}", size, 0.2,
+            partial(_set, f"axes.{name}.cylinder.closed_length"),
+        )]  # fmt: skip
         for way in across(machine, name):
-            at = pin["xyz".index(way)]
-            p = Parameter("m", at, at - 0.1 * size, at + 0.1 * size, share * size, 0.0)
-            change = partial(_set_rod_pin, name, "xyz".index(way))
-            p = _narrow(p, p.scale, _PLAIN)
-            found.append(Number(f"rod_pin.{name}.{way}", p, None, change))
+            index = "xyz".index(way)
+            change = partial(_set_rod_pin, name, index)
+            places.append((f"rod_pin.{name}.{way}", pin[index], 0.1, change))
+        for key, at, reach, change in places:
+            share = _share(machine, "pin_offset", name, key)
+            if share > 0.0:
+                p = Parameter("m", at, at - reach * size, at + reach * size, share * size, 0.0)
+                p = _narrow(p, p.scale, _PLAIN)
+                found.append(Number(key, share, p, None, change))
     return found
 
 

@@ -81,7 +81,7 @@ class FreeRunFit:
         before: (c,) RMS error of the windows before the fit [channel's unit].
         after: (c,) and after it.
         scale: (c,) of the errors, as of the robust loss [channel's unit].
-        information: (P, P) curvature of half the loss in deviations, the prior's unit included.
+        covariance: (P, P) of the deviations; the prior's is the unit matrix.
         loss: as fitted, with the last scales.
         iterations: damped Gauss-Newton steps taken.
         converged: whether the loss no longer fell; if not, allow more iterations.
@@ -96,7 +96,7 @@ class FreeRunFit:
     before: np.ndarray
     after: np.ndarray
     scale: np.ndarray
-    information: np.ndarray
+    covariance: np.ndarray
     loss: float
     iterations: int
     converged: bool
@@ -107,7 +107,7 @@ class FreeRunFit:
     @property
     def deviation_sd(self) -> np.ndarray:
         """(P,) standard deviations of the deviations; 1 is the prior's own."""
-        return np.sqrt(np.diag(np.linalg.inv(self.information)))
+        return np.sqrt(np.diag(self.covariance))
 
 
 def fit_free_runs(
@@ -152,7 +152,7 @@ def fit_free_runs(
         return FreeRunFit(
             guess=now.guess, machine=now.machine,
             before=_rms(first.errors), after=_rms(now.errors), scale=scale,
-            information=_normal_equations(now, columns, weights, scale)[1],
+            covariance=_covariance(now, columns, weights, scale, windows),
             loss=_loss(now, weights, scale), iterations=taken, converged=converged,
             windows=len(windows), step=problem.step,
             left_out=np.array([
@@ -356,6 +356,33 @@ def _half_loss(
     bent = weights[known] / np.sqrt(1.0 + z[known] ** 2)
     weighted = there * bent[:, None]
     return weighted.T @ z[known], there.T @ weighted
+
+
+def _covariance(
+    now: _Point, columns: np.ndarray, weights: np.ndarray, scale: np.ndarray,
+    windows: Sequence[Window],
+) -> np.ndarray:  # fmt: skip
+    """(P, P) covariance of the deviations, from curvature and from what windows contradict.
+
+    A model that is only nearly right is pulled another way by every window. So no number is surer
+    than the scatter of the windows' slopes says, each window counted as one observation.
+
+    Source: sandwich covariance, Huber 1967; by clusters, Liang and Zeger 1986, Biometrika 73(1).
+    """
+    usual = np.linalg.inv(_normal_equations(now, columns, weights, scale)[1])
+    slopes, end = [], 0
+    for window in windows:
+        rows = slice(end, end + window.count)
+        end += window.count
+        slopes.append(_half_loss(now.errors[rows] / scale, columns[rows], weights[rows])[0])
+    count = len(windows)
+    if count < 2:
+        return usual
+    away = np.array(slopes) - np.mean(slopes, axis=0)
+    scatter = away.T @ away * count / (count - 1) + np.eye(len(usual))
+    robust = usual @ scatter @ usual
+    wider = np.sqrt(np.maximum(np.diag(robust) / np.diag(usual), 1.0))
+    return usual * np.outer(wider, wider)
 
 
 def _left_out(

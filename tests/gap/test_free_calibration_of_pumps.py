@@ -7,6 +7,7 @@ from hydrotele.effects.effect import changed
 from hydrotele.gap.free_calibration import calibrate_freely
 from hydrotele.log import Log
 from hydrotele.machine_file import load_machine
+from hydrotele.prediction.calibration import numbers
 from tests.prediction.test_pump_drive import CHANNELS, NOISE, PERIOD, simulated
 
 DUTY = np.repeat(
@@ -39,12 +40,23 @@ def test_wrong_figures_of_a_data_sheet_are_found():
     for path, factor in WRONG.items():
         sheet = changed(sheet, path, factor * value(truth, path))
     share = {"area.piston.area_rod": 0.1, "motor_constant": 0.2, "motor_inertia": 0.5}
-    found = calibrate_freely(dataset(changed(sheet, "uncertainty", share), truth), 1)
+    sheet = changed(sheet, "uncertainty", share)
+    data = dataset(sheet, truth)
+    found = calibrate_freely(data, 1)
     assert found
     for path in WRONG:
         right, stated = value(truth, path), value(sheet, path)
         assert abs(value(found.machine, path) - right) < 0.34 * abs(stated - right), path
-    assert "area.piston.area_rod" in found.numbers
+    # what is left uncertain is what the interval says, and the search begins with that
+    before, after = numbers(sheet), numbers(found.machine)
+    for key, told in found.numbers.items():
+        scale, reach = after[key].parameter.scale, 1.96 * before[key].parameter.scale
+        wide = told.high - told.low
+        assert wide <= 2.0 * 1.96 * scale * (1.0 + 1e-6) and 1.96 * scale <= reach * (1.0 + 1e-6)
+    assert after["area.piston.area_rod"].parameter.scale < 0.3 * (
+        before["area.piston.area_rod"].parameter.scale
+    )
+    assert found.undone_by(data, sheet, 1) and not found.undone_by(data, found.machine, 1)
     assert calibrate_freely(dataset(changed(sheet, "uncertainty", {}), truth), 1) is None
 
 

@@ -1,5 +1,7 @@
 """Fits to free runs: what was planted comes out, tables never fall, linkages still close."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,12 @@ from hydrotele.prediction.open_numbers import (
     stretched,
     timing,
 )
-from hydrotele.prediction.output_error import fit_free_runs, free_run_windows
+from hydrotele.prediction.output_error import (
+    _covariance,
+    _normal_equations,
+    fit_free_runs,
+    free_run_windows,
+)
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario
 
@@ -129,3 +136,25 @@ def test_a_planted_delay_and_dead_band_come_out_of_angles_alone(planted):
         curve, travel = getattr(boom.valve, way).curve, (0.2 - deadband) / (1.0 - deadband)
         assert np.interp(travel, curve.travel, curve.opening) < 0.015
     assert fit.after[0] < 0.3 * fit.before[0]
+
+
+def test_windows_that_contradict_each_other_widen_intervals():
+    """The least squares' own scatter over 400 sets of windows, each pulled its own way."""
+    rng, windows = np.random.default_rng(5), [SimpleNamespace(count=50)] * 40
+    weights, scale = np.ones((2000, 1)), np.ones(1)
+    columns = np.repeat(rng.normal(size=40), 50)[:, None, None] + rng.normal(size=(2000, 1, 1))
+    pulls = rng.normal(scale=0.3, size=(400, 40))
+    covariance, found = [], []
+    for pull in pulls:
+        error = columns[:, :, 0] * np.repeat(pull, 50)[:, None]
+        guess = SimpleNamespace(deviation=np.zeros(1))
+        slope, curvature = _normal_equations(
+            SimpleNamespace(errors=error, guess=guess), columns, weights, scale
+        )
+        guess.deviation = -np.linalg.solve(curvature, slope)
+        left = error + columns @ guess.deviation
+        point = SimpleNamespace(errors=left, guess=guess)
+        covariance.append(_covariance(point, columns, weights, scale, windows)[0, 0])
+        found.append(guess.deviation[0])
+    assert np.mean(covariance) == pytest.approx(np.var(found), rel=0.25)
+    assert np.linalg.inv(curvature)[0, 0] < 0.3 * np.var(found)  # by curvature alone
