@@ -55,7 +55,7 @@ def _set_bulk_modulus(machine: Machine, location: str, values: Values) -> Machin
 EFFECTS = (
     Effect(
         "internal_leakage", "another leakage between the chambers of a drive", "flow", hydraulics,
-        _leakage, _set("leakage", "leakage"),
+        _leakage, _set("leakage", "leakage"), "leakage",
     ),
     Effect(
         "hose_compliance", "hoses that swell with pressure", "flow", valves, _hose,

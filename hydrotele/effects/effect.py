@@ -49,6 +49,8 @@ class Effect:
         parameters: (machine, location) -> parameter name -> Parameter.
         apply: (machine, location, parameter name -> value) -> machine that has it. With all values
             nominal it returns a machine that behaves as the given one.
+        mechanism: what other effects have in common with it that are the same thing in another
+            form, such as a delay and a lag of one sensor; empty for what stands alone.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Effect:
     locations: Callable[[Machine], tuple[str, ...]]
     parameters: Callable[[Machine, str], dict[str, Parameter]]
     apply: Callable[[Machine, str, Values], Machine]
+    mechanism: str = ""
 
 
 def changed(machine: Machine, path: str, value: Any) -> Machine:

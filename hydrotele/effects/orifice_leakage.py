@@ -42,5 +42,6 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
 
 
 EFFECT = Effect(
-    NAME, "turbulent leakage between the chambers of a drive", "flow", valves, _parameters, _apply
-)
+    NAME, "turbulent leakage between the chambers of a drive", "flow", valves, _parameters, _apply,
+    "leakage",
+)  # fmt: skip

@@ -191,11 +191,11 @@ EFFECTS = (
     ),
     Effect(
         "angle_delay", "a position sensor that reads late", "sensor", axes, _angle_delay,
-        _set_angle("delay", "delay"),
+        _set_angle("delay", "delay"), "late position sensor",
     ),
     Effect(
         "angle_lag", "a position sensor behind a first-order lag", "sensor", axes, _angle_lag,
-        _set_angle("time_constant", "time_constant"),
+        _set_angle("time_constant", "time_constant"), "late position sensor",
     ),
     Effect(
         "length_offset", "a cylinder's length sensor with an offset", "sensor", linkages,
@@ -207,7 +207,7 @@ EFFECTS = (
     ),
     Effect(
         "pressure_delay", "pressure transducers of an axis that read late", "sensor", hydraulics,
-        _pressure_delay, _set_pressure_delay,
+        _pressure_delay, _set_pressure_delay, "late pressure transducers",
     ),
     Effect(
         "pressure_scale", "a pressure transducer with another scale", "sensor", _ports,
@@ -215,7 +215,7 @@ EFFECTS = (
     ),
     Effect(
         "pressure_lag", "pressure transducers of an axis behind a first-order lag", "sensor",
-        hydraulics, _pressure_lag, _set_pressure_lag,
+        hydraulics, _pressure_lag, _set_pressure_lag, "late pressure transducers",
     ),
     Effect(
         "clock_offset", "a clock of the positions or of the pressures that is late", "sensor",

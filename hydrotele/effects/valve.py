@@ -62,8 +62,17 @@ EFFECTS = (
         _common_deadband,
         _deadband,
         _set_deadband,
+        "overlap",
     ),
-    Effect("valve_gain", "another flow gain of a valve", "valve", valves, _gain, _scale_gain),
+    Effect(
+        "valve_gain",
+        "another flow gain of a valve",
+        "valve",
+        valves,
+        _gain,
+        _scale_gain,
+        "flow gain",
+    ),
     Effect(
         "spool_lag", "another bandwidth of a spool", "valve", valves, _bandwidth, _set_bandwidth
     ),

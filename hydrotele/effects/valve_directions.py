@@ -49,10 +49,10 @@ def _set_deadbands(machine: Machine, location: str, values: Values) -> Machine:
 EFFECTS = (
     Effect(
         "valve_gain_direction", "flow gains of a valve that differ between its directions", "valve",
-        valves, _gains, _scale_gains,
+        valves, _gains, _scale_gains, "flow gain",
     ),
     Effect(
         "valve_deadband_direction", "overlaps of a valve that differ between its directions",
-        "valve", valves, _deadbands, _set_deadbands,
+        "valve", valves, _deadbands, _set_deadbands, "overlap",
     ),
 )  # fmt: skip

@@ -75,6 +75,17 @@ def _usual(deviation: np.ndarray, spread: np.ndarray) -> float:
     return max(usual, float(np.clip(_RIGHT + (1.0 - _RIGHT) * between, _RIGHT, 1.0)))
 
 
+def mostly_right(guess: Guess, fit: Fit) -> bool:
+    """Whether a guess calibrates numbers of which nearly all that the runs tell are right."""
+    first = 0
+    for hypothesis, deviation in guess.parts:
+        if hypothesis.name == CALIBRATION:
+            spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+            return _usual(deviation, spread[first : first + hypothesis.size]) < 1.0
+        first += hypothesis.size
+    return False
+
+
 def promoted(
     evidence: Evidence, now: Judged, fit: Fit, candidates: Sequence[Hypothesis]
 ) -> tuple[Guess, float] | None:

@@ -17,6 +17,7 @@ from hydrotele.gap.floor import perfect_tracks
 from hydrotele.gap.free_calibration import calibrate_freely
 from hydrotele.gap.residuals import residual_tests, rms
 from hydrotele.gap.result import (
+    SURE,
     Alternative,
     Candidate,
     Estimate,
@@ -39,7 +40,6 @@ from hydrotele.prediction.levels import rippled, undisturbed_loss
 from hydrotele.prediction.stretches import busiest, thinned
 from hydrotele.prediction.track import STEP, Levels, Track, known_levels, track_run
 
-SURE = 0.95  # probability below which an effect is called ambiguous
 LIKELY = 0.5  # probability above which an effect may explain a part: likelier than all else
 PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
 _MECHANISM, _STEEP = 0.35, 0.07  # see `_mechanism`
@@ -236,12 +236,12 @@ def _failed(tests: Mapping, before: float, after: float, floor: float | None) ->
 
 
 def _verdict(named: Sequence[NamedEffect], failed: bool, floor: float | None) -> Verdict:
-    sure = [effect for effect in named if effect.probability >= SURE]
+    sure = [effect for effect in named if effect.mechanism_probability >= SURE]
     if not named:
         return "unknown" if failed or floor is None else "no_gap"
     if not failed:
         return "named" if len(sure) == len(named) else "ambiguous"
-    closed = sum(effect.share for effect in named if effect.probability > LIKELY)
+    closed = sum(effect.share for effect in named if effect.mechanism_probability > LIKELY)
     return "partly" if closed >= PARTLY else "unknown"
 
 
@@ -270,7 +270,9 @@ def _named(
             continue
         chance, others = _chances(found, index, rest)
         part = (rest.loss - found.judged.loss) / max(rest.loss - ideal, 1.0)
-        chance *= _mechanism(part)
+        trust = _mechanism(part)
+        chance *= trust
+        others = tuple(dataclasses.replace(a, probability=trust * a.probability) for a in others)
         effects.append(
             NamedEffect(
                 hypothesis.name, hypothesis.location, chance,
@@ -367,9 +369,9 @@ def _experiment(machine: Machine, verdict: Verdict, named: Sequence[NamedEffect]
     if verdict == "unknown" and unknown:
         place = unknown.channel.partition(".")[2] or "supply"
         return next_experiment(machine, "no known effect explains the data", [(unknown.law, place)])
-    if verdict != "ambiguous":
-        return None
     unsure = [e for e in named if e.probability < SURE]
+    if verdict not in ("ambiguous", "named") or not unsure:
+        return None
     pairs = [(e.name, e.location) for e in unsure]
     pairs += [(a.name, a.location) for e in unsure for a in e.alternatives]
     return next_experiment(machine, "these effects cannot be told apart with this data", pairs)

@@ -18,7 +18,8 @@ def gap_document(gap: Gap) -> dict[str, Any]:
     Returns:
         `verdict`: named, partly, ambiguous, unknown or no_gap.
         `effects`: named effects, see `effect_document`; `share` is the part of the held-out run's
-        gap that comes back without the effect.
+        gap that comes back without the effect, `mechanism_probability` counts alternatives that are
+        the same mechanism in another form (a lag for a delay), and decides the verdict.
         `calibration`: uncertain number -> `value`, `nominal`, `unit`, `ci95`.
         `learned`: laws learned from the data: `balance` (force, flow_head, flow_rod, flow_through,
         command), `axis`, `variable`, `other` (a second variable, or empty), `formula` in SI,
@@ -82,6 +83,7 @@ def effect_document(effect: NamedEffect) -> dict[str, Any]:
         "name": effect.name,
         "location": effect.location,
         "probability": effect.probability,
+        "mechanism_probability": effect.mechanism_probability,
         "share": effect.share,
         "parameters": {
             name: {"value": e.value, "unit": e.unit, "ci95": [e.low, e.high]}

@@ -7,7 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hydrotele.effects import EFFECTS
 from hydrotele.machine import Machine
+
+SURE = 0.95
+"""Probability of a mechanism below which it is called ambiguous."""
 
 Verdict = Literal["named", "partly", "ambiguous", "unknown", "no_gap"]
 
@@ -51,6 +55,21 @@ class NamedEffect:
     parameters: Mapping[str, Estimate]
     alternatives: tuple[Alternative, ...] = ()
     share: float = math.nan
+
+    @property
+    def other_forms(self) -> tuple[Alternative, ...]:
+        """Alternatives that are the same mechanism at the same place, in another form."""
+        own = EFFECTS[self.name].mechanism if self.name in EFFECTS else ""
+        return tuple(
+            a for a in self.alternatives
+            if own and a.location == self.location and a.name in EFFECTS
+            and EFFECTS[a.name].mechanism == own
+        )  # fmt: skip
+
+    @property
+    def mechanism_probability(self) -> float:
+        """Probability of its mechanism at this place, in this or another form."""
+        return self.probability + sum(a.probability for a in self.other_forms)
 
 
 @dataclass(frozen=True)

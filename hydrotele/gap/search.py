@@ -6,13 +6,19 @@ reading that it misses. A guess is better if it is more likely over most stretch
 in a few readings (`weights`).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.calibrating import calibrated, calibration_of, free_of_calibration, promoted
+from hydrotele.gap.calibrating import (
+    calibrated,
+    calibration_of,
+    free_of_calibration,
+    mostly_right,
+    promoted,
+)
 from hydrotele.gap.pulses import timed
 from hydrotele.gap.rattling import rattling
 from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of
@@ -89,24 +95,58 @@ def search(
     """
     tell = progress or (lambda text, share: None)
     tell("find noise levels of the given model", 0.0)
-    base = now = evidence.set_base(Guess())
-    fit, weak, first, refused, tried, roomy = None, None, (), 0, False, False
+    base = evidence.set_base(Guess())
     candidates = timed(candidates, base)
     tell("try every effect as if nothing unknown acted", 0.03)
     bold, early = _early_options(evidence, base, candidates)
-    rankings: dict[tuple[str, str], Sequence[Screened]] = {}
-    worth = 0.0
+    grown = _grow(evidence, base, _Grown(base, early=early, first=bold.ranking), candidates, tell)
+    if grown.fit and mostly_right(grown.now.guess, grown.fit):
+        grown = _sparse(evidence, base, grown, candidates, tell)
+    return _compared(evidence, base, grown, tell)
+
+
+@dataclass(frozen=True)
+class _Grown:
+    """How far a search has got.
+
+    Attributes:
+        now: the guess, judged.
+        fit: its last fit, or None without effects.
+        first: the first screening, best first.
+        rankings: name and location of an effect -> the screening in which it was found.
+        weak: a candidate that was clear but smaller than worth naming, or None.
+        early: options that were found without a screening, best first.
+        calibrates: whether all uncertain numbers may be fitted together.
+    """
+
+    now: Judged
+    fit: Fit | None = None
+    first: Sequence[Screened] = ()
+    rankings: Mapping[tuple[str, str], Sequence[Screened]] = field(default_factory=dict)
+    weak: Fit | None = None
+    early: Sequence[tuple[Judged, float]] = ()
+    calibrates: bool = True
+
+
+def _grow(
+    evidence: Evidence, base: Judged, begin: _Grown, candidates: Sequence[Hypothesis],
+    tell: Progress,
+) -> _Grown:  # fmt: skip
+    """Add what brings most, again and again."""
+    now, fit, weak, first = begin.now, begin.fit, begin.weak, begin.first
+    early, rankings = begin.early, dict(begin.rankings)
+    refused, tried, roomy, worth = 0, False, False, 0.0
     ranked: Sequence[Screened] | None = None  # of the present guess
     while refused < _REFUSED:
         done = 0.85 * (1.0 - 0.7 ** len(now.guess.parts)) + 0.05
         if early and lacking(early[0][0], evidence) < _LITTLE * lacking(base, evidence):
-            options, first = early, bold.ranking
+            options = list(early)
         else:
             if ranked is None:
                 tell(f"try every effect ({_named_so_far(now.guess)} named so far)", done)
                 open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
                 ranked = screen(evidence, now.guess, open_ones)
-                first = first or tuple(ranked)
+                first = first if rankings else ranked
             options = sorted([*_best_singles(evidence, now, ranked), *early], key=_score)
             if not options and lacking(now, evidence) > LACKING and len(ranked) > 1:
                 options = _best_pairs(evidence, now, ranked)
@@ -141,7 +181,8 @@ def search(
                 refused += 1
                 continue
         if (
-            not calibration_of(now.guess)
+            begin.calibrates
+            and not calibration_of(now.guess)
             and lacking(grown, evidence) > LACKING
             and (best is None or not tried)
         ):
@@ -164,6 +205,45 @@ def search(
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = first if ranked is None else ranked
         now, fit, ranked = grown, settled, None
+    return replace(begin, now=now, fit=fit, first=first, rankings=rankings, weak=weak)
+
+
+def _sparse(
+    evidence: Evidence, base: Judged, grown: _Grown, candidates: Sequence[Hypothesis],
+    tell: Progress,
+) -> _Grown:  # fmt: skip
+    """The same search without calibration, if that is likelier: few effects in a right machine.
+
+    A calibration takes two effects at once, and a few pins, each by less than it is uncertain, take
+    a sensor's offset. Where nearly all numbers stay as they were, that is the unlikelier story.
+    """
+    tell("search without calibration", 0.8)
+    place = next(i for i, h in enumerate(grown.now.guess.hypotheses) if h.name == CALIBRATION)
+    guess, fit, now = grown.now.guess.without(place), None, base
+    if guess.parts:
+        now, fit = settle(evidence, evidence.judged(guess))
+    else:
+        evidence.set_base(base)
+    begin = replace(grown, now=now, fit=fit, early=(), calibrates=False)
+    other = _grow(evidence, base, begin, candidates, tell)
+    if other.fit is None or _total(other) > _total(grown):
+        evidence.set_base(grown.now)
+        return grown
+    return other
+
+
+def _total(grown: _Grown) -> float:
+    """Loss of a guess and what all its numbers cost."""
+    assert grown.fit
+    return grown.now.loss + charge(grown.fit.information, len(grown.fit.information))
+
+
+def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -> Found:
+    """Drop what is needless, and compare each effect with its rivals."""
+    now, fit, first = grown.now, grown.fit, tuple(grown.first)
+    charges: list[float] = []
+    rivals: list[Sequence[Rival]] = []
+    without: tuple[Judged | None, ...] = ()
     needless: Guess | None = Guess()
     while needless is not None:
         tell("drop what is needless", 0.87)
@@ -173,7 +253,7 @@ def search(
         for index, (hypothesis, _) in enumerate(now.guess.parts):
             assert fit
             charges.append(charge(_last(fit.information, now.guess, index), hypothesis.size))
-            ranked, rest = rankings.get(hypothesis.key, first), without[index]
+            ranked, rest = grown.rankings.get(hypothesis.key, first), without[index]
             rivals.append(find_rivals(evidence, now, index, ranked, rest) if rest else ())
         needless = _without_needless(now, charges, rivals)
         if needless is not None:
@@ -195,12 +275,11 @@ def search(
         now, fit = polished(evidence, now)
     else:
         evidence.set_base(now)
-    for index, others in enumerate(rivals):
-        rivals[index] = [
-            r for r in others if not is_case_of(evidence, now.guess, index, r.hypothesis)
-        ]
-    compared = tuple(map(tuple, rivals))
-    return Found(base, now, fit, first, tuple(charges), without, compared, weak)
+    compared = tuple(
+        tuple(r for r in others if not is_case_of(evidence, now.guess, index, r.hypothesis))
+        for index, others in enumerate(rivals)
+    )
+    return Found(base, now, fit, first, tuple(charges), without, compared, grown.weak)
 
 
 def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:

@@ -5,6 +5,7 @@ import math
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.customary import amount, said
 from hydrotele.gap.result import (
+    SURE,
     Alternative,
     Candidate,
     Estimate,
@@ -236,7 +237,7 @@ def verdict_words(gap: Gap) -> tuple[str, ...]:
         first = f"{first[:-1]}, but these data do not settle which effect it is."
     if gap.verdict == "partly":
         first = f"{first[:-1]} that can be named, and in a way that no known effect explains."
-    rivals = _rivals(gap) if gap.verdict in ("ambiguous", "partly") else ()
+    rivals = _rivals(gap)
     rest = (*_calibrated(gap), *_shrinking(gap), *rivals, *_leftover(gap), *_experiment(gap))
     return (first, *_effects(gap), *rest)
 
@@ -329,7 +330,17 @@ def _times(value: float, size: GapSize) -> str:
 def _rivals(gap: Gap) -> tuple[str, ...]:
     texts = []
     for effect in gap.effects:
-        if effect.alternatives:
+        unsure = gap.verdict in ("ambiguous", "partly")
+        if effect.other_forms and effect.mechanism_probability >= SURE > effect.probability:
+            others = _listed(
+                [f"{effect_title(a)} ({chance_words(a.probability)})" for a in effect.other_forms],
+                "or",
+            )
+            texts.append(
+                f"Its form is open: these data do not tell {effect_title(effect)} from {others}."
+                " The patched model has the first of them."
+            )
+        elif effect.alternatives and unsure:
             others = _listed(
                 [f"{effect_title(a)} ({chance_words(a.probability)})" for a in effect.alternatives],
                 "or",

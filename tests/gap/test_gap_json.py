@@ -34,6 +34,7 @@ def test_an_effect_in_full(gap_of):
         "name": "length_offset",
         "location": "boom",
         "probability": 0.62,
+        "mechanism_probability": 0.62,
         "share": None,
         "parameters": {"offset": {"value": -0.0061, "unit": "m", "ci95": [-0.0066, -0.0056]}},
         "alternatives": [{"name": "pin_offset", "location": "boom", "probability": 0.37}],

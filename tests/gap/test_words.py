@@ -7,7 +7,7 @@ import pytest
 
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.customary import amount, said
-from hydrotele.gap.result import Alternative, Estimate, GapSize
+from hydrotele.gap.result import Alternative, Estimate, GapSize, NamedEffect
 from hydrotele.gap.words import effect_title, gap_closed, headline, verdict_words
 from hydrotele.machine_file import load_machine
 
@@ -46,6 +46,23 @@ def test_an_ambiguity_names_both_and_the_experiment(gap_of):
     words = text_of(gap)
     for piece in ("62 %", "(37 %)", "-6.10 mm", "patched model has the first", "Next experiment"):
         assert piece in words
+
+
+def test_a_mechanism_of_open_form_is_named_with_both_forms(gap_of):
+    """A delay and a lag of one sensor are one mechanism; the pin of another place is none."""
+    form, place = Alternative("angle_lag", "swing", 0.38), Alternative("angle_lag", "boom", 0.38)
+    value = {"delay": Estimate(9.0e-3, "s", 8.9e-3, 9.1e-3, 0.0)}
+    late = NamedEffect("angle_delay", "swing", 0.61, value, (form, place))
+    assert late.other_forms == (form,)
+    assert late.mechanism_probability == pytest.approx(0.99)
+    words = text_of(dataclasses.replace(gap_of("named"), effects=(late,)))
+    assert "do not tell angle delay of the swing from angle lag of the swing (38 %)" in words
+    sure = dataclasses.replace(late, probability=0.99)
+    assert "form is open" not in text_of(dataclasses.replace(gap_of("named"), effects=(sure,)))
+    unlike = NamedEffect(
+        "length_offset", "boom", 0.61, {}, (Alternative("pin_offset", "boom", 0.3),)
+    )
+    assert unlike.other_forms == () and unlike.mechanism_probability == 0.61
 
 
 def test_a_partly_named_gap_says_what_is_named_learned_and_left(gap_of):
