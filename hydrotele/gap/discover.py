@@ -9,7 +9,7 @@ inside the machine, and kept if it is worth its parameters. It is a term of the 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from typing import NamedTuple
 
@@ -27,9 +27,10 @@ from hydrotele.gap.search import ENTER, lacking
 from hydrotele.gap.settling import loss_of
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
+from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import Evidence, Judged
 from hydrotele.prediction.free_run import free_run_errors, machine_runner
-from hydrotele.prediction.hypothesis import Hypothesis
+from hydrotele.prediction.hypothesis import Guess, Hypothesis
 from hydrotele.prediction.inputs import Input, input_sizes, input_units
 from hydrotele.prediction.levels import smoothed
 from hydrotele.prediction.track import Track
@@ -78,6 +79,9 @@ class Discovery:
 def discover(evidence: Evidence, judged: Judged) -> Discovery:
     """Learn laws of what a guess lacks, one after the other.
 
+    The numbers of named effects stay as they are: a law is what remains after them, and must not
+    take their place. Calibrated numbers may give way.
+
     Args:
         evidence: the runs.
         judged: the guess, judged with unknown inputs.
@@ -86,6 +90,13 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
         The guess with the laws that are worth their parameters.
     """
     laws: list[Learned] = []
+    named = [h.name != CALIBRATION for h in judged.guess.hypotheses]
+    parts = judged.guess.parts
+    held = [
+        (h.held(d), np.zeros(0)) if n else (h, d) for n, (h, d) in zip(named, parts, strict=True)
+    ]
+    prior = sum(float(d @ d) for n, (_, d) in zip(named, parts, strict=True) if n)
+    judged = replace(judged, guess=Guess(tuple(held)), loss=judged.loss - prior)
     noise = judged.tracks[0].levels.noise  # the same for all laws: each finds other levels
     begin, ahead = judged.loss, _open_loop(evidence, judged, noise)
     for _ in range(_MOST):
@@ -102,7 +113,10 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
         laws.append(law)
         if fall < _DETAIL * (begin - judged.loss) or lacking(judged, evidence) < ENTER:
             break
-    return Discovery(judged, tuple(laws))
+    found = judged.guess.parts
+    own = [old if n else new for n, old, new in zip(named, parts, found, strict=False)]
+    guess = Guess((*own, *found[len(parts) :]))
+    return Discovery(replace(judged, guess=guess, loss=judged.loss + prior), tuple(laws))
 
 
 def _best_law(

@@ -134,13 +134,16 @@ class Evidence:
         """A guess with noise levels found from given ones instead of from those of the base.
 
         What the base needs where it does not follow the readings at all may hide what a guess does.
+        Unknown inputs that the given levels lack are tried, too.
         """
         machine = guess.machine(self.data.machine)
         tracks = self.map(
             lambda run: track_run(machine, self.data, run, None, self.step, levels, None, True),
             self.runs,
         )
-        tracks = find_levels(self.data, machine, tracks, self.map, self.step, _ROUNDS)
+        tracks = find_levels(
+            self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True
+        )
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + _prior(guess))
 

@@ -1,7 +1,7 @@
 """A hypothesis: an effect at a place, its numbers counted in typical deviations from nominal."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -85,6 +85,12 @@ class Hypothesis:
         """Steps of a parameter from nominal to either side, as far as its bounds allow."""
         steps = (min(size, self.high[index]), max(-size, self.low[index]))
         return [float(step) for step in steps if step != 0.0]
+
+    def held(self, deviation: np.ndarray) -> "Hypothesis":
+        """The same with its numbers fixed at a deviation (p,): none is left to fit."""
+        return replace(
+            self, parameters={}, change=lambda nominal, _: self.machine(nominal, deviation)
+        )
 
     def nudges(self, deviation: np.ndarray, size: float = _CURVE) -> np.ndarray:
         """(p,) signed steps for slopes at a deviation, away from the nearer bound."""
