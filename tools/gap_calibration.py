@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.dataset.load import load_dataset
+from hydrotele.gap.pruning import ENTER
 from hydrotele.gap.residuals import LIMITS, residual_tests
 from hydrotele.gap.screening import screen
-from hydrotele.gap.search import ENTER
 from hydrotele.machine_file import load_machine
 from hydrotele.prediction.evidence import Evidence
 from hydrotele.prediction.hypothesis import Guess, hypotheses

@@ -1,9 +1,11 @@
 """Calibration within the search: all uncertain numbers together, and those that are effects."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from hydrotele.machine import Machine
 from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
@@ -138,7 +140,17 @@ def promoted(
         else:
             start.append(0.0)
     parts.append((known, np.clip(start, known.low, known.high)))
-    rest = calibration(evidence.data.machine, frozenset(set(table) - set(keys) | gone))
-    kept = np.array([d for key, d in zip(keys, deviation, strict=True) if key not in gone])
-    parts[place] = (rest, kept)
-    return Guess(tuple(parts)), moved[effect]
+    return uncalibrated(Guess(tuple(parts)), evidence.data.machine, gone), moved[effect]
+
+
+def uncalibrated(guess: Guess, machine: Machine, keys: Collection[str]) -> Guess:
+    """A guess whose calibration leaves some numbers as the given machine has them."""
+    parts = list(guess.parts)
+    for index, (hypothesis, deviation) in enumerate(parts):
+        if hypothesis.name == CALIBRATION:
+            left = [key for key in hypothesis.parameters if key not in keys]
+            kept = [d for k, d in zip(hypothesis.parameters, deviation, strict=True) if k in left]
+            group = calibration(machine, frozenset(numbers(machine)) - frozenset(left))
+            bounds = {key: hypothesis.parameters[key] for key in left}  # perhaps widened
+            parts[index] = (replace(group, parameters=bounds), np.array(kept))
+    return Guess(tuple(parts))

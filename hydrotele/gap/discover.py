@@ -23,7 +23,8 @@ from hydrotele.dynamics.supply import supply_of
 from hydrotele.effects import Parameter
 from hydrotele.gap.law_regression import Regression, regression
 from hydrotele.gap.law_shapes import THROUGH, Shape, possible_shapes
-from hydrotele.gap.search import ENTER, lacking
+from hydrotele.gap.pruning import ENTER
+from hydrotele.gap.search import lacking
 from hydrotele.gap.settling import loss_of
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hydrotele.effects import EFFECTS
 from hydrotele.gap.calibrating import free_of_calibration
 from hydrotele.gap.screening import Screened
 from hydrotele.gap.settling import fitted, settle, strained
@@ -98,6 +99,19 @@ def is_case_of(evidence: Evidence, guess: Guess, index: int, other: Hypothesis) 
     first = evidence.tracks[:1]
     change = evidence.errors(instead, MIDDLE, first) - evidence.errors(guess, MIDDLE, first)
     return float(change @ change) < _SAME
+
+
+def plain_form(hypothesis: Hypothesis, candidates: Sequence[Hypothesis]) -> Hypothesis | None:
+    """The same mechanism at the same place with one number instead of several of its unit."""
+    known = EFFECTS.get(hypothesis.name)
+    if known is None or not known.mechanism or hypothesis.size < 2:
+        return None
+    units = {p.unit for p in hypothesis.parameters.values()}
+    for other in candidates:
+        same = other.name in EFFECTS and EFFECTS[other.name].mechanism == known.mechanism
+        if same and other.location == hypothesis.location and other.size == 1:
+            return other if units == {p.unit for p in other.parameters.values()} else None
+    return None
 
 
 def better(

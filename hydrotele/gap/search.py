@@ -18,10 +18,21 @@ from hydrotele.gap.calibrating import (
     free_of_calibration,
     mostly_right,
     promoted,
+    uncalibrated,
+)
+from hydrotele.gap.pruning import (
+    ENTER,
+    TOLD,
+    idle,
+    moved_last,
+    pruned,
+    told,
+    without_needless,
+    worth_naming,
 )
 from hydrotele.gap.pulses import timed
 from hydrotele.gap.rattling import rattling
-from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of
+from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of, plain_form
 from hydrotele.gap.screening import Screened, screen
 from hydrotele.gap.settling import fitted, loss_of, polished, settle, strained, widened
 from hydrotele.gap.without_inputs import WithoutInputs, without_inputs
@@ -31,12 +42,8 @@ from hydrotele.prediction.hypothesis import Guess, Hypothesis
 from hydrotele.prediction.levels import input_excess
 from hydrotele.prediction.track import COARSE
 
-ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines stay below 14.7
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
-_BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
-# order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
 _LITTLE = 0.01  # of what the given machine lacks: an effect that leaves less is tried at once
-_TOLD = 9.0  # square of an effect's deviation over its uncertainty: three standard deviations
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
@@ -102,7 +109,7 @@ def search(
     grown = _grow(evidence, base, _Grown(base, early=early, first=bold.ranking), candidates, tell)
     if grown.fit and mostly_right(grown.now.guess, grown.fit):
         grown = _sparse(evidence, base, grown, candidates, tell)
-    return _compared(evidence, base, grown, tell)
+    return _compared(evidence, base, _plain(evidence, grown, candidates), tell)
 
 
 @dataclass(frozen=True)
@@ -232,6 +239,37 @@ def _sparse(
     return other
 
 
+def _plain(evidence: Evidence, grown: _Grown, candidates: Sequence[Hypothesis]) -> _Grown:
+    """Effects whose numbers say the same become their form with one number, where that is likelier.
+
+    A dead band that is calibrated already is no candidate, but dead bands by direction are.
+    """
+    for index, (hypothesis, deviation) in enumerate(grown.now.guess.parts):
+        plain = plain_form(hypothesis, candidates)
+        if plain is None:
+            continue
+        assert grown.fit
+        first = sum(h.size for h in grown.now.guess.hypotheses[:index])
+        own = slice(first, first + hypothesis.size)
+        covariance = np.linalg.inv(grown.fit.information)[own, own]
+        apart = np.diff(np.eye(hypothesis.size), axis=0)  # of the numbers, one from the next
+        gone = apart @ deviation
+        if gone @ np.linalg.solve(apart @ covariance @ apart.T, gone) > TOLD * len(gone):
+            continue
+        (p,) = plain.parameters.values()
+        start = (np.mean(list(hypothesis.values(deviation).values())) - p.nominal) / p.scale
+        parts = list(grown.now.guess.parts)
+        parts[index] = (plain, np.clip(np.array([start]), plain.low, plain.high))
+        keys = {f"{plain.name}.{plain.location}.{key}" for key in plain.parameters}
+        guess = uncalibrated(Guess(tuple(parts)), evidence.data.machine, keys)
+        now, fit = settle(evidence, evidence.judged(guess))
+        other = replace(grown, now=now, fit=fit)
+        if _total(other) < _total(grown):
+            return _plain(evidence, other, candidates)
+        evidence.set_base(grown.now)
+    return grown
+
+
 def _total(grown: _Grown) -> float:
     """Loss of a guess and what all its numbers cost."""
     assert grown.fit
@@ -247,18 +285,18 @@ def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -
     needless: Guess | None = Guess()
     while needless is not None:
         tell("drop what is needless", 0.87)
-        now, fit, without = _pruned(evidence, base, now, fit)
+        now, fit, without = pruned(evidence, base, now, fit)
         tell("compare rivals", 0.9)
         charges, rivals = [], []
         for index, (hypothesis, _) in enumerate(now.guess.parts):
             assert fit
-            charges.append(charge(_last(fit.information, now.guess, index), hypothesis.size))
+            charges.append(charge(moved_last(fit.information, now.guess, index), hypothesis.size))
             ranked, rest = grown.rankings.get(hypothesis.key, first), without[index]
             rivals.append(find_rivals(evidence, now, index, ranked, rest) if rest else ())
-        needless = _without_needless(now, charges, rivals)
+        needless = without_needless(now, charges, rivals)
         if needless is not None:
             now, fit = settle(evidence, evidence.judged(needless))
-    rivals = [[r for r in others if not _idle(r)] for others in rivals]
+    rivals = [[r for r in others if not idle(r)] for others in rivals]
     for index, rest in enumerate(without):
         if rest and (rival := better(now, index, charges[index], rest, rivals[index])):
             assert rival.fit
@@ -401,88 +439,3 @@ def _best_pairs(
         and not any(strained(fit.guess, k) for k in range(first, len(fit.guess.parts)))
     ]  # fmt: skip
     return _judged_best(evidence, now, fits)
-
-
-def worth_naming(guess: Guess, index: int, score: float) -> bool:
-    """Whether an effect is as large as its least size in any parameter, or beyond doubt."""
-    hypothesis, deviation = guess.parts[index]
-    return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
-
-
-def told(guess: Guess, fit: Fit, index: int) -> bool:
-    """Whether an effect's numbers differ from the model's by more than they are uncertain.
-
-    Where a likelihood is full of dents, as with teeth, it may fall by chance with a number moved.
-    """
-    hypothesis, deviation = guess.parts[index]
-    first = sum(h.size for h in guess.hypotheses[:index])
-    own = slice(first, first + hypothesis.size)
-    covariance = np.linalg.inv(fit.information)[own, own]
-    return float(deviation @ np.linalg.solve(covariance, deviation)) > _TOLD
-
-
-def _idle(rival: Rival) -> bool:
-    """Whether a rival does nothing: what is there without it was settled."""
-    guess = rival.judged.guess
-    return rival.fit is not None and not told(guess, rival.fit, len(guess.parts) - 1)
-
-
-def _without_needless(
-    now: Judged, charges: Sequence[float], rivals: Sequence[Sequence[Rival]]
-) -> Guess | None:
-    """The guess without an effect of which a rival that does nothing can take the place."""
-    for cost, others in zip(charges, rivals, strict=True):
-        for rival in others:
-            if _idle(rival) and rival.judged.loss - now.loss - cost < ENTER:
-                return rival.judged.guess.without(len(rival.judged.guess.parts) - 1)
-    return None
-
-
-def _pruned(
-    evidence: Evidence, base: Judged, now: Judged, fit: Fit | None
-) -> tuple[Judged, Fit | None, tuple[Judged | None, ...]]:
-    """Take out effects that the others have made needless; each effect's rest, judged."""
-    while True:
-        rests, scores = _rests(evidence, base, now, fit)
-        if len(scores) < 2 or min(scores) >= ENTER:
-            return now, fit, tuple(rests)
-        worst = rests[int(np.argmin(scores))]
-        assert worst
-        now, fit = settle(evidence, worst)
-
-
-def _rests(
-    evidence: Evidence, base: Judged, now: Judged, fit: Fit | None
-) -> tuple[list[Judged | None], list[float]]:
-    """For each part the guess without it, fitted and judged (None for calibration); scores."""
-    rests: list[Judged | None] = []
-    scores: list[float] = []
-    slopes = evidence.base_slopes(evidence.slope_step) if now.guess.parts else np.zeros((0, 0))
-    sizes = np.cumsum([0, *(h.size for h, _ in now.guess.parts)])
-    for index, (hypothesis, _) in enumerate(now.guess.parts):
-        assert fit
-        if hypothesis.name == CALIBRATION:
-            rests.append(None)
-            scores.append(np.inf)
-            continue
-        smaller = now.guess.without(index)
-        kept = np.delete(slopes, np.s_[sizes[index] : sizes[index + 1]], axis=1)
-        if smaller.parts:
-            smaller = evidence.fit(smaller, 0.0, kept=kept, steps=2, step=MIDDLE).guess
-        rest = evidence.judged(smaller, reopened=True) if smaller.parts else base
-        cost = charge(_last(fit.information, now.guess, index), hypothesis.size)
-        score = rest.loss - now.loss - cost
-        if not (worth_naming(now.guess, index, score) and told(now.guess, fit, index)):
-            score = min(score, 0.0)
-        rests.append(rest)
-        scores.append(score)
-    return rests, scores
-
-
-def _last(information: np.ndarray, guess: Guess, index: int) -> np.ndarray:
-    """Information with the parameters of one effect moved to the end."""
-    sizes = [h.size for h, _ in guess.parts]
-    first = sum(sizes[:index])
-    own = list(range(first, first + sizes[index]))
-    order = [i for i in range(len(information)) if i not in own] + own
-    return information[np.ix_(order, order)]
