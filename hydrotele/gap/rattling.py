@@ -22,6 +22,7 @@ from hydrotele.prediction.track import Levels, track_run
 
 _TEETH = "backlash"
 _GAPS = (0.002, 0.0035, 0.006, 0.01, 0.018, 0.03)  # rad; further apart, one may be jumped over
+_SHAKEN = 3.0  # times its floor, of the white noise on a rate; teeth may be hidden in other lacks
 _DAMPING = 0.05  # damping ratio to begin with: hard teeth, hardly oiled
 _STRETCH = 3.0  # s of the busiest run: some reversals of a motor
 _SIMPLEX = (0.15, 0.5, 1.0)  # of the logarithms of gap, inertia and damping ratio
@@ -45,7 +46,7 @@ def rattling(evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis])
     for candidate in candidates:
         axis = candidate.location
         if candidate.name != _TEETH or not rippled_at(
-            base.tracks[0].levels, f"rate.{machine.axes[axis].joint}"
+            base.tracks[0].levels, f"rate.{machine.axes[axis].joint}", _SHAKEN
         ):
             continue
         whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(machine, axis))

@@ -351,9 +351,9 @@ def rippled(levels: Levels) -> bool:
     return any(rippled_at(levels, name) for name in levels.drift)
 
 
-def rippled_at(levels: Levels, state: str) -> bool:
+def rippled_at(levels: Levels, state: str, times: float = _RIPPLE) -> bool:
     """Whether a state's white process noise, as of `rate.swing`, is more than an integrator's."""
-    return levels.drift.get(state, 0.0) > _RIPPLE * DRIFT[state.partition(".")[0]]
+    return levels.drift.get(state, 0.0) > times * DRIFT[state.partition(".")[0]]
 
 
 def input_excess(track: Track) -> float:
