@@ -44,6 +44,7 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
 
 def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
     """Fit with levels and gains computed anew until they no longer matter."""
+    begin = judged
     fit, last, guess, kept = None, None, judged.guess, None
     group = calibration_of(guess)
     for _ in range(_SETTLES):
@@ -67,7 +68,12 @@ def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
             break
         kept = kept if fall < _STALE else None
     assert fit
-    return evidence.set_base(evidence.judged(guess)), fit
+    found = evidence.judged(guess)
+    if found.loss > begin.loss:  # levels may end in another valley than those they came from
+        again = evidence.judged(guess, reopened=True)
+        found = min((found, again, begin), key=lambda one: one.loss)
+        fit = replace(fit, guess=found.guess)
+    return evidence.set_base(found), fit
 
 
 def polished(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
