@@ -330,25 +330,20 @@ def _times(value: float, size: GapSize) -> str:
 def _rivals(gap: Gap) -> tuple[str, ...]:
     texts = []
     for effect in gap.effects:
-        unsure = gap.verdict in ("ambiguous", "partly")
-        if effect.other_forms and effect.mechanism_probability >= SURE > effect.probability:
-            others = _listed(
-                [f"{effect_title(a)} ({chance_words(a.probability)})" for a in effect.other_forms],
-                "or",
+        form = bool(effect.other_forms) and effect.mechanism_probability >= SURE
+        rivals = effect.other_forms if form else effect.alternatives
+        if not rivals or (effect.probability >= SURE if form else gap.verdict == "named"):
+            continue
+        told = [f"{effect_title(a)} ({chance_words(a.probability)})" for a in rivals]
+        others = f"{effect_title(effect)} from {_listed(told, 'or')}"
+        if form:
+            text = f"Its form is open: these data do not tell {others}."
+        else:
+            text = (
+                f"These data cannot tell {others}: they would look the same to the sensors there"
+                " are."
             )
-            texts.append(
-                f"Its form is open: these data do not tell {effect_title(effect)} from {others}."
-                " The patched model has the first of them."
-            )
-        elif effect.alternatives and unsure:
-            others = _listed(
-                [f"{effect_title(a)} ({chance_words(a.probability)})" for a in effect.alternatives],
-                "or",
-            )
-            texts.append(
-                f"These data cannot tell {effect_title(effect)} from {others}: they would look the"
-                " same to the sensors there are. The patched model has the first of them."
-            )
+        texts.append(f"{text} The patched model has the first of them.")
     return tuple(texts)
 
 
