@@ -49,7 +49,8 @@ _REJECTED = (
     "What the fitted runs asked for makes {} held-out run worse; it was taken back, and nothing is"
     " named."
 )
-_MINOR = 0.02  # share of the gap up to which a learned law is a detail
+_MINOR = 0.02  # share of the gap up to which a learned law is a detail, or an effect beside one of
+# the same axis that closes most: laws are rarely closer to a machine than 15 % of what they do
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
@@ -111,7 +112,7 @@ def find_gap(
     finally:
         evidence.close()
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
-    named = _named(found, discovery.judged.guess, spread, shares)
+    named, details = without_details(_named(found, discovery.judged.guess, spread, shares))
     learned = learned_laws(discovery, nominal, spread, shares)
     needed = any(law.share > _MINOR for law in learned)  # a law that has no known cause
     verdict = _verdict(named, failed or needed, None if judge.ripple else floor)
@@ -150,7 +151,8 @@ def find_gap(
         learned=learned,
         lacks=lacks,
         noise=_noise(data, judge.levels),
-        notes=(*data.notes, *notes, *_notes(found, data, judge.levels, floor)),
+        notes=(*data.notes, *notes, *map(_detail, details),
+               *_notes(found, data, judge.levels, floor)),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 
@@ -280,6 +282,31 @@ def _named(
             )
         )  # fmt: skip
     return tuple(sorted(effects, key=lambda effect: -effect.probability))
+
+
+def without_details(
+    named: Sequence[NamedEffect],
+) -> tuple[tuple[NamedEffect, ...], tuple[NamedEffect, ...]]:
+    """Effects, and those that may only mend the form of one of the same axis that closes most.
+
+    Backlash in a form of its own is followed by the library's and a trace of presliding.
+    """
+
+    def beside(effect: NamedEffect, other: NamedEffect) -> bool:
+        same = effect.location.partition(".")[0] == other.location.partition(".")[0]
+        return same and other.share > 0.5 and effect.share <= _MINOR * other.share
+
+    details = tuple(e for e in named if any(beside(e, other) for other in named))
+    return tuple(e for e in named if e not in details), details
+
+
+def _detail(effect: NamedEffect) -> str:
+    told = ", ".join(f"{k} {e.value:.4g} {e.unit}" for k, e in effect.parameters.items())
+    return (
+        f"{effect.name} at {effect.location}, {told}, closes {100 * max(effect.share, 0.0):.1f} %"
+        " of the gap beside an effect of the same axis that closes most: it may only mend the form"
+        " of that. The patched machine has it; it is not named."
+    )
 
 
 def _estimates(hypothesis: Hypothesis, deviation: np.ndarray, spread: np.ndarray):

@@ -5,29 +5,33 @@ the rate. With that noise a filter follows any motion, so that a gap in the teet
 not yet right, makes nothing better. Here it is looked for without: the gap, the drive's own inertia
 and the damping of the contact that leave the smallest errors when the sensors' noise is all there
 is. The likelihood has many small dents in these numbers (every contact is one), so the search needs
-no slopes: gaps of several sizes first, then the simplex of Nelder and Mead 1965 (Comput. J. 7(4)).
+no slopes: gaps of several sizes first, then the simplex of Nelder and Mead 1965 (Comput. J. 7(4)),
+which also moves where the drive rests in the gap as the stretch begins.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from hydrotele.dataset.load import RunData
 from hydrotele.effects import EFFECTS
 from hydrotele.prediction.evidence import Evidence, Judged
 from hydrotele.prediction.hypothesis import Hypothesis
 from hydrotele.prediction.levels import noise_prior, rippled_at
-from hydrotele.prediction.track import Levels, track_run
+from hydrotele.prediction.track import Levels, Track, track_run
 
 _TEETH = "backlash"
 _GAPS = (0.002, 0.0035, 0.006, 0.01, 0.018, 0.03)  # rad; further apart, one may be jumped over
 _SHAKEN = 3.0  # times its floor, of the white noise on a rate; teeth may be hidden in other lacks
 _DAMPING = 0.05  # damping ratio to begin with: hard teeth, hardly oiled
-_STRETCH = 3.0  # s of the busiest run: some reversals of a motor
-_SIMPLEX = (0.15, 0.5, 1.0)  # of the logarithms of gap, inertia and damping ratio
-_EVALUATIONS = 50
-_CLOSE = 0.01  # of the logarithms: ends the search
+_STRETCH = 3.0  # s where a run is busiest: some reversals of a motor
+_STRETCHES = 4  # at most, each of another run, that are taken together at last
+_SIMPLEX = (0.15, 0.5, 1.0, 0.3)  # of the logarithms of gap, inertia and damping ratio; of the rest
+_SIMPLEXES = (1.0, 0.3)  # times that, one after the other
+_STARTS = 2  # gaps from which to search
+_EVALUATIONS = 60  # of a simplex
+_CLOSE = 0.01  # ends the search
 
 
 def rattling(evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis]) -> Judged | None:
@@ -65,43 +69,56 @@ def _sensors_only(evidence: Evidence) -> Levels:
 def _likeliest(evidence: Evidence, teeth: Hypothesis) -> np.ndarray | None:
     """Deviations of the likeliest teeth; None where every gap is less likely than none."""
     data, levels = evidence.data, _sensors_only(evidence)
-    run = _busiest_part(evidence.runs, list(data.axes).index(teeth.location))
+    column = list(data.axes).index(teeth.location)
+    parts = sorted((_busiest_part(run, column) for run in evidence.runs), key=lambda p: -p[0])
+    stretches = [run for _, run in parts[:_STRETCHES]]
     nominal = np.array([p.nominal for p in teeth.parameters.values()])
     scale = np.array([p.scale for p in teeth.parameters.values()])
 
     def deviation(x: np.ndarray) -> np.ndarray:
-        return np.clip((np.exp(x) - nominal) / scale, teeth.low, teeth.high)
+        return np.clip((np.exp(x[:3]) - nominal) / scale, teeth.low, teeth.high)
 
-    def loss(x: np.ndarray) -> float:
-        machine = teeth.machine(data.machine, deviation(x))
-        return track_run(machine, data, run, None, evidence.step, levels).loss
+    def track(x: np.ndarray | None, run: RunData, rest: np.ndarray | None = None) -> Track:
+        machine = data.machine if x is None else teeth.machine(data.machine, deviation(x))
+        return track_run(machine, data, run, None, evidence.step, levels, rest=rest)
 
     starts = [np.log([gap, nominal[1], _DAMPING]) for gap in _GAPS]
-    none, *losses = evidence.map(
-        lambda x: loss(x) if x is not None else
-        track_run(data.machine, data, run, None, evidence.step, levels).loss, [None, *starts],
-    )  # fmt: skip
-    begin = starts[int(np.argmin(losses))]
-    if not min(losses) < none:
+    none, *tracks = evidence.map(lambda x: track(x, stretches[0]), [None, *starts])
+    order = sorted(range(len(starts)), key=lambda k: tracks[k].loss)
+    if not tracks[order[0]].loss < none.loss:
         return None
-    simplex = np.vstack([begin, *(begin + np.diag(_SIMPLEX))])
-    answer = minimize(
+
+    def climbed(k: int) -> OptimizeResult:
+        """On one stretch, together with where the drive rests as it begins."""
+        answer = OptimizeResult(x=np.append(starts[k], tracks[k].rest))
+        for size in _SIMPLEXES:  # the simplex shrinks into a dent: once more from there
+            answer = _simplex(
+                lambda x: track(x, stretches[0], np.clip(x[3:], -1.0, 1.0)).loss, answer.x, size
+            )
+        return answer
+
+    best = min(evidence.map(climbed, order[:_STARTS]), key=lambda answer: answer.fun).x[:3]
+    rests = evidence.map(lambda run: track(best, run).rest, stretches)
+
+    def loss(x: np.ndarray) -> float:
+        pairs = list(zip(stretches, rests, strict=True))
+        return sum(evidence.map(lambda pair: track(x, *pair).loss, pairs))
+
+    return deviation(_simplex(loss, best, _SIMPLEXES[-1]).x)
+
+
+def _simplex(loss: Callable[[np.ndarray], float], begin: np.ndarray, size: float) -> OptimizeResult:
+    simplex = np.vstack([begin, *(begin + size * np.diag(_SIMPLEX[: len(begin)]))])
+    return minimize(
         loss, begin, method="Nelder-Mead",
         options={"initial_simplex": simplex, "maxfev": _EVALUATIONS, "xatol": _CLOSE, "fatol": 1.0},
     )  # fmt: skip
-    return deviation(answer.x)
 
 
-def _busiest_part(runs: Sequence[RunData], column: int) -> RunData:
-    """The stretch of some seconds of all runs in which a command changes most."""
-    best = None
-    for run in runs:
-        rows = min(round(_STRETCH / run.period), len(run.command) - 1)
-        passed = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(run.command[:, column])))])
-        changes = passed[rows:] - passed[: len(passed) - rows]
-        first = int(np.argmax(changes))
-        if best is None or changes[first] > best[0]:
-            best = float(changes[first]), run, first, rows
-    assert best
-    _, run, first, rows = best
-    return run.part(first, first + rows)
+def _busiest_part(run: RunData, column: int) -> tuple[float, RunData]:
+    """By how much a command changes in the stretch in which it changes most; and the stretch."""
+    rows = min(round(_STRETCH / run.period), len(run.command) - 1)
+    passed = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(run.command[:, column])))])
+    changes = passed[rows:] - passed[: len(passed) - rows]
+    first = int(np.argmax(changes))
+    return float(changes[first]), run.part(first, first + rows)

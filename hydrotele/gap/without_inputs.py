@@ -16,7 +16,7 @@ from hydrotele.prediction.calibration import calibration, numbers
 from hydrotele.prediction.evidence import MIDDLE, Evidence, Judged, charge
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
 from hydrotele.prediction.levels import noise_prior
-from hydrotele.prediction.track import COARSE, Levels, track_run
+from hydrotele.prediction.track import COARSE, Levels, Track, track_run
 
 _MUCH = 2.0  # RMS of the errors without unknown inputs, over noise, from which much is lacking
 _TRIED = 5  # candidates that are fitted
@@ -65,7 +65,7 @@ def without_inputs(
             break
         now = after
         if _rms(now) <= _MUCH or len(now.guess.parts) == 1:
-            options.append(_option(evidence, base, now.guess))
+            options.append(_option(evidence, base, now))
     if now.guess.parts and _rms(now) > _MUCH:
         options += _beside_calibration(evidence, base, now)
     evidence.set_base(base)
@@ -93,26 +93,28 @@ def _beside_calibration(
         evidence.set_base(_alone(evidence, guess))
         slopes = evidence.base_slopes(evidence.step_of(guess, COARSE))
         guess = evidence.fit(guess, 0.0, step=evidence.step_of(guess, MIDDLE), kept=slopes).guess
-    return [_option(evidence, base, guess)]
+    return [_option(evidence, base, _alone(evidence, guess))]
 
 
 def _alone(evidence: Evidence, guess: Guess) -> Judged:
     """A guess with its sensors' noise alone."""
     machine, levels = guess.machine(evidence.data.machine), _sensors(evidence)
 
-    def track(run):
-        return track_run(machine, evidence.data, run, None, evidence.step, levels)
+    def track(near: Track):
+        return track_run(
+            machine, evidence.data, near.run, None, evidence.step, levels, rest=near.rest
+        )
 
-    tracks = tuple(evidence.map(track, evidence.runs))
+    tracks = tuple(evidence.map(track, evidence.tracks))
     return Judged(guess, tracks, sum(t.loss for t in tracks))
 
 
-def _option(evidence: Evidence, base: Judged, guess: Guess) -> tuple[Judged, float]:
+def _option(evidence: Evidence, base: Judged, alone: Judged) -> tuple[Judged, float]:
     """A guess with levels of its own, and its score beside the given machine."""
-    evidence.set_base(_alone(evidence, guess))
+    evidence.set_base(alone)
     slopes = evidence.base_slopes(evidence.slope_step)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])
-    judged = evidence.judged_from(guess, _sensors(evidence))
+    judged = evidence.judged_from(alone.guess, _sensors(evidence))
     return judged, base.loss - judged.loss - charge(information, len(information))
 
 

@@ -138,8 +138,10 @@ class Evidence:
         """
         machine = guess.machine(self.data.machine)
         tracks = self.map(
-            lambda run: track_run(machine, self.data, run, None, self.step, levels, None, True),
-            self.runs,
+            lambda near: track_run(
+                machine, self.data, near.run, None, self.step, levels, None, True, near.rest
+            ),
+            self.tracks,
         )
         tracks = find_levels(
             self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True

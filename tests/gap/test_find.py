@@ -12,7 +12,8 @@ import pytest
 import yaml
 
 from hydrotele.dataset.load import Dataset, load_dataset
-from hydrotele.gap.find import find_gap
+from hydrotele.gap.find import find_gap, without_details
+from hydrotele.gap.result import NamedEffect
 from hydrotele.log import Log, load_log, save_log
 from hydrotele.machine_file import load_machine
 from hydrotele.prediction.stretches import busiest
@@ -134,3 +135,17 @@ def test_truth_columns_change_nothing(tmp_path):
     shutil.copytree(MEASURED / "open_04", tmp_path / "logs")
     data = load_dataset([tmp_path / "logs"], load_machine("cat215"))
     assert not any(c.startswith("truth") for run in data.fit for c in run.log.columns)
+
+
+def test_what_may_only_mend_the_form_of_an_effect_is_a_detail_of_it():
+    """Another axis, or more of the gap, and it is named."""
+
+    def effect(name: str, location: str, share: float) -> NamedEffect:
+        return NamedEffect(name, location, 0.99, {}, (), share)
+
+    teeth, trace = effect("backlash", "swing", 0.99), effect("presliding", "swing", 0.01)
+    elsewhere = effect("coulomb_friction", "stick", 0.001)
+    larger = effect("pressure_offset", "swing.rod", 0.03)
+    named, details = without_details((teeth, trace, elsewhere, larger))
+    assert named == (teeth, elsewhere, larger)
+    assert details == (trace,)
