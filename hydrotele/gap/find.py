@@ -49,8 +49,8 @@ _REJECTED = (
     "What the fitted runs asked for makes {} held-out run worse; it was taken back, and nothing is"
     " named."
 )
-_MINOR = 0.02  # share of the gap up to which a learned law is a detail, or an effect beside one of
-# the same axis that closes most: laws are rarely closer to a machine than 15 % of what they do
+_MINOR = 0.02  # share of the gap up to which something is a detail; laws are rarely closer to a
+# machine than 15 % of what they do
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
@@ -112,10 +112,10 @@ def find_gap(
     finally:
         evidence.close()
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
-    named, details = without_details(_named(found, discovery.judged.guess, spread, shares))
     learned = learned_laws(discovery, nominal, spread, shares)
-    needed = any(law.share > _MINOR for law in learned)  # a law that has no known cause
-    verdict = _verdict(named, failed or needed, None if judge.ripple else floor)
+    failed |= any(law.share > _MINOR for law in learned)  # a law that has no known cause
+    named, details = without_details(_named(found, discovery.judged.guess, spread, shares), failed)
+    verdict = _verdict(named, failed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
     lacks = _lacks(data.machine, discovery.judged)
@@ -285,27 +285,46 @@ def _named(
 
 
 def without_details(
-    named: Sequence[NamedEffect],
+    named: Sequence[NamedEffect], lacking: bool
 ) -> tuple[tuple[NamedEffect, ...], tuple[NamedEffect, ...]]:
-    """Effects, and those that may only mend the form of one of the same axis that closes most.
+    """Effects, and those that are details: nothing that these data say of the machine itself.
 
-    Backlash in a form of its own is followed by the library's and a trace of presliding.
+    What closes next to nothing may only mend the form of an effect of the same axis that closes
+    most, as a trace of presliding does for teeth, or make up for what is lacking still.
+
+    Args:
+        named: the effects, with shares of the gap.
+        lacking: whether the patched machine still lacks something.
+
+    Returns:
+        The effects, and the details: those that close at most 2 % beside such an effect or where
+        something is lacking, and those whose 95 % interval holds the given number (of several
+        numbers, which may be known together only, where they close as little).
     """
 
-    def beside(effect: NamedEffect, other: NamedEffect) -> bool:
-        same = effect.location.partition(".")[0] == other.location.partition(".")[0]
-        return same and other.share > 0.5 and effect.share <= _MINOR * other.share
+    def detail(effect: NamedEffect) -> bool:
+        axis = effect.location.partition(".")[0]
+        mends = lacking or any(
+            other.share > 0.5 and other.location.partition(".")[0] == axis
+            for other in named if other is not effect
+        )  # fmt: skip
+        told = any(not e.low <= e.nominal <= e.high for e in effect.parameters.values())
+        small = effect.share <= _MINOR
+        return (small and mends) or (not told and (small or len(effect.parameters) == 1))
 
-    details = tuple(e for e in named if any(beside(e, other) for other in named))
-    return tuple(e for e in named if e not in details), details
+    details = tuple(effect for effect in named if detail(effect))
+    return tuple(effect for effect in named if effect not in details), details
 
 
 def _detail(effect: NamedEffect) -> str:
-    told = ", ".join(f"{k} {e.value:.4g} {e.unit}" for k, e in effect.parameters.items())
+    told = ", ".join(
+        f"{key} {e.value:.4g} {e.unit} ({e.low:.4g} to {e.high:.4g})"
+        for key, e in effect.parameters.items()
+    )
     return (
         f"{effect.name} at {effect.location}, {told}, closes {100 * max(effect.share, 0.0):.1f} %"
-        " of the gap beside an effect of the same axis that closes most: it may only mend the form"
-        " of that. The patched machine has it; it is not named."
+        " of the gap. The patched machine has it, but it may only make up for what else is not"
+        " right; it is not named."
     )
 
 

@@ -13,7 +13,7 @@ import yaml
 
 from hydrotele.dataset.load import Dataset, load_dataset
 from hydrotele.gap.find import find_gap, without_details
-from hydrotele.gap.result import NamedEffect
+from hydrotele.gap.result import Estimate, NamedEffect
 from hydrotele.log import Log, load_log, save_log
 from hydrotele.machine_file import load_machine
 from hydrotele.prediction.stretches import busiest
@@ -137,15 +137,17 @@ def test_truth_columns_change_nothing(tmp_path):
     assert not any(c.startswith("truth") for run in data.fit for c in run.log.columns)
 
 
-def test_what_may_only_mend_the_form_of_an_effect_is_a_detail_of_it():
-    """Another axis, or more of the gap, and it is named."""
+def test_what_may_only_make_up_for_something_else_is_a_detail():
+    """Not where it is of another axis and nothing is lacking, or closes more of the gap."""
 
-    def effect(name: str, location: str, share: float) -> NamedEffect:
-        return NamedEffect(name, location, 0.99, {}, (), share)
+    def effect(name: str, location: str, share: float, low: float = 0.5) -> NamedEffect:
+        numbers = {"size": Estimate(1.0, "N", low, 1.5, 0.0)}
+        return NamedEffect(name, location, 0.99, numbers, (), share)
 
-    teeth, trace = effect("backlash", "swing", 0.99), effect("presliding", "swing", 0.01)
+    teeth, trace = effect("backlash", "swing", 0.9), effect("presliding", "swing", 0.01)
     elsewhere = effect("coulomb_friction", "stick", 0.001)
     larger = effect("pressure_offset", "swing.rod", 0.03)
-    named, details = without_details((teeth, trace, elsewhere, larger))
-    assert named == (teeth, elsewhere, larger)
-    assert details == (trace,)
+    untold = effect("pressure_lag", "boom", 0.06, low=-0.1)
+    effects = (teeth, trace, elsewhere, larger, untold)
+    assert without_details(effects, False) == ((teeth, elsewhere, larger), (trace, untold))
+    assert without_details(effects, True) == ((teeth, larger), (trace, elsewhere, untold))
