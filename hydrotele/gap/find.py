@@ -108,7 +108,7 @@ def find_gap(
         evidence.set_base(discovery.judged)
         scatter = tests.get("constancy", {}).get("value", 1.0)
         spread = spreads(evidence, discovery.judged.guess, scatter)
-        shares = judge.shares(discovery, before, after, floor)
+        shares = judge.shares(discovery, before, after, floor, evidence.map)
     finally:
         evidence.close()
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
@@ -187,7 +187,7 @@ class _Judge:
         the rows are too slow for) it is that noise that the floor counts, by definition 1.
         """
         noisy = dataclasses.replace(self.data, noise=self.levels.noise)
-        perfect = () if self.ripple else perfect_tracks(machine, noisy, tracks)
+        perfect = () if self.ripple else perfect_tracks(machine, noisy, tracks, evidence.map)
         floor = 1.0 if self.ripple else rms(perfect[:1])
         holds = np.isfinite(floor) and _FLOOR[0] < floor < _FLOOR[1]
         clean = holds and not self.ripple
@@ -204,25 +204,25 @@ class _Judge:
 
     def shares(
         self, discovery: Discovery, before: Sequence[Track], after: Sequence[Track],
-        floor: float | None,
+        floor: float | None, each: Callable,
     ) -> dict[tuple[str, str], float]:  # fmt: skip
         """Part -> share of the held-out run's gap that comes back without it.
 
         Of what acts for a while only, it is the share of all runs' gap.
         """
-        parts, table = discovery.judged.guess.parts, {}
-        for index, (hypothesis, _) in enumerate(parts):
-            guess = discovery.judged.guess.without(index)
-            machine = guess.machine(self.data.machine)
+
+        def share(index: int) -> float:
+            hypothesis = guess.parts[index][0]
+            machine = guess.without(index).machine(self.data.machine)
             once = {"start", "duration"} <= hypothesis.parameters.keys()  # not in every run
-            runs = self.runs if once else self.runs[:1]
-            (without,) = self.tracks([machine], map, runs)
-            size = rms(without) ** 2
+            (without,) = self.tracks([machine], map, self.runs if once else self.runs[:1])
             then, now = (rms(t if once else t[:1]) ** 2 for t in (before, after))
-            whole = then - (floor or 1.0) ** 2
-            back = size - now
-            table[hypothesis.key] = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0 else 0.0
-        return table
+            whole, back = then - (floor or 1.0) ** 2, rms(without) ** 2 - now
+            return float(np.clip(back / whole, 0.0, 1.0)) if whole > 0 else 0.0
+
+        guess = discovery.judged.guess
+        found = each(share, range(len(guess.parts)))
+        return {h.key: s for h, s in zip(guess.hypotheses, found, strict=True)}
 
 
 def _failed(tests: Mapping, before: float, after: float, floor: float | None) -> bool:

@@ -1,6 +1,6 @@
 """What a perfect model would score: runs simulated by the model with the sensors' noise."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -45,18 +45,23 @@ def clean_run(machine: Machine, data: Dataset, run: RunData, start: np.ndarray, 
     return replace(run, reading=reading)
 
 
-def perfect_tracks(machine: Machine, data: Dataset, tracks: Sequence[Track]) -> tuple[Track, ...]:
+def perfect_tracks(
+    machine: Machine, data: Dataset, tracks: Sequence[Track], each: Callable = map
+) -> tuple[Track, ...]:
     """Tracks of a model on readings that it made itself.
 
     Args:
         machine: the model.
         data: the dataset.
         tracks: the model's tracks of the runs to take after.
+        each: `map`, or that of a pool.
 
     Returns:
         One track per run, with gains of its own.
     """
-    return tuple(
-        track_run(machine, data, clean_run(machine, data, t.run, t.states[0], _SEED + k))
-        for k, t in enumerate(tracks)
-    )
+
+    def one(k: int) -> Track:
+        run = clean_run(machine, data, tracks[k].run, tracks[k].states[0], _SEED + k)
+        return track_run(machine, data, run)
+
+    return tuple(each(one, range(len(tracks))))
