@@ -71,10 +71,14 @@ class Learned:
 
 @dataclass(frozen=True)
 class Discovery:
-    """The guess with its learned laws, judged, and these laws."""
+    """The guess with its learned laws, judged, and these laws.
+
+    `refused` of them made free runs of the held-out run worse and were taken back.
+    """
 
     judged: Judged
     laws: tuple[Learned, ...]
+    refused: int = 0
 
 
 def discover(evidence: Evidence, judged: Judged) -> Discovery:
@@ -88,8 +92,10 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
         judged: the guess, judged with unknown inputs.
 
     Returns:
-        The guess with the laws that are worth their parameters.
+        The guess with the laws that are worth their parameters, and that do not make free runs of
+        the held-out run worse.
     """
+    begun, heldout = judged, (evidence.data.heldout,)
     laws: list[Learned] = []
     named = [h.name != CALIBRATION for h in judged.guess.hypotheses]
     parts = judged.guess.parts
@@ -99,21 +105,24 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
     prior = sum(float(d @ d) for n, (_, d) in zip(named, parts, strict=True) if n)
     judged = replace(judged, guess=Guess(tuple(held)), loss=judged.loss - prior)
     noise = judged.tracks[0].levels.noise  # the same for all laws: each finds other levels
-    begin, ahead = judged.loss, _open_loop(evidence, judged, noise)
+    bare = judged
+    begin, ahead = judged.loss, _open_loop(evidence, evidence.runs, judged, noise)
     for _ in range(_MOST):
         evidence.set_base(judged)
         seen = [_see(evidence.data.machine, judged, track) for track in judged.tracks]
         found = _best_law(evidence, judged, _candidates(evidence, judged, seen, laws))
         if found is None:
             break
-        now = _open_loop(evidence, found[0], noise)
-        if not (now < ahead or np.isnan(now)):
+        now = _open_loop(evidence, evidence.runs, found[0], noise)
+        if not _better(now, ahead):
             break
         ahead, fall = now, judged.loss - found[0].loss
         judged, law = found
         laws.append(law)
         if fall < _DETAIL * (begin - judged.loss) or lacking(judged, evidence) < ENTER:
             break
+    if laws and not _better(*(_open_loop(evidence, heldout, j, noise) for j in (judged, bare))):
+        return Discovery(begun, (), len(laws))
     found = judged.guess.parts
     own = [old if n else new for n, old, new in zip(named, parts, found, strict=False)]
     guess = Guess((*own, *found[len(parts) :]))
@@ -139,22 +148,33 @@ def _best_law(
     return None
 
 
-def _open_loop(evidence: Evidence, judged: Judged, noise: np.ndarray) -> float:
-    """RMS error of free runs through the fit runs over all channels, in units of a noise (c,).
+def _better(now: tuple[float, float], before: tuple[float, float]) -> bool:
+    """Whether free runs are better and none got lost; true where there are none."""
+    return bool(np.isnan(now[0]) or (now[0] < before[0] and now[1] <= before[1]))
 
-    A law is to make simulations better, not only predictions from one reading to the next. Of each
-    channel the median window counts, as one that diverges says nothing of the others. NaN where all
-    runs are shorter than a window.
+
+def _open_loop(
+    evidence: Evidence, runs: Sequence[RunData], judged: Judged, noise: np.ndarray
+) -> tuple[float, float]:
+    """RMS errors of free runs through some runs over all channels, in units of a noise (c,).
+
+    A law is to make simulations better, not only predictions from one reading to the next. First by
+    the median window of each channel, as one that diverges says nothing of the others; then by the
+    mean square of all, as a law must not make any diverge. NaN where all runs are shorter than a
+    window.
     """
     prepare = machine_runner(judged.guess.machine(evidence.data.machine), evidence.data, _STEP)
 
     def sizes(run: RunData) -> np.ndarray:
         errors = free_run_errors(prepare(run), run, (_AHEAD,), to_end=False)
-        return np.array([horizon.median / noise for horizon in errors.horizons.values()])
+        table = [(h.median / noise, h.rms / noise) for h in errors.horizons.values()]
+        return np.reshape(table, (-1, 2, len(noise)))
 
-    found = np.concatenate([part.ravel() for part in evidence.map(sizes, evidence.runs)])
-    found = found[~np.isnan(found)]
-    return float(np.sqrt(np.mean(found**2))) if len(found) else np.nan
+    found = np.concatenate(evidence.map(sizes, runs))
+    if not len(found) or np.isnan(found).all():
+        return np.nan, np.nan
+    median, whole = np.sqrt(np.nanmean(found**2, axis=(0, 2)))
+    return float(median), float(whole)
 
 
 class _Seen(NamedTuple):

@@ -49,6 +49,10 @@ _REJECTED = (
     "What the fitted runs asked for makes {} held-out run worse; it was taken back, and nothing is"
     " named."
 )
+_REFUSED = (
+    "A law that the fitted runs asked for makes free runs of the held-out run worse; it was taken"
+    " back."
+)
 _MINOR = 0.02  # share of the gap up to which something is a detail; laws are rarely closer to a
 # machine than 15 % of what they do
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
@@ -91,6 +95,8 @@ def find_gap(
         if lacking(found.judged, evidence) > 0.0 and not effects:
             tell("learn laws of what no effect explains", 0.93)
             discovery = discover(evidence, found.judged)
+            if discovery.refused:
+                notes.append(_REFUSED)
         tell("judge on the held-out run", 0.96)
         judge = _Judge(data, discovery.judged)
         nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)

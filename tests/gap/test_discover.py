@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hydrotele.dataset.load import load_dataset
-from hydrotele.gap.discover import _law, _Seen
+from hydrotele.gap.discover import _better, _law, _Seen
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.law_regression import Regression
 from hydrotele.gap.law_shapes import Shape, possible_shapes
@@ -148,3 +148,17 @@ def test_every_form_of_a_balance_can_be_written_as_a_term():
             Term(name="law", axis="slide", balance="force", law="formula",
                  parameters=dict.fromkeys(shape.products, 1.0))  # fmt: skip
             assert shape.columns(values[0], 0.01).shape == (400, len(shape.products))
+
+
+@pytest.mark.parametrize(
+    ("now", "before", "kept"),
+    [
+        ((0.9, 1.9), (1.0, 2.0), True),
+        ((0.9, 2.1), (1.0, 2.0), False),  # some windows got worse more than the others better
+        ((0.9, np.inf), (1.0, 2.0), False),  # one diverged
+        ((1.1, 1.9), (1.0, 2.0), False),
+        ((np.nan, np.nan), (np.nan, np.nan), True),  # no run is long enough to tell
+    ],
+)
+def test_a_law_is_kept_where_free_runs_get_better_and_none_is_lost(now, before, kept):
+    assert _better(now, before) is kept
