@@ -9,6 +9,7 @@ import numpy as np
 from hydrotele.dataset.load import Dataset
 from hydrotele.effects.effect import changed
 from hydrotele.gap.balances import run_balances
+from hydrotele.gap.belief import believed, believed_part, left_over
 from hydrotele.gap.constancy import constancy
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, discover
@@ -24,6 +25,7 @@ from hydrotele.gap.result import (
     Gap,
     GapSize,
     Lack,
+    LearnedLaw,
     NamedEffect,
     Prediction,
     Verdict,
@@ -39,10 +41,10 @@ from hydrotele.prediction.intervals import spreads
 from hydrotele.prediction.levels import rippled, undisturbed_loss
 from hydrotele.prediction.stretches import busiest, thinned
 from hydrotele.prediction.track import STEP, Levels, Track, known_levels, track_run
+from hydrotele.signals import parse_channel
 
 LIKELY = 0.5  # probability above which an effect may explain a part: likelier than all else
 PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
-_MECHANISM, _STEEP = 0.35, 0.07  # see `_mechanism`
 _TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`
 _WORSE = 1.05  # times the given model's errors on the held-out run: no patch may do more
 _REJECTED = (
@@ -120,7 +122,11 @@ def find_gap(
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
     learned = learned_laws(discovery, nominal, spread, shares)
     failed |= any(law.share > _MINOR for law in learned)  # a law that has no known cause
-    named, details = without_details(_named(found, discovery.judged.guess, spread, shares), failed)
+    named = _named(found, discovery.judged.guess, spread, shares)
+    if failed:
+        left = left_over(before[0], after[0], data.channels, floor)
+        named = believed(named, learned, left, _lost(tests, learned))
+    named, details = without_details(named, failed)
     verdict = _verdict(named, failed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
@@ -243,6 +249,14 @@ def _failed(tests: Mapping, before: float, after: float, floor: float | None) ->
     return not (excess < _TRACE and closed > _NEARLY_ALL)
 
 
+def _lost(tests: Mapping[str, dict], laws: Sequence[LearnedLaw]) -> set[str]:
+    """Axes in whose channels something is lacking still, "" for a channel without axis."""
+    channels = [t["channel"] for name, t in tests.items()
+                if not t["passed"] and name != "constancy"]  # fmt: skip
+    axes = {parse_channel(channel).axis or "" for channel in channels}
+    return axes | {law.axis for law in laws if law.share > _MINOR}
+
+
 def _verdict(named: Sequence[NamedEffect], failed: bool, floor: float | None) -> Verdict:
     sure = [effect for effect in named if effect.mechanism_probability >= SURE]
     if not named:
@@ -251,17 +265,6 @@ def _verdict(named: Sequence[NamedEffect], failed: bool, floor: float | None) ->
         return "named" if len(sure) == len(named) else "ambiguous"
     closed = sum(effect.share for effect in named if effect.mechanism_probability > LIKELY)
     return "partly" if closed >= PARTLY else "unknown"
-
-
-def _mechanism(part: float) -> float:
-    """Probability that an effect is the mechanism and not something else of the same balance.
-
-    `part` is the share of what the runs lacked without it that it takes away. A law of another
-    form in the same balance is imitated by the wrong effect to some part only; the right effect in
-    another form leaves little. The line between them is set by hand, from a handful of trials
-    (`docs/results/independent_trials.md`); no series has calibrated it.
-    """
-    return float(1.0 / (1.0 + np.exp(-(part - _MECHANISM) / _STEEP)))
 
 
 def _named(
@@ -278,7 +281,7 @@ def _named(
             continue
         chance, others = _chances(found, index, rest)
         part = (rest.loss - found.judged.loss) / max(rest.loss - ideal, 1.0)
-        trust = _mechanism(part)
+        trust = believed_part(part)
         chance *= trust
         others = tuple(dataclasses.replace(a, probability=trust * a.probability) for a in others)
         effects.append(
