@@ -57,6 +57,7 @@ _REFUSED = (
 )
 _MINOR = 0.02  # share of the gap up to which something is a detail; laws are rarely closer to a
 # machine than 15 % of what they do
+_TRACE_OF_FORM = 0.005  # share up to which an effect only mends the form of one beside it
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
@@ -306,20 +307,20 @@ def without_details(
         lacking: whether the patched machine still lacks something.
 
     Returns:
-        The effects, and the details: those that close at most 2 % beside such an effect or where
-        something is lacking, and those whose 95 % interval holds the given number (of several
-        numbers, which may be known together only, where they close as little).
+        The effects, and the details: those that close at most 2 % where something is lacking, or
+        0.5 % beside such an effect, and those whose 95 % interval holds the given number (of
+        several numbers, which may be known together only, where they close at most 2 %).
     """
 
     def detail(effect: NamedEffect) -> bool:
         axis = effect.location.partition(".")[0]
-        mends = lacking or any(
+        mends = effect.share <= _TRACE_OF_FORM and any(
             other.share > 0.5 and other.location.partition(".")[0] == axis
             for other in named if other is not effect
         )  # fmt: skip
         told = any(not e.low <= e.nominal <= e.high for e in effect.parameters.values())
         small = effect.share <= _MINOR
-        return (small and mends) or (not told and (small or len(effect.parameters) == 1))
+        return (small and lacking) or mends or (not told and (small or len(effect.parameters) == 1))
 
     details = tuple(effect for effect in named if detail(effect))
     return tuple(effect for effect in named if effect not in details), details
