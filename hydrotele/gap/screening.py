@@ -163,9 +163,11 @@ def _least(
     """Least `x' A x + 2 b' x` within bounds on x, which hold 0: (x, that)."""
     x = -np.linalg.solve(matrix, pull)
     if np.any((x < low) | (x > high)):
-        root = np.linalg.cholesky(matrix).T
+        squares, axes = np.linalg.eigh(matrix)  # signatures may be alike to the last digits
+        lengths = np.sqrt(np.maximum(squares, np.finfo(float).eps * squares[-1]))
         low, high = np.minimum(low, -_ROOM), np.maximum(high, _ROOM)
-        x = lsq_linear(root, -np.linalg.solve(root.T, pull), (low, high), method="bvls").x
+        root = lengths[:, None] * axes.T
+        x = lsq_linear(root, -(axes.T @ pull) / lengths, (low, high), method="bvls").x
     return x, float(x @ matrix @ x + 2.0 * pull @ x)
 
 

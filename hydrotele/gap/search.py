@@ -47,6 +47,7 @@ LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be 
 _LITTLE = 0.01  # of what the given machine lacks: an effect that leaves less is tried at once
 _SHORT = 5  # candidates that are fitted after a screening
 _JUDGED = 3  # of them that are judged with levels of their own
+_PLAIN = 0.8  # of the best score, from which a number that stopped at its end comes before it
 _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
 _WORTH = 0.1  # of the best screened score: below it a candidate is not fitted
 _PAIRED = 6  # candidates that are tried in pairs where no single one helps
@@ -163,7 +164,10 @@ def _grow(
         early = []  # once: what is refused does not come back
         moved = promoted(evidence, now, fit, candidates) if fit else None
         if moved:
-            options = sorted([*options, _let_go(evidence, now, moved)], key=_score)
+            let_go = _let_go(evidence, now, moved)
+            options = sorted([*options, let_go], key=_score)
+            if let_go[1] > _PLAIN * options[0][1] and ended(now.guess):
+                options = [let_go, *(one for one in options if one is not let_go)]
         small = []
         while options and not worth_naming(options[0][0].guess, -1, options[0][1]):
             judged, worth = options.pop(0)
