@@ -13,6 +13,7 @@ from mujoco.batch import Batch
 
 from hydrotele.commands.console import notes, out, print_json, table
 from hydrotele.errors import InputError
+from hydrotele.files import read_json
 from hydrotele.machine_file import load_machine
 from hydrotele.output import replacing
 from hydrotele.run import run_scenario
@@ -175,10 +176,10 @@ def _start(*arguments: str) -> float:
 
 def _read(path: Path) -> dict:
     try:
-        figures = json.loads(path.read_text())
+        figures = read_json(path)
         if not isinstance(figures, dict) or "ratio" not in figures:
             raise ValueError("it has no ratio")
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise InputError(path, f"is no saved benchmark: {error}") from None
     return figures
 

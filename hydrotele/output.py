@@ -3,7 +3,6 @@
 import contextlib
 import fnmatch
 import glob
-import json
 import os
 import re
 import secrets
@@ -13,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hydrotele.errors import InputError
+from hydrotele.files import read_json
 
 OURS = {
     "run": ("measured.parquet", "truth.parquet", "review.rrd", "scenario.yaml", "machine.*"),
@@ -114,9 +114,8 @@ def _matches(name: str, pattern: str) -> bool:
 
 def _kind(folder: Path) -> str | None:
     try:
-        summary = json.loads((folder / "summary.json").read_text())
-        return summary.get("kind")
-    except (OSError, ValueError, AttributeError):
+        return read_json(folder / "summary.json").get("kind")
+    except (InputError, AttributeError):
         return None
 
 
