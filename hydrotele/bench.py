@@ -18,7 +18,7 @@ from hydrotele.machine_file import load_machine
 from hydrotele.output import replacing
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
-from hydrotele.simulate.mechanism import assemble, mjcf_text
+from hydrotele.simulate.mechanism import assemble, mjcf_document
 from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 
@@ -112,7 +112,7 @@ def _bare_stepper(plant: Plant) -> Callable[[], float]:
     root = assemble(plant.machine, plant.model.opt.timestep, plant.ground, looks=False)
     for actuator in root.find_all("actuator"):
         actuator.remove()
-    model = mujoco.MjModel.from_xml_string(mjcf_text(root))
+    model = mjcf_document(root).compile()
     model.opt.gravity[:] = 0.0
     start = rest_state(plant)
     start.qvel[plant.dof[0]] = 0.1

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import stat
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -56,6 +57,31 @@ def read_text(path: str | Path) -> str:
         return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(path, f"cannot be read as text in UTF-8: {error.reason}") from None
+
+
+def read_xml(path: str | Path) -> ElementTree.Element:
+    """The root of the XML in a regular file.
+
+    Raises:
+        InputError: as `read_bytes`, or it is no XML, or nested too deeply for MuJoCo to read.
+    """
+    content = read_bytes(path)
+    depth = deepest = 0
+    try:
+        parser = ElementTree.XMLPullParser(("start", "end"))
+        parser.feed(content)
+        parser.close()
+        root = None
+        for event, element in parser.read_events():
+            root = element if root is None else root
+            depth += 1 if event == "start" else -1
+            deepest = max(deepest, depth)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # of its encoding
+        raise InputError(path, f"is not XML: {error}") from None
+    if root is None:
+        raise InputError(path, "is not XML: it holds no element")
+    check_limit(path, "FILE_DEPTH", deepest)
+    return root
 
 
 def json_value(text: str | bytes) -> Any:

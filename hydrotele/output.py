@@ -15,14 +15,16 @@ from hydrotele.errors import InputError
 from hydrotele.files import read_json
 
 OURS = {
-    "run": ("measured.parquet", "truth.parquet", "review.rrd", "scenario.yaml", "machine.*"),
+    "run": ("measured.parquet", "truth.parquet", "review.rrd", "scenario.yaml", "machine.*",
+            "machine_assets/*"),
     "replay": ("*.png", "*.rrd", "*_simulated.parquet"),
     "gap": (
         "gap.json", "report.html", "recording.rrd", "next_experiment.yaml",
-        "patched/machine.*", "patched/effects.yaml",
+        "patched/machine.*", "patched/machine_assets/*", "patched/effects.yaml",
     ),
     "compare": ("compare.json", "*.png"),
-    "identify": ("identify.json", "report.html", "identified/machine.*"),
+    "identify": ("identify.json", "report.html", "identified/machine.*",
+                 "identified/machine_assets/*"),
     "two-port analysis": ("analysis.json", "report.html", "stability.png"),
     "sweep": (
         "sweep.yaml", "journal.jsonl", "table.parquet", "timings.csv", "report.html", "*.png",

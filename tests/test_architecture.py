@@ -19,6 +19,7 @@ FLOORS = (
         "errors",
         "limits",
         "files",
+        "assets",
         "signals",
         "resources",
         "datafile",
