@@ -55,7 +55,7 @@ def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         for stale in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
-            if not _alive(stale):
+            if _ours(stale) and not _alive(stale):
                 shutil.rmtree(stale, ignore_errors=True)
         prefix = f".{target.name}.{os.getpid()}."
         part = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=target.parent))
@@ -121,11 +121,19 @@ def _kind(folder: Path) -> str | None:
         return None
 
 
+_PART = re.compile(r"\.(\d+)\.[a-z0-9_]{8}(?:\.old)?\.part$")  # process, letters of mkdtemp
+
+
+def _ours(part: Path) -> bool:
+    """Whether a killed run left this folder: a user's own is never removed."""
+    return bool(_PART.search(part.name)) and part.is_dir() and not part.is_symlink()
+
+
 def _alive(part: Path) -> bool:
     try:
-        pid = int(re.findall(r"\.(\d+)\.[^.]+(?:\.old)?\.part$", part.name)[0])
+        pid = int(_PART.findall(part.name)[0])
         os.kill(pid, 0)
-    except (ValueError, IndexError, ProcessLookupError):
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True
