@@ -73,6 +73,8 @@ def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
         if old.exists() and not target.exists():
             old.rename(target)
         shutil.rmtree(part, ignore_errors=True)
+        if isinstance(error, InputError) and str(part) in error.where:
+            raise InputError(error.where.replace(str(part), str(asked)), error.message) from error
         if isinstance(error, OSError):
             reason = error.strerror or str(error)
             raise InputError(asked, f"cannot be written, nothing is left: {reason}") from error
@@ -159,6 +161,8 @@ def replacing(path: str | os.PathLike, suffix: str) -> Iterator[Path]:
         raise InputError(path, f"give it a name that ends in {suffix}")
     if not path.parent.is_dir():
         raise InputError(path, f"cannot be written: {path.parent} is not a folder")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise InputError(path, f"cannot be written: {path.parent} cannot be written to")
     part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
     try:
         yield part
@@ -166,4 +170,5 @@ def replacing(path: str | os.PathLike, suffix: str) -> Iterator[Path]:
     except OSError as error:
         raise InputError(path, f"cannot be written: {error.strerror or error}") from error
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a file system that became read-only keeps it
+            part.unlink(missing_ok=True)
