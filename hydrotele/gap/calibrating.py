@@ -16,6 +16,7 @@ _RIGHT = 0.2  # of the stated uncertainty, by which numbers move that are right
 _INFORMED = 0.5  # of the stated uncertainty is left of a number that the runs tell
 _SEVERAL = 8  # of them say what is usual
 _ROUNDS = 2  # of levels and fit; `search.settle` does the rest
+_FURTHER = (1.0, 1.5, 2.5, 4.0, 6.0)  # times where a number stopped at the end of its range
 _SETTLED = 15.0  # fall of the loss that is worth another round
 
 
@@ -103,7 +104,8 @@ def promoted(
         candidates: the hypotheses.
 
     Returns:
-        The guess, and twice the log evidence that this brings; None if no number is.
+        The guess, and twice the log evidence that this brings as far as it went; None if no number
+        is, and none stands at an end of what it may take.
     """
     place = next((i for i, (h, _) in enumerate(now.guess.parts) if h.name == CALIBRATION), -1)
     if place < 0:
@@ -125,22 +127,60 @@ def promoted(
         ratio = usual * table[key].parameter.scale / known.parameters[effect[2]].scale
         gain = (d / usual) ** 2 * (1.0 - min(ratio, 1.0) ** 2) + 2.0 * np.log(min(ratio, 1.0))
         moved[effect[:2]] = moved.get(effect[:2], 0.0) + gain
-    effect = max(moved, key=moved.__getitem__, default=None)
-    if effect is None or moved[effect] <= BEYOND:
-        return None
-    parts, gone = list(now.guess.parts), set()
-    known = next(c for c in candidates if c.key == effect)
-    start = []
+    ends = {e[:2] for key in _at_ends(group, deviation) if (e := table[key].effect)}
+    told = {key: gain for key, gain in moved.items() if gain > BEYOND or key in ends}
+    options = {
+        key: _let_out(evidence, now.guess, place, next(c for c in candidates if c.key == key))
+        for key in told
+    }
+    stuck = {key: _further(evidence, options[key]) for key in told if key in ends}
+    if stuck and min(fall for _, fall in stuck.values()) < -BEYOND:
+        key = min(stuck, key=lambda one: stuck[one][1])
+        return stuck[key][0], told[key]
+    key = max(told, key=told.__getitem__, default=None)
+    return None if key is None or told[key] <= BEYOND else (options[key], told[key])
+
+
+def _let_out(evidence: Evidence, guess: Guess, place: int, known: Hypothesis) -> Guess:
+    """A guess whose calibration, at `place`, leaves the numbers of an effect to the effect."""
+    group, deviation = guess.parts[place]
+    table, keys = numbers(evidence.data.machine), list(group.parameters)
+    start, gone = [], set()
     for key, p in known.parameters.items():
         full = f"{known.name}.{known.location}.{key}"
+        start.append(0.0)
         if full in keys:
             gone.add(full)
-            value = p.nominal + deviation[keys.index(full)] * table[full].parameter.scale
-            start.append((value - p.nominal) / p.scale)
-        else:
-            start.append(0.0)
-    parts.append((known, np.clip(start, known.low, known.high)))
-    return uncalibrated(Guess(tuple(parts)), evidence.data.machine, gone), moved[effect]
+            start[-1] = deviation[keys.index(full)] * table[full].parameter.scale / p.scale
+    let_out = guess.plus(known, np.clip(start, known.low, known.high))
+    return uncalibrated(let_out, evidence.data.machine, gone)
+
+
+def _further(evidence: Evidence, guess: Guess) -> tuple[Guess, float]:
+    """The last effect of a guess at the best of some multiples of its numbers; fall of the loss."""
+    known, start = guess.parts[-1]
+    step = evidence.step_of(guess, COARSE)
+    options = [
+        Guess((*guess.parts[:-1], (known, np.clip(factor * start, known.low, known.high))))
+        for factor in _FURTHER
+    ]
+    errors = evidence.map(lambda option: evidence.errors(option, step), options)
+    losses = [float(e @ e) for e in errors]
+    best = int(np.argmin(losses))
+    return options[best], losses[best] - losses[0]
+
+
+def ended(guess: Guess) -> bool:
+    """Whether a calibrated number stands at an end of what it may take."""
+    return any(_at_ends(h, d) for h, d in guess.parts if h.name == CALIBRATION)
+
+
+def _at_ends(group: Hypothesis, deviation: np.ndarray) -> list[str]:
+    values = group.values(deviation)
+    return [
+        key for key, p in group.parameters.items()
+        if values[key] >= p.high or (values[key] <= p.low and p.low != 0.0)
+    ]  # fmt: skip
 
 
 def uncalibrated(guess: Guess, machine: Machine, keys: Collection[str]) -> Guess:

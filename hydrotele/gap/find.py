@@ -9,6 +9,7 @@ import numpy as np
 from hydrotele.dataset.load import Dataset
 from hydrotele.effects.effect import changed
 from hydrotele.gap.balances import run_balances
+from hydrotele.gap.belief import believed, believed_part, left_over
 from hydrotele.gap.constancy import constancy
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, discover
@@ -24,6 +25,7 @@ from hydrotele.gap.result import (
     Gap,
     GapSize,
     Lack,
+    LearnedLaw,
     NamedEffect,
     Prediction,
     Verdict,
@@ -39,10 +41,10 @@ from hydrotele.prediction.intervals import spreads
 from hydrotele.prediction.levels import rippled, undisturbed_loss
 from hydrotele.prediction.stretches import busiest, thinned
 from hydrotele.prediction.track import STEP, Levels, Track, known_levels, track_run
+from hydrotele.signals import parse_channel
 
 LIKELY = 0.5  # probability above which an effect may explain a part: likelier than all else
 PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
-_MECHANISM, _STEEP = 0.35, 0.07  # see `_mechanism`
 _TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`
 _WORSE = 1.05  # times the given model's errors on the held-out run: no patch may do more
 _REJECTED = (
@@ -55,6 +57,7 @@ _REFUSED = (
 )
 _MINOR = 0.02  # share of the gap up to which something is a detail; laws are rarely closer to a
 # machine than 15 % of what they do
+_TRACE_OF_FORM = 0.005  # share up to which an effect only mends the form of one beside it
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
@@ -120,7 +123,11 @@ def find_gap(
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
     learned = learned_laws(discovery, nominal, spread, shares)
     failed |= any(law.share > _MINOR for law in learned)  # a law that has no known cause
-    named, details = without_details(_named(found, discovery.judged.guess, spread, shares), failed)
+    named = _named(found, discovery.judged.guess, spread, shares)
+    if failed:
+        left = left_over(before[0], after[0], data.channels, floor)
+        named = believed(named, learned, left, _lost(tests, learned))
+    named, details = without_details(named, failed)
     verdict = _verdict(named, failed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
@@ -243,6 +250,14 @@ def _failed(tests: Mapping, before: float, after: float, floor: float | None) ->
     return not (excess < _TRACE and closed > _NEARLY_ALL)
 
 
+def _lost(tests: Mapping[str, dict], laws: Sequence[LearnedLaw]) -> set[str]:
+    """Axes in whose channels something is lacking still, "" for a channel without axis."""
+    channels = [t["channel"] for name, t in tests.items()
+                if not t["passed"] and name != "constancy"]  # fmt: skip
+    axes = {parse_channel(channel).axis or "" for channel in channels}
+    return axes | {law.axis for law in laws if law.share > _MINOR}
+
+
 def _verdict(named: Sequence[NamedEffect], failed: bool, floor: float | None) -> Verdict:
     sure = [effect for effect in named if effect.mechanism_probability >= SURE]
     if not named:
@@ -251,17 +266,6 @@ def _verdict(named: Sequence[NamedEffect], failed: bool, floor: float | None) ->
         return "named" if len(sure) == len(named) else "ambiguous"
     closed = sum(effect.share for effect in named if effect.mechanism_probability > LIKELY)
     return "partly" if closed >= PARTLY else "unknown"
-
-
-def _mechanism(part: float) -> float:
-    """Probability that an effect is the mechanism and not something else of the same balance.
-
-    `part` is the share of what the runs lacked without it that it takes away. A law of another
-    form in the same balance is imitated by the wrong effect to some part only; the right effect in
-    another form leaves little. The line between them is set by hand, from a handful of trials
-    (`docs/results/independent_trials.md`); no series has calibrated it.
-    """
-    return float(1.0 / (1.0 + np.exp(-(part - _MECHANISM) / _STEEP)))
 
 
 def _named(
@@ -278,7 +282,7 @@ def _named(
             continue
         chance, others = _chances(found, index, rest)
         part = (rest.loss - found.judged.loss) / max(rest.loss - ideal, 1.0)
-        trust = _mechanism(part)
+        trust = believed_part(part)
         chance *= trust
         others = tuple(dataclasses.replace(a, probability=trust * a.probability) for a in others)
         effects.append(
@@ -303,20 +307,20 @@ def without_details(
         lacking: whether the patched machine still lacks something.
 
     Returns:
-        The effects, and the details: those that close at most 2 % beside such an effect or where
-        something is lacking, and those whose 95 % interval holds the given number (of several
-        numbers, which may be known together only, where they close as little).
+        The effects, and the details: those that close at most 2 % where something is lacking, or
+        0.5 % beside such an effect, and those whose 95 % interval holds the given number (of
+        several numbers, which may be known together only, where they close at most 2 %).
     """
 
     def detail(effect: NamedEffect) -> bool:
         axis = effect.location.partition(".")[0]
-        mends = lacking or any(
+        mends = effect.share <= _TRACE_OF_FORM and any(
             other.share > 0.5 and other.location.partition(".")[0] == axis
             for other in named if other is not effect
         )  # fmt: skip
         told = any(not e.low <= e.nominal <= e.high for e in effect.parameters.values())
         small = effect.share <= _MINOR
-        return (small and mends) or (not told and (small or len(effect.parameters) == 1))
+        return (small and lacking) or mends or (not told and (small or len(effect.parameters) == 1))
 
     details = tuple(effect for effect in named if detail(effect))
     return tuple(effect for effect in named if effect not in details), details

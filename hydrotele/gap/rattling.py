@@ -43,23 +43,27 @@ def rattling(evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis])
         candidates: the hypotheses.
 
     Returns:
-        The base with teeth in the axis in which they explain most; None where none shakes or none
-        has teeth that are likelier than none.
+        The base with teeth in the axis in which they explain most, which need not be likelier than
+        the base: with wrong numbers, only both together are. None where none shakes or none has
+        teeth that are likelier than none as long as nothing unknown acts.
     """
-    machine, found = evidence.data.machine, []
+    found = []
     for candidate in candidates:
         axis = candidate.location
-        if candidate.name != _TEETH or not rippled_at(
-            base.tracks[0].levels, f"rate.{machine.axes[axis].joint}", _SHAKEN
-        ):
+        if candidate.name != _TEETH or not shaken(evidence, base, axis):
             continue
-        whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(machine, axis))
+        whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(evidence.data.machine, axis))
         deviation = _likeliest(evidence, whole)
         if deviation is not None:
             guess = base.guess.plus(whole, deviation)
             found.append(evidence.judged_from(guess, _sensors_only(evidence)))
-    best = min(found, key=lambda judged: judged.loss, default=None)
-    return best if best and best.loss < base.loss else None
+    return min(found, key=lambda judged: judged.loss, default=None)
+
+
+def shaken(evidence: Evidence, judged: Judged, axis: str) -> bool:
+    """Whether an axis moves as if hit: with white noise on its rate that a guess does not have."""
+    joint = evidence.data.machine.axes[axis].joint
+    return rippled_at(judged.tracks[0].levels, f"rate.{joint}", _SHAKEN)
 
 
 def _sensors_only(evidence: Evidence) -> Levels:

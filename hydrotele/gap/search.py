@@ -15,6 +15,7 @@ from hydrotele.effects import EFFECTS
 from hydrotele.gap.calibrating import (
     calibrated,
     calibration_of,
+    ended,
     free_of_calibration,
     mostly_right,
     promoted,
@@ -31,7 +32,7 @@ from hydrotele.gap.pruning import (
     worth_naming,
 )
 from hydrotele.gap.pulses import timed
-from hydrotele.gap.rattling import rattling
+from hydrotele.gap.rattling import rattling, shaken
 from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of, plain_form
 from hydrotele.gap.screening import Screened, screen
 from hydrotele.gap.settling import fitted, loss_of, polished, settle, strained, widened
@@ -105,8 +106,10 @@ def search(
     base = evidence.set_base(Guess())
     candidates = timed(candidates, base)
     tell("try every effect as if nothing unknown acted", 0.03)
-    bold, early = _early_options(evidence, base, candidates)
+    bold, early, teeth = _early_options(evidence, base, candidates)
     grown = _grow(evidence, base, _Grown(base, early=early, first=bold.ranking), candidates, tell)
+    if teeth:
+        grown = _toothed(evidence, base, grown, teeth, candidates, tell)
     if grown.fit and mostly_right(grown.now.guess, grown.fit):
         grown = _sparse(evidence, base, grown, candidates, tell)
     return _compared(evidence, base, _plain(evidence, grown, candidates), tell)
@@ -160,7 +163,7 @@ def _grow(
         early = []  # once: what is refused does not come back
         moved = promoted(evidence, now, fit, candidates) if fit else None
         if moved:
-            options = sorted([*options, (evidence.judged(moved[0]), moved[1])], key=_score)
+            options = sorted([*options, _let_go(evidence, now, moved)], key=_score)
         small = []
         while options and not worth_naming(options[0][0].guess, -1, options[0][1]):
             judged, worth = options.pop(0)
@@ -213,6 +216,32 @@ def _grow(
             rankings[part[0].key] = first if ranked is None else ranked
         now, fit, ranked = grown, settled, None
     return replace(begin, now=now, fit=fit, first=first, rankings=rankings, weak=weak)
+
+
+def _toothed(
+    evidence: Evidence, base: Judged, grown: _Grown, teeth: Judged,
+    candidates: Sequence[Hypothesis], tell: Progress,
+) -> _Grown:  # fmt: skip
+    """The search from teeth and a calibration together, if an axis still shakes and that is better.
+
+    Where all numbers are wrong, teeth explain nothing before these are right; and calibrated
+    without teeth, some make up for them.
+    """
+    own, _ = teeth.guess.parts[-1]
+    known = {hypothesis.key for hypothesis in grown.now.guess.hypotheses}
+    if own.key in known or not shaken(evidence, grown.now, own.location):
+        return grown
+    tell("calibrate with teeth", 0.78)
+    evidence.set_base(teeth)
+    other, _ = calibrated(evidence, teeth)
+    if other is not None:
+        now, fit = settle(evidence, other)
+        begin = replace(grown, now=now, fit=fit, early=(), rankings={own.key: grown.first})
+        toothed = _grow(evidence, base, begin, candidates, tell)
+        if _total(toothed) < _total(grown):
+            return toothed
+    evidence.set_base(grown.now)
+    return grown
 
 
 def _sparse(
@@ -272,7 +301,8 @@ def _plain(evidence: Evidence, grown: _Grown, candidates: Sequence[Hypothesis]) 
 
 def _total(grown: _Grown) -> float:
     """Loss of a guess and what all its numbers cost."""
-    assert grown.fit
+    if grown.fit is None:
+        return grown.now.loss
     return grown.now.loss + charge(grown.fit.information, len(grown.fit.information))
 
 
@@ -320,6 +350,17 @@ def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -
     return Found(base, now, fit, first, tuple(charges), without, compared, grown.weak)
 
 
+def _let_go(evidence: Evidence, now: Judged, moved: tuple[Guess, float]) -> tuple[Judged, float]:
+    """A guess of `promoted`, judged, and its score: fitted, where a number had come to its end."""
+    guess, gain = moved
+    judged = evidence.judged(guess)
+    if ended(now.guess):
+        judged, _ = settle(evidence, judged)
+        evidence.set_base(now)
+        gain += max(0.0, now.loss - judged.loss)
+    return judged, gain
+
+
 def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:
     """Candidates without those of balances of an axis in which nothing is lacking any more.
 
@@ -343,13 +384,14 @@ def lacking(judged: Judged, evidence: Evidence) -> float:
 
 def _early_options(
     evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis]
-) -> tuple[WithoutInputs, list[tuple[Judged, float]]]:
-    """What stands out as long as nothing unknown is let act, and teeth; best first."""
+) -> tuple[WithoutInputs, list[tuple[Judged, float]], Judged | None]:
+    """What stands out as long as nothing unknown is let act, and teeth; best first; and these."""
     bold = without_inputs(evidence, base, candidates)
     options = [option for option in bold.options if option[1] > ENTER]
-    if teeth := rattling(evidence, base, candidates):
+    teeth = rattling(evidence, base, candidates)
+    if teeth and teeth.loss < base.loss:
         options.append((teeth, base.loss - teeth.loss - ENTER))
-    return bold, sorted(options, key=_score)
+    return bold, sorted(options, key=_score), teeth
 
 
 def _others(

@@ -144,10 +144,11 @@ def test_what_may_only_make_up_for_something_else_is_a_detail():
         numbers = {"size": Estimate(1.0, "N", low, 1.5, 0.0)}
         return NamedEffect(name, location, 0.99, numbers, (), share)
 
-    teeth, trace = effect("backlash", "swing", 0.9), effect("presliding", "swing", 0.01)
+    teeth, trace = effect("backlash", "swing", 0.9), effect("presliding", "swing", 0.001)
     elsewhere = effect("coulomb_friction", "stick", 0.001)
     larger = effect("pressure_offset", "swing.rod", 0.03)
+    offset = effect("angle_offset", "swing", 0.01)
     untold = effect("pressure_lag", "boom", 0.06, low=-0.1)
-    effects = (teeth, trace, elsewhere, larger, untold)
-    assert without_details(effects, False) == ((teeth, elsewhere, larger), (trace, untold))
-    assert without_details(effects, True) == ((teeth, larger), (trace, elsewhere, untold))
+    effects = (teeth, trace, elsewhere, larger, offset, untold)
+    assert without_details(effects, False) == ((teeth, elsewhere, larger, offset), (trace, untold))
+    assert without_details(effects, True) == ((teeth, larger), (trace, elsewhere, offset, untold))

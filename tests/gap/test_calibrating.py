@@ -1,0 +1,44 @@
+"""Numbers of a calibration that stop at the end of their range."""
+
+import numpy as np
+
+from hydrotele.effects import Parameter
+from hydrotele.gap.calibrating import _further, ended
+from hydrotele.prediction.calibration import CALIBRATION
+from hydrotele.prediction.hypothesis import Guess, Hypothesis
+
+
+def number(name: str, high: float = 6.0) -> Hypothesis:
+    """One number whose nominal is 0, from 0 to `high`, in units of its uncertainty."""
+    return Hypothesis(name, "stick", {"value": Parameter("N", 0.0, 0.0, high, 1.0, 0.1)})
+
+
+class OneNumber:
+    """Evidence whose only error is how far a number is from the true one."""
+
+    def __init__(self, true: float) -> None:
+        self.true = true
+
+    def step_of(self, guess: Guess, step: float) -> float:
+        return step
+
+    def map(self, function, items):
+        return [function(item) for item in items]
+
+    def errors(self, guess: Guess, step: float) -> np.ndarray:
+        return guess.deviation - self.true
+
+
+def test_a_number_at_its_end_is_told_from_one_within():
+    for deviation, at_end in ((6.0, True), (5.9, False), (0.0, False)):
+        guess = Guess(((number(CALIBRATION), np.array([deviation])),))
+        assert ended(guess) is at_end
+    assert not ended(Guess(((number("coulomb_friction"), np.array([6.0])),)))
+
+
+def test_how_far_a_number_would_go_is_tried():
+    guess = Guess(((number("coulomb_friction", 100.0), np.array([6.0])),))
+    further, fall = _further(OneNumber(25.0), guess)
+    assert further.deviation.tolist() == [24.0] and fall == 1.0 - 19.0**2
+    same, none = _further(OneNumber(5.0), guess)
+    assert same.deviation.tolist() == [6.0] and none == 0.0
