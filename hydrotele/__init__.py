@@ -20,7 +20,7 @@ def _ignore_configuration() -> None:
             with contextlib.chdir(os.path.dirname(__file__)):
                 import_module(library)
             if library == "numba":  # it reads the file again for each function that it compiles
-                import_module("numba.core.config")._config_fname = os.devnull
+                vars(import_module("numba.core.config"))["_config_fname"] = os.devnull
 
 
 _ignore_configuration()

@@ -13,10 +13,12 @@ import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from numba import cfunc, njit
-from numba.core import config
+from numba.core import config as _numba_config
 
+_CONFIG: Any = _numba_config  # its settings are made at run time
 _UNUSED = 30 * 24 * 3600.0  # s, after which the cache of other sources is removed
 
 
@@ -105,9 +107,9 @@ if _FOLDER:
 @contextlib.contextmanager
 def _caching() -> Iterator[bool]:
     """Whether there is a cache; functions that are decorated meanwhile find it."""
-    given = config.CACHE_DIR
-    config.CACHE_DIR = str(_FOLDER or "")
+    given = _CONFIG.CACHE_DIR
+    _CONFIG.CACHE_DIR = str(_FOLDER or "")
     try:
         yield _FOLDER is not None
     finally:
-        config.CACHE_DIR = given
+        _CONFIG.CACHE_DIR = given

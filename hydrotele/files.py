@@ -67,12 +67,13 @@ def read_xml(path: str | Path) -> ElementTree.Element:
     """
     content = read_bytes(path)
     depth = deepest = 0
+    root: ElementTree.Element | None = None
     try:
         parser = ElementTree.XMLPullParser(("start", "end"))
         parser.feed(content)
         parser.close()
-        root = None
-        for event, element in parser.read_events():
+        events: Any = parser.read_events()
+        for event, element in events:
             root = element if root is None else root
             depth += 1 if event == "start" else -1
             deepest = max(deepest, depth)

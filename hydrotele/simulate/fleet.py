@@ -7,6 +7,7 @@ run beside the physics without Python. Results do not depend on the number of th
 
 import ctypes
 import os
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -29,7 +30,8 @@ class _Native:
     def seen(self, address: int, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
         """An array of its memory, which lives as long as the array does."""
         size = int(np.prod(shape)) * np.dtype(kind).itemsize
-        memory = type("_Memory", (ctypes.c_char * size,), {}).from_address(address)
+        kept: Any = type("_Memory", (ctypes.c_char * size,), {})  # with room for its owner
+        memory = kept.from_address(address)
         memory.owner = self
         return np.frombuffer(memoryview(memory), dtype=kind).reshape(shape)
 
