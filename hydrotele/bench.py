@@ -13,11 +13,12 @@ from mujoco.batch import Batch
 
 from hydrotele.commands.console import notes, out, print_json, table
 from hydrotele.errors import InputError
+from hydrotele.files import read_json
 from hydrotele.machine_file import load_machine
 from hydrotele.output import replacing
 from hydrotele.run import run_scenario
 from hydrotele.scenario import load_scenario
-from hydrotele.simulate.mechanism import assemble, mjcf_text
+from hydrotele.simulate.mechanism import assemble, mjcf_document
 from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 
@@ -111,7 +112,7 @@ def _bare_stepper(plant: Plant) -> Callable[[], float]:
     root = assemble(plant.machine, plant.model.opt.timestep, plant.ground, looks=False)
     for actuator in root.find_all("actuator"):
         actuator.remove()
-    model = mujoco.MjModel.from_xml_string(mjcf_text(root))
+    model = mjcf_document(root).compile()
     model.opt.gravity[:] = 0.0
     start = rest_state(plant)
     start.qvel[plant.dof[0]] = 0.1
@@ -175,10 +176,10 @@ def _start(*arguments: str) -> float:
 
 def _read(path: Path) -> dict:
     try:
-        figures = json.loads(path.read_text())
+        figures = read_json(path)
         if not isinstance(figures, dict) or "ratio" not in figures:
             raise ValueError("it has no ratio")
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise InputError(path, f"is no saved benchmark: {error}") from None
     return figures
 

@@ -1,5 +1,6 @@
 """Command line: one thin function per command. Heavy imports stay inside the functions."""
 
+import os
 import signal
 import sys
 from pathlib import Path
@@ -394,6 +395,7 @@ def _options(
 
 def main() -> None:
     """Entry point: the user's errors exit with 2, failed runs with 3, interrupts with 130."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # children import nothing from the working folder
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that everything is cleaned up
     try:
         app()

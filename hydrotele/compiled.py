@@ -1,15 +1,25 @@
 """How numerical functions are compiled: by numba, cached on disk, without checks for division by 0.
 
 numba looks only at the file of a function to see whether its cache is good. Compiled code here
-calls compiled code of other files, so a checkout's caches are dropped when any of them changed.
+calls compiled code of other files, so the cache of each state of the sources has its own folder.
+A cache is code: it lies in the user's cache folder, and no one else may write there.
 """
 
+import contextlib
 import hashlib
+import os
+import shutil
+import stat
+import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from numba import cfunc, njit
+from numba.core import config as _numba_config
 
-_STAMP = "compiled.stamp"
+_CONFIG: Any = _numba_config  # its settings are made at run time
+_UNUSED = 30 * 24 * 3600.0  # s, after which the cache of other sources is removed
 
 
 def compiled(function):
@@ -31,43 +41,75 @@ def lean(function):
 
 
 def _compile(function, **options):
-    try:
-        return njit(cache=True, error_model="numpy", nogil=True, **options)(function)
-    except RuntimeError:
-        return njit(error_model="numpy", nogil=True, **options)(function)
+    with _caching() as cache:
+        return njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
 
 
 def callback(signature):
     """Decorator that compiles a function for C to call, cached on disk where that is possible."""
 
     def decorate(function):
-        try:
-            return cfunc(signature, cache=True, error_model="numpy")(function)
-        except RuntimeError:
-            return cfunc(signature, error_model="numpy")(function)
+        with _caching() as cache:
+            return cfunc(signature, cache=cache, error_model="numpy")(function)
 
     return decorate
 
 
-def _drop_stale_caches() -> None:
-    """Remove numba's cache files of this package if a source with compiled code has changed.
+def cache_folder() -> Path | None:
+    """Folder of the compiled code, `$XDG_CACHE_HOME/hydrotele/...`, made for its owner only.
 
-    Where the package folder cannot be written, it was installed, and all its files change together.
+    None where there is none: no home, a file system without space or for reading, or a folder that
+    somebody else owns or may write to.
     """
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    if not os.path.isabs(home):
+        return None
+    folder = Path(home, "hydrotele", f"compiled_{_digest()}")
+    try:
+        new = not folder.exists()
+        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if not all(map(_private, (folder, folder.parent))) or not os.access(folder, os.W_OK):
+            return None
+        if new:
+            _remove_unused(folder)
+    except OSError:
+        return None
+    return folder
+
+
+def _private(folder: Path) -> bool:
+    found = folder.lstat()
+    shared = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not shared
+
+
+def _digest() -> str:
+    """Of all sources with compiled code: one of them that changes asks for another cache."""
     package = Path(__file__).parent
     texts = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
     used = [text for text in texts if b"hydrotele.compiled" in text or b"numba" in text]
-    digest = hashlib.sha256(b"".join(used)).hexdigest()
-    stamp = package / "__pycache__" / _STAMP
+    return hashlib.sha256(b"".join(used)).hexdigest()[:16]
+
+
+def _remove_unused(own: Path) -> None:
+    for folder in own.parent.glob("compiled_*"):
+        if folder != own and time.time() - folder.stat().st_mtime > _UNUSED:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+_FOLDER = cache_folder()
+if _FOLDER:
+    with contextlib.suppress(OSError):
+        os.utime(_FOLDER)  # it is in use
+
+
+@contextlib.contextmanager
+def _caching() -> Iterator[bool]:
+    """Whether there is a cache; functions that are decorated meanwhile find it."""
+    given = _CONFIG.CACHE_DIR
+    _CONFIG.CACHE_DIR = str(_FOLDER or "")
     try:
-        if stamp.is_file() and stamp.read_text() == digest:
-            return
-        for cached in (*package.rglob("*.nbi"), *package.rglob("*.nbc")):
-            cached.unlink(missing_ok=True)
-        stamp.parent.mkdir(exist_ok=True)
-        stamp.write_text(digest)
-    except OSError:
-        return
-
-
-_drop_stale_caches()
+        yield _FOLDER is not None
+    finally:
+        _CONFIG.CACHE_DIR = given

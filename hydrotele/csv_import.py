@@ -1,15 +1,20 @@
 """CSV from a data logger or a spreadsheet, as a table; the checks scale its units to SI."""
 
+import io
 import math
 import re
+from array import array
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from hydrotele.errors import InputError
+from hydrotele.files import open_regular
+from hydrotele.limits import check_limit, limit
 from hydrotele.log_checks import Table, place
 
+_LONGEST = 1_000_000  # letters of a line
 _HEADER = re.compile(r"(?P<name>.*?)\s*(\[(?P<unit>[^\[\]]*)\])?", re.DOTALL)
 
 
@@ -28,44 +33,63 @@ def read_csv(path: Path, missing: bool = False) -> Table:
         InputError: not readable as UTF-8 text, empty, no header, a row of the wrong width, or a
             cell that is not a number.
     """
-    header, rows, lines, metadata = _split(path)
-    source = str(path)
-    separator = max(",;\t", key=header.count)
-    names, units = _parse_header(header, separator)
-    if any(map(_is_number, names)):
-        remedy = "write a header of channel names above the numbers, such as time,angle.boom [deg]"
-        raise InputError(path, f"the first line {header[:40]!r} holds numbers, not names: {remedy}")
-    cells = [_parse_row(source, names, row, separator, lines, missing) for row in enumerate(rows)]
-    values = np.array(cells, dtype=np.float64).reshape(len(rows), len(names))
-    return Table(source, names, list(values.T), units, metadata, np.array(lines, dtype=np.int64))
+    read = _Reading(str(path), missing)
+    with open_regular(path) as file:
+        text = io.TextIOWrapper(file, encoding="utf-8-sig")  # line by line: a log may be large
+        try:
+            for number, line in enumerate(iter(lambda: text.readline(_LONGEST), ""), 1):
+                read.take(number, line)
+        except UnicodeDecodeError as error:
+            reason = f"is not text in UTF-8 ({error.reason}): save it as CSV UTF-8"
+            raise InputError(path, reason) from error
+    if not read.names:
+        raise InputError(path, "is empty: write a header of channel names, then one line per row")
+    values = np.frombuffer(read.values, dtype=np.float64).reshape(-1, len(read.names))
+    lines = np.array(read.lines, dtype=np.int64)
+    columns = [np.ascontiguousarray(column) for column in values.T]
+    return Table(read.source, read.names, columns, read.units, read.metadata, lines)
 
 
-def _split(path: Path) -> tuple[str, list[str], list[int], dict[str, str]]:
-    """Return the header, the data rows, their line numbers and the metadata of the comments."""
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            path, f"is not text in UTF-8 ({error.reason}): save it as CSV UTF-8"
-        ) from error
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror}") from error
-    header, rows, lines, metadata = None, [], [], {}
-    for number, line in enumerate(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), 1):
+class _Reading:
+    """What the lines of a file have brought so far."""
+
+    def __init__(self, source: str, missing: bool) -> None:
+        self.source, self.missing, self.most = source, missing, limit("LOG_VALUES")
+        self.names: list[str] = []
+        self.units: list[str | None] = []
+        self.metadata: dict[str, str] = {}
+        self.separator = ","
+        self.values, self.lines = array("d"), array("q")
+
+    def take(self, number: int, line: str) -> None:
+        """Take the next line of the file, with its end."""
+        if len(line) == _LONGEST:
+            raise InputError(f"{self.source}, line {number}", f"is longer than {_LONGEST} letters")
+        line = line.rstrip("\n")
         if line.startswith("#"):
             key, colon, value = line[1:].partition(":")
             if colon:
-                metadata[key.strip()] = value.strip()
+                self.metadata[key.strip()] = value.strip()
         elif not line.strip():
-            continue
-        elif header is None:
-            header = line
+            return
+        elif not self.names:
+            self._take_header(line)
         else:
-            rows.append(line)
-            lines.append(number)
-    if header is None:
-        raise InputError(path, "is empty: write a header of channel names, then one line per row")
-    return header, rows, lines, metadata
+            row = len(self.lines)
+            self.lines.append(number)
+            self.values.extend(_parse_row(
+                self.source, self.names, (row, line), self.separator, self.lines, self.missing,
+            ))  # fmt: skip
+            if len(self.values) > self.most:
+                check_limit(self.source, "LOG_VALUES", len(self.values))
+
+    def _take_header(self, line: str) -> None:
+        self.separator = max(",;\t", key=line.count)
+        self.names, self.units = _parse_header(line, self.separator)
+        if any(map(_is_number, self.names)):
+            remedy = "write a header of channel names above the numbers, such as"
+            message = f"the first line {line[:40]!r} holds numbers, not names: {remedy}"
+            raise InputError(self.source, f"{message} time,angle.boom [deg]")
 
 
 def _parse_header(header: str, separator: str) -> tuple[list[str], list[str | None]]:

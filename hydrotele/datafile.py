@@ -15,6 +15,8 @@ import pydantic
 import yaml
 
 from hydrotele.errors import InputError
+from hydrotele.files import read_text
+from hydrotele.limits import beyond, limit
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, pydantic.Field(gt=0)]
@@ -138,6 +140,46 @@ _Loader.add_implicit_resolver(
 )
 
 
+def _load(text: str) -> tuple[Any, Any]:
+    """Node and value of a YAML text, after `_check_size`."""
+    _check_size(text)
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        return node, (loader.construct_document(node) if node else None)
+    finally:
+        loader.dispose()
+
+
+def _check_size(text: str) -> None:
+    """Refuse what is too deep or too large once its aliases are replaced by what they stand for.
+
+    The parser's events come one by one, so that nothing is built for what is refused: libyaml's
+    composer has no bound of its own on either.
+    """
+    opened: list[tuple[str | None, int]] = []  # anchor of what is open, values before it
+    sizes: dict[str, int] = {}
+    values, most_values, most_depth = 0, limit("FILE_VALUES"), limit("FILE_DEPTH")
+    for event in yaml.parse(text, Loader=_BASE):
+        anchor = getattr(event, "anchor", None)
+        if isinstance(event, yaml.AliasEvent):
+            values += sizes.get(str(anchor), 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            values += 1
+            if anchor:
+                sizes[anchor] = 1
+        elif isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
+            opened.append((anchor, values))
+            values += 1
+        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
+            anchor, before = opened.pop()
+            if anchor:
+                sizes[anchor] = values - before
+        if values > most_values or len(opened) > most_depth:
+            said = beyond("FILE_DEPTH", len(opened)) or beyond("FILE_VALUES", values)
+            raise yaml.MarkedYAMLError(problem=f"it has {said}", problem_mark=event.start_mark)
+
+
 def _key_lines(root) -> dict[tuple, int]:
     """Line of every key; what an alias repeats has the line of the key that holds the alias."""
     lines: dict[tuple, int] = {(): root.start_mark.line + 1}
@@ -175,13 +217,9 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
         InputError: the file is missing, not YAML, or not a mapping.
     """
     path = Path(path)
+    text = read_text(path)
     try:
-        text = path.read_text(encoding="utf-8")
-        loader = _Loader(text)
-        node = loader.get_single_node()
-        data = loader.construct_document(node) if node else None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(path), f"cannot be read: {error}") from None
+        node, data = _load(text)
     except (yaml.YAMLError, RecursionError, *_BAD_SCALARS) as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark else ""
@@ -200,7 +238,7 @@ def read_value(text: str) -> Any:
     Raises:
         yaml.YAMLError: the text is no YAML.
     """
-    return yaml.load(text, Loader=_Loader)
+    return _load(text)[1]
 
 
 Model = TypeVar("Model", bound=Facts)

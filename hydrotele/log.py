@@ -15,6 +15,7 @@ import numpy as np
 from hydrotele import signals
 from hydrotele.csv_import import read_csv
 from hydrotele.errors import InputError
+from hydrotele.limits import check_limit
 from hydrotele.log_checks import (
     CommandRange,
     Table,
@@ -274,35 +275,47 @@ def _read_parquet(path: Path, missing: bool) -> Table:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    names, values, units = [], [], []
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            table = file.read()
-        names = [name for name in table.column_names if not name.startswith("__index_level_")]
-        file_metadata = _decoded(table.schema.metadata)
+            schema, rows = file.schema_arrow, file.metadata.num_rows
+            specs = [s for s in schema if not s.name.startswith("__index_level_")]  # pandas' labels
+            for spec in specs:
+                _check_numbers(path, spec)
+            check_limit(path, "LOG_VALUES", rows * len(specs))
+            for spec in specs:  # one by one, so that only one is there twice
+                read = file.read(columns=[spec.name])  # and columns whose names begin so
+                column = read.column(read.schema.get_all_field_indices(spec.name)[0])
+                names.append(spec.name)
+                values.append(_numbers(f"{path}, column {spec.name!r}", column, missing))
+                units.append(_decoded(spec.metadata).get("unit") or None)
+        metadata = {k: v for k, v in _decoded(schema.metadata).items() if k != "pandas"}
+    except InputError:
+        raise
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
             path, f"is not a readable Parquet file, copy it again ({reason})"
         ) from error
-    metadata = {k: v for k, v in file_metadata.items() if k != "pandas"}
-    values, units = [], []
-    for column, spec in zip(table.columns, table.schema, strict=True):
-        if spec.name.startswith("__index_level_"):  # pandas writes its row labels so
-            continue
-        where = f"{path}, column {spec.name!r}"
-        number = pa.types.is_floating(spec.type) or pa.types.is_integer(spec.type)
-        flag = pa.types.is_boolean(spec.type) and spec.name in ("valid", "mask")
-        if not (number or flag):
-            raise InputError(
-                where, f"holds {spec.type}, not numbers: write it as float64 or remove it"
-            )
-        if column.null_count and not missing:
-            row = int(np.flatnonzero(column.is_null().to_numpy())[0])
-            raise InputError(f"{where}, row {row}", "is null: remove the row or fill it in")
-        with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaN
-            values.append(column.to_numpy().astype(np.float64))
-        units.append(_decoded(spec.metadata).get("unit") or None)
     return Table(str(path), names, values, units, metadata)
+
+
+def _check_numbers(path: Path, spec) -> None:
+    import pyarrow as pa
+
+    number = pa.types.is_floating(spec.type) or pa.types.is_integer(spec.type)
+    if not (number or (pa.types.is_boolean(spec.type) and spec.name in ("valid", "mask"))):
+        message = f"holds {spec.type}, not numbers: write it as float64 or remove it"
+        raise InputError(f"{path}, column {spec.name!r}", message)
+
+
+def _numbers(where: str, column, missing: bool) -> np.ndarray:
+    """A Parquet column as (n,) float64, null as NaN."""
+    if column.null_count and not missing:
+        row = int(np.flatnonzero(column.is_null().to_numpy())[0])
+        raise InputError(f"{where}, row {row}", "is null: remove the row or fill it in")
+    with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaN
+        return column.to_numpy().astype(np.float64)
 
 
 def _decoded(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:

@@ -13,8 +13,10 @@ import mujoco
 import numpy as np
 import yaml
 
+from hydrotele.assets import copy_mjcf
 from hydrotele.datafile import PSI, parse, read_yaml, split_unit, suggest, to_si
 from hydrotele.errors import InputError
+from hydrotele.files import read_xml
 from hydrotele.machine import Machine
 from hydrotele.resources import models_folder
 from hydrotele.terms.law import LAWS
@@ -91,8 +93,9 @@ def save_machine(machine: Machine, path: str | Path) -> None:
         machine: the machine.
         path: file to write. A shipped MJCF is referred to by its place among the shipped models, so
             that the file works with any installation. A user's is copied beside it as
-            `<stem>.tree.xml`, so that the folder can be handed on, unless it needs further files.
-            So is a user's file that defines laws of its terms, which say so.
+            `<stem>.tree.xml`, with its meshes, textures and height fields in `<stem>_assets`, so
+            that the folder can be handed on, unless it includes further documents. So is a user's
+            file that defines laws of its terms, which say so.
     """
     machine = _with_law_files(machine, Path(path).parent)
     data = machine.model_dump(mode="json", exclude_defaults=True)
@@ -103,15 +106,13 @@ def save_machine(machine: Machine, path: str | Path) -> None:
     if machine.mjcf:
         mjcf = Path(machine.folder, machine.mjcf).resolve()
         shipped = models_folder().resolve()
-        text = mjcf.read_text(encoding="utf-8")
+        copy = Path(path).with_suffix(".tree.xml")
         if mjcf.is_relative_to(shipped):
             data["mjcf"] = str(mjcf.relative_to(shipped))
-        elif " file=" in text:
-            data["mjcf"] = str(mjcf)
-        else:
-            copy = Path(path).with_suffix(".tree.xml")
-            copy.write_text(text, encoding="utf-8")
+        elif copy_mjcf(mjcf, copy, f"{Path(path).stem}_assets"):
             data["mjcf"] = copy.name
+        else:
+            data["mjcf"] = str(mjcf)
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 
@@ -184,6 +185,10 @@ def _complete_links(data: dict, path: Path, lines) -> None:
     if not data.get("mjcf"):
         return
     mjcf = path.parent / str(data["mjcf"])
+    try:
+        read_xml(mjcf)
+    except InputError as error:
+        raise InputError(_place(path, lines, "mjcf"), str(error)) from None
     try:
         spec = mujoco.MjSpec.from_file(str(mjcf))
     except (OSError, ValueError) as error:

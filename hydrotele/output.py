@@ -3,7 +3,6 @@
 import contextlib
 import fnmatch
 import glob
-import json
 import os
 import re
 import secrets
@@ -13,16 +12,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hydrotele.errors import InputError
+from hydrotele.files import read_json
 
 OURS = {
-    "run": ("measured.parquet", "truth.parquet", "review.rrd", "scenario.yaml", "machine.*"),
+    "run": ("measured.parquet", "truth.parquet", "review.rrd", "scenario.yaml", "machine.*",
+            "machine_assets/*"),
     "replay": ("*.png", "*.rrd", "*_simulated.parquet"),
     "gap": (
         "gap.json", "report.html", "recording.rrd", "next_experiment.yaml",
-        "patched/machine.*", "patched/effects.yaml",
+        "patched/machine.*", "patched/machine_assets/*", "patched/effects.yaml",
     ),
     "compare": ("compare.json", "*.png"),
-    "identify": ("identify.json", "report.html", "identified/machine.*"),
+    "identify": ("identify.json", "report.html", "identified/machine.*",
+                 "identified/machine_assets/*"),
     "two-port analysis": ("analysis.json", "report.html", "stability.png"),
     "sweep": (
         "sweep.yaml", "journal.jsonl", "table.parquet", "timings.csv", "report.html", "*.png",
@@ -53,7 +55,7 @@ def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         for stale in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
-            if not _alive(stale):
+            if _ours(stale) and not _alive(stale):
                 shutil.rmtree(stale, ignore_errors=True)
         prefix = f".{target.name}.{os.getpid()}."
         part = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=target.parent))
@@ -71,6 +73,8 @@ def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
         if old.exists() and not target.exists():
             old.rename(target)
         shutil.rmtree(part, ignore_errors=True)
+        if isinstance(error, InputError) and str(part) in error.where:
+            raise InputError(error.where.replace(str(part), str(asked)), error.message) from error
         if isinstance(error, OSError):
             reason = error.strerror or str(error)
             raise InputError(asked, f"cannot be written, nothing is left: {reason}") from error
@@ -114,17 +118,24 @@ def _matches(name: str, pattern: str) -> bool:
 
 def _kind(folder: Path) -> str | None:
     try:
-        summary = json.loads((folder / "summary.json").read_text())
-        return summary.get("kind")
-    except (OSError, ValueError, AttributeError):
+        return read_json(folder / "summary.json").get("kind")
+    except (InputError, AttributeError):
         return None
+
+
+_PART = re.compile(r"\.(\d+)\.[a-z0-9_]{8}(?:\.old)?\.part$")  # process, letters of mkdtemp
+
+
+def _ours(part: Path) -> bool:
+    """Whether a killed run left this folder: a user's own is never removed."""
+    return bool(_PART.search(part.name)) and part.is_dir() and not part.is_symlink()
 
 
 def _alive(part: Path) -> bool:
     try:
-        pid = int(re.findall(r"\.(\d+)\.[^.]+(?:\.old)?\.part$", part.name)[0])
+        pid = int(_PART.findall(part.name)[0])
         os.kill(pid, 0)
-    except (ValueError, IndexError, ProcessLookupError):
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True
@@ -150,6 +161,8 @@ def replacing(path: str | os.PathLike, suffix: str) -> Iterator[Path]:
         raise InputError(path, f"give it a name that ends in {suffix}")
     if not path.parent.is_dir():
         raise InputError(path, f"cannot be written: {path.parent} is not a folder")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise InputError(path, f"cannot be written: {path.parent} cannot be written to")
     part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
     try:
         yield part
@@ -157,4 +170,5 @@ def replacing(path: str | os.PathLike, suffix: str) -> Iterator[Path]:
     except OSError as error:
         raise InputError(path, f"cannot be written: {error.strerror or error}") from error
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a file system that became read-only keeps it
+            part.unlink(missing_ok=True)

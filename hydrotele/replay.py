@@ -1,7 +1,6 @@
 """Open-loop replay: a log's commands drive the model from its initial state; how far is it off?"""
 
 import dataclasses
-import json
 import math
 import time as clock
 from collections.abc import Callable
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hydrotele.errors import InputError
+from hydrotele.files import json_value
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.noise import noise_rms, sensor_set
@@ -147,7 +147,7 @@ def _first(plant: Plant, log: Log, channel: str) -> float:
 
 def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
     try:
-        state = json.loads(log.metadata["initial_state"])
+        state = json_value(log.metadata["initial_state"])
         order = list(state["order"])
         if sorted(order) != sorted(plant.axes):
             raise ValueError(f"its order {order} is not that of the axes {list(plant.axes)}")

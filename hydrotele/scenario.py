@@ -22,6 +22,7 @@ from hydrotele.datafile import (
     suggest,
 )
 from hydrotele.errors import InputError
+from hydrotele.limits import beyond
 from hydrotele.log import load_log
 from hydrotele.resources import scenarios_folder
 from hydrotele.signals import parse_channel
@@ -85,6 +86,11 @@ def _falls(values) -> list[bool]:
     return [b <= a for a, b in zip(values, values[1:], strict=False)]
 
 
+def _refuse_beyond(name: str, amount: float) -> None:
+    if said := beyond(name, amount):
+        raise ValueError(f"has {said}")
+
+
 class Harmonics(Facts):
     """Fourier reference of one joint: mean + sum_k sin_k sin(k w t) + cos_k cos(k w t)."""
 
@@ -100,6 +106,12 @@ class FourierPilot(Facts):
     period: Positive
     fade: NonNegative = 2.0
     axes: dict[Name, Harmonics]
+
+    @model_validator(mode="after")
+    def _check(self):
+        counts = [max(len(axis.sin), len(axis.cos)) for axis in self.axes.values()]
+        _refuse_beyond("HARMONICS", max(counts, default=0))
+        return self
 
 
 class Move(Facts):
@@ -128,6 +140,11 @@ class LinesPilot(Facts):
     acceleration: Annotated[float, Field(ge=1e-3, le=1000)] = 1.0
     moves: Annotated[list[Move], Field(min_length=1)]
 
+    @model_validator(mode="after")
+    def _check(self):
+        _refuse_beyond("MOVES", len(self.moves))
+        return self
+
 
 class Waypoint(Facts):
     """A joint target or a pose, reached `duration` [s] after the one before, then held `pause`."""
@@ -144,6 +161,11 @@ class WaypointsPilot(Facts):
     kind: Literal["waypoints"]
     settle: NonNegative = 0.5
     points: Annotated[list[Waypoint], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _check(self):
+        _refuse_beyond("MOVES", len(self.points))
+        return self
 
 
 Pilot = Annotated[
@@ -216,6 +238,8 @@ class Scenario(Facts):
             raise ValueError(
                 f"log_rate {self.log_rate:g} Hz must divide control_rate {self.control_rate:g} Hz"
             )
+        _refuse_beyond("RUN_TICKS", self.duration * self.control_rate)
+        _refuse_beyond("RUN_ROWS", self.duration * self.log_rate)
         if not self.ground and any(thing.kind == "log" for thing in self.surroundings):
             raise ValueError("a log needs ground to lie on: set ground: true or remove the log")
         if self.duration * self.control_rate > 2e7:

@@ -15,7 +15,17 @@ PACKAGE = "hydrotele"
 # Bottom first. A room is a file or folder directly under hydrotele; it sees every floor below its
 # own. Rooms of one floor see each other, in one direction only, unless the floor is in WALLED.
 FLOORS = (
-    ("errors", "signals", "resources", "datafile", "output", "compiled"),
+    (
+        "errors",
+        "limits",
+        "files",
+        "assets",
+        "signals",
+        "resources",
+        "datafile",
+        "output",
+        "compiled",
+    ),
     (
         "drives",
         "sensors",
@@ -65,7 +75,7 @@ ONLY = {
     "kinematics": {"errors", "compiled", "drives", "machine"},
     "soil": {"errors", "compiled", "datafile"},
     "teleop": {"errors", "compiled"},
-    "devices": {"errors", "datafile", "joystick", "teleoperation"},
+    "devices": {"errors", "files", "datafile", "joystick", "teleoperation"},
     "identify": _FACTS,
     "simulate": _PLAIN,
     "operate": _PLAIN,

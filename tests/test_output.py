@@ -144,8 +144,8 @@ def test_left_over_parts_of_the_dead_are_removed(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     here = os.getppid()
-    keep = [f".run.{here}.abc.part", f".other.{dead.pid}.abc.part", ".run.part"]
-    for name in (*keep, f".run.{dead.pid}.abc.part", f".run.{dead.pid}.abc.old.part"):
+    keep = [f".run.{here}.abcd_123.part", f".other.{dead.pid}.abcd_123.part", ".run.part"]
+    for name in (*keep, f".run.{dead.pid}.abcd_123.part", f".run.{dead.pid}.abcd_123.old.part"):
         (tmp_path / name).mkdir()
     write(tmp_path / "run")
     assert names(tmp_path) == sorted([*keep, "run"])
@@ -180,3 +180,14 @@ def test_file_appears_whole_or_not_at_all(tmp_path):
     ):  # fmt: skip
         with pytest.raises(InputError, match=message), replacing(tmp_path / path, suffix):
             pass
+
+
+def test_a_users_own_hidden_folder_is_not_removed(tmp_path):
+    """Only what a killed run of that name left behind is."""
+    own, left = tmp_path / ".a.mine.part", tmp_path / ".a.999999999.abcd_123.part"
+    for folder in (own, left):
+        folder.mkdir()
+        (folder / "notes.txt").write_text("kept")
+    with whole_folder(tmp_path / "a", "run") as part:
+        (part / "summary.json").write_text('{"kind": "run"}')
+    assert (own / "notes.txt").is_file() and not left.exists()

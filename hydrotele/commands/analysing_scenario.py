@@ -4,11 +4,10 @@ import json
 import math
 from pathlib import Path
 
-import yaml
-
 import hydrotele
 from hydrotele.commands.analysing import analyse_teleop_to_folder
 from hydrotele.commands.console import out, plain, print_json, table
+from hydrotele.datafile import read_yaml
 from hydrotele.errors import InputError
 from hydrotele.joystick import load_joystick
 from hydrotele.operate.loop_findings import ScenarioFindings, find_loop, loop_document
@@ -28,10 +27,9 @@ def is_scenario(file: Path | None) -> bool:
     if str(file) in shipped_scenarios():
         return True
     try:
-        data = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError):
+        return "pilot" in read_yaml(file)[0]
+    except InputError:
         return False
-    return isinstance(data, dict) and "pilot" in data
 
 
 def analyse_any_to_folder(

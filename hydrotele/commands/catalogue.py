@@ -9,6 +9,7 @@ from hydrotele.datafile import read_yaml, suggest
 from hydrotele.errors import InputError
 from hydrotele.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
 from hydrotele.machine_file import load_machine, machine_path, shipped_machines
+from hydrotele.simulate.document import Mjcf
 
 _KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environments")
 
@@ -222,7 +223,6 @@ def _check_joystick(path: Path) -> str:
 
 
 def _check_machine(path: Path) -> str:
-    import mujoco
 
     from hydrotele.kinematics.from_machine import axis_linkage, check_strokes
     from hydrotele.simulate.plant import build_plant, rest_state
@@ -232,7 +232,7 @@ def _check_machine(path: Path) -> str:
         machine = load_machine(path, tool)
         plant = build_plant(machine)
         rest_state(plant)
-        mujoco.MjModel.from_xml_string(plant.mjcf)
+        plant.document.compile()
         for axis in machine.axes:
             axis_linkage(machine, axis)
         check_strokes(machine)
@@ -270,7 +270,7 @@ def export_machine(
         return
     from hydrotele.simulate.plant import build_plant
 
-    _write(build_plant(machine).mjcf, target)
+    _write(build_plant(machine).document, target)
 
 
 def _export_joystick(name: str, target: Path | None, picture: Path | None, camera: str) -> None:
@@ -281,7 +281,7 @@ def _export_joystick(name: str, target: Path | None, picture: Path | None, camer
     spec = joystick_spec(load_joystick(name), hand=False)
     model = spec.compile()
     if not picture:
-        _write(spec.to_xml(), target)
+        _write(Mjcf(name, spec.to_xml(), {}), target)
         return
     from hydrotele.show.picture import render_model
 
@@ -289,12 +289,15 @@ def _export_joystick(name: str, target: Path | None, picture: Path | None, camer
     notes.print(f"written to {picture}")
 
 
-def _write(text: str, target: Path | None) -> None:
+def _write(document: Mjcf, target: Path | None) -> None:
     from hydrotele.output import replacing
 
     if target:
         with replacing(target, ".xml") as part:
-            part.write_text(text)
+            document.save(part, target)
         notes.print(f"written to {target}")
+    elif document.assets:
+        message = f"needs {len(document.assets)} files beside it: give --out FILE.xml"
+        raise InputError("the MJCF", message)
     else:
-        print(text)
+        print(document.text)

@@ -2,17 +2,35 @@
 
 import contextlib
 import json
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.errors import MarkupError
 from rich.table import Table
+from rich.text import Text
 
 Progress = Callable[[float, float], None]
 
-out = Console(highlight=False)
-notes = Console(stderr=True, highlight=False)
+_STYLES = "bold|dim|red|green|yellow|blue|magenta"
+_NO_TAG = re.compile(rf"(?<!\\)\[(?!/\]|(?:{_STYLES})(?: (?:{_STYLES}))*\])")
+
+
+class _Console(Console):
+    """A console that takes our own styles in brackets only; names and paths may hold any text."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """The text with its styles; what looks like another tag, or is never opened, is text."""
+        try:
+            return super().render_str(_NO_TAG.sub(r"\[", text), **options)
+        except MarkupError:
+            return super().render_str(text, **{**options, "markup": False})
+
+
+out = _Console(highlight=False, emoji=False)
+notes = _Console(stderr=True, highlight=False, emoji=False)
 
 
 def print_json(data: Any) -> None:

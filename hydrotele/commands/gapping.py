@@ -87,7 +87,7 @@ def write_gap(
         patched = folder / "patched"
         patched.mkdir()
         write_patch(gap, patched)
-        (patched / "machine.xml").write_text(build_plant(gap.patched).mjcf, encoding="utf-8")
+        build_plant(gap.patched).document.save(patched / "machine.xml")
     if scenario := (gap.next_experiment or {}).get("scenario"):
         text = yaml.safe_dump(finite(scenario), sort_keys=False)
         (folder / "next_experiment.yaml").write_text(text, encoding="utf-8")

@@ -163,7 +163,7 @@ def _write(
     made = folder / "identified"
     made.mkdir()
     save_machine(patched, made / MACHINE_FILE)
-    (made / "machine.xml").write_text(build_plant(patched).mjcf, encoding="utf-8")
+    build_plant(patched).document.save(made / "machine.xml")
     from hydrotele.show.identify_report import write_identify_report
 
     notes.print("writing report.html ...", style="dim")

@@ -64,7 +64,7 @@ def write_run(result: Run, folder: Path, review: bool = True) -> None:
     save_log(result.measured, folder / "measured.parquet")
     save_log(result.truth, folder / "truth.parquet")
     save_scenario(result.scenario, folder / "scenario.yaml")
-    (folder / "machine.xml").write_text(result.plant.mjcf)
+    result.plant.document.save(folder / "machine.xml")
     save_machine(scenario_model(result.scenario), folder / "machine.yaml")
     if review:
         from hydrotele.show.recording import write_recording

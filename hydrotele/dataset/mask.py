@@ -10,6 +10,7 @@ import numpy as np
 
 from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
+from hydrotele.files import read_text
 
 _HEADER = ("run", "begin", "end")
 
@@ -32,10 +33,7 @@ def read_mask(path: str | Path) -> tuple[Masked, ...]:
         InputError: the file is not there, or a line is no stretch; names the line.
     """
     path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"cannot be read as a mask: {error}") from None
+    lines = read_text(path).splitlines()
     found, header = [], False
     for number, cells in enumerate(csv.reader(lines), start=1):
         cells = [cell.strip() for cell in cells]

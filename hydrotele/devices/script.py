@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from hydrotele.datafile import Facts, Name, NonNegative, parse, read_yaml, suggest
 from hydrotele.devices.reading import Reading
 from hydrotele.errors import InputError
+from hydrotele.files import read_text
 from hydrotele.joystick import AXES
 from hydrotele.teleoperation import JoystickAxis
 
@@ -106,8 +107,8 @@ def load_script(path: str | Path) -> Script:
 
 def _from_csv(path: Path) -> Script:
     try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = list(csv.reader(read_text(path).splitlines()))
+    except csv.Error as error:
         raise InputError(path, f"cannot be read: {error}") from None
     names = [name.strip() for name in rows[0]] if rows else []
     if "time" not in names:

@@ -1,10 +1,11 @@
 """From the keywords of `gymnasium.make` to a running task, and its spaces."""
 
 import dataclasses
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 from gymnasium.spaces import Box
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from hydrotele.datafile import suggest
 from hydrotele.errors import InputError
@@ -13,6 +14,10 @@ from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.memory import DISABLED, NEXT_STEP, SAME_STEP
 from hydrotele.tasks.task import Options
 
+_STRICT = ConfigDict(strict=True, allow_inf_nan=False)
+_TYPES: dict[str, TypeAdapter] = {
+    name: TypeAdapter(hint, config=_STRICT) for name, hint in get_type_hints(Options).items()
+}
 AUTORESET = {"NextStep": NEXT_STEP, "SameStep": SAME_STEP, "Disabled": DISABLED}
 
 
@@ -38,8 +43,21 @@ def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode
     if strange := set(choices) - known:
         name = sorted(strange)[0]
         raise InputError(f"environment option {name!r}", suggest(name, known))
-    kept: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in choices.items()}
-    return TaskCore(TASKS[task], Options(**kept), count, threads, mode)
+    return TaskCore(TASKS[task], _options(choices), count, threads, mode)
+
+
+def _options(choices: dict[str, Any]) -> Options:
+    """The choices, each of its own type: `variants="3"` is a mistake, and so is a NaN."""
+    kept: dict[str, Any] = {}
+    for name, value in choices.items():
+        plain = value.item() if isinstance(value, np.generic) else value
+        plain = tuple(plain) if isinstance(plain, list) else plain
+        try:
+            kept[name] = _TYPES[name].validate_python(plain)
+        except ValidationError as error:
+            message = f"{error.errors()[0]['msg']}; it is {value!r}"
+            raise InputError(f"environment option {name!r}", message) from None
+    return Options(**kept)
 
 
 def observation_space(core: TaskCore) -> Box:

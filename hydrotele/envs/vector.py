@@ -77,7 +77,8 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             (observations (n, o), infos).
 
         Raises:
-            ValueError: seeds or mask have a wrong length.
+            ValueError: seeds or mask have a wrong length, or a seed is not usable.
+            RuntimeError: the first reset leaves some out.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = self._chosen(options)
@@ -101,7 +102,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return None
         self._begun = True
         if isinstance(seed, (int, np.integer)):
-            return int(seed) + np.arange(self.num_envs)
+            return np.array([int(seed) + k for k in range(self.num_envs)])
         drawn = self.np_random.integers(2**62, size=self.num_envs)
         if seed is None:
             return drawn
@@ -124,6 +125,8 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ValueError: the actions have another shape, or are not finite numbers.
         """
         core = self.core
+        if np.shape(actions) != core.action.shape:
+            raise ValueError(f"actions are {core.action.shape}, not {np.shape(actions)}")
         core.step(actions)
         infos = self._infos(None)
         over = (core.terminated | core.truncated).astype(bool)

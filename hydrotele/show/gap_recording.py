@@ -15,17 +15,16 @@ from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Gap, Prediction
 from hydrotele.gap.words import channel_words, headline, learned_title, verdict_words
 from hydrotele.log import Log
-from hydrotele.output import replacing
 from hydrotele.show.channels import shown_unit
 from hydrotele.show.gap_layout import gap_blueprint
 from hydrotele.show.gap_windows import GapWindow, gap_windows, most_changed, windowed
 from hydrotele.show.recording import _log_machines, entity, time_column
+from hydrotele.show.recording_file import recording_file
 from hydrotele.signals import usual_unit
 
 _MEASURED, _NOMINAL, _PATCHED = (205, 210, 216), (240, 150, 0), (86, 160, 233)
 _LOUD, _FLOOR = (225, 70, 60), (120, 128, 136)
 _WIDTHS = {"measured": 3.0, "nominal": 1.4, "patched": 1.4}
-_LONGEST_ID = 180  # characters that rerun takes as an application id
 
 
 def write_gap_recording(
@@ -42,26 +41,22 @@ def write_gap_recording(
     Raises:
         InputError: a linkage does not close on the measured angles, or the file cannot be written.
     """
-    import rerun as rr
-
     before, after = gap.before[0], gap.after[0]
     models = {"nominal": (before, _NOMINAL)}
     if has_patch(gap):
         models["patched"] = (after, _PATCHED)
     windows = gap_windows(before, gap.size.noise_floor or gap.size.before)
     identity = f"hydrotele gap {gap.machine.name} {gap.machine.tool}"
-    with replacing(path, ".rrd") as part:
-        with rr.RecordingStream(identity.encode("ascii", "replace").decode()[:_LONGEST_ID]) as out:
-            out.save(part)
-            out.send_recording_name(f"{gap.machine.name} {before.run}: {headline(gap)}")
-            scene = _log_machines(out, {"measured": (gap.machine, _filled(before, run))})
-            _log_commands(out, run, axes)
-            _log_channels(out, models)
-            _log_sizes(out, models, gap.size.noise_floor)
-            _log_windows(out, gap, windows, before)
-            out.log("about", _about(gap), static=True)
-            worst = most_changed(before, after, 2)
-            out.send_blueprint(gap_blueprint(scene, before, models, worst))
+    with recording_file(path, identity) as out:
+        out.send_recording_name(f"{gap.machine.name} {before.run}: {headline(gap)}")
+        scene = _log_machines(out, {"measured": (gap.machine, _filled(before, run))})
+        _log_commands(out, run, axes)
+        _log_channels(out, models)
+        _log_sizes(out, models, gap.size.noise_floor)
+        _log_windows(out, gap, windows, before)
+        out.log("about", _about(gap), static=True)
+        worst = most_changed(before, after, 2)
+        out.send_blueprint(gap_blueprint(scene, before, models, worst))
 
 
 def _filled(prediction: Prediction, run: RunData) -> Log:

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 from hydrotele.log import Log
 from hydrotele.machine import Machine
 from hydrotele.simulate.closure import follow_loops, following_joints
-from hydrotele.simulate.mechanism import assemble
+from hydrotele.simulate.mechanism import assemble, mjcf_document
 from hydrotele.simulate.surroundings import thing_joints
 from hydrotele.surroundings import Thing
 
@@ -45,7 +45,7 @@ def model_with_looks(
         InputError: the MJCF cannot be assembled.
     """
     root = assemble(machine, ground=ground, surroundings=surroundings)
-    return mujoco.MjModel.from_xml_string(root.to_xml_string(precision=17), root.get_assets())
+    return mjcf_document(root).compile()
 
 
 def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:

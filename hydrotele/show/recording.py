@@ -15,7 +15,6 @@ import numpy as np
 from hydrotele.errors import InputError
 from hydrotele.log import Log
 from hydrotele.machine import Machine
-from hydrotele.output import replacing
 from hydrotele.show.channels import colours, common_channels, difference, grouped, shown
 from hydrotele.show.layout import Plot, Scene, blueprint
 from hydrotele.show.looks import bounds
@@ -27,6 +26,7 @@ from hydrotele.show.pose import (
     model_with_looks,
     points_on_body,
 )
+from hydrotele.show.recording_file import recording_file
 from hydrotele.show.scene import log_ground, log_machine, log_tip
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ _ENTRY = re.compile(r"[a-z][a-z0-9_]*")
 _RESERVED = ("about", "difference", "ground")
 _PALENESS = 0.65  # part of white in the lines of logs after the first
 _EYE_DISTANCE = 1.4  # in radii of what is to be seen
-_LONGEST_ID = 180  # characters that rerun takes as an application id
 
 
 def write_recording(
@@ -61,21 +60,19 @@ def write_recording(
             on the logged angles, or the file cannot be written. Nothing is written then.
     """
     _check_names(entries)
-    import rerun as rr
-
-    with replacing(path, ".rrd") as part:
-        machine, _ = next(iter(entries.values()))
-        runs = " and ".join(dict.fromkeys(entry_log.name for _, entry_log in entries.values()))
-        with rr.RecordingStream(_application_id(machine, entries)) as stream:
-            stream.save(part)
-            stream.send_recording_name(title or f"{machine.name} {runs}")
-            scene = _log_machines(stream, entries)
-            plots = _log_channels(stream, entries)
-            differences = _log_differences(stream, entries)
-            stream.log("about", _about(entries), static=True)
-            first, *others = entries
-            minus = f"{first} - {' or '.join(others)}"
-            stream.send_blueprint(blueprint(plots, differences, scene, minus))
+    machine, _ = next(iter(entries.values()))
+    runs = " and ".join(dict.fromkeys(entry_log.name for _, entry_log in entries.values()))
+    with recording_file(
+        path, f"hydrotele {machine.name} {machine.tool} {' '.join(entries)}"
+    ) as out:
+        out.send_recording_name(title or f"{machine.name} {runs}")
+        scene = _log_machines(out, entries)
+        plots = _log_channels(out, entries)
+        differences = _log_differences(out, entries)
+        out.log("about", _about(entries), static=True)
+        first, *others = entries
+        minus = f"{first} - {' or '.join(others)}"
+        out.send_blueprint(blueprint(plots, differences, scene, minus))
 
 
 def time_column(time: np.ndarray) -> "rr.TimeColumn":
@@ -104,12 +101,6 @@ def _check_names(entries: Mapping[str, tuple[Machine, Log]]) -> None:
                 f"recording entry {name!r}",
                 f"use lower-case letters, digits and _, and none of {', '.join(_RESERVED)}",
             )
-
-
-def _application_id(machine: Machine, entries: Mapping) -> str:
-    """Rerun keeps a user's layout per id: one per machine and kind of review."""
-    name = f"hydrotele {machine.name} {machine.tool} {' '.join(entries)}"
-    return name.encode("ascii", "replace").decode()[:_LONGEST_ID]
 
 
 def _log_machines(stream, entries) -> Scene:

@@ -14,6 +14,7 @@ from hydrotele.errors import InputError
 from hydrotele.kinematics import loops
 from hydrotele.machine import Machine
 from hydrotele.simulate.drive_side import drive_and_load_dofs, lock_drives
+from hydrotele.simulate.names import pin_site
 
 _STEP = 0.2  # largest move of an independent joint between two Newton solutions [rad] or [m]
 _CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
@@ -182,7 +183,8 @@ def _aim_cylinders(machine, model, data) -> None:
             if not axis.cylinder:
                 continue
             mujoco.mj_kinematics(model, data)
-            tube, rod_pin = model.body(f"{name}_tube").id, model.site(f"{name}_pin_b").id
+            tube = model.body(f"{name}_tube").id
+            rod_pin = model.site(pin_site(f"{name}_pin", "b")).id
             way = data.site_xpos[rod_pin] - data.xpos[tube]
             parent = data.xmat[model.body_parentid[tube]].reshape(3, 3)
             hinge = model.joint(f"{name}_tube")

@@ -6,6 +6,8 @@ run beside the physics without Python. Results do not depend on the number of th
 """
 
 import ctypes
+import os
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,6 +19,25 @@ STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 class _Config(ctypes.Structure):
     _fields_ = [("nthread", ctypes.c_int), ("persistent", ctypes.c_bool)]
+
+
+class _Native:
+    """What MuJoCo made; it is given back when neither a fleet nor an array looks at it."""
+
+    def __init__(self, library: ctypes.CDLL, handle: int) -> None:
+        self.library, self.handle, self.process = library, handle, os.getpid()
+
+    def seen(self, address: int, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
+        """An array of its memory, which lives as long as the array does."""
+        size = int(np.prod(shape)) * np.dtype(kind).itemsize
+        kept: Any = type("_Memory", (ctypes.c_char * size,), {})  # with room for its owner
+        memory = kept.from_address(address)
+        memory.owner = self
+        return np.frombuffer(memoryview(memory), dtype=kind).reshape(shape)
+
+    def __del__(self) -> None:
+        if self.process == os.getpid():  # its threads are not in a forked child
+            self.library.mjb_deleteBatch(self.handle)
 
 
 class Fleet:
@@ -39,7 +60,8 @@ class Fleet:
         Raises:
             RuntimeError: MuJoCo cannot make them; its own words.
         """
-        self._library, self._handle = mujoco_library(), None
+        self._library = mujoco_library()
+        self._native: _Native | None = None
         _declare(self._library)
         said = ctypes.create_string_buffer(500)
         handle = self._library.mjb_makeBatch(
@@ -47,9 +69,9 @@ class Fleet:
         )
         if not handle:
             raise RuntimeError(f"{count} simulations cannot be made: {said.value.decode()}")
-        self._handle, self.model, self.count = handle, model, count
+        self._native, self.model, self.count = _Native(self._library, handle), model, count
         size = self._library.mjb_nstate(handle)
-        self.state = _seen(self._library.mjb_state(handle), (count, size))
+        self.state = self._native.seen(self._library.mjb_state(handle), (count, size))
 
     def expand(self, name: str) -> np.ndarray:
         """Give a field of floats of the model a value per simulation.
@@ -63,13 +85,13 @@ class Fleet:
         Raises:
             ValueError: MuJoCo cannot give this field a value per simulation.
         """
-        size, width = ctypes.c_int(), ctypes.c_int()
+        native, size, width = self._usable(), ctypes.c_int(), ctypes.c_int()
         place = self._library.mjb_expand(
-            self._handle, name.encode(), ctypes.byref(size), ctypes.byref(width)
+            native.handle, name.encode(), ctypes.byref(size), ctypes.byref(width)
         )
         if not place or width.value != 8:
             raise ValueError(f"{name} cannot differ between simulations")
-        return _seen(place, (self.count, size.value))
+        return native.seen(place, (self.count, size.value))
 
     def apply(self, function: int, argument: int, chosen: np.ndarray | None = None) -> None:
         """Call a C function `(mjModel*, mjData*, int simulation, void*)` for simulations.
@@ -80,41 +102,46 @@ class Fleet:
             chosen: (m,) int32 numbers of simulations, None for all.
 
         Raises:
-            RuntimeError: they were closed, or MuJoCo raised an error in one of them.
+            RuntimeError: they were closed, this process was forked from the one that made them, or
+                MuJoCo raised an error in one of them.
         """
-        if not self._handle:
-            raise RuntimeError("the simulations were closed: make new ones")
+        native = self._usable()
         ids = None if chosen is None else chosen.ctypes.data
         count = self.count if chosen is None else len(chosen)
-        if self._library.mjb_apply(self._handle, ids, count, function, argument, 1):
-            status = _seen(self._library.mjb_status(self._handle), (self.count,), np.int32)
+        if self._library.mjb_apply(native.handle, ids, count, function, argument, 1):
+            status = native.seen(self._library.mjb_status(native.handle), (self.count,), np.int32)
             first = int(np.flatnonzero(status)[0])
-            words = self._library.mjb_error(self._handle, first).decode()
+            words = self._library.mjb_error(native.handle, first).decode()
             raise RuntimeError(f"simulation {first}: {words}")
 
     def get_model(self, number: int, model: mujoco.MjModel) -> None:
         """Write the model of one simulation into `model`, which has the same sizes."""
-        self._library.mjb_getModel(self._handle, number, model._address)
+        self._library.mjb_getModel(self._usable().handle, number, model._address)
 
     def get_data(self, number: int, data: mujoco.MjData) -> None:
         """Write the state of one simulation into `data`, which has the same sizes."""
-        self._library.mjb_getData(self._handle, number, data._address)
+        self._library.mjb_getData(self._usable().handle, number, data._address)
+
+    def _usable(self) -> _Native:
+        if self._native is None:
+            raise RuntimeError("the simulations were closed: make new ones")
+        if self._native.process != os.getpid():
+            raise RuntimeError(
+                "this process was forked from the one that made the simulations, whose threads it"
+                " lacks: make new ones here, or start processes by spawn"
+            )
+        return self._native
 
     def close(self) -> None:
-        """Give the memory back; `state` and expanded fields must not be used any more."""
-        if self._handle:
-            self._library.mjb_deleteBatch(self._handle)
-            self._handle = None
+        """Give the memory back, once nobody holds `state` or an expanded field."""
+        self._native, self.state = None, np.empty((0, 0))
 
-    def __del__(self) -> None:
-        """Close at the latest when nobody holds it."""
-        self.close()
-
-
-def _seen(address: int, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
-    size = int(np.prod(shape)) * np.dtype(kind).itemsize
-    memory = (ctypes.c_char * size).from_address(address)
-    return np.frombuffer(memoryview(memory), dtype=kind).reshape(shape)
+    def __reduce__(self):
+        """Refuse to be copied or pickled."""
+        raise TypeError(
+            "simulations in native memory can be neither copied nor pickled: make a second"
+            " environment with the same options and seed"
+        )
 
 
 def _declare(library: ctypes.CDLL) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from hydrotele.compiled import compiled
 from hydrotele.errors import InputError
+from hydrotele.files import read_xml
 from hydrotele.joystick import Joystick
 
 GRAVITY = -9.81
@@ -133,7 +134,10 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     """
     path = Path(facts.folder, facts.mjcf)
     try:
+        read_xml(path)
         spec = mujoco.MjSpec.from_file(str(path))
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         raise InputError(path, f"cannot be read: {error}") from None
     flotor, grip = spec.body("flotor"), spec.body("hand")

@@ -5,6 +5,7 @@ leaves them out; masses do not come from geoms here.
 """
 
 import xml.etree.ElementTree as ElementTree
+from pathlib import PurePosixPath
 
 Element = ElementTree.Element
 
@@ -20,13 +21,19 @@ def without_looks(root: Element) -> None:
         return
     touching = _touching_by_class(root)
     _prune(world, "main", touching)
-    kept = {geom.get("mesh") for geom in world.iter("geom")}
+    geoms = [*world.iter("geom"), *(g for top in root.findall("default") for g in top.iter("geom"))]
+    kept = {(kind, geom.get(kind)) for geom in geoms for kind in ("mesh", "hfield")}
     for asset in root.findall("asset"):
         for element in list(asset):
-            if element.tag != "mesh" or element.get("name") not in kept:
+            if (element.tag, _asset_name(element)) not in kept:
                 asset.remove(element)
     for geom in root.iter("geom"):  # in bodies and in default classes
         geom.attrib.pop("material", None)
+
+
+def _asset_name(element: Element) -> str:
+    """Name of an asset; MuJoCo takes the file's where there is none."""
+    return element.get("name") or PurePosixPath(element.get("file", "")).stem
 
 
 def name_geoms(root: Element) -> None:

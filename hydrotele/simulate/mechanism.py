@@ -11,15 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
+from hydrotele.assets import check_assets
 from hydrotele.datafile import Vector
 from hydrotele.drives import Axis, Cylinder, Pin
 from hydrotele.errors import InputError
+from hydrotele.files import read_xml
 from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS, Slot
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
 from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
 from hydrotele.machine import Link, Machine
+from hydrotele.simulate.document import Mjcf
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, write_drive_side
 from hydrotele.simulate.looks import name_geoms, without_looks
+from hydrotele.simulate.names import GROUND, OWN, TIP_SITE, pin_site
 from hydrotele.simulate.surroundings import write_surroundings
 from hydrotele.surroundings import Thing
 from hydrotele.terms.table import terms_table
@@ -52,12 +56,25 @@ def assemble(
         surroundings: what stands around the machine.
 
     Returns:
-        The MJCF document. `mjcf_text` writes it out.
+        The MJCF document. `mjcf_document` writes it out.
 
     Raises:
         InputError: the machine's MJCF cannot be read or lacks a body's parent.
     """
     root = _read_mjcf(machine, looks)
+    try:
+        return _completed(root, machine, timestep, ground, looks, surroundings)
+    except InputError:
+        raise
+    except ValueError as error:  # of dm_control: a name that is there twice, a size that is none
+        raise InputError(f"machine {machine.name}", f"cannot be assembled: {error}") from None
+
+
+def _completed(
+    root, machine: Machine, timestep: float, ground: bool, looks: bool,
+    surroundings: tuple[Thing, ...],
+) -> mjcf.RootElement:  # fmt: skip
+    """The document with what the machine file, the surroundings and the scene say."""
     root.model = machine.name
     for name in machine.removed_bodies:
         if body := root.find("body", name):
@@ -77,7 +94,7 @@ def assemble(
     if machine.arm:
         tip = machine.arm.tip
         body = _body(root, tip.link)
-        add_element(body, "site", name="tip", pos=tip.position, size=(0.03,), group=4)
+        add_element(body, "site", name=TIP_SITE, pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
     if machine.terms:
         table = terms_table(machine.terms, actuator_order(machine))
@@ -92,9 +109,9 @@ def add_element(parent, kind: str, **attributes):
     return parent.add(kind, **attributes)
 
 
-def mjcf_text(root: mjcf.RootElement) -> str:
-    """The MJCF document as text that MuJoCo and any other tool reads."""
-    return root.to_xml_string(precision=17, filename_with_hash=False)
+def mjcf_document(root: mjcf.RootElement) -> Mjcf:
+    """The MJCF document as text that MuJoCo and any other tool reads, with the files it needs."""
+    return Mjcf(root.model, root.to_xml_string(precision=17), root.get_assets())
 
 
 def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
@@ -102,14 +119,15 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
         return mjcf.RootElement(model=machine.name)
     path = Path(machine.folder, machine.mjcf)
     try:
-        tree = ElementTree.parse(path).getroot()
+        tree = read_xml(path)
         name_geoms(tree)
         if not looks:
             without_looks(tree)
+        check_assets(tree, path)
         text = ElementTree.tostring(tree, encoding="unicode")
         return mjcf.from_xml_string(text, model_dir=str(path.parent))
-    except ElementTree.ParseError as error:
-        raise InputError(path, f"is not XML: {error}") from None
+    except InputError:
+        raise
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise InputError(path, f"is not an MJCF that dm_control reads: {error}") from None
 
@@ -207,10 +225,10 @@ def _write_travel(root, machine: Machine, name: str) -> None:
 def _connect(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
     for end, pin in (("a", a), ("b", b)):
         _body(root, pin.link).add(
-            "site", name=f"{name}_{end}", pos=pin.position, size=(0.03,), group=4
+            "site", name=pin_site(name, end), pos=pin.position, size=(0.03,), group=4
         )
     root.equality.add(
-        "connect", name=name, site1=f"{name}_a", site2=f"{name}_b",
+        "connect", name=name, site1=pin_site(name, "a"), site2=pin_site(name, "b"),
         solref=(2.0 * timestep, 1.0), solimp=_IMPEDANCE,
     )  # fmt: skip
 
@@ -239,7 +257,7 @@ def _write_scene(root, ground: bool, looks: bool) -> None:
     touch = {"contype": 1, "conaffinity": 2} if ground else {"contype": 0, "conaffinity": 0}
     if ground or looks:
         root.worldbody.add(
-            "geom", name="ground", type="plane", size=(40, 40, 1), friction=_SOIL_FRICTION,
+            "geom", name=GROUND, type="plane", size=(40, 40, 1), friction=_SOIL_FRICTION,
             solref=_CONTACT_SOLREF, priority=1, **touch,
         )  # fmt: skip
     if not looks:
@@ -249,16 +267,16 @@ def _write_scene(root, ground: bool, looks: bool) -> None:
     getattr(root.visual, "global").offwidth = 1920
     getattr(root.visual, "global").offheight = 1200
     root.asset.add(
-        "texture", name="sky", type="skybox", builtin="gradient", rgb1=(0.62, 0.75, 0.88),
+        "texture", name=f"{OWN}sky", type="skybox", builtin="gradient", rgb1=(0.62, 0.75, 0.88),
         rgb2=(0.92, 0.94, 0.96), width=256, height=256,
     )  # fmt: skip
     root.asset.add(
-        "texture", name="ground", type="2d", builtin="checker", rgb1=(0.52, 0.47, 0.40),
+        "texture", name=GROUND, type="2d", builtin="checker", rgb1=(0.52, 0.47, 0.40),
         rgb2=(0.56, 0.51, 0.44), width=256, height=256,
     )  # fmt: skip
-    root.asset.add("material", name="ground", texture="ground", texrepeat=(40, 40), reflectance=0)
-    root.find("geom", "ground").material = "ground"
+    root.asset.add("material", name=GROUND, texture=GROUND, texrepeat=(40, 40), reflectance=0)
+    root.find("geom", GROUND).material = GROUND
     root.worldbody.add(
-        "light", name="sun", pos=(4, 8, 14), dir=(-0.25, -0.5, -1), directional=True,
+        "light", name=f"{OWN}sun", pos=(4, 8, 14), dir=(-0.25, -0.5, -1), directional=True,
         castshadow=True, diffuse=(0.6, 0.6, 0.55),
     )  # fmt: skip

@@ -25,6 +25,7 @@ from numba.extending import intrinsic
 
 from hydrotele.compiled import callback, compiled
 from hydrotele.hydraulics.circuit import (
+    MAX_AXES,
     SCRATCH,
     SLOTS,
     Kind,
@@ -44,6 +45,7 @@ from hydrotele.hydraulics.presliding import (
     bristle_rate,
     settled_bristle_friction,
 )
+from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS
 from hydrotele.simulate.layout import field_offsets, option_offset, verify_layout
 from hydrotele.simulate.library import mujoco_library
 from hydrotele.simulate.pointers import floats, pointer
@@ -55,6 +57,7 @@ _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _OFFSET, _INERTIA = int(Slot.OFFSET), int(Slot.DRIVE_INERTIA)
 _STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _FELT, _MEMORY = int(Slot.BRISTLE_INERTIA), int(Slot.MEMORY)
+_LAG, _DELIVERY, _CURVES = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY), int(Slot.CURVES)
 _FORCE, _PUMPED = float(Kind.FORCE), float(Kind.PUMPED)
 _GAINS = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
@@ -119,7 +122,7 @@ def _state(d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, vel
     """State of a drive with the pressures at the end of the step; the rest are offsets."""
     count, act = int(user[_COUNT]), floats(d, 0)
     x = floats(carray(pointer(d + d_length), (1,), np.int64)[0], nu)[i]
-    command = floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu)[i]
+    command = _given(floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu), i)
     time, supply = floats(d + d_time, 1)[0], 0.0
     if count > 0:
         size = 4 * count + int(user[_MEMORY])
@@ -156,6 +159,40 @@ def _advance_with_memory(
             act_dot[at] = bristle_rate(user, u, act[at], velocity[i], user[u + _FELT], dt)
 
 
+@compiled
+def _sound(user, first, count, nu, free):
+    """Whether the numbers of a group of axes index nothing that is not there.
+
+    Anyone may write them into a model. `free` is the number of activations from the first axis' on.
+    Comparisons are such that NaN is unsound.
+    """
+    if not (0 <= first and 1 <= count <= MAX_AXES and first + count <= nu):
+        return False
+    group = first * SLOTS
+    size = 4.0 * count + user[group + _MEMORY]
+    if not (4.0 * count <= size <= free):
+        return False
+    if user[group + _LAG] != 0.0 and not (4.0 * count <= user[group + _DELIVERY] < size):
+        return False
+    for u in range(group, (first + count) * SLOTS, SLOTS):
+        if user[u + _STIFFNESS] != 0.0 and not (4.0 * count <= user[u + _BRISTLE] < size):
+            return False
+        if not (0.0 <= user[u + _CURVES] <= CURVE_KNOTS):
+            return False
+        if not (0.0 <= user[u + _CURVES + CURVE] <= CURVE_KNOTS):
+            return False
+    return True
+
+
+@compiled
+def _given(command, k):
+    """Command of actuator k; 0 where any is NaN, as MuJoCo has it, which also warns."""
+    for value in command:
+        if value != value:
+            return 0.0
+    return command[k]
+
+
 @functools.cache
 def _compile_callbacks():
     """Compile (or load from the cache) the dynamics and bias callbacks for this MuJoCo."""
@@ -175,6 +212,7 @@ def _callbacks(remembers):
     m_user, m_actadr = model_at["actuator_user"], model_at["actuator_actadr"]
     m_nuser, m_timestep = model_at["nuser_actuator"], option_offset("timestep")
     m_nu, m_dofadr, m_nv = model_at["nu"], model_at["jnt_dofadr"], model_at["nv"]
+    m_na = model_at["na"]
     m_trnid, m_njnt, m_gainprm = (
         model_at["actuator_trnid"],
         model_at["njnt"],
@@ -205,6 +243,8 @@ def _callbacks(remembers):
             else:
                 at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
                 start = 8 * np.int64(carray(pointer(at_actadr), (nu,), np.int32)[i])
+                if start < 0 or start + 16 > 8 * carray(pointer(m + m_na), (1,), np.int64)[0]:
+                    return 0.0
                 at_range = carray(pointer(m + m_range), (1,), np.int64)[0]
                 ends = floats(at_range + 16 * i, 2)
                 _advance_force_drive(
@@ -212,15 +252,19 @@ def _callbacks(remembers):
                     floats(carray(pointer(d + d_act), (1,), np.int64)[0] + start, 2),
                     floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0] + start, 2),
                     floats(carray(pointer(d + d_velocity), (1,), np.int64)[0], nu)[i],
-                    floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu)[i],
+                    _given(floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu), i),
                     ends[0], ends[1], floats(m + m_timestep, 1)[0],
                 )  # fmt: skip
             return 0.0
         if not remembers:
-            if user[first * SLOTS + _MEMORY] > 0.0:
+            if 0 <= first < nu and user[first * SLOTS + _MEMORY] > 0.0:
                 return _ADVANCE_REMEMBERING(m, d, i)
         at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
-        start = 8 * carray(pointer(at_actadr), (nu,), np.int32)[first]
+        address = np.int64(carray(pointer(at_actadr), (nu,), np.int32)[max(0, min(first, nu - 1))])
+        na = carray(pointer(m + m_na), (1,), np.int64)[0]
+        if address < 0 or not _sound(user, first, count, nu, na - address):
+            return 0.0
+        start = 8 * address
         at_act = carray(pointer(d + d_act), (1,), np.int64)[0]
         at_act_dot = carray(pointer(d + d_act_dot), (1,), np.int64)[0]
         at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
@@ -237,11 +281,17 @@ def _callbacks(remembers):
         dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
         time = carray(pointer(d + d_time), (1,), np.float64)[0]
         scratch = carray(_stack(0), (2 * SCRATCH,), np.float64)
+        given = scratch[SCRATCH:]
+        for k in range(nu):
+            if command[k] != command[k]:  # MuJoCo then takes all of them as 0, and warns
+                for j in range(first, first + count):
+                    given[j] = 0.0
+                command = given
+                break
         terms = floats(m, 0)
         if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
             terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
         if len(terms) > 0 and first == 0:
-            given = scratch[SCRATCH:]
             add_to_commands(
                 user, terms, count, act, command, length, velocity, dt, time, scratch, given
             )
@@ -279,7 +329,9 @@ def _callbacks(remembers):
             drive = -user[u + _OFFSET]
         else:
             at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
-            start = 8 * carray(pointer(at_actadr), (nu,), np.int32)[i]
+            start = 8 * np.int64(carray(pointer(at_actadr), (nu,), np.int32)[i])
+            if start < 0 or start + 32 > 8 * carray(pointer(m + m_na), (1,), np.int64)[0]:
+                return 0.0
             at_act = carray(pointer(d + d_act), (1,), np.int64)[0]
             at_act_dot = carray(pointer(d + d_act_dot), (1,), np.int64)[0]
             act = carray(pointer(at_act + start), (4,), np.float64)
@@ -291,6 +343,10 @@ def _callbacks(remembers):
         if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
             terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
         gain = _gain(m, i, m_gainprm) if user[u + _KIND] == _FORCE else 0.0
+        if len(terms) > 0 and user[_COUNT] != 0.0:
+            held = int(user[_COUNT])
+            if not _sound(user, 0, held, nu, carray(pointer(m + m_na), (1,), np.int64)[0]):
+                terms = floats(m, 0)
         if len(terms) > 0:
             s = _state(
                 d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, velocity, nu,
@@ -310,9 +366,11 @@ def _callbacks(remembers):
         else:
             force_drive = user[u + _KIND] == _FORCE
             at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
-            owner = i if force_drive else np.int64(user[u + _FIRST])
+            owner = i if force_drive else max(0, min(nu - 1, np.int64(user[u + _FIRST])))
             place = np.int64(carray(pointer(at_actadr), (nu,), np.int32)[owner])
             place += 0 if force_drive else np.int64(user[u + _BRISTLE])
+            if not 0 <= place < carray(pointer(m + m_na), (1,), np.int64)[0]:
+                return 0.0
             share = floats(carray(pointer(d + d_act), (1,), np.int64)[0] + 8 * place, 1)[0]
             rising = floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0] + 8 * place, 1)[0]
             share += dt * rising
@@ -321,7 +379,7 @@ def _callbacks(remembers):
         push = drive + _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)
         if gain != 0.0:
             at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
-            push += gain * carray(pointer(at_ctrl), (nu,), np.float64)[i]
+            push += gain * _given(carray(pointer(at_ctrl), (nu,), np.float64), i)
         damping = max(0.0, -steep)  # of the terms, implicit as friction is: the drive side is light
         inertia = user[u + _INERTIA] + dt * damping
         if not remembers:

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
-from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.parameters import actuator_order, memory_names
 from hydrotele.machine import Machine
@@ -18,8 +17,9 @@ from hydrotele.simulate.closure import (
     independent_dofs,
     motion_basis,
 )
+from hydrotele.simulate.document import Mjcf
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, wind_up
-from hydrotele.simulate.mechanism import add_element, assemble, mjcf_text
+from hydrotele.simulate.mechanism import add_element, assemble, mjcf_document
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.simulate.stops import set_stops, write_stops
 from hydrotele.simulate.term_readout import terms_at_rest
@@ -61,9 +61,14 @@ class Plant:
     hydraulic: int
     memory: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
-    @functools.cached_property
+    @property
     def mjcf(self) -> str:
-        """The complete MJCF as text, with looks and the `home` keyframe, made when asked for."""
+        """The complete MJCF as text."""
+        return self.document.text
+
+    @functools.cached_property
+    def document(self) -> Mjcf:
+        """The complete MJCF, with looks and the `home` keyframe, made when asked for."""
         root = assemble(
             self.machine, self.model.opt.timestep, self.ground, surroundings=self.surroundings
         )
@@ -80,7 +85,8 @@ class Plant:
             note += (
                 " Commands act in it without the delays that hydrotele run and replay give them."
             )
-        return mjcf_text(root).replace(">", f">\n  <!-- {note} -->", 1)
+        made = mjcf_document(root)
+        return made._replace(text=made.text.replace(">", f">\n  <!-- {note} -->", 1))
 
 
 def build_plant(
@@ -104,11 +110,7 @@ def build_plant(
     """
     install_hydraulics()
     root = assemble(machine, timestep, ground, looks=False, surroundings=surroundings)
-    text = mjcf_text(root)
-    try:
-        model = mujoco.MjModel.from_xml_string(text)
-    except ValueError as error:
-        raise InputError(f"machine {machine.name}", f"does not compile: {error}") from None
+    model = mjcf_document(root).compile()
     set_stops(machine, model)
     set_bristles(machine, model)
     if not _can_touch(model):  # then looking for contacts is a tenth of a step, for nothing

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.machine import Machine
+from hydrotele.simulate.names import TIP_SITE
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.surroundings import is_thing
 
@@ -124,7 +125,7 @@ class Recorder:
         """Make room for all rows."""
         model = plant.model
         self.model = model
-        self.tip_site = model.site("tip").id if plant.machine.arm else -1
+        self.tip_site = model.site(TIP_SITE).id if plant.machine.arm else -1
         self.around = surrounding_bodies(plant)
         self.time = np.zeros(rows)
         self.qpos, self.qvel = np.zeros((rows, model.nq)), np.zeros((rows, model.nv))

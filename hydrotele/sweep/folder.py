@@ -14,6 +14,7 @@ import yaml
 
 import hydrotele
 from hydrotele.errors import InputError
+from hydrotele.files import read_json
 from hydrotele.output import check_target, replacing, whole_folder
 from hydrotele.sweep.checking import Base, Checked
 from hydrotele.sweep.inputs import unpack
@@ -60,7 +61,7 @@ def sweep_folder(target: Path, base: Base, checked: Checked, fresh: bool) -> Ite
     if not os.access(target, os.W_OK | os.X_OK):
         raise InputError(target, "cannot be written to; choose another --out")
     with _alone(target):
-        there = json.loads((target / "summary.json").read_text()).get("identity", {})
+        there = read_json(target / "summary.json").get("identity", {})
         if found := list(_differences(there, asked)):
             more = f", and {len(found) - 4} more" if len(found) > 4 else ""
             message = "; ".join(found[:4]) + more + "; --fresh starts anew, or choose another --out"

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hydrotele.errors import InputError
+from hydrotele.files import json_value
 from hydrotele.output import replacing
 from hydrotele.sweep.numbers import Numbers
 
@@ -66,7 +67,7 @@ class Journal:
 
     def _take(self, line: bytes) -> bool:
         try:
-            entry = Entry(**json.loads(line))
+            entry = Entry(**json_value(line))
             numbers = {name: (value, unit) for name, (value, unit) in entry.numbers.items()}
         except (ValueError, TypeError, AttributeError):
             return False

@@ -63,6 +63,12 @@ def streams(seeds: np.ndarray) -> np.ndarray:
 
     Returns:
         (n,) values of `random` in MEMORY; seeds that follow each other give unrelated streams.
+
+    Raises:
+        ValueError: a seed is no integer from 0 to 2^64 - 1.
     """
+    seeds = np.asarray(seeds)
+    if seeds.dtype.kind not in "iu" or (seeds < 0).any():
+        raise ValueError("a seed must be an integer from 0 to 2^64 - 1")
     with np.errstate(over="ignore"):
         return mixed.py_func(np.asarray(seeds, np.uint64) * _STEP + _SECOND)

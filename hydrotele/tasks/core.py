@@ -93,7 +93,7 @@ class TaskCore:
         self._make_arrays()
         self.facts = make_facts(self.setup, count, autoreset)
         self._link()
-        self._seeded = False
+        self._begun = np.zeros(count, bool)
 
     def _make_arrays(self) -> None:
         n, o, v = self.count, len(self.setup.fields), self.setup.variants
@@ -167,14 +167,20 @@ class TaskCore:
             chosen: (m,) numbers of simulations, None for all.
 
         Raises:
-            RuntimeError: without seeds, before the first seed was given.
+            RuntimeError: without seeds, before the first seed was given; or the first reset leaves
+                some episodes out.
+            ValueError: a seed is negative or beyond 64 bits.
         """
+        place = slice(None) if chosen is None else chosen
+        begun = self._begun.copy()
+        begun[place] = True
+        if not begun.all():
+            raise RuntimeError("the first reset must begin all episodes: give it no mask")
         if seeds is not None:
-            place = slice(None) if chosen is None else chosen
             self.memory["random"][place] = streams(seeds)
-            self._seeded = True
-        elif not self._seeded:
+        elif not self._begun.all():
             raise RuntimeError("the first reset needs seeds")
+        self._begun = begun
         self.facts["call"] = RESET
         ids = None if chosen is None else np.ascontiguousarray(chosen, np.int32)
         self.simulations.apply(advance.address, self.facts.ctypes.data, ids)
@@ -183,14 +189,17 @@ class TaskCore:
         """Advance all episodes by one environment step.
 
         Args:
-            action: (n, a), full at +-1; beyond they count as full.
+            action: (n, a), or (a,) where n is 1, full at +-1; beyond they count as full.
 
         Raises:
             ValueError: the shape is wrong, or an action is not a number.
             RuntimeError: there was no reset before, or the simulations were closed.
         """
-        if not self._seeded:
+        if not self._begun.all():
             raise RuntimeError("reset before the first step")
+        wanted = self.action.shape
+        if np.shape(action) not in (wanted, wanted[1:] if self.count == 1 else wanted):
+            raise ValueError(f"an action is {wanted}, not {np.shape(action)}")
         self.action[...] = action
         if not np.isfinite(self.action).all():
             raise ValueError("an action is not a finite number")
@@ -208,4 +217,9 @@ class TaskCore:
 
     def close(self) -> None:
         """Give the simulations' memory back."""
+        self._expanded = {}
         self.simulations.close()
+
+    def __reduce__(self):
+        """Refuse to be copied or pickled."""
+        return self.simulations.__reduce__()

@@ -15,6 +15,7 @@ from hydrotele.operate.servo import servo_numbers
 from hydrotele.sensors import SensorSet
 from hydrotele.simulate.feedback import samples_every
 from hydrotele.simulate.layout import field_offsets, verify_layout
+from hydrotele.simulate.names import TIP_SITE
 from hydrotele.simulate.pointers import function_address
 from hydrotele.tasks.kinds import KINDS
 from hydrotele.tasks.memory import ACTIONS, FACTS, VALVE
@@ -119,8 +120,8 @@ def make_facts(setup: Setup, count: int, autoreset: int) -> np.ndarray:
     k, model = len(plant.axes), plant.model
     facts["qpos"][:k], facts["dof"][:k] = plant.qpos, plant.dof
     facts["nq"], facts["nv"], facts["na"] = model.nq, model.nv, model.na
-    facts["nbody"], facts["tip_site"] = model.nbody, model.site("tip").id
-    facts["tip_body"] = model.site("tip").bodyid[0]
+    facts["nbody"], facts["tip_site"] = model.nbody, model.site(TIP_SITE).id
+    facts["tip_body"] = model.site(TIP_SITE).bodyid[0]
     theta = 1 if options.action == "resolved_motion" else 0  # place of the swing among actions
     facts["locked"] = theta if task.swing_locked else -1
     facts["neq"], facts["eq_width"] = model.eq_data.shape

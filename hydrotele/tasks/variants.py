@@ -17,6 +17,7 @@ from hydrotele.errors import InputError
 from hydrotele.machine import Machine
 from hydrotele.sensors import SensorError
 from hydrotele.simulate.fleet import STATE
+from hydrotele.simulate.names import TIP_SITE
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import begin_leapfrog, split_delay
 from hydrotele.surroundings import Thing
@@ -99,7 +100,7 @@ def _make(task: Task, options: Options, nominal: Machine) -> Variants:
         state = np.zeros(mujoco.mj_stateSize(plant.model, STATE))
         mujoco.mj_getState(plant.model, data, state, STATE)
         states.append(state)
-        tips.append(data.site("tip").xpos.copy())
+        tips.append(data.site(TIP_SITE).xpos.copy())
     return Variants(
         plants[0], tuple(machines), tuple(plant.surroundings for plant in plants),
         np.array(states), np.array(tips), _differing(plants, task.writes),

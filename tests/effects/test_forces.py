@@ -56,7 +56,7 @@ def test_payload_is_a_mass_welded_to_the_tip(tool):
     plant, data = at_rest(machine)
     full = np.zeros((plant.model.nv, plant.model.nv))
     jac = np.zeros((3, plant.model.nv))
-    mujoco.mj_jacSite(plant.model, data, jac, None, plant.model.site("tip").id)
+    mujoco.mj_jacSite(plant.model, data, jac, None, plant.model.site("hydrotele_tip").id)
     mujoco.mj_fullM(plant.model, data, full)
     heavy, rest = at_rest(loaded)
     heavier = np.zeros_like(full)
@@ -71,7 +71,7 @@ def test_payload_is_carried_by_the_chambers():
     plant, data = at_rest(machine)
     loaded, heavy = at_rest(apply_effect(machine, "payload", "", {"mass": mass}))
     jac = np.zeros((3, plant.model.nv))
-    mujoco.mj_jacSite(plant.model, data, jac, None, plant.model.site("tip").id)
+    mujoco.mj_jacSite(plant.model, data, jac, None, plant.model.site("hydrotele_tip").id)
     up = (jac @ motion_basis(machine, plant.model, data))[2]
     boom = plant.axes.index("boom")
     free = list(independent_dofs(machine, plant.model)).index(plant.dof[boom])
@@ -144,7 +144,7 @@ def test_a_longer_boom_carries_its_stick_farther_out():
     longer = apply_effect(machine, "link_length", "boom", {"length": length})
     (plant, data), (other, moved) = at_rest(machine), at_rest(longer)
     way = np.array([math.cos(machine.home["boom"]), 0, math.sin(machine.home["boom"])])
-    shift = moved.site("tip").xpos - data.site("tip").xpos
+    shift = moved.site("hydrotele_tip").xpos - data.site("hydrotele_tip").xpos
     np.testing.assert_allclose(shift, length * way, atol=1e-12)
     np.testing.assert_allclose(
         moved.qpos[other.rod_qpos[1:]], data.qpos[plant.rod_qpos[1:]], atol=1e-12
@@ -170,7 +170,7 @@ def test_pin_offset_moves_the_base_pin():
     machine, (dx, dz) = load_machine("cat215"), (0.02, -0.01)
     moved = apply_effect(machine, "pin_offset", "boom", {"x": dx, "z": dz})
     (_, data), (other, shifted) = at_rest(machine), at_rest(moved)
-    rod, base = data.site("boom_pin_b").xpos, data.body("boom_tube").xpos
+    rod, base = data.site("hydrotele_boom_pin_b").xpos, data.body("boom_tube").xpos
     length = np.linalg.norm(rod - base - np.array([dx, 0, dz]))
     x = shifted.qpos[other.rod_qpos[1]]
     assert x == pytest.approx(length - machine.axes["boom"].cylinder.closed_length, abs=1e-9)

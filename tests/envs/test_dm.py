@@ -133,7 +133,8 @@ def test_physics_shows_the_simulation():
     for name in ("swing", "boom", "stick"):
         joint = env.core.setup.machine.axes[name].joint
         assert physics.named.data.qpos[joint] == data.joint(joint).qpos
-    assert np.array_equal(physics.named.data.site_xpos["tip"], data.site("tip").xpos)
+    tip = data.site("hydrotele_tip").xpos
+    assert np.array_equal(physics.named.data.site_xpos["hydrotele_tip"], tip)
     assert np.array_equal(physics.data.act, data.act)
     env.step(np.zeros(3))
     assert env.physics is physics and physics.data.time == pytest.approx(0.1)

@@ -43,7 +43,7 @@ def test_length_is_the_distance_of_the_pins(name, axis):
     for q, data in poses(plant, axis):
         mujoco.mj_forward(plant.model, data)
         if cylinder:
-            way = data.site(f"{axis}_pin_b").xpos - data.body(f"{axis}_tube").xpos
+            way = data.site(f"hydrotele_{axis}_pin_b").xpos - data.body(f"{axis}_tube").xpos
             assert linkage.length(q) == pytest.approx(np.linalg.norm(way), abs=1e-9)
             x = data.joint(f"{axis}_rod").qpos[0]
             assert linkage.length(q) - cylinder.closed_length == pytest.approx(x, abs=1e-9)
@@ -109,13 +109,13 @@ def test_arm_puts_the_tip_where_mujoco_does(name):
     geometry = arm_geometry(plant.machine)
     for _, q, data in arm_samples(plant):
         mujoco.mj_kinematics(plant.model, data)
-        x, y, z = data.site("tip").xpos
+        x, y, z = data.site("hydrotele_tip").xpos
         pose = forward(geometry, q)
         assert pose[0] == pytest.approx(math.hypot(x, y), abs=1e-10)
         assert math.remainder(pose[1] - math.atan2(y, x), math.tau) == pytest.approx(0, abs=1e-10)
         assert pose[2] == pytest.approx(z, abs=1e-10)
         if geometry.tool_joint:
-            along = data.site("tip").xmat.reshape(3, 3)[:, 0]
+            along = data.site("hydrotele_tip").xmat.reshape(3, 3)[:, 0]
             assert math.sin(pose[3]) == pytest.approx(along[2], abs=1e-10)
         back = inverse(geometry, pose)
         turn = math.remainder(back[0] - q[0], math.tau)
@@ -133,9 +133,9 @@ def test_arm_jacobian_is_mujocos(name):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         jac = np.zeros((3, model.nv))
-        mujoco.mj_jacSite(model, data, jac, None, model.site("tip").id)
+        mujoco.mj_jacSite(model, data, jac, None, model.site("hydrotele_tip").id)
         jac = jac[:, [model.joint(n).dofadr[0] for n in names]]
-        x, y, _ = data.site("tip").xpos
+        x, y, _ = data.site("hydrotele_tip").xpos
         r = math.hypot(x, y)
         rows = [(x * jac[0] + y * jac[1]) / r, (x * jac[1] - y * jac[0]) / r**2, jac[2]]
         np.testing.assert_allclose(np.array(jacobian(geometry, q))[:3], rows, atol=1e-9)

@@ -15,7 +15,7 @@ from hydrotele.errors import InputError
 from hydrotele.kinematics.from_machine import check_strokes
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine, machine_path, save_machine, shipped_machines
-from hydrotele.simulate.mechanism import assemble, mjcf_text
+from hydrotele.simulate.mechanism import assemble, mjcf_document
 from hydrotele.simulate.plant import build_plant, rest_state
 
 ANY = settings(
@@ -373,7 +373,7 @@ def test_round_trip(tmp_path, name, tool):
     again = load_machine(path)
     moved = {"folder": "", "mjcf": None, "tools": ()}
     assert again.model_copy(update=moved) == machine.model_copy(update=moved)
-    assert mjcf_text(assemble(again)) == mjcf_text(assemble(machine))
+    assert mjcf_document(assemble(again)) == mjcf_document(assemble(machine))
     save_machine(again, tmp_path / "twice.yaml")
     assert (tmp_path / "twice.yaml").read_text() == path.read_text()
 

@@ -37,7 +37,7 @@ def felt_in_plant(machine, kind, force, command, seconds):
     data = rest_state(plant)
     begin_leapfrog(plant.model, data)
     felt = EndpointForce(plant.machine, plant.axes, kind, 0.005)
-    site, out, tips = plant.model.site("tip"), [], []
+    site, out, tips = plant.model.site("hydrotele_tip"), [], []
     body = plant.model.site_bodyid[site.id]
     for tick in range(round(seconds / 0.005)):
         data.ctrl[:] = command(0.005 * tick)

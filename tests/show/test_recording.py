@@ -1,13 +1,18 @@
 """The recording can be read again and holds what was logged, where it was logged."""
 
 import dataclasses
+import errno
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
 
 from hydrotele.errors import InputError
 from hydrotele.show.pose import body_poses, logged_joints, model_with_looks
 from hydrotele.show.recording import write_recording
+from hydrotele.show.recording_file import recording_file
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +143,21 @@ def test_importing_the_room_does_not_import_rerun():
         "assert not {'rerun', 'matplotlib'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
+
+
+def test_a_full_disk_is_one_sentence_at_once_and_leaves_nothing(tmp_path, monkeypatch):
+    """As a file system without space does: the write fails, whoever does it."""
+    monkeypatch.setattr(Path, "write_bytes", _no_space)
+    with (
+        pytest.raises(InputError, match=r"review\.rrd: cannot be written: No space left"),
+        recording_file(tmp_path / "review.rrd", "full") as out,
+    ):
+        for _ in range(300):
+            out.log("points", rr.Points3D(np.zeros((2000, 3))))
+    assert list(tmp_path.iterdir()) == []
+
+
+def _no_space(path, content):
+    with path.open("wb") as file:
+        file.write(content[:100])
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -18,8 +18,9 @@ from hydrotele.hydraulics.circuit import (
     circuit_scratch,
     step_circuit,
 )
+from hydrotele.machine_file import load_machine
 from hydrotele.simulate.native import install_hydraulics
-from hydrotele.simulate.plant import rest_state
+from hydrotele.simulate.plant import build_plant, rest_state
 
 HOLD = 20  # steps of one command
 
@@ -204,3 +205,51 @@ def test_callbacks_of_others_are_not_replaced(which):
     said = in_a_process_of_its_own(TAKEN.replace("{which}", which))
     assert said.startswith("refused: another package has installed")
     assert "process of its own" in said, "says what to do"
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["cat215", "emps", "eha", "ec20"])
+def test_a_command_that_is_no_number_counts_as_mujoco_counts_it(name):
+    """One NaN makes all commands 0, with a warning; an infinite one is at its end."""
+    plant = build_plant(load_machine(name))
+
+    def reached(command):
+        data = rest_state(plant)
+        for _ in range(50):
+            data.ctrl[:] = command
+            mujoco.mj_step(plant.model, data)
+        warned = data.warning[mujoco.mjtWarning.mjWARN_BADCTRL].number
+        return np.concatenate([data.qpos, data.qvel, data.act]), warned
+
+    half = np.full(plant.model.nu, 0.5)
+    broken, endless, most = half.copy(), half.copy(), half.copy()
+    broken[-1], endless[-1], most[-1] = np.nan, np.inf, plant.model.actuator_ctrlrange[-1, 1]
+    still, told = reached(0.0 * half)[0], reached(broken)
+    assert np.array_equal(told[0], still) and told[1] > 0
+    np.testing.assert_array_equal(reached(endless)[0], reached(most)[0])
+    assert not np.array_equal(reached(half)[0], still)
+
+
+WRITTEN_OVER = """
+import mujoco, numpy as np
+from hydrotele.hydraulics.circuit import Slot
+from hydrotele.machine_file import load_machine
+from hydrotele.simulate.plant import build_plant, rest_state
+random = np.random.default_rng(0)
+INDICES = [Slot.FIRST, Slot.COUNT, Slot.MEMORY, Slot.BRISTLE, Slot.DELIVERY, Slot.CURVES]
+SWITCHES = [Slot.BRISTLE_STIFFNESS, Slot.PUMP_TIME_CONSTANT, Slot.KIND, Slot.DRIVE_INERTIA]
+for name in ("cat215", "emps", "rig"):
+    plant = build_plant(load_machine(name))
+    for trial in range(200):
+        model, data = plant.model.__copy__(), rest_state(plant)
+        for slot in random.choice(INDICES, 2):
+            model.actuator_user[:, slot] = random.choice([np.nan, -1e8, 1e8, 3.7, 2.0**31, 1e18])
+        model.actuator_user[:, random.choice(SWITCHES)] = random.choice([1.0, 3.0, np.nan])
+        data.ctrl[:] = random.uniform(-1, 1, model.nu)
+        mujoco.mj_step(model, data, nstep=3)
+print("alive")
+"""
+
+
+def test_numbers_that_are_written_over_index_nothing_that_is_not_there():
+    assert "alive" in in_a_process_of_its_own(WRITTEN_OVER)

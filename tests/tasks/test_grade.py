@@ -134,7 +134,7 @@ def test_what_acts_on_the_bucket_is_the_wrench_of_soil_and_load():
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         out, wrench = parts(core, 0)[3], np.zeros(6)
-        tip = data.site("tip").xpos
+        tip = data.site("hydrotele_tip").xpos
         theta = math.atan2(tip[1], tip[0])
         bucket_wrench(out, tip, theta, data.xipos[body], wrench)
         scale = max(1.0, np.abs(wrench).max())
