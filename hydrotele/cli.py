@@ -399,7 +399,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that everything is cleaned up
     try:
         app()
-    except InputError as error:
+    except (InputError, OSError) as error:
+        if isinstance(error, OSError):  # a name that is too long, a disk that fails
+            error = InputError(error.filename or "the system", error.strerror or str(error))
         typer.secho("error ", fg="red", bold=True, err=True, nl=False)
         typer.echo(str(error), err=True)
         sys.exit(2)
