@@ -21,8 +21,7 @@ def without_looks(root: Element) -> None:
         return
     touching = _touching_by_class(root)
     _prune(world, "main", touching)
-    geoms = [*world.iter("geom"), *(g for top in root.findall("default") for g in top.iter("geom"))]
-    kept = {(kind, geom.get(kind)) for geom in geoms for kind in ("mesh", "hfield")}
+    kept = {(kind, geom.get(kind)) for geom in world.iter("geom") for kind in ("mesh", "hfield")}
     for asset in root.findall("asset"):
         for element in list(asset):
             if (element.tag, _asset_name(element)) not in kept:

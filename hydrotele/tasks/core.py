@@ -114,6 +114,10 @@ class TaskCore:
         self._sensed = np.zeros((n, int(np.ceil(late.max())) + 2 if late.any() else 0, CHANNELS))
         self._lags = late
         self._expanded = {name: self.simulations.expand(name) for name in v.fields}
+        for name, live in self._expanded.items():
+            if live.shape[1] != v.fields[name].shape[1]:  # native code copies the one to the other
+                message = f"variants cannot differ in {name} of a model with meshes that touch"
+                raise InputError("randomise", message)
         same = np.tile(v.plant.model.actuator_user.ravel(), (len(v.states), 1))
         self._users = np.ascontiguousarray(v.fields.get("actuator_user", same))
 
@@ -199,7 +203,7 @@ class TaskCore:
             raise RuntimeError("reset before the first step")
         wanted = self.action.shape
         if np.shape(action) not in (wanted, wanted[1:] if self.count == 1 else wanted):
-            raise ValueError(f"an action is {wanted}, not {np.shape(action)}")
+            raise ValueError(f"an action has the shape {wanted}, not {np.shape(action)}")
         self.action[...] = action
         if not np.isfinite(self.action).all():
             raise ValueError("an action is not a finite number")
