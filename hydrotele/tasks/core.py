@@ -193,7 +193,7 @@ class TaskCore:
         """Advance all episodes by one environment step.
 
         Args:
-            action: (n, a), or (a,) where n is 1, full at +-1; beyond they count as full.
+            action: (n, a), or (a,) for all, full at +-1; beyond they count as full.
 
         Raises:
             ValueError: the shape is wrong, or an action is not a number.
@@ -202,7 +202,7 @@ class TaskCore:
         if not self._begun.all():
             raise RuntimeError("reset before the first step")
         wanted = self.action.shape
-        if np.shape(action) not in (wanted, wanted[1:] if self.count == 1 else wanted):
+        if np.shape(action) not in (wanted, wanted[1:]):
             raise ValueError(f"an action has the shape {wanted}, not {np.shape(action)}")
         self.action[...] = action
         if not np.isfinite(self.action).all():
