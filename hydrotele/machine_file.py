@@ -188,7 +188,8 @@ def _complete_links(data: dict, path: Path, lines) -> None:
     try:
         read_xml(mjcf)
     except InputError as error:
-        raise InputError(_place(path, lines, "mjcf"), str(error)) from None
+        message = f"{mjcf} cannot be read: {error.message}"
+        raise InputError(_place(path, lines, "mjcf"), message) from None
     try:
         spec = mujoco.MjSpec.from_file(str(mjcf))
     except (OSError, ValueError) as error:
