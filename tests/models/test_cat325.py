@@ -89,7 +89,7 @@ def test_closed_form_puts_tip_and_head_where_mujoco_does():
     assert tuple(vars(geometry).values()) == pytest.approx(lengths, abs=1e-12)
     for q, data in random_poses(60):
         mujoco.mj_kinematics(PLANT.model, data)
-        pose, tip = five_dof.forward(geometry, q), data.site("tip")
+        pose, tip = five_dof.forward(geometry, q), data.site("hydrotele_tip")
         assert pose[:3] == pytest.approx(tip.xpos, abs=1e-9)
         frame = tip.xmat.reshape(3, 3)
         assert five_dof.tool_direction(q) == pytest.approx(frame[:, 0], abs=1e-9)
@@ -103,7 +103,7 @@ def test_closed_form_jacobian_is_mujocos():
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         table = np.zeros((3, model.nv))
-        mujoco.mj_jacSite(model, data, table, None, model.site("tip").id)
+        mujoco.mj_jacSite(model, data, table, None, model.site("hydrotele_tip").id)
         columns = [model.joint(name).dofadr[0] for name in ARM]
         # 1e-9 of metres: as the positions
         np.testing.assert_allclose(five_dof.jacobian(geometry, q)[:3], table[:, columns], atol=1e-9)
@@ -116,7 +116,7 @@ def test_home_is_a_felling_posture():
     frame = data.body("head").xmat.reshape(3, 3)
     np.testing.assert_allclose(frame, np.eye(3), atol=1e-9)  # rounding: angles of home sum to 0
     assert 0.2 < data.body("saw").xpos[2] < 0.5
-    assert 7.0 < data.site("tip").xpos[0] < 8.0
+    assert 7.0 < data.site("hydrotele_tip").xpos[0] < 8.0
 
 
 @pytest.mark.parametrize("axis", CYLINDERS)
@@ -128,7 +128,7 @@ def test_linkage_follows_the_cylinder_over_the_whole_range(axis):
     for q in np.linspace(first, last, 41):
         data = rest_state(PLANT, {axis: float(q)})
         mujoco.mj_kinematics(PLANT.model, data)
-        way = data.site(f"{axis}_pin_b").xpos - data.body(f"{axis}_tube").xpos
+        way = data.site(f"hydrotele_{axis}_pin_b").xpos - data.body(f"{axis}_tube").xpos
         assert linkage.length(float(q)) == pytest.approx(np.linalg.norm(way), abs=1e-9)
         assert linkage.angle(linkage.length(float(q))) == pytest.approx(q, abs=1e-9)
         pistons.append(data.joint(f"{axis}_rod").qpos[0])
@@ -146,9 +146,9 @@ def test_stands_still_with_closed_valves(boom, stick, tilt):
     """
     data = rest_state(PLANT, {"boom": boom, "stick": stick, "tilt": tilt})
     mujoco.mj_kinematics(PLANT.model, data)
-    start = data.site("tip").xpos.copy()
+    start = data.site("hydrotele_tip").xpos.copy()
     mujoco.mj_step(PLANT.model, data, 2000)
-    assert np.linalg.norm(data.site("tip").xpos - start) < 0.05
+    assert np.linalg.norm(data.site("hydrotele_tip").xpos - start) < 0.05
     assert abs(data.joint("saw").qvel[0]) < 1e-6
     assert sum(w.number for w in data.warning) == 0
 
