@@ -32,7 +32,8 @@ def test_emps_names_friction_that_depends_on_the_direction():
     # published: 166.7 and 240.4 N s/m, which differ by 0.181 of their mean
     found = effect.parameters["viscous_asymmetry"]
     assert found.low < (166.7 - 240.4) / (166.7 + 240.4) < found.high
-    assert effect.share > 0.9, "nothing else closes the gap"
+    # nearly half of the mean square: a learned law that closed more made free runs worse
+    assert gap.size.after**2 < 0.6 * gap.size.before**2
     # published 4.08 % before and 3.11 % after, all samples fitted; here none of these was
     assert force_error(machine, data.heldout, 20.0) > 3.5
     assert force_error(gap.patched, data.heldout, 20.0) < 3.2

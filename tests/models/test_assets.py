@@ -10,16 +10,8 @@ import pytest
 from hydrotele.errors import InputError
 from hydrotele.machine_file import load_machine, save_machine
 from hydrotele.simulate.plant import build_plant
+from tests.models.test_foreign_mjcf import MACHINE
 
-MACHINE = """\
-name: gate
-mjcf: gate.xml
-links:
-  wing: {mass: 20, inertia: [1, 2, 2], joint: {range_deg: [-30, 60]}}
-axes:
-  wing: {joint: wing, force: {gain: 100}}
-home: {wing: 0.5}
-"""
 MJCF = """\
 <mujoco><compiler meshdir="parts/meshes" texturedir="parts"/>
 <asset><mesh file="leaf.stl"/><mesh name="other" file="more/leaf.stl"/>
