@@ -75,7 +75,9 @@ class Supply(Facts):
     `pump_flow` and `relief_pressure` allow. `constant_pressure`: it holds `relief_pressure`
     whatever is drawn. `pump_droop` [m^3/(s Pa)] is by how much its flow falls with its pressure.
     With a `time_constant` [s] the pump's displacement follows what the valves draw with a
-    first-order lag, as a swash plate does; 0: at once.
+    first-order lag, as a swash plate does; 0: at once. `dissolved_air` is the volume of air, at
+    atmosphere, per volume of oil that the oil gives off where it is drawn below atmosphere (mineral
+    oil: 0.07 .. 0.10).
     """
 
     kind: Literal["constant_flow", "load_sensing", "constant_pressure"] = "constant_flow"
@@ -86,6 +88,7 @@ class Supply(Facts):
     load_sensing_margin: Positive = 2.0e6
     time_constant: NonNegative = 0.0
     bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
+    dissolved_air: Annotated[float, Field(ge=0.001, le=0.5)] = 0.09
 
     @model_validator(mode="after")
     def _check(self):

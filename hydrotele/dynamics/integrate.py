@@ -26,7 +26,7 @@ from hydrotele.dynamics.model import (
 )
 from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_ROW, RATE, Q, move_links, place_links
 from hydrotele.dynamics.motion import LENGTH as BAR_LENGTH
-from hydrotele.dynamics.supply import add_commands, supply_of, term_force
+from hydrotele.dynamics.supply import add_commands, feel, keep, supply_of, term_force
 from hydrotele.dynamics.transducers import follow_trail, show_late
 from hydrotele.hydraulics.circuit import (
     SLOTS,
@@ -43,12 +43,12 @@ _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 
 @lean
 def place(model, sp, z):
-    """Put the mechanism at a state: frames, drive positions and their Jacobian rows.
+    """Put mechanism and drives at a state: frames, positions, Jacobian rows, pressures felt.
 
     Args:
         model: Model.
-        sp: Space; `motion`, `row` and X of `drive` are written. X of a drive with a transmission
-            is its own position, not the load's.
+        sp: Space; `motion`, `row`, `act` and X of `drive` are written. X of a drive with a
+            transmission is its own position, not the load's.
         z: (nz,) state.
 
     Returns:
@@ -85,6 +85,7 @@ def place(model, sp, z):
                 sp.row[i, f] = total
         gear = model.gear[i]
         sp.drive[X, i] = load_position(model, sp, i) if gear < 0 else z[n + gear]
+    feel(model, sp, z)
 
 
 @lean
@@ -110,7 +111,7 @@ def accelerate(model, sp, z, dt):
     Args:
         model: Model.
         sp: Space after `place`; `force` receives the (n + t,) acceleration.
-        z: (nz,) state, whose rates and pressures act.
+        z: (nz,) state, whose rates act; pressures are those of `sp`.
         dt: length of the kick, scalar [s]; 0 gives the acceleration itself.
 
     Returns:
@@ -126,15 +127,14 @@ def accelerate(model, sp, z, dt):
     for i in range(len(model.gear)):
         u, gear = i * SLOTS, model.gear[i]
         if i < model.hydraulic:
-            a = 2 * first + 4 * i
-            push = user[u + _AH] * z[a + 2] - user[u + _AR] * z[a + 3]
+            push = user[u + _AH] * sp.act[4 * i + 2] - user[u + _AR] * sp.act[4 * i + 3]
         else:
             push = model.gain[i] * sp.drive[COMMAND, i] - user[u + _OFFSET]
         v = 0.0
         for f in range(n):
             v += sp.row[i, f] * z[first + f]
         own = v if gear < 0 else z[first + n + gear]
-        act, more, steep = z[2 * first + 4 * i :], 0.0, 0.0
+        act, more, steep = sp.act[4 * i :], 0.0, 0.0
         if len(model.terms) > 0:
             more, steep = term_force(model, sp, z, i, own)
         slope, plain = 0.0, True
@@ -142,7 +142,7 @@ def accelerate(model, sp, z, dt):
             if user[u + _BRISTLE_STIFFNESS] > 0.0:
                 plain, moved = False, _inertia(model, sp, i)
                 sp.drive[INERTIA, i] = moved
-                share = z[2 * first + int(user[u + _BRISTLE])]
+                share = sp.act[int(user[u + _BRISTLE])]
                 rubbing, damping, stiff = bristle_friction(user, u, share, own, moved, dt)
                 push += more - rubbing
                 slope = half * (damping + half * stiff - steep)
@@ -277,7 +277,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
     """
     total = len(model.mech.free) + len(model.transmission)
     nu, count, h = len(model.gear), model.hydraulic, period / steps
-    act, drive, given = z[2 * total :], sp.drive, COMMAND
+    act, drive, given = sp.act, sp.drive, COMMAND
     sp.time[0] = sp.time[1] + row * period
     _take_commands(model, drive, command, row, 0.0, h, period)
     place(model, sp, z)
@@ -299,7 +299,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
             _bend(model.user, act, drive, h, sp.act_dot)
         if count > 0:
             if len(model.terms) > 0:
-                add_commands(model, sp, act, h)
+                add_commands(model, sp, h)
                 given = GIVEN
             first = np.int64(0)  # numba compiles a function anew for a written number
             step_circuit(
@@ -311,6 +311,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
         if model.memory is not None:
             for k in range(4 * count, len(sp.act_dot)):
                 act[k] += h * sp.act_dot[k]
+        keep(model, sp, z)
         sp.time[0] = sp.time[1] + row * period + (step + 1) * h
         kick = h if step < steps - 1 else 0.5 * h
         accelerate(model, sp, z, kick)
@@ -370,7 +371,7 @@ def _shown(model, sp, z, c):
         return sp.drive[X, i]
     if kind == SUPPLY:
         return supply_of(model, sp, z)
-    return z[2 * (len(model.mech.free) + len(model.transmission)) + 4 * i + kind]
+    return sp.act[4 * i + kind]
 
 
 @lean

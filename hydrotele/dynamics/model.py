@@ -26,7 +26,9 @@ class Model(NamedTuple):
     """Numbers of the reduced model; n independent coordinates, t transmissions, h valves.
 
     A state is `(n positions, t drive positions, n rates, t drive rates, 4 h activations)` and what
-    bristles and a slow pump remember, see `parameters.memory_names`.
+    bristles and a slow pump remember, see `parameters.memory_names`. Its pressures are those that
+    the oil would have if it held its air (`laws.pressure_without_air`): any number is one, which a
+    filter needs, and they are the felt ones wherever these are not below the atmosphere's.
 
     Attributes:
         mech: the mechanism.
@@ -75,7 +77,8 @@ class Space(NamedTuple):
         row: (nu, n) d(load-side drive velocity) / d(independent rates).
         mass: (n + t, n + t) mass matrix, then its factor.
         force: (n + t,) forces, then acceleration.
-        act_dot: (4 h + memory,) rates of the activations and of what is remembered.
+        act: (4 h + memory,) activations and what is remembered, with the pressures that are felt.
+        act_dot: (4 h + memory,) rates of `act`.
         scratch: (SCRATCH,) work space of the circuit.
         time: (2,) now, and of the run's first row; only terms see it [s].
     """
@@ -85,6 +88,7 @@ class Space(NamedTuple):
     row: np.ndarray
     mass: np.ndarray
     force: np.ndarray
+    act: np.ndarray
     act_dot: np.ndarray
     scratch: np.ndarray
     time: np.ndarray
@@ -146,7 +150,7 @@ def model_space(model: Model) -> Space:
     total = n + len(model.transmission)
     return Space(
         motion_space(model.mech), np.zeros((5, nu)), np.zeros((nu, n)), np.zeros((total, total)),
-        np.zeros(total), np.zeros(acts), np.zeros(SCRATCH), np.zeros(2),
+        np.zeros(total), np.zeros(acts), np.zeros(acts), np.zeros(SCRATCH), np.zeros(2),
     )  # fmt: skip
 
 

@@ -1,22 +1,70 @@
-"""What drives share in the reduced model: the supply's pressure, and the laws that terms add."""
+"""What drives share in the reduced model: supply, pressures that are felt, laws that terms add."""
 
 from hydrotele.compiled import lean
 from hydrotele.dynamics.model import COMMAND, GIVEN, V, X
 from hydrotele.hydraulics.circuit import circuit_supply, delivered_share, open_ports
 from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state
+from hydrotele.hydraulics.laws import pressure_with_air, pressure_without_air
+from hydrotele.hydraulics.slots import SLOTS, Slot
 from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
 from hydrotele.terms.table import added_with_slope
 
+_AIR = int(Slot.AIR_RELEASE)
+
+
+@lean
+def feel(model, sp, z):
+    """Write the activations of a state with the pressures that are felt into `sp.act`.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state.
+
+    Returns:
+        Nothing.
+
+    Source: `laws.pressure_with_air`.
+    """
+    first = 2 * (len(model.mech.free) + len(model.transmission))
+    for k in range(len(sp.act)):
+        sp.act[k] = z[first + k]
+    for i in range(model.hydraulic):
+        for k in range(4 * i + 2, 4 * i + 4):
+            sp.act[k] = pressure_with_air(sp.act[k], model.user[i * SLOTS + _AIR])
+
+
+@lean
+def keep(model, sp, z):
+    """Write `sp.act` back into a state, the inverse of `feel`.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state, of which the activations are written.
+
+    Returns:
+        Nothing.
+
+    Source: `laws.pressure_without_air`.
+    """
+    first = 2 * (len(model.mech.free) + len(model.transmission))
+    for k in range(len(sp.act)):
+        z[first + k] = sp.act[k]
+    for i in range(model.hydraulic):
+        for k in range(4 * i + 2, 4 * i + 4):
+            z[first + k] = pressure_without_air(sp.act[k], model.user[i * SLOTS + _AIR])
+
 
 @lean
 def supply_of(model, sp, z):
-    """Supply pressure in a state, scalar [Pa].
+    """Supply pressure in a state, scalar [Pa]; `sp.act` is written, see `feel`.
 
     Source: nominal model, "Supply".
     """
-    user, count = model.user, model.hydraulic
-    act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
+    user, count, act = model.user, model.hydraulic, sp.act
+    feel(model, sp, z)
     open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
     if model.memory is None:
         return circuit_supply(user, 0, count, sp.scratch)
@@ -29,8 +77,8 @@ def term_force(model, sp, z, i, velocity):
 
     Args:
         model: Model.
-        sp: Space after `place`; its time, positions and commands.
-        z: (nz,) state, whose pressures act.
+        sp: Space after `place`; its time, positions, pressures and commands.
+        z: (nz,) state.
         i: index of the drive.
         velocity: of the drive, scalar [m/s] or [rad/s].
 
@@ -38,10 +86,9 @@ def term_force(model, sp, z, i, velocity):
         (force [N] or [N m], d force / d velocity); of a force drive with the terms of its command.
     """
     count = model.hydraulic
-    act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
     supply = supply_of(model, sp, z) if count > 0 else 0.0
     s = drive_state(
-        model.user, i, count, act, supply, sp.time[0], sp.drive[X, i], velocity,
+        model.user, i, count, sp.act, supply, sp.time[0], sp.drive[X, i], velocity,
         sp.drive[COMMAND, i], model.gain[i],
     )  # fmt: skip
     force, slope = added_with_slope(model.terms, ON_FORCE, i, s)
@@ -53,13 +100,13 @@ def term_force(model, sp, z, i, velocity):
 
 
 @lean
-def add_commands(model, sp, act, h):
+def add_commands(model, sp, h):
     """Write the commands that the valves are given: what arrives and what the terms add.
 
     Args:
         model: Model.
-        sp: Space with positions at the end of the step, velocities over it, time at its start.
-        act: (>= 4 h,) activations at the start of the step.
+        sp: Space with positions at the end of the step, velocities over it, time and activations
+            at its start.
         h: step, scalar [s].
 
     Returns:
@@ -67,6 +114,6 @@ def add_commands(model, sp, act, h):
     """
     drive = sp.drive
     add_to_commands(
-        model.user, model.terms, model.hydraulic, act, drive[COMMAND], drive[X], drive[V], h,
+        model.user, model.terms, model.hydraulic, sp.act, drive[COMMAND], drive[X], drive[V], h,
         sp.time[0], sp.scratch, drive[GIVEN],
     )  # fmt: skip

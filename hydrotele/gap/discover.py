@@ -185,8 +185,8 @@ class _Seen(NamedTuple):
 
 
 @compiled
-def _drives_of(model, sp, states, position, velocity, supply):
-    """Positions and velocities (n, nu) of the drives, supply (n,), along states (n, nz)."""
+def _drives_of(model, sp, states, position, velocity, act, supply):
+    """Positions, velocities (n, nu), activations (n, 4 h) and supply (n,) along states (n, nz)."""
     n, t = len(model.mech.free), len(model.transmission)
     for row in range(len(states)):
         place(model, sp, states[row])
@@ -196,6 +196,8 @@ def _drives_of(model, sp, states, position, velocity, supply):
             for f in range(n):
                 total += sp.row[i, f] * states[row, n + t + f]
             velocity[row, i] = total
+        for k in range(act.shape[1]):
+            act[row, k] = sp.act[k]
         if model.hydraulic > 0:
             supply[row] = supply_of(model, sp, states[row])
 
@@ -208,9 +210,10 @@ def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
     model = reduced_model(machine, ())
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
-    supply = np.zeros(len(states))
-    _drives_of(model, model_space(model), np.ascontiguousarray(states), position, velocity, supply)
-    first = 2 * (len(model.mech.free) + len(model.transmission))
+    supply, act = np.zeros(len(states)), np.empty((len(states), 4 * model.hydraulic))
+    _drives_of(
+        model, model_space(model), np.ascontiguousarray(states), position, velocity, act, supply
+    )
     clock = track.run.start + track.run.period * np.arange(len(states))
     values = {}
     for i, axis in enumerate(order):
@@ -218,11 +221,11 @@ def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
                "command": track.run.command[:, i]}  # fmt: skip
         facts = machine.axes[axis]
         if facts.hydraulic:
-            head, rod = states[:, first + 4 * i + 2], states[:, first + 4 * i + 3]
+            head, rod = act[:, 4 * i + 2], act[:, 4 * i + 3]
             areas = facts.hydraulic_drive.areas
             own |= {"pressure_head": head, "pressure_rod": rod,
                     "force": areas[0] * head - areas[1] * rod}  # fmt: skip
-            own["pump_speed" if facts.pump else "spool"] = states[:, first + 4 * i]
+            own["pump_speed" if facts.pump else "spool"] = act[:, 4 * i]
             if facts.valve:
                 own["pressure_supply"] = supply
         elif facts.force:

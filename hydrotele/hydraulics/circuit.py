@@ -22,7 +22,13 @@ from hydrotele.hydraulics.actuator import (
     pumped_rates,
     pumped_volumes,
 )
-from hydrotele.hydraulics.laws import port_flow, spool_step
+from hydrotele.hydraulics.laws import (
+    port_flow,
+    pressure_with_air,
+    pressure_without_air,
+    softening,
+    spool_step,
+)
 from hydrotele.hydraulics.presliding import bristle_friction
 from hydrotele.hydraulics.pump import (
     load_pressure_step,
@@ -53,8 +59,9 @@ __all__ = [
 
 ACTIVATIONS = 4
 MAX_AXES = 8
-SCRATCH = 8 * MAX_AXES  # ports, then the factors of the pressures and how the supply couples them
-_FACTORS = 4 * MAX_AXES
+_FACTORS = 4 * MAX_AXES  # after the ports: of the pressures, and how the supply couples them
+_FIRST = 8 * MAX_AXES  # then both chambers' softening, later their rates in the first stage
+SCRATCH = 10 * MAX_AXES
 
 _ROS2 = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approximate Jacobian
 _NO_FLOWS = (0.0, 0.0, 0.0, 0.0)
@@ -66,7 +73,7 @@ _W, _Z = int(Slot.BANDWIDTH), int(Slot.DAMPING)
 _SLEW, _PORT = int(Slot.SLEW_LIMIT), int(Slot.PORT_RELIEF)
 _KR, _KM = int(Slot.RELIEF_GAIN), int(Slot.MAKEUP_GAIN)
 _BETA, _TANK = int(Slot.BULK_MODULUS), int(Slot.TANK_PRESSURE)
-_HOSE = int(Slot.HOSE_COMPLIANCE)
+_HOSE, _AIR = int(Slot.HOSE_COMPLIANCE), int(Slot.AIR_RELEASE)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
@@ -88,6 +95,9 @@ def _chamber_stiffness(user, u, x):
 @compiled
 def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added):
     """Pressure rates of both chambers and their slopes with respect to their own pressure.
+
+    The rates are those of oil that holds its air; what a chamber drawn below atmosphere makes of
+    them says `laws.pressure_with_air`.
 
     `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`,
     where a hose of compliance C_h counts as `beta C_h` of volume. Beyond an end of the stroke the
@@ -154,7 +164,9 @@ def step_circuit(
     Spools follow their exact exponential; pressures take one step of the L-stable second-order
     Rosenbrock method ROS2, with piston velocities held over the step. Its Jacobian is diagonal but
     for the supply, by which all fed chambers act on each other (`supply_coupling`, solved by the
-    Sherman-Morrison formula). The supply pressure is solved in both stages. A pump with a time
+    Sherman-Morrison formula). The supply pressure is solved in both stages. Where a chamber is
+    below atmosphere, the method steps the pressure P that its oil would have if it held its air
+    (`laws.pressure_without_air`), which is linear in the volume that is missing. A pump with a time
     constant follows the mean of what the valves draw at both ends of the step, by its exact
     exponential.
 
@@ -219,13 +231,21 @@ def step_circuit(
         head, rod, j_head, j_rod = pressure_rates(
             user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3], x, v, dt, more,
         )  # fmt: skip
-        f = _FACTORS + a
-        scratch[f], scratch[f + 1] = 1.0 / (1.0 - gamma_h * j_head), 1.0 / (1.0 - gamma_h * j_rod)
+        f, k, air = _FACTORS + a, _FIRST + 2 * i, user[u + _AIR]
+        scratch[k] = _softening_ahead(act[a + 2], head, dt, air)
+        scratch[k + 1] = _softening_ahead(act[a + 3], rod, dt, air)
+        scratch[f] = 1.0 / (1.0 - gamma_h * (scratch[k] * j_head))
+        scratch[f + 1] = 1.0 / (1.0 - gamma_h * (scratch[k + 1] * j_rod))
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
     coupled = supply_coupling(user, first, count, scratch, p_start, scratch[_FACTORS:])
     if coupled:
         _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch)
         _couple(count, act_dot, scratch)
+    for i in range(count):
+        a, k, air = 4 * i, _FIRST + 2 * i, user[(first + i) * SLOTS + _AIR]
+        scratch[k], scratch[k + 1] = act_dot[a + 2], act_dot[a + 3]
+        act_dot[a + 2] = _rate_with_air(act[a + 2], act_dot[a + 2], dt, air)
+        act_dot[a + 3] = _rate_with_air(act[a + 3], act_dot[a + 3], dt, air)
     open_ports(user, act, act_dot, scratch, first, count, dt, act_dot)
     if memory is None:
         p_end = circuit_supply(user, first, count, scratch)
@@ -237,9 +257,8 @@ def step_circuit(
             act_dot[at] = (pump_response(user, first, wanted, act[at], dt) - act[at]) / dt
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
-        k_head, k_rod = act_dot[a + 2], act_dot[a + 3]
         x, v = length[first + i], velocity[first + i]
-        p_head, p_rod = act[a + 2] + dt * k_head, act[a + 3] + dt * k_rod
+        p_head, p_rod = act[a + 2] + dt * act_dot[a + 2], act[a + 3] + dt * act_dot[a + 3]
         more = _NO_FLOWS
         if terms is not None:
             if len(terms) > 0:
@@ -250,18 +269,39 @@ def step_circuit(
         head, rod, _, _ = pressure_rates(
             user, u, scratch[a + 3], p_end, p_head, p_rod, x, v, 0.0, more,
         )  # fmt: skip
-        f = _FACTORS + a
-        act_dot[a + 2] = scratch[f] * (head - 2.0 * k_head)
-        act_dot[a + 3] = scratch[f + 1] * (rod - 2.0 * k_rod)
-        scratch[a], scratch[a + 1] = k_head, k_rod
+        f, k = _FACTORS + a, _FIRST + 2 * i
+        act_dot[a + 2] = scratch[f] * (head - 2.0 * scratch[k])
+        act_dot[a + 3] = scratch[f + 1] * (rod - 2.0 * scratch[k + 1])
         act_dot[a] = (act_dot[a] - act[a]) / dt
         act_dot[a + 1] = (act_dot[a + 1] - act[a + 1]) / dt
     if coupled:
         _couple(count, act_dot, scratch)
-    for a in range(0, 4 * count, 4):
-        act_dot[a + 2] = 1.5 * scratch[a] + 0.5 * act_dot[a + 2]
-        act_dot[a + 3] = 1.5 * scratch[a + 1] + 0.5 * act_dot[a + 3]
+    for i in range(count):
+        a, k, air = 4 * i, _FIRST + 2 * i, user[(first + i) * SLOTS + _AIR]
+        head = 1.5 * scratch[k] + 0.5 * act_dot[a + 2]
+        rod = 1.5 * scratch[k + 1] + 0.5 * act_dot[a + 3]
+        act_dot[a + 2] = _rate_with_air(act[a + 2], head, dt, air)
+        act_dot[a + 3] = _rate_with_air(act[a + 3], rod, dt, air)
     return p_start, p_end
+
+
+@compiled
+def _rate_with_air(pressure, rate, dt, release):
+    """Mean rate of a pressure over a step in which it would change at a rate without air [Pa/s]."""
+    if (pressure >= 0.0 and pressure + dt * rate >= 0.0) or release == 0.0:
+        return rate
+    oil = pressure_without_air(pressure, release)
+    return (pressure_with_air(oil + dt * rate, release) - pressure) / dt
+
+
+@compiled
+def _softening_ahead(pressure, rate, dt, release):
+    """Softening that slopes reckon with over a step: none where the step would refill a chamber."""
+    if pressure >= 0.0 or release == 0.0:
+        return 1.0
+    if pressure_without_air(pressure, release) + dt * rate > 0.0:
+        return 1.0
+    return softening(pressure, release)
 
 
 @compiled
@@ -271,7 +311,7 @@ def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
     Of `(I - gamma h (D + b w^T)) k = r` with D diagonal, b the rates per supply pressure and
     w = dp_s/dp, writes `gamma h b / (1 - gamma h D)` over the common divisor
     `1 - gamma h w^T b / (1 - gamma h D)` at place 2 of every axis' factors, negative where the rod
-    side is fed.
+    side is fed, and at place 3 w with the softening of the fed chamber.
     """
     divisor = 1.0
     for i in range(count):
@@ -283,6 +323,8 @@ def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
         )
         own = gamma_h * scratch[f + 2]
         own *= head * scratch[f] if scratch[4 * i + 3] > 0.0 else rod * scratch[f + 1]
+        k = _FIRST + 2 * i
+        scratch[f + 3] *= scratch[k] if scratch[4 * i + 3] > 0.0 else scratch[k + 1]
         divisor -= scratch[f + 3] * own
         scratch[f + 2] = own if scratch[4 * i + 3] > 0.0 else -own
     for f in range(_FACTORS, _FACTORS + 4 * count, 4):

@@ -9,6 +9,8 @@ import math
 
 from hydrotele.compiled import compiled
 
+ATMOSPHERE = 101325.0  # Pa
+
 
 @compiled
 def valve_opening(spool, deadband):
@@ -87,6 +89,83 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
     if pressure < tank_pressure:
         return makeup_gain * (tank_pressure - pressure), -makeup_gain
     return 0.0, 0.0
+
+
+@compiled
+def pressure_with_air(oil, release):
+    """Pressure in a chamber whose oil gives off its dissolved air below atmosphere.
+
+    Oil drawn below atmospheric pressure gives off air in proportion to the missing pressure
+    (Henry's law), and that air takes `V a |p| / (p + p_atm)` of the chamber (Boyle's law). So the
+    pressure p of a chamber that lacks oil, which would be P without air, follows from
+    `P = p (1 + R / (p + p_atm))` with `R = a beta`, and never reaches absolute zero.
+
+    Args:
+        oil: P, what the lack of oil alone would give, scalar [Pa] above atmosphere.
+        release: R = a beta with the volume a of dissolved air at atmosphere per volume of oil, scalar
+            [Pa]; 0 for oil without air.
+
+    Returns:
+        p, scalar [Pa] above atmosphere; P itself where that is not below 0.
+
+    Source: air release below saturation in equilibrium: Merritt 1967, sec. 2-3; Gholizadeh, Burton
+    and Schoenau 2012, "Fluid bulk modulus: comparison of low pressure models", Int. J. Fluid Power
+    13(1).
+
+    >>> round(pressure_with_air(-1.0e8, 1.35e8))
+    -43106
+    >>> pressure_with_air(2.0e6, 1.35e8)
+    2000000.0
+    """
+    if oil >= 0.0 or release == 0.0:
+        return oil
+    b = ATMOSPHERE + release - oil
+    return 2.0 * oil * ATMOSPHERE / (b + math.sqrt(b * b + 4.0 * oil * ATMOSPHERE))
+
+
+@compiled
+def pressure_without_air(pressure, release):
+    """What a pressure below atmosphere would be if the oil gave off no air.
+
+    Args:
+        pressure: p, scalar [Pa] above atmosphere, above -ATMOSPHERE where there is air.
+        release: R, scalar [Pa].
+
+    Returns:
+        P, scalar [Pa].
+
+    Source: inverse of `pressure_with_air`.
+
+    >>> round(pressure_without_air(pressure_with_air(-1.0e8, 1.35e8), 1.35e8))
+    -100000000
+    """
+    if pressure >= 0.0 or release == 0.0:
+        return pressure
+    return pressure * (1.0 + release / (pressure + ATMOSPHERE))
+
+
+@compiled
+def softening(pressure, release):
+    """How much less the pressure of oil with released air changes than that of oil alone.
+
+    Args:
+        pressure: p, scalar [Pa] above atmosphere.
+        release: R, scalar [Pa].
+
+    Returns:
+        dp/dP, scalar [1]: 1 where p is not below 0.
+
+    Source: derivative of `pressure_with_air`.
+
+    >>> softening(1.0e5, 1.35e8)
+    1.0
+    >>> round(1.0 / softening(-50662.5, 1.35e8))
+    5330
+    """
+    if pressure >= 0.0 or release == 0.0:
+        return 1.0
+    absolute = pressure + ATMOSPHERE
+    return 1.0 / (1.0 + release * ATMOSPHERE / (absolute * absolute))
 
 
 @compiled

@@ -142,6 +142,7 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     _write_holding(numbers, Slot.HOLDING_HEAD, axis.load_holding.head)
     _write_holding(numbers, Slot.HOLDING_ROD, axis.load_holding.rod)
     numbers[Slot.BULK_MODULUS] = supply.bulk_modulus
+    numbers[Slot.AIR_RELEASE] = supply.dissolved_air * supply.bulk_modulus
     numbers[Slot.TANK_PRESSURE] = supply.tank_pressure
     numbers[Slot.RELIEF_PRESSURE] = supply.relief_pressure
     numbers[Slot.PUMP_FLOW] = supply.pump_flow

@@ -15,9 +15,9 @@ pressures are above the atmosphere's.
 import math
 
 from hydrotele.compiled import compiled
+from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.slots import PumpSlot
 
-ATMOSPHERE = 101325.0  # Pa
 STALLED = 1.0e-9  # rad/s, of a pump that stands while its valve is open
 _THINNEST = 0.1 * ATMOSPHERE  # Pa absolute: below it the air is not let grow any further
 

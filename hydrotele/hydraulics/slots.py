@@ -39,6 +39,7 @@ class Slot(enum.IntEnum):
     MAKEUP_GAIN = enum.auto()
     BULK_MODULUS = enum.auto()
     TANK_PRESSURE = enum.auto()
+    AIR_RELEASE = enum.auto()
     RELIEF_PRESSURE = enum.auto()
     PUMP_FLOW = enum.auto()
     COULOMB = enum.auto()

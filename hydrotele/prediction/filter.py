@@ -20,10 +20,11 @@ from hydrotele.dynamics.integrate import (
 )
 from hydrotele.dynamics.mechanism import JOINT
 from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
+from hydrotele.hydraulics.laws import softening
 from hydrotele.hydraulics.pump import STALLED
 from hydrotele.prediction.late import begin_late, move_late, nudge_late, spread_late
 
-_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
+_KIND, _PUMPED, _AIR = int(Slot.KIND), float(Kind.PUMPED), int(Slot.AIR_RELEASE)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _ASYMMETRY, _DELIVERY = int(Slot.COULOMB_ASYMMETRY), int(Slot.DELIVERY)
 
@@ -60,7 +61,9 @@ def _slopes(model, sp, z, nudge, slope, moved):
                 for f in range(n):
                     slope[c, f] = model.scale[c] * sp.row[i, f]
         elif model.kind[c] < 4:
-            slope[c, first + 4 * i + model.kind[c]] = model.scale[c]
+            air = model.user[i * SLOTS + _AIR]
+            soft = softening(sp.act[4 * i + model.kind[c]], air)
+            slope[c, first + 4 * i + model.kind[c]] = model.scale[c] * soft
     for c in range(len(model.kind)):
         if model.kind[c] != 4:
             continue

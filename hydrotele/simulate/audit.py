@@ -9,7 +9,7 @@ import numpy as np
 from mujoco import rollout
 
 from hydrotele.hydraulics.circuit import ACTIVATIONS
-from hydrotele.hydraulics.laws import port_flow
+from hydrotele.hydraulics.laws import port_flow, pressure_without_air
 from hydrotele.hydraulics.pump import oil_compliance, switched_speed
 from hydrotele.simulate.closure import pin_count
 from hydrotele.simulate.drive_side import drive_and_load_dofs
@@ -90,6 +90,7 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
     volume_head, volume_rod = drive.volumes(x[:, i])
     p_head, p_rod = act[:, ACTIVATIONS * i + 2], act[:, ACTIVATIONS * i + 3]
     leak = drive.leakage * (p_head - p_rod)
+    release = supply.dissolved_air * supply.bulk_modulus
     sides = (
         (p_head, table[:, 1 + 3 * i] - leak + more[:, i, 1], head * v[:, i], volume_head),
         (p_rod, table[:, 2 + 3 * i] + leak + more[:, i, 2], -rod * v[:, i], volume_rod),
@@ -103,7 +104,8 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
         entered = np.sum(0.5 * dt * (net[1:] + net[:-1]))
         middle = 0.5 * (volume[1:] + volume[:-1])
         soft = middle / supply.bulk_modulus + drive.hose_compliance
-        compressed = np.sum(soft * np.diff(pressure))
+        oil = np.array([pressure_without_air(p, release) for p in pressure])
+        compressed = np.sum(soft * np.diff(oil))
         through = np.sum(np.abs(inflow) + np.abs(port) + np.abs(swept)) * dt
         yield abs(entered - compressed) / max(through, 1e-12)
 

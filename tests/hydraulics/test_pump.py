@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.pump import (
-    ATMOSPHERE,
     accumulator_pressure,
     load_pressure_step,
     oil_compliance,
