@@ -16,10 +16,12 @@ import numpy as np
 from numba import njit
 
 STATES = 10
-"""Per axis: joint position, joint velocity, spool, spool rate, head and rod pressure, bristle
-deflection, lagged command, drive position and drive velocity behind a transmission."""
+"""Per axis: joint position, joint velocity, spool, spool rate, head and rod pressure (below 0 that
+of oil without air, see `felt`), bristle deflection, lagged command, drive position and drive
+velocity behind a transmission."""
 Q, W, S, R, PA, PB, Z, U, QD, WD = range(STATES)
 _BRISTLE_DAMPING = 0.002  # s, sigma_1 over sigma_0
+_ATMOSPHERE = 1.01325e5  # Pa
 
 _jit = njit(cache=True, error_model="numpy", nogil=True)
 
@@ -95,6 +97,7 @@ class Drives(NamedTuple):
     viscous_asymmetry: np.ndarray
     delay: np.ndarray
     bulk_modulus: float
+    dissolved_air: float
     tank: float
     relief: float
     pump: float
@@ -472,6 +475,25 @@ def _compliance(p, volume, i, drives, forms):
 
 
 @_jit
+def felt(p, drives):
+    """Pressure above atmosphere of a chamber whose oil alone would be at p [Pa].
+
+    Below atmosphere the air that comes out of V of oil fills `V a (-x) / (x + p_atm)` of what is
+    missing, `-V p / beta = -V x / beta + that`: Newton's method from 0, from where it only descends.
+    """
+    if p >= 0.0:
+        return p
+    x, air = 0.0, drives.dissolved_air * drives.bulk_modulus
+    for _ in range(60):
+        slope = (x + _ATMOSPHERE) + (x - p) + air
+        step = ((x - p) * (x + _ATMOSPHERE) + air * x) / slope
+        x -= step
+        if step <= 1e-9 * _ATMOSPHERE:
+            break
+    return x
+
+
+@_jit
 def _port(p, i, drives):
     """Flow into a chamber through port relief and make-up valve [m^3/s]."""
     if p > drives.port_relief[i]:
@@ -517,7 +539,7 @@ def rates(machine, y, u, terms, dy, work):
         work[4, i] = o
         gain = drives.flow_gain[i] * abs(o)
         gain_open[i] = gain * (forms.gain_extend[i] if o > 0.0 else forms.gain_retract[i])
-        port[i] = y[i, PA] if o > 0.0 else y[i, PB]
+        port[i] = felt(y[i, PA] if o > 0.0 else y[i, PB], drives)
     pump = drives.pump + terms[5, 0]
     supply = supply_pressure(gain_open, port, n, drives, forms, pump)
     for i in range(n):
@@ -526,7 +548,7 @@ def rates(machine, y, u, terms, dy, work):
         v = slope * y[i, W]
         if geared:
             v = y[i, WD]
-        p_head, p_rod, o = y[i, PA], y[i, PB], work[4, i]
+        p_head, p_rod, o = felt(y[i, PA], drives), felt(y[i, PB], drives), work[4, i]
         q_head, q_rod = terms[1, i], terms[2, i]
         if o > 0.0:
             if supply > p_head:
@@ -605,15 +627,16 @@ def _variable(kind, i, machine, y, u, supply, time):
     if kind == 1:
         return linkage(machine.mechanism, i, y[i, Q])[1] * y[i, W]
     if kind == 2:
-        return y[i, PA]
+        return felt(y[i, PA], drives)
     if kind == 3:
-        return y[i, PB]
+        return felt(y[i, PB], drives)
     if kind == 4:
         return y[i, S]
     if kind == 5:
         return u[i]
     if kind == 6:
-        return y[i, PA] - y[i, PB] * drives.area_rod[i] / drives.area_head[i]
+        rod = felt(y[i, PB], drives)
+        return felt(y[i, PA], drives) - rod * drives.area_rod[i] / drives.area_head[i]
     if kind == 7:
         return supply
     return time
@@ -663,8 +686,8 @@ def _true_channels(machine, y, supply, out):
             out[at] = linkage(machine.mechanism, i, y[i, Q])[0]
             at += 1
     for i in range(n):
-        out[at] = y[i, PA]
-        out[at + n] = y[i, PB]
+        out[at] = felt(y[i, PA], drives)
+        out[at + n] = felt(y[i, PB], drives)
         at += 1
     out[at + n] = supply
 

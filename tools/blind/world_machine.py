@@ -153,6 +153,7 @@ def _drives(facts: Facts) -> Drives:
         viscous_asymmetry=of(rub, "viscous_asymmetry"),
         delay=of(axes, "command_delay"),
         bulk_modulus=supply.bulk_modulus,
+        dissolved_air=supply.dissolved_air,
         tank=supply.tank_pressure,
         relief=supply.relief_pressure,
         pump=supply.pump_flow,

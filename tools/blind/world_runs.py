@@ -23,6 +23,7 @@ from tools.blind.world import (
     U,
     W,
     arm_equations,
+    felt,
     linkage,
     simulate,
 )  # fmt: skip
@@ -259,11 +260,12 @@ def travelled(machine: Machine, run: WorldRun) -> dict[str, np.ndarray]:
         [linkage(machine.mechanism, i, q) for i, q in enumerate(row)] for row in s[:, :, Q]
     ])  # fmt: skip
     time = np.repeat(run.log.time[:, None], n, axis=1)
+    head, rod = (np.vectorize(lambda p: felt(p, d))(s[:, :, side]) for side in (PA, PB))
     return {
         "position": places[:, :, 0], "velocity": places[:, :, 1] * s[:, :, W],
-        "pressure_head": s[:, :, PA], "pressure_rod": s[:, :, PB], "spool": s[:, :, S],
+        "pressure_head": head, "pressure_rod": rod, "spool": s[:, :, S],
         "command": run.commands,
-        "load_pressure": s[:, :, PA] - s[:, :, PB] * d.area_rod / d.area_head,
+        "load_pressure": head - rod * d.area_rod / d.area_head,
         "supply": np.repeat(run.clean[:, -1:], n, axis=1), "time": time,
     }  # fmt: skip
 

@@ -1,0 +1,160 @@
+"""Chambers that are drawn below atmosphere: the air that oil gives off, and what comes after."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from hydrotele.hydraulics.circuit import SLOTS, Slot, circuit_scratch, step_circuit
+from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air, pressure_without_air
+from hydrotele.hydraulics.parameters import actuator_numbers
+from hydrotele.machine_file import load_machine
+
+BOOM = 1
+CLOSED = np.zeros(1)
+
+
+@pytest.fixture
+def boom():
+    """Actuator numbers of the CAT 215's boom, as the only axis."""
+    numbers = actuator_numbers(load_machine("cat215", "none"))["boom"].copy()
+    numbers[Slot.COUNT] = 1
+    return numbers
+
+
+def run(user, motion, dt, seconds, command=CLOSED, start=(1.0e6, 1.0e6)):
+    """Pressures (steps + 1, 2) of one axis whose piston moves as `motion(time)` -> (x, v) says."""
+    act, rate, scratch = np.array([0.0, 0.0, *start]), np.zeros(4), circuit_scratch()
+    states = [act[2:].copy()]
+    for k in range(round(seconds / dt)):
+        before, after = motion(k * dt)[0], motion((k + 1) * dt)[0]
+        x, v = np.array([after]), np.array([(after - before) / dt])
+        step_circuit(user, 0, 1, act, command, x, v, dt, rate, scratch)
+        act += dt * rate
+        states.append(act[2:].copy())
+    return np.array(states)
+
+
+def drawn_and_let_go(time):
+    """Piston out at 0.3 m/s for half a second, then at rest."""
+    return 0.5 + 0.3 * min(time, 0.5), 0.3 if time < 0.5 else 0.0
+
+
+def test_without_a_way_in_the_missing_volume_is_filled_by_oil_that_stretches_and_air(boom):
+    """A closed chamber against the volumes that Henry's and Boyle's law give, written anew."""
+    boom[[Slot.MAKEUP_GAIN, Slot.LEAKAGE]] = 0.0
+    beta, area, dead = boom[Slot.BULK_MODULUS], boom[Slot.AREA_HEAD], boom[Slot.VOLUME_HEAD]
+    air = boom[Slot.AIR_RELEASE] / beta
+    assert 0.05 < air < 0.15
+    got = run(boom, drawn_and_let_go, 1e-4, 0.5)[-1, 0]
+    volume = np.array([dead + area * 0.5, dead + area * 0.65])
+    # The chamber's volume grows while it is drawn: beta / V integrates to a logarithm.
+    stretch = 1.0e6 / beta - np.log(volume[1] / volume[0])
+
+    def lack(p):  # of the volume, as shares of it: oil that stretches, air that comes out
+        return p / beta + air * (p / ATMOSPHERE) * ATMOSPHERE / (p + ATMOSPHERE) - stretch
+
+    expected = brentq(lack, -ATMOSPHERE * (1 - 1e-12), 0.0, xtol=1e-6)
+    assert -ATMOSPHERE < expected < -0.5 * ATMOSPHERE
+    assert got == pytest.approx(expected, abs=10.0)  # 1e-4 of what the step misses in the volume
+
+
+@pytest.mark.parametrize("dt", [1e-3, 2.5e-4])
+def test_drawing_and_refilling_as_an_independent_integration_has_them(boom, dt):
+    """Chambers as compliances that depend on their pressure, integrated by scipy's Radau."""
+    user, seconds = boom, 3.0
+    beta, leak, tank = user[Slot.BULK_MODULUS], user[Slot.LEAKAGE], user[Slot.TANK_PRESSURE]
+    make, port, top = user[Slot.MAKEUP_GAIN], user[Slot.PORT_RELIEF], user[Slot.RELIEF_GAIN]
+    areas, dead, stroke = user[[Slot.AREA_HEAD, Slot.AREA_ROD]], user[Slot.VOLUME_HEAD], \
+        user[Slot.STROKE]  # fmt: skip
+
+    def rates(time, p):
+        x, v = drawn_and_let_go(time)
+        volume = dead + areas * [x, stroke - x]
+        flow = areas * [-v, v] + leak * (p[::-1] - p)
+        flow += make * np.maximum(0.0, tank - p) - top * np.maximum(0.0, p - port)
+        soft = volume / beta
+        air = user[Slot.AIR_RELEASE] / beta * ATMOSPHERE / (p + ATMOSPHERE) ** 2
+        return flow / (soft + np.where(p < 0.0, volume * air, 0.0))
+
+    times, end = np.arange(1, round(seconds / dt) + 1) * dt, None
+    found = []
+    for begin, stop in ((0.0, 0.5), (0.5, seconds)):  # the piston's speed jumps between
+        at = times[(times > begin + 1e-9) & (times <= stop + 1e-9)]
+        solution = solve_ivp(rates, (begin, stop), end if end is not None else [1.0e6, 1.0e6],
+                             "Radau", at, rtol=1e-9, atol=1e-3)  # fmt: skip
+        assert solution.success
+        found.append(solution.y.T)
+        end = solution.y[:, -1]
+    expected = np.concatenate(found)
+    states = run(user, drawn_and_let_go, dt, seconds)[1:]
+    assert expected[:, 0].min() < -0.5 * ATMOSPHERE, "nothing cavitates here"
+    assert expected[-1, 0] > 0.0, "the chamber does not fill again here"
+    # A step may begin to draw or end to fill anywhere inside: first order there, in the time of a
+    # step times the fastest change of a pressure between these two.
+    fastest = np.abs(np.diff(expected[:, 0])).max()
+    assert np.abs(states - expected)[:, 0].max() < fastest
+    calm = (times > 0.1) & (times <= 0.5)
+    assert np.abs(states - expected)[calm, 0].max() < 0.002 * ATMOSPHERE
+
+
+@pytest.mark.parametrize("dt", [1e-3, 2.5e-4])
+def test_refilling_does_not_overshoot_the_valve_that_fills(boom, dt):
+    """Only the make-up valve fills: nothing may go beyond the tank, from which the oil comes."""
+    boom[Slot.LEAKAGE] = 0.0
+    states = run(boom, drawn_and_let_go, dt, 3.0)
+    after = states[round(0.5 / dt) :, 0]
+    assert after[0] < 0.0
+    assert after[-1] == pytest.approx(boom[Slot.TANK_PRESSURE], rel=1e-3)
+    assert after.max() <= boom[Slot.TANK_PRESSURE] * (1 + 1e-9)  # rounding
+
+
+def test_however_fast_it_is_drawn_the_pressure_stays_above_vacuum(boom):
+    rng = np.random.default_rng(0)
+    for dt in (1e-4, 1e-3, 5e-3):
+        speed = rng.uniform(-30.0, 30.0, 400)
+        place = 0.6 + 0.5 * np.sin(np.cumsum(speed) * dt)  # beyond both ends of the stroke, too
+        states = run(boom, lambda t, p=place, h=dt: (p[round(t / h)], 0.0), dt, 399 * dt)
+        assert np.isfinite(states).all()
+        assert states.min() > -ATMOSPHERE
+        assert states.min() < 0.0, "nothing cavitates here"
+
+
+def test_a_machine_above_atmosphere_knows_nothing_of_its_air(boom):
+    """Not a bit changes with the amount of air where no chamber is drawn empty."""
+    ends = []
+    for air in (0.001, 0.5):
+        boom[Slot.AIR_RELEASE] = air * boom[Slot.BULK_MODULUS]
+        states = run(boom, lambda t: (0.5 + 0.02 * np.sin(t), 0.0), 1e-3, 2.0,
+                     np.full(1, 0.3), (6.0e6, 4.0e6))  # fmt: skip
+        assert states.min() > 0.0
+        ends.append(states)
+    np.testing.assert_array_equal(*ends)
+
+
+def test_with_and_without_air_are_inverse_over_all_that_a_chamber_may_lack():
+    for oil in -np.geomspace(1e-3, 1e11, 60):
+        for release in (1e5, 8.1e7, 5e9):
+            felt = pressure_with_air(oil, release)
+            assert -ATMOSPHERE < felt < 0.0
+            assert pressure_without_air(felt, release) == pytest.approx(oil, rel=1e-6)
+
+
+def test_axes_that_share_a_supply_stay_sound_while_one_of_them_is_empty():
+    """A fed chamber that is drawn empty beside one that the supply couples it with."""
+    user = np.concatenate(list(actuator_numbers(load_machine("cat215", "none")).values()))
+    act, rate, scratch = np.zeros(12), np.zeros(12), circuit_scratch()
+    act[2::4] = act[3::4] = 2.0e6
+    x, v = np.full(3, 0.4), np.array([0.0, 0.6, 0.1])
+    command = np.array([0.2, 0.3, 1.0])
+    least = []
+    for _ in range(1500):
+        x = x + 1e-3 * v
+        step_circuit(user, 0, 3, act, command, x, v, 1e-3, rate, scratch)
+        act = act + 1e-3 * rate
+        least.append(act[4 * BOOM + 2])
+        assert np.isfinite(act).all()
+        assert min(act[2::4].min(), act[3::4].min()) > -ATMOSPHERE
+    assert min(least) < 0.0, "the boom is not drawn empty here"
+    assert np.ptp(least[-100:]) < 1e3, "the fed chamber hunts"
+    assert len(user) == 3 * SLOTS
