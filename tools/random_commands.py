@@ -1,4 +1,8 @@
-"""Step a machine with random valve commands in every tool: no NaN, no warning, closed pins."""
+"""Step a machine with random valve commands in every tool, and look at every state.
+
+Wanted: no NaN, no warning of MuJoCo, closed pins, no pressure at or below vacuum, and none above
+what the chamber's relief valve lets stand at the flow that the piston presses through it.
+"""
 
 import argparse
 import sys
@@ -9,11 +13,13 @@ import numpy as np
 from mujoco.batch import Batch
 
 from hydrotele.errors import InputError
+from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.hydraulics.laws import ATMOSPHERE
+from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine_file import load_machine
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 
-HOLD = 20  # steps for which a command is held
 STATES = 64  # reachable states to start from
 
 
@@ -45,13 +51,60 @@ def reachable_states(plant: Plant, count: int, rng: np.random.Generator) -> np.n
     raise InputError(f"machine {plant.machine.name}", "its joint ranges hold no reachable state")
 
 
+class Pressures:
+    """Extremes of the chambers' pressures over all states of a batch.
+
+    Attributes:
+        least: lowest pressure [Pa above vacuum].
+        most: highest pressure [Pa above vacuum].
+        beyond: most by which a chamber exceeded `p_port + q / k_r` [Pa], negative if none did; q is
+            the largest flow that the piston and the leakage pressed in since the relief opened, as
+            the pressure follows a falling flow late.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        """Look at no state yet."""
+        machine = plant.machine
+        axes = [machine.axes[n] for n in actuator_order(machine) if machine.axes[n].hydraulic]
+        self.least, self.most, self.beyond = np.inf, -np.inf, -np.inf
+        self._count = len(axes)
+        self._areas = np.array([a.hydraulic_drive.areas for a in axes]).reshape(-1, 2)
+        self._port = np.array([a.valve.port_relief if a.valve else np.inf for a in axes])
+        self._gain = np.array([a.valve.port_relief_gain if a.valve else 1.0 for a in axes])
+        self._leak = np.array([a.hydraulic_drive.leakage for a in axes])
+        self._pressed: np.ndarray | None = None
+        self._before = self._now = np.empty(0)
+
+    def look(self, batch: Batch, fresh: bool) -> None:
+        """Take the present states in; `fresh` where they do not follow from those seen last."""
+        if not self._count:
+            return
+        act = batch.act[:, : ACTIVATIONS * self._count].reshape(-1, self._count, ACTIVATIONS)
+        chambers = act[:, :, 2:]
+        self.least = min(self.least, float(chambers.min()) + ATMOSPHERE)
+        self.most = max(self.most, float(chambers.max()) + ATMOSPHERE)
+        speed = batch.actuator_velocity[:, : self._count]
+        pressed = np.stack([-speed * self._areas[:, 0], speed * self._areas[:, 1]], axis=2)
+        drop = self._leak * (chambers[:, :, 0] - chambers[:, :, 1])
+        pressed = np.maximum(0.0, pressed) + np.maximum(0.0, np.stack([-drop, drop], axis=2))
+        if not fresh and self._pressed is not None:
+            was_open = self._before > self._port[:, None]
+            most = np.maximum(pressed, self._now)
+            self._pressed = np.where(was_open, np.maximum(most, self._pressed), most)
+        else:
+            self._pressed = pressed
+        self._before, self._now = chambers.copy(), pressed
+        allowed = self._port[:, None] + self._pressed / self._gain[:, None]
+        self.beyond = max(self.beyond, float((chambers - allowed).max()))
+
+
 def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator) -> dict:
     """Random commands with one tool.
 
     Half of the simulations add a drift to their commands, which drives them into limits and ground.
 
     Returns:
-        Counts and extremes: steps, rate [1/s], nan, warnings, gap [m], speed [rad/s].
+        Counts and extremes: steps, rate [1/s], nan, warnings, gap [m], speed [rad/s], pressures.
     """
     plant = build_plant(load_machine(machine, tool), args.timestep)
     states = reachable_states(plant, STATES, rng)
@@ -59,17 +112,21 @@ def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator
     nq, pins = plant.model.nq, (plant.model.eq_obj1id, plant.model.eq_obj2id)
     warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), dtype=np.int64)
     drift, gap, speed, nan, done = np.zeros(batch.ctrl.shape), 0.0, 0.0, 0, 0
+    pressures = Pressures(plant)
     start = time.perf_counter()
-    for k in range(-(-steps // (args.simulations * HOLD))):
-        if k % max(1, args.reset // HOLD) == 0:
+    for k in range(-(-steps // (args.simulations * args.hold))):
+        fresh = k % max(1, args.reset // args.hold) == 0
+        if fresh:
             warnings += batch.warning[:, :, 1].sum(axis=0)  # a reset clears the counters
             batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
             chosen = states[rng.integers(len(states), size=args.simulations)]
             batch.qpos[:], batch.act[:] = chosen[:, :nq], chosen[:, nq:]
             drift[::2] = rng.uniform(-1.5, 1.5, drift[::2].shape)
         batch.ctrl[:] = np.clip(drift + rng.uniform(-1.0, 1.0, drift.shape), -1.0, 1.0)
-        batch.step(nstep=HOLD)
-        done += args.simulations * HOLD
+        for step in range(args.hold):
+            batch.step(nstep=1)
+            pressures.look(batch, fresh and step == 0)
+        done += args.simulations * args.hold
         nan += int((~np.isfinite(batch.state)).any(axis=1).sum())
         opening = batch.site_xpos[:, pins[0]] - batch.site_xpos[:, pins[1]]
         gap = max(gap, float(np.sqrt((opening**2).sum(axis=2)).max(initial=0.0)))
@@ -82,16 +139,27 @@ def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator
         "warnings": {mujoco.mjtWarning(i).name: int(n) for i, n in enumerate(warnings) if n},
         "gap": gap,
         "speed": speed,
+        "pressures": pressures,
     }
 
 
+def _said(pressures: Pressures) -> str:
+    if not np.isfinite(pressures.least):
+        return ""
+    said = f", pressures {pressures.least / 1e6:.4f} .. {pressures.most / 1e6:.1f} MPa absolute"
+    if np.isfinite(pressures.beyond):
+        said += f", {pressures.beyond / 1e6:+.2f} MPa beyond a relief's characteristic at most"
+    return said
+
+
 def main() -> int:
-    """Parse the arguments, run every tool, print one line each; 1 on a NaN or a warning."""
+    """Parse the arguments, run every tool, print one line each; 1 where one is not as wanted."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--machine", default="cat215")
     parser.add_argument("--tools", nargs="*", help="default: all tools of the machine")
     parser.add_argument("--steps", type=float, default=1e7, help="in all, over all tools")
     parser.add_argument("--simulations", type=int, default=256)
+    parser.add_argument("--hold", type=int, default=20, help="steps for which a command is held")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--reset", type=int, default=4000, help="steps between new states")
     parser.add_argument("--timestep", type=float, default=1.0e-3, help="[s]")
@@ -104,14 +172,16 @@ def main() -> int:
         result = run_tool(args.machine, tool, int(args.steps / len(tools)), args, rng)
         total += result["steps"]
         bad += result["nan"] + sum(result["warnings"].values())
+        bad += result["pressures"].least <= 0.0
+        bad += result["pressures"].beyond > 0.0
         print(
             f"{tool}: {result['steps']} steps, {result['rate']:.0f} steps/s, NaN {result['nan']},"
             f" warnings {result['warnings'] or 'none'},"
             f" largest pin opening {1e3 * result['gap']:.4f} mm,"
-            f" fastest driven joint {result['speed']:.1f} rad/s",
+            f" fastest driven joint {result['speed']:.1f} rad/s{_said(result['pressures'])}",
             flush=True,
         )
-    print(f"in all {total} steps, {bad} NaN states and warnings")
+    print(f"in all {total} steps, {bad} NaN states, warnings and pressures that cannot be")
     return 1 if bad else 0
 
 

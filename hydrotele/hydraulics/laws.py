@@ -102,15 +102,13 @@ def pressure_with_air(oil, release):
 
     Args:
         oil: P, what the lack of oil alone would give, scalar [Pa] above atmosphere.
-        release: R = a beta with the volume a of dissolved air at atmosphere per volume of oil, scalar
-            [Pa]; 0 for oil without air.
+        release: R = a beta with the volume a of dissolved air at atmosphere per volume of oil,
+            scalar [Pa]; 0 for oil without air.
 
     Returns:
         p, scalar [Pa] above atmosphere; P itself where that is not below 0.
 
-    Source: air release below saturation in equilibrium: Merritt 1967, sec. 2-3; Gholizadeh, Burton
-    and Schoenau 2012, "Fluid bulk modulus: comparison of low pressure models", Int. J. Fluid Power
-    13(1).
+    Source: Henry's and Boyle's law in equilibrium; see "Dissolved air" of the nominal model.
 
     >>> round(pressure_with_air(-1.0e8, 1.35e8))
     -43106

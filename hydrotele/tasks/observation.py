@@ -16,7 +16,7 @@ from hydrotele.tasks.memory import ARM
 _TURNS = 20.0  # rad: of a slewing house, which has no end
 _BEYOND = 0.15  # rad or m by which a joint and its sensor may read beyond the range
 _FASTEST = 5.0  # rad/s or m/s of a difference quotient of noisy readings
-_PRESSURES = (-1.0e6, 6.0e7)  # Pa: cavitation is not cut off, port reliefs open at some 32 MPa
+_PRESSURES = (-1.0e6, 6.0e7)  # Pa: with a sensor's offset and noise; reliefs open at some 32 MPa
 
 
 class Field(NamedTuple):

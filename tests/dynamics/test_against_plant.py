@@ -9,6 +9,8 @@ from hydrotele.drives import EndStop
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import predicted_channels, state_names
 from hydrotele.effects import apply_effect
+from hydrotele.hydraulics.laws import ATMOSPHERE
+from hydrotele.hydraulics.slots import SLOTS, Slot
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario
 
@@ -181,6 +183,42 @@ def test_a_cylinder_that_runs_into_its_end(machine_of, reduced_of, size):
     without = machine.model_copy(update={"axes": {"slide": machine.axes["slide"].model_copy(
         update={"end_stop": EndStop(stiffness=1e-6, damping=0.0)})}})  # fmt: skip
     assert beyond(differences_of(reduced_of, without, run, 40)), "without it, it leaves the stroke"
+
+
+def drawn_empty(run):
+    """Largest lack of pressure below atmosphere in a run of the plant [Pa]."""
+    names = [c for c in run.truth.columns if c.startswith("pressure_")]
+    return -min(run.truth[c].min() for c in names)
+
+
+def test_a_chamber_that_is_drawn_empty(machine_of, reduced_of):
+    """The wind takes the swing: its motor draws faster than the make-up valve fills."""
+    effect = ("force_pulse", "swing", {"size": 1.5e5, "start": 0.3, "duration": 0.4})
+    machine = apply_effect(machine_of("cat215/none"), *effect)
+    run = run_scenario(scenario("cat215/none", machine.axes, (effect,), 1.25e-4))
+    assert 0.3 * ATMOSPHERE < drawn_empty(run) < ATMOSPHERE
+    assert not beyond(differences_of(reduced_of, machine, run, 40))
+
+    def without_air(machine, channels):
+        model, space, z = reduced_of(machine, channels)
+        user = model.user.copy()
+        user[Slot.AIR_RELEASE :: SLOTS] = 0.0
+        return model._replace(user=user), space, z
+
+    assert beyond(differences_of(without_air, machine, run, 40)), "the air would not be missed"
+
+
+def test_the_plant_converges_to_the_reduced_model_in_hammering_chambers(machine_of, reduced_of):
+    """Torn by 1.1 MN a chamber empties, is filled and slams shut at 45 MPa, and both agree on it."""
+    effect = ("force_pulse", "boom", {"size": 1.1e6, "start": 0.3, "duration": 0.4})
+    machine, errors = apply_effect(machine_of("cat215/none"), *effect), []
+    for timestep in (2.5e-4, 1.25e-4):
+        run = run_scenario(scenario("cat215/none", machine.axes, (effect,), timestep))
+        assert 0.7 * ATMOSPHERE < drawn_empty(run) < ATMOSPHERE
+        found = differences_of(reduced_of, machine, run, 160)
+        errors.append([found[c][0] for c in ("angle.boom", "pressure_head.boom")])
+    ratio = np.array(errors[1]) / errors[0]
+    assert np.all((ratio > 0.4) & (ratio < 0.6)), errors  # first order, as everywhere
 
 
 @pytest.mark.parametrize(
