@@ -209,7 +209,7 @@ def test_a_chamber_that_is_drawn_empty(machine_of, reduced_of):
 
 
 def test_the_plant_converges_to_the_reduced_model_in_hammering_chambers(machine_of, reduced_of):
-    """Torn by 1.1 MN a chamber empties, is filled and slams shut at 45 MPa, and both agree on it."""
+    """Torn by 1.1 MN a chamber empties, is filled and slams shut at 45 MPa."""
     effect = ("force_pulse", "boom", {"size": 1.1e6, "start": 0.3, "duration": 0.4})
     machine, errors = apply_effect(machine_of("cat215/none"), *effect), []
     for timestep in (2.5e-4, 1.25e-4):

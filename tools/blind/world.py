@@ -479,7 +479,7 @@ def felt(p, drives):
     """Pressure above atmosphere of a chamber whose oil alone would be at p [Pa].
 
     Below atmosphere the air that comes out of V of oil fills `V a (-x) / (x + p_atm)` of what is
-    missing, `-V p / beta = -V x / beta + that`: Newton's method from 0, from where it only descends.
+    missing, `-V p / beta = -V x / beta + that`: Newton's method from 0, where it descends only.
     """
     if p >= 0.0:
         return p
