@@ -18,9 +18,11 @@ from hydrotele.errors import InputError
 from hydrotele.files import read_text
 from hydrotele.limits import beyond, limit
 
-Vector = tuple[float, float, float]
-Positive = Annotated[float, pydantic.Field(gt=0)]
-NonNegative = Annotated[float, pydantic.Field(ge=0)]
+LARGEST = 1.0e20  # of any SI number of a file, so that products of a few stay finite
+Number = Annotated[float, pydantic.Field(ge=-LARGEST, le=LARGEST)]
+Vector = tuple[Number, Number, Number]
+Positive = Annotated[float, pydantic.Field(gt=0, le=LARGEST)]
+NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST)]
 Name = Annotated[str, pydantic.Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
 PSI = 6894.757293168361  # Pa, exact pound-force and inch

@@ -128,6 +128,12 @@ class ForceDrive(Facts):
     friction: Friction = Friction()
     offset: float = 0.0
 
+    @model_validator(mode="after")
+    def _check(self):
+        if self.gain == 0.0:
+            raise ValueError("gain: 0 is a drive that no command moves; leave the axis out instead")
+        return self
+
 
 class FlowCurve(Facts):
     """Opening [1] over spool travel beyond the dead band [1], linear between 2 to 8 knots.

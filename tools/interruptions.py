@@ -112,7 +112,7 @@ class Bench:
 
 
 def trace(out: Path) -> dict:
-    """What is in a file or folder: hashes of files and tables, leaves of JSON, counts of recordings."""
+    """What is in a file or folder: hashes of files and tables, leaves of JSON, counts of rows."""
     facts = {}
     for file in sorted(out.rglob("*")) if out.is_dir() else [out]:
         if not file.is_file():

@@ -2,6 +2,7 @@
 
 import math
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hydrotele.errors import InputError
 from hydrotele.kinematics.from_machine import check_strokes
 from hydrotele.machine import Machine
 from hydrotele.machine_file import load_machine, machine_path, save_machine, shipped_machines
+from hydrotele.resources import models_folder
 from hydrotele.simulate.mechanism import assemble, mjcf_document
 from hydrotele.simulate.plant import build_plant, rest_state
 
@@ -533,11 +535,20 @@ def test_facts_refuse_infinity(write):
         (("relief_pressure_bar: 200", "relief_pressure: 200"), "is not below relief_pressure 200"),
         (("bulk_modulus: 0.9e9", "bulk_modulus: 900"), "greater than or equal to 10000000"),
         (("home: {jib: 0.3}", "home: {jib: 1.3}"), "home.jib: 1.3 is outside its range"),
+        (("stroke: 0.85", "stroke: 1.0e+200"), "less than or equal to 100000000000000000000"),
     ],
 )
 def test_impossible_machines_are_refused(write, change, said):
     """Slips of unit and sign that would simulate nonsense."""
     assert said in refusal(write(edited(change)))
+
+
+def test_a_drive_without_gain_is_refused(tmp_path):
+    shutil.copytree(models_folder() / "emps", tmp_path / "emps")
+    file = tmp_path / "emps/machine.yaml"
+    file.write_text(file.read_text().replace("gain: 35.150651882", "gain: 0"))
+    with pytest.raises(InputError, match="a drive that no command moves"):
+        load_machine(str(tmp_path / "emps"))
 
 
 def test_stroke_must_span_the_range_of_the_joint(write):
