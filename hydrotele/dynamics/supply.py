@@ -10,7 +10,7 @@ from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
 from hydrotele.terms.table import added_with_slope
 
-_AIR = int(Slot.AIR_RELEASE)
+_AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 
 
 @lean
@@ -31,8 +31,9 @@ def feel(model, sp, z):
     for k in range(len(sp.act)):
         sp.act[k] = z[first + k]
     for i in range(model.hydraulic):
+        release, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
         for k in range(4 * i + 2, 4 * i + 4):
-            sp.act[k] = pressure_with_air(sp.act[k], model.user[i * SLOTS + _AIR])
+            sp.act[k] = pressure_with_air(sp.act[k], release, onset)
 
 
 @lean
@@ -53,8 +54,9 @@ def keep(model, sp, z):
     for k in range(len(sp.act)):
         z[first + k] = sp.act[k]
     for i in range(model.hydraulic):
+        release, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
         for k in range(4 * i + 2, 4 * i + 4):
-            z[first + k] = pressure_without_air(sp.act[k], model.user[i * SLOTS + _AIR])
+            z[first + k] = pressure_without_air(sp.act[k], release, onset)
 
 
 @lean

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.compiled import compiled
-from hydrotele.dataset.load import RunData
+from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import place
-from hydrotele.dynamics.model import X, model_space, reduced_model
+from hydrotele.dynamics.model import X, model_space
 from hydrotele.dynamics.supply import supply_of
 from hydrotele.effects import Parameter
 from hydrotele.gap.law_regression import Regression, regression
@@ -34,7 +34,7 @@ from hydrotele.prediction.free_run import free_run_errors, machine_runner
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
 from hydrotele.prediction.inputs import Input, input_sizes, input_units
 from hydrotele.prediction.levels import smoothed
-from hydrotele.prediction.track import Track
+from hydrotele.prediction.track import Track, following_model
 from hydrotele.terms.facts import Term
 
 LEARNED = "learned"
@@ -109,7 +109,7 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
     begin, ahead = judged.loss, _open_loop(evidence, evidence.runs, judged, noise)
     for _ in range(_MOST):
         evidence.set_base(judged)
-        seen = [_see(evidence.data.machine, judged, track) for track in judged.tracks]
+        seen = [_see(evidence.data, judged, track) for track in judged.tracks]
         found = _best_law(evidence, judged, _candidates(evidence, judged, seen, laws))
         if found is None:
             break
@@ -202,12 +202,12 @@ def _drives_of(model, sp, states, position, velocity, act, supply):
             supply[row] = supply_of(model, sp, states[row])
 
 
-def _see(nominal: Machine, judged: Judged, track: Track) -> _Seen:
-    machine = judged.guess.machine(nominal)
+def _see(data: Dataset, judged: Judged, track: Track) -> _Seen:
+    machine = judged.guess.machine(data.machine)
     size = track.states.shape[1]
     run, told = smoothed(track)
     states = track.states - run.correction[:, :size] + told.deviation[:, :size]
-    model = reduced_model(machine, ())
+    model = following_model(machine, data)
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
     supply, act = np.zeros(len(states)), np.empty((len(states), 4 * model.hydraulic))

@@ -74,6 +74,7 @@ _SLEW, _PORT = int(Slot.SLEW_LIMIT), int(Slot.PORT_RELIEF)
 _KR, _KM = int(Slot.RELIEF_GAIN), int(Slot.MAKEUP_GAIN)
 _BETA, _TANK = int(Slot.BULK_MODULUS), int(Slot.TANK_PRESSURE)
 _HOSE, _AIR = int(Slot.HOSE_COMPLIANCE), int(Slot.AIR_RELEASE)
+_ONSET = int(Slot.AIR_ONSET)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
@@ -231,9 +232,9 @@ def step_circuit(
         head, rod, j_head, j_rod = pressure_rates(
             user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3], x, v, dt, more,
         )  # fmt: skip
-        f, k, air = _FACTORS + a, _FIRST + 2 * i, user[u + _AIR]
-        scratch[k] = _softening_ahead(act[a + 2], head, dt, air)
-        scratch[k + 1] = _softening_ahead(act[a + 3], rod, dt, air)
+        f, k = _FACTORS + a, _FIRST + 2 * i
+        scratch[k] = _softening_ahead(user, u, act[a + 2], head, dt)
+        scratch[k + 1] = _softening_ahead(user, u, act[a + 3], rod, dt)
         scratch[f] = 1.0 / (1.0 - gamma_h * (scratch[k] * j_head))
         scratch[f + 1] = 1.0 / (1.0 - gamma_h * (scratch[k + 1] * j_rod))
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
@@ -242,10 +243,10 @@ def step_circuit(
         _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch)
         _couple(count, act_dot, scratch)
     for i in range(count):
-        a, k, air = 4 * i, _FIRST + 2 * i, user[(first + i) * SLOTS + _AIR]
+        u, a, k = (first + i) * SLOTS, 4 * i, _FIRST + 2 * i
         scratch[k], scratch[k + 1] = act_dot[a + 2], act_dot[a + 3]
-        act_dot[a + 2] = _rate_with_air(act[a + 2], act_dot[a + 2], dt, air)
-        act_dot[a + 3] = _rate_with_air(act[a + 3], act_dot[a + 3], dt, air)
+        act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], act_dot[a + 2], dt)
+        act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], act_dot[a + 3], dt)
     open_ports(user, act, act_dot, scratch, first, count, dt, act_dot)
     if memory is None:
         p_end = circuit_supply(user, first, count, scratch)
@@ -277,31 +278,33 @@ def step_circuit(
     if coupled:
         _couple(count, act_dot, scratch)
     for i in range(count):
-        a, k, air = 4 * i, _FIRST + 2 * i, user[(first + i) * SLOTS + _AIR]
+        u, a, k = (first + i) * SLOTS, 4 * i, _FIRST + 2 * i
         head = 1.5 * scratch[k] + 0.5 * act_dot[a + 2]
         rod = 1.5 * scratch[k + 1] + 0.5 * act_dot[a + 3]
-        act_dot[a + 2] = _rate_with_air(act[a + 2], head, dt, air)
-        act_dot[a + 3] = _rate_with_air(act[a + 3], rod, dt, air)
+        act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], head, dt)
+        act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], rod, dt)
     return p_start, p_end
 
 
 @compiled
-def _rate_with_air(pressure, rate, dt, release):
+def _rate_with_air(user, u, pressure, rate, dt):
     """Mean rate of a pressure over a step in which it would change at a rate without air [Pa/s]."""
-    if (pressure >= 0.0 and pressure + dt * rate >= 0.0) or release == 0.0:
+    release, onset = user[u + _AIR], user[u + _ONSET]
+    if (pressure >= -onset and pressure + dt * rate >= -onset) or release == 0.0:
         return rate
-    oil = pressure_without_air(pressure, release)
-    return (pressure_with_air(oil + dt * rate, release) - pressure) / dt
+    oil = pressure_without_air(pressure, release, onset)
+    return (pressure_with_air(oil + dt * rate, release, onset) - pressure) / dt
 
 
 @compiled
-def _softening_ahead(pressure, rate, dt, release):
+def _softening_ahead(user, u, pressure, rate, dt):
     """Softening that slopes reckon with over a step: none where the step would refill a chamber."""
-    if pressure >= 0.0 or release == 0.0:
+    release, onset = user[u + _AIR], user[u + _ONSET]
+    if pressure >= -onset or release == 0.0:
         return 1.0
-    if pressure_without_air(pressure, release) + dt * rate > 0.0:
+    if pressure_without_air(pressure, release, onset) + dt * rate > -onset:
         return 1.0
-    return softening(pressure, release)
+    return softening(pressure, release, onset)
 
 
 @compiled

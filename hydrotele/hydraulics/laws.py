@@ -92,7 +92,7 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
 
 
 @compiled
-def pressure_with_air(oil, release):
+def pressure_with_air(oil, release, onset=0.0):
     """Pressure in a chamber whose oil gives off its dissolved air below atmosphere.
 
     Oil drawn below atmospheric pressure gives off air in proportion to the missing pressure
@@ -104,9 +104,11 @@ def pressure_with_air(oil, release):
         oil: P, what the lack of oil alone would give, scalar [Pa] above atmosphere.
         release: R = a beta with the volume a of dissolved air at atmosphere per volume of oil,
             scalar [Pa]; 0 for oil without air.
+        onset: by how much oil must lack atmosphere before air comes out, scalar [Pa]: 0 in a
+            machine; a filter cannot tell less than the noise of its readings.
 
     Returns:
-        p, scalar [Pa] above atmosphere; P itself where that is not below 0.
+        p, scalar [Pa] above atmosphere; P itself where that is not below -onset.
 
     Source: Henry's and Boyle's law in equilibrium; see "Dissolved air" of the nominal model.
 
@@ -115,19 +117,21 @@ def pressure_with_air(oil, release):
     >>> pressure_with_air(2.0e6, 1.35e8)
     2000000.0
     """
-    if oil >= 0.0 or release == 0.0:
+    lack = oil + onset
+    if lack >= 0.0 or release == 0.0:
         return oil
-    b = ATMOSPHERE + release - oil
-    return 2.0 * oil * ATMOSPHERE / (b + math.sqrt(b * b + 4.0 * oil * ATMOSPHERE))
+    b = ATMOSPHERE + release - lack
+    return 2.0 * lack * ATMOSPHERE / (b + math.sqrt(b * b + 4.0 * lack * ATMOSPHERE)) - onset
 
 
 @compiled
-def pressure_without_air(pressure, release):
+def pressure_without_air(pressure, release, onset=0.0):
     """What a pressure below atmosphere would be if the oil gave off no air.
 
     Args:
-        pressure: p, scalar [Pa] above atmosphere, above -ATMOSPHERE where there is air.
+        pressure: p, scalar [Pa] above atmosphere, above -ATMOSPHERE - onset where there is air.
         release: R, scalar [Pa].
+        onset: scalar [Pa].
 
     Returns:
         P, scalar [Pa].
@@ -137,21 +141,23 @@ def pressure_without_air(pressure, release):
     >>> round(pressure_without_air(pressure_with_air(-1.0e8, 1.35e8), 1.35e8))
     -100000000
     """
-    if pressure >= 0.0 or release == 0.0:
+    lack = pressure + onset
+    if lack >= 0.0 or release == 0.0:
         return pressure
-    return pressure * (1.0 + release / (pressure + ATMOSPHERE))
+    return lack * (1.0 + release / (lack + ATMOSPHERE)) - onset
 
 
 @compiled
-def softening(pressure, release):
+def softening(pressure, release, onset=0.0):
     """How much less the pressure of oil with released air changes than that of oil alone.
 
     Args:
         pressure: p, scalar [Pa] above atmosphere.
         release: R, scalar [Pa].
+        onset: scalar [Pa].
 
     Returns:
-        dp/dP, scalar [1]: 1 where p is not below 0.
+        dp/dP, scalar [1]: 1 where p is not below -onset.
 
     Source: derivative of `pressure_with_air`.
 
@@ -160,9 +166,9 @@ def softening(pressure, release):
     >>> round(1.0 / softening(-50662.5, 1.35e8))
     5330
     """
-    if pressure >= 0.0 or release == 0.0:
+    if pressure + onset >= 0.0 or release == 0.0:
         return 1.0
-    absolute = pressure + ATMOSPHERE
+    absolute = pressure + onset + ATMOSPHERE
     return 1.0 / (1.0 + release * ATMOSPHERE / (absolute * absolute))
 
 

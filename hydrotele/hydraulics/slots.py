@@ -40,6 +40,7 @@ class Slot(enum.IntEnum):
     BULK_MODULUS = enum.auto()
     TANK_PRESSURE = enum.auto()
     AIR_RELEASE = enum.auto()
+    AIR_ONSET = enum.auto()
     RELIEF_PRESSURE = enum.auto()
     PUMP_FLOW = enum.auto()
     COULOMB = enum.auto()

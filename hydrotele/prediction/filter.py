@@ -24,7 +24,8 @@ from hydrotele.hydraulics.laws import softening
 from hydrotele.hydraulics.pump import STALLED
 from hydrotele.prediction.late import begin_late, move_late, nudge_late, spread_late
 
-_KIND, _PUMPED, _AIR = int(Slot.KIND), float(Kind.PUMPED), int(Slot.AIR_RELEASE)
+_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
+_AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _ASYMMETRY, _DELIVERY = int(Slot.COULOMB_ASYMMETRY), int(Slot.DELIVERY)
 
@@ -61,8 +62,8 @@ def _slopes(model, sp, z, nudge, slope, moved):
                 for f in range(n):
                     slope[c, f] = model.scale[c] * sp.row[i, f]
         elif model.kind[c] < 4:
-            air = model.user[i * SLOTS + _AIR]
-            soft = softening(sp.act[4 * i + model.kind[c]], air)
+            air, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
+            soft = softening(sp.act[4 * i + model.kind[c]], air, onset)
             slope[c, first + 4 * i + model.kind[c]] = model.scale[c] * soft
     for c in range(len(model.kind)):
         if model.kind[c] != 4:

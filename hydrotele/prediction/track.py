@@ -8,7 +8,8 @@ import numpy as np
 
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
-from hydrotele.hydraulics.parameters import longest_step
+from hydrotele.hydraulics.parameters import actuator_order, longest_step
+from hydrotele.hydraulics.slots import SLOTS, Slot
 from hydrotele.machine import Machine
 from hydrotele.prediction.filter import Gains, filter_run
 from hydrotele.prediction.inputs import Input, decay, input_drift
@@ -104,6 +105,7 @@ STARTLE = {
     "delivery": 0.2,
 }
 
+_DOUBT = 3.0  # times a reading's noise: lacks of pressure below it are taken for noise
 _LOOK = 3.0  # s at a run's start that tell where drives rested in their backlash
 
 
@@ -177,7 +179,7 @@ def track_run(
     Returns:
         The track.
     """
-    model = reduced_model(machine, data.channels)
+    model = following_model(machine, data)
     names = state_names(machine)
     if kept is not None:
         levels, columns = kept.levels, _for_states(kept, names)
@@ -202,6 +204,22 @@ def track_run(
         )
     return _cross(machine, model, data, run, kept, step, rest, levels, columns, noise, linearise,
                   flow)  # fmt: skip
+
+
+def following_model(machine: Machine, data: Dataset) -> Model:
+    """Reduced model whose chambers give off air only where readings can tell that they lack oil.
+
+    An estimate below atmosphere by less than a few times the noise is mostly just that; taken for a
+    chamber with air it would be a thousand times as soft, and stay there. A chamber whose pressure
+    no sensor reads is taken for filled.
+    """
+    model, user = reduced_model(machine, data.channels), None
+    noise = dict(zip(data.channels, data.noise, strict=True))
+    for i, name in enumerate(actuator_order(machine)[: model.hydraulic]):
+        read = [noise.get(f"pressure_{side}.{name}", np.nan) for side in ("head", "rod")]
+        user = model.user.copy() if user is None else user
+        user[i * SLOTS + Slot.AIR_ONSET] = np.inf if np.isnan(read).any() else _DOUBT * max(read)
+    return model if user is None else model._replace(user=user)
 
 
 def _for_states(kept: Track, names: list[str]) -> np.ndarray:
