@@ -113,6 +113,22 @@ def test_the_machines_agree_where_a_chamber_is_drawn_empty():
     assert np.abs(other[empty, lack] - drawn[empty]).max() < 0.01 * ATMOSPHERE
 
 
+def test_a_delay_is_not_rounded_to_the_integrators_steps():
+    """What 0.2 ms more of delay do is 0.4 of what a step of 0.5 ms more does."""
+    commands, ends = np.zeros((40, 3)), []
+    commands[5:, 1] = 0.5
+    start = np.zeros((3, STATES))
+    start[:, Q], start[:, [PA, PB]] = (
+        [0.1, 0.45, -1.4],
+        [[2e6, 2e6], [8.7e6, 2.6e6], [1.9e6, 3.8e6]],
+    )
+    for delay in (0.0500, 0.0502, 0.0505):  # a step is 0.5 ms
+        late = apply_effect(CAT, "command_delay", "boom", {"delay": delay})
+        ends.append(replay(late, start, commands, 0.02, 40)[-1, 1])
+    share = (ends[1] - ends[0]) / (ends[2] - ends[0])
+    assert share == pytest.approx(0.4, abs=0.01)  # of a path that bends little over 0.5 ms
+
+
 @pytest.fixture(scope="module")
 def asked():
     return references(CAT, np.random.default_rng(4), SHORT)

@@ -706,6 +706,14 @@ def _rk4(machine, y, u, terms, dt, k, trial, work):
 
 
 @_jit
+def _arrived(command, late, closed):
+    """Command that holds at a time, in rows: before the first one that, or none."""
+    index = int(math.floor(late + 1.0e-9))
+    sent = 0.0 if index < 0 and closed else command[max(0, index)]
+    return min(1.0, max(-1.0, sent))
+
+
+@_jit
 def simulate(machine, start, commands, closed, reference, ahead, arm, gains, noise, period, steps,
              restart, states):  # fmt: skip
     """Run the machine along given commands, or under a controller that sees its sensors.
@@ -789,9 +797,12 @@ def simulate(machine, start, commands, closed, reference, ahead, arm, gains, noi
                         commands[row, i] = math.floor(o * 2048.0 + 0.5) / 2048.0
             for i in range(n):
                 late = (at * dt - machine.drives.delay[i]) / period
-                index = int(math.floor(late + 1.0e-9))
-                u[i] = 0.0 if index < 0 and closed else commands[max(0, index), i]
-                u[i] = min(1.0, max(-1.0, u[i]))
+                u[i] = _arrived(commands[:, i], late, closed)
+                end = late + dt / period
+                begun = end - math.floor(end - 1.0e-9)  # of a row, by this step's end
+                if begun * period < dt:  # the command changes inside the step: its mean counts
+                    after = _arrived(commands[:, i], end - 2.0e-9, closed)
+                    u[i] += (after - u[i]) * begun * period / dt
             unknown_term(machine, y, u, supply, at * dt, memory, terms)
             _rk4(machine, y, u, terms, dt, k, trial, work)
     return readings, clean
