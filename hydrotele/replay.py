@@ -134,8 +134,8 @@ def _start(plant: Plant, log: Log) -> dict[str, Any]:
     valves = axes[: plant.hydraulic]
     names = [f"pressure_{side}.{a}" for side in ("head", "rod") for a in valves]
     if valves and all(n in log for n in names):
-        state["pressure_head"] = [_first(plant, log, f"pressure_head.{a}") for a in valves]
-        state["pressure_rod"] = [_first(plant, log, f"pressure_rod.{a}") for a in valves]
+        for side in ("pressure_head", "pressure_rod"):  # a lack at rest is the reading's noise
+            state[side] = [max(0.0, _first(plant, log, f"{side}.{a}")) for a in valves]
     return state
 
 

@@ -199,7 +199,12 @@ def _end(bench: Bench, name: str, out: Path, how: int, dice: random.Random) -> I
 
 def _again(bench: Bench, name: str, out: Path) -> Iterator[str]:
     process = bench.start(bench.words(name, out))
-    said = process.communicate()[1]
+    try:
+        said = process.communicate(timeout=4 * bench.seconds[name] + SECONDS)[1]
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        yield "afterwards: it hangs"
+        return
     if process.returncode:
         yield f"afterwards: status {process.returncode}: {said[-300:]}"
     elif wrong := bench.check(name, out):

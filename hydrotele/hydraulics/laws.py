@@ -10,6 +10,7 @@ import math
 from hydrotele.compiled import compiled
 
 ATMOSPHERE = 101325.0  # Pa
+_VACUUM = 0.01  # Pa absolute: what is said to be at or below it counts as this
 
 
 @compiled
@@ -129,7 +130,7 @@ def pressure_without_air(pressure, release, onset=0.0):
     """What a pressure below atmosphere would be if the oil gave off no air.
 
     Args:
-        pressure: p, scalar [Pa] above atmosphere, above -ATMOSPHERE - onset where there is air.
+        pressure: p, scalar [Pa] above atmosphere; what is below vacuum counts as nearly that.
         release: R, scalar [Pa].
         onset: scalar [Pa].
 
@@ -144,6 +145,7 @@ def pressure_without_air(pressure, release, onset=0.0):
     lack = pressure + onset
     if lack >= 0.0 or release == 0.0:
         return pressure
+    lack = max(lack, _VACUUM - ATMOSPHERE)
     return lack * (1.0 + release / (lack + ATMOSPHERE)) - onset
 
 
@@ -168,7 +170,7 @@ def softening(pressure, release, onset=0.0):
     """
     if pressure + onset >= 0.0 or release == 0.0:
         return 1.0
-    absolute = pressure + onset + ATMOSPHERE
+    absolute = max(pressure + onset + ATMOSPHERE, _VACUUM)
     return 1.0 / (1.0 + release * ATMOSPHERE / (absolute * absolute))
 
 

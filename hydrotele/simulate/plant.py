@@ -8,7 +8,9 @@ import mujoco
 import numpy as np
 
 from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air
 from hydrotele.hydraulics.parameters import actuator_order, memory_names
+from hydrotele.hydraulics.slots import Slot
 from hydrotele.machine import Machine
 from hydrotele.simulate.bristles import set_bristles, write_bristles
 from hydrotele.simulate.closure import (
@@ -223,6 +225,8 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
         for name, value in zip(order, state.get(key, ()), strict=False):
             i = plant.axes.index(name)
             if i < plant.hydraulic:
+                if key.startswith("pressure") and value <= -ATMOSPHERE:  # of oil that held its air
+                    value = pressure_with_air(value, plant.model.actuator_user[i, Slot.AIR_RELEASE])
                 data.act[ACTIVATIONS * i + column] = value
     for name, place in plant.memory.items():
         kind, _, owner = name.partition(".")

@@ -140,6 +140,16 @@ def test_with_and_without_air_are_inverse_over_all_that_a_chamber_may_lack():
             assert pressure_without_air(felt, release) == pytest.approx(oil, rel=1e-6)
 
 
+def test_what_is_said_to_be_below_vacuum_is_nearly_empty_and_nothing_worse(boom):
+    """Readings and states of other programs may be anything; none may turn into a pressure wave."""
+    for start in (-ATMOSPHERE, -120e3, -2.9e6):
+        assert pressure_without_air(start, 8.1e7) < -ATMOSPHERE
+        states = run(boom, lambda _: (0.5, 0.0), 1e-3, 0.2, start=(start, 1.0e6))
+        assert np.isfinite(states).all()
+        assert states[1:].max() < 1.1e6
+        assert states[1:].min() > -ATMOSPHERE
+
+
 def test_axes_that_share_a_supply_stay_sound_while_one_of_them_is_empty():
     """A fed chamber that is drawn empty beside one that the supply couples it with."""
     user = np.concatenate(list(actuator_numbers(load_machine("cat215", "none")).values()))
