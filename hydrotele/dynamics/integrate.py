@@ -43,12 +43,30 @@ _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 
 @lean
 def place(model, sp, z):
-    """Put mechanism and drives at a state: frames, positions, Jacobian rows, pressures felt.
+    """Put mechanism and drives at a state: `place_mechanism`, and the pressures that are felt.
 
     Args:
         model: Model.
-        sp: Space; `motion`, `row`, `act` and X of `drive` are written. X of a drive with a
-            transmission is its own position, not the load's.
+        sp: Space; what `place_mechanism` says and `act` are written.
+        z: (nz,) state.
+
+    Returns:
+        Nothing.
+
+    Source: `place_mechanism`, `supply.feel`.
+    """
+    place_mechanism(model, sp, z)
+    feel(model, sp, z)
+
+
+@lean
+def place_mechanism(model, sp, z):
+    """Put the mechanism at a state: frames, drive positions and their Jacobian rows.
+
+    Args:
+        model: Model.
+        sp: Space; `motion`, `row` and X of `drive` are written. X of a drive with a transmission
+            is its own position, not the load's.
         z: (nz,) state.
 
     Returns:
@@ -85,7 +103,6 @@ def place(model, sp, z):
                 sp.row[i, f] = total
         gear = model.gear[i]
         sp.drive[X, i] = load_position(model, sp, i) if gear < 0 else z[n + gear]
-    feel(model, sp, z)
 
 
 @lean

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hydrotele.dynamics.forces import gather_forces
-from hydrotele.dynamics.integrate import place
+from hydrotele.dynamics.integrate import place_mechanism
 from hydrotele.dynamics.model import X
 from hydrotele.errors import InputError
 from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
@@ -111,7 +111,7 @@ def tip_drive(
 def _inertia(arm: Arm, row: int) -> tuple[float, np.ndarray, np.ndarray]:
     """Effective mass, Jacobian row (k,), and joint rates (k,) for a unit rate of the coordinate."""
     motion, k = arm.space.motion, len(arm.joint)
-    place(arm.model, arm.space, arm.z)
+    place_mechanism(arm.model, arm.space, arm.z)
     gather_forces(arm.model.mech, motion)
     full = motion.basis.T @ motion.mass @ motion.basis
     own = full[np.ix_(arm.joint, arm.joint)]

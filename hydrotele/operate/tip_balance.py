@@ -7,7 +7,7 @@ import numpy as np
 
 from hydrotele.compiled import lean
 from hydrotele.dynamics.forces import gather_forces
-from hydrotele.dynamics.integrate import place
+from hydrotele.dynamics.integrate import place_mechanism
 from hydrotele.dynamics.mechanism import DAMPING, Mechanism
 from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Motion
 from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
@@ -87,7 +87,7 @@ def dynamic_balance(arm, outside):
     """
     model, m = arm.model, arm.space.motion
     n, nt = len(outside), m.joint.shape[1]
-    place(model, arm.space, arm.z)
+    place_mechanism(model, arm.space, arm.z)
     gather_forces(model.mech, m)
     for f in range(n):
         outside[f] = 0.0
@@ -119,7 +119,7 @@ def static_balance(arm, outside):
 
     Source: Zhu 1994, 6.6.
     """
-    place(arm.model, arm.space, arm.z)
+    place_mechanism(arm.model, arm.space, arm.z)
     for f in range(len(outside)):
         outside[f] = 0.0
     for i in range(len(arm.joint)):
