@@ -6,7 +6,6 @@ what the chamber's relief valve lets stand at the flow that the piston presses t
 
 import argparse
 import sys
-import time
 
 import mujoco
 import numpy as np
@@ -101,10 +100,11 @@ class Pressures:
 def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator) -> dict:
     """Random commands with one tool.
 
-    Half of the simulations add a drift to their commands, which drives them into limits and ground.
+    Half of the simulations add a drift to their commands, which drives them into limits and ground;
+    a quarter has commands of -1 or 1 only.
 
     Returns:
-        Counts and extremes: steps, rate [1/s], nan, warnings, gap [m], speed [rad/s], pressures.
+        Counts and extremes: steps, nan, warnings, gap [m], speed [rad/s], pressures.
     """
     plant = build_plant(load_machine(machine, tool), args.timestep)
     states = reachable_states(plant, STATES, rng)
@@ -113,7 +113,6 @@ def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator
     warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), dtype=np.int64)
     drift, gap, speed, nan, done = np.zeros(batch.ctrl.shape), 0.0, 0.0, 0, 0
     pressures = Pressures(plant)
-    start = time.perf_counter()
     for k in range(-(-steps // (args.simulations * args.hold))):
         fresh = k % max(1, args.reset // args.hold) == 0
         if fresh:
@@ -123,6 +122,7 @@ def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator
             batch.qpos[:], batch.act[:] = chosen[:, :nq], chosen[:, nq:]
             drift[::2] = rng.uniform(-1.5, 1.5, drift[::2].shape)
         batch.ctrl[:] = np.clip(drift + rng.uniform(-1.0, 1.0, drift.shape), -1.0, 1.0)
+        batch.ctrl[1::4] = np.sign(batch.ctrl[1::4])
         for step in range(args.hold):
             batch.step(nstep=1)
             pressures.look(batch, fresh and step == 0)
@@ -134,7 +134,6 @@ def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator
     warnings += batch.warning[:, :, 1].sum(axis=0)
     return {
         "steps": done,
-        "rate": done / (time.perf_counter() - start),
         "nan": nan,
         "warnings": {mujoco.mjtWarning(i).name: int(n) for i, n in enumerate(warnings) if n},
         "gap": gap,
@@ -144,20 +143,19 @@ def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator
 
 
 def _said(pressures: Pressures) -> str:
+    """The table's two columns of pressures."""
     if not np.isfinite(pressures.least):
-        return ""
-    said = f", pressures {pressures.least / 1e6:.4f} .. {pressures.most / 1e6:.1f} MPa absolute"
-    if np.isfinite(pressures.beyond):
-        said += f", {pressures.beyond / 1e6:+.2f} MPa beyond a relief's characteristic at most"
-    return said
+        return "- | -"
+    beyond = f"{pressures.beyond / 1e6:+.2f}" if np.isfinite(pressures.beyond) else "-"
+    return f"{pressures.least / 1e6:.4f} .. {pressures.most / 1e6:.1f} | {beyond}"
 
 
 def main() -> int:
     """Parse the arguments, run every tool, print one line each; 1 where one is not as wanted."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--machine", default="cat215")
-    parser.add_argument("--tools", nargs="*", help="default: all tools of the machine")
-    parser.add_argument("--steps", type=float, default=1e7, help="in all, over all tools")
+    parser.add_argument("--machines", nargs="+", default=["cat215"])
+    parser.add_argument("--tools", nargs="*", help="default: all tools of each machine")
+    parser.add_argument("--steps", type=float, default=1e7, help="in all: machines, then tools")
     parser.add_argument("--simulations", type=int, default=256)
     parser.add_argument("--hold", type=int, default=20, help="steps for which a command is held")
     parser.add_argument("--threads", type=int, default=2)
@@ -165,23 +163,29 @@ def main() -> int:
     parser.add_argument("--timestep", type=float, default=1.0e-3, help="[s]")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    tools = args.tools or load_machine(args.machine).tools
     rng = np.random.default_rng(args.seed)
     total, bad = 0, 0
-    for tool in tools:
-        result = run_tool(args.machine, tool, int(args.steps / len(tools)), args, rng)
-        total += result["steps"]
-        bad += result["nan"] + sum(result["warnings"].values())
-        bad += result["pressures"].least <= 0.0
-        bad += result["pressures"].beyond > 0.0
-        print(
-            f"{tool}: {result['steps']} steps, {result['rate']:.0f} steps/s, NaN {result['nan']},"
-            f" warnings {result['warnings'] or 'none'},"
-            f" largest pin opening {1e3 * result['gap']:.4f} mm,"
-            f" fastest driven joint {result['speed']:.1f} rad/s{_said(result['pressures'])}",
-            flush=True,
-        )
-    print(f"in all {total} steps, {bad} NaN states, warnings and pressures that cannot be")
+    print(
+        "| machine | tool | steps | NaN | warnings | pins open [mm] | fastest [rad/s, m/s] |"
+        " pressures [MPa absolute] | beyond relief [MPa] |\n" + "| --- " * 2 + "| ---: " * 7 + "|"
+    )
+    for name in args.machines:
+        tools = args.tools or load_machine(name).tools
+        for tool in tools:
+            steps = int(args.steps / len(args.machines) / len(tools))
+            result = run_tool(name, tool, steps, args, rng)
+            pressures = result["pressures"]
+            total += result["steps"]
+            bad += result["nan"] + sum(result["warnings"].values())
+            bad += pressures.least <= 0.0
+            bad += pressures.beyond > 0.0
+            print(
+                f"| {name} | {tool} | {result['steps']} | {result['nan']} |"
+                f" {result['warnings'] or 0} | {1e3 * result['gap']:.4f} |"
+                f" {result['speed']:.1f} | {_said(pressures)} |",
+                flush=True,
+            )
+    print(f"\nIn all {total} steps, {bad} NaN states, warnings and pressures that cannot be.")
     return 1 if bad else 0
 
 

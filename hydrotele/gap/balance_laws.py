@@ -21,12 +21,13 @@ from hydrotele.hydraulics.circuit import (
     pump_response,
     wanted_share,
 )
-from hydrotele.hydraulics.laws import port_flow
+from hydrotele.hydraulics.laws import port_flow, softening
 
 _AH, _AR, _LEAK = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.LEAKAGE)
 _PORT, _KR = int(Slot.PORT_RELIEF), int(Slot.RELIEF_GAIN)
 _TANK, _KM = int(Slot.TANK_PRESSURE), int(Slot.MAKEUP_GAIN)
 _BETA, _HOSE = int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE)
+_AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 
 
@@ -92,7 +93,9 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
         velocity: (n,) piston velocity [m/s] or [rad/s].
 
     Returns:
-        (2, n) residual flows of head and rod chamber [m^3/s]; positive: oil is missing.
+        (2, n) residual flows of head and rod chamber [m^3/s]; positive: oil is missing. Those of a
+        chamber drawn below atmosphere count as little as its pressure tells of them
+        (`laws.softening`).
 
     Source: nominal model, "Chambers".
     """
@@ -107,8 +110,10 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
         leak = user[_LEAK] * (p_head - p_rod)
         stored_head = (volumes[0, k] / beta + hose) * head[1, k]
         stored_rod = (volumes[1, k] / beta + hose) * rod[1, k]
-        out[0, k] = stored_head + user[_AH] * velocity[k] + leak - q_head - r_head
-        out[1, k] = stored_rod - user[_AR] * velocity[k] - leak - q_rod - r_rod
+        soft_head = softening(p_head, user[_AIR], user[_ONSET])
+        soft_rod = softening(p_rod, user[_AIR], user[_ONSET])
+        out[0, k] = stored_head + soft_head * (user[_AH] * velocity[k] + leak - q_head - r_head)
+        out[1, k] = stored_rod - soft_rod * (user[_AR] * velocity[k] + leak + q_rod + r_rod)
     return out
 
 

@@ -5,8 +5,21 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hydrotele.hydraulics.circuit import SLOTS, Slot, circuit_scratch, step_circuit
-from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air, pressure_without_air
+from hydrotele.gap.balance_laws import chamber_residuals
+from hydrotele.hydraulics.circuit import (
+    SLOTS,
+    Slot,
+    axis_opening,
+    circuit_scratch,
+    pressure_rates,
+    step_circuit,
+)
+from hydrotele.hydraulics.laws import (
+    ATMOSPHERE,
+    pressure_with_air,
+    pressure_without_air,
+    softening,
+)
 from hydrotele.hydraulics.parameters import actuator_numbers
 from hydrotele.machine_file import load_machine
 
@@ -168,3 +181,21 @@ def test_axes_that_share_a_supply_stay_sound_while_one_of_them_is_empty():
     assert min(least) < 0.0, "the boom is not drawn empty here"
     assert np.ptp(least[-100:]) < 1e3, "the fed chamber hunts"
     assert len(user) == 3 * SLOTS
+
+
+def test_a_balance_of_readings_misses_no_oil_where_a_chamber_gives_off_air(boom):
+    """Readings of a chamber below atmosphere, whose true rates `pressure_rates` has."""
+    pressures, x, v, spool = np.array([-6.0e4, 2.0e6]), 0.5, 0.3, 0.2
+    numbers = (boom, 0, axis_opening(boom, 0, spool), 20.0e6, *pressures, x, v, 0.0, (0.0,) * 4)
+    oil = np.array(pressure_rates(*numbers)[:2])
+    soft = np.array([softening(p, boom[Slot.AIR_RELEASE]) for p in pressures])
+    assert soft[0] < 1e-3 and soft[1] == 1.0
+    volumes = np.array([
+        [boom[Slot.VOLUME_HEAD] + boom[Slot.AREA_HEAD] * x],
+        [boom[Slot.VOLUME_ROD] + boom[Slot.AREA_ROD] * (boom[Slot.STROKE] - x)],
+    ])  # fmt: skip
+    sides = np.stack([pressures, oil * soft], axis=1)[:, :, None]
+    lacks = chamber_residuals(
+        boom, np.array([spool]), np.array([20.0e6]), *sides, volumes, np.array([v])
+    )
+    assert np.abs(lacks).max() < 1e-12 * boom[Slot.AREA_HEAD] * v
