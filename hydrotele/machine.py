@@ -294,6 +294,10 @@ def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis]) -> None:
         _expect(term.axis, axes, f"terms.{k}.axis")
         if term.balance.startswith("flow") and not axes[term.axis].hydraulic:
             raise ValueError(f"terms.{k}: axis {term.axis} has no chambers for a {term.balance}")
+        for variable, axis in term.of.items():
+            _expect(axis, axes, f"terms.{k}.of.{variable}")
+            if variable not in ("position", "velocity", "command") and not axes[axis].hydraulic:
+                raise ValueError(f"terms.{k}.of: axis {axis} has no {variable}")
         key = (term.name, term.axis, term.balance)
         if key in seen:
             raise ValueError(

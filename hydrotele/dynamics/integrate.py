@@ -141,6 +141,9 @@ def accelerate(model, sp, z, dt):
     gather_forces(mech, m)
     _project(mech.joint, m.mass, m.joint, m.basis, half, n, sp.mass, sp.force)
     first = n + t  # of the rates
+    if len(model.terms) > 0:
+        for i in range(len(model.gear)):
+            sp.drive[V, i] = _drive_velocity(model, sp, z, i)
     for i in range(len(model.gear)):
         u, gear = i * SLOTS, model.gear[i]
         if i < model.hydraulic:
@@ -189,6 +192,18 @@ def accelerate(model, sp, z, dt):
                 sp.mass[f, g] += slope * sp.row[i, f] * sp.row[i, g]
     factorise(sp.mass)
     solve(sp.mass, sp.force)
+
+
+@lean
+def _drive_velocity(model, sp, z, i):
+    """Velocity of a drive, its own where it has a transmission, scalar [m/s] or [rad/s]."""
+    n, first = len(model.mech.free), len(model.mech.free) + len(model.transmission)
+    if model.gear[i] >= 0:
+        return z[first + n + model.gear[i]]
+    v = 0.0
+    for f in range(n):
+        v += sp.row[i, f] * z[first + f]
+    return v
 
 
 @lean

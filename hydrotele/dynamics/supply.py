@@ -6,6 +6,7 @@ from hydrotele.hydraulics.circuit import circuit_supply, delivered_share, open_p
 from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state
 from hydrotele.hydraulics.laws import pressure_with_air, pressure_without_air
 from hydrotele.hydraulics.slots import SLOTS, Slot
+from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
 from hydrotele.terms.table import added_with_slope
@@ -93,9 +94,10 @@ def term_force(model, sp, z, i, velocity):
         model.user, i, count, sp.act, supply, sp.time[0], sp.drive[X, i], velocity,
         sp.drive[COMMAND, i], model.gain[i],
     )  # fmt: skip
-    force, slope = added_with_slope(model.terms, ON_FORCE, i, s)
+    drives = Drives(count, sp.act, sp.drive[X], sp.drive[V], sp.drive[COMMAND])
+    force, slope = added_with_slope(model.terms, ON_FORCE, i, s, drives)
     if i >= count:
-        more, steep = added_with_slope(model.terms, ON_COMMAND, i, s)
+        more, steep = added_with_slope(model.terms, ON_COMMAND, i, s, drives)
         force += model.gain[i] * more
         slope += model.gain[i] * steep
     return force, slope

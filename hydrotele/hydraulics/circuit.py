@@ -47,7 +47,7 @@ from hydrotele.hydraulics.supply import (
     wanted_share,
 )
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
-from hydrotele.terms.law import DriveState
+from hydrotele.terms.law import Drives, DriveState
 from hydrotele.terms.table import added_flows
 
 __all__ = [
@@ -147,12 +147,14 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
 
 
 @compiled
-def _flows_of_terms(terms, i, user, time, x, v, spool, rate, p_head, p_rod, supply, command):
+def _flows_of_terms(
+    terms, i, user, time, x, v, spool, rate, p_head, p_rod, supply, command, drives
+):
     """What the terms add to the flows of an axis, see `terms.table.added_flows`."""
     u = i * SLOTS
     force = user[u + _AH] * p_head - user[u + _AR] * p_rod
-    s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command, force)
-    return added_flows(terms, i, s)
+    s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command[i], force)
+    return added_flows(terms, i, s, drives)
 
 
 @compiled
@@ -196,6 +198,7 @@ def step_circuit(
     Source: nominal model; ROS2: Verwer et al. 1999, SIAM J. Sci. Comput. 20(4), Eq. 2.6.
     """
     gamma_h = _ROS2 * dt
+    drives = Drives(count, act, length, velocity, command)
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         bounded = min(1.0, max(-1.0, command[first + i]))
@@ -227,7 +230,7 @@ def step_circuit(
             if len(terms) > 0:
                 more = _flows_of_terms(
                     terms, first + i, user, time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3],
-                    p_start, command[first + i],
+                    p_start, command, drives,
                 )  # fmt: skip
         head, rod, j_head, j_rod = pressure_rates(
             user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3], x, v, dt, more,
@@ -265,7 +268,7 @@ def step_circuit(
             if len(terms) > 0:
                 more = _flows_of_terms(
                     terms, first + i, user, time + dt, x, v, act_dot[a], act_dot[a + 1], p_head,
-                    p_rod, p_end, command[first + i],
+                    p_rod, p_end, command, drives,
                 )  # fmt: skip
         head, rod, _, _ = pressure_rates(
             user, u, scratch[a + 3], p_end, p_head, p_rod, x, v, 0.0, more,
@@ -281,9 +284,33 @@ def step_circuit(
         u, a, k = (first + i) * SLOTS, 4 * i, _FIRST + 2 * i
         head = 1.5 * scratch[k] + 0.5 * act_dot[a + 2]
         rod = 1.5 * scratch[k + 1] + 0.5 * act_dot[a + 3]
+        port = user[u + _PORT]
+        if act[a + 2] < port < act[a + 2] + dt * head:
+            stiffness = _chamber_stiffness(user, u, length[first + i])[0]
+            head = _relieved(port - act[a + 2], head, stiffness * user[u + _KR], dt)
+        if act[a + 3] < port < act[a + 3] + dt * rod:
+            stiffness = _chamber_stiffness(user, u, length[first + i])[1]
+            rod = _relieved(port - act[a + 3], rod, stiffness * user[u + _KR], dt)
         act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], head, dt)
         act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], rod, dt)
     return p_start, p_end
+
+
+@compiled
+def _relieved(room, rate, quick, dt):
+    """Mean rate over a step in which a port relief opens that no stage has seen open [Pa/s].
+
+    A rate r lifts the pressure to the setting; from there on `e' = r - e q` for what is beyond it.
+
+    Args:
+        room: up to the setting, scalar [Pa].
+        rate: without the relief, scalar [Pa/s].
+        quick: q, by which the relief's flow takes the pressure back, scalar [1/s].
+        dt: scalar [s].
+    """
+    beyond = dt * rate - room
+    turns = quick * beyond / rate
+    return rate if turns <= 0.0 else (room - beyond * math.expm1(-turns) / turns) / dt
 
 
 @compiled

@@ -2,7 +2,7 @@
 
 from hydrotele.compiled import compiled
 from hydrotele.hydraulics.circuit import SLOTS, Slot, circuit_supply, delivered_share, open_ports
-from hydrotele.terms.law import DriveState
+from hydrotele.terms.law import Drives, DriveState
 from hydrotele.terms.table import COMMAND, added
 
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
@@ -63,7 +63,8 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
     open_ports(user, act, act, scratch, 0, count, 0.0, act)
     supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
     middle = time + 0.5 * dt
+    drives = Drives(count, act, length, velocity, command)
     for i in range(count):
         x = length[i] - 0.5 * dt * velocity[i]
         s = drive_state(user, i, count, act, supply, middle, x, velocity[i], command[i], 0.0)
-        out[i] = command[i] + added(terms, COMMAND, i, s)
+        out[i] = command[i] + added(terms, COMMAND, i, s, drives)

@@ -49,6 +49,7 @@ from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS
 from hydrotele.simulate.layout import field_offsets, option_offset, verify_layout
 from hydrotele.simulate.library import mujoco_library
 from hydrotele.simulate.pointers import floats, pointer
+from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND, COUNT, FORCE, added_with_slope
 from hydrotele.terms.table import MARKER as TERMS
 
@@ -118,11 +119,15 @@ def _terms_of(m, m_nnumeric, m_adr, m_size, m_data):
 
 
 @compiled
-def _state(d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, velocity, nu, scratch):
-    """State of a drive with the pressures at the end of the step; the rest are offsets."""
+def _state(
+    d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, d_velocity, nu, scratch
+):
+    """State of a drive with the pressures at the end of the step, and all drives' variables."""
     count, act = int(user[_COUNT]), floats(d, 0)
-    x = floats(carray(pointer(d + d_length), (1,), np.int64)[0], nu)[i]
-    command = _given(floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu), i)
+    lengths = floats(carray(pointer(d + d_length), (1,), np.int64)[0], nu)
+    velocities = floats(carray(pointer(d + d_velocity), (1,), np.int64)[0], nu)
+    commands = floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu)
+    x, velocity, command = lengths[i], velocities[i], _given(commands, i)
     time, supply = floats(d + d_time, 1)[0], 0.0
     if count > 0:
         size = 4 * count + int(user[_MEMORY])
@@ -133,7 +138,8 @@ def _state(d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, vel
             act[k] = start[k] + dt * rate[k]
         open_ports(user, act, act, scratch, 0, count, 0.0, act)
         supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
-    return drive_state(user, i, count, act, supply, time, x, velocity, command, gain)
+    s = drive_state(user, i, count, act, supply, time, x, velocity, command, gain)
+    return s, Drives(count, act, lengths, velocities, commands)
 
 
 @compiled
@@ -348,13 +354,13 @@ def _callbacks(remembers):
             if not _sound(user, 0, held, nu, carray(pointer(m + m_na), (1,), np.int64)[0]):
                 terms = floats(m, 0)
         if len(terms) > 0:
-            s = _state(
-                d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, velocity, nu,
+            s, drives = _state(
+                d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, d_velocity, nu,
                 carray(_stack(0), (2 * SCRATCH,), np.float64),
             )  # fmt: skip
-            more, steep = added_with_slope(terms, FORCE, i, s)
+            more, steep = added_with_slope(terms, FORCE, i, s, drives)
             if gain != 0.0:
-                extra, slope = added_with_slope(terms, COMMAND, i, s)
+                extra, slope = added_with_slope(terms, COMMAND, i, s, drives)
                 more += gain * extra
                 steep += gain * slope
         if user[u + _KIND] == _PUMPED:  # friction that holds resists the terms, too

@@ -14,6 +14,7 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.hydraulics.drive_terms import drive_state
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
 from hydrotele.machine import Machine
+from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added, terms_table
 
 
@@ -60,16 +61,17 @@ def _evaluate(user, terms, count, gain, time, act, x, v, command, out):
             open_ports(user, act[row], act[row], scratch, 0, count, 0.0, act[row])
             share = delivered_share(user, 0, act[row])
             supply = circuit_supply(user, 0, count, scratch, share)
+        drives = Drives(count, act[row], x[row], v[row], command[row])
         for i in range(len(gain)):
             s = drive_state(
                 user, i, count, act[row], supply, time[row], x[row, i], v[row, i], command[row, i],
                 gain[i],
             )  # fmt: skip
-            out[row, i, 0] = added(terms, FORCE, i, s)
+            out[row, i, 0] = added(terms, FORCE, i, s, drives)
             if i >= count:
-                out[row, i, 0] += gain[i] * added(terms, COMMAND, i, s)
-            out[row, i, 1] = added(terms, FLOW_HEAD, i, s)
-            out[row, i, 2] = added(terms, FLOW_ROD, i, s)
+                out[row, i, 0] += gain[i] * added(terms, COMMAND, i, s, drives)
+            out[row, i, 1] = added(terms, FLOW_HEAD, i, s, drives)
+            out[row, i, 2] = added(terms, FLOW_ROD, i, s, drives)
 
 
 def terms_at_rest(

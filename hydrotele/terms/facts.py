@@ -11,6 +11,11 @@ from hydrotele.terms.law import LAWS, VARIABLES, Value
 
 BALANCES = ("force", "flow_head", "flow_rod", "command")
 Balance = Literal["force", "flow_head", "flow_rod", "command"]
+OF_A_DRIVE = (
+    "position", "velocity", "spool", "spool_rate", "pump_speed", "pressure_load", "pressure_head",
+    "pressure_rod", "command",
+)  # fmt: skip
+"""Variables that a law may see of another drive than the one that it adds to."""
 
 
 class Term(Facts):
@@ -18,9 +23,10 @@ class Term(Facts):
 
     `balance` is `force` (on the drive [N] or [N m]), `flow_head` or `flow_rod` (into a chamber
     [m^3/s]) or `command` (to valve or drive [1] or [V]). `name` says what put it there, such as an
-    effect's name. In `domain` a variable's range, beyond which it counts with the nearer end; the
-    `uncertainty` is the standard deviation of what the law adds. `source` is the file or plug-in
-    that defines the law, empty for laws of hydrotele.
+    effect's name. In `of` the variables that are another drive's: `{velocity: swing}` lets the law
+    see the swing's velocity as its `velocity`. In `domain` a variable's range, beyond which it
+    counts with the nearer end; the `uncertainty` is the standard deviation of what the law adds.
+    `source` is the file or plug-in that defines the law, empty for laws of hydrotele.
     """
 
     name: Name
@@ -28,6 +34,7 @@ class Term(Facts):
     balance: Balance
     law: str
     parameters: Mapping[str, Value] = {}
+    of: dict[str, Name] = {}
     domain: dict[str, tuple[float, float]] = {}
     uncertainty: NonNegative | None = None
     description: str = ""
@@ -43,6 +50,9 @@ class Term(Facts):
             )
         if self.law not in LAWS:
             raise ValueError(f"law {self.law!r} is not known; {suggest(self.law, LAWS)}")
+        for variable in self.of:
+            if variable not in OF_A_DRIVE:
+                raise ValueError(f"of: {variable!r}; {suggest(variable, OF_A_DRIVE)}")
         for variable, (low, high) in self.domain.items():
             if variable not in VARIABLES:
                 raise ValueError(f"domain: {variable!r}; {suggest(variable, VARIABLES)}")

@@ -53,6 +53,27 @@ class DriveState(NamedTuple):
     force: float
 
 
+class Drives(NamedTuple):
+    """All drives at an instant, for laws with variables of another drive than the term's own.
+
+    Attributes:
+        count: number of hydraulic drives, which come first.
+        act: (>= 4 count,) spool [1], spool rate [1/s], head- and rod-side pressure [Pa] of each.
+        position: (nu,) piston displacements or motor angles [m] or [rad].
+        velocity: (nu,) their rates [m/s] or [rad/s].
+        command: (nu,) commands as they arrive [1] or [V].
+    """
+
+    count: int
+    act: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    command: np.ndarray
+
+
+NO_DRIVES = Drives(0, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
+"""For laws that see no other drive's variables."""
+
 VARIABLES = {name: index for index, name in enumerate(DriveState._fields)}
 """Variable of the state, as files name it -> its index."""
 VARIABLES |= {"pump_speed": VARIABLES["spool"], "pressure_load": VARIABLES["spool_rate"]}

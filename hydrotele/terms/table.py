@@ -27,7 +27,9 @@ FORCE, FLOW_HEAD, FLOW_ROD, COMMAND = range(len(BALANCES))
 MARKER = 215325.75  # of a table of terms among other custom numbers of a model
 NO_TERMS = np.zeros(0)
 COUNT = 1  # place of the number of terms, after the marker
-_AXIS, _BALANCE, _LAW, _CHECKSUM, _PARAMETERS, _DOMAIN, _RANGES, _ROW = range(8)  # of a term
+_AXIS, _BALANCE, _LAW, _CHECKSUM, _PARAMETERS, _DOMAIN, _RANGES, _OTHERS, _ROW = range(
+    9
+)  # of a term
 _HEAD = 2
 _MOST = 1024  # laws in a process
 _SPEED = 1.0e-6  # m/s or rad/s, and of the speed: difference for slopes, small against 5 mm/s
@@ -111,7 +113,7 @@ def terms_table(terms: Sequence[Term], order: Sequence[str]) -> np.ndarray:
 
     Returns:
         (n,) numbers, none where there are no terms: marker, count, a row per term, then the laws'
-        parameters and the ranges of variables.
+        parameters, the ranges of variables, and variables with the drives that they are of.
 
     Raises:
         InputError: a law is not known in this process, or cannot be compiled.
@@ -126,9 +128,10 @@ def terms_table(terms: Sequence[Term], order: Sequence[str]) -> np.ndarray:
         at = first + len(back)
         rows += [
             order.index(term.axis), BALANCES.index(term.balance), place, checksum(term.law), at,
-            at + len(numbers), len(term.domain),
+            at + len(numbers), len(term.domain), len(term.of),
         ]  # fmt: skip
-        back += [*numbers, *ranges]
+        others = [x for name, axis in term.of.items() for x in (VARIABLES[name], order.index(axis))]
+        back += [*numbers, *ranges, *others]
     return np.array([MARKER, len(terms), *rows, *back], float)
 
 
@@ -174,17 +177,37 @@ def _call(typingctx, function, terms, at, state):
 
 
 @lean
-def _bounded(terms, at, k, value):
-    """A variable inside the domain of a term."""
+def _seen(terms, at, k, value, s, drives):
+    """A variable as the law of a term sees it: of the drive that it names, inside its domain."""
     first = int(terms[at + _DOMAIN])
-    for j in range(first, first + 3 * int(terms[at + _RANGES]), 3):
+    last = first + 3 * int(terms[at + _RANGES])
+    for j in range(last, last + 2 * int(terms[at + _OTHERS]), 2):
+        if int(terms[j]) == k:
+            value = _of_drive(int(terms[j + 1]), k, s, drives)
+    for j in range(first, last, 3):
         if int(terms[j]) == k:
             value = min(terms[j + 2], max(terms[j + 1], value))
     return value
 
 
 @lean
-def added(terms, balance, axis, s):
+def _of_drive(i, k, s, drives):
+    """Variable k of drive i; what all drives share is that of the state."""
+    if i < 0 or i >= len(drives.velocity):
+        return 0.0
+    if k == 1:
+        return drives.position[i]
+    if k == 2:
+        return drives.velocity[i]
+    if k == 8:
+        return drives.command[i] if drives.command[i] == drives.command[i] else 0.0
+    if 3 <= k <= 6:
+        return drives.act[4 * i + k - 3] if i < drives.count else 0.0
+    return s[k]
+
+
+@lean
+def added(terms, balance, axis, s, drives):
     """What the terms add to a balance of a drive.
 
     Args:
@@ -192,6 +215,7 @@ def added(terms, balance, axis, s):
         balance: FORCE, FLOW_HEAD, FLOW_ROD or COMMAND.
         axis: index of the actuator.
         s: DriveState.
+        drives: Drives, for variables that are another drive's.
 
     Returns:
         Their sum, scalar [N], [N m], [m^3/s], [1] or [V].
@@ -211,14 +235,19 @@ def added(terms, balance, axis, s):
         if address == 0 or _word(entry + 8) != int(terms[at + _CHECKSUM]):
             continue
         seen = s
-        if terms[at + _RANGES] > 0.0:
+        if terms[at + _RANGES] > 0.0 or terms[at + _OTHERS] > 0.0:
             seen = DriveState(
-                _bounded(terms, at, 0, s.time), _bounded(terms, at, 1, s.position),
-                _bounded(terms, at, 2, s.velocity), _bounded(terms, at, 3, s.spool),
-                _bounded(terms, at, 4, s.spool_rate), _bounded(terms, at, 5, s.pressure_head),
-                _bounded(terms, at, 6, s.pressure_rod), _bounded(terms, at, 7, s.pressure_supply),
-                _bounded(terms, at, 8, s.command), _bounded(terms, at, 9, s.force),
-            )  # fmt: skip
+                _seen(terms, at, 0, s.time, s, drives),
+                _seen(terms, at, 1, s.position, s, drives),
+                _seen(terms, at, 2, s.velocity, s, drives),
+                _seen(terms, at, 3, s.spool, s, drives),
+                _seen(terms, at, 4, s.spool_rate, s, drives),
+                _seen(terms, at, 5, s.pressure_head, s, drives),
+                _seen(terms, at, 6, s.pressure_rod, s, drives),
+                _seen(terms, at, 7, s.pressure_supply, s, drives),
+                _seen(terms, at, 8, s.command, s, drives),
+                _seen(terms, at, 9, s.force, s, drives),
+            )
         total += _call(address, terms, int(terms[at + _PARAMETERS]), seen)
     return total
 
@@ -233,7 +262,7 @@ def _moved(s, velocity, head, rod):
 
 
 @lean
-def added_with_slope(terms, balance, axis, s):
+def added_with_slope(terms, balance, axis, s, drives):
     """What the terms add to force or command, and its slope with respect to the velocity.
 
     Args:
@@ -241,30 +270,33 @@ def added_with_slope(terms, balance, axis, s):
         balance: FORCE or COMMAND.
         axis: index of the actuator.
         s: DriveState.
+        drives: Drives.
 
     Returns:
         (sum, d sum / d velocity), by a forward difference.
     """
-    value = added(terms, balance, axis, s)
+    value = added(terms, balance, axis, s, drives)
     step = _SPEED * (1.0 + abs(s.velocity))
-    beyond = added(terms, balance, axis, _moved(s, step, 0.0, 0.0))
+    beyond = added(terms, balance, axis, _moved(s, step, 0.0, 0.0), drives)
     return value, (beyond - value) / step
 
 
 @lean
-def added_flows(terms, axis, s):
+def added_flows(terms, axis, s, drives):
     """What the terms add to the flows into both chambers of an axis, and slopes for a stiff step.
 
     Args:
         terms: (n,) table of `terms_table`.
         axis: index of the actuator.
         s: DriveState.
+        drives: Drives.
 
     Returns:
         (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)], both <= 0), the
         slopes by forward differences.
     """
-    head, rod = added(terms, FLOW_HEAD, axis, s), added(terms, FLOW_ROD, axis, s)
-    more = added(terms, FLOW_HEAD, axis, _moved(s, 0.0, _PRESSURE, 0.0))
-    less = added(terms, FLOW_ROD, axis, _moved(s, 0.0, 0.0, _PRESSURE))
+    head = added(terms, FLOW_HEAD, axis, s, drives)
+    rod = added(terms, FLOW_ROD, axis, s, drives)
+    more = added(terms, FLOW_HEAD, axis, _moved(s, 0.0, _PRESSURE, 0.0), drives)
+    less = added(terms, FLOW_ROD, axis, _moved(s, 0.0, 0.0, _PRESSURE), drives)
     return head, rod, min(0.0, (more - head) / _PRESSURE), min(0.0, (less - rod) / _PRESSURE)

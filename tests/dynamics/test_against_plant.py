@@ -11,8 +11,10 @@ from hydrotele.dynamics.model import predicted_channels, state_names
 from hydrotele.effects import apply_effect
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.slots import SLOTS, Slot
+from hydrotele.machine_file import save_machine
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario
+from hydrotele.terms.facts import Term
 
 ROWS, PERIOD = 60, 0.02
 ANGLE, LENGTH, PRESSURE = np.radians(0.01), 0.2e-3, 0.1 * 25 * 6894.757
@@ -241,6 +243,31 @@ def test_a_plain_force_drive(effects, machine_of, reduced_of):
     error, travel = found["position.slide"]
     assert error < 1e-3 * travel  # three times what the plant's first-order step leaves
     assert travel > 1e-3
+
+
+def test_terms_with_variables_of_another_drive(machine_of, reduced_of, tmp_path):
+    """Force, flow and command of one drive that go with another's motion, pressure and command."""
+    nominal = machine_of("cat215/none")
+    laws = (
+        ("boom", "force", {"velocity": 1.5e5}, {"velocity": "swing"}),
+        ("stick", "flow_head", {"position * pressure_rod": -4e-11},
+         {"position": "boom", "pressure_rod": "boom"}),
+        ("swing", "command", {"command": 0.15, "spool": 0.1},
+         {"command": "stick", "spool": "stick"}),
+    )  # fmt: skip
+    terms = tuple(
+        Term(name="t", axis=axis, balance=balance, law="formula", parameters=law, of=of)
+        for axis, balance, law, of in laws
+    )
+    plan = scenario("cat215/none", nominal.axes, (), 1.25e-4)
+    for k in range(len(terms)):
+        (tmp_path / f"{k}").mkdir()
+        machine = nominal.model_copy(update={"terms": terms[k : k + 1]})
+        save_machine(machine, tmp_path / f"{k}" / "machine.yaml")
+        own = plan.model_copy(update={"machine": str(tmp_path / f"{k}" / "machine.yaml")})
+        run = run_scenario(own.model_copy(update={"tool": None}))
+        assert not beyond(differences_of(reduced_of, machine, run, 40))
+        assert beyond(differences_of(reduced_of, nominal, run, 40)), "without it it would be seen"
 
 
 def test_the_plant_converges_to_the_reduced_model(machine_of, reduced_of):

@@ -8,6 +8,7 @@ from scipy.optimize import brentq
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
+    _relieved,
     axis_state,
     circuit_scratch,
     open_ports,
@@ -285,3 +286,14 @@ def test_command_is_clipped(user):
         for u in (1.0, 10.0)
     )
     assert np.array_equal(one, ten)
+
+
+@pytest.mark.parametrize(("rate", "quick"), [(2.0e9, 5.0e3), (1.1e9, 2.0e4), (3.0e9, 10.0)])
+def test_a_relief_that_opens_within_a_step_takes_its_part_of_it(rate, quick):
+    """Pressure that rises to the setting, then against the relief, integrated by scipy."""
+    room, dt = 1.0e6, 1.0e-3
+    answer = solve_ivp(
+        lambda t, e: rate - quick * np.maximum(0.0, e), (0.0, dt), [-room], max_step=1e-6,
+        rtol=1e-8,
+    )  # fmt: skip
+    assert _relieved(room, rate, quick, dt) * dt - room == pytest.approx(answer.y[0, -1], rel=1e-4)

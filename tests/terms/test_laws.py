@@ -10,7 +10,7 @@ from hydrotele.errors import InputError
 from hydrotele.terms import laws
 from hydrotele.terms.facts import Term
 from hydrotele.terms.formula import formula_arguments
-from hydrotele.terms.law import LAWS, VARIABLES, DriveState, law
+from hydrotele.terms.law import LAWS, NO_DRIVES, VARIABLES, Drives, DriveState, law
 from hydrotele.terms.table import (
     FLOW_ROD,
     FORCE,
@@ -78,10 +78,12 @@ def test_every_law_of_the_package_is_tried_here():
 def test_compiled_laws_are_those_by_hand(name):
     table = terms_table([force_term(name, USED[name])], ["a"])
     # smoothing of the orifice over its pressure drop squared: 1e-4 / 4
-    assert added(table, FORCE, 0, STATE) == pytest.approx(by_hand(name, USED[name]), rel=3e-5)
-    assert added(table, FORCE, 1, STATE) == 0.0, "another axis"
-    assert added(table, FLOW_ROD, 0, STATE) == 0.0, "another balance"
-    assert added(NO_TERMS, FORCE, 0, STATE) == 0.0
+    assert added(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(
+        by_hand(name, USED[name]), rel=3e-5
+    )
+    assert added(table, FORCE, 1, STATE, NO_DRIVES) == 0.0, "another axis"
+    assert added(table, FLOW_ROD, 0, STATE, NO_DRIVES) == 0.0, "another balance"
+    assert added(NO_TERMS, FORCE, 0, STATE, NO_DRIVES) == 0.0
 
 
 @pytest.mark.parametrize("text", [
@@ -100,7 +102,7 @@ def test_basic_functions_of_formulas(text):
     }  # fmt: skip
     table = terms_table([force_term("formula", {text: -2.5})], ["a"])
     expected = -2.5 * eval(text, functions, s)
-    assert added(table, FORCE, 0, STATE) == pytest.approx(expected, rel=1e-12)
+    assert added(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(expected, rel=1e-12)
     assert expected != 0.0
 
 
@@ -109,7 +111,7 @@ def test_terms_add_up_and_know_their_slopes():
         force_term("quadratic_drag", {"coefficient": 40.0}),
         force_term("constant", USED["constant"]),
     ]
-    value, slope = added_with_slope(terms_table(terms, ["a"]), FORCE, 0, STATE)
+    value, slope = added_with_slope(terms_table(terms, ["a"]), FORCE, 0, STATE, NO_DRIVES)
     assert value == pytest.approx(12.0 + 40.0 * 0.21**2)
     assert slope == pytest.approx(-80.0 * 0.21, rel=1e-4)  # a forward difference of 1e-6
     leak = [
@@ -117,7 +119,7 @@ def test_terms_add_up_and_know_their_slopes():
              parameters={"flow_gain": k, "smoothing": 1e3})
         for b, k in (("flow_rod", 1e-8), ("flow_head", -1e-8))
     ]  # fmt: skip
-    head, rod, by_head, by_rod = added_flows(terms_table(leak, ["a"]), 0, STATE)
+    head, rod, by_head, by_rod = added_flows(terms_table(leak, ["a"]), 0, STATE, NO_DRIVES)
     assert -head == rod == pytest.approx(1e-8 * math.sqrt(5e6))
     exact = -0.5e-8 / math.sqrt(5e6)
     assert [by_head, by_rod] == pytest.approx([exact, exact], rel=1e-4)  # differences of 100 Pa
@@ -127,22 +129,41 @@ def test_beyond_its_domain_a_variable_counts_with_the_nearer_end():
     law_ = ("formula", {"velocity": 1.0, "position": 10.0})
     bounded = force_term(*law_, domain={"velocity": (-0.1, 0.1), "position": (0.0, 1.0)})
     table = terms_table([bounded], ["a"])
-    assert added(table, FORCE, 0, STATE) == pytest.approx(-0.1 + 4.3)
-    assert added(table, FORCE, 0, STATE._replace(velocity=0.05)) == pytest.approx(0.05 + 4.3)
+    assert added(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(-0.1 + 4.3)
+    assert added(table, FORCE, 0, STATE._replace(velocity=0.05), NO_DRIVES) == pytest.approx(
+        0.05 + 4.3
+    )
+
+
+def test_a_law_may_see_variables_of_another_drive():
+    law_ = ("formula", {"velocity": 1.0, "pressure_rod": 1e-6, "position": 10.0})
+    term = force_term(*law_, of={"velocity": "b", "pressure_rod": "b"}, domain={"velocity": (0, 2)})
+    drives = Drives(
+        2, np.arange(8.0) * 1e6, np.array([0.1, 0.2]), np.array([-0.3, 0.5]), np.zeros(2)
+    )
+    table = terms_table([term], ["a", "b"])
+    assert added(table, FORCE, 0, STATE, drives) == pytest.approx(0.5 + 7.0 + 4.3)
+    faster = drives._replace(velocity=np.array([0.0, 3.0]))
+    assert added(table, FORCE, 0, STATE, faster) == pytest.approx(2.0 + 7.0 + 4.3)
+    assert added_with_slope(table, FORCE, 0, STATE, drives)[1] == 0.0, "not its own velocity"
+    lone = force_term(*law_, of={"velocity": "b"})
+    assert added(terms_table([lone], ["a", "b"]), FORCE, 0, STATE, NO_DRIVES) == 4.0 + 4.3
+    with pytest.raises(ValidationError, match="of: 'force'"):
+        force_term(*law_, of={"force": "b"})
 
 
 def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
     """As in a file that another process has exported."""
     table = terms_table([force_term("constant", {"value": 12.0})], ["a"])
     law_at, checksum_at = 4, 5
-    assert added(table, FORCE, 0, STATE) == 12.0
+    assert added(table, FORCE, 0, STATE, NO_DRIVES) == 12.0
     for place in (-1.0, 500.0, 1023.0, 1024.0, 1e9, -1e9):
         wrong = table.copy()
         wrong[law_at] = place
-        assert added(wrong, FORCE, 0, STATE) == 0.0
+        assert added(wrong, FORCE, 0, STATE, NO_DRIVES) == 0.0
     wrong = table.copy()
     wrong[checksum_at] += 1
-    assert added(wrong, FORCE, 0, STATE) == 0.0
+    assert added(wrong, FORCE, 0, STATE, NO_DRIVES) == 0.0
 
 
 @pytest.mark.parametrize(
