@@ -12,6 +12,7 @@ again and keeps its files.
 
 import argparse
 import copy
+import functools
 import json
 import os
 import random
@@ -34,6 +35,9 @@ import yaml
 
 from hydrotele.log import Log, save_log
 from hydrotele.resources import models_folder, scenarios_folder
+from hydrotele.run import run_scenario
+from hydrotele.scenario import load_scenario
+from hydrotele.teleop_case import SHIPPED
 
 SECONDS, MEMORY, LETTERS = 60.0, 4_000_000_000, 2048  # limits of a case
 _FINE = (0, 2, 3)  # done, the user's mistake, a simulation that left the finite numbers
@@ -42,6 +46,7 @@ _STRANGE: tuple[Any, ...] = (
     2**70, float("nan"), float("inf"), [], {}, [[]], {"a": {"b": [1]}}, [1e9] * 3,
     "../../etc/passwd", "/dev/zero", "!!python/object:os.system", list(range(50)),
 )  # fmt: skip
+_MOVE = "name: move\nmachine: ./m\nduration: 0.2\npilot: {kind: constant}\n"
 
 
 class Case(NamedTuple):
@@ -147,7 +152,13 @@ def _defect(status: int, words: str, seconds: float) -> str:
 def _yaml_file(dice: random.Random, source: Path, target: Path) -> None:
     """A damaged copy of a YAML file: as a structure, or as text."""
     text = source.read_text(encoding="utf-8")
-    if dice.random() < 0.7:
+    way = dice.random()
+    if way < 0.4:
+        data = yaml.safe_load(text)
+        for _ in range(dice.randint(1, 3)):
+            _change_number(dice, data)
+        text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+    elif way < 0.8:
         data = yaml.safe_load(text)
         for _ in range(dice.randint(1, 4)):
             data = _changed(dice, data)
@@ -155,6 +166,25 @@ def _yaml_file(dice: random.Random, source: Path, target: Path) -> None:
     else:
         text = _torn(dice, text)
     target.write_bytes(text.encode("utf-8", "surrogatepass"))
+
+
+def _change_number(dice: random.Random, data: Any) -> None:
+    """Change one number of a structure, such that it may still pass for one."""
+    found: list[tuple[Any, Any]] = []
+
+    def look(inside: Any) -> None:
+        items = inside.items() if isinstance(inside, dict) else enumerate(inside)
+        for key, value in items:
+            if isinstance(value, dict | list):
+                look(value)
+            elif isinstance(value, int | float) and not isinstance(value, bool):
+                found.append((inside, key))
+
+    look(data)
+    if found:
+        inside, key = dice.choice(found)
+        factor = dice.choice([-1.0, 0.0, 1e-6, 1e-3, 0.5, 0.9, 1.1, 2.0, 10.0, 1e3, 1e6])
+        inside[key] = type(inside[key])(inside[key] * factor)
 
 
 def _changed(dice: random.Random, data: Any) -> Any:
@@ -208,6 +238,9 @@ def _machine(dice: random.Random, folder: Path) -> list[str]:
     name = dice.choice([path.parent.name for path in models_folder().glob("*/machine.yaml")])
     shutil.copytree(models_folder() / name, folder / "m")
     _yaml_file(dice, models_folder() / name / "machine.yaml", folder / "m/machine.yaml")
+    if dice.random() < 0.3:
+        (folder / "s.yaml").write_text(_MOVE)
+        return ["run", "s.yaml", "--out", "out", "--no-review"]
     return dice.choice([["validate", "./m"], ["export", "./m", "--out", "scene.xml"]])
 
 
@@ -270,8 +303,7 @@ def _joystick(dice: random.Random, folder: Path) -> list[str]:
 
 
 def _teleop(dice: random.Random, folder: Path) -> list[str]:
-    sources = sorted(p for p in scenarios_folder().rglob("*.yaml") if "pilot" not in p.read_text())
-    _yaml_file(dice, dice.choice(sources), folder / "case.yaml")
+    _yaml_file(dice, SHIPPED, folder / "case.yaml")
     return ["analyse", "teleop", "case.yaml", "--json"]
 
 
@@ -328,6 +360,83 @@ def _csv(dice: random.Random, folder: Path) -> list[str]:
     return ["validate", "log.csv"]
 
 
+def _data_folder(dice: random.Random, folder: Path) -> list[str]:
+    """Three runs of the rig, one of them damaged, for the commands that fit models to data."""
+    (folder / "data").mkdir()
+    for name, log in _rig_runs().items():
+        if name == "fit_2":
+            _write_unchecked(folder / f"data/{name}.parquet", *_damaged(dice, log))
+        else:
+            save_log(log, folder / f"data/{name}.parquet")
+    most = ["--machine", "rig", "--json"]
+    return dice.choice([
+        ["compare", "rig", "--data", "data", "--json"], ["replay", "data/fit_2.parquet", *most],
+        ["review", "data/fit_2.parquet", "--out", "out.rrd"],
+        ["validate", "data/fit_2.parquet"], ["identify", "--data", "data", *most, "--out", "out"],
+    ])  # fmt: skip
+
+
+def _write_unchecked(
+    path: Path, time_: np.ndarray, columns: dict[str, np.ndarray], units: dict[str, str],
+    told: dict[str, str],
+) -> None:  # fmt: skip
+    """What `save_log` writes, without its checks."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = {"time": time_, **columns}
+    fields = [pa.field(n, pa.float64(), metadata={"unit": units.get(n, "s")}) for n in table]
+    arrays = [pa.array(values) for values in table.values()]
+    schema = pa.schema(fields, metadata=told)
+    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), path)
+
+
+@functools.cache
+def _rig_runs() -> dict[str, Log]:
+    """Three short runs of the rig that the commands accept."""
+    scenario = load_scenario("rig_steps").model_copy(update={"duration": 4.0})
+    return {
+        name: run_scenario(scenario.model_copy(update={"seed": k})).measured
+        for k, name in enumerate(("fit_1", "fit_2", "test_1"))
+    }
+
+
+def _damaged(dice: random.Random, log: Log) -> tuple[np.ndarray, dict, dict, dict]:
+    """Time, columns, units and metadata of a log with something wrong in them."""
+    time_, units, told = log.time.copy(), dict(log.units), dict(log.metadata)
+    names = sorted(log.columns)
+    columns = {name: values.copy() for name, values in log.columns.items()}
+    for _ in range(dice.randint(1, 3)):
+        name = dice.choice([n for n in names if n in columns])
+        a, b = sorted(dice.sample(range(len(time_)), 2))
+        match dice.randrange(10):
+            case 0:
+                columns[name] = columns[name] * dice.choice([0.0, -1.0, 1e-6, 1e3, 1e300])
+            case 1:
+                columns[name][a:b] = dice.choice([np.nan, np.inf, 0.0, 1e308])
+            case 2:
+                columns.pop(name)
+                units.pop(name)
+            case 3:
+                units[name] = dice.choice(["", "deg", "bar", "m", "1", "furlong"])
+            case 4:
+                time_[a:b] += dice.choice([-1.0, 1e-9, 100.0, 1e12])
+            case 5:
+                time_[a:b] = time_[a]
+            case 6:
+                time_ = time_ * dice.choice([1e-6, 1e3, -1.0])
+            case 7:
+                other = dice.choice(["angle.nothing", "x" * 300, "truth.angle.slide", name + ".y"])
+                columns[other], units[other] = columns.pop(name), units.pop(name)
+            case 8:
+                rows = dice.choice([1, 9, 12, len(time_) // 2])
+                time_, columns = time_[:rows], {n: v[:rows] for n, v in columns.items()}
+                return time_, columns, units, told
+            case 9:
+                told[dice.choice(sorted(told) or ["x"])] = dice.choice(["", "{", "null", "[1]"])
+    return time_, columns, units, told
+
+
 def _run_folder(dice: random.Random, folder: Path) -> list[str]:
     log = _log(random.Random(dice.random()))
     (folder / "run").mkdir()
@@ -342,19 +451,22 @@ def _run_folder(dice: random.Random, folder: Path) -> list[str]:
 _MAKERS: dict[str, Callable[[random.Random, Path], list[str]]] = {
     "machine": _machine, "mjcf": _mjcf, "scenario": _scenario, "sweep": _sweep,
     "joystick": _joystick, "teleop case": _teleop, "parquet": _parquet, "csv": _csv,
-    "run folder": _run_folder,
+    "run folder": _run_folder, "data folder": _data_folder,
 }  # fmt: skip
 
 
 def _ready() -> None:
     """Load what every case needs, so that the children need not."""
     import hydrotele.commands.analysing_scenario
+    import hydrotele.commands.comparing
+    import hydrotele.commands.identifying
     import hydrotele.commands.replaying
     import hydrotele.commands.running  # noqa: F401
     from hydrotele.machine_file import load_machine
     from hydrotele.simulate.plant import build_plant, rest_state
 
     rest_state(build_plant(load_machine("cat215")))
+    _rig_runs()
 
 
 def main() -> None:
