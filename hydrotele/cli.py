@@ -394,9 +394,23 @@ def _options(
 
 
 def main() -> None:
-    """Entry point: the user's errors exit with 2, failed runs with 3, interrupts with 130."""
+    """Entry point; exits with 2 for the user's errors, 3 for failed runs, 130 and 143 for signals."""
     os.environ["PYTHONSAFEPATH"] = "1"  # children import nothing from the working folder
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that everything is cleaned up
+    ended: list[int] = []
+
+    def end(number: int, _: object) -> None:
+        ended.append(128 + number)
+        sys.exit(ended[0])  # so that everything is cleaned up
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        _run()
+    finally:
+        if ended:  # a library on the way may have made another error of it
+            sys.exit(ended[0])
+
+
+def _run() -> None:
     try:
         app()
     except (InputError, OSError) as error:

@@ -118,7 +118,7 @@ class Joystick(Facts):
     workspace: Workspace
     sensing: OpticalSensing
     diodes: DiodeFacts
-    control_rate: Positive
+    control_rate: Annotated[Positive, Field(le=1.0e5)]
     flotor: FlotorFacts
     coils: CoilFacts
     alone: AloneFacts

@@ -450,3 +450,21 @@ def test_export_is_mjcf(tmp_path):
     assert (tmp_path / "rig.xml").read_text().strip() == out.strip() and names(tmp_path) == [
         "rig.xml"
     ]
+
+
+def test_a_library_that_makes_another_error_of_sigterm_changes_no_exit_status():
+    """As dm_control's parser does with whatever is raised while it reads an element."""
+    code = """if True:
+        import os, signal, time
+        from hydrotele import cli
+        def app():
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(5.0)
+            except BaseException as error:
+                raise type(error)(f"Line 3: {error}")
+        cli.app = app
+        cli.main()
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert (done.returncode, done.stderr) == (143, "")

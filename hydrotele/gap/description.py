@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from hydrotele.gap.discover import Discovery, Learned
-from hydrotele.gap.law_shapes import THROUGH
+from hydrotele.gap.law_tables import THROUGH
 from hydrotele.gap.result import Lack, LearnedLaw, Prediction, Unknown
 from hydrotele.gap.words import lack_words, learned_words
 from hydrotele.machine import Machine
@@ -23,91 +23,73 @@ _UNITS = {"time": "s", "spool": "1", "pump_speed": "rad/s", "command": "1",
 
 
 def learned_laws(
-    discovery: Discovery, machine: Machine, spread: np.ndarray,
-    shares: Mapping[tuple[str, str], float],
-) -> tuple[LearnedLaw, ...]:  # fmt: skip
+    discovery: Discovery, machine: Machine, shares: Mapping[tuple[str, str], float]
+) -> tuple[LearnedLaw, ...]:
     """The learned laws of a guess as curves, formulas and sentences.
 
     Args:
         discovery: the guess with its laws.
         machine: the given model.
-        spread: (P,) standard deviations of the guess's deviations.
         shares: part of the guess -> share of the gap that it closes.
 
     Returns:
         The laws in the order of the guess.
     """
-    found, first = [], 0
     laws = {law.hypothesis.key: law for law in discovery.laws}
-    for hypothesis, deviation in discovery.judged.guess.parts:
-        own = spread[first : first + hypothesis.size]
-        first += hypothesis.size
-        if hypothesis.key in laws:
-            law, share = laws[hypothesis.key], shares[hypothesis.key]
-            found.append(_learned_law(machine, law, deviation, own, share))
-    return tuple(found)
+    keys = [h.key for h in discovery.judged.guess.hypotheses if h.key in laws]
+    return tuple(_learned_law(machine, laws[key], shares[key]) for key in keys)
 
 
-def _learned_law(
-    machine: Machine, law: Learned, deviation: np.ndarray, spread: np.ndarray, share: float
-) -> LearnedLaw:
-    """A law along its (first) variable, with the other variables at their medians.
-
-    A law that goes with the sign of the motion is shown for positive motion, one in proportion to
-    the speed per unit of speed.
-    """
-    shape = law.shape
-    scales = np.array([p.scale for p in law.hypothesis.parameters.values()])
-    coefficients = deviation * scales
-    a, _, b = shape.variable.partition(" - ")
-    x = law.seen[a] - law.seen[b] if b else law.seen[a]
-    points = np.unique(np.quantile(x[np.isfinite(x)], np.linspace(0.01, 0.99, _POINTS)))
-    probe = {name: np.full(len(points), float(np.median(v))) for name, v in law.seen.items()}
-    probe[a] = points + probe[b] if b else points
-    if shape.factor:
-        fast = 1e3  # sign(velocity) is 1 there
-        probe["velocity"] = np.full(len(points), 1.0 if shape.factor == "velocity" else fast)
-    if shape.other:  # at the median of the second variable
-        c, _, e = shape.other.partition(" - ")
-        across = law.seen[c] - law.seen[e] if e else law.seen[c]
-        probe[c] = np.full(len(points), float(np.median(across))) + (probe[e] if e else 0.0)
-    columns = shape.columns(probe, law.smoothing)
-    error = np.sqrt((columns**2) @ (spread * scales) ** 2)
-    along = shape.columns(law.seen, law.smoothing) @ coefficients
+def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
+    """A law along its (first) variable, with the other variable at its median."""
+    table = law.table
+    variable, other = table.variables[0], table.variables[1] if len(table.variables) > 1 else ""
+    points = np.unique(np.quantile(law.seen[variable], np.linspace(0.01, 0.99, _POINTS)))
+    probe = {variable: points}
+    if other:
+        probe[other] = np.full(len(points), float(np.median(law.seen[other])))
+    if table.window:
+        probe["time"] = np.full(len(points), sum(table.window) / 2.0)
+    columns = table.columns(probe)
+    error = np.sqrt(np.maximum(np.einsum("pk,kl,pl->p", columns, law.covariance, columns), 0.0))
+    along = table.columns(law.seen) @ law.entries
     balance = "flow_head" if law.balance == THROUGH else law.balance
     (unit,) = input_units(machine, [Input(balance, law.axis)])
-    formula = " + ".join(
-        f"{c:.3g} {p}" if p != "1" else f"{c:.3g}"
-        for p, c in zip(shape.products, coefficients, strict=True)
-    ).replace("+ -", "- ")
-    resembles = _resembles(law, along)
-    length = "rad" if _turns(machine, law.axis) else "m"
+    resembles = "" if table.of or table.window else _resembles(law, along)
+    name, _, axis = variable.partition(".")
+    length = "rad" if _turns(machine, axis or law.axis) else "m"
     size = float(np.sqrt(np.mean(along**2)))
     return LearnedLaw(
-        law.balance, law.axis, formula,
+        law.balance, law.axis, _formula(law),
         learned_words(
-            law.balance, law.axis, shape.variable, shape.factor, size, unit, resembles, shape.other
+            law.balance, law.axis, variable, size, unit, resembles, other, table.window
         ),
-        resembles, shape.variable, tuple(points.tolist()), tuple((columns @ coefficients).tolist()),
-        tuple(error.tolist()), _per_speed(unit, length) if shape.factor == "velocity" else unit,
-        _unit_of(a, unit, length), share, shape.other,
+        resembles, variable, tuple(points.tolist()), tuple((columns @ law.entries).tolist()),
+        tuple(error.tolist()), unit, _unit_of(name, unit, length), share, other,
     )  # fmt: skip
+
+
+def _formula(law: Learned) -> str:
+    """The law's table as the term of the patched machine has it, with its numbers if they are few.
+
+    A law of one variable is told point by point.
+    """
+    table = law.table
+    if len(table.variables) == 1:
+        pairs = ", ".join(
+            f"{x:.3g}: {y:.3g}" for x, y in zip(table.points[0], law.entries, strict=True)
+        )
+        text = f"linear_table({table.variables[0]}; {pairs})"
+    else:
+        ways = (f"{v}: {len(p)} points from {p[0]:.3g} to {p[-1]:.3g}"
+                for v, p in zip(table.variables, table.points, strict=True))  # fmt: skip
+        text = f"table2({'; '.join(ways)})"
+    return text + (" from {:.4g} to {:.4g} s".format(*table.window) if table.window else "")
 
 
 def _turns(machine: Machine, axis: str) -> bool:
     """Whether an axis' drive moves in rad."""
     return machine.axes[axis].cylinder is None and machine.position_kind(axis) == "angle"
-
-
-def _per_speed(unit: str, length: str) -> str:
-    """Unit of a law's part that is multiplied by the speed.
-
-    >>> _per_speed("N", "m"), _per_speed("m^3/s", "m"), _per_speed("m^3/s", "rad")
-    ('N s/m', 'm^2', 'm^3/rad')
-    """
-    if unit == "m^3/s":
-        return "m^2" if length == "m" else "m^3/rad"
-    return f"{unit} s/{length}"
 
 
 def _unit_of(variable: str, unit: str, length: str) -> str:
@@ -164,7 +146,7 @@ def describe(
     if learned:
         law, term = _LAW_OF[learned[0].balance], learned[0].formula
         depends = tuple(
-            "time" if part == "time" else f"{part}.{learned[0].axis}"
+            part if part == "time" or "." in part else f"{part}.{learned[0].axis}"
             for part in _variables(learned[0])
         )
         words += [one.description for one in learned]
@@ -175,8 +157,7 @@ def describe(
 
 
 def _variables(law: LearnedLaw) -> list[str]:
-    both = (law.variable, law.other) if law.other else (law.variable,)
-    return [part for variable in both for part in variable.split(" - ")]
+    return [law.variable, law.other] if law.other else [law.variable]
 
 
 def _worst_channel(after: Sequence[Prediction]) -> str:

@@ -1,13 +1,13 @@
 """Laws of what no effect explains: located, estimated, fitted, and written into the machine.
 
 The filter's unknown inputs (`prediction.inputs`) say which balance lacks something, where and when;
-in their places laws of physical variables of the drive are tried (`law_shapes`): piecewise linear
-in one of them, alone or with the sign of the motion or in proportion to the speed, or in two of
-them. What predicts runs that it was not fitted to best (`law_regression`) is fitted once more,
-inside the machine, and kept if it is worth its parameters. It is a term of the patched machine
-(`hydrotele.terms`), which every simulator calculates.
+in their places tables over one or two physical variables of this drive or another are tried
+(`law_tables`). What predicts runs that it was not fitted to best (`law_regression`) is put into the
+machine, fitted again there, where the filter sees clearer, and kept if it is worth its entries. It
+is a term of the patched machine (`hydrotele.terms`), which every simulator calculates.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
@@ -20,32 +20,37 @@ from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import place
 from hydrotele.dynamics.model import X, model_space
 from hydrotele.dynamics.supply import supply_of
-from hydrotele.effects import Parameter
-from hydrotele.gap.law_regression import Regression, regression
-from hydrotele.gap.law_shapes import THROUGH, Shape, possible_shapes
+from hydrotele.gap.law_regression import Regression, at_a_glance, regression
+from hydrotele.gap.law_tables import THROUGH, Table, paired_tables, possible_tables
 from hydrotele.gap.pruning import ENTER
 from hydrotele.gap.search import lacking
-from hydrotele.gap.settling import loss_of
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine import Machine
 from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import Evidence, Judged
 from hydrotele.prediction.free_run import free_run_errors, machine_runner
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
-from hydrotele.prediction.inputs import Input, input_sizes, input_units
-from hydrotele.prediction.levels import smoothed
+from hydrotele.prediction.inputs import Input, input_sizes
+from hydrotele.prediction.levels import smoothed, smoothed_inputs
 from hydrotele.prediction.track import Track, following_model
-from hydrotele.terms.facts import Term
+from hydrotele.terms.facts import OF_A_DRIVE, Term
 
 LEARNED = "learned"
 """First part of the name of a hypothesis that holds a learned law."""
 _MOST = 3  # laws that are learned one after the other
 _LARGEST = 4  # unknown inputs in whose places laws are looked for
-_TRIED = 2  # laws that are fitted inside the machine, of all that the regression finds
-_STEPS = 3  # of Gauss-Newton for each
+_COUPLED = 2  # of these, for which variables of other drives are paired, too
+_PAIRS = 12  # tables over two variables that are looked at closely, for each lack
+_TRIED = 2  # laws that are put into the machine, of all that the regression finds
+_PLAINER = 0.9  # of the best law's fall that one of a single variable needs to go before it
+_AGAIN = 5  # times that a law is fitted again inside the machine
+_STEPS = 3  # of Gauss-Newton for the numbers beside a law
 _DETAIL = 0.05  # of what all laws brought: one that brings less is the last
 _AHEAD = 1.0  # s, of free runs that a law must make better; longer ones drift without readings
 _STEP = 2.0e-3  # s, for the fits
+_BLOCK = 0.25  # s, of the search for a window: less than the memory of an unknown input
+_CONTRAST = 4.0  # times the mean square beyond a window that there is within
+_MOVES = (-0.25, -0.1, 0.0, 0.1, 0.25)  # s, by which a window's ends are moved
 
 
 @dataclass(frozen=True)
@@ -53,10 +58,13 @@ class Learned:
     """A law in the guess.
 
     Attributes:
-        hypothesis: its coefficients as parameters.
+        hypothesis: the machine with it; it has no parameters.
         balance: force, flow_head, flow_rod, `THROUGH` or command.
         axis: of the drive.
-        shape: its form.
+        table: its form.
+        entries: (K,) of the table [unit of the balance].
+        covariance: (K, K) of the entries.
+        left: RMS of the lack that it does not take [unit of the balance].
         smoothing: of the sign of the velocity [m/s] or [rad/s].
         seen: variable -> values along the fit runs.
     """
@@ -64,9 +72,17 @@ class Learned:
     hypothesis: Hypothesis
     balance: str
     axis: str
-    shape: Shape
+    table: Table
+    entries: np.ndarray
+    covariance: np.ndarray
+    left: float
     smoothing: float
     seen: Mapping[str, np.ndarray] = field(repr=False)
+
+    @property
+    def kind(self) -> tuple:
+        """Balance, axis and variables; two laws of one kind would be one."""
+        return self.balance, self.axis, *self.table.kind
 
 
 @dataclass(frozen=True)
@@ -79,6 +95,14 @@ class Discovery:
     judged: Judged
     laws: tuple[Learned, ...]
     refused: int = 0
+
+
+class _Seen(NamedTuple):
+    """A run by what its smoother says: variables of every axis, and the rows that are known."""
+
+    values: dict[str, dict[str, np.ndarray]]
+    known: np.ndarray
+    inputs: np.ndarray
 
 
 def discover(evidence: Evidence, judged: Judged) -> Discovery:
@@ -110,7 +134,7 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
     for _ in range(_MOST):
         evidence.set_base(judged)
         seen = [_see(evidence.data, judged, track) for track in judged.tracks]
-        found = _best_law(evidence, judged, _candidates(evidence, judged, seen, laws))
+        found = _best_law(evidence, judged, seen, _candidates(evidence, judged, seen, laws))
         if found is None:
             break
         now = _open_loop(evidence, evidence.runs, found[0], noise)
@@ -130,22 +154,57 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
 
 
 def _best_law(
-    evidence: Evidence, judged: Judged, candidates: Sequence[tuple[Learned, np.ndarray]]
+    evidence: Evidence, judged: Judged, seen: Sequence[_Seen], candidates: Sequence[Learned]
 ) -> tuple[Judged, Learned] | None:
-    """The candidate that fits the readings best and is worth its parameters, judged."""
-    kept = evidence.base_slopes(_STEP)
-    before = loss_of(evidence, judged.guess, _STEP)
-    fits = []
-    for law, start in candidates:
-        guess = judged.guess.plus(law.hypothesis, start)
-        fits.append((evidence.fit(guess, before, step=_STEP, kept=kept, steps=_STEPS), law))
-    for fit, law in sorted(fits, key=lambda pair: -pair[0].score):
-        if fit.score <= 0.0:
+    """The first candidate that is worth its entries, fitted again inside the machine, judged."""
+    best: tuple[Judged, Learned] | None = None
+    for law in candidates:
+        now = _with_law(evidence, judged, law)
+        if judged.loss - now.loss > ENTER and (best is None or now.loss < best[0].loss):
+            best = now, law
+    for _ in range(_AGAIN if best else 0):
+        assert best
+        now, law = best
+        evidence.set_base(now)
+        again = _refitted(evidence, now, seen, law)
+        if again is None:
             break
-        now = evidence.judged(fit.guess)
-        if judged.loss - now.loss - fit.charge > ENTER:
-            return now, law
-    return None
+        tried = _with_law(evidence, judged, again)
+        if now.loss - tried.loss < ENTER:
+            break
+        best = tried, again
+    evidence.set_base(judged)
+    return best
+
+
+def _with_law(evidence: Evidence, judged: Judged, law: Learned) -> Judged:
+    """A guess with a law more, its other numbers fitted anew."""
+    guess = judged.guess.plus(law.hypothesis, np.zeros(0))
+    if len(guess.deviation):
+        kept = evidence.base_slopes(_STEP)
+        if kept.shape[1] == len(guess.deviation):
+            guess = evidence.fit(guess, 0.0, step=_STEP, kept=kept, steps=_STEPS).guess
+    return evidence.judged(guess)
+
+
+def _refitted(
+    evidence: Evidence, judged: Judged, seen: Sequence[_Seen], law: Learned
+) -> Learned | None:
+    """A law with what the machine that has it still lacks in its form; None for nothing."""
+    inputs = judged.tracks[0].levels.inputs
+    i = next((n for n in inputs if n.name == f"{_side(law.balance)}.{law.axis}"), None)
+    if i is None or (law.balance == THROUGH and Input("flow_rod", law.axis) not in inputs):
+        return None
+    more = _regressed(judged, seen, (i, law.balance, law.table))
+    if more.predicted < ENTER:
+        return None
+    entries = law.entries + more.entries
+    found = more._replace(entries=entries)
+    return _law(evidence.data.machine, (i, law.balance, law.table), found, seen, law.hypothesis)
+
+
+def _side(balance: str) -> str:
+    return "flow_head" if balance == THROUGH else balance
 
 
 def _better(now: tuple[float, float], before: tuple[float, float]) -> bool:
@@ -175,13 +234,6 @@ def _open_loop(
         return np.nan, np.nan
     median, whole = np.sqrt(np.nanmean(found**2, axis=(0, 2)))
     return float(median), float(whole)
-
-
-class _Seen(NamedTuple):
-    """A run by what its smoother says: variables of every axis, and the rows that are known."""
-
-    values: dict[str, dict[str, np.ndarray]]
-    known: np.ndarray
 
 
 @compiled
@@ -215,7 +267,7 @@ def _see(data: Dataset, judged: Judged, track: Track) -> _Seen:
         model, model_space(model), np.ascontiguousarray(states), position, velocity, act, supply
     )
     clock = track.run.start + track.run.period * np.arange(len(states))
-    values = {}
+    values: dict[str, dict[str, np.ndarray]] = {}
     for i, axis in enumerate(order):
         own = {"time": clock, "position": position[:, i], "velocity": velocity[:, i],
                "command": track.run.command[:, i]}  # fmt: skip
@@ -231,57 +283,131 @@ def _see(data: Dataset, judged: Judged, track: Track) -> _Seen:
         elif facts.force:
             own["force"] = facts.force.gain * own["command"]
         values[axis] = own
+    plain = {axis: dict(own) for axis, own in values.items()}
+    for axis, own in values.items():
+        own |= {f"{name}.{other}": column for other, columns in plain.items() if other != axis
+                for name, column in columns.items() if name in OF_A_DRIVE}  # fmt: skip
     known = np.isfinite(states.sum(axis=1))
     known[: min(round(0.5 / track.run.period), len(states) // 4)] = False
     if track.run.valid is not None:
         known &= track.run.valid
-    return _Seen(values, known)
+    return _Seen(values, known, smoothed_inputs(track, (run, told)))
+
+
+_Case = tuple[Input, str, Table]
 
 
 def _candidates(
     evidence: Evidence, judged: Judged, seen: Sequence[_Seen], laws: Sequence[Learned]
-) -> list[tuple[Learned, np.ndarray]]:
-    """Laws worth a fit, with the deviations from which to fit them, for the largest lacks."""
+) -> list[Learned]:
+    """Laws worth a trial for the largest lacks, those that predict best first."""
     machine, levels = evidence.data.machine, judged.tracks[0].levels
     order = np.argsort(-levels.sizes / input_sizes(machine, levels.inputs))
-    taken = {(law.balance, law.axis, law.shape.kind) for law in laws}
-    cases = []
-    for k in order[:_LARGEST]:
+    taken = {law.kind for law in laws}
+
+    def tried(cases: Sequence[_Case]) -> list[tuple[_Case, Regression]]:
+        cases = [c for c in cases if (c[1], c[0].axis, *c[2].kind) not in taken]
+        return list(zip(cases, evidence.map(lambda c: _regressed(judged, seen, c), cases),
+                        strict=True))  # fmt: skip
+
+    looked = []
+    for rank, k in enumerate(order[:_LARGEST]):
         i = levels.inputs[int(k)]
         balances = [i.balance]
         if i.balance == "flow_head" and Input("flow_rod", i.axis) in levels.inputs:
             balances.append(THROUGH)
-        speed = _smoothing(machine, i.axis)
+        window = _busy_window(seen, int(k))
+        values, speed = [s.values[i.axis] for s in seen], _smoothing(machine, i.axis)
         for balance in balances:
-            values = [s.values[i.axis] for s in seen]
-            cases += [
-                (i, balance, shape) for shape in possible_shapes(balance, values, speed)
-                if (balance, i.axis, shape.kind) not in taken
-            ]  # fmt: skip
-
-    def look(case: tuple[Input, str, Shape]) -> Regression:
-        i, balance, shape = case
-        size = float(levels.sizes[levels.inputs.index(i)])
-        parts = []
-        for track, s in zip(judged.tracks, seen, strict=True):
-            column = track.columns[:, levels.inputs.index(i)]
-            if balance == THROUGH:
-                column = track.columns[:, levels.inputs.index(Input("flow_rod", i.axis))] - column
-            products = shape.columns(s.values[i.axis], _smoothing(machine, i.axis))
-            parts.append((track, column, np.where(s.known[:, None], products, 0.0)))
-        return regression(parts, size)
-
-    looked = list(zip(cases, evidence.map(look, cases), strict=True))
+            tables = possible_tables(balance, values, speed)
+            pairs = paired_tables(balance, values, speed, rank < _COUPLED)
+            tables += _likely_pairs(evidence, seen, levels.inputs, (i, balance), pairs)
+            looked += tried([(i, balance, table) for table in tables])
+            if window:
+                tables = possible_tables(balance, values, speed, window)
+                inside = tried([(i, balance, table) for table in tables])
+                best = max(inside, key=lambda pair: pair[1].predicted, default=None)
+                if best and best[1].predicted > ENTER:
+                    moved = [best[0][2]._replace(window=w) for w in _moved_windows(window)]
+                    inside += tried([(i, balance, table) for table in moved])
+                looked += inside
     looked = [pair for pair in looked if pair[1].predicted > ENTER]
-    looked.sort(key=lambda pair: -pair[1].predicted)
-    known, found = {law.hypothesis.key for law in laws}, []
-    for case, answer in looked:  # what the chosen products leave may be known already
-        law, start = _law(machine, case, answer, seen)
-        if law.hypothesis.key not in known:
-            known.add(law.hypothesis.key)
-            found.append((law, start))
-        if len(found) == _TRIED:
-            break
+    most = max((answer.predicted for _, answer in looked), default=0.0)
+
+    def place(pair: tuple[_Case, Regression]) -> tuple[bool, float]:
+        plain = len(pair[0][2].variables) == 1 and pair[1].predicted >= _PLAINER * most
+        return not plain, -pair[1].predicted
+
+    looked.sort(key=place)
+    return [_law(machine, case, answer, seen) for case, answer in looked[:_TRIED]]
+
+
+def _likely_pairs(
+    evidence: Evidence, seen: Sequence[_Seen], inputs: Sequence[Input], at: tuple[Input, str],
+    tables: Sequence[Table],
+) -> list[Table]:  # fmt: skip
+    """Those that take most of an unknown input as the smoother tells it."""
+    i, balance = at
+    told = [s.inputs[s.known, inputs.index(i)] for s in seen]
+    if balance == THROUGH:
+        rod = inputs.index(Input("flow_rod", i.axis))
+        told = [0.5 * (s.inputs[s.known, rod] - t) for s, t in zip(seen, told, strict=True)]
+
+    def glance(table: Table) -> float:
+        shares = [table.columns(s.values[i.axis])[s.known] for s in seen]
+        return at_a_glance(table, list(zip(told, shares, strict=True)))
+
+    found = evidence.map(glance, tables)
+    return [tables[k] for k in np.argsort(found)[::-1][:_PAIRS]]
+
+
+def _regressed(judged: Judged, seen: Sequence[_Seen], case: _Case) -> Regression:
+    """Regression of a table in the place of an unknown input."""
+    i, balance, table = case
+    levels = judged.tracks[0].levels
+    k = levels.inputs.index(i)
+    parts = []
+    for track, s in zip(judged.tracks, seen, strict=True):
+        column = track.columns[:, k]
+        if balance == THROUGH:
+            column = track.columns[:, levels.inputs.index(Input("flow_rod", i.axis))] - column
+        shares = table.columns(s.values[i.axis])
+        parts.append((track, column, np.where(s.known[:, None], shares, 0.0)))
+    return regression(table, parts, float(levels.sizes[k]))
+
+
+def _moved_windows(window: tuple[float, ...]) -> list[tuple[float, float]]:
+    """Windows whose ends are somewhat earlier or later."""
+    begin, end = window
+    return [(begin + a, end + b) for a in _MOVES for b in _MOVES if a or b]
+
+
+def _busy_window(seen: Sequence[_Seen], k: int) -> tuple[float, float] | tuple[()]:
+    """Times between which an unknown input is large, and small beyond, in all runs; or none.
+
+    The change points of the largest likelihood, with one variance within and one beyond, told from
+    the smoother's answer in blocks of `_BLOCK` seconds.
+    """
+    clocks = [next(iter(s.values.values()))["time"] for s in seen]
+    edges = np.arange(0.0, max(float(c[-1]) for c in clocks) + _BLOCK, _BLOCK)
+    squares, counts = np.zeros(len(edges)), np.zeros(len(edges))
+    for s, clock in zip(seen, clocks, strict=True):
+        values = s.inputs[s.known, k] ** 2
+        squares[1:] += np.histogram(clock[s.known], edges, weights=values)[0]
+        counts[1:] += np.histogram(clock[s.known], edges)[0]
+    squares, counts = np.cumsum(squares), np.cumsum(counts)
+    best, found, least = 0.0, (), 1.0 / _BLOCK * counts[-1] / max(1, len(edges) - 1)
+    for a, b in itertools.combinations(range(len(edges)), 2):
+        within, beyond = counts[b] - counts[a], counts[-1] - counts[b] + counts[a]
+        if min(within, beyond) < least:
+            continue
+        high = (squares[b] - squares[a]) / within
+        low = (squares[-1] - squares[b] + squares[a]) / beyond
+        if high > _CONTRAST * low:
+            fall = counts[-1] * np.log(squares[-1] / counts[-1])
+            fall -= within * np.log(high) + beyond * np.log(max(low, 1e-6 * high))
+            if fall > best:
+                best, found = fall, (float(edges[a]), float(edges[b]))
     return found
 
 
@@ -290,39 +416,30 @@ def _smoothing(machine: Machine, axis: str) -> float:
 
 
 def _law(
-    machine: Machine, case: tuple[Input, str, Shape], found: Regression, seen: Sequence[_Seen]
-) -> tuple[Learned, np.ndarray]:
-    """A law of the products that are worth it, with the regression's coefficients as start."""
-    i, balance, shape = case
-    shape = shape.with_products(found.chosen)
-    (unit,) = input_units(machine, [i])
-    parameters = {
-        product: Parameter(f"{unit} / [{product}]" if product != "1" else unit, 0.0, -50.0 * s,
-                           50.0 * s, float(s), 0.0)
-        for product, s in zip(shape.products, found.scale, strict=True)
-    }  # fmt: skip
+    machine: Machine, case: _Case, found: Regression, seen: Sequence[_Seen],
+    known: Hypothesis | None = None,
+) -> Learned:  # fmt: skip
+    """A law of a regression; `known` is the hypothesis that it replaces."""
+    i, balance, table = case
     values = [s.values[i.axis] for s in seen]
     everywhere = {v: np.concatenate([x[v] for x in values]) for v in values[0]}
-    domain = {v: (float(everywhere[v].min()), float(everywhere[v].max()))
-              for v in shape.variables if np.ptp(everywhere[v]) > 0.0}  # fmt: skip
     name = f"{LEARNED}_{balance}"
+    sides = (("flow_head", -1.0), ("flow_rod", 1.0)) if balance == THROUGH else ((balance, 1.0),)
 
-    def change(nominal: Machine, coefficients: Mapping[str, float]) -> Machine:
+    def change(nominal: Machine, _: Mapping[str, float]) -> Machine:
         terms = list(nominal.terms)
-        sides = (
-            (("flow_head", -1.0), ("flow_rod", 1.0)) if balance == THROUGH else ((balance, 1.0),)
-        )
         taken = {term.name for term in terms if term.axis == i.axis}
         own = next(n for n in chain([name], (f"{name}_{k}" for k in count(2))) if n not in taken)
         for side, sign in sides:
             terms.append(Term.model_validate({
-                "name": own, "axis": i.axis, "balance": side, "law": "formula",
-                "parameters": {p: sign * value for p, value in coefficients.items()},
-                "domain": domain, "uncertainty": found.left,
-                "description": f"learned from data: {balance} over {shape.name}",
+                "name": own, "axis": i.axis, "balance": side, "uncertainty": found.left,
+                "description": f"learned from data: {balance} over {table.name}",
+                **table.law(sign * found.entries),
             }))  # fmt: skip
         return nominal.model_copy(update={"terms": tuple(terms)})
 
-    hypothesis = Hypothesis(name, f"{i.axis}.{shape.name}", parameters, change)
-    law = Learned(hypothesis, balance, i.axis, shape, _smoothing(machine, i.axis), everywhere)
-    return law, found.deviation
+    hypothesis = Hypothesis(name, known.location if known else f"{i.axis}.{table.name}", {}, change)
+    return Learned(
+        hypothesis, balance, i.axis, table, found.entries, found.covariance, found.left,
+        _smoothing(machine, i.axis), everywhere,
+    )  # fmt: skip

@@ -121,7 +121,7 @@ def find_gap(
     finally:
         evidence.close()
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
-    learned = learned_laws(discovery, nominal, spread, shares)
+    learned = learned_laws(discovery, nominal, shares)
     failed |= any(law.share > _MINOR for law in learned)  # a law that has no known cause
     named = _named(found, discovery.judged.guess, spread, shares)
     if failed:

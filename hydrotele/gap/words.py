@@ -1,6 +1,7 @@
 """The verdict in plain words, as the console, the report and the README say it."""
 
 import math
+from collections.abc import Sequence
 
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.customary import amount, said
@@ -41,7 +42,6 @@ _VARIABLES = {
     "spool": "spool position", "pump_speed": "pump speed", "force": "load",
     "pressure_head": "head side pressure", "pressure_rod": "rod side pressure",
     "pressure_supply": "supply pressure",
-    "pressure_head - pressure_rod": "pressure difference between head and rod side",
 }  # fmt: skip
 _TOLD = 3  # calibrated numbers that the verdict tells
 _SLIGHT = 0.1  # of the noise: a gap below it hardly shows in single predictions
@@ -77,27 +77,31 @@ def channel_words(channel: str) -> str:
 
 
 def variable_words(variable: str) -> str:
-    """A variable of a learned law in plain words."""
-    return _VARIABLES.get(variable, variable.replace("_", " "))
+    """A variable of a learned law in plain words.
+
+    >>> variable_words("pressure_rod.swing")
+    'rod side pressure of the swing'
+    """
+    name, _, axis = variable.partition(".")
+    words = _VARIABLES.get(name, name.replace("_", " "))
+    return f"{words} of the {axis}" if axis else words
 
 
 def learned_words(
-    balance: str, axis: str, variable: str, factor: str, size: float, unit: str, resembles: str,
-    other: str = "",
+    balance: str, axis: str, variable: str, size: float, unit: str, resembles: str,
+    other: str = "", window: Sequence[float] = (),
 ) -> str:  # fmt: skip
     """What a learned law does, in a sentence or two.
 
-    >>> learned_words("force", "boom", "position", "velocity", 9e3, "N", "")
-    'A force on the boom drive, 9 kN RMS, that varies with position and grows with the velocity.'
+    >>> learned_words("force", "boom", "position", 9e3, "N", "", "velocity.swing")
+    'A force on the boom drive, 9 kN RMS, that varies with position and the velocity of the swing.'
     """
     how = f"that varies with the {variable_words(variable)}"
     if other:
         how += f" and the {variable_words(other)}"
     how = how.replace("the position", "position").replace("the time", "time")
-    if factor == "velocity":
-        how += " and grows with the velocity"
-    elif factor:
-        how += " and changes sign with the motion"
+    if window:
+        how += f", from {window[0]:.3g} to {window[1]:.3g} s"
     text = f"{_capital(_LACKS[balance].format(axis=axis))}, {amount(size, unit)} RMS, {how}."
     return f"{text} It resembles {resembles.replace('_', ' ')}." if resembles else text
 

@@ -5,10 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hydrotele.effects import Parameter
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, Learned
-from hydrotele.gap.law_shapes import Shape
+from hydrotele.gap.law_tables import Table
 from hydrotele.gap.result import Lack, Prediction
 from hydrotele.machine_file import load_machine
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
@@ -20,53 +19,62 @@ SEEN = {
     "position": 0.5 + 0.2 * np.sin(_TIME),
     "velocity": 0.2 * np.cos(_TIME),
     "command": 0.4 * np.cos(_TIME),
+    "velocity.swing": 0.3 + 0.2 * np.sin(2.0 * _TIME),
 }
 
 
-def learned(shape, coefficients, balance="force", axis="boom"):
-    """The description of a law with these coefficients, each known to a tenth of its scale."""
-    scale = 10.0
-    parameters = {p: Parameter("N", 0.0, -1e6, 1e6, scale, 0.0) for p in shape.products}
-    hypothesis = Hypothesis(f"learned_{balance}", f"{axis}.x", parameters, lambda m, _: m)
-    law = Learned(hypothesis, balance, axis, shape, _SMOOTHING, SEEN)
-    guess = Guess(((hypothesis, np.array(coefficients) / scale),))
-    spread = np.full(len(coefficients), 0.1)
+def learned(table, entries, balance="force", axis="boom", covariance=None):
+    """The description of a law with these entries, each known to 1 N or so."""
+    hypothesis = Hypothesis(f"learned_{balance}", f"{axis}.x", {}, lambda m, _: m)
+    covariance = np.eye(len(entries)) if covariance is None else covariance
+    law = Learned(
+        hypothesis, balance, axis, table, np.array(entries, float), covariance, 1.0, _SMOOTHING,
+        SEEN,
+    )  # fmt: skip
+    guess = Guess(((hypothesis, np.zeros(0)),))
     (found,) = learned_laws(
-        Discovery(SimpleNamespace(guess=guess), (law,)), load_machine("cat215"), spread,
+        Discovery(SimpleNamespace(guess=guess), (law,)), load_machine("cat215"),
         {hypothesis.key: 0.4},
     )  # fmt: skip
     return found
 
 
-def test_a_curve_is_its_formula_with_the_band_of_its_coefficients():
-    found = learned(Shape("position", "", (0.55,)), [100.0, -200.0, 3000.0])
-    x, share = np.array(found.points), found.share
-    kink = np.maximum(0.0, x - 0.55)
-    np.testing.assert_allclose(found.values, 100.0 - 200.0 * x + 3000.0 * kink, rtol=1e-9)
-    np.testing.assert_allclose(found.spread, np.sqrt(1.0 + x**2 + kink**2), rtol=1e-9)
-    assert found.formula == "100 - 200 position + 3e+03 above(position, 0.55)"
-    assert (found.unit, found.variable_unit, share) == ("N", "m", 0.4)
+def test_a_curve_is_its_table_with_the_band_of_its_entries():
+    covariance = np.array([[4.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
+    found = learned(
+        Table(("position",), ((0.3, 0.5, 0.7),)), [100.0, -200.0, 300.0], covariance=covariance
+    )
+    x = np.array(found.points)
+    np.testing.assert_allclose(found.values, np.interp(x, (0.3, 0.5, 0.7), (100, -200, 300)))
+    part = np.clip((x - 0.3) / 0.2, 0.0, 1.0)
+    left = x < 0.5
+    expected = np.sqrt(4 * (1 - part) ** 2 + part**2 + 2 * part * (1 - part))
+    np.testing.assert_allclose(np.array(found.spread)[left], expected[left], rtol=1e-9)
+    assert found.formula == "linear_table(position; 0.3: 100, 0.5: -200, 0.7: 300)"
+    assert (found.unit, found.variable_unit, found.share) == ("N", "m", 0.4)
     assert x[0] >= SEEN["position"].min() and x[-1] <= SEEN["position"].max()
     assert "force on the boom drive" in found.description and found.resembles == ""
 
 
-def test_a_law_with_the_sign_of_the_motion_is_shown_for_positive_motion():
-    """A constant times the sign is Coulomb friction, and is said to resemble it."""
-    found = learned(Shape("position", f"sign(velocity, {_SMOOTHING})", ()), [-500.0, 0.0])
-    np.testing.assert_allclose(found.values, -500.0, rtol=1e-9)
-    assert found.resembles == "coulomb_friction"
-    assert "changes sign with the motion" in found.description
+def test_a_table_that_is_friction_is_said_to_resemble_it():
+    points = (-0.3, -_SMOOTHING, _SMOOTHING, 0.3)
+    found = learned(Table(("velocity",), (points,)), [500.0, 500.0, -500.0, -500.0])
+    assert found.resembles == "coulomb_friction" and found.variable_unit == "m/s"
 
 
-@pytest.mark.parametrize(
-    ("balance", "axis", "unit"),
-    [("force", "boom", "N s/m"), ("force", "swing", "N m s/rad"), ("flow_head", "boom", "m^2")],
-)
-def test_a_law_in_proportion_to_the_speed_is_per_speed(balance, axis, unit):
-    found = learned(Shape("position", "velocity", ()), [-50.0, 0.0], balance, axis)
-    np.testing.assert_allclose(found.values, -50.0, rtol=1e-9)
-    assert found.unit == unit
-    assert found.variable_unit == ("rad" if axis == "swing" else "m")
+def test_a_law_of_two_variables_is_shown_at_the_median_of_the_second():
+    table = Table(("position", "velocity.swing"), ((0.3, 0.7), (-1.0, 0.0, 1.0)))
+    found = learned(table, [1.0, 2.0, 3.0, 5.0, 6.0, 7.0])
+    x, across = np.array(found.points), float(np.median(SEEN["velocity.swing"]))
+    np.testing.assert_allclose(found.values, 2.0 + across + 4.0 * (x - 0.3) / 0.4)
+    assert "varies with position and the velocity of the swing" in found.description
+    told = describe((), (found,), [predictions((6.0, 9.0))])
+    assert told.depends_on == ("position.boom", "velocity.swing")
+
+
+def test_a_law_that_acts_for_a_while_says_when():
+    found = learned(Table(("position",), ((0.3, 0.7),), (4.0, 9.5)), [1.0, 2.0])
+    assert "from 4 to 9.5 s" in found.description and "from 4 to 9.5 s" in found.formula
 
 
 def predictions(loud):
@@ -90,7 +98,7 @@ def test_what_is_left_is_located_in_balance_channel_and_time():
 
 
 def test_a_learned_law_tells_on_what_it_depends():
-    law = learned(Shape("position", "", ()), [100.0, 5.0])
+    law = learned(Table(("position",), ((0.3, 0.7),)), [100.0, 5.0])
     found = describe((), (law,), [predictions((6.0, 9.0))])
     assert found.law == "force" and found.depends_on == ("position.boom",)
     assert found.term == law.formula and law.description in found.description

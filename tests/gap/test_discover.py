@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from hydrotele.dataset.load import load_dataset
-from hydrotele.gap.discover import _better, _law, _Seen
+from hydrotele.gap.discover import _better, _busy_window, _law, _Seen
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.law_regression import Regression
-from hydrotele.gap.law_shapes import Shape, possible_shapes
+from hydrotele.gap.law_regression import Regression, at_a_glance
+from hydrotele.gap.law_tables import Table, paired_tables, possible_tables
 from hydrotele.log import save_log
 from hydrotele.machine_file import load_machine, save_machine
 from hydrotele.prediction.free_run import free_run_errors, machine_runner
@@ -24,6 +24,8 @@ from hydrotele.prediction.track import track_run
 from hydrotele.run import run_scenario
 from hydrotele.scenario import Scenario
 from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Drives, DriveState
+from hydrotele.terms.table import FORCE, added, terms_table
 from tests.prediction.test_filter import machine_data
 
 PERIOD, SECONDS = 0.01, 10.0
@@ -92,62 +94,97 @@ def test_answers_of_the_errors_are_those_of_a_simulated_term():
 def test_two_laws_of_one_balance_are_written_and_read(tmp_path):
     """A machine that learned twice, or learns again after it was patched, is still a machine."""
     rig, case = load_machine("rig"), Input("flow_head", "slide")
-    seen = _Seen({"slide": {"position": np.array([0.0, 0.4]), "velocity": np.array([-1.0, 1.0])}},
-                 np.ones(2, bool))  # fmt: skip
-    found = Regression(1.0, (1,), np.ones(1), np.ones(1), 0.1)
+    values = {"position": np.array([0.0, 0.4]), "velocity": np.array([-1.0, 1.0])}
+    seen = _Seen({"slide": values}, np.ones(2, bool), np.zeros((2, 1)))
+    found = Regression(1.0, np.array([1.0, 2.0]) * 1e-5, np.eye(2), 1.0, 0.1)
     patched = rig
     for variable in ("position", "velocity", "position"):
-        shape = Shape(variable, "", (0.1,), "", ())
+        table = Table((variable,), ((-0.1, 0.1),))
         for balance in ("flow_head", "flow_through"):
-            law, start = _law(patched, (case, balance, shape), found, [seen])
-            patched = law.hypothesis.machine(patched, start)
+            law = _law(patched, (case, balance, table), found, [seen])
+            patched = law.hypothesis.machine(patched, np.zeros(0))
     save_machine(patched, tmp_path / "machine.yaml")
     assert len(load_machine(str(tmp_path / "machine.yaml")).terms) == 9  # through is on both sides
 
 
-def test_products_of_two_variables_are_bilinear_between_their_kinks():
-    shape = Shape("position", "", (0.3,), "pressure_head - pressure_rod", ())
-    values = {
-        "position": np.array([0.1, 0.5]), "pressure_head": np.array([3e6, 5e6]),
-        "pressure_rod": np.array([1e6, 1e6]),
-    }  # fmt: skip
-    assert shape.products == [
-        "1", "(pressure_head - pressure_rod)", "position",
-        "position * (pressure_head - pressure_rod)", "above(position, 0.3)",
-        "above(position, 0.3) * (pressure_head - pressure_rod)",
-    ]  # fmt: skip
-    expected = [[1, 2e6, 0.1, 2e5, 0, 0], [1, 4e6, 0.5, 2e6, 0.2, 8e5]]
-    np.testing.assert_allclose(shape.columns(values, 0.01), expected)
-    some = shape.with_products((1, 3))
-    assert some.products == [shape.products[1], shape.products[3]]
-    np.testing.assert_allclose(some.columns(values, 0.01), np.array(expected)[:, [1, 3]])
-    Term(name="law", axis="slide", balance="force", law="formula",
-         parameters=dict.fromkeys(shape.products, 1.0))  # fmt: skip
+NAMES = ("time", "position", "velocity", "spool", "command", "force", "pressure_head",
+         "pressure_rod", "pressure_supply", "velocity.swing", "spool.swing", "command.stick")  # fmt: skip
 
 
-def test_a_variable_without_products_is_none_of_the_laws():
-    shape = Shape("position", "", (0.3,), "velocity", (0.0,))
-    assert shape.with_products((3, 6)) == Shape("position", "", (0.3,), chosen=(1, 2))
-    assert shape.with_products((1, 2)) == Shape("velocity", "", (0.0,), chosen=(1, 2))
-    assert shape.with_products((1, 4)).kind == ("position", "", "velocity")
-    for chosen in ((3, 6), (1, 2), (1, 4)):
-        expected = [shape.products[k] for k in chosen]
-        assert shape.with_products(chosen).products == expected
-
-
-def test_every_form_of_a_balance_can_be_written_as_a_term():
+@pytest.fixture(scope="module")
+def made_up():
+    """Values of a boom's variables that have nothing to do with each other."""
     rng = np.random.default_rng(0)
-    names = ("time", "position", "velocity", "spool", "command", "force", "pressure_head",
-             "pressure_rod", "pressure_supply")  # fmt: skip
-    values = [{name: rng.normal(size=400) for name in names}]
-    for balance in ("force", "flow_head", "flow_rod", "flow_through", "command"):
-        shapes = possible_shapes(balance, values, 0.01)
-        assert len({shape.kind for shape in shapes}) == len(shapes) > 10
-        assert len({shape.name for shape in shapes}) == len(shapes)  # two laws of one place
-        for shape in shapes:
-            Term(name="law", axis="slide", balance="force", law="formula",
-                 parameters=dict.fromkeys(shape.products, 1.0))  # fmt: skip
-            assert shape.columns(values[0], 0.01).shape == (400, len(shape.products))
+    return {name: rng.normal(size=400) for name in NAMES} | {"time": np.linspace(0.0, 9.0, 400)}
+
+
+@pytest.mark.parametrize("balance", ["force", "flow_head", "flow_rod", "flow_through", "command"])
+def test_every_table_is_a_term_that_adds_what_its_columns_say(balance, made_up):
+    rng = np.random.default_rng(1)
+    tables = possible_tables(balance, [made_up], 0.01)
+    tables += possible_tables(balance, [made_up], 0.01, (2.0, 5.0))
+    tables += paired_tables(balance, [made_up], 0.01, others=True)
+    assert len({table.kind for table in tables}) == len(tables) > 20
+    assert len({table.name for table in tables}) == len(tables)  # two laws of one place
+    order = ["swing", "boom", "stick"]
+    for table in rng.permutation(np.array(tables, object))[:12]:
+        table = Table(*table)
+        entries = rng.normal(size=table.size)
+        term = Term(name="law", axis="boom", balance="force", **table.law(entries))
+        written = terms_table([term], order)
+        columns = table.columns(made_up)
+        assert columns.shape == (400, table.size)
+        for row in rng.integers(400, size=20):
+            own = {name: made_up[name][row] for name in NAMES if "." not in name}
+            swing, stick = made_up["velocity.swing"][row], made_up["command.stick"][row]
+            act = np.zeros(12)
+            act[0] = made_up["spool.swing"][row]
+            drives = Drives(3, act, np.zeros(3), np.array([swing, 0, 0]), np.array([0, 0, stick]))
+            got = added(written, FORCE, 1, DriveState(**own, spool_rate=0.0), drives)
+            assert got == pytest.approx(columns[row] @ entries, rel=1e-9, abs=1e-12)
+
+
+def test_pairs_are_never_of_variables_that_only_their_drives_tell_apart(made_up):
+    pairs = [t.variables for t in paired_tables("command", [made_up], 0.01, others=True)]
+    assert ("velocity", "spool.swing") in pairs or ("spool.swing", "velocity") in pairs
+    assert ("velocity.swing", "spool.swing") in pairs
+    assert not any({"velocity", "velocity.swing"} == set(pair) for pair in pairs)
+    assert not any({"velocity.swing", "command.stick"} == set(pair) for pair in pairs)
+    alone = paired_tables("command", [made_up], 0.01, others=False)
+    assert not any("." in variable for table in alone for variable in table.variables)
+
+
+def test_a_smooth_surface_is_found_among_other_tables():
+    rng = np.random.default_rng(2)
+    values = {name: rng.normal(size=6000) for name in NAMES}
+    x, y = values["velocity"], values["pressure_rod"]
+    told = np.cos(1.5 * x + y) + rng.normal(size=6000)
+    shares = {
+        table.variables: at_a_glance(
+            table, [(told[k::2], table.columns(values)[k::2]) for k in range(2)]
+        )
+        for table in paired_tables("flow_head", [values], 0.01, others=True)
+    }
+    assert max(shares, key=shares.__getitem__) in (
+        ("velocity", "pressure_rod"), ("pressure_rod", "velocity")
+    )  # fmt: skip
+    strange = [s for pair, s in shares.items() if not {"velocity", "pressure_rod"} & set(pair)]
+    assert len(strange) > 10 and max(strange) < 0.2 * max(shares.values())
+
+
+def test_a_window_is_seen_where_a_lack_is_there_for_a_while(made_up):
+    clock = np.linspace(0.0, 20.0, 1000)
+    rng = np.random.default_rng(3)
+    inside = (clock > 6.1) & (clock < 11.4)
+    known, values = np.ones(1000, bool), {"boom": {"time": clock}}
+    seen = [
+        _Seen(values, known, (rng.normal(size=1000) * np.where(inside, 5.0, 0.5))[:, None])
+        for _ in range(3)
+    ]
+    begin, end = _busy_window(seen, 0)
+    assert (begin, end) == (pytest.approx(6.1, abs=0.26), pytest.approx(11.4, abs=0.26))
+    even = [_Seen(values, known, rng.normal(size=(1000, 1))) for _ in range(3)]
+    assert _busy_window(even, 0) == ()
 
 
 @pytest.mark.parametrize(
