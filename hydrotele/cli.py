@@ -394,7 +394,7 @@ def _options(
 
 
 def main() -> None:
-    """Entry point; exits with 2 for the user's errors, 3 for failed runs, 130 and 143 for signals."""
+    """Entry point; exits with 2 for users' errors, 3 for failed runs, 130 or 143 for signals."""
     os.environ["PYTHONSAFEPATH"] = "1"  # children import nothing from the working folder
     ended: list[int] = []
 

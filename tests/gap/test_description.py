@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, Learned

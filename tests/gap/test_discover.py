@@ -107,8 +107,10 @@ def test_two_laws_of_one_balance_are_written_and_read(tmp_path):
     assert len(load_machine(str(tmp_path / "machine.yaml")).terms) == 9  # through is on both sides
 
 
-NAMES = ("time", "position", "velocity", "spool", "command", "force", "pressure_head",
-         "pressure_rod", "pressure_supply", "velocity.swing", "spool.swing", "command.stick")  # fmt: skip
+NAMES = (
+    "time", "position", "velocity", "spool", "command", "force", "pressure_head", "pressure_rod",
+    "pressure_supply", "velocity.swing", "spool.swing", "command.stick",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
