@@ -19,6 +19,7 @@ import random
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -362,6 +363,14 @@ def _csv(dice: random.Random, folder: Path) -> list[str]:
     return ["validate", "log.csv"]
 
 
+_RIG = ["--machine", "rig", "--json"]
+_FITTING = [
+    ["compare", "rig", "--data", "data", "--json"], ["replay", "data/fit_2.parquet", *_RIG],
+    ["review", "data/fit_2.parquet", "--out", "out.rrd"], ["validate", "data/fit_2.parquet"],
+    ["identify", "--data", "data", *_RIG, "--out", "out"],
+]  # fmt: skip
+
+
 def _data_folder(dice: random.Random, folder: Path) -> list[str]:
     """Three runs of the rig, one of them damaged, for the commands that fit models to data."""
     (folder / "data").mkdir()
@@ -370,12 +379,7 @@ def _data_folder(dice: random.Random, folder: Path) -> list[str]:
             _write_unchecked(folder / f"data/{name}.parquet", *_damaged(dice, log))
         else:
             save_log(log, folder / f"data/{name}.parquet")
-    most = ["--machine", "rig", "--json"]
-    return dice.choice([
-        ["compare", "rig", "--data", "data", "--json"], ["replay", "data/fit_2.parquet", *most],
-        ["review", "data/fit_2.parquet", "--out", "out.rrd"],
-        ["validate", "data/fit_2.parquet"], ["identify", "--data", "data", *most, "--out", "out"],
-    ])  # fmt: skip
+    return dice.choice(_FITTING)
 
 
 def _write_unchecked(
@@ -474,6 +478,18 @@ def _ready() -> None:
     _rig_runs()
 
 
+def _compile_once() -> None:
+    """What the commands compile when they first run is no part of a case's time."""
+    with tempfile.TemporaryDirectory() as name:
+        (Path(name) / "data").mkdir()
+        for run, log in _rig_runs().items():
+            save_log(log, Path(name) / f"data/{run}.parquet")
+        teleop = ["analyse", "teleop", "--json"]
+        for words in (*_FITTING, teleop, ["run", "zhu_up", "--set", "duration=0.3", "--out", "r"]):
+            command = [sys.executable, "-m", "hydrotele.cli", *words]
+            subprocess.run(command, cwd=name, check=True, capture_output=True)
+
+
 def main() -> None:
     """Judge cases, print the defects and how many there were of each kind."""
     parser = argparse.ArgumentParser(
@@ -491,6 +507,7 @@ def main() -> None:
         print(folder, *make_case(args.only, folder).arguments)
         print(judge(args.only))
         return
+    _compile_once()
     begin, found, kinds = time.monotonic(), Counter(), Counter()
     with ProcessPoolExecutor(args.jobs, get_context("spawn"), _ready) as pool:
         seeds = range(args.seed, args.seed + args.count)
