@@ -34,10 +34,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from hydrotele.log import Log, save_log
+from hydrotele.log import Log, load_log, save_log
 from hydrotele.resources import models_folder, scenarios_folder
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
 from hydrotele.teleop_case import SHIPPED
 
 SECONDS, MEMORY, LETTERS = 60.0, 4_000_000_000, 2048  # limits of a case
@@ -399,12 +397,22 @@ def _write_unchecked(
 
 @functools.cache
 def _rig_runs() -> dict[str, Log]:
-    """Three short runs of the rig that the commands accept."""
-    scenario = load_scenario("rig_steps").model_copy(update={"duration": 4.0})
-    return {
-        name: run_scenario(scenario.model_copy(update={"seed": k})).measured
-        for k, name in enumerate(("fit_1", "fit_2", "test_1"))
-    }
+    """Three short runs of the rig that the commands accept.
+
+    They are made by other processes: a simulation here might hold locks that a forked child needs.
+    """
+    runs = {}
+    with tempfile.TemporaryDirectory() as name:
+        for k, run in enumerate(("fit_1", "fit_2", "test_1")):
+            words = ["run", "rig_steps", "--set", f"seed={k}", "--set", "duration=4.0"]
+            _command([*words, "--out", run, "--no-review"], name)
+            runs[run] = load_log(Path(name) / run / "measured.parquet")
+    return runs
+
+
+def _command(words: list[str], folder: str) -> None:
+    command = [sys.executable, "-m", "hydrotele.cli", *words]
+    subprocess.run(command, cwd=folder, check=False, capture_output=True)
 
 
 def _damaged(dice: random.Random, log: Log) -> tuple[np.ndarray, dict, dict, dict]:
@@ -485,9 +493,12 @@ def _compile_once() -> None:
         for run, log in _rig_runs().items():
             save_log(log, Path(name) / f"data/{run}.parquet")
         teleop = ["analyse", "teleop", "--json"]
-        for words in (*_FITTING, teleop, ["run", "zhu_up", "--set", "duration=0.3", "--out", "r"]):
-            command = [sys.executable, "-m", "hydrotele.cli", *words]
-            subprocess.run(command, cwd=name, check=True, capture_output=True)
+        runs = [
+            ["run", file.stem, "--set", "duration=0.3", "--out", file.stem, "--no-review"]
+            for file in sorted(scenarios_folder().glob("*.yaml"))
+        ]
+        for words in (*_FITTING, teleop, *runs):
+            _command(words, name)
 
 
 def main() -> None:
