@@ -118,7 +118,7 @@ class Joystick(Facts):
     workspace: Workspace
     sensing: OpticalSensing
     diodes: DiodeFacts
-    control_rate: Annotated[Positive, Field(le=1.0e5)]
+    control_rate: Annotated[Positive, Field(ge=1.0, le=1.0e5)]
     flotor: FlotorFacts
     coils: CoilFacts
     alone: AloneFacts

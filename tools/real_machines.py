@@ -33,7 +33,8 @@ from hydrotele.prediction.free_run import (
 from hydrotele.prediction.open_numbers import open_numbers
 from hydrotele.prediction.output_error import fit_free_runs
 from hydrotele.prediction.stretches import busiest_rows
-from hydrotele.terms.law import LAWS, DriveState
+from hydrotele.terms.law import NO_DRIVES, DriveState
+from hydrotele.terms.table import FORCE, added, terms_table
 
 WINDOW, LEAD = 5.0, 0.5  # s; of each window the lead has readings, the rest none
 PUSH = (176.0, 7.3, 0.7)  # N, s, s: half of the drive's largest force
@@ -69,20 +70,15 @@ def force_error(machine: Machine, run: RunData, cutoff: float) -> float:
 
 def _added(machine: Machine, run: RunData, position: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Forces (n,) that learned laws and other terms add to the drive along a motion [N]."""
-    total = np.zeros(len(rate))
-    for term in machine.terms:
-        law = LAWS[term.law]
-        given = law.translate(term.parameters) if law.translate else term.parameters
-        arguments = {k: np.array(v) if isinstance(v, list) else v for k, v in given.items()}
-        for row, (x, v) in enumerate(zip(position, rate, strict=True)):
-            command = float(run.command[row, 0])
-            force = machine.axes["slide"].force.gain * command
-            now = {"time": run.start + row * run.period, "position": x, "velocity": v,
-                   "command": command, "force": force}  # fmt: skip
-            for name, (low, high) in term.domain.items():
-                now[name] = min(max(now[name], low), high)
-            state = DriveState(**{**dict.fromkeys(DriveState._fields, 0.0), **now})
-            total[row] += law.function(state, **arguments)
+    total, table = np.zeros(len(rate)), terms_table(machine.terms, ["slide"])
+    nothing = DriveState(*[0.0] * len(DriveState._fields))
+    for row, (x, v) in enumerate(zip(position, rate, strict=True)):
+        command = float(run.command[row, 0])
+        state = nothing._replace(
+            time=run.start + row * run.period, position=x, velocity=v, command=command,
+            force=machine.axes["slide"].force.gain * command,
+        )  # fmt: skip
+        total[row] = added(table, FORCE, 0, state, NO_DRIVES)
     return total
 
 

@@ -19,6 +19,7 @@ from hydrotele.prediction.track import Track
 from hydrotele.signals import parse_channel
 
 _PART, _PART_STEEP = 0.35, 0.07  # see `believed_part`
+_LEADS = 0.9  # share of the gap that comes back without an effect that leads
 _LEFT, _LEFT_STEEP = 0.12, 0.03  # see `believed`
 _PIECE = 0.2, 0.99  # probability between which an effect may be one of several pieces
 
@@ -69,7 +70,8 @@ def believed(
 
     Args:
         named: the effects, with their probabilities among the library's.
-        laws: that were learned beside them; what they close, the effects leave.
+        laws: that were learned beside them; what they close, the effects leave, but for one without
+            which nearly all of the gap comes back: laws then tell what else there is.
         left: of `left_over`.
         lost: axes whose channels still show a gap, "" for channels without axis; none where the
             patched machine predicts as well as a perfect one.
@@ -91,7 +93,9 @@ def believed(
         if not lost or (axis and axis not in lost):
             found.append(effect)
             continue
-        rest = left[axis] + sum(law.share for law in laws if axis in ("", law.axis))
+        beside = [law.share for law in laws if axis in ("", law.axis)]
+        leads = effect.share >= _LEADS and effect.share > max(beside, default=0.0)
+        rest = left[axis] + (0.0 if leads else sum(beside))
         trust = 1.0 / (1.0 + np.exp((min(rest, 1.0) - _LEFT) / _LEFT_STEEP))
         if axis and effect.probability < _PIECE[1]:
             trust /= max(1, pieces.count(axis))

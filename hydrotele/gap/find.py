@@ -114,9 +114,11 @@ def find_gap(
             patched, after = nominal, before
         before = asked
         tests, floor = judge.tests(evidence, discovery.judged, patched, after)
-        evidence.set_base(discovery.judged)
+        # Numbers of effects were found before the laws, and so were their intervals.
+        told = found.judged if discovery.laws else discovery.judged
+        evidence.set_base(told)
         scatter = tests.get("constancy", {}).get("value", 1.0)
-        spread = spreads(evidence, discovery.judged.guess, scatter)
+        spread = spreads(evidence, told.guess, scatter)
         shares = judge.shares(discovery, before, after, floor, evidence.map)
     finally:
         evidence.close()
