@@ -85,3 +85,15 @@ def test_a_users_joystick_is_a_file_or_a_folder(tmp_path):
     with pytest.raises(InputError, match="valid: joystick"):
         load_joystick("gamepad")
     assert shipped_joysticks() == ["joystick"]
+
+
+@pytest.mark.parametrize("rate", ["1.0e-320", "1.0e9"])
+def test_a_control_rate_that_leaves_no_period_is_refused(tmp_path, rate):
+    """Found by tools/fuzz.py: its period was infinite."""
+    shutil.copytree(models_folder() / "joystick", tmp_path / "own")
+    file = tmp_path / "own" / "joystick.yaml"
+    text = file.read_text()
+    line = next(line for line in text.splitlines() if line.startswith("control_rate"))
+    file.write_text(text.replace(line, f"control_rate: {rate}"))
+    with pytest.raises(InputError, match="control_rate"):
+        load_joystick(tmp_path / "own")
