@@ -91,6 +91,8 @@ def _files(path: Path) -> list[tuple[str, Path]]:
         raise InputError(path, "is not there: name a folder with logs, or logs")
     if path.is_file():
         return [(path.stem if path.stem != MEASURED else path.resolve().parent.name, path)]
+    if not path.is_dir():
+        raise InputError(path, "is neither a file nor a folder: name a folder with logs, or logs")
     seen = sorted(p for p in path.iterdir() if not p.name.startswith("."))
     if record := _record(path):
         return [(path.resolve().name, record)]

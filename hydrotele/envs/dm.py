@@ -97,7 +97,7 @@ class MachineEnvironment(dm_env.Environment):
         if self._over:
             return self.reset()
         core = self.core
-        core.step(action)
+        core.step_one(action)
         reward, seen = float(core.reward[0]), self._observation()
         self._over = bool(core.terminated[0] or core.truncated[0])
         if core.terminated[0]:

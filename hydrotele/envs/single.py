@@ -93,7 +93,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             ValueError: the action has another shape, or is not a finite number.
         """
         core = self.core
-        core.step(action)
+        core.step_one(action)
         self._show()
         return (
             core.observation[0].copy(), float(core.reward[0]), bool(core.terminated[0]),

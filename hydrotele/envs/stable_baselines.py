@@ -72,7 +72,13 @@ class StableVecEnv(_Base):
         return self.core.observation.copy()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions (n, a) for `step_wait`."""
+        """Keep the actions (n, a) for `step_wait`.
+
+        Raises:
+            ValueError: there are not as many actions as environments.
+        """
+        if np.ndim(actions) != 2 or len(actions) != self.num_envs:
+            raise ValueError(f"{self.num_envs} actions are wanted, not {np.shape(actions)}")
         self._given = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:

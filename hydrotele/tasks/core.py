@@ -210,6 +210,13 @@ class TaskCore:
         self.facts["call"] = STEP
         self.simulations.apply(advance.address, self.facts.ctypes.data)
 
+    def step_one(self, action: np.ndarray) -> None:
+        """Advance the only episode; as `step`, but for an action (a,) and no other shape."""
+        wanted = self.action.shape[1:]
+        if np.shape(action) != wanted:
+            raise ValueError(f"an action has the shape {wanted}, not {np.shape(action)}")
+        self.step(action)
+
     def model_and_data(self, number: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Model and state of one simulation, brought up to date by `mj_forward`, to look at."""
         model = copy.copy(self.setup.variants.plant.model)

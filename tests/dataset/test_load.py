@@ -1,6 +1,7 @@
 """Whole, damaged and unusable logs as data sets: what is mended, what is said, what is refused."""
 
 import dataclasses
+import os
 from pathlib import Path
 
 import numpy as np
@@ -330,6 +331,12 @@ def test_held_out_run(tmp_path):
     assert load_dataset(named, CAT).heldout.name == "b"
     with pytest.raises(InputError, match="is not there; .*valid: a, b, test_1, test_2"):
         load_dataset(folder, CAT, heldout="c")
+
+
+def test_a_pipe_is_no_data(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(InputError, match="neither a file nor a folder"):
+        load_dataset([tmp_path / "pipe.csv"], CAT)
 
 
 @given(seconds=st.floats(20.0, 90.0), start=st.sampled_from([0.0, 50.0]))

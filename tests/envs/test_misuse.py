@@ -65,6 +65,15 @@ def test_actions_are_not_stretched(three, actions):
         three.step(actions)
 
 
+@pytest.mark.parametrize("action", [0.0, np.zeros(1), np.zeros((1, 3)), np.zeros(4), []])
+def test_one_environment_takes_one_action(action):
+    env = MachineEnv(TASK, variants=1)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"\(3,\)"):
+        env.step(action)
+    env.close()
+
+
 @pytest.mark.parametrize("seed", [2**200, 2**64 - 1])
 def test_seeds_beyond_64_bits_are_refused(three, seed):
     with pytest.raises(ValueError, match="seed"):
