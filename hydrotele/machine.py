@@ -267,7 +267,7 @@ class Machine(Facts):
             _expect(self.arm.tip.link, known, "arm.tip.link")
         for channel in self.sensor_errors:
             _expect(channel, self.sensed_channels, "sensor_errors")
-        _check_terms(self.terms, self.axes)
+        _check_terms(self.terms, self.axes, self.supply)
         for name, sensors in self.sensors.items():
             for channel in sensors.channels:
                 _expect(channel, self.sensed_channels, f"sensors.{name}.channels")
@@ -288,12 +288,17 @@ def _expect(name: str, valid, where: str) -> None:
         raise ValueError(f"{where}: {name!r} is not known; {suggest(name, valid)}")
 
 
-def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis]) -> None:
-    seen = set()
+def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply | None) -> None:
+    seen, limited = set(), supply is not None and supply.kind != "constant_pressure"
     for k, term in enumerate(terms):
         _expect(term.axis, axes, f"terms.{k}.axis")
         if term.balance.startswith("flow") and not axes[term.axis].hydraulic:
             raise ValueError(f"terms.{k}: axis {term.axis} has no chambers for a {term.balance}")
+        if term.balance == "flow_supply" and not (axes[term.axis].valve and limited):
+            raise ValueError(
+                f"terms.{k}: flow_supply adds to the flow of a pump that valves share: name an axis"
+                " with a valve, of a machine whose supply is constant_flow or load_sensing"
+            )
         for variable, axis in term.of.items():
             _expect(axis, axes, f"terms.{k}.of.{variable}")
             if variable not in ("position", "velocity", "command") and not axes[axis].hydraulic:

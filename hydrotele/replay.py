@@ -162,7 +162,7 @@ def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
             sides = dict(state.get(key, {}))
             known = flexible_axes(plant.machine)
             start[key] = {name: float(_vector(sides, name)) for name in sides if name in known}
-        for key in ("bristle", "delivery"):
+        for key in ("bristle", "delivery", "added_delivery"):
             owners = dict(state.get(key, {}))
             start[key] = {name: float(_vector(owners, name)) for name in owners}
     except (ValueError, KeyError, TypeError) as error:

@@ -80,6 +80,7 @@ TRUTH: Mapping[str, Kind] = {
     "spool_rate": Kind(("1/s",), "spool speed over the spool's stroke"),
     "bristle": Kind(("1",), "part of a drive's breakaway force that friction holds it with"),
     "delivery": Kind(("1",), "part of its largest flow that the pump is set to", "none"),
+    "added_delivery": Kind(("1",), "part of its largest flow that terms add to a pump's", "none"),
     "flow_head": Kind(("m^3/s",), "valve flow into the head side chamber"),
     "flow_rod": Kind(("m^3/s",), "valve flow into the rod side chamber"),
     "flow_supply": Kind(("m^3/s",), "pump flow", "none"),

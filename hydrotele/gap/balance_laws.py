@@ -29,6 +29,7 @@ _TANK, _KM = int(Slot.TANK_PRESSURE), int(Slot.MAKEUP_GAIN)
 _BETA, _HOSE = int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE)
 _AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
+_MEMORY = int(Slot.MEMORY)
 
 
 @compiled
@@ -135,7 +136,8 @@ def supply_pressures(user, spools, pressures, period):
     """
     count, rows = spools.shape
     at = int(user[_DELIVERY])
-    ports, act, out = np.zeros(4 * count), np.zeros(max(4 * count, at + 1)), np.empty(rows)
+    ports, out = np.zeros(4 * count), np.empty(rows)
+    act = np.zeros(4 * count + int(user[_MEMORY]))
     for k in range(rows):
         for i in range(count):
             act[4 * i] = spools[i, k]

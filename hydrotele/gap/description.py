@@ -9,7 +9,8 @@ from hydrotele.gap.law_tables import THROUGH
 from hydrotele.gap.result import Lack, LearnedLaw, Prediction, Unknown
 from hydrotele.gap.words import lack_words, learned_words
 from hydrotele.machine import Machine
-from hydrotele.prediction.inputs import Input, input_units
+from hydrotele.prediction.inputs import SUPPLY, Input, input_units
+from hydrotele.terms.facts import OF_A_DRIVE
 
 _POINTS = 41  # at which a learned law is shown
 _WINDOW = 1.0  # s, of the windows in which a lack shows
@@ -17,7 +18,7 @@ _SHOWS, _MOST_WINDOWS = 0.4, 5
 _MOST_LACKS = 3  # that are said
 _ALIKE = 0.9  # share of a law's square that a simple form must have to be said to resemble it
 _LAW_OF = {"force": "force", "flow_head": "flow", "flow_rod": "flow", THROUGH: "flow",
-           "command": "valve"}  # fmt: skip
+           "command": "valve", SUPPLY: "supply"}  # fmt: skip
 _UNITS = {"time": "s", "spool": "1", "pump_speed": "rad/s", "command": "1",
           "pressure_head": "Pa", "pressure_rod": "Pa", "pressure_supply": "Pa"}  # fmt: skip
 
@@ -59,6 +60,8 @@ def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
     name, _, axis = variable.partition(".")
     length = "rad" if _turns(machine, axis or law.axis) else "m"
     size = float(np.sqrt(np.mean(along**2)))
+    if law.balance == SUPPLY:
+        variable, other = (_with_axis(v, law.axis) for v in (variable, other))
     return LearnedLaw(
         law.balance, law.axis, _formula(law),
         learned_words(
@@ -67,6 +70,11 @@ def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
         resembles, variable, tuple(points.tolist()), tuple((columns @ law.entries).tolist()),
         tuple(error.tolist()), unit, _unit_of(name, unit, length), share, other,
     )  # fmt: skip
+
+
+def _with_axis(variable: str, axis: str) -> str:
+    """A variable with its drive, where it is one of a drive."""
+    return f"{variable}.{axis}" if variable in OF_A_DRIVE else variable
 
 
 def _formula(law: Learned) -> str:

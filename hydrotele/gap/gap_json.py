@@ -22,9 +22,9 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         the same mechanism in another form (a lag for a delay), and decides the verdict.
         `calibration`: uncertain number -> `value`, `nominal`, `unit`, `ci95`.
         `learned`: laws learned from the data: `balance` (force, flow_head, flow_rod, flow_through,
-        command), `axis`, `variable`, `other` (a second variable, or empty), `formula` in SI,
-        `points` [`variable_unit`], `values` there and their standard deviations `spread` [`unit`],
-        `resembles` (a library effect or null), `share`, `description`.
+        flow_supply, command), `axis`, `variable`, `other` (a second variable, or empty), `formula`
+        in SI, `points` [`variable_unit`], `values` there and their standard deviations `spread`
+        [`unit`], `resembles` (a library effect or null), `share`, `description`.
         `unknown`: what no effect explains, or null: `law`, `channel`, `depends_on`, `windows`
         [s], `description`.
         `lacks`: what the patched machine still lacks: `balance`, `axis`, standard deviation `size`

@@ -112,7 +112,7 @@ class Lack:
     """What a model lacks in one balance, as an unknown input of the filter.
 
     Attributes:
-        balance: force, flow_head, flow_rod or command.
+        balance: force, flow_head, flow_rod, command or flow_supply.
         axis: on which it acts.
         size: its standard deviation [unit].
         unit: SI.

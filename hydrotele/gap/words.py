@@ -36,6 +36,7 @@ _LACKS = {
     "flow_rod": "an oil flow into the {axis} rod side",
     "flow_through": "an oil flow from the {axis} head side to its rod side",
     "command": "a signal added to the {axis} command",
+    "flow_supply": "a flow of the pump",
 }
 _VARIABLES = {
     "time": "time", "position": "position", "velocity": "velocity", "command": "command",

@@ -38,17 +38,20 @@ from hydrotele.hydraulics.pump import (
 )
 from hydrotele.hydraulics.slots import PUMP, SLOTS, Kind, Slot
 from hydrotele.hydraulics.supply import (
+    ADDED_LAG,
     circuit_supply,
     delivered_share,
     open_ports,
+    own_share,
     pump_response,
     supply_coupling,
     supply_pressure,
     wanted_share,
+    with_added,
 )
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
 from hydrotele.terms.law import Drives, DriveState
-from hydrotele.terms.table import added_flows
+from hydrotele.terms.table import FLOW_SUPPLY, added, added_flows
 
 __all__ = [
     "ACTIVATIONS", "MAX_AXES", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
@@ -76,6 +79,7 @@ _BETA, _TANK = int(Slot.BULK_MODULUS), int(Slot.TANK_PRESSURE)
 _HOSE, _AIR = int(Slot.HOSE_COMPLIANCE), int(Slot.AIR_RELEASE)
 _ONSET = int(Slot.AIR_ONSET)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
+_ADDED, _PUMP = int(Slot.ADDED_DELIVERY), int(Slot.PUMP_FLOW)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
@@ -158,6 +162,30 @@ def _flows_of_terms(
 
 
 @compiled
+def _delivery_of_terms(user, first, count, terms, act, length, velocity, command, time, supply, dt):
+    """Share of the pump's largest flow that the terms add after a step, scalar [1].
+
+    The pump follows the terms, as they are at the step's start, by the exact exponential.
+    """
+    at = int(user[first * SLOTS + _ADDED])
+    if at == 0:
+        return 0.0
+    total, drives = 0.0, Drives(count, act, length, velocity, command)
+    if terms is not None:
+        if len(terms) > 0:
+            for i in range(count):
+                u, a = (first + i) * SLOTS, 4 * i
+                force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
+                s = DriveState(
+                    time, length[first + i] - dt * velocity[first + i], velocity[first + i],
+                    act[a], act[a + 1], act[a + 2], act[a + 3], supply, command[first + i], force,
+                )  # fmt: skip
+                total += added(terms, FLOW_SUPPLY, first + i, s, drives)
+    wanted = total / user[first * SLOTS + _PUMP]
+    return wanted + (act[at] - wanted) * math.exp(-dt / ADDED_LAG)
+
+
+@compiled
 def step_circuit(
     user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms=None, time=0.0,
     memory=None,
@@ -212,14 +240,17 @@ def step_circuit(
             act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]
         )
     open_ports(user, act, act, scratch, first, count, 0.0, act_dot)
-    share, begun = 1.0, 0.0
+    share, begun, more_delivered = 1.0, 0.0, 0.0
     if memory is None:
         p_start = circuit_supply(user, first, count, scratch)
     else:
-        share = delivered_share(user, first, act)
-        p_start = circuit_supply(user, first, count, scratch, share)
+        p_start = circuit_supply(user, first, count, scratch, delivered_share(user, first, act))
         begun = wanted_share(user, first, count, scratch)
-        share = pump_response(user, first, begun, share, dt)
+        more_delivered = _delivery_of_terms(
+            user, first, count, terms, act, length, velocity, command, time, p_start, dt
+        )
+        share = pump_response(user, first, begun, own_share(user, first, act), dt)
+        share = with_added(share, more_delivered)
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         x, v = length[first + i] - dt * velocity[first + i], velocity[first + i]
@@ -259,6 +290,9 @@ def step_circuit(
             at = int(user[first * SLOTS + _DELIVERY])
             wanted = 0.5 * (begun + wanted_share(user, first, count, scratch))
             act_dot[at] = (pump_response(user, first, wanted, act[at], dt) - act[at]) / dt
+        if user[first * SLOTS + _ADDED] > 0.0:
+            at = int(user[first * SLOTS + _ADDED])
+            act_dot[at] = (more_delivered - act[at]) / dt
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         x, v = length[first + i], velocity[first + i]

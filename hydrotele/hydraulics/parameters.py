@@ -10,6 +10,7 @@ from hydrotele.kinematics.from_machine import drive_travel
 from hydrotele.machine import Machine, Supply
 
 DELIVERY = "delivery.supply"
+ADDED_DELIVERY = "added_delivery.supply"
 MARKER = 215325.0  # CAT 215, CAT 325: no other model writes this into actuator_user[0]
 
 
@@ -22,7 +23,8 @@ def memory_names(machine: Machine) -> list[str]:
     """Names of the states that follow the activations of the hydraulic axes, in their order.
 
     `bristle.<axis>` of every hydraulic axis with presliding friction, `delivery.supply` of a pump
-    with a time constant, then `bristle.<axis>` of the force drives. None in most machines.
+    with a time constant, `added_delivery.supply` of one to whose flow terms add, then
+    `bristle.<axis>` of the force drives. None in most machines.
     """
     supply, rubbing = machine.supply, [
         n for n in actuator_order(machine) if machine.axes[n].drive.friction.presliding
@@ -30,6 +32,8 @@ def memory_names(machine: Machine) -> list[str]:
     names = [f"bristle.{n}" for n in rubbing if machine.axes[n].hydraulic]
     if supply and supply.time_constant and machine.valve_axes:
         names.append(DELIVERY)
+    if any(term.balance == "flow_supply" for term in machine.terms):
+        names.append(ADDED_DELIVERY)
     return names + [f"bristle.{n}" for n in rubbing if not machine.axes[n].hydraulic]
 
 
@@ -44,7 +48,7 @@ def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
     """
     count = len(machine.hydraulic_axes)
     memory = {name: 4 * count + k for k, name in enumerate(memory_names(machine))}
-    shared = sum(name == DELIVERY or name[8:] in machine.hydraulic_axes for name in memory)
+    shared = sum(name.partition(".")[2] in ("supply", *machine.hydraulic_axes) for name in memory)
     table = {}
     for name in actuator_order(machine):
         numbers = np.zeros(SLOTS)
@@ -59,6 +63,8 @@ def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
         if DELIVERY in memory and axis.valve and machine.supply:
             numbers[Slot.PUMP_TIME_CONSTANT] = machine.supply.time_constant
             numbers[Slot.DELIVERY] = memory[DELIVERY]
+        if ADDED_DELIVERY in memory and axis.valve:
+            numbers[Slot.ADDED_DELIVERY] = memory[ADDED_DELIVERY]
         _write_friction(numbers, axis)
         _write_end_stop(numbers, machine, name)
         if axis.transmission:

@@ -8,11 +8,12 @@ CURVE_KNOTS = 8  # at most, of a valve's flow curve in one direction
 class Slot(enum.IntEnum):
     """Places of an actuator's numbers in `actuator_user`, all SI; a new number is a new line.
 
-    Beyond the plain valve and drive, 0 switches a law off (a metering ratio of 1 does). BRISTLE and
-    DELIVERY are places among the activations, counted from the first hydraulic axis, and MEMORY is
-    how many of them follow those of the hydraulic axes (see `parameters.memory_names`). CURVES, the
-    last, begins two flow curves, of the positive and of the negative direction: number
-    of knots (0: straight), CURVE_KNOTS travels and CURVE_KNOTS openings each.
+    Beyond the plain valve and drive, 0 switches a law off (a metering ratio of 1 does). BRISTLE,
+    DELIVERY and ADDED_DELIVERY are places among the activations, counted from the first hydraulic
+    axis, and MEMORY is how many of them follow those of the hydraulic axes (see
+    `parameters.memory_names`). CURVES, the last, begins two flow curves, of the positive and of the
+    negative direction: number of knots (0: straight), CURVE_KNOTS travels and CURVE_KNOTS openings
+    each.
     """
 
     @staticmethod
@@ -78,6 +79,7 @@ class Slot(enum.IntEnum):
     BRISTLE = enum.auto()
     PUMP_TIME_CONSTANT = enum.auto()
     DELIVERY = enum.auto()
+    ADDED_DELIVERY = enum.auto()
     MEMORY = enum.auto()
     CURVES = enum.auto()
 

@@ -12,12 +12,14 @@ from hydrotele.hydraulics.valve import axis_opening, inlet_flow, inlet_gain
 _NEWTON_STEPS = 60
 _FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the flow balance of 1e-6 that is promised
 _LEAST_SHARE = 1.0e-6  # of a pump's flow that it always gives, so that its pressure is determined
+ADDED_LAG = 0.02  # s, with which a pump's flow follows what terms add: it cannot change at once
 
 _D, _TANK = int(Slot.ORIFICE_SMOOTHING), int(Slot.TANK_PRESSURE)
 _RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 _MARGIN, _DROOP = int(Slot.LOAD_SENSING_MARGIN), int(Slot.PUMP_DROOP)
 _DROP = int(Slot.COMPENSATED_DROP)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
+_ADDED = int(Slot.ADDED_DELIVERY)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
@@ -120,12 +122,33 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
 
 @compiled
 def delivered_share(user, first, act):
-    """Share of its largest flow that the pump is set to: 1 where it follows at once.
+    """Share of its largest flow that the pump gives: 1 where it follows at once, and without terms.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
         first: index of the first hydraulic actuator.
-        act: (>= 4 count + MEMORY,) activations, whose DELIVERY is read where there is a lag [1].
+        act: (>= 4 count + MEMORY,) activations, whose DELIVERY is read where there is a lag, and
+            ADDED_DELIVERY where terms add to the flow [1].
+
+    Returns:
+        Share, scalar [1].
+
+    Source: `wanted_share`.
+    """
+    s, added = first * SLOTS, 0.0
+    if user[s + _ADDED] > 0.0:
+        added = act[int(user[s + _ADDED])]
+    return with_added(own_share(user, first, act), added)
+
+
+@compiled
+def own_share(user, first, act):
+    """As `delivered_share`, without what terms add.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        act: (>= 4 count + MEMORY,) activations [1].
 
     Returns:
         Share, scalar [1].
@@ -136,6 +159,22 @@ def delivered_share(user, first, act):
     if user[s + _LAG] == 0.0:
         return 1.0
     return min(1.0, max(_LEAST_SHARE, act[int(user[s + _DELIVERY])]))
+
+
+@compiled
+def with_added(share, added):
+    """Share of a pump's largest flow with what terms add to it; never none.
+
+    Args:
+        share: without them, scalar [1].
+        added: what they add, scalar [1].
+
+    Returns:
+        Share, scalar [1], > 0.
+
+    Source: a pump's displacement, bounded from below.
+    """
+    return max(_LEAST_SHARE, share + added)
 
 
 @compiled

@@ -17,7 +17,13 @@ from hydrotele.dynamics.integrate import accelerate, advance, place
 from hydrotele.dynamics.linear import solve
 from hydrotele.dynamics.model import X, model_space, reduced_model
 from hydrotele.effects.effect import changed
-from hydrotele.hydraulics.parameters import actuator_order, longest_step
+from hydrotele.hydraulics.parameters import (
+    ADDED_DELIVERY,
+    actuator_order,
+    longest_step,
+    memory_names,
+)
+from hydrotele.hydraulics.supply import ADDED_LAG
 from hydrotele.machine import Machine
 from hydrotele.terms.facts import Term
 
@@ -26,13 +32,15 @@ _USUAL_PRESSURE = 2.0e7  # Pa, of a pump's own circuit that states no relief set
 _TRIED = 1.0e-4  # of its largest size, by which an input of a pump drive is tried
 _ROWS_STEP = 4.0e-3  # s, for what inputs do in a row
 BALANCES = ("force", "flow_head", "flow_rod", "command")
+SUPPLY = "flow_supply"
+"""Balance of the pump that valves share; its input stands under the first axis with a valve."""
 
 
 class Input(NamedTuple):
     """An unknown input.
 
     Attributes:
-        balance: out of `BALANCES`.
+        balance: out of `BALANCES`, or `SUPPLY`.
         axis: the axis on which it acts.
     """
 
@@ -46,7 +54,10 @@ class Input(NamedTuple):
 
 
 def possible_inputs(machine: Machine, axes: Sequence[str] = ()) -> tuple[Input, ...]:
-    """Every unknown input of a machine, or of some of its axes; a force drive has one."""
+    """Every unknown input of a machine, or of some of its axes; a force drive has one.
+
+    One of the pump's flow is among them where the machine has a term of it.
+    """
     found = []
     for axis in actuator_order(machine):
         if axes and axis not in axes:
@@ -54,6 +65,8 @@ def possible_inputs(machine: Machine, axes: Sequence[str] = ()) -> tuple[Input, 
         facts = machine.axes[axis]
         count = 4 if facts.valve else 3 if facts.pump else 1
         found += [Input(balance, axis) for balance in BALANCES[:count]]
+    if ADDED_DELIVERY in memory_names(machine):
+        found.append(Input(SUPPLY, next(iter(machine.valve_axes))))
     return tuple(found)
 
 
@@ -64,6 +77,9 @@ def input_sizes(machine: Machine, inputs: Sequence[Input]) -> np.ndarray:
         facts = machine.axes[axis]
         if balance == "command":
             sizes.append(0.5)
+        elif balance == SUPPLY:
+            assert machine.supply
+            sizes.append(machine.supply.pump_flow)
         elif balance != "force":
             pump = facts.pump
             sizes.append(
@@ -80,7 +96,7 @@ def input_sizes(machine: Machine, inputs: Sequence[Input]) -> np.ndarray:
 
 def input_units(machine: Machine, inputs: Sequence[Input]) -> list[str]:
     """SI unit of each input."""
-    units = {"command": "1", "flow_head": "m^3/s", "flow_rod": "m^3/s"}
+    units = {"command": "1", "flow_head": "m^3/s", "flow_rod": "m^3/s", SUPPLY: "m^3/s"}
     return [units.get(i.balance) or ("N m" if _turns(machine, i.axis) else "N") for i in inputs]
 
 
@@ -180,6 +196,11 @@ def input_columns(
             continue
         if balance == "force":
             columns[:, m, rates : 2 * rates] = response[:, i]
+        elif balance == SUPPLY:
+            assert machine.supply
+            at = first + 4 * model.hydraulic + memory_names(machine).index(ADDED_DELIVERY)
+            follows = 2.0 / period * math.tanh(0.5 * period / ADDED_LAG)  # of its exponential
+            columns[:, m, at] = follows / machine.supply.pump_flow
         elif balance == "command":
             assert facts.valve
             columns[:, m, first + 4 * i + 1] = facts.valve.bandwidth**2

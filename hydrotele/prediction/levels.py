@@ -141,7 +141,8 @@ def find_levels(
     """
     prior = noise_prior(data)
     if start:
-        levels = _reopened(start[0].levels, machine) if reopened else start[0].levels
+        levels = start[0].levels
+        levels = _reopened(levels, machine) if reopened else _possible(levels, machine)
         tracks = _crossed(data, machine, levels, start, each, step, same)
     else:
         noise = np.clip(prior.noise, prior.low, prior.high)
@@ -175,6 +176,14 @@ def _reopened(levels: Levels, machine: Machine) -> Levels:
     small = 10.0 * LEAST * input_sizes(machine, inputs)
     sizes = [max(known.get(i, 0.0), s) for i, s in zip(inputs, small, strict=True)]
     return dataclasses.replace(levels, inputs=inputs, sizes=np.array(sizes))
+
+
+def _possible(levels: Levels, machine: Machine) -> Levels:
+    """Levels without inputs that a machine cannot have."""
+    there = possible_inputs(machine)
+    kept = np.array([i in there for i in levels.inputs], bool)
+    inputs = tuple(i for i in levels.inputs if i in there)
+    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept])
 
 
 def _pruned(levels: Levels, machine: Machine) -> Levels:

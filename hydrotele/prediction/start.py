@@ -24,6 +24,7 @@ _WIDE = {
     "position": 0.02, "drive": 0.0, "rate": 0.05, "drive_rate": 0.0, "spool": 0.02,
     "spool_rate": 0.2, "pressure_head": 1e6, "pressure_rod": 1e6,
     "speed": 1.0, "pressure_load": 1e5, "bristle": 0.5, "delivery": 0.3,
+    "added_delivery": 0.1,
 }  # fmt: skip
 _SLIP = 0.01  # m/s or rad/s, rate at which a drive may leave its load
 _LOOSE = 0.02  # of the backlash, within which a drive's rest is known once it was looked for

@@ -84,13 +84,14 @@ _NUDGE = {
     "position": 1e-6, "drive": 1e-6, "rate": 1e-5, "drive_rate": 1e-5, "spool": 1e-5,
     "spool_rate": 1e-3, "pressure_head": 100.0, "pressure_rod": 100.0,
     "speed": 1e-3, "pressure_load": 100.0,
-    "bristle": 1e-3, "delivery": 1e-4, "late": 1.0, "input": 1.0,
+    "bristle": 1e-3, "delivery": 1e-4, "added_delivery": 1e-4, "late": 1.0, "input": 1.0,
 }  # fmt: skip
 # What 20 ms may add to a state beyond the model: integrator error, not physics.
 DRIFT = {
     "position": 2e-6, "drive": 2e-6, "rate": 2e-4, "drive_rate": 2e-4, "spool": 1e-4,
     "spool_rate": 1e-2, "pressure_head": 5e3, "pressure_rod": 5e3,
     "speed": 2e-2, "pressure_load": 5e3, "bristle": 5e-3, "delivery": 1e-3,
+    "added_delivery": 1e-3,
 }  # fmt: skip
 DRIFT_TIME = 0.02  # s over which a process noise adds its standard deviation, as of a random walk
 STARTLE = {
@@ -103,6 +104,7 @@ STARTLE = {
     "pressure_load": 2e6,
     "bristle": 0.5,
     "delivery": 0.2,
+    "added_delivery": 0.1,
 }
 
 _DOUBT = 3.0  # times a reading's noise: lacks of pressure below it are taken for noise

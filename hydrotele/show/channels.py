@@ -33,6 +33,7 @@ TITLES: Mapping[str, str] = {
     "flow_rod": "flow into rod side",
     "flow_supply": "pump flow",
     "delivery": "flow that the pump is set to",
+    "added_delivery": "flow that terms add to the pump's",
     "pressure_supply": "supply pressure",
     "pressure_head": "head side pressure",
     "pressure_rod": "rod side pressure",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 MEASURED, NOMINAL, PATCHED = "#262b33", "#e07b00", "#1769aa"
 _ADDED = {"force": "force", "command": "command"} | dict.fromkeys(
-    ("flow_head", "flow_rod", "flow_through"), "flow"
+    ("flow_head", "flow_rod", "flow_through", "flow_supply"), "flow"
 )
 _ZOOM = 2.0  # s
 _LOUDEST = 6.0  # times noise, where the colours of the heat map end at the latest

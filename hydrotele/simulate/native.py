@@ -59,6 +59,7 @@ _OFFSET, _INERTIA = int(Slot.OFFSET), int(Slot.DRIVE_INERTIA)
 _STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _FELT, _MEMORY = int(Slot.BRISTLE_INERTIA), int(Slot.MEMORY)
 _LAG, _DELIVERY, _CURVES = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY), int(Slot.CURVES)
+_ADDED = int(Slot.ADDED_DELIVERY)
 _FORCE, _PUMPED = float(Kind.FORCE), float(Kind.PUMPED)
 _GAINS = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
@@ -179,6 +180,8 @@ def _sound(user, first, count, nu, free):
     if not (4.0 * count <= size <= free):
         return False
     if user[group + _LAG] != 0.0 and not (4.0 * count <= user[group + _DELIVERY] < size):
+        return False
+    if user[group + _ADDED] != 0.0 and not (4.0 * count <= user[group + _ADDED] < size):
         return False
     for u in range(group, (first + count) * SLOTS, SLOTS):
         if user[u + _STIFFNESS] != 0.0 and not (4.0 * count <= user[u + _BRISTLE] < size):

@@ -199,9 +199,10 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
         state: `order` (axis names) and, in that order, `angle` [rad] or [m], `velocity`, `spool`,
             `spool_rate`, `pressure_head`, `pressure_rod`; any but `order` and `angle` may lack and
             is then that of rest. `bristle` (axis -> part of the breakaway force that the bristles
-            of its friction carry) and `delivery` (`supply` -> part of its flow that a slow pump is
-            set to) are 0 at rest. `joints` (name -> value) may give undriven joints, `drive` and
-            `drive_velocity` (axis -> value) the drive sides of transmissions.
+            of its friction carry), `delivery` and `added_delivery` (`supply` -> part of its flow
+            that a slow pump is set to, and that terms add to it) are 0 at rest. `joints` (name ->
+            value) may give undriven joints, `drive` and `drive_velocity` (axis -> value) the drive
+            sides of transmissions.
 
     Returns:
         A new MjData.

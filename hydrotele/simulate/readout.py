@@ -162,7 +162,7 @@ def _hidden(plant: Plant, record: Record):
             kind, unit = ("angle", "rad") if joint.type == "hinge" else ("position", "m")
             put(f"truth.{kind}.{name}", record.qpos[:, model.joint(name).qposadr[0]], unit)
     for name, place in plant.memory.items():
-        shown = "delivery" if name.startswith("delivery") else name
+        shown = name.removesuffix(".supply")
         put(f"truth.{shown}", record.act[:, place], "1")
     _put_things(plant, record, put)
     _put_hydraulics(plant, record, put)

@@ -9,8 +9,8 @@ from hydrotele.datafile import Facts, Name, NonNegative, suggest
 from hydrotele.terms import laws as _laws  # noqa: F401 - puts the laws of this package into LAWS
 from hydrotele.terms.law import LAWS, VARIABLES, Value
 
-BALANCES = ("force", "flow_head", "flow_rod", "command")
-Balance = Literal["force", "flow_head", "flow_rod", "command"]
+BALANCES = ("force", "flow_head", "flow_rod", "command", "flow_supply")
+Balance = Literal["force", "flow_head", "flow_rod", "command", "flow_supply"]
 OF_A_DRIVE = (
     "position", "velocity", "spool", "spool_rate", "pump_speed", "pressure_load", "pressure_head",
     "pressure_rod", "command",
@@ -22,11 +22,12 @@ class Term(Facts):
     """A law that adds to a balance of a drive.
 
     `balance` is `force` (on the drive [N] or [N m]), `flow_head` or `flow_rod` (into a chamber
-    [m^3/s]) or `command` (to valve or drive [1] or [V]). `name` says what put it there, such as an
-    effect's name. In `of` the variables that are another drive's: `{velocity: swing}` lets the law
-    see the swing's velocity as its `velocity`. In `domain` a variable's range, beyond which it
-    counts with the nearer end; the `uncertainty` is the standard deviation of what the law adds.
-    `source` is the file or plug-in that defines the law, empty for laws of hydrotele.
+    [m^3/s]), `command` (to valve or drive [1] or [V]) or `flow_supply` (to the flow of the pump
+    that the valves share, which follows it with a lag of 20 ms [m^3/s]). `name` says what put it
+    there, such as an effect's name. In `of` the variables that are another drive's: `{velocity:
+    swing}` lets the law see the swing's velocity as its `velocity`. In `domain` a variable's range,
+    beyond which it counts with the nearer end; the `uncertainty` is the standard deviation of what
+    the law adds. `source` is the file or plug-in that defines the law, empty for laws of hydrotele.
     """
 
     name: Name

@@ -23,7 +23,7 @@ from hydrotele.errors import InputError
 from hydrotele.terms.facts import BALANCES, Term
 from hydrotele.terms.law import LAWS, VARIABLES, DriveState, Law, Numbers, Variable
 
-FORCE, FLOW_HEAD, FLOW_ROD, COMMAND = range(len(BALANCES))
+FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = range(len(BALANCES))
 MARKER = 215325.75  # of a table of terms among other custom numbers of a model
 NO_TERMS = np.zeros(0)
 COUNT = 1  # place of the number of terms, after the marker
@@ -212,7 +212,7 @@ def added(terms, balance, axis, s, drives):
 
     Args:
         terms: (n,) table of `terms_table`.
-        balance: FORCE, FLOW_HEAD, FLOW_ROD or COMMAND.
+        balance: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
         axis: index of the actuator.
         s: DriveState.
         drives: Drives, for variables that are another drive's.

@@ -112,7 +112,7 @@ def begin(machine, model, z, state):
     for s, name in enumerate(state_names(machine)):
         kind, _, where = name.partition(".")
         axis = joints.get(where, where)
-        if kind in ("drive", "drive_rate", "bristle", "delivery"):
+        if kind in ("drive", "drive_rate", "bristle", "delivery", "added_delivery"):
             z[s] = state[kind.replace("rate", "velocity")][axis]
         else:
             z[s] = state[renamed.get(kind, kind)][state["order"].index(axis)]
@@ -246,7 +246,7 @@ def test_a_plain_force_drive(effects, machine_of, reduced_of):
 
 
 def test_terms_with_variables_of_another_drive(machine_of, reduced_of, tmp_path):
-    """Force, flow and command of one drive that go with another's motion, pressure and command."""
+    """Force, flows and command of one drive that go with another's motion, pressure and command."""
     nominal = machine_of("cat215/none")
     laws = (
         ("boom", "force", {"velocity": 1.5e5}, {"velocity": "swing"}),
@@ -254,6 +254,8 @@ def test_terms_with_variables_of_another_drive(machine_of, reduced_of, tmp_path)
          {"position": "boom", "pressure_rod": "boom"}),
         ("swing", "command", {"command": 0.15, "spool": 0.1},
          {"command": "stick", "spool": "stick"}),
+        ("boom", "flow_supply", {"velocity": 4e-3, "pressure_supply": -4e-11},
+         {"velocity": "swing"}),
     )  # fmt: skip
     terms = tuple(
         Term(name="t", axis=axis, balance=balance, law="formula", parameters=law, of=of)

@@ -17,6 +17,9 @@ Fixed before any trial was run:
   numbers are uncertain ones of the machine and stand in its calibration with intervals that hold
   the truth and not all the model's values; a pump that gives 6 % less where all numbers are off by
   up to 10 % is such a number. It changes none of the other columns.
+- Since 23 November 2026 an effect that is planted beside wrong numbers is drawn anew where all its
+  numbers are uncertain ones of the machine and differ by less than three of their standard
+  deviations: by what the machine states, that is no effect. `redrawn` in the key counts them.
 - Something outside the library is right if no effect of the library has more than one half, in any
   verdict.
 """

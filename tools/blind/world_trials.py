@@ -19,6 +19,7 @@ from hydrotele.effects.payload import PAYLOAD
 from hydrotele.errors import InputError
 from hydrotele.machine import Machine as Facts
 from hydrotele.machine_file import load_machine
+from hydrotele.prediction.calibration import numbers as uncertain_numbers
 from tools.blind.forms import FORMS
 from tools.blind.generate import key_hash, write_logs
 from tools.blind.spreads import draw_library_effect, log_uniform, off_everywhere
@@ -40,6 +41,7 @@ _ATTEMPTS = 20
 _SENSOR_KINDS = ("angle", "position", "length", "pressure")
 _PLANTED_SHARE = 0.5  # of the trials with wrong noise or wrong numbers that hide an effect, too
 _DOUBLE_SHARE = 0.3  # of the library's trials
+_APART = 3.0  # standard deviations of an uncertain number beyond which it is an effect
 _SEEN = 10.0  # least visibility of a planted effect; a weaker draw is replaced
 
 
@@ -190,6 +192,8 @@ def _attempt(
     model: Facts, kind: str, turn: int, rng: np.random.Generator, seconds: float
 ) -> tuple[Drawn, list[WorldRun], list[float]]:
     drawn = draw_trial(model, kind, turn, rng)
+    if kind == "off":
+        _refuse_uncertain(model, drawn)
     asked = references(model, rng, seconds)
     if kind == "outside":
         plain = drawn.world
@@ -203,6 +207,23 @@ def _attempt(
         names = ", ".join(p["name"] for p in drawn.planted)
         raise InputError("trial", f"{names} shows no more than {min(seen):.3g}")
     return drawn, runs, [float(f"{size:.4g}") for size in seen]
+
+
+def _refuse_uncertain(model: Facts, drawn: Drawn) -> None:
+    """Refuse planted effects that are no more than what the model says its numbers may be off by.
+
+    Raises:
+        InputError: all numbers of one are uncertain, and within `_APART` of their deviations.
+    """
+    uncertain = {n.effect: n.parameter for n in uncertain_numbers(model).values() if n.effect}
+    truth = true_parameters(model, drawn.facts)
+    for part in drawn.planted:
+        name, place = part["name"], part["location"]
+        values = truth.get(f"{name}({place})", {})
+        known = [uncertain.get((name, place, key)) for key in part["parameters"]]
+        if all(p and key in values and abs(values[key] - p.nominal) < _APART * p.scale
+               for key, p in zip(part["parameters"], known, strict=True)):  # fmt: skip
+            raise InputError("trial", f"{name} of {place} is within what its numbers may be off by")
 
 
 def true_parameters(model: Facts, truth: Facts) -> dict[str, dict[str, float]]:
