@@ -6,7 +6,7 @@ import pytest
 from hydrotele.dynamics.integrate import advance
 from hydrotele.dynamics.model import model_space, reduced_model, state_names
 from hydrotele.machine_file import load_machine
-from hydrotele.prediction.inputs import Input, input_columns
+from hydrotele.prediction.inputs import SUPPLY, Input, input_columns, possible_inputs
 from hydrotele.prediction.track import track_run
 from hydrotele.terms.facts import Term
 from tests.prediction.test_filter import PERIOD, machine_data
@@ -27,6 +27,27 @@ def row_later(machine, track, row):
     trail = np.zeros((0, 0))
     advance(model, model_space(model), z, track.run.command, row, PERIOD, _STEPS, trail)
     return z
+
+
+def test_a_constant_flow_of_the_pump_moves_what_the_pump_is_set_to():
+    """Its state follows by the exact exponential, which the column holds to rounding."""
+    nominal = load_machine("cat215")
+
+    def with_flow(size):
+        term = Term(name="extra", axis="boom", balance=SUPPLY, law="constant",
+                    parameters={"value": size})  # fmt: skip
+        return nominal.model_copy(update={"terms": (term,)})
+
+    machine, size = with_flow(0.0), 1.0e-4
+    data, _ = machine_data(nominal, machine)
+    track = track_run(machine, data, data.heldout, linearise=True)
+    (own,) = (i for i in possible_inputs(machine) if i.balance == SUPPLY)
+    assert all(i.balance != SUPPLY for i in possible_inputs(nominal))
+    columns = input_columns(machine, track.states, track.flow, PERIOD, [own], track.run.command)
+    at = state_names(machine).index("added_delivery.supply")
+    for row in (100, 250, 400):
+        later = row_later(with_flow(size), track, row) - row_later(machine, track, row)
+        assert columns[row, 0, at] == pytest.approx(later[at] / size, rel=1e-3)  # slopes of `flow`
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from hydrotele.errors import InputError
+from hydrotele.machine import Machine, Supply
+from hydrotele.machine_file import load_machine
 from hydrotele.terms import laws
 from hydrotele.terms.facts import Term
 from hydrotele.terms.formula import formula_arguments
@@ -194,6 +196,22 @@ def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
 def test_refused_with_what_is_valid(law_, parameters, message):
     with pytest.raises(ValidationError, match=message):
         force_term(law_, parameters)
+
+
+@pytest.mark.parametrize(
+    ("machine", "axis"), [("emps", "slide"), ("eha", "piston"), ("cat215", "boom")]
+)
+def test_a_flow_of_the_pump_needs_valves_and_a_pump_that_gives_so_much(machine, axis):
+    facts = load_machine(machine)
+    term = Term(name="more", axis=axis, balance="flow_supply", law="constant",
+                parameters={"value": 1e-4})  # fmt: skip
+    if machine == "cat215":
+        Machine.model_validate({**dict(facts), "terms": (term,)})
+        held = Supply(kind="constant_pressure", relief_pressure=2e7, tank_pressure=0.0,
+                      bulk_modulus=1e9)  # fmt: skip
+        facts = facts.model_copy(update={"supply": held})
+    with pytest.raises(ValueError, match="flow_supply adds to|has no chambers for"):
+        Machine.model_validate({**dict(facts), "terms": (term,)})
 
 
 def test_domains_are_checked():

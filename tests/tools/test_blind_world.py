@@ -12,6 +12,7 @@ from hydrotele.dataset.load import load_dataset
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.effects import EFFECTS, apply_effect
+from hydrotele.errors import InputError
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.log import load_log, save_log
 from hydrotele.machine_file import load_machine
@@ -25,9 +26,11 @@ from tools.blind.world_machine import channels
 from tools.blind.world_runs import Noise, nominal_world, record_run, references, visibility
 from tools.blind.world_trials import (
     KINDS,
+    Drawn,
     WorldSeries,
     draw_trial,
     make_trial,
+    refuse_uncertain,
     true_parameters,
 )
 
@@ -207,6 +210,20 @@ def test_a_trial_of_each_kind_is_made_and_sealed(tmp_path, kind):
         assert set(log.metadata) == {"machine", "tool", "sample_rate_hz", "sensors", "run"}
         assert not [name for name in log.columns if name.startswith("truth")]
         assert len(log) == round(SHORT * 50)
+
+
+def test_an_effect_within_what_numbers_may_be_off_by_is_drawn_anew():
+    def drawn(name, place, **values):
+        part = {"name": name, "location": place, "right": [[name, place]], "parameters": values}
+        return Drawn(nominal_world(CAT), apply_effect(CAT, name, place, values), [part], [],
+                     Noise({}), {})  # fmt: skip
+
+    assert CAT.supply
+    stated = CAT.supply.relief_pressure  # good to 3 %
+    with pytest.raises(InputError, match="within what its numbers"):
+        refuse_uncertain(CAT, drawn("relief_pressure", "supply", relief_pressure=0.95 * stated))
+    refuse_uncertain(CAT, drawn("relief_pressure", "supply", relief_pressure=0.85 * stated))
+    refuse_uncertain(CAT, drawn("payload", "tool", mass=20.0))  # no uncertain number
 
 
 def test_the_rig_has_trials_too():

@@ -19,7 +19,7 @@ Fixed before any trial was run:
   up to 10 % is such a number. It changes none of the other columns.
 - Since 23 November 2026 an effect that is planted beside wrong numbers is drawn anew where all its
   numbers are uncertain ones of the machine and differ by less than three of their standard
-  deviations: by what the machine states, that is no effect. `redrawn` in the key counts them.
+  deviations: by what the machine states, that is no effect. `redrawn` in the key names them.
 - Something outside the library is right if no effect of the library has more than one half, in any
   verdict.
 """

@@ -193,7 +193,7 @@ def _attempt(
 ) -> tuple[Drawn, list[WorldRun], list[float]]:
     drawn = draw_trial(model, kind, turn, rng)
     if kind == "off":
-        _refuse_uncertain(model, drawn)
+        refuse_uncertain(model, drawn)
     asked = references(model, rng, seconds)
     if kind == "outside":
         plain = drawn.world
@@ -209,8 +209,12 @@ def _attempt(
     return drawn, runs, [float(f"{size:.4g}") for size in seen]
 
 
-def _refuse_uncertain(model: Facts, drawn: Drawn) -> None:
+def refuse_uncertain(model: Facts, drawn: Drawn) -> None:
     """Refuse planted effects that are no more than what the model says its numbers may be off by.
+
+    Args:
+        model: the nominal machine.
+        drawn: the true one.
 
     Raises:
         InputError: all numbers of one are uncertain, and within `_APART` of their deviations.
