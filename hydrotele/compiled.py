@@ -40,6 +40,15 @@ def lean(function):
     return _compile(function, _nrt=False)
 
 
+def inlined(function):
+    """Like `lean`, for a small function whose code is put into that of every caller.
+
+    What a caller does not use of several results, such as a slope, is then not computed, and a
+    function whose arguments are constants there costs less.
+    """
+    return _compile(function, _nrt=False, forceinline=True)
+
+
 def _compile(function, **options):
     with _caching() as cache:
         return njit(cache=cache, error_model="numpy", nogil=True, **options)(function)

@@ -3,7 +3,7 @@
 Actuator numbers stand at `user[u + Slot]`, those of a pump drive at `user[u + PUMP + PumpSlot]`.
 """
 
-from hydrotele.compiled import compiled
+from hydrotele.compiled import inlined, lean
 from hydrotele.hydraulics.laws import friction, friction_slope, stop_force
 from hydrotele.hydraulics.pump import load_force, pump_piston_friction, pump_pressure_rates
 from hydrotele.hydraulics.slots import PUMP, Kind, Slot
@@ -20,7 +20,7 @@ _HARD, _SOFT = int(Slot.STOP_STIFFNESS), int(Slot.STOP_DAMPING)
 _PUMPED = float(Kind.PUMPED)
 
 
-@compiled
+@inlined
 def actuator_friction(user, u, velocity):
     """Friction of one actuator at a velocity.
 
@@ -46,7 +46,7 @@ def actuator_friction(user, u, velocity):
     )
 
 
-@compiled
+@lean
 def actuator_friction_slope(user, u, velocity):
     """Slope of `actuator_friction` with respect to the velocity.
 
@@ -66,7 +66,7 @@ def actuator_friction_slope(user, u, velocity):
     )  # fmt: skip
 
 
-@compiled
+@lean
 def actuator_stop(user, u, position, velocity):
     """Force of the ends of an actuator's travel, and its slopes.
 
@@ -89,7 +89,7 @@ def actuator_stop(user, u, position, velocity):
     )
 
 
-@compiled
+@lean
 def pumped_volumes(user, u, x):
     """Volumes of both chambers and the oil that the piston has taken from the accumulator.
 
@@ -112,7 +112,7 @@ def pumped_volumes(user, u, x):
     )
 
 
-@compiled
+@lean
 def pumped_rates(user, u, speed, p_head, p_rod, x, v, added):
     """`circuit.pressure_rates` of an axis with a pump of its own.
 
@@ -138,7 +138,7 @@ def pumped_rates(user, u, speed, p_head, p_rod, x, v, added):
     )  # fmt: skip
 
 
-@compiled
+@lean
 def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
     """Force of an axis with a pump of its own, after its load cylinder and friction.
 
@@ -164,7 +164,7 @@ def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
     return force - pump_piston_friction(user, u + PUMP, seal, v, force + other, p_load, dt)
 
 
-@compiled
+@lean
 def force_after_friction(user, u, push, other, act, velocity, dt):
     """Force of an actuator after its friction, and the damping that this adds to an implicit step.
 

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.compiled import inlined, lean
 from hydrotele.hydraulics.actuator import (
     actuator_friction,
     actuator_friction_slope,
@@ -84,7 +84,7 @@ _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
-@compiled
+@inlined
 def _chamber_stiffness(user, u, x):
     """Pressure per volume of both chambers, oil and hose [Pa/m^3]."""
     beta = user[u + _BETA]
@@ -97,7 +97,7 @@ def _chamber_stiffness(user, u, x):
     return beta / (volume_head + hose), beta / (volume_rod + hose)
 
 
-@compiled
+@inlined
 def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added):
     """Pressure rates of both chambers and their slopes with respect to their own pressure.
 
@@ -150,7 +150,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     )
 
 
-@compiled
+@lean
 def _flows_of_terms(
     terms, i, user, time, x, v, spool, rate, p_head, p_rod, supply, command, drives
 ):
@@ -161,7 +161,7 @@ def _flows_of_terms(
     return added_flows(terms, i, s, drives)
 
 
-@compiled
+@lean
 def _delivery_of_terms(user, first, count, terms, act, length, velocity, command, time, supply, dt):
     """Share of the pump's largest flow that the terms add after a step, scalar [1].
 
@@ -185,7 +185,7 @@ def _delivery_of_terms(user, first, count, terms, act, length, velocity, command
     return wanted + (act[at] - wanted) * math.exp(-dt / ADDED_LAG)
 
 
-@compiled
+@lean
 def step_circuit(
     user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms=None, time=0.0,
     memory=None,
@@ -330,7 +330,7 @@ def step_circuit(
     return p_start, p_end
 
 
-@compiled
+@lean
 def _relieved(room, rate, quick, dt):
     """Mean rate over a step in which a port relief opens that no stage has seen open [Pa/s].
 
@@ -347,7 +347,7 @@ def _relieved(room, rate, quick, dt):
     return rate if turns <= 0.0 else (room - beyond * math.expm1(-turns) / turns) / dt
 
 
-@compiled
+@inlined
 def _rate_with_air(user, u, pressure, rate, dt):
     """Mean rate of a pressure over a step in which it would change at a rate without air [Pa/s]."""
     release, onset = user[u + _AIR], user[u + _ONSET]
@@ -357,7 +357,7 @@ def _rate_with_air(user, u, pressure, rate, dt):
     return (pressure_with_air(oil + dt * rate, release, onset) - pressure) / dt
 
 
-@compiled
+@inlined
 def _softening_ahead(user, u, pressure, rate, dt):
     """Softening that slopes reckon with over a step: none where the step would refill a chamber."""
     release, onset = user[u + _AIR], user[u + _ONSET]
@@ -368,7 +368,7 @@ def _softening_ahead(user, u, pressure, rate, dt):
     return softening(pressure, release, onset)
 
 
-@compiled
+@lean
 def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
     """What a supply pressure of 1 Pa more adds to the stage rates of the fed chambers.
 
@@ -395,7 +395,7 @@ def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
         scratch[f + 2] /= divisor
 
 
-@compiled
+@inlined
 def _couple(count, rate, scratch):
     """Add what the supply carries from chamber to chamber to rates of independent ones."""
     pull = 0.0
@@ -410,7 +410,7 @@ def _couple(count, rate, scratch):
             rate[a + 3] -= scratch[f + 2] * pull
 
 
-@compiled
+@lean
 def axis_state(user, i, supply, act, x, v, share=0.0):
     """Flows and force of one axis in a state, for logs and balances.
 

@@ -1,13 +1,13 @@
 """Friction on a drive side so light that an explicit step would throw it through rest and back."""
 
-from hydrotele.compiled import compiled
+from hydrotele.compiled import lean
 from hydrotele.hydraulics.circuit import actuator_friction, actuator_friction_slope
 
 _STEPS = 60  # bisections alone reach rounding in that many
 _ROUNDING = 1.0e-13
 
 
-@compiled
+@lean
 def settled_friction(user, u, velocity, push, inertia, dt):
     """Friction at the end of a step of a body that nothing else holds.
 

@@ -1,6 +1,6 @@
 """What the terms of a machine see and add: the state of a drive, and commands with their terms."""
 
-from hydrotele.compiled import compiled
+from hydrotele.compiled import lean
 from hydrotele.hydraulics.circuit import SLOTS, Slot, circuit_supply, delivered_share, open_ports
 from hydrotele.terms.law import Drives, DriveState
 from hydrotele.terms.table import COMMAND, added
@@ -8,7 +8,7 @@ from hydrotele.terms.table import COMMAND, added
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
 
 
-@compiled
+@lean
 def drive_state(user, i, count, act, supply, time, x, v, command, gain):
     """State of one drive, as laws of terms see it.
 
@@ -37,7 +37,7 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
     )
 
 
-@compiled
+@lean
 def add_to_commands(user, terms, count, act, command, length, velocity, dt, time, scratch, out):
     """Commands of the valves with their terms, at the middle of a step.
 

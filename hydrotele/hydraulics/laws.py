@@ -7,13 +7,13 @@ Equations: Merritt, *Hydraulic Control Systems* (1967); the set is fixed as the 
 
 import math
 
-from hydrotele.compiled import compiled
+from hydrotele.compiled import inlined, lean
 
 ATMOSPHERE = 101325.0  # Pa
 _VACUUM = 0.01  # Pa absolute: what is said to be at or below it counts as this
 
 
-@compiled
+@inlined
 def valve_opening(spool, deadband):
     """Opening of a valve with overlap: 0 inside the dead band, then linear up to 1.
 
@@ -37,7 +37,7 @@ def valve_opening(spool, deadband):
     return math.copysign(beyond / (1.0 - deadband), spool)
 
 
-@compiled
+@inlined
 def orifice(pressure_drop, flow_gain, smoothing):
     """Turbulent orifice flow, made smooth through zero pressure drop, and its slope.
 
@@ -59,12 +59,13 @@ def orifice(pressure_drop, flow_gain, smoothing):
     >>> orifice(0.0, 1.0, 4.0)
     (0.0, 0.5)
     """
-    square = pressure_drop * pressure_drop + smoothing * smoothing
-    scaled = flow_gain / math.sqrt(math.sqrt(square))
-    return scaled * pressure_drop, scaled * (1.0 - 0.5 * pressure_drop * pressure_drop / square)
+    square = pressure_drop * pressure_drop
+    inverse = 1.0 / (square + smoothing * smoothing)
+    scaled = flow_gain * math.sqrt(math.sqrt(inverse))
+    return scaled * pressure_drop, scaled * (1.0 - 0.5 * square * inverse)
 
 
-@compiled
+@inlined
 def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
     """Flow into a chamber through port relief (outward) and make-up valve (inward), and its slope.
 
@@ -92,7 +93,7 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
     return 0.0, 0.0
 
 
-@compiled
+@lean
 def pressure_with_air(oil, release, onset=0.0):
     """Pressure in a chamber whose oil gives off its dissolved air below atmosphere.
 
@@ -125,7 +126,7 @@ def pressure_with_air(oil, release, onset=0.0):
     return 2.0 * lack * ATMOSPHERE / (b + math.sqrt(b * b + 4.0 * lack * ATMOSPHERE)) - onset
 
 
-@compiled
+@lean
 def pressure_without_air(pressure, release, onset=0.0):
     """What a pressure below atmosphere would be if the oil gave off no air.
 
@@ -149,7 +150,7 @@ def pressure_without_air(pressure, release, onset=0.0):
     return lack * (1.0 + release / (lack + ATMOSPHERE)) - onset
 
 
-@compiled
+@inlined
 def softening(pressure, release, onset=0.0):
     """How much less the pressure of oil with released air changes than that of oil alone.
 
@@ -174,7 +175,7 @@ def softening(pressure, release, onset=0.0):
     return 1.0 / (1.0 + release * ATMOSPHERE / (absolute * absolute))
 
 
-@compiled
+@lean
 def holding_share(pressure, pilot, setting, pilot_ratio, override):
     """Share of the outlet that a counterbalance valve leaves open, and its slope.
 
@@ -203,7 +204,7 @@ def holding_share(pressure, pilot, setting, pilot_ratio, override):
     return share, 1.0 / override
 
 
-@compiled
+@lean
 def stop_force(position, velocity, low, high, stiffness, damping):
     """Force of an end stop: a spring and a damper that push and never pull.
 
@@ -235,7 +236,7 @@ def stop_force(position, velocity, low, high, stiffness, damping):
     return force, stiffness, damping
 
 
-@compiled
+@inlined
 def friction(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
@@ -270,7 +271,7 @@ def friction(
     return dry + viscous * velocity * (1.0 + viscous_asymmetry * way)
 
 
-@compiled
+@lean
 def friction_slope(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
@@ -309,7 +310,7 @@ def friction_slope(
     return slope + viscous * (1.0 + lean)
 
 
-@compiled
+@lean
 def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.0):
     """One step of the spool `s'' = w^2 (u - s) - 2 z w s'`, `|s'| <= s_max`, with the command held.
 

@@ -14,7 +14,7 @@ friction", IEEE Trans. Automatic Control 40(3), Eqs 1-4; Dahl 1968, Aerospace Co
 
 import math
 
-from hydrotele.compiled import compiled
+from hydrotele.compiled import lean
 from hydrotele.hydraulics.laws import friction, friction_slope
 from hydrotele.hydraulics.slots import Slot
 
@@ -27,7 +27,7 @@ _STIFF, _DAMP = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE_DAMPING)
 _RESOLVED = 0.5  # (w dt)^2 of a drive on its bristles; an explicit step is stable up to 4
 
 
-@compiled
+@lean
 def sliding_level(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
     """Dry friction of a drive that slides, without smoothing of its sign.
 
@@ -53,7 +53,7 @@ def sliding_level(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
     return (coulomb + stribeck * math.exp(-ratio * ratio)) * (sign + asymmetry)
 
 
-@compiled
+@lean
 def bristle_step(force, velocity, level, stiffness, dt):
     """Force of the bristles after a time at a held velocity, by the exact exponential.
 
@@ -83,13 +83,13 @@ def bristle_step(force, velocity, level, stiffness, dt):
     return level + (force - level) * math.exp(-stiffness * abs(velocity) * dt / abs(level))
 
 
-@compiled
+@lean
 def _level(user, u, velocity):
     """`sliding_level` of an actuator."""
     return sliding_level(velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _AC])
 
 
-@compiled
+@lean
 def _followed(user, u, inertia, dt):
     """Stiffness of an actuator's bristles that a step can follow, see `bristle_rate`."""
     stiffness = user[u + _STIFF]
@@ -98,7 +98,7 @@ def _followed(user, u, inertia, dt):
     return stiffness
 
 
-@compiled
+@lean
 def bristle_rate(user, u, share, velocity, inertia, dt):
     """Mean rate over a step of the bristles' share of the breakaway force.
 
@@ -122,7 +122,7 @@ def bristle_rate(user, u, share, velocity, inertia, dt):
     return (after - share) / dt
 
 
-@compiled
+@lean
 def bristle_friction(user, u, share, velocity, inertia, dt):
     """Friction of a drive with bristles, and its slopes.
 
@@ -157,7 +157,7 @@ def bristle_friction(user, u, share, velocity, inertia, dt):
     return force, damping * bent + slope, _followed(user, u, inertia, dt) * bent
 
 
-@compiled
+@lean
 def settled_bristle_friction(user, u, share, velocity, push, inertia, dt):
     """`bristle_friction` at the end of a step of a body that nothing else holds.
 

@@ -5,7 +5,7 @@ Flat arrays are laid out as in `circuit`; `ports` holds four numbers per axis, s
 
 import math
 
-from hydrotele.compiled import compiled
+from hydrotele.compiled import inlined, lean
 from hydrotele.hydraulics.slots import SLOTS, Kind, Slot
 from hydrotele.hydraulics.valve import axis_opening, inlet_flow, inlet_gain
 
@@ -23,7 +23,7 @@ _ADDED = int(Slot.ADDED_DELIVERY)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
-@compiled
+@lean
 def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0):
     """Largest pressure up to the relief setting at which the valves draw no more than the pump.
 
@@ -86,7 +86,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0):
     return p
 
 
-@compiled
+@inlined
 def open_ports(user, act, spool, ports, first, count, ahead, rate):
     """Flow gain and supply-side pressure of every axis, for `supply_pressure`.
 
@@ -120,7 +120,7 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
             ports[4 * i + 1] += ahead * rate[4 * i + side]
 
 
-@compiled
+@lean
 def delivered_share(user, first, act):
     """Share of its largest flow that the pump gives: 1 where it follows at once, and without terms.
 
@@ -141,7 +141,7 @@ def delivered_share(user, first, act):
     return with_added(own_share(user, first, act), added)
 
 
-@compiled
+@lean
 def own_share(user, first, act):
     """As `delivered_share`, without what terms add.
 
@@ -161,7 +161,7 @@ def own_share(user, first, act):
     return min(1.0, max(_LEAST_SHARE, act[int(user[s + _DELIVERY])]))
 
 
-@compiled
+@lean
 def with_added(share, added):
     """Share of a pump's largest flow with what terms add to it; never none.
 
@@ -177,7 +177,7 @@ def with_added(share, added):
     return max(_LEAST_SHARE, share + added)
 
 
-@compiled
+@lean
 def pump_response(user, first, wanted, share, dt):
     """Share of its largest flow that the pump is set to after a time, by the exact exponential.
 
@@ -197,7 +197,7 @@ def pump_response(user, first, wanted, share, dt):
     return wanted + (share - wanted) * math.exp(-dt / lag) if lag > 0.0 else 1.0
 
 
-@compiled
+@lean
 def wanted_share(user, first, count, ports):
     """Share of its largest flow that the valves draw from a pump that follows at once.
 
@@ -227,7 +227,7 @@ def wanted_share(user, first, count, ports):
     return min(1.0, drawn / user[s + _PUMP])
 
 
-@compiled
+@inlined
 def circuit_supply(user, first, count, ports, share=1.0):
     """Supply pressure of a circuit: what pump and relief give, or what load sensing asks for.
 
@@ -258,7 +258,7 @@ def circuit_supply(user, first, count, ports, share=1.0):
     return supply_pressure(ports, count, user[s + _D], most, flow, user[s + _DROOP])
 
 
-@compiled
+@lean
 def supply_coupling(user, first, count, ports, supply, out):
     """How the supply pressure follows the chambers that it feeds.
 
@@ -282,6 +282,8 @@ def supply_coupling(user, first, count, ports, supply, out):
     """
     s, total, leader = first * SLOTS, user[first * SLOTS + _DROOP], -1
     most, load = user[s + _RELIEF], user[s + _TANK]
+    if supply >= most and user[s + _MARGIN] == 0.0:
+        return False
     for i in range(count):
         out[4 * i + 2], out[4 * i + 3] = 0.0, 0.0
         drop = supply - ports[4 * i + 1]

@@ -8,7 +8,7 @@ the oil of either side.
 
 import math
 
-from hydrotele.compiled import compiled
+from hydrotele.compiled import inlined
 from hydrotele.hydraulics.laws import holding_share, orifice, valve_opening
 from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS, Slot
 
@@ -20,7 +20,7 @@ _HEAD, _ROD = int(Slot.HOLDING_HEAD), int(Slot.HOLDING_ROD)
 _CURVES = int(Slot.CURVES)
 
 
-@compiled
+@inlined
 def axis_opening(user, u, spool):
     """Opening of an axis' valve: dead band and flow curve of the direction of travel.
 
@@ -52,7 +52,7 @@ def axis_opening(user, u, spool):
     return math.copysign(low + (high - low) * (travel - before) / (after - before), spool)
 
 
-@compiled
+@inlined
 def inlet_gain(user, u, opening):
     """Flow gain of the edge that feeds a chamber.
 
@@ -70,7 +70,7 @@ def inlet_gain(user, u, opening):
     return user[u + _K] * edge * abs(opening)
 
 
-@compiled
+@inlined
 def inlet_flow(drop, gain, smoothing, compensated):
     """Flow through an inlet edge and its slope; a compensator takes up the drop beyond its setting.
 
@@ -93,7 +93,7 @@ def inlet_flow(drop, gain, smoothing, compensated):
     return orifice(drop, gain, smoothing)
 
 
-@compiled
+@inlined
 def _outlet_flow(user, u, holding, gain, pressure, pilot):
     """Flow out of a chamber to tank, throttled by its counterbalance valve, and its slope."""
     flow, slope = orifice(pressure - user[u + _TANK], gain, user[u + _D])
@@ -105,7 +105,7 @@ def _outlet_flow(user, u, holding, gain, pressure, pilot):
     return share * flow, share * slope + steep * flow
 
 
-@compiled
+@inlined
 def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     """Valve flows into both chambers of an axis and their slopes.
 
