@@ -22,6 +22,7 @@ from hydrotele.hydraulics.circuit import (
     wanted_share,
 )
 from hydrotele.hydraulics.laws import port_flow, softening
+from hydrotele.hydraulics.supply import drawn_flow, highest_supply
 
 _AH, _AR, _LEAK = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.LEAKAGE)
 _PORT, _KR = int(Slot.PORT_RELIEF), int(Slot.RELIEF_GAIN)
@@ -29,7 +30,7 @@ _TANK, _KM = int(Slot.TANK_PRESSURE), int(Slot.MAKEUP_GAIN)
 _BETA, _HOSE = int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE)
 _AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
-_MEMORY = int(Slot.MEMORY)
+_MEMORY, _PUMP = int(Slot.MEMORY), int(Slot.PUMP_FLOW)
 
 
 @compiled
@@ -119,6 +120,19 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
 
 
 @compiled
+def _settle(user, spools, pressures, period, act, ports):
+    """Write a row's activations and ports; a slow pump has followed over a period, 0 at first."""
+    count, at = len(spools), int(user[_DELIVERY])
+    for i in range(count):
+        act[4 * i] = spools[i]
+        act[4 * i + 2], act[4 * i + 3] = pressures[i]
+    open_ports(user, act, act, ports, 0, count, 0.0, act)
+    if user[_LAG] > 0.0:
+        wanted = wanted_share(user, 0, count, ports)
+        act[at] = pump_response(user, 0, wanted, act[at], period) if period > 0.0 else wanted
+
+
+@compiled
 def supply_pressures(user, spools, pressures, period):
     """Supply pressure from spools and chamber pressures.
 
@@ -135,16 +149,37 @@ def supply_pressures(user, spools, pressures, period):
     Source: nominal model, "Supply".
     """
     count, rows = spools.shape
-    at = int(user[_DELIVERY])
     ports, out = np.zeros(4 * count), np.empty(rows)
     act = np.zeros(4 * count + int(user[_MEMORY]))
     for k in range(rows):
-        for i in range(count):
-            act[4 * i] = spools[i, k]
-            act[4 * i + 2], act[4 * i + 3] = pressures[i, 0, k], pressures[i, 1, k]
-        open_ports(user, act, act, ports, 0, count, 0.0, act)
-        if user[_LAG] > 0.0:
-            wanted = wanted_share(user, 0, count, ports)
-            act[at] = wanted if k == 0 else pump_response(user, 0, wanted, act[at], period)
+        _settle(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
         out[k] = circuit_supply(user, 0, count, ports, delivered_share(user, 0, act))
+    return out
+
+
+@compiled
+def pump_lacks(user, spools, pressures, supply, period):
+    """Flow that a pump which is short gives beyond what it should.
+
+    Args:
+        user: (h * SLOTS,) numbers of the h valves.
+        spools: (h, n) [1].
+        pressures: (h, 2, n) head and rod pressures [Pa].
+        supply: (n,) supply pressure [Pa].
+        period: as of `supply_pressures`.
+
+    Returns:
+        (2, n): what the valves draw at that pressure less the pump's flow [m^3/s], and by how much
+        the pressure is below that of a pump that is not short [Pa].
+
+    Source: nominal model, "Supply".
+    """
+    count, rows = spools.shape
+    ports, out = np.zeros(4 * count), np.empty((2, rows))
+    act = np.zeros(4 * count + int(user[_MEMORY]))
+    for k in range(rows):
+        _settle(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
+        given = user[_PUMP] * delivered_share(user, 0, act)
+        out[0, k] = drawn_flow(user, 0, count, ports, supply[k]) - given
+        out[1, k] = highest_supply(user, 0, count, ports) - supply[k]
     return out

@@ -13,7 +13,7 @@ from scipy.signal import butter, sosfiltfilt
 from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.mechanism import JOINT
 from hydrotele.dynamics.model import model_space, reduced_model
-from hydrotele.gap.balance_laws import chamber_residuals, load_forces, supply_pressures
+from hydrotele.gap.balance_laws import chamber_residuals, load_forces, pump_lacks, supply_pressures
 from hydrotele.gap.balance_signals import (
     Signals,
     joint_motion,
@@ -33,6 +33,8 @@ from hydrotele.signals import usual_unit
 BAND = 1.5
 _AVERAGE = 1.0  # s: the draws' scatter is averaged over it
 _SUPPLY = "supply"
+_HALF = 0.5  # of a margin: a load that swings takes up some of it
+_NOT_SHORT = 0.02  # of its setting: a relief valve, and its reading, hold it no better
 
 
 @dataclass(frozen=True)
@@ -71,23 +73,64 @@ def run_balances(
     Returns:
         As `balances`; residuals are NaN in rows that a mask leaves out.
     """
+    found = _balances(machine, _signals(machine, data, run, noise))
+    if run.valid is None or run.valid.all():
+        return found
+
+    def masked(balance: Balance) -> Balance:
+        row = np.clip(np.round((balance.time - run.start) / run.period), 0, len(run.command) - 1)
+        assert run.valid is not None
+        residual = np.where(run.valid[row.astype(int)], balance.residual, np.nan)
+        return _balance(balance.time, residual, balance.noise, balance.unit)
+
+    return {law: {p: masked(b) for p, b in places.items()} for law, places in found.items()}
+
+
+def pump_lack(
+    machine: Machine, data: Dataset, run: RunData, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flow that the pump of the valves gives beyond the model's, where it is short.
+
+    Read off the supply's balance, row by row: a filter whose model has the pump at its relief
+    setting cannot tell that its flow is short, as more or less of it would change nothing.
+
+    Args:
+        machine: the model.
+        data: the dataset.
+        run: one of its runs.
+        noise: as of `run_balances`.
+
+    Returns:
+        ((n,) flow [m^3/s], (n,) its standard deviation): NaN where the pressure is within
+        `_NOT_SHORT` or half a load-sensing margin of a pump's that is not short, and everywhere if
+        a channel is missing.
+    """
+    signals = _signals(machine, data, run, noise)
+    unknown = np.full((2, len(run.command)), np.nan)
+    parts = _supply_signals(machine, signals)
+    if parts is None or len(signals.time) != unknown.shape[1]:
+        return unknown[0], unknown[1]
+    user, spools, pressures, supplies = parts
+    found = np.stack([
+        pump_lacks(user, spools, p, supply, signals.period)
+        for p, supply in zip(pressures, supplies, strict=True)
+    ])  # fmt: skip
+    flow, below = found[:, 0], found[0, 1]
+    supply = machine.supply
+    senses = supply is not None and supply.kind == "load_sensing"
+    margin = supply.load_sensing_margin if supply and senses else 0.0
+    short = below > np.maximum(_NOT_SHORT * (below + supplies[0]), _HALF * margin)
+    return np.where(short, flow[0], np.nan), _scatter(flow, signals.period)
+
+
+def _signals(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) -> Signals:
     columns = {f"command.{axis}": v for axis, v in zip(data.axes, run.command.T, strict=True)}
     columns |= dict(zip(data.channels, run.reading.T, strict=True))
     time = run.start + run.period * np.arange(len(run.command))
     log = Log(time, columns, {c: usual_unit(c, columns) for c in columns}, source=run.name)
     each = noise if run.behind is None else noise / np.sqrt(run.behind)
     known = dict(zip(data.channels, each.tolist(), strict=True))
-    found = balances(machine, log, data.sensors, known)
-    if run.valid is None or run.valid.all():
-        return found
-
-    def masked(balance: Balance) -> Balance:
-        row = np.clip(np.round((balance.time - run.start) / run.period), 0, len(time) - 1)
-        assert run.valid is not None
-        residual = np.where(run.valid[row.astype(int)], balance.residual, np.nan)
-        return _balance(balance.time, residual, balance.noise, balance.unit)
-
-    return {law: {p: masked(b) for p, b in places.items()} for law, places in found.items()}
+    return read_signals(machine, log, data.sensors, known)
 
 
 def balances(
@@ -113,7 +156,10 @@ def balances(
     Raises:
         InputError: the time stamps follow no clock, or the machine has no such sensors.
     """
-    signals = read_signals(machine, log, sensors, noise)
+    return _balances(machine, read_signals(machine, log, sensors, noise))
+
+
+def _balances(machine: Machine, signals: Signals) -> dict[str, dict[str, Balance]]:
     found: dict[str, dict[str, Balance]] = {}
     for law in (_closure, _force, _flow_and_timing, _supply):
         for name, place, balance in law(machine, signals):
@@ -245,23 +291,38 @@ def _flow_and_timing(machine: Machine, signals: Signals) -> Found:
 
 
 def _supply(machine: Machine, signals: Signals) -> Found:
-    names = [name for name, axis in machine.hydraulic_axes.items() if axis.valve]
+    parts = _supply_signals(machine, signals)
+    if parts is None:
+        return
+    user, spools, pressures, supplies = parts
+    expected = np.stack([supply_pressures(user, spools, p, signals.period) for p in pressures])
+    yield (
+        _SUPPLY,
+        _SUPPLY,
+        _balance(signals.time, *_in_band(supplies - expected, signals.period), "Pa"),
+    )
+
+
+def _supply_signals(
+    machine: Machine, signals: Signals
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """What the supply's balance is made of, None if a channel is missing.
+
+    Returns:
+        The h valves' numbers, their spools (h, n) [1], the pressures of their chambers
+        (d, h, 2, n) and of the supply (d, n) [Pa].
+    """
+    names = list(machine.valve_axes)
     chambers = [f"pressure_{side}.{name}" for name in names for side in ("head", "rod")]
     commanded = all(name in signals.command for name in names)
     if not (names and commanded and signals.has("pressure_supply", *chambers)):
-        return
+        return None
     numbers = actuator_numbers(machine)
     user = np.concatenate([numbers[name] for name in names])
     spools = np.stack([spool_positions(machine, signals, name) for name in names])
     table = np.stack([signals.smoothed[c][:, 0] for c in chambers], axis=1)
-    expected = np.stack(
-        [
-            supply_pressures(user, spools, p.reshape(len(names), 2, -1), signals.period)
-            for p in table
-        ]
-    )
-    residual = signals.smoothed["pressure_supply"][:, 0] - expected
-    yield _SUPPLY, _SUPPLY, _balance(signals.time, *_in_band(residual, signals.period), "Pa")
+    pressures = table.reshape(len(table), len(names), 2, -1)
+    return user, spools, pressures, signals.smoothed["pressure_supply"][:, 0]
 
 
 def _in_band(sets: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

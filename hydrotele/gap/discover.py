@@ -2,9 +2,10 @@
 
 The filter's unknown inputs (`prediction.inputs`) say which balance lacks something, where and when;
 in their places tables over one or two physical variables of this drive or another are tried
-(`law_tables`). What predicts runs that it was not fitted to best (`law_regression`) is put into the
-machine, fitted again there, where the filter sees clearer, and kept if it is worth its entries. It
-is a term of the patched machine (`hydrotele.terms`), which every simulator calculates.
+(`law_tables`). What the pump lacks is read off the supply's balance (`balances.pump_lack`). What
+predicts runs that it was not fitted to best (`law_regression`) is put into the machine, fitted
+again there, where the filter sees clearer, and kept if it is worth its entries. It is a term of the
+patched machine (`hydrotele.terms`), which every simulator calculates.
 """
 
 import itertools
@@ -20,7 +21,8 @@ from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import place
 from hydrotele.dynamics.model import X, model_space
 from hydrotele.dynamics.supply import supply_of
-from hydrotele.gap.law_regression import Regression, at_a_glance, regression
+from hydrotele.gap.balances import pump_lack
+from hydrotele.gap.law_regression import Regression, at_a_glance, lack_regression, regression
 from hydrotele.gap.law_tables import THROUGH, Table, paired_tables, possible_tables
 from hydrotele.gap.pruning import ENTER
 from hydrotele.gap.search import lacking
@@ -30,7 +32,7 @@ from hydrotele.prediction.calibration import CALIBRATION
 from hydrotele.prediction.evidence import Evidence, Judged
 from hydrotele.prediction.free_run import free_run_errors, machine_runner
 from hydrotele.prediction.hypothesis import Guess, Hypothesis
-from hydrotele.prediction.inputs import Input, input_sizes
+from hydrotele.prediction.inputs import SUPPLY, Input, input_sizes
 from hydrotele.prediction.levels import smoothed, smoothed_inputs
 from hydrotele.prediction.track import Track, following_model
 from hydrotele.terms.facts import OF_A_DRIVE, Term
@@ -42,6 +44,8 @@ _LARGEST = 4  # unknown inputs in whose places laws are looked for
 _COUPLED = 2  # of these, for which variables of other drives are paired, too
 _PAIRS = 12  # tables over two variables that are looked at closely, for each lack
 _TRIED = 2  # laws that are put into the machine, of all that the regression finds
+_MOSTLY = 0.5  # of the square of what a pump lacks that a law must predict to be tried
+_SHORT_ROWS = 20  # of a run in which its pump is short that it takes to be read
 _PLAINER = 0.9  # of the best law's fall that one of a single variable needs to go before it
 _AGAIN = 5  # times that a law is fitted again inside the machine
 _STEPS = 3  # of Gauss-Newton for the numbers beside a law
@@ -59,7 +63,7 @@ class Learned:
 
     Attributes:
         hypothesis: the machine with it; it has no parameters.
-        balance: force, flow_head, flow_rod, `THROUGH` or command.
+        balance: force, flow_head, flow_rod, `THROUGH`, command or `SUPPLY`.
         axis: of the drive.
         table: its form.
         entries: (K,) of the table [unit of the balance].
@@ -316,7 +320,7 @@ def _candidates(
         balances = [i.balance]
         if i.balance == "flow_head" and Input("flow_rod", i.axis) in levels.inputs:
             balances.append(THROUGH)
-        window = _busy_window(seen, int(k))
+        window = _busy_window(seen, [(s.known, s.inputs[:, int(k)]) for s in seen])
         values, speed = [s.values[i.axis] for s in seen], _smoothing(machine, i.axis)
         for balance in balances:
             tables = possible_tables(balance, values, speed)
@@ -331,15 +335,59 @@ def _candidates(
                     moved = [best[0][2]._replace(window=w) for w in _moved_windows(window)]
                     inside += tried([(i, balance, table) for table in moved])
                 looked += inside
-    looked = [pair for pair in looked if pair[1].predicted > ENTER]
+    best = _best_first(looked)[:_TRIED] + _pump_laws(evidence, judged, seen)[:1]
+    return [_law(machine, case, answer, seen) for case, answer in best]
+
+
+def _best_first(looked: Sequence[tuple[_Case, Regression]]) -> list[tuple[_Case, Regression]]:
+    """What is worth its entries, by what it predicts; one variable goes before two."""
     most = max((answer.predicted for _, answer in looked), default=0.0)
 
     def place(pair: tuple[_Case, Regression]) -> tuple[bool, float]:
         plain = len(pair[0][2].variables) == 1 and pair[1].predicted >= _PLAINER * most
         return not plain, -pair[1].predicted
 
-    looked.sort(key=place)
-    return [_law(machine, case, answer, seen) for case, answer in looked[:_TRIED]]
+    return sorted((pair for pair in looked if pair[1].predicted > ENTER), key=place)
+
+
+def _pump_laws(
+    evidence: Evidence, judged: Judged, seen: Sequence[_Seen]
+) -> list[tuple[_Case, Regression]]:
+    """Laws of what the pump lacks that a machine's valves share, best first.
+
+    None where a term already adds to its flow: what that lacks is an unknown input of the filter.
+    """
+    data = evidence.data
+    machine = judged.guess.machine(data.machine)
+    limited = machine.supply is not None and machine.supply.kind != "constant_pressure"
+    if not (limited and machine.valve_axes) or any(t.balance == SUPPLY for t in machine.terms):
+        return []
+    noise = judged.tracks[0].levels.noise
+    told = evidence.map(lambda track: pump_lack(machine, data, track.run, noise), judged.tracks)
+    rows = [s.known & np.isfinite(flow) for s, (flow, _) in zip(seen, told, strict=True)]
+    own = Input(SUPPLY, next(iter(machine.valve_axes)))
+    used = [k for k, row in enumerate(rows) if np.count_nonzero(row) > _SHORT_ROWS]
+    if not used:
+        return []
+    values = [seen[k].values[own.axis] for k in used]
+    lacks = [(told[k][0][rows[k]], told[k][1][rows[k]]) for k in used]
+
+    def tried(tables: Sequence[Table]) -> list[tuple[_Case, Regression]]:
+        def fitted(table: Table) -> tuple[Regression, float]:
+            shares = [table.columns(v)[rows[k]] for k, v in zip(used, values, strict=True)]
+            parts = [(*lack, share) for lack, share in zip(lacks, shares, strict=True)]
+            return lack_regression(table, parts)
+
+        found = zip(tables, evidence.map(fitted, tables), strict=True)
+        return [((own, SUPPLY, t), fit) for t, (fit, share) in found if share > _MOSTLY]
+
+    speed = _smoothing(machine, own.axis)
+    window = _busy_window([seen[k] for k in used], [(rows[k], told[k][0]) for k in used])
+    tables = possible_tables(SUPPLY, values, speed) + paired_tables(SUPPLY, values, speed, True)
+    looked = tried(tables)
+    if window:
+        looked += tried(possible_tables(SUPPLY, values, speed, window))
+    return _best_first(looked)
 
 
 def _likely_pairs(
@@ -382,8 +430,12 @@ def _moved_windows(window: tuple[float, ...]) -> list[tuple[float, float]]:
     return [(begin + a, end + b) for a in _MOVES for b in _MOVES if a or b]
 
 
-def _busy_window(seen: Sequence[_Seen], k: int) -> tuple[float, float] | tuple[()]:
-    """Times between which an unknown input is large, and small beyond, in all runs; or none.
+def _busy_window(
+    seen: Sequence[_Seen], lacks: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> tuple[float, float] | tuple[()]:
+    """Times between which a lack is large, and small beyond, in all runs; or none.
+
+    Of every run the rows (n,) in which it is known, and the lack (n,).
 
     The change points of the largest likelihood, with one variance within and one beyond, told from
     the smoother's answer in blocks of `_BLOCK` seconds.
@@ -391,10 +443,9 @@ def _busy_window(seen: Sequence[_Seen], k: int) -> tuple[float, float] | tuple[(
     clocks = [next(iter(s.values.values()))["time"] for s in seen]
     edges = np.arange(0.0, max(float(c[-1]) for c in clocks) + _BLOCK, _BLOCK)
     squares, counts = np.zeros(len(edges)), np.zeros(len(edges))
-    for s, clock in zip(seen, clocks, strict=True):
-        values = s.inputs[s.known, k] ** 2
-        squares[1:] += np.histogram(clock[s.known], edges, weights=values)[0]
-        counts[1:] += np.histogram(clock[s.known], edges)[0]
+    for (known, lack), clock in zip(lacks, clocks, strict=True):
+        squares[1:] += np.histogram(clock[known], edges, weights=lack[known] ** 2)[0]
+        counts[1:] += np.histogram(clock[known], edges)[0]
     squares, counts = np.cumsum(squares), np.cumsum(counts)
     best, found, least = 0.0, (), 1.0 / _BLOCK * counts[-1] / max(1, len(edges) - 1)
     for a, b in itertools.combinations(range(len(edges)), 2):

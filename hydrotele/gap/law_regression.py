@@ -56,9 +56,51 @@ def regression(
     answers = []
     for track, column, shares in parts:
         slope = error_responses(track, column, shares * size)
-        there = slope.reshape(-1, slope.shape[2]), flat(track.whitened)
-        cuts = 1 if len(parts) > 1 else _PARTS
-        answers += zip(*(np.array_split(part, cuts) for part in there), strict=True)
+        answers.append((slope.reshape(-1, slope.shape[2]), flat(track.whitened)))
+    falls, x, covariance, charge = _entries(table, answers)
+    along = np.concatenate([shares @ x for _, _, shares in parts])
+    left = size * float(np.sqrt(max(1.0 - np.mean(along**2), 0.0)))
+    return Regression(falls, x * size, covariance * size**2, charge, left)
+
+
+def lack_regression(
+    table: Table, parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> tuple[Regression, float]:
+    """Fit a table's entries to a lack that readings tell row by row.
+
+    Args:
+        table: with K entries.
+        parts: per run the lack (n,), its standard deviation (n,) and the entries' shares (n, K).
+
+    Returns:
+        (The regression, the share of the lack's square in its standard deviations that it predicts
+        where it was left out); rows over which smoothed readings hang together count as one.
+    """
+    lack = np.concatenate([told for told, _, _ in parts])
+    size = float(np.sqrt(np.mean(lack**2)))
+    answers = []
+    for told, deviation, shares in parts:
+        each = np.sqrt(_MEMORY_ROWS) * deviation
+        answers.append((-size * shares / each[:, None], told / each))
+    falls, x, covariance, charge = _entries(table, answers)
+    along = np.concatenate([shares @ x for _, _, shares in parts])
+    left = float(np.sqrt(np.mean((lack - size * along) ** 2)))
+    share = falls / sum(float(errors @ errors) for _, errors in answers)
+    return Regression(falls, x * size, covariance * size**2, charge, left), share
+
+
+def _entries(
+    table: Table, answers: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Fall of what is left out, entries, their covariance and charge, with the best smoothness.
+
+    Args:
+        table: with K entries.
+        answers: per run the slopes of its errors with the entries (n, K), and the errors (n,).
+    """
+    if len(answers) == 1:
+        cuts = (np.array_split(part, _PARTS) for part in answers[0])
+        answers = list(zip(*cuts, strict=True))
     curvature = np.array([s.T @ s for s, _ in answers])
     slope = np.array([s.T @ e for s, e in answers])
     falls = {
@@ -71,11 +113,8 @@ def regression(
     prior = table.precision(smooth)
     whole = curvature.sum(axis=0) + prior
     x = -np.linalg.solve(whole, slope.sum(axis=0))
-    along = np.concatenate([shares @ x for _, _, shares in parts])
-    left = size * float(np.sqrt(max(1.0 - np.mean(along**2), 0.0)))
     charge = np.linalg.slogdet(whole)[1] - np.linalg.slogdet(prior)[1]
-    covariance = np.linalg.inv(whole) * size**2
-    return Regression(falls[smooth], x * size, covariance, float(charge), left)
+    return falls[smooth], x, np.linalg.inv(whole), float(charge)
 
 
 def at_a_glance(table: Table, parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:

@@ -217,14 +217,59 @@ def wanted_share(user, first, count, ports):
 
     Source: nominal model, "Supply"; first-order swash plate: Merritt 1967, sec. 8-6.
     """
-    s = first * SLOTS
     supply = circuit_supply(user, first, count, ports)
+    return min(1.0, drawn_flow(user, first, count, ports, supply) / user[first * SLOTS + _PUMP])
+
+
+@lean
+def drawn_flow(user, first, count, ports, supply):
+    """Flow that the valves and the pump's own leak take at a supply pressure.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        supply: p_s, scalar [Pa].
+
+    Returns:
+        `sum_i q_i + c_p p_s`, scalar [m^3/s].
+
+    Source: nominal model, "Supply".
+    """
+    s = first * SLOTS
     drawn = user[s + _DROOP] * supply
     for i in range(count):
         drop = supply - ports[4 * i + 1]
         if drop > 0.0 and ports[4 * i] > 0.0:
             drawn += inlet_flow(drop, ports[4 * i], user[s + _D], ports[4 * i + 2])[0]
-    return min(1.0, drawn / user[s + _PUMP])
+    return drawn
+
+
+@inlined
+def highest_supply(user, first, count, ports):
+    """Supply pressure where the pump's flow is not short: the relief's, or that of load sensing.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+
+    Returns:
+        p_s, scalar [Pa].
+
+    Source: `circuit_supply`.
+    """
+    s = first * SLOTS
+    most = user[s + _RELIEF]
+    if user[s + _MARGIN] > 0.0:
+        load = user[s + _TANK]
+        for i in range(count):
+            if ports[4 * i] > 0.0:
+                load = max(load, ports[4 * i + 1])
+        most = min(most, load + user[s + _MARGIN])
+    return most
 
 
 @inlined
@@ -246,14 +291,7 @@ def circuit_supply(user, first, count, ports, share=1.0):
 
     Source: nominal model, "Supply".
     """
-    s = first * SLOTS
-    most = user[s + _RELIEF]
-    if user[s + _MARGIN] > 0.0:
-        load = user[s + _TANK]
-        for i in range(count):
-            if ports[4 * i] > 0.0:
-                load = max(load, ports[4 * i + 1])
-        most = min(most, load + user[s + _MARGIN])
+    s, most = first * SLOTS, highest_supply(user, first, count, ports)
     flow = user[s + _PUMP] * share
     return supply_pressure(ports, count, user[s + _D], most, flow, user[s + _DROOP])
 

@@ -1,5 +1,6 @@
 """Balances are at their noise where the model holds and stand out in the law that was changed."""
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -8,16 +9,26 @@ import pytest
 
 from hydrotele.drives import Transmission
 from hydrotele.dynamics.integrate import advance, read_channels
-from hydrotele.dynamics.model import model_space, predicted_channels, reduced_model, state_size
+from hydrotele.dynamics.model import (
+    model_space,
+    predicted_channels,
+    reduced_model,
+    state_names,
+    state_size,
+)
 from hydrotele.effects.effect import changed
 from hydrotele.gap.balance_timing import peak_lag, window_lags
-from hydrotele.gap.balances import balances
+from hydrotele.gap.balances import balances, pump_lack
+from hydrotele.gap.law_regression import lack_regression
+from hydrotele.gap.law_tables import Table
 from hydrotele.log import Log, load_log
 from hydrotele.machine_file import load_machine
 from hydrotele.noise import noise_rms, sensor_set
 from hydrotele.sensors import SensorError
 from hydrotele.signals import usual_unit
 from hydrotele.simulate.plant import build_plant, rest_state
+from hydrotele.terms.facts import Term
+from tests.prediction.test_filter import machine_data
 
 SENSORS, PERIOD = "khoshzaban1992", 0.02
 MEASURED = Path(__file__).parents[3] / "shared" / "measured"
@@ -269,3 +280,46 @@ def test_the_delay_of_open_03_is_read_off_in_seconds():
     found = balances(load_machine("cat215"), log, SENSORS)["timing"]
     for axis in ("swing", "boom", "stick"):
         assert np.nanmedian(found[axis].residual) == pytest.approx(0.06, abs=0.01)
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_what_a_pump_lacks_is_read_off_where_it_is_short(slow):
+    nominal = load_machine("cat215")
+    if slow:
+        nominal = changed(nominal, "supply.time_constant", 0.1)
+    nominal = changed(nominal, "supply.pump_flow", 0.6 * nominal.supply.pump_flow)
+    law = {"velocity": 4.0e-3}
+    term = Term(name="more", axis="boom", balance="flow_supply", law="formula", parameters=law,
+                of={"velocity": "swing"})  # fmt: skip
+    data, states = machine_data(nominal, nominal.model_copy(update={"terms": (term,)}))
+    run, swing = data.heldout, state_names(nominal).index("rate.swing")
+    lack, deviation = pump_lack(nominal, data, run, data.noise)
+    short = np.isfinite(lack)
+    assert 50 < np.count_nonzero(short) < len(lack)
+    hidden = law["velocity"] * states[short, swing]
+    assert np.std(hidden) > 5.0 * np.median(deviation[short])
+    left = (lack[short] - hidden) / np.std(hidden)
+    assert np.median(np.abs(left)) < 0.1  # smoothing errs more where the pump begins to be short
+    along = states[short, swing]
+    table = Table(("velocity",), (tuple(np.linspace(along.min(), along.max(), 5).tolist()),))
+    shares = table.columns({"velocity": along})
+    found, share = lack_regression(table, [(lack[short], deviation[short], shares)])
+    assert share > 0.8 and found.predicted > 0.0
+    assert np.median(np.abs(shares @ found.entries - hidden)) < 0.1 * np.std(hidden)
+
+
+def test_a_pump_lacks_nothing_that_cannot_be_read():
+    nominal = load_machine("cat215")
+    data, _ = machine_data(nominal, nominal)
+    kept = [k for k, c in enumerate(data.channels) if c != "pressure_supply"]
+    run = dataclasses.replace(data.heldout, reading=data.heldout.reading[:, kept])
+    less = dataclasses.replace(data, channels=tuple(data.channels[k] for k in kept))
+    lack, _ = pump_lack(nominal, less, run, data.noise[kept])
+    assert np.isnan(lack).all()
+    lack, deviation = pump_lack(nominal, data, data.heldout, data.noise)
+    short = np.isfinite(lack)
+    assert not short.any() or np.median(np.abs(lack[short])) < 3.0 * np.median(deviation[short])
+    senses = changed(nominal, "supply.kind", "load_sensing")  # a load that swings is no short flow
+    data, _ = machine_data(senses, senses)
+    lack, _ = pump_lack(senses, data, data.heldout, data.noise)
+    assert np.count_nonzero(np.isfinite(lack)) <= 2  # of 600: the first rows are a start

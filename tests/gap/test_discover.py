@@ -179,14 +179,11 @@ def test_a_window_is_seen_where_a_lack_is_there_for_a_while(made_up):
     rng = np.random.default_rng(3)
     inside = (clock > 6.1) & (clock < 11.4)
     known, values = np.ones(1000, bool), {"boom": {"time": clock}}
-    seen = [
-        _Seen(values, known, (rng.normal(size=1000) * np.where(inside, 5.0, 0.5))[:, None])
-        for _ in range(3)
-    ]
-    begin, end = _busy_window(seen, 0)
+    seen = [_Seen(values, known, np.zeros((1000, 0)))] * 3
+    busy = [(known, rng.normal(size=1000) * np.where(inside, 5.0, 0.5)) for _ in range(3)]
+    begin, end = _busy_window(seen, busy)
     assert (begin, end) == (pytest.approx(6.1, abs=0.26), pytest.approx(11.4, abs=0.26))
-    even = [_Seen(values, known, rng.normal(size=(1000, 1))) for _ in range(3)]
-    assert _busy_window(even, 0) == ()
+    assert _busy_window(seen, [(known, rng.normal(size=1000)) for _ in range(3)]) == ()
 
 
 @pytest.mark.parametrize(
