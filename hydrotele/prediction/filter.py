@@ -181,8 +181,9 @@ def filter_run(
                 for s in range(full):
                     gain[row, c, s] = pull[s] / total
                 for s in range(full):
+                    part = gain[row, c, s]
                     for k in range(full):
-                        spread[s, k] -= pull[s] * pull[k] / total
+                        spread[s, k] -= part * pull[k]
             for s in range(few):
                 delta[s] += gain[row, c, s] * error
             whitened[row, c] = error / width[row, c]

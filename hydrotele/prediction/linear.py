@@ -107,18 +107,18 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
                 gain[row, c, s] = pull[s] / total
                 d[s] += gain[row, c, s] * y
             for s in range(size):
+                part = gain[row, c, s]
                 for k in range(size):
-                    p[s, k] -= pull[s] * pull[k] / total
+                    p[s, k] -= part * pull[k]
         if row == rows - 1:
             break
         for s in range(size):
             pull[s] = d[s] - run.correction[row, s]
         f = run.flow[row]
-        for r in range(size):
-            total = 0.0
-            for s in range(size):
-                total += f[s, r] * pull[s]
-            d[r] = total
+        d[:] = 0.0
+        for s in range(size):
+            for r in range(size):
+                d[r] += f[s, r] * pull[s]
         for a in range(size):  # work = F p, then p = work F'; the innermost index is contiguous
             for b in range(size):
                 work[a, b] = 0.0
@@ -129,15 +129,13 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
                 for b in range(size):
                     work[a, b] += part * p[k, b]
         for a in range(size):
-            for b in range(size):
-                p[a, b] = 0.0
+            p[a] = 0.0
             for k in range(size):
                 part = work[a, k]
-                for b in range(size):
+                for b in range(a + 1):
                     p[a, b] += part * f[k, b]
         for a in range(size):
             for b in range(a):
-                p[a, b] = 0.5 * (p[a, b] + p[b, a])
                 p[b, a] = p[a, b]
             p[a, a] += drift[a] + run.startle[row, a]
     return loss
@@ -176,15 +174,14 @@ def linear_smoother(run, whitened, width, gain, noise_slope, drift_slope, pulls,
             for s in range(size):
                 drift_slope[s] += n[s, s] - r[s] * r[s]
             for s in range(size):
-                total = 0.0
-                for k in range(size):
-                    total += f[s, k] * r[k]
-                new[s] = total
-            for s in range(size):
-                r[s] = new[s]
-            for s in range(size):
                 for k in range(size):
                     turned[k, s] = f[s, k]
+            new[:] = 0.0
+            for k in range(size):
+                for s in range(size):
+                    new[s] += turned[k, s] * r[k]
+            for s in range(size):
+                r[s] = new[s]
             for a in range(size):  # n = F' n F with f the transpose of F
                 for b in range(size):
                     work[a, b] = 0.0
@@ -195,15 +192,13 @@ def linear_smoother(run, whitened, width, gain, noise_slope, drift_slope, pulls,
                     for b in range(size):
                         work[a, b] += part * n[k, b]
             for a in range(size):
-                for b in range(size):
-                    n[a, b] = 0.0
+                n[a] = 0.0
                 for k in range(size):
                     part = work[a, k]
-                    for b in range(size):
+                    for b in range(a + 1):
                         n[a, b] += part * turned[k, b]
             for a in range(size):
                 for b in range(a):
-                    n[a, b] = 0.5 * (n[a, b] + n[b, a])
                     n[b, a] = n[a, b]
         for c in range(channels - 1, -1, -1):
             if np.isnan(whitened[row, c]):
@@ -212,20 +207,20 @@ def linear_smoother(run, whitened, width, gain, noise_slope, drift_slope, pulls,
             square = width[row, c] * width[row, c]
             u = whitened[row, c] / width[row, c]
             inner = 1.0 / square
-            for s in range(size):
-                u -= k_gain[s] * r[s]
-                pull[s] = 0.0
-                for k in range(size):
-                    pull[s] += n[s, k] * k_gain[k]
+            pull[:] = 0.0
+            for k in range(size):
+                u -= k_gain[k] * r[k]
+                for s in range(size):
+                    pull[s] += n[k, s] * k_gain[k]
             for s in range(size):
                 inner += k_gain[s] * pull[s]
             noise_slope[c] += inner - u * u
             for s in range(size):
-                r[s] += h[s] * u
-            for s in range(size):
-                for k in range(s + 1):
-                    n[s, k] += inner * h[s] * h[k] - h[s] * pull[k] - pull[s] * h[k]
-                    n[k, s] = n[s, k]
+                if h[s] != 0.0:  # a reading depends on few states
+                    r[s] += h[s] * u
+                    for k in range(size):
+                        n[s, k] += h[s] * (0.5 * inner * h[k] - pull[k])
+                        n[k, s] += h[s] * (0.5 * inner * h[k] - pull[k])
         for s in range(size):
             pulls[row, s] = r[s]
             lacks[row, s] = n[s, s]
