@@ -34,12 +34,16 @@ _EVALUATIONS = 60  # of a simplex
 _CLOSE = 0.01  # ends the search
 
 
-def rattling(evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis]) -> Judged | None:
+def rattling(
+    evidence: Evidence, base: Judged, ahead: Judged, candidates: Sequence[Hypothesis]
+) -> Judged | None:
     """Teeth with a gap for an axis that shakes, with levels of their own.
 
     Args:
         evidence: on the fit runs.
         base: the given machine, judged.
+        ahead: the best other explanation so far, or the base: an axis that does not shake with it
+            has no teeth to look for, which takes minutes.
         candidates: the hypotheses.
 
     Returns:
@@ -50,7 +54,7 @@ def rattling(evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis])
     found = []
     for candidate in candidates:
         axis = candidate.location
-        if candidate.name != _TEETH or not shaken(evidence, base, axis):
+        if candidate.name != _TEETH or not all(shaken(evidence, j, axis) for j in (base, ahead)):
             continue
         whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(evidence.data.machine, axis))
         deviation = _likeliest(evidence, whole)

@@ -392,7 +392,8 @@ def _early_options(
     """What stands out as long as nothing unknown is let act, and teeth; best first; and these."""
     bold = without_inputs(evidence, base, candidates)
     options = [option for option in bold.options if option[1] > ENTER]
-    teeth = rattling(evidence, base, candidates)
+    ahead, _ = min(options, key=_score, default=(base, 0.0))
+    teeth = rattling(evidence, base, ahead, candidates)
     if teeth and teeth.loss < base.loss:
         options.append((teeth, base.loss - teeth.loss - ENTER))
     return bold, sorted(options, key=_score), teeth

@@ -59,7 +59,8 @@ class Track:
         names: the states that the gains know, those of readings on their way and of unknown inputs
             included.
         start: (nz,) state before the first reading.
-        rest: (t,) where the drives of transmissions rested in their backlash, see `start_state`.
+        rest: (t,) where the drives of transmissions rested in their backlash, see `start_state`;
+            NaN where they have none.
         columns: (n, m, nz) what unit inputs add to the model's states over a row.
         initial: (nz, nz) covariance before the first reading, of all states; 0 with kept gains.
         flow: (n, nz, nz) transition Jacobians as of `filter_run`; empty unless asked for.
@@ -174,7 +175,7 @@ def track_run(
         columns: (n, m, nz) what unit inputs add to the states over a row.
         linearise: whether to keep the transition Jacobians; only without `kept`.
         rest: (t,) where drives rest in their backlash, from a track of a machine like it; it is
-            looked for where this is None or of another machine.
+            looked for where this is None, of another machine, or NaN for a drive with backlash.
         flow: (n, nz, nz) transition Jacobians of the same machine near by, used instead of new
             ones, which cost most of a pass; only without `kept`.
 
@@ -190,20 +191,19 @@ def track_run(
     if columns is None:
         columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
     play = model.transmission[:, BACKLASH] > 0.0
-    if rest is None or len(rest) != len(play) or not rest.any():
-        rest = np.zeros(len(play))
-        unknown = kept is None and bool(play.any())
-    else:
-        unknown = False
     if kept is not None and len(kept.rest) == len(play):
         rest = kept.rest
-    elif unknown:
+    known = rest is not None and len(rest) == len(play) and bool(np.isfinite(rest[play]).all())
+    if kept is None and not known:
         rows = min(max(2, round(_LOOK / run.period)), len(run.command))
         first, part = run.part(0, rows), columns[:rows]
         rest = find_rest(
             lambda r: _cross(machine, model, data, first, None, step, r, levels, part, noise).loss,
             play,
         )
+    elif rest is None or not known:
+        rest = np.zeros(len(play))
+    rest = np.where(play, rest, np.nan)
     return _cross(machine, model, data, run, kept, step, rest, levels, columns, noise, linearise,
                   flow)  # fmt: skip
 
@@ -246,7 +246,7 @@ def _cross(
     space.time[1] = run.start
     names, late = state_names(machine), late_readings(model, run.period)
     rows, c, size, m = len(run.command), len(data.channels), len(names), len(levels.inputs)
-    start, spread = start_state(machine, data, run, model, names, rest)
+    start, spread = start_state(machine, data, run, model, names, np.nan_to_num(rest))
     shown = [data.channels[k] for k in late.channel]
     names += [
         f"late.{channel}.{i - late.first[k]}"

@@ -22,7 +22,7 @@ def looked(truth):
     evidence = Evidence(data, data.fit, 2, lacking=True)
     try:
         base = evidence.set_base(Guess())
-        return base, gap_rattling.rattling(evidence, base, hypotheses(machine, ("backlash",)))
+        return base, gap_rattling.rattling(evidence, base, base, hypotheses(machine, ("backlash",)))
     finally:
         evidence.close()
 

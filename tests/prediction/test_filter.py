@@ -249,3 +249,22 @@ def test_what_bristles_and_a_slow_pump_remember_is_estimated():
     assert np.isfinite(track_run(machine, data, data.heldout, given).whitened).all()
     assert np.isfinite(track_run(plain, data, data.heldout, track).whitened).all()
     assert given.loss > track.loss + 30.0
+
+
+def test_a_drive_that_rests_in_the_middle_of_its_backlash_is_not_looked_for_again(monkeypatch):
+    """A track remembers where it rested, the middle (0) as well; NaN says that nobody looked."""
+    machine = apply_effect(load_machine("cat215"), "backlash", "swing", {"gap": 0.01})
+    data, _ = machine_data(machine, machine)
+    run, searches = data.heldout.part(0, 5), []
+
+    def find(loss, free):
+        searches.append(free)
+        return np.zeros(len(free))
+
+    monkeypatch.setattr("hydrotele.prediction.track.find_rest", find)
+    first = track_run(machine, data, run)
+    assert len(searches) == 1
+    assert track_run(machine, data, run, rest=first.rest).rest == 0.0
+    assert len(searches) == 1
+    track_run(machine, data, run, rest=np.full(1, np.nan))
+    assert len(searches) == 2
