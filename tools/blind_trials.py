@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from tools.blind.generate import key_hash
 from tools.blind.judge import judge
 from tools.blind.pictures import draw_closure, draw_confusion, draw_reliability

@@ -24,7 +24,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from tools.blind.generate import key_hash
 from tools.blind.run_trial import ROOT, WORKFLOW, ask
 from tools.blind.trials import Place, write_json

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.log import load_logs
-from hydrotele.machine_file import load_machine
-from hydrotele.replay import replay_log
+from hydrotele.logs.log import load_logs
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.replay import replay_log
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("logs", type=Path, help="folder of logs with initial_state")

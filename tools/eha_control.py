@@ -12,7 +12,7 @@ import math
 import numpy as np
 from eha_runs import CHANNELS, FIRMWARE_RPM, EhaRun, true_start
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.simulate.plant import build_plant, initial_state
 from hydrotele.simulate.record import begin_leapfrog
 from hydrotele.simulate.stepping import Stepper

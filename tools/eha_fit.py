@@ -31,8 +31,8 @@ from scipy.optimize import least_squares
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model, state_names
 from hydrotele.effects.effect import changed
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
 
 UNIT = np.array([0.5e-3, 1.5e5, 1.5e5])  # m, Pa, Pa: what counts as one
 _COARSE = 4  # rows of 1 ms per row of the fit, which the model crosses in two steps

@@ -14,12 +14,12 @@ from eha_fit import free_run
 from eha_published import PUBLISHED, as_published
 from eha_runs import LOADS, differences, load_run
 
-from hydrotele.dataset.load import load_dataset
 from hydrotele.effects.effect import changed
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.load import load_dataset
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
 
 # relative: figures of data sheets and drawings that nobody checked on the stand
 _UNCERTAINTY = {

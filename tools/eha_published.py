@@ -14,8 +14,8 @@ from eha_fit import free_run
 from eha_runs import LOADS, STRETCH, EhaRun, differences, load_runs
 
 from hydrotele.effects.effect import changed
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
 
 _PUMP = "axes.piston.pump"
 PUBLISHED = {  # what -> path -> value in SI

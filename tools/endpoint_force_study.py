@@ -13,14 +13,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
-from hydrotele.noise import sensor_set
-from hydrotele.operate.endpoint_force import BANDWIDTH, FAST, EndpointForce, endpoint_force_of_log
-from hydrotele.operate.gravity_model import Gravity, gravity_from_masses, identify_gravity
-from hydrotele.operate.state_filter import LOW, filter_delay, filter_table, filtered
-from hydrotele.run import Run, prepare, run_scenario
-from hydrotele.scenario import Scenario, load_scenario
+from hydrotele.control.endpoint_force import BANDWIDTH, FAST, EndpointForce, endpoint_force_of_log
+from hydrotele.control.gravity_model import Gravity, gravity_from_masses, identify_gravity
+from hydrotele.control.state_filter import LOW, filter_delay, filter_table, filtered
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.noise import sensor_set
+from hydrotele.run.run import Run, prepare, run_scenario
+from hydrotele.scenario.scenario import Scenario, load_scenario
 from hydrotele.simulate.record import begin_leapfrog
 from tools.study import options, publish, side_by_side
 

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 from study import options, publish
 
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.controllers.catalogue import CONTROLLERS, REFERENCES, make_controller
 from hydrotele.tasks.core import TaskCore

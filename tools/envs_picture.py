@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import hydrotele.envs
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.tasks.controllers.catalogue import make_controller
 
 SECONDS = {"TrackTrajectory": 4.0, "StraightLine": 2.0, "ReachFeller": 1.5, "PlaceLog": 12.0}

@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from hydrotele.commands.identifying import closed_chain
-from hydrotele.dataset.files import RunFiles
-from hydrotele.dataset.load import make_dataset
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.excitation import (
     Excitation,
     design_excitation,
@@ -28,9 +26,11 @@ from hydrotele.identify.identification import identify
 from hydrotele.identify.parameter_rows import parameter_rows
 from hydrotele.identify.record import force_noise, records
 from hydrotele.identify.setup import machine_setup
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import Scenario, load_scenario
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.load import make_dataset
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import Scenario, load_scenario
 from tools.study import options, publish
 
 SENSORS, OLD, HELD_OUT = "khoshzaban1992", "excitation", "excitation_fast"

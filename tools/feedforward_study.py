@@ -15,10 +15,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from hydrotele.commands.identifying import closed_chain
-from hydrotele.dataset.files import RunFiles
-from hydrotele.dataset.load import make_dataset
-from hydrotele.drives import Axis, ForceDrive, Friction
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.effects.effect import changed
 from hydrotele.identify.identification import identify
 from hydrotele.identify.identified_machine import identified_machine
@@ -26,10 +23,13 @@ from hydrotele.identify.record import records
 from hydrotele.identify.setup import machine_setup
 from hydrotele.kinematics.arm import forward_cartesian, inverse
 from hydrotele.kinematics.from_machine import arm_geometry
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine, save_machine
-from hydrotele.run import Run, run_scenario
-from hydrotele.scenario import Scenario, load_scenario
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.load import make_dataset
+from hydrotele.machine.drives import Axis, ForceDrive, Friction
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine, save_machine
+from hydrotele.run.run import Run, run_scenario
+from hydrotele.scenario.scenario import Scenario, load_scenario
 from tools.study import options, publish
 
 SENSORS = "khoshzaban1992"

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from hydrotele.log import load_log
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.log import load_log
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.show.pose import (
     logged_joints,
     logged_positions,

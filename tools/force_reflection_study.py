@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from study import options, publish
 
-from hydrotele.commands.analysing_scenario import analyse_scenario
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.cli.analysing_scenario import analyse_scenario
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 
 TARGET = 2.2e4  # N, of parts a to c
 SHARE = 0.25  # of the target: half the 5 to 95 % spread of an unstable contact force, last third

@@ -34,9 +34,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from hydrotele.log import Log, load_log, save_log
-from hydrotele.resources import models_folder, scenarios_folder
-from hydrotele.teleop_case import SHIPPED
+from hydrotele.core.resources import models_folder, scenarios_folder
+from hydrotele.logs.log import Log, load_log, save_log
+from hydrotele.teleop.teleop_case import SHIPPED
 
 SECONDS, MEMORY, LETTERS = 60.0, 4_000_000_000, 2048  # limits of a case
 _FINE = (0, 2, 3)  # done, the user's mistake, a simulation that left the finite numbers
@@ -125,7 +125,7 @@ def _read(case: Case, folder: Path, said: Path) -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         os.chdir(folder)
         sys.argv = ["hydrotele", *case.arguments]
-        from hydrotele.cli import main
+        from hydrotele.cli.main import main
 
         main()
         status = 0
@@ -474,12 +474,7 @@ _LONG = {"teleop case", "data folder"}  # take seconds: fewer of them
 
 def _ready() -> None:
     """Load what every case needs, so that the children need not."""
-    import hydrotele.commands.analysing_scenario
-    import hydrotele.commands.comparing
-    import hydrotele.commands.identifying
-    import hydrotele.commands.replaying
-    import hydrotele.commands.running  # noqa: F401
-    from hydrotele.machine_file import load_machine
+    from hydrotele.machine.machine_file import load_machine
     from hydrotele.simulate.plant import build_plant, rest_state
 
     rest_state(build_plant(load_machine("cat215")))

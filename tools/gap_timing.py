@@ -10,9 +10,9 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from hydrotele.dataset.load import Dataset, RunData, load_dataset
 from hydrotele.gap.find import find_gap
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.load import Dataset, RunData, load_dataset
+from hydrotele.machine.machine_file import load_machine
 
 LENGTHS = (10.0, 20.0, 40.0)  # s
 

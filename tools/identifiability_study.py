@@ -13,12 +13,12 @@ in the null space.
 
 import numpy as np
 
-from hydrotele.commands.identifying import closed_chain
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identifiability import identifiability
 from hydrotele.identify.machine_friction import pin_friction
 from hydrotele.identify.projection import project
 from hydrotele.identify.regressor import Regressor, Rubbing, regressor
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from tools.study import options, publish
 
 TABLE_13 = (31, 24, 27)

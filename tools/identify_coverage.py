@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from hydrotele.commands.identifying import closed_chain
-from hydrotele.dataset.files import RunFiles
-from hydrotele.dataset.load import make_dataset
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identification import identify
 from hydrotele.identify.record import records
 from hydrotele.identify.setup import Setup, machine_setup
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.load import make_dataset
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 from tools.study import options, publish, side_by_side
 
 FIT, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"

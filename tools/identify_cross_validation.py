@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.commands.identifying import closed_chain
-from hydrotele.dataset.files import RunFiles
-from hydrotele.dataset.load import load_dataset, make_dataset
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identification import identify
 from hydrotele.identify.record import Record, records
 from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import machine_setup
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.load import load_dataset, make_dataset
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 from tools.identify_coverage import wrong_setup
 from tools.study import options, publish, side_by_side
 

@@ -13,8 +13,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hydrotele.commands.identifying import closed_chain
-from hydrotele.dataset.load import load_dataset
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.chain import Chain, load_chain
 from hydrotele.identify.friction_shape import identify_with_shapes
 from hydrotele.identify.motion import Processing
@@ -23,8 +22,9 @@ from hydrotele.identify.record import Record, records
 from hydrotele.identify.regressor import Rubbing
 from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import Setup, machine_setup
-from hydrotele.log import load_log
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.load import load_dataset
+from hydrotele.logs.log import load_log
+from hydrotele.machine.machine_file import load_machine
 
 HELD_OUT = 0.25
 WIDE = 10.0  # Hz: the whole of what is in the Panda's torques besides noise

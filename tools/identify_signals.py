@@ -14,9 +14,7 @@ identified parameters, mean over the trials. No noise has a part in the judgemen
 
 import numpy as np
 
-from hydrotele.commands.identifying import closed_chain
-from hydrotele.dataset.files import RunFiles
-from hydrotele.dataset.load import make_dataset
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import identify
 from hydrotele.identify.motion import Processing
@@ -26,10 +24,12 @@ from hydrotele.identify.regressor import regressor
 from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.kinematics.arm import inverse
 from hydrotele.kinematics.from_machine import arm_geometry
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.load import make_dataset
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 from tools.identify_coverage import wrong_setup
 from tools.study import options, publish, side_by_side
 

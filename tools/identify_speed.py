@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.commands.identifying import closed_chain
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.projection import project
 from hydrotele.identify.regressor import regressor
 from hydrotele.identify.setup import machine_setup
-from hydrotele.log import Log, save_log
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.logs.log import Log, save_log
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 from tools.study import options, publish
 
 CHILD = """

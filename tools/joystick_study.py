@@ -10,18 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.identify.flotor import FlotorFit, identify_flotor
-from hydrotele.joystick import AXES, load_joystick
-from hydrotele.levitation import Flight, designed_step, fly, rotation_vector, wobble
-from hydrotele.operate.levitate import levitation
-from hydrotele.operate.master import master, master_step
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.machine.joystick import AXES, load_joystick
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
+from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import Flotor as Simulated
 from hydrotele.teleop.compliance import Flotor
+from hydrotele.teleop.flotor import FlotorFit, identify_flotor
 from hydrotele.teleop.handle import Detent
+from hydrotele.teleop.levitate import levitation
+from hydrotele.teleop.levitation import Flight, designed_step, fly, rotation_vector, wobble
+from hydrotele.teleop.master import master, master_step
 from hydrotele.teleop.optics import sensed_spread
-from hydrotele.teleoperation import TeleopPilot
 from tools.study import options, publish, side_by_side
 
 JOYSTICK = load_joystick()

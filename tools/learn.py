@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from hydrotele.machine_file import load_machine
-from hydrotele.scenario import Servo
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.scenario.scenario import Servo
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.controllers.agent import AgentView
 from hydrotele.tasks.controllers.catalogue import make_controller

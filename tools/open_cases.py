@@ -14,10 +14,10 @@ from pathlib import Path
 
 import yaml
 
-from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.load import load_dataset
+from hydrotele.machine.machine_file import load_machine
 
 NAMES = {
     "higher viscous friction": "viscous_friction",

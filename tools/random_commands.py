@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 

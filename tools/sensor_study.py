@@ -15,9 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.commands.identifying import closed_chain
-from hydrotele.dataset.files import RunFiles
-from hydrotele.dataset.load import make_dataset
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.equations import build_equations, stacked
 from hydrotele.identify.estimators import estimate
 from hydrotele.identify.identifiability import identifiability
@@ -27,10 +25,12 @@ from hydrotele.identify.record import Record, records
 from hydrotele.identify.reference_size import reference_sizes
 from hydrotele.identify.regressor import regressor
 from hydrotele.identify.setup import Setup, machine_setup
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
-from hydrotele.run import Run, run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.load import make_dataset
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import Run, run_scenario
+from hydrotele.scenario.scenario import load_scenario
 from tools.study import options, publish, side_by_side
 
 RUNS, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"

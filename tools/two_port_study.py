@@ -10,8 +10,8 @@ from study import options, publish, side_by_side
 
 from hydrotele.teleop.case import Case
 from hydrotele.teleop.confirm import agreement, sweep
+from hydrotele.teleop.teleop_case import load_teleop_case
 from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance
-from hydrotele.teleop_case import load_teleop_case
 
 SPREAD = 0.5  # decades by which every number of the shipped case is varied, up and down
 LONGEST = 0.5  # s each way, the largest delay of a map

@@ -1,12 +1,12 @@
 """A device by its name."""
 
-from hydrotele.datafile import suggest
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
 from hydrotele.devices.keyboard import Keyboard
 from hydrotele.devices.pad import Pad, Sticks
 from hydrotele.devices.reading import Device
 from hydrotele.devices.script import Scripted, load_script
 from hydrotele.devices.tables import LAYOUTS
-from hydrotele.errors import InputError
 
 SCRIPTED = "scripted:"
 NAMES = ("keyboard", *LAYOUTS, f"{SCRIPTED}FILE")

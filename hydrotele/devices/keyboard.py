@@ -8,7 +8,7 @@ from collections import deque
 
 from hydrotele.devices.reading import Reading, Switches
 from hydrotele.devices.tables import CENTRE_KEY, KEYS, NUDGE, QUIT_KEY, SWITCH_KEYS
-from hydrotele.joystick import AXES
+from hydrotele.machine.joystick import AXES
 
 
 class Keyboard:

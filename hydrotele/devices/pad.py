@@ -3,10 +3,10 @@
 import os
 from typing import Any
 
+from hydrotele.core.errors import InputError
 from hydrotele.devices.reading import Reading, Switches, outside
 from hydrotele.devices.tables import LAYOUTS, SPACEMOUSE_NAMES, Layout
-from hydrotele.errors import InputError
-from hydrotele.joystick import AXES
+from hydrotele.machine.joystick import AXES
 
 
 class Pad:

@@ -14,12 +14,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from hydrotele.datafile import Facts, Name, NonNegative, parse, read_yaml, suggest
+from hydrotele.core.datafile import Facts, Name, NonNegative, parse, read_yaml, suggest
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_text
 from hydrotele.devices.reading import Reading
-from hydrotele.errors import InputError
-from hydrotele.files import read_text
-from hydrotele.joystick import AXES
-from hydrotele.teleoperation import JoystickAxis
+from hydrotele.machine.joystick import AXES
+from hydrotele.scenario.teleoperation import JoystickAxis
 
 _Part = Annotated[float, Field(ge=-1, le=1)]
 

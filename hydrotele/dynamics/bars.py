@@ -2,7 +2,7 @@
 
 import math
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.dynamics.mechanism import AXIS, PARENT, REACH
 from hydrotele.dynamics.motion import (
     ACCELERATION,

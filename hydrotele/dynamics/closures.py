@@ -2,7 +2,7 @@
 
 import math
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.dynamics.linear import factorise, solve
 from hydrotele.dynamics.mechanism import HOME
 from hydrotele.dynamics.motion import (

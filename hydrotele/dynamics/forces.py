@@ -1,6 +1,6 @@
 """Mass matrix and bias forces of a mechanism: the projection method."""
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.dynamics.mechanism import COM, INERTIA, MASS, REACH
 from hydrotele.dynamics.motion import (
     ACCELERATION,

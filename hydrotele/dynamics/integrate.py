@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from hydrotele.compiled import compiled, lean
+from hydrotele.core.compiled import compiled, lean
 from hydrotele.dynamics.bars import move_bars, place_bars
 from hydrotele.dynamics.closures import close_chains, drift_chains
 from hydrotele.dynamics.forces import gather_forces

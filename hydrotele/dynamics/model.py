@@ -8,9 +8,9 @@ from hydrotele.dynamics.mechanism import Mechanism, coordinate_names, mechanism
 from hydrotele.dynamics.motion import Motion, motion_space
 from hydrotele.hydraulics.circuit import SCRATCH
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
-from hydrotele.machine import Machine
-from hydrotele.sensors import SensorError
-from hydrotele.signals import parse_channel
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.signals import parse_channel
 from hydrotele.terms.table import terms_table
 
 POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)

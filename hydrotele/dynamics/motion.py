@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.dynamics.mechanism import (
     AXIS,
     COORDINATE,

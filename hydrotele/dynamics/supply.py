@@ -1,6 +1,6 @@
 """What drives share in the reduced model: supply, pressures that are felt, laws that terms add."""
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.dynamics.model import COMMAND, GIVEN, V, X
 from hydrotele.hydraulics.circuit import circuit_supply, delivered_share, open_ports
 from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state

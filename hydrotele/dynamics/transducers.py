@@ -1,7 +1,7 @@
 """Sensors with a first-order lag, along what an ideal sensor would show over a row of a log."""
 
-from hydrotele.compiled import lean
-from hydrotele.noise import first_order
+from hydrotele.core.compiled import lean
+from hydrotele.machine.noise import first_order
 
 
 @lean

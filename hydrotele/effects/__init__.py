@@ -28,12 +28,12 @@ import pkgutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from hydrotele.datafile import suggest
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
 from hydrotele.effects._own import add_from_environment, add_plugins, read_effects
 from hydrotele.effects._terms import term_number, with_terms
 from hydrotele.effects.effect import Effect, Parameter, changed
-from hydrotele.errors import InputError
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Term
 from hydrotele.terms.law import DriveState, Numbers, Variable, law
 

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from hydrotele.drives import Transmission
 from hydrotele.effects._sizes import outboard_links
 from hydrotele.effects.effect import changed
-from hydrotele.machine import Machine
+from hydrotele.machine.drives import Transmission
+from hydrotele.machine.machine import Machine
 
 _SHARE = 0.03  # of the load's inertia: rotor and gears of a slewing drive, seen at the ring
 _CONTACT = 2.0 * math.pi * 40.0  # rad/s of the drive on closed teeth: six steps of 1 ms a radian

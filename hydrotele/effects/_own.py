@@ -11,8 +11,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import Effect
-from hydrotele.errors import InputError
 from hydrotele.terms.law import LAWS, defined_by
 
 GROUP = "hydrotele.effects"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _IN_LINE = 1.0e-3  # of its length, by which a cylinder may lie off the slide that it pushes
 _FULL_TRAVEL = 2.0  # s that a force-driven slide takes through its range: no flow rating says it

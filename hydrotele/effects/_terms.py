@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Balance, Term
 
 

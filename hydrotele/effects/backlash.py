@@ -2,11 +2,11 @@
 
 import math
 
-from hydrotele.drives import Transmission
 from hydrotele.effects._drive_side import rigid_drive, with_transmission
 from hydrotele.effects._sizes import drive_turns
 from hydrotele.effects.effect import Effect, Parameter, Values
-from hydrotele.machine import Machine
+from hydrotele.machine.drives import Transmission
+from hydrotele.machine.machine import Machine
 
 _CLOSED = 1.0e-6  # rad, a gap that is none: a slewing ring's tooth moves 1 um in it
 

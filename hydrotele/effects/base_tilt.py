@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 
 def _place(machine: Machine) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from hydrotele.effects._sizes import drive_kind, hydraulics, valves
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _SOFTEST = 1.0e7  # Pa, oil full of air: the lowest bulk modulus that a machine may state
 

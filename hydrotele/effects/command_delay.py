@@ -1,7 +1,7 @@
 """Commands that arrive late."""
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 ALL = "all"
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 Law = Literal["force", "flow", "valve", "supply", "geometry", "timing", "sensor"]
 Values = Mapping[str, float]

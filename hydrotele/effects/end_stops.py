@@ -1,9 +1,9 @@
 """End stops that are harder or softer than in the model."""
 
-from hydrotele.drives import EndStop
 from hydrotele.effects._sizes import drive_turns
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.drives import EndStop
+from hydrotele.machine.machine import Machine
 
 
 def _ending(machine: Machine) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from hydrotele.effects._sizes import axes, force_unit, largest_force, speed_unit, usual_speed
 from hydrotele.effects._terms import term_number, with_terms
 from hydrotele.effects.effect import Effect, Parameter, Values
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Term
 
 CONSTANT, PULSE, DRAG = "external_force", "force_pulse", "speed_dependent_force"

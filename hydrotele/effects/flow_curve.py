@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from hydrotele.drives import FlowCurve, Metering
 from hydrotele.effects._sizes import valves
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.drives import FlowCurve, Metering
+from hydrotele.machine.machine import Machine
 
 _KNOTS = tuple(float(t) for t in np.linspace(0.0, 1.0, 8))
 _DIRECTIONS = ("positive", "negative")

@@ -9,7 +9,7 @@ from hydrotele.effects._sizes import (
     usual_speed,
 )
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 
 def _numbers(field: str, scale: float, high: float):

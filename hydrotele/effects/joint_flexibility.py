@@ -8,7 +8,7 @@ from hydrotele.effects._drive_side import (
 )
 from hydrotele.effects._sizes import drive_turns, largest_force, valves
 from hydrotele.effects.effect import Effect, Parameter, Values
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _RIGID = 0.02  # of the least compliance worth naming: stiffer than the parts taken as rigid
 _TURN = 0.015  # rad, deflection of a slewing drive's gears and shafts at full torque

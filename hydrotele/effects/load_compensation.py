@@ -4,7 +4,7 @@ import math
 
 from hydrotele.effects._sizes import valves
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _USUAL_DROP = 0.5  # of the relief pressure: there a valve flows with a compensator as without one
 

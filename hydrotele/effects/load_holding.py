@@ -1,8 +1,8 @@
 """Counterbalance valves that hold a load and throttle its lowering."""
 
-from hydrotele.drives import Counterbalance
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.drives import Counterbalance
+from hydrotele.machine.machine import Machine
 
 
 def _sides(machine: Machine) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ import numpy as np
 
 from hydrotele.effects._sizes import hinges, link_size
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _LETTERS = "xyz"
 

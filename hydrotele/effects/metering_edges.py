@@ -2,7 +2,7 @@
 
 from hydrotele.effects._sizes import valves
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 EDGES = {
     "p_a": "positive.inlet", "b_t": "positive.outlet", "p_b": "negative.inlet",

@@ -5,7 +5,7 @@ import math
 from hydrotele.effects._sizes import valves
 from hydrotele.effects._terms import term_number, with_terms
 from hydrotele.effects.effect import Effect, Parameter, Values
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Term
 
 NAME = "orifice_leakage"

@@ -2,7 +2,7 @@
 
 from hydrotele.effects._sizes import outboard_links
 from hydrotele.effects.effect import Effect, Parameter, Values
-from hydrotele.machine import Link, Machine
+from hydrotele.machine.machine import Link, Machine
 
 PAYLOAD = "payload"
 """Name of the link that carries the load."""

@@ -2,7 +2,7 @@
 
 from hydrotele.effects._sizes import across, linkages
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 
 def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:

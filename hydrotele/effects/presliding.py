@@ -2,7 +2,7 @@
 
 from hydrotele.effects._sizes import drive_kind, drive_turns
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _WAY, _TURN = 5.0e-5, 2.0e-4  # m, rad: what seals and gears give before they slide, an estimate
 _RIGID = 0.02  # of the least compliance worth naming: friction as without bristles

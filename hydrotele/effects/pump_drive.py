@@ -5,7 +5,7 @@ sized relative to themselves; losses that a catalogue leaves out, relative to wh
 """
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _SIDES = ("head", "rod")
 

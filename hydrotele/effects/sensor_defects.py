@@ -4,8 +4,8 @@ import math
 
 from hydrotele.effects._sizes import axes, hydraulics, linkages
 from hydrotele.effects.effect import Effect, Parameter, Values
-from hydrotele.machine import Machine
-from hydrotele.sensors import SensorError
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError
 
 _PERFECT = SensorError()
 _SIDES = ("head", "rod")

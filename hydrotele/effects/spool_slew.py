@@ -2,7 +2,7 @@
 
 from hydrotele.effects._sizes import valves
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 
 def _travel_time(machine: Machine, location: str) -> dict[str, Parameter]:

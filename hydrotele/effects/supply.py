@@ -1,7 +1,7 @@
 """A pump or a main relief valve with other limits, droop or response than in the model."""
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 
 def _place(machine: Machine) -> tuple[str, ...]:

@@ -1,9 +1,9 @@
 """Valves that open later, wider or slower than in the model."""
 
-from hydrotele.drives import Valve
 from hydrotele.effects._sizes import valves
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.drives import Valve
+from hydrotele.machine.machine import Machine
 
 
 def _valve(machine: Machine, location: str) -> Valve:

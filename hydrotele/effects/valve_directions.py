@@ -1,9 +1,9 @@
 """Valves whose two directions differ: notches, springs and centring are not made alike."""
 
-from hydrotele.drives import Valve
 from hydrotele.effects._sizes import valves
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine import Machine
+from hydrotele.machine.drives import Valve
+from hydrotele.machine.machine import Machine
 
 DIRECTIONS = ("positive", "negative")
 

@@ -7,8 +7,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from hydrotele.datafile import suggest
-from hydrotele.errors import InputError
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.memory import DISABLED, NEXT_STEP, SAME_STEP

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 
+from hydrotele.core.errors import InputError
 from hydrotele.envs.making import action_space, make_core, observation_space
-from hydrotele.errors import InputError
 from hydrotele.tasks.controllers.agent import AgentView
 from hydrotele.tasks.memory import SAME_STEP
 

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 from mujoco.batch import MODEL_FIELDS
 
+from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.core.errors import InputError
 from hydrotele.envs.goals import goal_markers
-from hydrotele.errors import InputError
 from hydrotele.kinematics.task import ALONG, BASE_RADIUS, BOOM, STICK
-from hydrotele.operate.resolved_motion import arm_facts
 from hydrotele.show.canvas import Canvas
 from hydrotele.show.markers import Marker
 from hydrotele.show.pose import model_with_looks

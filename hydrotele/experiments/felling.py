@@ -3,8 +3,8 @@
 import numpy as np
 
 from hydrotele.experiments.finding import Finding, Panel, cylindrical, perform, truth
-from hydrotele.operate.tip_over import tipping_share
-from hydrotele.teleoperation import TeleopPilot
+from hydrotele.scenario.teleoperation import TeleopPilot
+from hydrotele.teleop.tip_over import tipping_share
 
 
 def tree() -> Finding:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.run import Run, run_scenario
-from hydrotele.scenario import Scenario, load_scenario
+from hydrotele.run.run import Run, run_scenario
+from hydrotele.scenario.scenario import Scenario, load_scenario
 
 
 class Panel(NamedTuple):

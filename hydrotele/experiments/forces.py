@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.experiments.finding import Finding, Panel, perform, truth
-from hydrotele.run import Run
-from hydrotele.scenario import Scenario
-from hydrotele.teleoperation import Regulate, TeleopPilot, Track
+from hydrotele.run.run import Run
+from hydrotele.scenario.scenario import Scenario
+from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track
 
 _WITHIN = 0.1  # of the target
 _HELD = 6.0  # s before the end of a target in which it should be held

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from hydrotele.control.endpoint_force import endpoint_force_of_log
 from hydrotele.experiments.finding import Finding, Panel, cylindrical, perform
-from hydrotele.operate.endpoint_force import endpoint_force_of_log
 
 _STRAY = 0.03  # m, of lines of 1.4 m: what the published plots leave open
 _TURN = 5.0  # degrees, of the bucket, the same

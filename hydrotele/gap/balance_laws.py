@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.integrate import load_position, place
 from hydrotele.dynamics.mechanism import BAR, DAMPING

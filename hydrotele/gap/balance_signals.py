@@ -5,17 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.dataset.clock import fit_clock
 from hydrotele.dynamics.integrate import arriving
 from hydrotele.hydraulics.laws import spool_step
 from hydrotele.identify import smoothing
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.triangle import LoopOpen
-from hydrotele.log import Log
-from hydrotele.machine import Machine
-from hydrotele.noise import noise_rms, sensor_set
-from hydrotele.sensors import SensorError
-from hydrotele.signals import parse_channel
+from hydrotele.logs.clock import fit_clock
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import noise_rms, sensor_set
+from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.signals import parse_channel
 
 DRAWS = 16  # a standard deviation from 16 draws, averaged over a second, is known to some 5 %
 _LEAST = 10  # readings that a channel needs

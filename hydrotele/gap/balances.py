@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.mechanism import JOINT
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.gap.balance_laws import chamber_residuals, load_forces, pump_lacks, supply_pressures
@@ -25,9 +24,10 @@ from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
 from hydrotele.hydraulics.pump import load_force, load_pressure_step
 from hydrotele.hydraulics.slots import PUMP
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.log import Log
-from hydrotele.machine import Machine
-from hydrotele.signals import usual_unit
+from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.signals import usual_unit
 
 # Hz: below the 2.5 Hz at which an excavator rings on its oil and accelerations drown in the noise
 BAND = 1.5

@@ -13,10 +13,10 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from hydrotele.estimate.track import Track
 from hydrotele.gap.residuals import settled
 from hydrotele.gap.result import LearnedLaw, NamedEffect
-from hydrotele.prediction.track import Track
-from hydrotele.signals import parse_channel
+from hydrotele.machine.signals import parse_channel
 
 _PART, _PART_STEEP = 0.35, 0.07  # see `believed_part`
 _LEADS = 0.9  # share of the gap that comes back without an effect that leads

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.machine import Machine
-from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
-from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
-from hydrotele.prediction.hypothesis import Guess, Hypothesis
-from hydrotele.prediction.track import COARSE
+from hydrotele.estimate.calibration import CALIBRATION, calibration, numbers
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, charge
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.track import COARSE
+from hydrotele.machine.machine import Machine
 
 BEYOND = 15.0  # twice the log evidence that a number must bring to be an effect of its own
 _RIGHT = 0.2  # of the stated uncertainty, by which numbers move that are right

@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from hydrotele.estimate.calibration import CALIBRATION
+from hydrotele.estimate.evidence import Evidence
+from hydrotele.estimate.hypothesis import Guess
 from hydrotele.gap.residuals import ALLOWED
-from hydrotele.prediction.calibration import CALIBRATION
-from hydrotele.prediction.evidence import Evidence
-from hydrotele.prediction.hypothesis import Guess
 
 LIMIT = 8.0
 """Largest chi-square per degree of freedom that still passes; noise alone leaves 1."""

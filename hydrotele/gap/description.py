@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from hydrotele.estimate.inputs import SUPPLY, Input, input_units
 from hydrotele.gap.discover import Discovery, Learned
 from hydrotele.gap.law_tables import THROUGH
 from hydrotele.gap.result import Lack, LearnedLaw, Prediction, Unknown
 from hydrotele.gap.words import lack_words, learned_words
-from hydrotele.machine import Machine
-from hydrotele.prediction.inputs import SUPPLY, Input, input_units
+from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import OF_A_DRIVE
 
 _POINTS = 41  # at which a learned law is shown

@@ -1,6 +1,6 @@
 """Laws of what no effect explains: located, estimated, fitted, and written into the machine.
 
-The filter's unknown inputs (`prediction.inputs`) say which balance lacks something, where and when;
+The filter's unknown inputs (`estimate.inputs`) say which balance lacks something, where and when;
 in their places tables over one or two physical variables of this drive or another are tried
 (`law_tables`). What the pump lacks is read off the supply's balance (`balances.pump_lack`). What
 predicts runs that it was not fitted to best (`law_regression`) is put into the machine, fitted
@@ -16,25 +16,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.dataset.load import Dataset, RunData
+from hydrotele.core.compiled import compiled
 from hydrotele.dynamics.integrate import place
 from hydrotele.dynamics.model import X, model_space
 from hydrotele.dynamics.supply import supply_of
+from hydrotele.estimate.calibration import CALIBRATION
+from hydrotele.estimate.evidence import Evidence, Judged
+from hydrotele.estimate.free_run import free_run_errors, machine_runner
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.inputs import SUPPLY, Input, input_sizes
+from hydrotele.estimate.levels import smoothed, smoothed_inputs
+from hydrotele.estimate.track import Track, following_model
 from hydrotele.gap.balances import pump_lack
 from hydrotele.gap.law_regression import Regression, at_a_glance, lack_regression, regression
 from hydrotele.gap.law_tables import THROUGH, Table, paired_tables, possible_tables
 from hydrotele.gap.pruning import ENTER
 from hydrotele.gap.search import lacking
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.machine import Machine
-from hydrotele.prediction.calibration import CALIBRATION
-from hydrotele.prediction.evidence import Evidence, Judged
-from hydrotele.prediction.free_run import free_run_errors, machine_runner
-from hydrotele.prediction.hypothesis import Guess, Hypothesis
-from hydrotele.prediction.inputs import SUPPLY, Input, input_sizes
-from hydrotele.prediction.levels import smoothed, smoothed_inputs
-from hydrotele.prediction.track import Track, following_model
+from hydrotele.logs.load import Dataset, RunData
+from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import OF_A_DRIVE, Term
 
 LEARNED = "learned"

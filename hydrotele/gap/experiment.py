@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from hydrotele.core.resources import models_folder
 from hydrotele.gap import experiment_motions as motions
 from hydrotele.gap.experiment_motions import Leg, Stage
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.machine import Machine
-from hydrotele.resources import models_folder
+from hydrotele.machine.machine import Machine
 
 
 class Motion(NamedTuple):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from hydrotele.kinematics import five_dof
 from hydrotele.kinematics.arm import forward
 from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _MARGIN = 0.06  # of a joint's range that is left at each end, for overshoot
 _UNBOUNDED = 1.5  # [rad] or [m] to either side of home, of a joint without a range

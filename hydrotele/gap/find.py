@@ -6,8 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from hydrotele.dataset.load import Dataset
 from hydrotele.effects.effect import changed
+from hydrotele.estimate.calibration import CALIBRATION
+from hydrotele.estimate.evidence import Evidence, Judged
+from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.estimate.inputs import input_sizes, input_units
+from hydrotele.estimate.intervals import spreads
+from hydrotele.estimate.levels import rippled, undisturbed_loss
+from hydrotele.estimate.stretches import busiest, thinned
+from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.belief import believed, believed_part, left_over
 from hydrotele.gap.constancy import constancy
@@ -32,16 +39,9 @@ from hydrotele.gap.result import (
 )
 from hydrotele.gap.rivals import chances
 from hydrotele.gap.search import Found, lacking, search
-from hydrotele.machine import Machine
-from hydrotele.prediction.calibration import CALIBRATION
-from hydrotele.prediction.evidence import Evidence, Judged
-from hydrotele.prediction.hypothesis import Guess, Hypothesis, hypotheses
-from hydrotele.prediction.inputs import input_sizes, input_units
-from hydrotele.prediction.intervals import spreads
-from hydrotele.prediction.levels import rippled, undisturbed_loss
-from hydrotele.prediction.stretches import busiest, thinned
-from hydrotele.prediction.track import STEP, Levels, Track, known_levels, track_run
-from hydrotele.signals import parse_channel
+from hydrotele.logs.load import Dataset
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.signals import parse_channel
 
 LIKELY = 0.5  # probability above which an effect may explain a part: likelier than all else
 PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model, state_size
-from hydrotele.machine import Machine
-from hydrotele.prediction.track import STEP, Track, track_run
+from hydrotele.estimate.track import STEP, Track, track_run
+from hydrotele.logs.load import Dataset, RunData
+from hydrotele.machine.machine import Machine
 
 _SEED = 0  # of the first run; any: the floor's scatter over seeds is 0.003
 

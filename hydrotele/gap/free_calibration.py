@@ -17,14 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.effects.effect import changed
-from hydrotele.gap.result import Estimate
-from hydrotele.machine import Machine
-from hydrotele.prediction.calibration import CALIBRATION, calibration, numbers
-from hydrotele.prediction.free_run import free_run_errors, machine_runner
-from hydrotele.prediction.hypothesis import Guess
-from hydrotele.prediction.open_numbers import (
+from hydrotele.estimate.calibration import CALIBRATION, calibration, numbers
+from hydrotele.estimate.free_run import free_run_errors, machine_runner
+from hydrotele.estimate.hypothesis import Guess
+from hydrotele.estimate.open_numbers import (
     DIRECTIONS,
     LOG,
     TRAVEL,
@@ -32,14 +29,11 @@ from hydrotele.prediction.open_numbers import (
     states_open_numbers,
     table_steps,
 )
-from hydrotele.prediction.output_error import (
-    LEAD,
-    REMEMBERED,
-    WINDOW,
-    FreeRunFit,
-    fit_free_runs,
-)
-from hydrotele.prediction.stretches import thinned
+from hydrotele.estimate.output_error import LEAD, REMEMBERED, WINDOW, FreeRunFit, fit_free_runs
+from hydrotele.estimate.stretches import thinned
+from hydrotele.gap.result import Estimate
+from hydrotele.logs.load import Dataset, RunData
+from hydrotele.machine.machine import Machine
 
 _NORMAL95 = 1.96
 _WORSE = 1.05  # times the errors of free runs: less is no loss

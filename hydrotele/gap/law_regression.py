@@ -1,7 +1,7 @@
 """Regression of prediction errors on the entries of a law's table, judged by runs left out.
 
 The errors are those of a track whose unknown inputs have taken up what they could; how they answer
-to an addition is known to first order (`prediction.responses`). So a reading counts as it does in
+to an addition is known to first order (`estimate.responses`). So a reading counts as it does in
 the likelihood, and a law that is faster than the unknown inputs is seen as it is, not as a smoother
 blurs it. Entries that follow each other are taken to be alike (P-splines, Eilers and Marx 1996).
 """
@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hydrotele.estimate.evidence import flat
+from hydrotele.estimate.responses import error_responses
+from hydrotele.estimate.track import Track
 from hydrotele.gap.law_tables import Table
-from hydrotele.prediction.evidence import flat
-from hydrotele.prediction.responses import error_responses
-from hydrotele.prediction.track import Track
 
 _PARTS = 4  # of a single run, left out one by one
 _MEMORY_ROWS = 15.0  # that a smoother's answer is alike

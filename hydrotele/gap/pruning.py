@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hydrotele.estimate.calibration import CALIBRATION
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, charge
+from hydrotele.estimate.hypothesis import Guess
 from hydrotele.gap.rivals import Rival
 from hydrotele.gap.settling import settle
-from hydrotele.prediction.calibration import CALIBRATION
-from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
-from hydrotele.prediction.hypothesis import Guess
 
 ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines stay below 14.7
 TOLD = 9.0  # square of an effect's deviation over its uncertainty: three standard deviations

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.prediction.evidence import Judged
-from hydrotele.prediction.hypothesis import Hypothesis
-from hydrotele.prediction.inputs import Input
-from hydrotele.prediction.levels import smoothed_inputs
+from hydrotele.estimate.evidence import Judged
+from hydrotele.estimate.hypothesis import Hypothesis
+from hydrotele.estimate.inputs import Input
+from hydrotele.estimate.levels import smoothed_inputs
 
 
 def timed(candidates: Sequence[Hypothesis], base: Judged) -> list[Hypothesis]:

@@ -14,12 +14,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
-from hydrotele.dataset.load import RunData
 from hydrotele.effects import EFFECTS
-from hydrotele.prediction.evidence import Evidence, Judged
-from hydrotele.prediction.hypothesis import Hypothesis
-from hydrotele.prediction.levels import noise_prior, rippled_at
-from hydrotele.prediction.track import Levels, Track, track_run
+from hydrotele.estimate.evidence import Evidence, Judged
+from hydrotele.estimate.hypothesis import Hypothesis
+from hydrotele.estimate.levels import noise_prior, rippled_at
+from hydrotele.estimate.track import Levels, Track, track_run
+from hydrotele.logs.load import RunData
 
 _TEETH = "backlash"
 _GAPS = (0.002, 0.0035, 0.006, 0.01, 0.018, 0.03)  # rad; further apart, one may be jumped over

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hydrotele.prediction.track import Track
+from hydrotele.estimate.track import Track
 
 _EXPECTED = (1.0, 1.0, 0.0)  # of white noise of size 1, in the order of LIMITS
 ALLOWED = 5.0  # times what the filter leaves on simulated readings, which varies by two

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 SURE = 0.95
 """Probability of a mechanism below which it is called ambiguous."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from hydrotele.prediction.evidence import Evidence
-from hydrotele.prediction.hypothesis import WIDE, Guess, Hypothesis
-from hydrotele.prediction.track import COARSE, Track, first_rows
+from hydrotele.estimate.evidence import Evidence
+from hydrotele.estimate.hypothesis import WIDE, Guess, Hypothesis
+from hydrotele.estimate.track import COARSE, Track, first_rows
 
 _FEW = 16  # candidates that are tried on all runs
 _GLANCE = 20.0  # s of the run that fits worst on which all are tried

@@ -1,6 +1,6 @@
 """From the errors of the given model to named effects: screen, fit, calibrate, compare rivals.
 
-Every guess is judged with noise levels of its own (`prediction.levels`): what it leaves over is
+Every guess is judged with noise levels of its own (`estimate.levels`): what it leaves over is
 counted as unknown inputs, so that a model that is only nearly right is not refuted by the first
 reading that it misses. A guess is better if it is more likely over most stretches of the runs, not
 in a few readings (`weights`).
@@ -12,6 +12,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hydrotele.effects import EFFECTS
+from hydrotele.estimate.calibration import CALIBRATION
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, charge
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.levels import input_excess
+from hydrotele.estimate.track import COARSE
 from hydrotele.gap.calibrating import (
     calibrated,
     calibration_of,
@@ -37,11 +42,6 @@ from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of, plain_f
 from hydrotele.gap.screening import Screened, screen
 from hydrotele.gap.settling import fitted, loss_of, polished, settle, strained, widened
 from hydrotele.gap.without_inputs import WithoutInputs, without_inputs
-from hydrotele.prediction.calibration import CALIBRATION
-from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged, charge
-from hydrotele.prediction.hypothesis import Guess, Hypothesis
-from hydrotele.prediction.levels import input_excess
-from hydrotele.prediction.track import COARSE
 
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _LITTLE = 0.01  # of what the given machine lacks: an effect that leaves less is tried at once

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from hydrotele.estimate.calibration import CALIBRATION
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged
+from hydrotele.estimate.hypothesis import Guess
 from hydrotele.gap.calibrating import calibration_of
 from hydrotele.gap.screening import Screened
-from hydrotele.prediction.calibration import CALIBRATION
-from hydrotele.prediction.evidence import MIDDLE, Evidence, Fit, Judged
-from hydrotele.prediction.hypothesis import Guess
 
 _STEPS = 3  # of Gauss-Newton for a candidate
 _SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit

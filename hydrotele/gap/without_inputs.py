@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hydrotele.estimate.calibration import calibration, numbers
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Judged, charge
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.levels import noise_prior
+from hydrotele.estimate.track import COARSE, Levels, Track, track_run
 from hydrotele.gap.screening import Screened, screen
 from hydrotele.gap.settling import fitted, strained
-from hydrotele.prediction.calibration import calibration, numbers
-from hydrotele.prediction.evidence import MIDDLE, Evidence, Judged, charge
-from hydrotele.prediction.hypothesis import Guess, Hypothesis
-from hydrotele.prediction.levels import noise_prior
-from hydrotele.prediction.track import COARSE, Levels, Track, track_run
 
 _MUCH = 2.0  # RMS of the errors without unknown inputs, over noise, from which much is lacking
 _TRIED = 5  # candidates that are fitted

@@ -3,7 +3,7 @@
 Actuator numbers stand at `user[u + Slot]`, those of a pump drive at `user[u + PUMP + PumpSlot]`.
 """
 
-from hydrotele.compiled import inlined, lean
+from hydrotele.core.compiled import inlined, lean
 from hydrotele.hydraulics.laws import friction, friction_slope, stop_force
 from hydrotele.hydraulics.pump import load_force, pump_piston_friction, pump_pressure_rates
 from hydrotele.hydraulics.slots import PUMP, Kind, Slot

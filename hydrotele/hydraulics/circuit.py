@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from hydrotele.compiled import inlined, lean
+from hydrotele.core.compiled import inlined, lean
 from hydrotele.hydraulics.actuator import (
     actuator_friction,
     actuator_friction_slope,

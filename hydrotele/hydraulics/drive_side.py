@@ -1,6 +1,6 @@
 """Friction on a drive side so light that an explicit step would throw it through rest and back."""
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.hydraulics.circuit import actuator_friction, actuator_friction_slope
 
 _STEPS = 60  # bisections alone reach rounding in that many

@@ -1,6 +1,6 @@
 """What the terms of a machine see and add: the state of a drive, and commands with their terms."""
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.hydraulics.circuit import SLOTS, Slot, circuit_supply, delivered_share, open_ports
 from hydrotele.terms.law import Drives, DriveState
 from hydrotele.terms.table import COMMAND, added

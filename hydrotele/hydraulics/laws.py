@@ -7,7 +7,7 @@ Equations: Merritt, *Hydraulic Control Systems* (1967); the set is fixed as the 
 
 import math
 
-from hydrotele.compiled import inlined, lean
+from hydrotele.core.compiled import inlined, lean
 
 ATMOSPHERE = 101325.0  # Pa
 _VACUUM = 0.01  # Pa absolute: what is said to be at or below it counts as this

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from hydrotele.drives import Axis, Counterbalance, FlowCurve, LoadCylinder, Pump, Valve
 from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS, PUMP, SLOTS, Kind, PumpSlot, Slot
 from hydrotele.kinematics.from_machine import drive_travel
-from hydrotele.machine import Machine, Supply
+from hydrotele.machine.drives import Axis, Counterbalance, FlowCurve, LoadCylinder, Pump, Valve
+from hydrotele.machine.machine import Machine, Supply
 
 DELIVERY = "delivery.supply"
 ADDED_DELIVERY = "added_delivery.supply"
@@ -96,7 +96,7 @@ def longest_step(machine: Machine, name: str) -> float:
 
     Source: stability limit of Verlet's method, h < 2 / omega, halved.
 
-    >>> from hydrotele.machine_file import load_machine
+    >>> from hydrotele.machine.machine_file import load_machine
     >>> longest_step(load_machine("eha", "load_30_bar"), "piston")
     0.002
     """

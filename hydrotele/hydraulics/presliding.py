@@ -14,7 +14,7 @@ friction", IEEE Trans. Automatic Control 40(3), Eqs 1-4; Dahl 1968, Aerospace Co
 
 import math
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.hydraulics.laws import friction, friction_slope
 from hydrotele.hydraulics.slots import Slot
 

@@ -14,7 +14,7 @@ pressures are above the atmosphere's.
 
 import math
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.slots import PumpSlot
 

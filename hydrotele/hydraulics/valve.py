@@ -8,7 +8,7 @@ the oil of either side.
 
 import math
 
-from hydrotele.compiled import inlined
+from hydrotele.core.compiled import inlined
 from hydrotele.hydraulics.laws import holding_share, orifice, valve_opening
 from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS, Slot
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import nnls
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.estimators import Estimate, autoregression, estimate
 from hydrotele.identify.gathering import Gathered
 from hydrotele.identify.identifiability import Identifiability, told_in_noise

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 
 _WHERE = "estimate"
 _NORMAL95 = 1.959964

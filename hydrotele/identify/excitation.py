@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.identify.identifiability import told_in_noise
 from hydrotele.identify.projection import Projection, project
 from hydrotele.identify.reference_size import reference_sizes
 from hydrotele.identify.regressor import regressor
 from hydrotele.identify.setup import Setup
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _ROWS = 12  # per period of the highest harmonic
 _MARGIN = 0.05  # of a range, stroke or limit that is left free

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.equations import build_equations, stacked
 from hydrotele.identify.motion import Processing, Resolution
 from hydrotele.identify.record import Record

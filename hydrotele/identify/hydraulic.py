@@ -13,15 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.dataset.load import Dataset
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
-from hydrotele.errors import InputError
-from hydrotele.machine import Machine
-from hydrotele.prediction.evidence import Evidence, Fit
-from hydrotele.prediction.hypothesis import Guess, hypotheses
-from hydrotele.prediction.intervals import spreads
-from hydrotele.prediction.stretches import busiest
-from hydrotele.prediction.track import Levels, known_levels, track_run
+from hydrotele.estimate.evidence import Evidence, Fit
+from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.intervals import spreads
+from hydrotele.estimate.stretches import busiest
+from hydrotele.estimate.track import Levels, known_levels, track_run
+from hydrotele.logs.load import Dataset
+from hydrotele.machine.machine import Machine
 
 HYDRAULIC = (
     "valve_gain", "valve_deadband", "spool_lag", "internal_leakage", "bulk_modulus",

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.bias import motion_bias
 from hydrotele.identify.equations import build_equations
 from hydrotele.identify.estimation import REPEATED, Estimator, Weighted, told_by, weighted

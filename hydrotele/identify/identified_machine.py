@@ -5,8 +5,8 @@ import numpy as np
 from hydrotele.effects.effect import changed
 from hydrotele.identify.consistent import Consistent, Freedom, consistent
 from hydrotele.identify.result import Identification
-from hydrotele.machine import Machine
-from hydrotele.sensors import SensorError
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError
 
 _SURE = 2.0  # standard deviations by which an offset must differ to be written
 _FRICTION = {"coulomb": "coulomb", "stribeck": "stribeck_extra", "viscous": "viscous"}

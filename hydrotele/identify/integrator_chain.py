@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 
 _SETTLED = 1.0e-12  # relative change of the information matrix per sample
 

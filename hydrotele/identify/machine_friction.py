@@ -1,10 +1,10 @@
 """Where a machine rubs: its drives as it states them, and the pins of its joints and closures."""
 
-from hydrotele.drives import Friction
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.identify.chain import Chain
 from hydrotele.identify.regressor import Rubbing
-from hydrotele.machine import Machine
+from hydrotele.machine.drives import Friction
+from hydrotele.machine.machine import Machine
 
 
 def drive_friction(machine: Machine, chain: Chain) -> list[Rubbing]:

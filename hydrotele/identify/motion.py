@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.periodic import periodic
 from hydrotele.identify.projection import Projection
 from hydrotele.identify.smoothed import Smoothed

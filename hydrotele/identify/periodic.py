@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.smoothed import Smoothed, checked_period, columns_of, per_column
 
 _WHERE = "periodic filter"

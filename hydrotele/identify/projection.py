@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.compiled import compiled, lean
-from hydrotele.errors import InputError
+from hydrotele.core.compiled import compiled, lean
+from hydrotele.core.errors import InputError
 from hydrotele.identify.chain import Chain
 from hydrotele.identify.small_least_squares import factor, least
 from hydrotele.identify.space import dot, less, vector

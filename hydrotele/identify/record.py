@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hydrotele.dataset.load import Dataset, RunData
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import DriveLinkage, axis_linkage
 from hydrotele.kinematics.triangle import LoopOpen
-from hydrotele.machine import Machine
-from hydrotele.noise import noise_rms, sensor_set
-from hydrotele.sensors import SensorError
+from hydrotele.logs.load import Dataset, RunData
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import noise_rms, sensor_set
+from hydrotele.machine.sensors import SensorError
 
 _WHERE = "identification"
 _DRIFT = 0.5  # rows by which a cycle may move away from the rows over a whole record

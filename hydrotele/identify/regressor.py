@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.chain import Chain
 from hydrotele.identify.projection import Projection
 

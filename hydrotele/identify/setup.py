@@ -8,7 +8,7 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.identify.chain import Chain
 from hydrotele.identify.machine_friction import drive_friction, pin_friction
 from hydrotele.identify.regressor import Rubbing
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 Model = Literal["complete", "reduced"]
 

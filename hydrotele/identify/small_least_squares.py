@@ -2,7 +2,7 @@
 
 import math
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 
 _STIFF = 1e-7  # least ratio of a column's own part to the largest column; below, rank is lacking
 

@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.errors import InputError
+from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
 from hydrotele.identify.integrator_chain import (
     smooth_states,
     state_variances,

@@ -2,7 +2,7 @@
 
 import math
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 
 
 @lean

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.compiled import compiled, lean
+from hydrotele.core.compiled import compiled, lean
 from hydrotele.identify.space import (
     about,
     add,

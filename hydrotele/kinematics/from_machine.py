@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from hydrotele.drives import Axis
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry
 from hydrotele.kinematics.five_dof import FellerGeometry
 from hydrotele.kinematics.linkage import FourBar, TwoBar, two_bar_from_points
 from hydrotele.kinematics.triangle import LoopOpen
-from hydrotele.machine import Machine
+from hydrotele.machine.drives import Axis
+from hydrotele.machine.machine import Machine
 
 _PLAY = 2.0e-3  # m: joint ranges are given in whole degrees
 _EXACT = 1.0e-9  # m or 1, by which the closed form of a feller-buncher's arm may be missed

@@ -1,6 +1,6 @@
 """Which joints of a machine's links follow from its closures."""
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 
 def following_joints(machine: Machine) -> tuple[str, ...]:

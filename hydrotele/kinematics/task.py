@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.arm import ArmGeometry
 from hydrotele.kinematics.five_dof import FellerGeometry
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.show.markers import Marker, write_markers
 
 PACKAGES = "libegl1 and libgl1-mesa-dri, or libosmesa6"

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.log import Log
-from hydrotele.signals import Channel, parse_channel, to_si
+from hydrotele.core.errors import InputError
+from hydrotele.logs.log import Log
+from hydrotele.machine.signals import Channel, parse_channel, to_si
 
 # SI unit -> the unit on a plot.
 _SHOWN_UNITS: Mapping[str, str] = {

@@ -7,10 +7,10 @@ import numpy as np
 from hydrotele.gap.customary import customary
 from hydrotele.gap.result import LearnedLaw, Prediction
 from hydrotele.gap.words import channel_words, variable_words
+from hydrotele.machine.signals import usual_unit
 from hydrotele.show.channels import padded_range, shown_unit
 from hydrotele.show.gap_windows import windowed
 from hydrotele.show.report_figure import drawing, png
-from hydrotele.signals import usual_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

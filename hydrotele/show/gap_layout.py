@@ -7,10 +7,10 @@ import numpy as np
 
 from hydrotele.gap.result import Prediction
 from hydrotele.gap.words import channel_words
+from hydrotele.machine.signals import parse_channel, usual_unit
 from hydrotele.show.channels import padded_range, shown_unit
 from hydrotele.show.layout import Scene, _machine_view
 from hydrotele.show.recording import entity
-from hydrotele.signals import parse_channel, usual_unit
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

@@ -10,17 +10,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.dataset.load import RunData
 from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Gap, Prediction
 from hydrotele.gap.words import channel_words, headline, learned_title, verdict_words
-from hydrotele.log import Log
+from hydrotele.logs.load import RunData
+from hydrotele.logs.log import Log
+from hydrotele.machine.signals import usual_unit
 from hydrotele.show.channels import shown_unit
 from hydrotele.show.gap_layout import gap_blueprint
 from hydrotele.show.gap_windows import GapWindow, gap_windows, most_changed, windowed
 from hydrotele.show.recording import _log_machines, entity, time_column
 from hydrotele.show.recording_file import recording_file
-from hydrotele.signals import usual_unit
 
 _MEASURED, _NOMINAL, _PATCHED = (205, 210, 216), (240, 150, 0), (86, 160, 233)
 _LOUD, _FLOOR = (225, 70, 60), (120, 128, 136)

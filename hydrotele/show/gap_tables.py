@@ -17,9 +17,9 @@ from hydrotele.gap.words import (
     most_moved,
     number_title,
 )
+from hydrotele.machine.signals import usual_unit
 from hydrotele.show.gap_windows import channel_rms
 from hydrotele.show.report_html import Cell, Markup, bar, dumbbell, interval, table, tag
-from hydrotele.signals import usual_unit
 
 _CANDIDATES = 12
 _LOUDEST = 10.0  # times noise, where the colour of a cell is darkest

@@ -4,13 +4,13 @@ import math
 from pathlib import Path
 
 import hydrotele
-from hydrotele.dataset.load import Dataset
 from hydrotele.gap.customary import amount, said
 from hydrotele.gap.result import Estimate
 from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.hydraulic import Hydraulics
 from hydrotele.identify.parameter_rows import MEANING, counts, parameter_rows
 from hydrotele.identify.result import Identification
+from hydrotele.logs.load import Dataset
 from hydrotele.show.identify_figures import draw_forces
 from hydrotele.show.report_html import Markup, interval, page, picture, section, table, tag, text
 from hydrotele.show.report_style import STYLE

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.operate.loop_findings import ScenarioFindings
 from hydrotele.show.report_figure import drawing, png
 from hydrotele.show.report_html import page, picture, section, table, tag
 from hydrotele.show.report_style import STYLE
 from hydrotele.teleop.analysis import stability_map
 from hydrotele.teleop.findings import said_size
+from hydrotele.teleop.loop_findings import ScenarioFindings
 
 _DELAYS, _FACTORS = 13, 25
 _LONGEST = 0.3  # s each way

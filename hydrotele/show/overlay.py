@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.log import Log
-from hydrotele.output import replacing
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import replacing
+from hydrotele.logs.log import Log
+from hydrotele.machine.signals import parse_channel
 from hydrotele.show.channels import (
     TITLES,
     Trace,
@@ -20,7 +21,6 @@ from hydrotele.show.channels import (
     padded_range,
     shown,
 )
-from hydrotele.signals import parse_channel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,9 +14,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.machine import Machine
-from hydrotele.output import replacing
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import replacing
+from hydrotele.machine.machine import Machine
 from hydrotele.show.looks import bounds
 from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.closure import close_loops

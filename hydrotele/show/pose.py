@@ -7,12 +7,12 @@ import mujoco
 import numpy as np
 from pydantic import TypeAdapter
 
-from hydrotele.log import Log
-from hydrotele.machine import Machine
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.closure import follow_loops, following_joints
 from hydrotele.simulate.mechanism import assemble, mjcf_document
 from hydrotele.simulate.surroundings import thing_joints
-from hydrotele.surroundings import Thing
 
 _THINGS = TypeAdapter(list[Thing])
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.log import Log
-from hydrotele.machine import Machine
+from hydrotele.core.errors import InputError
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine import Machine
 from hydrotele.show.channels import colours, common_channels, difference, grouped, shown
 from hydrotele.show.layout import Plot, Scene, blueprint
 from hydrotele.show.looks import bounds

@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from hydrotele.output import replacing
+from hydrotele.core.output import replacing
 
 if TYPE_CHECKING:
     import rerun as rr

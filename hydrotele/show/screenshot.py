@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hydrotele.errors import InputError
-from hydrotele.output import replacing
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import replacing
 from hydrotele.show.recording import TIMELINE
 from hydrotele.show.viewer import Viewer, free_port, recording_file, running
 

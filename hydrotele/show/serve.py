@@ -8,7 +8,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from urllib.parse import quote
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.show.viewer import free_port, recording_file, running
 
 _POLL = 0.1  # s

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 import hydrotele
-from hydrotele.output import replacing
+from hydrotele.core.output import replacing
 from hydrotele.show.report_html import Cell, Markup, page, picture, section, table, tag
 from hydrotele.show.report_style import STYLE
 from hydrotele.show.sweep_figures import (

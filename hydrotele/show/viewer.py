@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 
 _PATIENCE = 5.0  # s that the program has to end by itself
 _PR_SET_PDEATHSIG = 1  # of Linux's prctl: a signal when the parent dies

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.show.canvas import has_screen
 from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.plant import Plant

@@ -9,7 +9,7 @@ import numpy as np
 
 from hydrotele.hydraulics.circuit import Slot
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.simulate.closure import close_loops, motion_basis
 from hydrotele.simulate.drive_side import drive_joint
 

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.errors import InputError
+from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics import loops
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.simulate.drive_side import drive_and_load_dofs, lock_drives
 from hydrotele.simulate.names import pin_site
 

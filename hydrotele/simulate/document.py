@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import mujoco
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 
 
 class Mjcf(NamedTuple):

@@ -9,8 +9,8 @@ a dead band as wide as the backlash is the spring and the damper between the two
 import mujoco
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.machine import Machine
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine import Machine
 
 _SPECK = (1.0e-6, (1.0e-9, 1.0e-9, 1.0e-9))  # kg, kg m^2: MuJoCo takes no moving body without mass
 _SLACK = 1.0e-9  # m or rad of deflection under a static load so small that it stays inside the gap

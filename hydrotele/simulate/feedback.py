@@ -6,11 +6,11 @@ import math
 import mujoco
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.errors import InputError
+from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.circuit import circuit_scratch
-from hydrotele.noise import channel_sensor, converter
-from hydrotele.sensors import SensorError, SensorSet
+from hydrotele.machine.noise import channel_sensor, converter
+from hydrotele.machine.sensors import SensorError, SensorSet
 from hydrotele.simulate.past import Past
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import state_supply

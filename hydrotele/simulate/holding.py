@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 
 CLOSED, OPEN, LINE, STRAIGHT, CENTRE, HALF, OWN, BEFORE, BEHIND = 0, 1, 2, 3, 4, 7, 10, 11, 12
 GRIP = 13

@@ -10,10 +10,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.errors import InputError
-from hydrotele.files import read_xml
-from hydrotele.joystick import Joystick
+from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_xml
+from hydrotele.machine.joystick import Joystick
 
 GRAVITY = -9.81
 _STEPS = 2  # physics steps per control period of 5 ms: its stiffest spring turns over in 30 ms

@@ -11,21 +11,21 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.assets import check_assets
-from hydrotele.datafile import Vector
-from hydrotele.drives import Axis, Cylinder, Pin
-from hydrotele.errors import InputError
-from hydrotele.files import read_xml
+from hydrotele.core.assets import check_assets
+from hydrotele.core.datafile import Vector
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_xml
 from hydrotele.hydraulics.circuit import ACTIVATIONS, SLOTS, Slot
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
 from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
-from hydrotele.machine import Link, Machine
+from hydrotele.machine.drives import Axis, Cylinder, Pin
+from hydrotele.machine.machine import Link, Machine
+from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.document import Mjcf
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, write_drive_side
 from hydrotele.simulate.looks import name_geoms, without_looks
 from hydrotele.simulate.names import GROUND, OWN, TIP_SITE, pin_site
 from hydrotele.simulate.surroundings import write_surroundings
-from hydrotele.surroundings import Thing
 from hydrotele.terms.table import terms_table
 
 with warnings.catch_warnings():  # glfw warns when there is no screen, which nobody needs here

@@ -23,7 +23,7 @@ from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.compiled import callback, compiled, lean
+from hydrotele.core.compiled import callback, compiled, lean
 from hydrotele.hydraulics.circuit import (
     MAX_AXES,
     SCRATCH,

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.hydraulics.circuit import circuit_scratch
-from hydrotele.noise import first_order
+from hydrotele.machine.noise import first_order
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.readout import state_supply
 from hydrotele.simulate.record import Lag, aligned_positions, sensor_lags, split_delay

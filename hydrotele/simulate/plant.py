@@ -11,7 +11,8 @@ from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air
 from hydrotele.hydraulics.parameters import actuator_order, memory_names
 from hydrotele.hydraulics.slots import Slot
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.bristles import set_bristles, write_bristles
 from hydrotele.simulate.closure import (
     close_loops,
@@ -25,7 +26,6 @@ from hydrotele.simulate.mechanism import add_element, assemble, mjcf_document
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.simulate.stops import set_stops, write_stops
 from hydrotele.simulate.term_readout import terms_at_rest
-from hydrotele.surroundings import Thing
 
 REST_PRESSURE = 2.0e6  # Pa, in the chamber that carries no load when a machine stands
 

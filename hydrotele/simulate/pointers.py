@@ -14,7 +14,7 @@ from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.simulate.library import mujoco_library
 
 

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS,
     SCRATCH,

@@ -15,7 +15,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.simulate.names import TIP_SITE
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.surroundings import is_thing

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.machine import Machine
-from hydrotele.noise import channel_sensor, converter
-from hydrotele.sensors import Sensor, SensorSet
+from hydrotele.core.compiled import compiled
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import channel_sensor, converter
+from hydrotele.machine.sensors import Sensor, SensorSet
 
 
 def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ by the implicit Euler rule, stable however light the load and stiff the stop.
 import mujoco
 import numpy as np
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.simulate.drive_side import load_joint
 
 _IMPEDANCE = 1.0e-4, 0.9999  # range of d that MuJoCo keeps to

@@ -11,11 +11,11 @@ import math
 import mujoco
 import numpy as np
 
-from hydrotele.datafile import suggest
-from hydrotele.errors import InputError
-from hydrotele.machine import Machine
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.surroundings import LogOnGround, Plate, Thing, Tree
 from hydrotele.simulate.holding import LET_GO, TAKEN, grip_numbers, grip_step
-from hydrotele.surroundings import LogOnGround, Plate, Thing, Tree
 
 _PLATE_SOLREF = (0.01, 1.0)  # s, 1: firm steel on steel, stiffer than any plate's spring
 _GAP = 0.02  # m, the kerf

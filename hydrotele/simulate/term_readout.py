@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS,
     SCRATCH,
@@ -13,7 +13,7 @@ from hydrotele.hydraulics.circuit import (
 )
 from hydrotele.hydraulics.drive_terms import drive_state
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added, terms_table
 

@@ -10,7 +10,7 @@ surface and load it with the weight Q of what the bucket has swept up. All angle
 
 import math
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 
 STEEPEST_RAKE = 0.5 * math.pi  # a wedge of soil sticks to a steeper blade and is the blade then
 FLATTEST_RAKE = math.radians(15.0)

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 import pydantic
 from pydantic import Field
 
-from hydrotele.datafile import Facts
+from hydrotele.core.datafile import Facts
 
 GRAVITY = 9.81  # m/s^2
 

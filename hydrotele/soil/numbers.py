@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.soil.facts import GRAVITY, Soil
 from hydrotele.soil.shape import Bucket, outline_from_edge
 

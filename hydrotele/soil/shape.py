@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 
 
 class Bucket(NamedTuple):

@@ -10,7 +10,7 @@ of 5 ms against a machine of 20 t.
 
 import math
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.soil.bucket import held_soil
 from hydrotele.soil.cutting import (
     acting_rake,

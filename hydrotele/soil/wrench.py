@@ -2,7 +2,7 @@
 
 import math
 
-from hydrotele.compiled import lean
+from hydrotele.core.compiled import lean
 from hydrotele.soil.facts import GRAVITY
 from hydrotele.soil.numbers import FORCE_R, FORCE_Z, MASS, MASS_R, MOMENT
 

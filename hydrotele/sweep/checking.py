@@ -8,12 +8,12 @@ import hashlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.errors import InputError
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
-from hydrotele.noise import sensor_set
-from hydrotele.scenario import (
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.noise import sensor_set
+from hydrotele.scenario.scenario import (
     Scenario,
     ScenarioFile,
     own_machine,

@@ -6,7 +6,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.sweep.running import Outcome, Task, failed, perform
 
 _WAIT = 30  # s for the scheduler and the first worker

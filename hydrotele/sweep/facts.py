@@ -12,10 +12,10 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import AfterValidator, Field, model_validator
 
-from hydrotele.datafile import Facts, Name, parse, read_yaml, suggest
-from hydrotele.errors import InputError
-from hydrotele.resources import scenarios_folder
-from hydrotele.scenario import shipped_scenarios
+from hydrotele.core.datafile import Facts, Name, parse, read_yaml, suggest
+from hydrotele.core.errors import InputError
+from hydrotele.core.resources import scenarios_folder
+from hydrotele.scenario.scenario import shipped_scenarios
 
 Key = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*$")]
 MOST_RUNS = 100_000

@@ -13,9 +13,9 @@ from typing import Any
 import yaml
 
 import hydrotele
-from hydrotele.errors import InputError
-from hydrotele.files import read_json
-from hydrotele.output import check_target, replacing, whole_folder
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_json
+from hydrotele.core.output import check_target, replacing, whole_folder
 from hydrotele.sweep.checking import Base, Checked
 from hydrotele.sweep.inputs import unpack
 

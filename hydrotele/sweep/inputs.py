@@ -8,10 +8,10 @@ import hashlib
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from hydrotele.datafile import read_yaml
-from hydrotele.errors import InputError
-from hydrotele.machine_file import machine_path, shipped_machines
-from hydrotele.scenario import Scenario, own_machine
+from hydrotele.core.datafile import read_yaml
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine_file import machine_path, shipped_machines
+from hydrotele.scenario.scenario import Scenario, own_machine
 
 INPUTS = "inputs"
 Files = dict[str, bytes]

@@ -9,9 +9,9 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from hydrotele.errors import InputError
-from hydrotele.files import json_value
-from hydrotele.output import replacing
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import json_value
+from hydrotele.core.output import replacing
 from hydrotele.sweep.numbers import Numbers
 
 OK, FAILED = "ok", "failed"

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from hydrotele.datafile import UNIT_SUFFIXES, suggest
-from hydrotele.errors import InputError
+from hydrotele.core.datafile import UNIT_SUFFIXES, suggest
+from hydrotele.core.errors import InputError
 
 Number = float | int | bool | None
 Numbers = dict[str, tuple[Number, str]]

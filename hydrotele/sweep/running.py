@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hydrotele.errors import InputError
-from hydrotele.run import Run, run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.core.errors import InputError
+from hydrotele.run.run import Run, run_scenario
+from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.record import SimulationFailed
 from hydrotele.sweep.inputs import Files, placed, unpack
@@ -27,7 +27,7 @@ class Task(NamedTuple):
         scenario: of `Inputs.named`.
         folder: where the scenario's own machines lie, None where `files` brings them.
         files: path -> content of these machines.
-        keep: writes a run into a folder, as `commands.running.write_run`; None to keep no logs.
+        keep: writes a run into a folder, as `cli.running.write_run`; None to keep no logs.
         scratch: folder for that on the way; None for the system's.
     """
 

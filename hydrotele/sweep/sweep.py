@@ -7,9 +7,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
-from hydrotele.errors import InputError
-from hydrotele.output import replacing, whole_folder
-from hydrotele.scenario import save_scenario
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import replacing, whole_folder
+from hydrotele.scenario.scenario import save_scenario
 from hydrotele.sweep.checking import (
     Base,
     Checked,

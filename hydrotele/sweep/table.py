@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import hydrotele
-from hydrotele.output import replacing
+from hydrotele.core.output import replacing
 from hydrotele.sweep.facts import Sweep
 from hydrotele.sweep.journal import Entry
 from hydrotele.sweep.numbers import key_unit

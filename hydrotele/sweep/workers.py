@@ -13,7 +13,7 @@ from collections.abc import Generator, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.sweep.running import Outcome, Task, failed, perform
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")

@@ -6,11 +6,11 @@ references, pose rates those of the arm by resolved motion, and the joint servo 
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.control.drive_rows import POINTS, drive_row
+from hydrotele.control.resolved_motion import follow_pose
+from hydrotele.control.servo import servo_step
+from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
-from hydrotele.operate.drive_rows import POINTS, drive_row
-from hydrotele.operate.resolved_motion import follow_pose
-from hydrotele.operate.servo import servo_step
 from hydrotele.simulate.pointers import floats
 from hydrotele.tasks.memory import ARM, JOINT_RATE, RESOLVED_MOTION, VALVE
 
@@ -82,7 +82,7 @@ def act(f, e, action):
     Returns:
         Nothing.
 
-    Source: `operate.resolved_motion`, `operate.servo`.
+    Source: `control.resolved_motion`, `control.servo`.
     """
     if f.mode == VALVE:
         for a in range(f.actions):

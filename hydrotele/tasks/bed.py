@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.errors import InputError
+from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.soil.facts import Soil
 from hydrotele.soil.numbers import OUT, OUTLINE, STATE, WIDTH, soil_numbers

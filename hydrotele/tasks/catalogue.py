@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.tasks.force_task import HOLD_FORCE
 from hydrotele.tasks.grade_task import GRADE
 from hydrotele.tasks.line_task import STRAIGHT_LINE

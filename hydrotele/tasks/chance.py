@@ -5,7 +5,7 @@ Source: Steele, Lea and Flood 2014, "Fast splittable pseudorandom number generat
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _FIRST = np.uint64(0xBF58476D1CE4E5B9)

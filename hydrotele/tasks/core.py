@@ -9,10 +9,10 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.machine_file import load_machine
-from hydrotele.operate.drive_rows import drive_tables
-from hydrotele.operate.resolved_motion import arm_axes
+from hydrotele.control.drive_rows import drive_tables
+from hydrotele.control.resolved_motion import arm_axes
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.fleet import Fleet
 from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.tasks.chance import streams

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.tasks.controllers.controller import Controller
 from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.memory import DISABLED

@@ -4,15 +4,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.datafile import suggest
-from hydrotele.errors import InputError
+from hydrotele.control.drive_rows import drive_tables
+from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.control.servo import servo_numbers
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.machine import Machine
-from hydrotele.noise import channel_sensor, converter, sensor_set
-from hydrotele.operate.drive_rows import drive_tables
-from hydrotele.operate.resolved_motion import arm_facts
-from hydrotele.operate.servo import servo_numbers
-from hydrotele.sensors import SensorSet
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import channel_sensor, converter, sensor_set
+from hydrotele.machine.sensors import SensorSet
 from hydrotele.simulate.feedback import samples_every
 from hydrotele.simulate.layout import field_offsets, verify_layout
 from hydrotele.simulate.names import TIP_SITE
@@ -51,7 +51,7 @@ class Setup(NamedTuple):
         arm_axes: how many of them, the first ones, are the arm's.
         variants: machines and starts that episodes have.
         fields: of the observation.
-        table: (k, POINTS, 3) of `operate.drive_rows.drive_tables`.
+        table: (k, POINTS, 3) of `control.drive_rows.drive_tables`.
     """
 
     task: Task

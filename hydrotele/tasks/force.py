@@ -5,8 +5,8 @@ What the plate's spring and damper carry is the force: a load cell under the pla
 
 import math
 
-from hydrotele.compiled import compiled
-from hydrotele.machine import Machine
+from hydrotele.core.compiled import compiled
+from hydrotele.machine.machine import Machine
 from hydrotele.simulate.pointers import field
 from hydrotele.tasks.chance import between
 from hydrotele.tasks.observation import Field

@@ -5,11 +5,11 @@ import math
 import mujoco
 import numpy as np
 
+from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.kinematics.task import task_forward
-from hydrotele.machine import Machine
-from hydrotele.operate.resolved_motion import arm_facts
-from hydrotele.scenario import Servo
-from hydrotele.surroundings import Plate, Thing
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Servo
+from hydrotele.scenario.surroundings import Plate, Thing
 from hydrotele.tasks.force import force_fields
 from hydrotele.tasks.starts import draw_start
 from hydrotele.tasks.task import Task

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.soil.numbers import FORCE_R, FORCE_Z, MASS
 from hydrotele.soil.terrain import surface_height
 from hydrotele.tasks.bed import CELL, CELLS, START, lay_bed, result_of, soil_of, surface_of

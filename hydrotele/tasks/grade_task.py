@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.soil.facts import SOILS
 from hydrotele.tasks.bed import TERRAIN, bed_numbers
 from hydrotele.tasks.grade import grade_fields

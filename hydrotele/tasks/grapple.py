@@ -6,12 +6,12 @@ Angle sensors of the machine's kind sit on both free joints: same rate, error an
 import mujoco
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.machine import Machine
+from hydrotele.core.compiled import compiled
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.surroundings import LogOnGround
 from hydrotele.simulate.holding import CENTRE, GRIP, ROW, TAKEN, grip_step
 from hydrotele.simulate.sensors import convert
 from hydrotele.simulate.surroundings import log_grip
-from hydrotele.surroundings import LogOnGround
 from hydrotele.tasks.chance import draw
 
 HAND, LOG, WELD, JAW, PLACE, RADIUS, HALF_LENGTH = range(GRIP, GRIP + 7)  # in Facts.numbers

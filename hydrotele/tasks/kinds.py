@@ -4,7 +4,7 @@ A task is a file of its own with four compiled functions of the same names and a
 is its place in KINDS.
 """
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.tasks.bed import tick_bed
 from hydrotele.tasks.force import begin_force, judge_force, observe_force, tick_force
 from hydrotele.tasks.grade import begin_grade, judge_grade, observe_grade

@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.tasks.chance import between, draw
 from hydrotele.tasks.memory import ARM
 from hydrotele.tasks.observation import Field, pose_fields, reach

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hydrotele.machine import Machine
-from hydrotele.scenario import Servo
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Servo
 from hydrotele.tasks.line import line_fields
 from hydrotele.tasks.starts import draw_start
 from hydrotele.tasks.task import Task

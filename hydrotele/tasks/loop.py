@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numba import carray, types
 
-from hydrotele.compiled import callback, compiled
+from hydrotele.core.compiled import callback, compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.simulate.fleet import STATE
 from hydrotele.simulate.pointers import call_set_state, call_step, floats, pointer

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from hydrotele.tasks.memory import ARM
 
 _TURNS = 20.0  # rad: of a slewing house, which has no end

@@ -5,9 +5,9 @@ import math
 import mujoco
 import numpy as np
 
-from hydrotele.machine import Machine
-from hydrotele.scenario import Servo
-from hydrotele.surroundings import LogOnGround
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Servo
+from hydrotele.scenario.surroundings import LogOnGround
 from hydrotele.tasks.grapple import grapple_numbers
 from hydrotele.tasks.place import place_fields
 from hydrotele.tasks.starts import draw_start

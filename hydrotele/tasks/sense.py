@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.hydraulics.circuit import SCRATCH, SLOTS
 from hydrotele.simulate.pointers import floats
 from hydrotele.simulate.readout import state_supply

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 _DEADBAND = (0.5, 2.0)  # times the nominal overlap
 _FLOW = (0.8, 1.2)  # makers' ratings are good to 5 or 10 %, wear and temperature do the rest

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics.task import REACHED, task_inverse
-from hydrotele.machine import Machine
-from hydrotele.operate.resolved_motion import arm_facts
+from hydrotele.machine.machine import Machine
 
 _DRAWS = 1000
 _ROOM = 0.08  # rad to the ends of the joints' ranges

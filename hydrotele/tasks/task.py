@@ -7,9 +7,9 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from hydrotele.machine import Machine
-from hydrotele.scenario import Servo
-from hydrotele.surroundings import Thing
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Servo
+from hydrotele.scenario.surroundings import Thing
 from hydrotele.tasks.memory import ACTIONS
 from hydrotele.tasks.observation import Field
 

@@ -12,15 +12,15 @@ import mujoco
 import numpy as np
 from mujoco.batch import MODEL_FIELDS
 
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.errors import InputError
-from hydrotele.machine import Machine
-from hydrotele.sensors import SensorError
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError
+from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.fleet import STATE
 from hydrotele.simulate.names import TIP_SITE
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import begin_leapfrog, split_delay
-from hydrotele.surroundings import Thing
 from hydrotele.tasks.memory import AXES, CHANNELS
 from hydrotele.tasks.task import Options, Task
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward, task_inverse, task_rates
 from hydrotele.tasks.memory import ARM
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray
 
-from hydrotele.compiled import compiled
+from hydrotele.core.compiled import compiled
 from hydrotele.simulate.pointers import field, floats, pointer
 from hydrotele.tasks.memory import MEASURES
 

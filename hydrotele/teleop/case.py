@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.teleop.two_port import Block, Gains, Impedance, TwoPort, two_port
 
 

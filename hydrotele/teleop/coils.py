@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 
 _WHERE = "coils"
 _SINGULAR = 1e6  # condition beyond which six coils do not make six directions

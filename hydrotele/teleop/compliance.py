@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.errors import InputError
+from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
 
 _WHERE = "compliance"
 GRAVITY = (0.0, 0.0, -9.81)

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 
 _WHERE = "joystick axis"
 

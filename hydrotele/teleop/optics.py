@@ -6,7 +6,7 @@ the stator, which tells where: sideways and up. Six readings make the six number
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 
 _WHERE = "optical sensing"
 _ENOUGH, _MOST = 1e-12, 20  # m and rad of a Newton step; 4 steps do within the stops

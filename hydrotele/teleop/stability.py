@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.teleop.two_port import Block, TwoPort, characteristic
 
 _ORIGIN = 4  # poles at 0 that blocks with springs and integrators can have together

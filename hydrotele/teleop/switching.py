@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.errors import InputError
+from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
 from hydrotele.teleop.two_port import Impedance, stiffness_margin
 
 _PER_RATE = 0.01  # steps over the time constant of the fastest rate

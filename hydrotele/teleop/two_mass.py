@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.compiled import compiled
-from hydrotele.errors import InputError
+from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
 from hydrotele.teleop.case import Case
 from hydrotele.teleop.two_port import Impedance
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 
 Block = Callable[[np.ndarray], np.ndarray]  # transfer function of the complex frequency [rad/s]
 _RATE = ("rate_position", "rate_force", "four_channel_rate")

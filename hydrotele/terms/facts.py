@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import model_validator
 
-from hydrotele.datafile import Facts, Name, NonNegative, suggest
+from hydrotele.core.datafile import Facts, Name, NonNegative, suggest
 from hydrotele.terms import laws as _laws  # noqa: F401 - puts the laws of this package into LAWS
 from hydrotele.terms.law import LAWS, VARIABLES, Value
 

@@ -10,7 +10,7 @@ a function of one; an argument is a variable of `DriveState` or a difference of 
 import ast
 from collections.abc import Mapping
 
-from hydrotele.datafile import suggest
+from hydrotele.core.datafile import suggest
 from hydrotele.terms.law import VARIABLES
 
 FUNCTIONS = {

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hydrotele.datafile import suggest
-from hydrotele.errors import InputError
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
 
 
 class DriveState(NamedTuple):

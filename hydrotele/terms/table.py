@@ -18,8 +18,8 @@ from numba import carray, cfunc, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.compiled import compiled, lean
-from hydrotele.errors import InputError
+from hydrotele.core.compiled import compiled, lean
+from hydrotele.core.errors import InputError
 from hydrotele.terms.facts import BALANCES, Term
 from hydrotele.terms.law import LAWS, VARIABLES, DriveState, Law, Numbers, Variable
 

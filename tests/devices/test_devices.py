@@ -4,13 +4,13 @@ import sys
 
 import pytest
 
+from hydrotele.core.errors import InputError
 from hydrotele.devices.choose import open_device
 from hydrotele.devices.keyboard import Keyboard
 from hydrotele.devices.pad import Pad
 from hydrotele.devices.script import load_script
 from hydrotele.devices.tables import CENTRE_KEY, KEYS, LAYOUTS, QUIT_KEY, SWITCH_KEYS
-from hydrotele.errors import InputError
-from hydrotele.joystick import AXES
+from hydrotele.machine.joystick import AXES
 
 
 class Stick:

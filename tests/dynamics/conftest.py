@@ -7,7 +7,7 @@ import pytest
 
 from hydrotele.dynamics.mechanism import HOME
 from hydrotele.dynamics.model import model_space, reduced_model, state_names, state_size
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 
 
 @pytest.fixture(scope="session")

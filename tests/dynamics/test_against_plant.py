@@ -5,15 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from hydrotele.drives import EndStop
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import predicted_channels, state_names
 from hydrotele.effects import apply_effect
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.slots import SLOTS, Slot
-from hydrotele.machine_file import save_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.machine.drives import EndStop
+from hydrotele.machine.machine_file import save_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import Scenario
 from hydrotele.terms.facts import Term
 
 ROWS, PERIOD = 60, 0.02

@@ -25,8 +25,8 @@ from hydrotele.dynamics.model import predicted_channels, state_names
 from hydrotele.dynamics.motion import BIAS, ORIGIN, RATE, TURN
 from hydrotele.effects.effect import changed
 from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
-from hydrotele.log import load_log
-from hydrotele.sensors import SensorError
+from hydrotele.logs.log import load_log
+from hydrotele.machine.sensors import SensorError
 
 TRUTH = Path(__file__).parents[3] / "shared" / "measured" / "nominal_truth"
 PERIOD, RELIEF = 0.02, 28.0e6

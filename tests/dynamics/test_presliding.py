@@ -10,10 +10,10 @@ from scipy.integrate import solve_ivp
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import predicted_channels, state_names
 from hydrotele.effects import apply_effect, changed
-from hydrotele.machine_file import load_machine
-from hydrotele.replay import replay_log
-from hydrotele.run import run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.replay import replay_log
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.plant import build_plant, rest_state
 
 PERIOD, ROWS = 0.005, 400

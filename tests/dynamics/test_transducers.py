@@ -6,8 +6,8 @@ from scipy.signal import lsim, lti
 
 from hydrotele.dynamics.integrate import advance, simulate_rows
 from hydrotele.dynamics.transducers import follow_channel
-from hydrotele.noise import first_order
-from hydrotele.sensors import SensorError
+from hydrotele.machine.noise import first_order
+from hydrotele.machine.sensors import SensorError
 
 
 @pytest.mark.parametrize("ratio", [1e-9, 1e-3, 0.3, 1.0, 50.0])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.closure import holding_forces, independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 

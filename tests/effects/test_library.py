@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import hydrotele.effects as library
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, Effect, apply_effect
-from hydrotele.errors import InputError
-from hydrotele.machine_file import load_machine, save_machine, shipped_machines
-from hydrotele.run import run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.machine.machine_file import load_machine, save_machine, shipped_machines
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import Scenario
 
 MACHINES = [("cat215", "none"), ("cat215", "bucket"), ("cat215", "grapple"), ("rig", None),
             ("ec20", None), ("emps", None), ("cat325", None), ("eha", "load_30_bar")]  # fmt: skip

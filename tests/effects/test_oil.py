@@ -6,7 +6,7 @@ import pytest
 
 from hydrotele.effects import apply_effect
 from hydrotele.hydraulics.circuit import ACTIVATIONS
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.simulate.readout import state_flows
 

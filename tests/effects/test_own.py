@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 import hydrotele
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect, load_effects
 from hydrotele.effects import _own as own
 from hydrotele.effects.effect import Effect
-from hydrotele.errors import InputError
-from hydrotele.machine_file import load_machine, save_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.machine.machine_file import load_machine, save_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import Scenario
 from hydrotele.terms.law import LAWS, DriveState
 
 ROOT = Path(__file__).parents[2]

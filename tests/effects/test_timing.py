@@ -7,11 +7,11 @@ import pytest
 from scipy.signal import lsim, lti
 
 from hydrotele.effects import apply_effect
-from hydrotele.log import Log
-from hydrotele.machine_file import load_machine
-from hydrotele.replay import replay_log
-from hydrotele.run import prepare, run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.replay import replay_log
+from hydrotele.run.run import prepare, run_scenario
+from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.simulate.readout import late_channels, true_channels
 from hydrotele.simulate.record import Recorder, begin_leapfrog, split_delay

@@ -11,10 +11,10 @@ from hydrotele.effects import apply_effect
 from hydrotele.effects._drive_side import load_inertia
 from hydrotele.hydraulics.circuit import SLOTS, actuator_friction
 from hydrotele.hydraulics.drive_side import settled_friction
-from hydrotele.machine_file import load_machine
-from hydrotele.replay import replay_log
-from hydrotele.run import run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.replay import replay_log
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.closure import holding_forces, independent_dofs
 from hydrotele.simulate.plant import build_plant, initial_state, rest_state
 from hydrotele.simulate.record import aligned_positions, begin_leapfrog

@@ -9,9 +9,9 @@ from absl.testing import absltest
 from dm_env import test_utils
 
 import hydrotele.envs
+from hydrotele.core.errors import InputError
 from hydrotele.envs import dm
 from hydrotele.envs.single import MachineEnv
-from hydrotele.errors import InputError
 
 SHORT = {"duration": 0.2, "variants": 2}
 

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import hydrotele.envs
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.kinds import KINDS
 from hydrotele.tasks.memory import ACTIONS

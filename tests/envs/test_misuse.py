@@ -7,10 +7,10 @@ import pickle
 import numpy as np
 import pytest
 
+from hydrotele.core.errors import InputError
 from hydrotele.envs.dm import load
 from hydrotele.envs.single import MachineEnv
 from hydrotele.envs.vector import MachineVectorEnv
-from hydrotele.errors import InputError
 
 TASK = "TrackTrajectory"
 

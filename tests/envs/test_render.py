@@ -14,11 +14,11 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import AddRenderObservation, RenderCollection
 
 import hydrotele.envs
+from hydrotele.core.errors import InputError
 from hydrotele.envs.goals import goal_markers
 from hydrotele.envs.single import MachineEnv
 from hydrotele.envs.stage import Stage
 from hydrotele.envs.vector import MachineVectorEnv
-from hydrotele.errors import InputError
 from hydrotele.show.canvas import Canvas
 
 SMALL = {"width": 80, "height": 60, "variants": 2, "duration": 0.2}

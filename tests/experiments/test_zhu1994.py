@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele.cli import app
-from hydrotele.commands import experimenting
-from hydrotele.errors import InputError
+from hydrotele.cli import experimenting
+from hydrotele.cli.main import app
+from hydrotele.core.errors import InputError
 from hydrotele.experiments import felling, forces, motion
 from hydrotele.experiments.finding import Finding, Panel
 

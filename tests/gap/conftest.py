@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hydrotele.dataset.load import RunData
 from hydrotele.effects import apply_effect
 from hydrotele.gap.result import (
     Alternative,
@@ -19,9 +18,10 @@ from hydrotele.gap.result import (
     Prediction,
     Unknown,
 )
-from hydrotele.log import Log
-from hydrotele.machine_file import load_machine
-from hydrotele.signals import usual_unit
+from hydrotele.logs.load import RunData
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.signals import usual_unit
 from hydrotele.terms.facts import Term
 
 NOISE = {"angle": 1.0e-3, "length": 1.2e-3, "pressure_head": 1e5, "pressure_rod": 1e5}

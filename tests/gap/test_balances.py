@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hydrotele.drives import Transmission
 from hydrotele.dynamics.integrate import advance, read_channels
 from hydrotele.dynamics.model import (
     model_space,
@@ -21,14 +20,15 @@ from hydrotele.gap.balance_timing import peak_lag, window_lags
 from hydrotele.gap.balances import balances, pump_lack
 from hydrotele.gap.law_regression import lack_regression
 from hydrotele.gap.law_tables import Table
-from hydrotele.log import Log, load_log
-from hydrotele.machine_file import load_machine
-from hydrotele.noise import noise_rms, sensor_set
-from hydrotele.sensors import SensorError
-from hydrotele.signals import usual_unit
+from hydrotele.logs.log import Log, load_log
+from hydrotele.machine.drives import Transmission
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.noise import noise_rms, sensor_set
+from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.signals import usual_unit
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.terms.facts import Term
-from tests.prediction.test_filter import machine_data
+from tests.estimate.test_filter import machine_data
 
 SENSORS, PERIOD = "khoshzaban1992", 0.02
 MEASURED = Path(__file__).parents[3] / "shared" / "measured"

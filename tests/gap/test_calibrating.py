@@ -3,9 +3,9 @@
 import numpy as np
 
 from hydrotele.effects import Parameter
+from hydrotele.estimate.calibration import CALIBRATION
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.calibrating import _further, ended
-from hydrotele.prediction.calibration import CALIBRATION
-from hydrotele.prediction.hypothesis import Guess, Hypothesis
 
 
 def number(name: str, high: float = 6.0) -> Hypothesis:

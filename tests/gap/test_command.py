@@ -7,10 +7,10 @@ import types
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele import cli
-from hydrotele.errors import InputError
-from hydrotele.log import save_log
-from hydrotele.machine_file import load_machine
+from hydrotele.cli import main as cli
+from hydrotele.core.errors import InputError
+from hydrotele.logs.log import save_log
+from hydrotele.machine.machine_file import load_machine
 
 _ALWAYS = ["gap.json", "report.html", "summary.json"]
 

@@ -4,12 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, Learned
 from hydrotele.gap.law_tables import Table
 from hydrotele.gap.result import Lack, Prediction
-from hydrotele.machine_file import load_machine
-from hydrotele.prediction.hypothesis import Guess, Hypothesis
+from hydrotele.machine.machine_file import load_machine
 
 _SMOOTHING = 0.01  # m/s
 _TIME = np.linspace(0.0, 20.0, 1001)

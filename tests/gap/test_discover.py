@@ -9,24 +9,24 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hydrotele.dataset.load import load_dataset
+from hydrotele.estimate.free_run import free_run_errors, machine_runner
+from hydrotele.estimate.inputs import Input
+from hydrotele.estimate.levels import columns_of
+from hydrotele.estimate.responses import error_responses
+from hydrotele.estimate.track import track_run
 from hydrotele.gap.discover import _better, _busy_window, _law, _Seen
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.law_regression import Regression, at_a_glance
 from hydrotele.gap.law_tables import Table, paired_tables, possible_tables
-from hydrotele.log import save_log
-from hydrotele.machine_file import load_machine, save_machine
-from hydrotele.prediction.free_run import free_run_errors, machine_runner
-from hydrotele.prediction.inputs import Input
-from hydrotele.prediction.levels import columns_of
-from hydrotele.prediction.responses import error_responses
-from hydrotele.prediction.track import track_run
-from hydrotele.run import run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.logs.load import load_dataset
+from hydrotele.logs.log import save_log
+from hydrotele.machine.machine_file import load_machine, save_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import Scenario
 from hydrotele.terms.facts import Term
 from hydrotele.terms.law import Drives, DriveState
 from hydrotele.terms.table import FORCE, added, terms_table
-from tests.prediction.test_filter import machine_data
+from tests.estimate.test_filter import machine_data
 
 PERIOD, SECONDS = 0.01, 10.0
 HIDDEN = Term(

@@ -10,9 +10,9 @@ from hydrotele.effects import EFFECTS
 from hydrotele.gap.experiment import MOTIONS, OF_EFFECT, OF_LAW, next_experiment
 from hydrotele.kinematics.arm import forward
 from hydrotele.kinematics.from_machine import arm_geometry
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 
 CAT = load_machine("cat215")
 EXAMPLES = {  # motion -> two effects that it separates

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
-from hydrotele.dataset.load import Dataset, load_dataset
+from hydrotele.estimate.stretches import busiest
 from hydrotele.gap.find import find_gap, without_details
 from hydrotele.gap.result import Estimate, NamedEffect
-from hydrotele.log import Log, load_log, save_log
-from hydrotele.machine_file import load_machine
-from hydrotele.prediction.stretches import busiest
+from hydrotele.logs.load import Dataset, load_dataset
+from hydrotele.logs.log import Log, load_log, save_log
+from hydrotele.machine.machine_file import load_machine
 
 MEASURED = Path(__file__).resolve().parents[3] / "shared" / "measured"
 pytestmark = pytest.mark.skipif(not MEASURED.is_dir(), reason="../shared/measured is absent")

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from hydrotele.dataset.load import Dataset, RunData
 from hydrotele.effects.effect import changed
+from hydrotele.estimate.calibration import numbers
 from hydrotele.gap.free_calibration import calibrate_freely
-from hydrotele.log import Log
-from hydrotele.machine_file import load_machine
-from hydrotele.prediction.calibration import numbers
-from tests.prediction.test_pump_drive import CHANNELS, NOISE, PERIOD, simulated
+from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine_file import load_machine
+from tests.estimate.test_pump_drive import CHANNELS, NOISE, PERIOD, simulated
 
 DUTY = np.repeat(
     [0.0, 0.7, 0.0, -0.5, 0.0, 0.5, 0.8, -0.6, 0.0], [220, 150, 50, 100, 50, 80, 60, 150, 40]

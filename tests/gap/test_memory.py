@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.find import find_gap
-from hydrotele.log import save_log
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.logs.load import load_dataset
+from hydrotele.logs.log import save_log
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import Scenario
 
 RATE, SECONDS = 200, 6.0
 

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from hydrotele.gap.patched import has_patch, write_patch
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 
 
 @pytest.fixture

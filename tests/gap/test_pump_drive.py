@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele.cli import app
-from hydrotele.dataset.load import load_dataset
+from hydrotele.cli.main import app
 from hydrotele.effects import apply_effect
 from hydrotele.effects.effect import changed
+from hydrotele.estimate.calibration import numbers
+from hydrotele.estimate.levels import rough_noise
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.find import find_gap
-from hydrotele.log import save_log
-from hydrotele.machine_file import load_machine, save_machine
-from hydrotele.prediction.calibration import numbers
-from hydrotele.prediction.levels import rough_noise
-from hydrotele.run import run_scenario
-from hydrotele.scenario import Scenario
+from hydrotele.logs.load import load_dataset
+from hydrotele.logs.log import save_log
+from hydrotele.machine.machine_file import load_machine, save_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import Scenario
 
 TOOL, SECONDS, RATE = "load_30_bar", 5.0, 100
 LESS = 0.047  # V s/rad: 20 % under the model's

@@ -6,10 +6,10 @@ import pytest
 
 import hydrotele.gap.rattling as gap_rattling
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.machine_file import load_machine
-from hydrotele.prediction.evidence import Evidence
-from hydrotele.prediction.hypothesis import Guess, hypotheses
-from tests.prediction.test_filter import machine_data
+from hydrotele.estimate.evidence import Evidence
+from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.machine.machine_file import load_machine
+from tests.estimate.test_filter import machine_data
 
 GAP = 0.012  # rad
 

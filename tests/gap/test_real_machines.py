@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele.cli import app
-from hydrotele.dataset.load import load_dataset
+from hydrotele.cli.main import app
+from hydrotele.estimate.baselines import fit_baseline
+from hydrotele.estimate.free_run import free_run_errors, machine_runner
+from hydrotele.estimate.stretches import busiest
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.free_calibration import calibrate_freely
-from hydrotele.machine_file import load_machine
-from hydrotele.prediction.baselines import fit_baseline
-from hydrotele.prediction.free_run import free_run_errors, machine_runner
-from hydrotele.prediction.stretches import busiest
+from hydrotele.logs.load import load_dataset
+from hydrotele.machine.machine_file import load_machine
 from tools.real_machines import FIRST_THREE_QUARTERS, PUSH, ec20_splits, force_error, pushed
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "real"

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from hydrotele.estimate.evidence import Evidence
+from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.gap.rivals import is_case_of
-from hydrotele.machine_file import load_machine
-from hydrotele.prediction.evidence import Evidence
-from hydrotele.prediction.hypothesis import Guess, hypotheses
-from tests.prediction.test_filter import machine_data
+from hydrotele.machine.machine_file import load_machine
+from tests.estimate.test_filter import machine_data
 
 
 @pytest.fixture(scope="module")

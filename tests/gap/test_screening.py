@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import Parameter
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.screening import screen
-from hydrotele.prediction.hypothesis import Guess, Hypothesis
 
 ROWS, CHANNELS = 400, 3
 

@@ -3,13 +3,13 @@
 import numpy as np
 
 from hydrotele.effects import apply_effect
+from hydrotele.estimate.calibration import CALIBRATION, calibration
+from hydrotele.estimate.evidence import Evidence
+from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.track import STEP
 from hydrotele.gap.without_inputs import without_inputs
-from hydrotele.machine_file import load_machine
-from hydrotele.prediction.calibration import CALIBRATION, calibration
-from hydrotele.prediction.evidence import Evidence
-from hydrotele.prediction.hypothesis import Guess, hypotheses
-from hydrotele.prediction.track import STEP
-from tests.prediction.test_filter import machine_data
+from hydrotele.machine.machine_file import load_machine
+from tests.estimate.test_filter import machine_data
 
 NAMES = ("payload", "com_offset", "external_force", "pressure_lag", "command_delay")
 

@@ -9,7 +9,7 @@ from hydrotele.effects import EFFECTS
 from hydrotele.gap.customary import amount, said
 from hydrotele.gap.result import Alternative, Estimate, GapSize, NamedEffect
 from hydrotele.gap.words import effect_title, gap_closed, headline, verdict_words
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 
 
 def text_of(gap) -> str:

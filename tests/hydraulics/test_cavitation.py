@@ -21,7 +21,7 @@ from hydrotele.hydraulics.laws import (
     softening,
 )
 from hydrotele.hydraulics.parameters import actuator_numbers
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 
 BOOM = 1
 CLOSED = np.zeros(1)

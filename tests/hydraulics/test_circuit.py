@@ -17,7 +17,7 @@ from hydrotele.hydraulics.circuit import (
 )
 from hydrotele.hydraulics.laws import port_flow
 from hydrotele.hydraulics.parameters import actuator_numbers
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 
 SWING, BOOM, STICK = range(3)
 RELIEF, TANK, PUMP, BETA = 28.0e6, 0.3e6, 5.0e-3, 0.9e9

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hydrotele.drives import Axis, Friction
 from hydrotele.effects import EFFECTS, apply_effect, changed
 from hydrotele.hydraulics.actuator import actuator_friction
 from hydrotele.hydraulics.circuit import (
@@ -23,8 +22,9 @@ from hydrotele.hydraulics.presliding import (
     settled_bristle_friction,
     sliding_level,
 )
-from hydrotele.machine import Supply
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.drives import Axis, Friction
+from hydrotele.machine.machine import Supply
+from hydrotele.machine.machine_file import load_machine
 
 COULOMB, STRIBECK, SLOW, UNEQUAL = 150.0, 50.0, 0.02, 0.2
 STIFFNESS = 4.0e6  # N/m: 200 N break away after some 50 um

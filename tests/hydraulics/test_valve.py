@@ -16,8 +16,8 @@ from hydrotele.hydraulics.laws import holding_share, spool_step, stop_force, val
 from hydrotele.hydraulics.parameters import actuator_numbers
 from hydrotele.hydraulics.slots import Slot
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
-from hydrotele.machine import Supply
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine import Supply
+from hydrotele.machine.machine_file import load_machine
 
 CAT = load_machine("cat215", "none")
 CYLINDER = CAT.axes["boom"].cylinder

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from hydrotele.commands.identifying import closed_chain
-from hydrotele.dataset.files import RunFiles
-from hydrotele.dataset.load import make_dataset
-from hydrotele.errors import InputError
+from hydrotele.cli.identifying import closed_chain
+from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import METHODS, Estimator
 from hydrotele.identify.identification import identify
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import beginning, records
 from hydrotele.identify.setup import machine_setup
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.load import make_dataset
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 from tools.identify_coverage import one_trial
 
 PERIOD = 20.0  # s, of the scenario `excitation`

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.estimators import autoregression, estimate
 
 TRUTH = np.array([95.0, 200.0, 20.0, -3.0])

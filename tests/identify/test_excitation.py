@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from hydrotele.commands.identifying import closed_chain
+from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.excitation import (
     Excitation,
     design_excitation,
@@ -13,9 +13,9 @@ from hydrotele.identify.excitation import (
 )
 from hydrotele.identify.record import force_noise
 from hydrotele.identify.setup import machine_setup
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.periodic import periodic
 from hydrotele.identify.smoothing import smooth
 from hydrotele.identify.zero_phase import zero_phase

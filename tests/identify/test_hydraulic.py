@@ -4,15 +4,15 @@ import dataclasses
 
 import pytest
 
-from hydrotele.dataset.files import RunFiles
-from hydrotele.dataset.load import make_dataset
+from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import changed
-from hydrotele.errors import InputError
 from hydrotele.identify.hydraulic import HYDRAULIC, identify_hydraulics
 from hydrotele.identify.identify_json import identify_document
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.load import make_dataset
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 
 TRUTH = {
     "axes.slide.valve.rated_flow": 1.15, "axes.slide.valve.bandwidth": 0.8,

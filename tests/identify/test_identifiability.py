@@ -10,7 +10,7 @@ from hydrotele.identify.identifiability import COMBINATION, FULL, UNIDENTIFIABLE
 from hydrotele.identify.machine_friction import pin_friction
 from hydrotele.identify.projection import project
 from hydrotele.identify.regressor import Rubbing, regressor
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from tests.identify.test_projection import panda
 

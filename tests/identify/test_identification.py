@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hydrotele.commands.identifying import closed_chain
-from hydrotele.dataset.load import load_dataset
-from hydrotele.errors import InputError
+from hydrotele.cli.identifying import closed_chain
+from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.friction_shape import identify_with_shapes
 from hydrotele.identify.identifiability import FULL, WEAK
@@ -17,8 +16,9 @@ from hydrotele.identify.motion import Processing
 from hydrotele.identify.parameter_rows import counts, parameter_rows
 from hydrotele.identify.record import records
 from hydrotele.identify.setup import machine_setup
-from hydrotele.log import load_log, save_log
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.load import load_dataset
+from hydrotele.logs.log import load_log, save_log
+from hydrotele.machine.machine_file import load_machine
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 MEASURED, REAL = SHARED / "measured", SHARED / "real"

@@ -15,7 +15,7 @@ from hydrotele.identify.projection import project
 from hydrotele.identify.regressor import BODY_PARAMETERS, regressor
 from hydrotele.identify.result import Forces, Identification
 from hydrotele.identify.setup import cylinder_bars, machine_setup
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 
 

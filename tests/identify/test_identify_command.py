@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele import cli
-from hydrotele.errors import InputError
-from hydrotele.log import save_log
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.cli import main as cli
+from hydrotele.core.errors import InputError
+from hydrotele.logs.log import save_log
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 
 KEYS = {"parameters", "condition", "heldout", "counts", "status", "seconds"}
 

@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.chain import load_chain
 from hydrotele.identify.projection import project
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 
 # Franka Panda, joint by joint: orientation of the frame [rad], its place [m]

@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hydrotele.dataset.files import RunFiles
-from hydrotele.dataset.load import make_dataset
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.record import records
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.log import Log
-from hydrotele.machine_file import load_machine
-from hydrotele.sensors import SensorError
-from hydrotele.signals import usual_unit
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.load import make_dataset
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.signals import usual_unit
 
 ROWS = 600
 AXES = {"swing": 0.1, "boom": 0.45, "stick": -1.6}

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import changed
-from hydrotele.errors import InputError
 from hydrotele.hydraulics.laws import friction
 from hydrotele.identify.chain import load_chain
 from hydrotele.identify.estimators import estimate
@@ -17,7 +17,7 @@ from hydrotele.identify.projection import project
 from hydrotele.identify.reference_size import reference_sizes
 from hydrotele.identify.regressor import Rubbing, regressor
 from hydrotele.identify.setup import machine_setup
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 

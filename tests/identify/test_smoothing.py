@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.identify.integrator_chain import transition
 from hydrotele.identify.smoothing import error_draws, smooth
 

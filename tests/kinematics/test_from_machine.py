@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import forward, inverse, jacobian
 from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage
-from hydrotele.machine_file import load_machine, shipped_machines
+from hydrotele.machine.machine_file import load_machine, shipped_machines
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 

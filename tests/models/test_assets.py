@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
-from hydrotele.machine_file import load_machine, save_machine
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.simulate.plant import build_plant
 from tests.models.test_foreign_mjcf import MACHINE
 

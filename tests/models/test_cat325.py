@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.errors import InputError
 from hydrotele.kinematics import five_dof
 from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.closure import pin_opening
 from hydrotele.simulate.plant import build_plant, rest_state
 

@@ -7,11 +7,11 @@ import pytest
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model, state_names
 from hydrotele.effects.effect import changed
-from hydrotele.log import load_log
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.logs.log import load_log
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.plant import build_plant, rest_state
 
 CHANNELS = ("position.piston", "pressure_head.piston", "pressure_rod.piston")

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
-from hydrotele.machine_file import load_machine
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant
 
 MACHINE = """\

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
-from hydrotele.joystick import AXES, load_joystick, shipped_joysticks
-from hydrotele.resources import models_folder
+from hydrotele.core.errors import InputError
+from hydrotele.core.resources import models_folder
+from hydrotele.machine.joystick import AXES, load_joystick, shipped_joysticks
 from hydrotele.simulate.joystick import joystick_spec
 
 JOYSTICK = load_joystick()

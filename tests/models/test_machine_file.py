@@ -10,13 +10,18 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hydrotele import datafile
-from hydrotele.datafile import PSI, UNIT_SUFFIXES, read_yaml, split_unit, suggest
-from hydrotele.errors import InputError
+from hydrotele.core import datafile
+from hydrotele.core.datafile import PSI, UNIT_SUFFIXES, read_yaml, split_unit, suggest
+from hydrotele.core.errors import InputError
+from hydrotele.core.resources import models_folder
 from hydrotele.kinematics.from_machine import check_strokes
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine, machine_path, save_machine, shipped_machines
-from hydrotele.resources import models_folder
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import (
+    load_machine,
+    machine_path,
+    save_machine,
+    shipped_machines,
+)
 from hydrotele.simulate.mechanism import assemble, mjcf_document
 from hydrotele.simulate.plant import build_plant, rest_state
 

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.machine_file import load_machine, shipped_machines
-from hydrotele.resources import models_folder
-from hydrotele.signals import parse_channel
+from hydrotele.core.resources import models_folder
+from hydrotele.machine.machine_file import load_machine, shipped_machines
+from hydrotele.machine.signals import parse_channel
 from hydrotele.simulate.closure import holding_forces, independent_dofs, motion_basis, pin_opening
 from hydrotele.simulate.plant import build_plant, rest_state
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hydrotele.log import Log
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine_file import load_machine
 
 _ROWS = 50
 

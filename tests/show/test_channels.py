@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
-from hydrotele.log import Log
+from hydrotele.core.errors import InputError
+from hydrotele.logs.log import Log
+from hydrotele.machine.signals import MEASURED, TRUTH
 from hydrotele.show.channels import TITLES, colours, difference, grouped, padded_range, shown
-from hydrotele.signals import MEASURED, TRUTH
 
 
 def test_every_kind_has_a_title():

@@ -6,8 +6,8 @@ import struct
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
-from hydrotele.machine_file import load_machine
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.show.overlay import plot_log, plot_overlay
 from hydrotele.show.picture import render_picture
 from hydrotele.show.recording import write_recording

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.show.pose import body_poses, logged_joints, model_with_looks, points_on_body
 from hydrotele.simulate.closure import close_loops, follow_loops, pin_opening
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.show.pose import body_poses, logged_joints, model_with_looks
 from hydrotele.show.recording import write_recording
 from hydrotele.show.recording_file import recording_file
@@ -106,7 +106,7 @@ def test_the_layout_is_in_the_file(tmp_path, machine, log):
 
 
 def test_a_machine_of_another_tool_can_stand_beside(tmp_path, machine, log):
-    from hydrotele.machine_file import load_machine
+    from hydrotele.machine.machine_file import load_machine
 
     bare = load_machine("cat215", tool="none")
     kept = {k: v for k, v in log.columns.items() if "bucket" not in k}

@@ -4,7 +4,7 @@ import functools
 
 import pytest
 
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant
 
 

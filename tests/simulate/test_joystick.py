@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.joystick import load_joystick
-from hydrotele.levitation import rotation_vector
+from hydrotele.machine.joystick import load_joystick
 from hydrotele.simulate.joystick import Flotor, joystick_spec
 from hydrotele.teleop.coils import three_stations
+from hydrotele.teleop.levitation import rotation_vector
 
 JOYSTICK = load_joystick()
 REST = np.zeros(6)

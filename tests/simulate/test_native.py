@@ -18,7 +18,7 @@ from hydrotele.hydraulics.circuit import (
     circuit_scratch,
     step_circuit,
 )
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.simulate.plant import build_plant, rest_state
 

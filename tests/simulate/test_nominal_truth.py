@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.log import load_log
+from hydrotele.logs.log import load_log
 from hydrotele.simulate.plant import initial_state
 
 TRUTH = Path(__file__).parents[3] / "shared" / "measured" / "nominal_truth"

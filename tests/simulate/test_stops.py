@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hydrotele.drives import EndStop
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.drives import EndStop
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 
 EMPS = load_machine("emps")

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
-from hydrotele.run import begin, prepare, run_scenario
-from hydrotele.scenario import Scenario, load_scenario
+from hydrotele.core.errors import InputError
+from hydrotele.run.run import begin, prepare, run_scenario
+from hydrotele.scenario.scenario import Scenario, load_scenario
 from hydrotele.simulate.record import contact_force, surrounding_bodies
 
 PLATE = {"kind": "plate", "position": [6.0, -0.11, 0.3], "size": [0.8, 0.9]}

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hydrotele.errors import InputError
-from hydrotele.resources import models_folder
+from hydrotele.core.errors import InputError
+from hydrotele.core.resources import models_folder
 from hydrotele.soil.bucket import held_soil
 from hydrotele.soil.facts import SOILS
 from hydrotele.soil.numbers import level_profile, soil_numbers

@@ -8,7 +8,7 @@ import pytest
 
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.kinematics.task import task_forward, task_inverse, task_jacobian, task_numbers
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.soil.facts import GRAVITY, SOILS
 from hydrotele.soil.numbers import (

@@ -13,7 +13,7 @@ from numba import (
     types,
 )
 
-from hydrotele.compiled import callback
+from hydrotele.core.compiled import callback
 from hydrotele.soil.facts import GRAVITY, SOILS
 from hydrotele.soil.numbers import (
     CARRIED,

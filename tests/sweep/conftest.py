@@ -32,7 +32,7 @@ def rows_of(folder: Path) -> list[dict]:
 @pytest.fixture(scope="session")
 def done(tmp_path_factory) -> Path:
     """The folder of the tiny sweep, done once without interruption, with logs."""
-    from hydrotele.commands.running import write_run
+    from hydrotele.cli.running import write_run
     from hydrotele.sweep.facts import load_sweep
     from hydrotele.sweep.sweep import How, run_sweep
 

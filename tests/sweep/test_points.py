@@ -78,7 +78,7 @@ def test_samples_are_distributed_as_asked():
     "value", [1, 1e-7, 2.5e300, True, None, "yes", "1.0", "a: b # c", 'x"\n', [1, {"a": [2]}], "é"]
 )
 def test_values_survive_the_way_into_overrides(value):
-    from hydrotele.datafile import read_value
+    from hydrotele.core.datafile import read_value
 
     sweep = Sweep.model_validate({"scenario": "a", "grid": {"servo.lead": [value]}, "repeat": 2})
     (text,) = overrides(sweep, next(points(sweep)).values).values()

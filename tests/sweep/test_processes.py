@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import hydrotele
-from hydrotele.resources import models_folder, scenarios_folder
+from hydrotele.core.resources import models_folder, scenarios_folder
 from tests.sweep.conftest import rows_of, write_sweep
 
 ROOT = Path(hydrotele.__file__).parents[1]
@@ -98,7 +98,7 @@ def test_a_cluster_gives_the_same_table(done, tmp_path):
 
 def test_a_cluster_that_is_not_there_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    from hydrotele.errors import InputError
+    from hydrotele.core.errors import InputError
     from hydrotele.sweep import cluster
     from hydrotele.sweep.facts import load_sweep
     from hydrotele.sweep.sweep import How, run_sweep

@@ -12,12 +12,12 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele import cli
-from hydrotele.errors import InputError
-from hydrotele.log import save_log
-from hydrotele.resources import models_folder, scenarios_folder
-from hydrotele.run import run_scenario
-from hydrotele.scenario import load_scenario
+from hydrotele.cli import main as cli
+from hydrotele.core.errors import InputError
+from hydrotele.core.resources import models_folder, scenarios_folder
+from hydrotele.logs.log import save_log
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.record import SimulationFailed
 from hydrotele.sweep import running
 from hydrotele.sweep.checking import check_points, open_base, scenario_of

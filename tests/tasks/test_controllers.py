@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.controllers.catalogue import CONTROLLERS, REFERENCES, make_controller
 from hydrotele.tasks.controllers.controller import columns

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.simulate.feedback import feedback
 from hydrotele.simulate.fleet import STATE
 from hydrotele.simulate.plant import build_plant, rest_state

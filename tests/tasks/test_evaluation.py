@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
-from hydrotele.machine_file import load_machine
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.controllers.agent import AgentView, difference_columns
 from hydrotele.tasks.controllers.catalogue import make_controller

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics.task import REACHED, task_inverse
 from hydrotele.soil.facts import GRAVITY, SOILS
 from hydrotele.soil.numbers import (

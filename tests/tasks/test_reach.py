@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics.task import REACHED, task_forward, task_inverse
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.core import TaskCore

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.controllers.catalogue import make_controller
 from hydrotele.tasks.core import TaskCore

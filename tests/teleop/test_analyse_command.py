@@ -6,10 +6,10 @@ import re
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele import cli
-from hydrotele.errors import InputError
+from hydrotele.cli import main as cli
+from hydrotele.core.errors import InputError
+from hydrotele.teleop.teleop_case import SHIPPED, load_teleop_case
 from hydrotele.teleop.two_port import STRUCTURES
-from hydrotele.teleop_case import SHIPPED, load_teleop_case
 
 SMALL = "map: {points: 3}\n"  # nine cells
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import (
     analyse,
     gain_margin,
@@ -19,9 +19,9 @@ from hydrotele.teleop.case import Case
 from hydrotele.teleop.findings import find, findings_document, why_unstable
 from hydrotele.teleop.stability import stable, unstable_held
 from hydrotele.teleop.switching import Spring, worst_growth
+from hydrotele.teleop.teleop_case import load_teleop_case
 from hydrotele.teleop.two_mass import grows, kicked, step_of, swept
 from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance, characteristic, transmitted
-from hydrotele.teleop_case import load_teleop_case
 
 CASE = Case(
     Impedance(0.8, 0.5), Impedance(2.0, 3.0), Impedance(0.0, 12.0, 150.0),

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.teleop.coils import Coils, three_stations
 
 COILS = three_stations(0.05, 8.0, 4.0)

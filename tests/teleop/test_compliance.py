@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.teleop.compliance import Axes, Flotor, Motion, compliance_wrench
 
 BODY = Flotor(

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.errors import InputError
-from hydrotele.joystick import load_joystick
-from hydrotele.levitation import quaternion_of, rotation_vector
+from hydrotele.core.errors import InputError
+from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.compliance import rotation_between, turn_matrix
+from hydrotele.teleop.levitation import quaternion_of, rotation_vector
 from hydrotele.teleop.optics import diode_readings, pose_of_readings, sensed_spread
 
 JOYSTICK = load_joystick()

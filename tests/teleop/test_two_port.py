@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.teleop.case import Case
 from hydrotele.teleop.confirm import agreement
 from hydrotele.teleop.stability import stable, unstable_held, unstable_poles

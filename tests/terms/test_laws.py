@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hydrotele.errors import InputError
-from hydrotele.machine import Machine, Supply
-from hydrotele.machine_file import load_machine
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine import Machine, Supply
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms import laws
 from hydrotele.terms.facts import Term
 from hydrotele.terms.formula import formula_arguments

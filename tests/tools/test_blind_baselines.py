@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import EFFECTS
-from hydrotele.log import save_log
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.log import save_log
+from hydrotele.machine.machine_file import load_machine
 from tools.blind.baselines import (
     changed,
     errors,

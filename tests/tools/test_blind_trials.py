@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from hydrotele.effects import EFFECTS
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from tools.blind.draw import SMALLEST, Planted, draw_double, draw_effect, draw_outside, with_effects
 from tools.blind.generate import make_trial
 from tools.blind.motions import motions

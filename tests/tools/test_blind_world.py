@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hydrotele.dataset.load import load_dataset
+from hydrotele.core.errors import InputError
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.errors import InputError
 from hydrotele.hydraulics.laws import ATMOSPHERE
-from hydrotele.log import load_log, save_log
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.load import load_dataset
+from hydrotele.logs.log import load_log, save_log
+from hydrotele.machine.machine_file import load_machine
 from tools.blind.forms import FORMS
 from tools.blind.open_loop import open_loop_error
 from tools.blind.spreads import SIZES, draw_library_effect, off_everywhere

@@ -28,12 +28,12 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import lfilter, savgol_filter
 
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.errors import InputError
-from hydrotele.log import Log, load_log
-from hydrotele.machine import Machine as Facts
-from hydrotele.machine_file import load_machine
-from hydrotele.noise import noise_rms, sensor_set
+from hydrotele.logs.log import Log, load_log
+from hydrotele.machine.machine import Machine as Facts
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.noise import noise_rms, sensor_set
 from tools.blind.score import share
 from tools.blind.spreads import SIZES
 from tools.blind.trials import Place, write_json
@@ -178,7 +178,7 @@ def floor(problem: Problem, rng: np.random.Generator) -> float:
 
 
 def _units(names: list[str]) -> dict[str, str]:
-    from hydrotele.signals import usual_unit
+    from hydrotele.machine.signals import usual_unit
 
     return {name: usual_unit(name, names) for name in names}
 

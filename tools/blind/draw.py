@@ -8,7 +8,7 @@ import numpy as np
 
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.effects.effect import Parameter
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from tools.blind.outside import OUTSIDE
 
 SMALLEST, LARGEST = 2.0, 3.0  # drawn deviations: in units of `least` and of `scale`

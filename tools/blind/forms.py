@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hydrotele.machine import Machine as Facts
+from hydrotele.machine.machine import Machine as Facts
 from tools.blind.spreads import either, log_uniform
 from tools.blind.world import Machine
 from tools.blind.world_machine import channels

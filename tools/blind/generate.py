@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.log import Log, save_log
-from hydrotele.machine import Machine
-from hydrotele.machine_file import load_machine
+from hydrotele.core.errors import InputError
+from hydrotele.logs.log import Log, save_log
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.record import SimulationFailed
 from tools.blind.draw import Planted, draw_double, draw_effect, draw_outside, with_effects
 from tools.blind.motions import motions

@@ -4,8 +4,8 @@ import numpy as np
 
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.machine import Machine
-from hydrotele.scenario import Scenario, Servo, Start, TablePilot
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Scenario, Servo, Start, TablePilot
 
 RATE = 50.0  # Hz, of controller, sensors and log
 SENSORS = "khoshzaban1992"

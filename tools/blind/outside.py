@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 from tools.blind import outside_readings, outside_steps
 
 Draw = Callable[[Machine, np.random.Generator], tuple[str, dict[str, float]]]

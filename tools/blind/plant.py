@@ -10,12 +10,12 @@ from scipy.signal import lsim, lti
 
 from hydrotele.hydraulics.circuit import circuit_scratch
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.log import Log
-from hydrotele.machine import Machine
-from hydrotele.noise import sensor_set
-from hydrotele.run import Run, run_scenario
-from hydrotele.scenario import PlantedEffect, Scenario
-from hydrotele.sensors import SensorError
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import sensor_set
+from hydrotele.machine.sensors import SensorError
+from hydrotele.run.run import Run, run_scenario
+from hydrotele.scenario.scenario import PlantedEffect, Scenario
 from hydrotele.simulate.readout import state_supply
 from hydrotele.simulate.sensors import measure
 from tools.blind.draw import Planted

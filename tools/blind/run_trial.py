@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from tools.blind.trials import Place, write_json
 
 ROOT = Path(__file__).resolve().parents[2]

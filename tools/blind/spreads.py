@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.machine import Machine
+from hydrotele.machine.machine import Machine
 
 Rng = np.random.Generator
 Values = dict[str, float]

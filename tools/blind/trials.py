@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.output import replacing
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import replacing
 
 CLASSES = ("single", "double", "clean", "outside")
 

@@ -10,10 +10,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hydrotele.log import Log
-from hydrotele.machine import Machine
-from hydrotele.noise import noise_rms, sensor_set
-from hydrotele.sensors import SensorError
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import noise_rms, sensor_set
+from hydrotele.machine.sensors import SensorError
 from hydrotele.simulate.drive_side import flexible_axes
 from hydrotele.simulate.past import Past
 from hydrotele.simulate.plant import Plant, build_plant, initial_state

@@ -6,7 +6,7 @@ variables, with and without switching, play (hysteresis) and a window of time.
 
 import numpy as np
 
-from hydrotele.machine import Machine as Facts
+from hydrotele.machine.machine import Machine as Facts
 from tools.blind.world import TARGETS, VARIABLES, Added, Machine
 
 _WAVES = 6

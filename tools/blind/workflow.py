@@ -12,10 +12,10 @@ import json
 import math
 import resource
 
-from hydrotele.dataset.load import load_dataset
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.gap_json import gap_document
-from hydrotele.machine_file import load_machine
+from hydrotele.logs.load import load_dataset
+from hydrotele.machine.machine_file import load_machine
 from tools.blind.open_loop import HORIZON, open_loop_error
 
 

@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from hydrotele import signals
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.log import Log
-from hydrotele.machine import Machine as Facts
-from hydrotele.noise import noise_rms, sensor_set
+from hydrotele.logs.log import Log
+from hydrotele.machine import signals
+from hydrotele.machine.machine import Machine as Facts
+from hydrotele.machine.noise import noise_rms, sensor_set
 from tools.blind.motions import RATE, motions
 from tools.blind.world import (
     PA,

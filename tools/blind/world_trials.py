@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.effects.payload import PAYLOAD
-from hydrotele.errors import InputError
-from hydrotele.machine import Machine as Facts
-from hydrotele.machine_file import load_machine
-from hydrotele.prediction.calibration import numbers as uncertain_numbers
+from hydrotele.estimate.calibration import numbers as uncertain_numbers
+from hydrotele.machine.machine import Machine as Facts
+from hydrotele.machine.machine_file import load_machine
 from tools.blind.forms import FORMS
 from tools.blind.generate import key_hash, write_logs
 from tools.blind.spreads import draw_library_effect, log_uniform, off_everywhere

@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from hydrotele.datafile import suggest
-from hydrotele.errors import InputError
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
 from hydrotele.tasks.controllers.controller import Controller, Random, Zero
 from hydrotele.tasks.controllers.grade import grade_controller
 from hydrotele.tasks.controllers.place import place_controller

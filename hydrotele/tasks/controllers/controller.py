@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.tasks.facts import Setup
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.operate.resolved_motion import COORDINATES
+from hydrotele.control.resolved_motion import COORDINATES
 from hydrotele.tasks.controllers.controller import Controller, columns, step_time
 from hydrotele.tasks.controllers.pose_follower import PoseFollower
 from hydrotele.tasks.facts import Setup

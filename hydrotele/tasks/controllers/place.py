@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from hydrotele.operate.resolved_motion import arm_facts
+from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.tasks.controllers.controller import Controller, columns, position_columns, step_time
 from hydrotele.tasks.controllers.rows import inverse_rows
 from hydrotele.tasks.controllers.track import Asked

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.operate.resolved_motion import COORDINATES, arm_facts
+from hydrotele.control.resolved_motion import COORDINATES, arm_facts
 from hydrotele.tasks.controllers.controller import columns, position_columns, step_time
 from hydrotele.tasks.controllers.rows import inverse_rows
 from hydrotele.tasks.controllers.track import Asked

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.errors import InputError
+from hydrotele.core.errors import InputError
 from hydrotele.tasks.controllers.controller import Controller, columns
 from hydrotele.tasks.facts import Setup
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from hydrotele.compiled import compiled
+from hydrotele.control.drive_rows import drive_row
+from hydrotele.control.servo import servo_step
+from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward, task_inverse
-from hydrotele.operate.drive_rows import drive_row
-from hydrotele.operate.servo import servo_step
 
 
 @compiled
@@ -15,8 +15,8 @@ def servo_rows(
     """Commands of n episodes by the joint servo.
 
     Args:
-        numbers: (k, 14) of `operate.servo.servo_numbers`.
-        grid: (k, 2) of `operate.drive_rows.drive_tables`.
+        numbers: (k, 14) of `control.servo.servo_numbers`.
+        grid: (k, 2) of `control.drive_rows.drive_tables`.
         table: (k, POINTS, 3) of the same.
         reference: (n, k) [rad] or [m].
         rate_ahead: (n, k) wanted rates, ahead by the spool's lag [rad/s] or [m/s].
@@ -31,7 +31,7 @@ def servo_rows(
     Returns:
         Nothing.
 
-    Source: `operate.servo.servo_step`.
+    Source: `control.servo.servo_step`.
     """
     k = len(numbers)
     closed, none = np.ones(k), np.zeros(k)

@@ -6,7 +6,7 @@ slews on its oil is slower still.
 
 import numpy as np
 
-from hydrotele.operate.resolved_motion import COORDINATES, arm_facts
+from hydrotele.control.resolved_motion import COORDINATES, arm_facts
 from hydrotele.tasks.controllers.controller import Controller, columns, position_columns
 from hydrotele.tasks.controllers.rows import inverse_rows
 from hydrotele.tasks.controllers.valve_law import ValveLaw

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from hydrotele.errors import InputError
-from hydrotele.operate.resolved_motion import COORDINATES, arm_facts
-from hydrotele.scenario import Servo
+from hydrotele.control.resolved_motion import COORDINATES, arm_facts
+from hydrotele.core.errors import InputError
+from hydrotele.scenario.scenario import Servo
 from hydrotele.tasks.controllers.controller import (
     Controller,
     columns,

@@ -1,15 +1,15 @@
 """Valve commands that make axes follow references: the joint servo with an integral, at env rate.
 
 Feedforward of the drive's velocity through the flow gain at the measured pressures, compensation of
-the dead band, position feedback, dynamic pressure feedback (`operate.servo`); the integral takes
+the dead band, position feedback, dynamic pressure feedback (`control.servo`); the integral takes
 out what the nominal machine does not know: leakage, other dead bands and flow gains.
 """
 
 import numpy as np
 
-from hydrotele.operate.drive_rows import drive_tables
-from hydrotele.operate.servo import servo_numbers
-from hydrotele.scenario import Servo
+from hydrotele.control.drive_rows import drive_tables
+from hydrotele.control.servo import servo_numbers
+from hydrotele.scenario.scenario import Servo
 from hydrotele.tasks.controllers.controller import columns, position_columns, step_time
 from hydrotele.tasks.controllers.rows import servo_rows
 from hydrotele.tasks.facts import Setup

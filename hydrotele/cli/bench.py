@@ -1,0 +1,207 @@
+"""`hydrotele bench`: what a step, a scenario, a batch and a start cost, all from one process."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from hydrotele.cli.console import notes, out, print_json, table
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_json
+from hydrotele.core.output import replacing
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
+from hydrotele.simulate.mechanism import assemble, mjcf_document
+from hydrotele.simulate.native import stop_profiling_clock
+from hydrotele.simulate.plant import Plant, build_plant, rest_state
+
+STEPS = 1000
+SIMULATIONS = 256
+TELEOPERATED = ("joystick_up", "press_stiffness", "feller_steps")
+COMMAND = (0.2, 0.1, -0.1)
+_SHORT_RUN = ("run", "excitation", "--set", "duration=1.0", "--no-review")
+
+
+def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json: bool) -> None:
+    """Measure, print, and save or compare.
+
+    Args:
+        save: file for the figures, or None.
+        compare: file with earlier figures, or None.
+        quick: fewer repetitions.
+        as_json: print JSON only.
+
+    Raises:
+        InputError: the file to compare with cannot be read.
+    """
+    earlier = _read(compare) if compare else None
+    if save and not save.parent.is_dir():
+        raise InputError(save, f"cannot be written: {save.parent} is not a folder")
+    figures = measure(5 if quick else 25)
+    if save:
+        with replacing(save, ".json") as part:
+            part.write_text(json.dumps(figures, indent=2) + "\n")
+    if as_json:
+        print_json(figures)
+        return
+    _print(figures, earlier)
+
+
+def measure(repeats: int) -> dict:
+    """All figures; times are the best of several turns, so that ratios hold.
+
+    Args:
+        repeats: number of turns; six times as many for `ratio`.
+
+    Returns:
+        mechanism_us, hydraulics_us, ratio, scenario_realtime_factor, teleoperation_realtime_factor
+        by scenario, batch_steps_per_s by thread count, batch_scaling, help_s, run_s.
+    """
+    stop_profiling_clock()
+    notes.print("mechanism with and without hydraulics ...", style="dim")
+    plant = build_plant(load_machine("cat215", "none"))
+    bare, full = best_of(6 * repeats, [_bare_stepper(plant), _full_stepper(plant)])
+    notes.print("whole scenario ...", style="dim")
+    factor = max(_scenario_factor() for _ in range(max(2, repeats // 2)))
+    notes.print("teleoperation ...", style="dim")
+    turns = max(2, repeats // 2)
+    teleoperated = {
+        name: round(max(_teleoperation_factor(name) for _ in range(turns)), 1)
+        for name in TELEOPERATED
+    }
+    notes.print("batches ...", style="dim")
+    one, two = best_of(max(3, repeats), [_batch_stepper(plant, n) for n in (1, 2)])
+    notes.print("start-up ...", style="dim")
+    steps = SIMULATIONS * STEPS / 5
+    return {
+        "mechanism_us": round(bare / STEPS * 1e6, 3),
+        "hydraulics_us": round(full / STEPS * 1e6, 3),
+        "ratio": round(full / bare, 4),
+        "scenario_realtime_factor": round(factor, 1),
+        "teleoperation_realtime_factor": teleoperated,
+        "batch_steps_per_s": {"1": round(steps / one), "2": round(steps / two)},
+        "batch_scaling": round(one / two, 3),
+        "help_s": round(min(_start("--help") for _ in range(3)), 3),
+        "run_s": round(min(_start(*_SHORT_RUN) for _ in range(2)), 3),
+    }
+
+
+def best_of(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:
+    """Shortest time of each job [s], the jobs taken in turns."""
+    best = [float("inf")] * len(jobs)
+    for _ in range(repeats):
+        best = [min(b, job()) for b, job in zip(best, jobs, strict=True)]
+    return best
+
+
+def _full_stepper(plant: Plant) -> Callable[[], float]:
+    start = rest_state(plant)
+    start.ctrl[:] = COMMAND
+    return _stepper(plant.model, start)
+
+
+def _bare_stepper(plant: Plant) -> Callable[[], float]:
+    """The same mechanism without any actuator, coasting without gravity."""
+    root = assemble(plant.machine, plant.model.opt.timestep, plant.ground, looks=False)
+    for actuator in root.find_all("actuator"):
+        actuator.remove()
+    model = mjcf_document(root).compile()
+    model.opt.gravity[:] = 0.0
+    start = rest_state(plant)
+    start.qvel[plant.dof[0]] = 0.1
+    return _stepper(model, start)
+
+
+def _stepper(model: mujoco.MjModel, start: mujoco.MjData) -> Callable[[], float]:
+    data = mujoco.MjData(model)
+
+    def job() -> float:
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = start.qpos, start.qvel
+        if model.nu:
+            data.ctrl[:], data.act[:] = start.ctrl, start.act
+        begin = time.perf_counter()
+        mujoco.mj_step(model, data, nstep=STEPS)
+        return time.perf_counter() - begin
+
+    return job
+
+
+def _batch_stepper(plant: Plant, threads: int) -> Callable[[], float]:
+    start = rest_state(plant)
+    batch = Batch(plant.model, SIMULATIONS, nthread=threads)
+    commands = np.random.default_rng(0).uniform(-0.3, 0.3, (SIMULATIONS, plant.model.nu))
+
+    def job() -> float:
+        batch.qpos[:], batch.qvel[:], batch.act[:] = start.qpos, start.qvel, start.act
+        batch.ctrl[:] = commands
+        begin = time.perf_counter()
+        batch.step(nstep=STEPS // 5)
+        return time.perf_counter() - begin
+
+    return job
+
+
+def _scenario_factor() -> float:
+    """Real-time factor of the excitation scenario with control, sensors and log, all included."""
+    scenario = load_scenario("excitation")
+    begin = time.perf_counter()
+    run_scenario(scenario)
+    return scenario.duration / (time.perf_counter() - begin)
+
+
+def _teleoperation_factor(name: str) -> float:
+    """Real-time factor of the loop: machine, joystick, hand, line, control, sensors."""
+    return run_scenario(load_scenario(name)).summary["realtime_factor"]
+
+
+def _start(*arguments: str) -> float:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "hydrotele.cli", *arguments]
+        if arguments[0] == "run":
+            command += ["--out", f"{folder}/run"]
+        begin = time.perf_counter()
+        subprocess.run(command, check=True, capture_output=True)
+        return time.perf_counter() - begin
+
+
+def _read(path: Path) -> dict:
+    try:
+        figures = read_json(path)
+        if not isinstance(figures, dict) or "ratio" not in figures:
+            raise ValueError("it has no ratio")
+    except ValueError as error:
+        raise InputError(path, f"is no saved benchmark: {error}") from None
+    return figures
+
+
+def _flat(figures: dict) -> dict[str, float]:
+    flat = {}
+    for key, value in figures.items():
+        if isinstance(value, dict):
+            flat |= {f"{key}.{k}": v for k, v in value.items()}
+        else:
+            flat[key] = value
+    return flat
+
+
+def _print(figures: dict, earlier: dict | None) -> None:
+    columns = ["figure", "now", *(["earlier", "now / earlier"] if earlier else [])]
+    rows = table("hydrotele bench", *columns)
+    before = _flat(earlier) if earlier else {}
+    for key, value in _flat(figures).items():
+        cells = [key, f"{value:,}"]
+        if earlier:
+            old = before.get(key)
+            cells += [f"{old:,}", f"{value / old:.3f}"] if old else ["-", "-"]
+        rows.add_row(*cells)
+    out.print(rows)

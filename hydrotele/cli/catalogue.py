@@ -1,0 +1,303 @@
+"""`hydrotele list`, `validate` and `export`: what there is, and whether a file is right."""
+
+from pathlib import Path
+
+from rich.markup import escape
+
+from hydrotele.cli.console import notes, out, print_json, table
+from hydrotele.core.datafile import read_yaml, suggest
+from hydrotele.core.errors import InputError
+from hydrotele.machine.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
+from hydrotele.machine.machine_file import load_machine, machine_path, shipped_machines
+from hydrotele.simulate.document import Mjcf
+
+_KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environments")
+
+
+def list_things(what: str, as_json: bool) -> None:
+    """List machines, joysticks, scenarios, sweeps, effects, environments, or all of them.
+
+    Raises:
+        InputError: there is no such list.
+    """
+    if what not in (*_KINDS, "all"):
+        raise InputError(f"list {what}", suggest(what, [*_KINDS, "all"]))
+    wanted = _KINDS if what == "all" else (what,)
+    tables = {
+        "machines": _machines, "joysticks": _joysticks, "scenarios": _scenarios,
+        "sweeps": _sweeps, "effects": _effects, "environments": _environments,
+    }  # fmt: skip
+    data = {kind: tables[kind]() for kind in wanted}
+    if as_json:
+        print_json(data if what == "all" else data[what])
+        return
+    for kind, rows in data.items():
+        columns = list(rows[0]) if rows else ["name"]
+        shown = table(kind, *columns)
+        for column in shown.columns:
+            column.justify = "left"
+        for row in rows:
+            shown.add_row(*(_cell(row[c]) for c in columns))
+        out.print(shown)
+
+
+def _cell(value) -> str:
+    if isinstance(value, dict):
+        return escape(
+            ", ".join(
+                f"{n} [{p['unit']}] {p['low']:.4g} .. {p['high']:.4g}" for n, p in value.items()
+            )
+        )
+    return ", ".join(value) if isinstance(value, list) else str(value)
+
+
+def _machines() -> list[dict]:
+    rows = []
+    for name in shipped_machines():
+        data, _ = read_yaml(machine_path(name))
+        tools = list(data.get("tools") or ["none"])
+        axes = list(data.get("axes") or {})
+        rows.append(
+            {"name": name, "axes": axes, "tools": tools, "description": data.get("description", "")}
+        )
+    return rows
+
+
+def _joysticks() -> list[dict]:
+    found = map(load_joystick, shipped_joysticks())
+    return [{"name": j.name, "gains": list(j.gains), "description": j.description} for j in found]
+
+
+def _scenarios() -> list[dict]:
+    from hydrotele.scenario.scenario import scenario_path, shipped_scenarios
+
+    rows = []
+    for name in shipped_scenarios():
+        data, _ = read_yaml(scenario_path(name))
+        keys = ("machine", "tool", "duration", "description")
+        rows.append({"name": name, **{k: data.get(k, "") for k in keys}})
+    return rows
+
+
+def _sweeps() -> list[dict]:
+    from hydrotele.sweep.facts import load_sweep, shipped_sweeps
+
+    rows = []
+    for name in shipped_sweeps():
+        sweep = load_sweep(name).sweep
+        facts = {"runs": sweep.runs, "scenario": sweep.scenario, "keys": list(sweep.varied)}
+        rows.append({"name": name, **facts, "description": sweep.description})
+    return rows
+
+
+def _effects() -> list[dict]:
+    """Effects at the first shipped machine that has a place for them; ranges at the last of these.
+
+    The CAT 215 with bucket comes before all others.
+    """
+    from hydrotele.effects import EFFECTS
+
+    names = [n for n in shipped_machines() if n != "cat215"]
+    machines = [load_machine("cat215", "bucket"), *map(load_machine, names)]
+    rows = []
+    for effect in EFFECTS.values():
+        machine = next((m for m in machines if effect.locations(m)), machines[0])
+        places = effect.locations(machine)
+        numbers = effect.parameters(machine, places[-1]) if places else {}
+        rows.append(
+            {
+                "name": effect.name,
+                "what": effect.sentence,
+                "machine": machine.name if places else "",
+                "locations": list(places),
+                "parameters": {
+                    n: {"unit": p.unit, "low": p.low, "high": p.high, "optional": p.optional}
+                    for n, p in numbers.items()
+                },
+            }
+        )
+    return rows
+
+
+def _environments() -> list[dict]:
+    """Gymnasium environments."""
+    from hydrotele.tasks.catalogue import TASKS
+
+    return [
+        {
+            "name": f"hydrotele/{task.name}-v0",
+            "machine": f"{task.machine}, {task.tool or 'its first tool'}",
+            "what": task.sentence,
+            "reward": task.reward,
+        }
+        for task in TASKS.values()
+    ]
+
+
+def validate_files(paths: list[Path], as_json: bool) -> None:
+    """Check machines with all their tools, joysticks, scenarios, sweeps and logs; say what each is.
+
+    Raises:
+        InputError: something is wrong; all files have been reported by then.
+    """
+    checked: list[dict] = []
+    wrong: list[InputError] = []
+    for path in paths:
+        try:
+            kind, said = _validate(path)
+            checked.append({"file": str(path), "kind": kind, "valid": True, "contents": said})
+            if not as_json:
+                out.print(f"[green]valid[/] {kind} {path}: {said}", soft_wrap=True)
+        except InputError as error:
+            checked.append({"file": str(path), "valid": False, "error": str(error)})
+            wrong.append(error)
+    if as_json:
+        print_json(checked)
+    for error in wrong[:-1]:
+        notes.print(f"error {error}", markup=False, soft_wrap=True)
+    if wrong:
+        raise wrong[-1]
+
+
+def _validate(path: Path) -> tuple[str, str]:
+    if path.suffix.lower() in (".parquet", ".csv"):
+        from hydrotele.logs.log import load_log
+
+        log = load_log(path)
+        return "log", f"{len(log)} rows at {log.rate:g} Hz, {len(log.columns)} columns"
+    if path.is_dir() and (path / "summary.json").is_file():
+        return _validate(path / "measured.parquet")
+    from hydrotele.scenario.scenario import load_scenario, shipped_scenarios
+
+    name = str(path)
+    if _is_joystick(path):
+        return "joystick", _check_joystick(path)
+    if path.is_dir() or name in shipped_machines():
+        return "machine", _check_machine(path)
+    if name in shipped_scenarios() or (path.is_file() and "pilot" in read_yaml(path)[0]):
+        return "scenario", _check_scenario(load_scenario(path))
+    if name in _sweep_names() or (path.is_file() and "scenario" in read_yaml(path)[0]):
+        return "sweep", _check_sweep(path)
+    if path.is_file():
+        return "machine", _check_machine(path)
+    names = [*shipped_machines(), *shipped_joysticks(), *shipped_scenarios(), *_sweep_names()]
+    message = "is no file, machine, joystick, scenario or sweep"
+    raise InputError(path, f"{message}; {suggest(name, names)}")
+
+
+def _sweep_names() -> list[str]:
+    from hydrotele.sweep.facts import shipped_sweeps
+
+    return shipped_sweeps()
+
+
+def _check_sweep(path: Path) -> str:
+    from hydrotele.sweep.checking import check_points, open_base
+    from hydrotele.sweep.facts import load_sweep
+
+    file = load_sweep(path)
+    check_points(open_base(file))
+    varied = ", ".join(file.sweep.varied) or "seed"
+    return f"{file.sweep.runs} runs of {file.sweep.scenario}, varied: {varied}"
+
+
+def _is_joystick(path: Path) -> bool:
+    """Whether a name, folder or file is that of a joystick."""
+    if str(path) in shipped_joysticks() or (path / JOYSTICK_FILE).is_file():
+        return True
+    return path.suffix in (".yaml", ".yml") and path.is_file() and "flotor" in read_yaml(path)[0]
+
+
+def _check_joystick(path: Path) -> str:
+    import numpy as np
+
+    from hydrotele.teleop.levitation import fly
+
+    joystick = load_joystick(path)
+    flight = fly(joystick, np.zeros((round(joystick.control_rate), 6)))
+    far = np.abs(flight.pose[:, :3]).max()
+    if far > 0.1 * joystick.workspace.translation:
+        raise InputError(path, f"its flotor does not hover: it moves by {1e3 * far:.1f} mm in 1 s")
+    current, most = np.abs(flight.currents[-1]).max(), joystick.coils.max_current
+    return f"hovers with {current:.2f} of {most:g} A; gains {', '.join(joystick.gains)}"
+
+
+def _check_machine(path: Path) -> str:
+
+    from hydrotele.kinematics.from_machine import axis_linkage, check_strokes
+    from hydrotele.simulate.plant import build_plant, rest_state
+
+    first = load_machine(path)
+    for tool in first.tools:
+        machine = load_machine(path, tool)
+        plant = build_plant(machine)
+        rest_state(plant)
+        plant.document.compile()
+        for axis in machine.axes:
+            axis_linkage(machine, axis)
+        check_strokes(machine)
+    tools = "" if first.tools == ("none",) else f", tools {', '.join(first.tools)}"
+    return f"axes {', '.join(first.axes)}{tools}; all assemble and stand at rest at home"
+
+
+def _check_scenario(scenario) -> str:
+    from hydrotele.run.run import prepare
+
+    plan = prepare(scenario).plan
+    notes_ = f"; {'; '.join(plan.notes)}" if plan.notes else ""
+    return f"{scenario.duration:g} s of {scenario.machine}, {scenario.pilot.kind} pilot{notes_}"
+
+
+def export_machine(
+    name: str, tool: str | None, target: Path | None, picture: Path | None, camera: str
+) -> None:
+    """Write a machine's or joystick's complete MJCF (default: to stdout), or a picture of it.
+
+    Raises:
+        InputError: it is not usable, or pictures cannot be rendered here.
+    """
+    if _is_joystick(Path(name)):
+        if tool:
+            raise InputError("--tool", f"the joystick {name} has no tools")
+        _export_joystick(name, target, picture, camera)
+        return
+    machine = load_machine(name, tool)
+    if picture:
+        from hydrotele.show.picture import render_picture
+
+        render_picture(machine, picture, camera=camera)
+        notes.print(f"written to {picture}")
+        return
+    from hydrotele.simulate.plant import build_plant
+
+    _write(build_plant(machine).document, target)
+
+
+def _export_joystick(name: str, target: Path | None, picture: Path | None, camera: str) -> None:
+    import mujoco
+
+    from hydrotele.simulate.joystick import joystick_spec
+
+    spec = joystick_spec(load_joystick(name), hand=False)
+    model = spec.compile()
+    if not picture:
+        _write(Mjcf(name, spec.to_xml(), {}), target)
+        return
+    from hydrotele.show.picture import render_model
+
+    render_model(model, mujoco.MjData(model), picture, camera)
+    notes.print(f"written to {picture}")
+
+
+def _write(document: Mjcf, target: Path | None) -> None:
+    from hydrotele.core.output import replacing
+
+    if target:
+        with replacing(target, ".xml") as part:
+            document.save(part, target)
+        notes.print(f"written to {target}")
+    elif document.assets:
+        message = f"needs {len(document.assets)} files beside it: give --out FILE.xml"
+        raise InputError("the MJCF", message)
+    else:
+        print(document.text)

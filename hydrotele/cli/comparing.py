@@ -1,0 +1,318 @@
+"""`hydrotele compare`: how well machines and black boxes predict runs on the commands alone."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import hydrotele
+from hydrotele.cli.console import notes, out, plain, print_json, stages, table
+from hydrotele.cli.opening import machine_of
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import check_target, whole_folder
+from hydrotele.dynamics.model import predicted_channels
+from hydrotele.estimate.baselines import BASELINES, fit_baseline
+from hydrotele.estimate.free_run import (
+    TO_THE_END,
+    Prepare,
+    RunErrors,
+    chained,
+    free_run_errors,
+    machine_runner,
+)
+from hydrotele.gap.customary import customary
+from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.logs.load import Dataset, RunData, load_dataset
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import MACHINE_FILE
+from hydrotele.machine.signals import usual_unit
+from hydrotele.simulate.native import stop_profiling_clock
+
+_MADE = ("patched", "identified")  # where `gap` and `identify` put the machine in their folders
+_PICTURED, _MOST_PLOTS = 120.0, 12  # s of a run, and channels, that fit into a picture
+_ROW_BY_ROW = "one row"
+
+
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """One model along the judged runs.
+
+    Attributes:
+        name: as the user gave it.
+        kind: `machine` or `baseline`.
+        runs: its errors, run by run.
+        pictured: (n, c) its free runs along the first of them.
+    """
+
+    name: str
+    kind: str
+    runs: tuple[RunErrors, ...]
+    pictured: np.ndarray
+
+    def mean(self, horizon: str) -> np.ndarray:
+        """(c,) RMS errors of a horizon, or of `_ROW_BY_ROW`, mean over the runs that have it."""
+        if horizon == _ROW_BY_ROW:
+            found = [errors.one_step for errors in self.runs]
+        else:
+            found = [e.horizons[horizon].rms for e in self.runs if horizon in e.horizons]
+        columns = [column[~np.isnan(column)] for column in np.array(found).T]
+        return np.array([column.mean() if len(column) else math.nan for column in columns])
+
+    def count(self, horizon: str) -> tuple[int, int]:
+        """Windows of a horizon that left the machine's range, and all of them."""
+        found = [e.horizons[horizon] for e in self.runs if horizon in e.horizons]
+        return sum(h.diverged for h in found), sum(h.windows for h in found)
+
+
+def compare_models(
+    machines: Sequence[str], data: Sequence[Path], tool: str | None, heldout: str | None,
+    sensors: str | None, horizons: Sequence[float], baselines: Sequence[str], every: bool,
+    target: Path | None, as_json: bool, force: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Compare models on runs that they were not fitted to.
+
+    Args:
+        machines: names, folders, or folders of `gap` and `identify`; the first one says which
+            channels count.
+        data: log files, folders of logs, run folders.
+        tool: the machines' tool, None for the logs'.
+        heldout: name of the run to judge on, None to choose.
+        sensors: name of the machines' sensors, None for those that the logs name.
+        horizons: of the free runs [s].
+        baselines: names of black boxes, which are fitted on the other runs.
+        every: judge on the fitted runs, too.
+        target: folder for compare.json and the picture, None to write nothing.
+        as_json: print JSON instead of tables.
+        force: accept logs whose metadata name another machine or tool.
+
+    Returns:
+        The document that is printed or written.
+
+    Raises:
+        InputError: data, machines, horizons, baselines or target are not usable.
+    """
+    for name in baselines:
+        if name not in BASELINES:
+            raise InputError(f"--baseline {name}", f"is not known; {suggest(name, BASELINES)}")
+    if target is not None:
+        check_target(target, "compare")
+    stop_profiling_clock()
+    named = {name: machine_of(data, machine_place(name), tool) for name in machines}
+    dataset = load_dataset(
+        list(data), next(iter(named.values())), sensors, heldout, force=force
+    )  # fmt: skip
+    for name, machine in named.items():
+        _check_fits(name, machine, dataset)
+    judged = [*dataset.fit, dataset.heldout] if every else [dataset.heldout]
+    _check_horizons(horizons, judged)
+    with stages("compare", as_json) as progress:
+        compared = _compare(named, baselines, dataset, judged, horizons, progress)
+    shown = _shown_horizons(compared)
+    document = compare_document(compared, shown, dataset, data)
+    if target is not None:
+        with whole_folder(target, "compare") as folder:
+            _write(folder, document, compared, dataset, judged[0], _pictured(horizons, judged[0]))
+    if as_json:
+        print_json(document)
+    else:
+        _print(compared, shown, dataset, judged)
+        if target is not None:
+            out.print(f"written to [bold]{target}[/]")
+    return document
+
+
+def machine_place(name: str) -> str:
+    """A machine's name or folder; of a folder of `gap` or `identify`, the machine that it made."""
+    for inside in _MADE:
+        if (Path(name) / inside / MACHINE_FILE).is_file():
+            return str(Path(name) / inside)
+    return name
+
+
+def compare_document(
+    compared: Sequence[Compared], shown: Sequence[str], dataset: Dataset, data: Sequence[Path]
+) -> dict[str, Any]:
+    """The comparison as JSON: RMS errors in SI units; null where a window left the range."""
+
+    def by_channel(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(dataset.channels, values.tolist(), strict=True))
+
+    models = []
+    for model in compared:
+        runs = [
+            {
+                "run": errors.run,
+                "one_step": by_channel(errors.one_step),
+                "horizons": {
+                    name: {
+                        "seconds": h.seconds, "windows": h.windows, "diverged": h.diverged,
+                        "rms": by_channel(h.rms), "final": by_channel(h.final),
+                        "median": by_channel(h.median),
+                    }
+                    for name, h in errors.horizons.items()
+                },
+            }
+            for errors in model.runs
+        ]  # fmt: skip
+        mean = {name: by_channel(model.mean(name)) for name in shown}
+        one_step = by_channel(model.mean(_ROW_BY_ROW))
+        models.append(
+            {"name": model.name, "kind": model.kind, "runs": runs,
+             "mean": {"one_step": one_step, "horizons": mean}}
+        )  # fmt: skip
+    return plain(
+        {
+            "machine": dataset.machine.name,
+            "data": [str(path) for path in data],
+            "fitted": [run.name for run in dataset.fit],
+            "judged": [errors.run for errors in compared[0].runs],
+            "units": {channel: usual_unit(channel) for channel in dataset.channels},
+            "models": models,
+            "notes": list(dataset.notes),
+        }
+    )
+
+
+def _compare(
+    named: dict[str, Machine], baselines: Sequence[str], dataset: Dataset,
+    judged: Sequence[RunData], horizons: Sequence[float], progress: Callable | None,
+) -> list[Compared]:  # fmt: skip
+    say = progress or (lambda said, share: None)
+    total = (len(named) + len(baselines)) * (len(judged) + 1)
+    models: list[tuple[str, str, Callable[[], Prepare]]] = [
+        (name, "machine", lambda machine=machine: machine_runner(machine, dataset))
+        for name, machine in named.items()
+    ]
+    models += [(n, "baseline", lambda n=n: fit_baseline(n, dataset)) for n in baselines]
+    compared, done = [], 0
+    for name, kind, make in models:
+        say(name, done / total)
+        prepare, errors, pictured = make(), [], np.empty(0)
+        for run in judged:
+            done += 1
+            say(f"{name} on {run.name}", done / total)
+            runner = prepare(run)
+            errors.append(free_run_errors(runner, run, horizons))
+            if run is judged[0]:
+                begin = _beginning(run)
+                pictured = chained(runner, begin, _pictured(horizons, run))
+        done += 1
+        compared.append(Compared(name, kind, tuple(errors), pictured))
+    return compared
+
+
+def _check_fits(name: str, machine: Machine, dataset: Dataset) -> None:
+    """Whether a machine predicts what the first one does, from the same commands."""
+    if tuple(actuator_order(machine)) != dataset.axes:
+        raise InputError(
+            f"machine {name}",
+            f"has the axes {', '.join(actuator_order(machine))}, the first one"
+            f" {', '.join(dataset.axes)}: compare machines with the same axes",
+        )
+    lacking = [c for c in dataset.channels if c not in predicted_channels(machine)]
+    if lacking:
+        raise InputError(f"machine {name}", f"does not predict {', '.join(lacking)}")
+
+
+def _check_horizons(horizons: Sequence[float], judged: Sequence[RunData]) -> None:
+    for seconds in horizons:
+        rows = max(run.period for run in judged)
+        if not (math.isfinite(seconds) and seconds >= rows):
+            raise InputError(
+                f"--horizons {seconds:g}", f"must be seconds, {rows:g} (one row of the log) or more"
+            )
+
+
+def _shown_horizons(compared: Sequence[Compared]) -> list[str]:
+    """Horizons that any judged run is long enough for, the shortest first."""
+    found = {name: h.seconds for m in compared for e in m.runs for name, h in e.horizons.items()}
+    return sorted(found, key=lambda name: math.inf if name == TO_THE_END else found[name])
+
+
+def _pictured(horizons: Sequence[float], run: RunData) -> float:
+    """The longest horizon that fits three times into what is pictured of a run, or a third."""
+    seconds = min(_PICTURED, len(run.reading) * run.period)
+    return max([h for h in horizons if 3.0 * h <= seconds], default=seconds / 3.0)
+
+
+def _beginning(run: RunData) -> RunData:
+    rows = slice(0, round(_PICTURED / run.period))
+    return dataclasses.replace(
+        run, command=run.command[rows], command_known=run.command_known[rows],
+        reading=run.reading[rows],
+    )  # fmt: skip
+
+
+def _write(
+    folder: Path, document: dict[str, Any], compared: Sequence[Compared], dataset: Dataset,
+    run: RunData, seconds: float,
+) -> None:  # fmt: skip
+    from hydrotele.show.compare_figures import draw_free_runs
+
+    text = json.dumps(document, indent=2, allow_nan=False)
+    (folder / "compare.json").write_text(text + "\n", encoding="utf-8")
+    notes.print("drawing free_run.png ...", style="dim")
+    begin, some = _beginning(run), slice(0, _MOST_PLOTS)
+    time = run.start + run.period * np.arange(len(begin.reading))
+    channels = dataset.channels[some]
+    picture = draw_free_runs(
+        time, begin.reading[:, some], {m.name: m.pictured[:, some] for m in compared}, channels,
+        [usual_unit(channel) for channel in channels],
+        f"{run.name}: free runs of {seconds:.3g} s, one after the other",
+    )  # fmt: skip
+    (folder / "free_run.png").write_bytes(picture)
+    summary = {
+        "kind": "compare",
+        "machine": document["machine"],
+        "data": document["data"],
+        "models": [model.name for model in compared],
+        "judged": document["judged"],
+        "hydrotele": hydrotele.__version__,
+    }
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _print(
+    compared: Sequence[Compared], shown: Sequence[str], dataset: Dataset, judged: Sequence[RunData]
+) -> None:
+    runs = ", ".join(run.name for run in judged)
+    rows = table(f"RMS errors on {runs}", "channel", "ahead", *(m.name for m in compared), "unit")
+    for c, channel in enumerate(dataset.channels):
+        errors = {h: [m.mean(h)[c] for m in compared] for h in (_ROW_BY_ROW, *shown)}
+        finite = [e for row in errors.values() for e in row if math.isfinite(e)]
+        unit, factor = customary(usual_unit(channel), max(finite, default=math.nan))
+        for horizon, row in errors.items():
+            cells = [_cell(m, horizon, e * factor) for m, e in zip(compared, row, strict=True)]
+            best = min((e for e in row if math.isfinite(e)), default=math.nan)
+            cells = [f"[bold]{cell}[/]" if e == best and len(row) > 1 else cell
+                     for cell, e in zip(cells, row, strict=True)]  # fmt: skip
+            first = channel if horizon == _ROW_BY_ROW else ""
+            rows.add_row(first, _ahead(horizon), *cells, unit, end_section=horizon == shown[-1])
+    out.print(rows)
+    fitted = [m.name for m in compared if m.kind == "baseline"]
+    if fitted:
+        trained = ", ".join(run.name for run in dataset.fit)
+        out.print(f"{', '.join(fitted)}: fitted on {trained}")
+    for note in dataset.notes:
+        out.print(f"[yellow]note[/] {note}")
+
+
+def _ahead(horizon: str) -> str:
+    if horizon in (_ROW_BY_ROW, TO_THE_END):
+        return {_ROW_BY_ROW: _ROW_BY_ROW, TO_THE_END: "to the end"}[horizon]
+    return f"{horizon} s"
+
+
+def _cell(model: Compared, horizon: str, error: float) -> str:
+    """An error in customary units, or how many windows left the machine's range."""
+    if math.isnan(error):
+        return "-"
+    if math.isinf(error):
+        gone, windows = model.count(horizon)
+        return f"diverged in {gone} of {windows}" if windows else "diverged"
+    return f"{error:.3g}"

@@ -1,0 +1,175 @@
+"""`hydrotele drive`: a person drives a machine, into a folder like a run's."""
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from hydrotele.cli.console import notes, out, print_json
+from hydrotele.cli.running import print_summary, write_run
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import check_target, whole_folder
+from hydrotele.devices.choose import open_device
+from hydrotele.devices.keyboard import Keyboard
+from hydrotele.devices.reading import Device
+from hydrotele.run.live import Pacer, Status, Watch, drive, further_axes
+from hydrotele.run.run import Run, scenario_machine
+from hydrotele.run.session import Session
+from hydrotele.scenario.scenario import Scenario, load_scenario
+from hydrotele.simulate.closure import following_joints
+from hydrotele.simulate.native import stop_profiling_clock
+
+LONGEST = 600.0  # s of a drive without --duration
+_FRAMES, _LINES = 30.0, 5.0  # Hz of window and status line
+
+
+class Wishes(NamedTuple):
+    """What the command line asks for."""
+
+    scenario: str | None
+    overrides: dict[str, str]
+    device: str
+    target: Path | None
+    viewer: bool
+    duration: float | None
+    speed: float
+    review: bool
+    json: bool
+
+
+def drive_to_folder(wishes: Wishes) -> Path:
+    """Drive a machine live and write everything into a folder, whole or not at all.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: scenario, device, screen or target are not usable.
+        SimulationFailed: the simulation left the finite numbers.
+    """
+    stop_profiling_clock()
+    if not wishes.speed >= 0.0:
+        raise InputError("--speed", "must be 0 (as fast as it goes) or more; 1 is real time")
+    if wishes.device == "keyboard" and not wishes.viewer:
+        message = "reads the keys of the viewer's window; leave out --no-viewer, or choose another"
+        raise InputError("--device keyboard", message)
+    scenario = _scenario(wishes)
+    target = wishes.target or Path("runs", scenario.name)
+    check_target(target, "run")
+    machine = scenario_machine(scenario)
+    device = open_device(wishes.device, tuple(further_axes(machine)))
+    pacer = Pacer(wishes.speed)
+    try:
+        with first_interrupt() as interrupted, _watching(wishes, device, interrupted) as watch:
+            result = drive(scenario, machine, device, pacer, watch, _say)
+    finally:
+        device.close()
+    _write(result, target, wishes)
+    return target
+
+
+def _write(result: Run, target: Path, wishes: Wishes) -> None:
+    with whole_folder(target, "run") as folder:
+        write_run(result, folder, wishes.review)
+    if wishes.json:
+        print_json({**result.summary, "folder": str(target)})
+        return
+    print_summary(result.summary)
+    if result.summary["pauses"]:
+        said = f"{result.summary['late_seconds']:.2f} s in {result.summary['pauses']} pauses"
+        out.print(f"[yellow]note[/] it could not keep up with real time: {said}")
+    out.print(f"written to [bold]{target}[/]; its scenario.yaml repeats it in hydrotele run")
+
+
+def _scenario(wishes: Wishes) -> Scenario:
+    """The scenario that is named, or the usual one of the machine."""
+    overrides, name = dict(wishes.overrides), wishes.scenario
+    duration = LONGEST if wishes.duration is None else wishes.duration
+    if name is None:
+        own = _usual(overrides.get("machine", "cat215").strip('"'))
+        name = str(own or _usual("cat215"))
+        if own is None:  # a machine of the user's: what is known of none but cat215 is left out
+            overrides = {"tool": "null", "sensors": "ideal", "servo": "{}"} | overrides
+    overrides["duration"] = repr(duration)
+    scenario = load_scenario(name, overrides)
+    if wishes.scenario is None and "pilot.force" not in overrides and _loose(scenario):
+        overrides |= {"pilot.force": '"true"', "sensors": "ideal"}
+        scenario = load_scenario(name, overrides)
+    return scenario
+
+
+def _loose(scenario: Scenario) -> list[str]:
+    """Joints that hang freely: with such, pressures do not tell the force at the tip."""
+    machine = scenario_machine(scenario)
+    known = {axis.joint for axis in machine.axes.values()} | set(following_joints(machine))
+    return [joint for joint in machine.joints if joint not in known]
+
+
+def _usual(machine: str) -> Path | None:
+    path = Path(__file__).with_name(f"drive_{machine}.yaml")
+    return path if "/" not in machine and path.is_file() else None
+
+
+def _say(sentence: str) -> None:
+    if notes.is_terminal:
+        notes.file.write("\r\x1b[K")  # the status line gives way
+    notes.print(f"[yellow]{sentence}[/]", soft_wrap=True)
+
+
+@contextlib.contextmanager
+def first_interrupt() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C only sets what this yields; the second one interrupts as usual."""
+    seen: list[bool] = []
+
+    def note(number, frame) -> None:
+        if seen:
+            raise KeyboardInterrupt
+        seen.append(True)
+
+    try:
+        before = signal.signal(signal.SIGINT, note)
+    except ValueError:  # not in the main thread, where no signals come
+        yield lambda: False
+        return
+    try:
+        yield lambda: bool(seen)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _watching(wishes: Wishes, device: Device, interrupted: Callable[[], bool]) -> Iterator[Watch]:
+    """Window and status line of a drive; opened with the first tick."""
+    from hydrotele.show.window import Window, check_screen
+
+    if wishes.viewer:
+        check_screen()
+    lines = notes.is_terminal and not wishes.json
+    window: list[Window] = []
+    due = [0.0, 0.0]
+
+    def watch(session: Session, status: Callable[[], Status], now: float) -> bool:
+        if interrupted():
+            return False
+        if wishes.viewer and now >= due[0]:
+            due[0] = now + 1.0 / _FRAMES
+            if not window:
+                pressed = device.press if isinstance(device, Keyboard) else None
+                window.append(Window(session.plant, pressed))
+            if not window[0].show(session.data.qpos, status().rows()):
+                return False
+        if lines and now >= due[1]:
+            due[1] = now + 1.0 / _LINES
+            notes.print(_line(status()), end="\r", overflow="crop", no_wrap=True, style="dim")
+        return True
+
+    try:
+        yield watch
+    finally:
+        for opened in window:
+            opened.close()
+
+
+def _line(status: Status) -> str:
+    return "  ".join(f"{name} {value}" for name, value in status.rows())

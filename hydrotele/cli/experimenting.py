@@ -1,0 +1,86 @@
+"""`hydrotele experiments`: published experiments repeated, beside what was published."""
+
+import json
+from pathlib import Path
+
+import hydrotele
+from hydrotele.cli.console import notes, out, print_json, stages
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import check_target, whole_folder
+from hydrotele.experiments.finding import Finding
+from hydrotele.experiments.zhu1994 import zhu1994
+
+SERIES = ("zhu1994",)
+
+
+def experiments_to_folder(
+    name: str, target: Path | None, seeds: int, jobs: int | None, as_json: bool
+) -> list[Finding]:
+    """Run a series of experiments; write the table and the curves, whole or not at all.
+
+    Args:
+        name: of the series.
+        target: folder, default `runs/<name>`; with `as_json` none.
+        seeds: operators of the experiments that are repeated.
+        jobs: processes; as many as there are cores by default.
+        as_json: print the findings as JSON instead of words.
+
+    Returns:
+        The findings.
+
+    Raises:
+        InputError: no such series, or the target is not usable.
+    """
+    if name not in SERIES:
+        raise InputError(f"experiments {name!r}", f"valid: {', '.join(SERIES)}")
+    target = target or (None if as_json else Path("runs") / name)
+    if target:
+        check_target(target, "experiments")
+    with stages(f"experiments {name}", as_json) as progress:
+        findings = zhu1994(seeds, jobs, progress)
+    if target:
+        with whole_folder(target, "experiments") as folder:
+            _write(folder, name, seeds, findings)
+    if as_json:
+        print_json([finding.row() for finding in findings])
+    else:
+        _print(findings)
+        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    return findings
+
+
+def _write(folder: Path, name: str, seeds: int, findings: list[Finding]) -> None:
+    from hydrotele.show.experiment_report import write_experiment_report
+
+    notes.print("writing report.html ...", style="dim")
+    rows = [finding.row() | {"source": finding.source} for finding in findings]
+    text = json.dumps(rows, indent=2, allow_nan=False)
+    (folder / "experiments.json").write_text(text + "\n", encoding="utf-8")
+    write_experiment_report(name, findings, folder / "report.html")
+    head = f"# Experiments of {name}\n\n`hydrotele experiments {name} --seeds {seeds}`\n\n"
+    (folder / "table.md").write_text(head + markdown_table(findings), encoding="utf-8")
+    summary = {"kind": "experiments", "name": name, "hydrotele": hydrotele.__version__}
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def markdown_table(findings: list[Finding]) -> str:
+    """The findings as a Markdown table."""
+    lines = ["| experiment | published | simulated | same |", "| --- | --- | --- | --- |"]
+    for one in findings:
+        name = f"{one.name} ({one.source})"
+        lines.append(f"| {name} | {one.published} | {one.simulated} | {_word(one)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _word(finding: Finding) -> str:
+    return "yes" if finding.ok else "no"
+
+
+def _print(findings: list[Finding]) -> None:
+    for one in findings:
+        mark = "[green]same[/]" if one.ok else "[red]differs[/]"
+        out.print(f"{mark} [bold]{one.name}[/] ({one.source})")
+        out.print(f"  published: {one.published}")
+        out.print(f"  simulated: {one.simulated}")
+    same = sum(one.ok for one in findings)
+    out.print(f"{same} of {len(findings)} as published")

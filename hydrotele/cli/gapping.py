@@ -1,0 +1,136 @@
+"""`hydrotele gap`: where model and measured logs disagree, and the machine that agrees better."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+import hydrotele
+from hydrotele.cli.console import notes, out, print_json, stages, table
+from hydrotele.cli.opening import data_name, machine_of
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import check_target, whole_folder
+from hydrotele.effects import EFFECTS
+from hydrotele.gap.customary import said
+from hydrotele.gap.gap_json import finite, gap_document
+from hydrotele.gap.patched import has_patch, write_patch
+from hydrotele.gap.result import Gap
+from hydrotele.gap.words import effect_title, headline, verdict_words
+from hydrotele.logs.load import Dataset, load_dataset
+from hydrotele.simulate.native import stop_profiling_clock
+
+_COLOURS = {
+    "named": "blue", "partly": "magenta", "no_gap": "green", "ambiguous": "yellow",
+    "unknown": "red",
+}  # fmt: skip
+_COLUMNS = ("effect", "parameter", "model had", "found", "95 % interval", "unit")
+
+
+def gap_to_folder(
+    data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
+    sensors: str | None, target: Path | None, as_json: bool, recording: bool,
+    effects: Sequence[str] = (), jobs: int | None = None, force: bool = False,
+    mask: Path | None = None,
+) -> Path:  # fmt: skip
+    """Find the gap between a model and logs; write everything into a folder, whole or not at all.
+
+    Args:
+        data: log files, folders of logs, run folders.
+        machine: the model, None for the one that the logs name.
+        tool: its tool, None for the logs'.
+        heldout: name of the run to judge on, None to choose.
+        sensors: name of the machine's sensors, None for those that the logs name.
+        target: folder, default `gap_<data>`.
+        as_json: print `gap.json` instead of words.
+        recording: whether to write the rerun recording.
+        effects: names of the effects to try; none means all.
+        jobs: processes to use, None to let the search choose.
+        force: accept logs whose metadata name another machine or tool.
+        mask: file of stretches that may not be used.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: data, machine, effects or target are not usable.
+    """
+    for name in effects:
+        if name not in EFFECTS:
+            raise InputError(f"--effect {name}", f"is not known; {suggest(name, EFFECTS)}")
+    target = target or Path(f"gap_{data_name(data)}")
+    check_target(target, "gap")
+    stop_profiling_clock()
+    model = machine_of(data, machine, tool)
+    dataset = load_dataset(list(data), model, sensors, heldout, force=force, mask=mask)
+    gap = _search(dataset, effects, jobs, quiet=as_json)
+    with whole_folder(target, "gap") as folder:
+        write_gap(gap, dataset, folder, recording, data)
+    if as_json:
+        print_json(gap_document(gap))
+    else:
+        _print(gap)
+        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    return target
+
+
+def write_gap(
+    gap: Gap, dataset: Dataset, folder: Path, recording: bool = True, data: Sequence[Path] = ()
+) -> None:
+    """Write gap.json, the report, the patched machine, the next experiment and the recording."""
+    document = json.dumps(gap_document(gap), indent=2, allow_nan=False)
+    (folder / "gap.json").write_text(document + "\n", encoding="utf-8")
+    if has_patch(gap):
+        from hydrotele.simulate.plant import build_plant
+
+        patched = folder / "patched"
+        patched.mkdir()
+        write_patch(gap, patched)
+        build_plant(gap.patched).document.save(patched / "machine.xml")
+    if scenario := (gap.next_experiment or {}).get("scenario"):
+        text = yaml.safe_dump(finite(scenario), sort_keys=False)
+        (folder / "next_experiment.yaml").write_text(text, encoding="utf-8")
+    from hydrotele.show.gap_report import write_report
+
+    notes.print("writing report.html ...", style="dim")
+    write_report(gap, folder / "report.html")
+    if recording:
+        from hydrotele.show.gap_recording import write_gap_recording
+
+        notes.print("writing recording.rrd ...", style="dim")
+        write_gap_recording(folder / "recording.rrd", gap, dataset.heldout, dataset.axes)
+    summary = {
+        "kind": "gap",
+        "machine": gap.machine.name,
+        "tool": gap.machine.tool,
+        "data": [str(path) for path in data],
+        "heldout": dataset.heldout.name,
+        "verdict": gap.verdict,
+        "hydrotele": hydrotele.__version__,
+    }
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool) -> Gap:
+    from hydrotele.gap.find import find_gap
+
+    with stages(f"gap {dataset.machine.name}", quiet) as progress:
+        return find_gap(dataset, progress, effects=tuple(effects), jobs=jobs or 2)
+
+
+def _print(gap: Gap) -> None:
+    out.print(f"[bold {_COLOURS[gap.verdict]}]{headline(gap)}[/]", soft_wrap=True)
+    for words in verdict_words(gap):
+        out.print(words, markup=False)
+    if gap.effects:
+        rows = table("what was found", *_COLUMNS)
+        for effect in gap.effects:
+            for name, estimate in effect.parameters.items():
+                s = said(estimate, name)
+                between = f"{s.low} .. {s.high}"
+                rows.add_row(effect_title(effect), name, s.nominal, s.value, between, s.unit)
+        rows.columns[4].no_wrap = True
+        out.print(rows)
+    for note in gap.notes:
+        out.print(f"[yellow]note[/] {note}")

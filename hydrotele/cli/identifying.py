@@ -1,0 +1,230 @@
+"""`hydrotele identify`: parameters of a machine from logs, and the machine that has them."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import hydrotele
+from hydrotele.cli.console import notes, out, plain, print_json, stages, table
+from hydrotele.cli.opening import data_name, machine_of
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import check_target, whole_folder
+from hydrotele.identify.chain import Chain, load_chain
+from hydrotele.identify.consistent import Consistent
+from hydrotele.identify.estimation import Estimator
+from hydrotele.identify.friction_shape import identify_with_shapes
+from hydrotele.identify.hydraulic import Hydraulics, identify_hydraulics
+from hydrotele.identify.identified_machine import identified_machine
+from hydrotele.identify.identify_json import identify_document
+from hydrotele.identify.motion import Processing
+from hydrotele.identify.parameter_rows import MEANING, counts, parameter_rows
+from hydrotele.identify.record import records
+from hydrotele.identify.result import Identification
+from hydrotele.identify.setup import Model, cylinder_bars, machine_setup
+from hydrotele.logs.load import Dataset, load_dataset
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
+from hydrotele.simulate.native import stop_profiling_clock
+from hydrotele.simulate.plant import build_plant, rest_state
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """What was found of bodies, friction and offsets.
+
+    Attributes:
+        found: the identification, None where no force is known.
+        best: the nearest machine that can exist, None with it.
+        machine: the identified machine.
+        lacking: why there is none, or nothing.
+    """
+
+    found: Identification | None
+    best: Consistent | None
+    machine: Machine
+    lacking: str = ""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a user may choose, besides data and machine.
+
+    Attributes:
+        model: complete or reduced to the links.
+        pins: friction in joints and closures without drive.
+        asymmetry: viscous friction that depends on the direction.
+        processing: of the signals.
+        estimator: of the parameters.
+        hydraulics: whether valves, oil and supply are identified, too.
+    """
+
+    model: Model = "complete"
+    pins: bool = False
+    asymmetry: bool = False
+    processing: Processing = dataclasses.field(default_factory=Processing)
+    estimator: Estimator = dataclasses.field(default_factory=Estimator)
+    hydraulics: bool = False
+
+
+def identify_to_folder(
+    data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
+    sensors: str | None, target: Path | None, as_json: bool, choices: Choices,
+    force: bool = False,
+) -> Path:  # fmt: skip
+    """Identify a machine from logs; write everything into a folder, whole or not at all.
+
+    Args:
+        data: log files, folders of logs, run folders.
+        machine: the model, None for the one that the logs name.
+        tool: its tool, None for the logs'.
+        heldout: name of the run to judge on, None to choose.
+        sensors: name of the machine's sensors, None for those that the logs name.
+        target: folder, default `identify_<data>`.
+        as_json: print `identify.json` instead of words.
+        choices: what to identify, and how.
+        force: accept logs whose metadata name another machine or tool.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: data, machine or target are not usable.
+    """
+    target = target or Path(f"identify_{data_name(data)}")
+    check_target(target, "identify")
+    stop_profiling_clock()
+    model = machine_of(data, machine, tool)
+    dataset = load_dataset(list(data), model, sensors, heldout, force=force)
+    with stages(f"identify {model.name}", as_json) as progress:
+        say = progress or (lambda said, share: None)
+        say("mechanism", 0.0)
+        mechanism, hydraulics = identify_mechanism(dataset, choices), None
+        if choices.hydraulics:
+            better = dataclasses.replace(dataset, machine=mechanism.machine)
+            hydraulics = identify_hydraulics(better, progress=progress)
+    if mechanism.found is None and hydraulics is None:
+        raise InputError(target, mechanism.lacking)
+    with whole_folder(target, "identify") as folder:
+        _write(folder, dataset, mechanism, hydraulics, data, choices)
+    if as_json:
+        print_json(identify_document(mechanism.found, hydraulics, mechanism.best))
+    else:
+        _print(mechanism, hydraulics, dataset)
+        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    return target
+
+
+def identify_mechanism(dataset: Dataset, choices: Choices) -> Mechanism:
+    """Identify bodies, friction and offsets.
+
+    Args:
+        dataset: logs of a machine.
+        choices: what to identify, and how.
+
+    Returns:
+        What was found.
+
+    Raises:
+        InputError: the logs do not tell it, and hydraulics were not asked for.
+    """
+    try:
+        fit, heldout, said = records(dataset)
+    except InputError as error:
+        if not choices.hydraulics:
+            raise
+        return Mechanism(None, None, dataset.machine, str(error))
+    setup = machine_setup(
+        dataset.machine, closed_chain(dataset.machine), choices.model, pins=choices.pins,
+        asymmetry=choices.asymmetry,
+    )  # fmt: skip
+    found = identify_with_shapes(
+        fit, heldout, setup, choices.processing, choices.estimator, notes=(*dataset.notes, *said)
+    )  # fmt: skip
+    patched, best = identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
+    return Mechanism(found, best, patched)
+
+
+def closed_chain(machine: Machine) -> Chain:
+    """Chain of a machine, with its loops closed at its home position."""
+    plant = build_plant(machine)
+    return dataclasses.replace(load_chain(plant.model), start=rest_state(plant).qpos.copy())
+
+
+def _write(
+    folder: Path, dataset: Dataset, mechanism: Mechanism, hydraulics: Hydraulics | None,
+    data: Sequence[Path], choices: Choices,
+) -> None:  # fmt: skip
+    found, patched = mechanism.found, hydraulics.machine if hydraulics else mechanism.machine
+    document = plain(identify_document(found, hydraulics, mechanism.best))
+    text = json.dumps(document, indent=2, allow_nan=False)
+    (folder / "identify.json").write_text(text + "\n", encoding="utf-8")
+    made = folder / "identified"
+    made.mkdir()
+    save_machine(patched, made / MACHINE_FILE)
+    build_plant(patched).document.save(made / "machine.xml")
+    from hydrotele.show.identify_report import write_identify_report
+
+    notes.print("writing report.html ...", style="dim")
+    write_identify_report(dataset, found, hydraulics, mechanism.best, folder / "report.html")
+    summary = {
+        "kind": "identify",
+        "machine": dataset.machine.name,
+        "tool": dataset.machine.tool,
+        "data": [str(path) for path in data],
+        "heldout": dataset.heldout.name,
+        "model": choices.model,
+        "status": document["status"],
+        "hydrotele": hydrotele.__version__,
+    }
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _print(mechanism: Mechanism, hydraulics: Hydraulics | None, dataset: Dataset) -> None:
+    if mechanism.found:
+        _print_mechanism(mechanism.found, dataset)
+    else:
+        out.print(f"[yellow]note[/] {mechanism.lacking}")
+    if hydraulics:
+        rows = table("hydraulics", "number", "given", "identified", "std", "unit")
+        for n in hydraulics.numbers:
+            shown = (f"{n.value:.6g}", f"{n.std:.2g}") if n.told else ("not told", "")
+            rows.add_row(n.name, f"{n.nominal:.6g}", *shown, n.unit)
+        out.print(rows)
+        out.print(
+            f"one-step prediction errors on {dataset.heldout.name}: {hydraulics.before:.3g} times"
+            f" noise with the given hydraulics, {hydraulics.after:.3g} identified;"
+            f" {hydraulics.status}"
+        )
+
+
+def _print_mechanism(found: Identification, dataset: Dataset) -> None:
+    rows = parameter_rows(found)
+    many = counts(rows)
+    out.print(f"[bold]{found.status}[/]", soft_wrap=True)
+    shown = table("what the data tell", "parameter", "given", "identified", "std", "unit")
+    for row in rows:
+        if row.value is None or row.std is None:
+            continue
+        name = row.name + (" + ..." if row.combination else "")
+        shown.add_row(name, f"{row.nominal:.6g}", f"{row.value:.6g}", f"{row.std:.2g}", row.unit)
+    out.print(shown)
+    for status, number in many.items():
+        out.print(f"{number:4d} {status}: {MEANING[status]}")
+    judged = table(
+        f"force on {dataset.heldout.name}, not fitted, below {found.band:.3g} Hz", "drive",
+        "as given", "identified", "noise alone", "unit", "relative",
+    )  # fmt: skip
+    for drive, h in found.heldout.items():
+        judged.add_row(drive, f"{h.nominal_rms:.4g}", f"{h.rms:.4g}", f"{h.noise_rms:.4g}", h.unit,
+                       f"{100 * h.relative:.2f} %")  # fmt: skip
+    out.print(judged)
+    distance, limit = found.distance(found.nominal)
+    out.print(
+        f"the given parameters lie {'in' if distance <= limit else 'out'}side the 95 % ellipsoid of"
+        f" all together: {distance:.3g}, limit {limit:.3g}"
+    )
+    out.print(f"condition {found.estimate.condition:.3g}, {found.seconds:.1f} s")
+    for note in found.notes:
+        out.print(f"[yellow]note[/] {note}")

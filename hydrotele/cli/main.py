@@ -1,0 +1,426 @@
+"""Command line: one thin function per command. Heavy imports stay inside the functions."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hydrotele.cli import compare_command, drive_command, sweep_command
+from hydrotele.cli.options import EffectFiles
+from hydrotele.core.errors import InputError
+
+app = typer.Typer(
+    name="hydrotele",
+    help="Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+analyse_app = typer.Typer(help="Analyse by formula what others simulate.", no_args_is_help=True)
+app.add_typer(analyse_app, name="analyse")
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+MachineName = Annotated[
+    str | None,
+    typer.Option("--machine", "-m", help="Shipped machine, or a folder with machine.yaml."),
+]
+ToolName = Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")]
+Logs = Annotated[
+    list[Path], typer.Option("--data", "-d", help="Folder of logs, log file or run folder.")
+]
+MoreLogs = Annotated[list[Path] | None, typer.Argument(help="More of them.")]
+HeldOut = Annotated[
+    str | None, typer.Option(help="Run to judge on, not fitted; default test*, or the last.")
+]
+Sensors = Annotated[str | None, typer.Option(help="Sensors of the machine.")]
+Force = Annotated[
+    bool, typer.Option("--force", help="Accept logs that name another machine or tool.")
+]
+
+
+@app.command(
+    epilog="Examples:  hydrotele run zhu_up   |   hydrotele run my.yaml --out runs/a --set seed=7"
+)
+def run(
+    scenario: Annotated[str, typer.Argument(help="Shipped scenario, or a YAML file.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write; default runs/SCENARIO.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Override key=value; may be repeated.")
+    ] = None,
+    machine: Annotated[
+        str | None,
+        typer.Option(
+            "--machine", "-m", help="Machine instead of the scenario's, such as patched/."
+        ),
+    ] = None,
+    tool: ToolName = None,
+    review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
+    effects: EffectFiles = None,
+    json: Json = False,
+) -> None:
+    """Simulate a scenario; write both logs, the rerun recording, the summary and the MJCF."""
+    from hydrotele.cli.running import run_to_folder
+    from hydrotele.cli.words import chosen, overrides_of
+
+    run_to_folder(scenario, out, overrides_of(set_ or []) | chosen(machine, tool), review, json)
+
+
+app.command(epilog=drive_command.EPILOG)(drive_command.drive)
+app.command(epilog=sweep_command.EPILOG)(sweep_command.sweep)
+app.command(epilog=compare_command.EPILOG)(compare_command.compare)
+
+
+@app.command(
+    epilog="Example:  hydrotele replay measured/fit_1.parquet --machine cat215 --out overlay"
+)
+def replay(
+    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv) or run folders.")],
+    machine: MachineName = None,
+    tool: ToolName = None,
+    timestep: Annotated[float, typer.Option(help="Physics step in seconds.")] = 1.0e-3,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for plots and recordings; default runs/replay_LOG, with --json none.",
+        ),
+    ] = None,
+    effects: EffectFiles = None,
+    json: Json = False,
+) -> None:
+    """Drive the model with logged commands from the logged initial state; print the differences."""
+    from hydrotele.cli.replaying import replay_logs
+
+    replay_logs(logs, machine, tool, timestep, out, json)
+
+
+@app.command(
+    epilog="Examples:  hydrotele gap --machine cat215 --data measured/site_a   |   "
+    "hydrotele gap --data runs/a runs/b --heldout b   |   "
+    "hydrotele gap --data logs --effects my_effects.py"
+)
+def gap(
+    data: Logs,
+    more: MoreLogs = None,
+    machine: MachineName = None,
+    tool: ToolName = None,
+    heldout: HeldOut = None,
+    sensors: Sensors = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write; default gap_DATA.")
+    ] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option("--effect", help="Try only the effect of this name; may be repeated."),
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
+    mask: Annotated[Path | None, typer.Option(help="CSV run,begin,end [s] not to use.")] = None,
+    force: Force = False,
+    recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
+    effects: EffectFiles = None,
+    json: Json = False,
+) -> None:
+    """Find where the model and measured logs disagree, name the effect, patch the model."""
+    from hydrotele.cli.gapping import gap_to_folder
+
+    gap_to_folder(
+        [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,
+        effect or [], jobs, force, mask,
+    )  # fmt: skip
+
+
+@app.command(
+    epilog="Examples:  hydrotele identify --machine cat215 --data logs   |   "
+    "hydrotele identify --machine emps --data main.parquet --asymmetry"
+)
+def identify(
+    data: Logs,
+    more: MoreLogs = None,
+    machine: MachineName = None,
+    tool: ToolName = None,
+    heldout: HeldOut = None,
+    sensors: Sensors = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write; default identify_DATA.")
+    ] = None,
+    reduced: Annotated[
+        bool, typer.Option("--reduced", help="Links only, without tubes and rods.")
+    ] = False,
+    pins: Annotated[
+        bool, typer.Option("--pins", help="Friction in joints and pins without drive, too.")
+    ] = False,
+    asymmetry: Annotated[
+        bool, typer.Option("--asymmetry", help="Viscous friction that depends on the direction.")
+    ] = False,
+    hydraulics: Annotated[
+        bool, typer.Option("--hydraulics", help="Identify valves, oil, leakage and supply, too.")
+    ] = False,
+    processing: Annotated[
+        str, typer.Option(help="zero_phase, optimal, periodic (needs the period) or raw.")
+    ] = "zero_phase",
+    band: Annotated[
+        float | None, typer.Option(help="Compare forces below this frequency [Hz].")
+    ] = None,
+    period: Annotated[
+        float | None, typer.Option(help="Period of a repeated motion, in seconds.")
+    ] = None,
+    harmonics: Annotated[int, typer.Option(help="Harmonics of it to keep; 0: enough.")] = 0,
+    estimator: Annotated[
+        str,
+        typer.Option(
+            help="weighted, gauss_markov, least_squares or instruments (needs the period)."
+        ),
+    ] = "weighted",
+    keep_bias: Annotated[
+        bool, typer.Option("--keep-bias", help="Leave in what the positions' noise does to it.")
+    ] = False,
+    ridge: Annotated[float, typer.Option(help="Ridge, share of the largest singular value.")] = 0.0,
+    truncate: Annotated[float, typer.Option(help="Leave out smaller singular values.")] = 0.0,
+    force: Force = False,
+    effects: EffectFiles = None,
+    json: Json = False,
+) -> None:
+    """Identify masses, friction and hydraulics from measured logs; write the identified machine."""
+    from hydrotele.cli.identifying import Choices, identify_to_folder
+    from hydrotele.identify.estimation import Estimator
+    from hydrotele.identify.motion import Processing
+
+    choices = Choices(
+        model="reduced" if reduced else "complete", pins=pins, asymmetry=asymmetry,
+        processing=Processing(processing, band, period, harmonics),  # pyright: ignore - checks itself
+        estimator=Estimator(
+            estimator, ridge, truncate, **({"pairs": 0} if keep_bias else {})  # pyright: ignore
+        ),
+        hydraulics=hydraulics,
+    )  # fmt: skip
+    identify_to_folder(
+        [*data, *(more or [])], machine, tool, heldout, sensors, out, json, choices, force
+    )
+
+
+@app.command(epilog="Example:  hydrotele excite cat215 --out my_excitation.yaml")
+def excite(
+    machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Scenario to write (.yaml).")],
+    tool: ToolName = None,
+    sensors: Sensors = None,
+    period: Annotated[float, typer.Option(min=1.0, help="Of the motion, in seconds.")] = 20.0,
+    harmonics: Annotated[int, typer.Option(min=1, max=30, help="Of the motion.")] = 8,
+    starts: Annotated[int, typer.Option(min=1, help="Searches from random motions.")] = 2,
+    seed: Annotated[int, typer.Option(help="Of these.")] = 0,
+    cycles: Annotated[float, typer.Option(min=1.0, help="Periods to run.")] = 3.0,
+    effects: EffectFiles = None,
+    json: Json = False,
+) -> None:
+    """Design the motion that tells a machine's parameters best, within its limits."""
+    from hydrotele.cli.exciting import excite_to_file
+
+    excite_to_file(machine, tool, sensors, out, period, harmonics, starts, seed, cycles, json)
+
+
+@analyse_app.command(
+    "teleop",
+    epilog="Examples:  hydrotele analyse teleop   |   "
+    "hydrotele analyse teleop my_case.yaml --structure rate_force --delay 0.1 --confirm   |   "
+    "hydrotele analyse teleop press_direct --set pilot.ratio=2.0e-5",
+)
+def analyse_teleop(
+    file: Annotated[
+        Path | None, typer.Argument(help="Case (.yaml), scenario; default one of the CAT 215.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Folder to write; default runs/analyse_NAME, with --json none."
+        ),
+    ] = None,
+    structure: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--structure",
+            help="position_position, position_force, four_channel_position, rate_position, "
+            "rate_force or four_channel_rate; may be repeated; default the case's.",
+        ),
+    ] = None,
+    delay: Annotated[
+        float | None, typer.Option(help="Delay each way in seconds, instead of the case's.")
+    ] = None,
+    confirm: Annotated[
+        bool,
+        typer.Option("--confirm", help="Simulate sine sweeps and every cell of the map, too."),
+    ] = False,
+    coordinate: Annotated[str | None, typer.Option(help="Of a scenario: r, theta, z ...")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Of a scenario.")] = None,
+    json: Json = False,
+) -> None:
+    """Two-port of a teleoperator: what is felt, passivity, stability with delay, margins."""
+    from hydrotele.cli.analysing_scenario import analyse_any_to_folder
+    from hydrotele.cli.words import overrides_of
+
+    pairs = overrides_of(set_ or [])
+    analyse_any_to_folder(file, out, structure, delay, confirm, coordinate, pairs, json)
+
+
+@app.command(
+    epilog="Examples:  hydrotele review runs/zhu_up   |   hydrotele review a.parquet b.parquet"
+)
+def review(
+    log: Annotated[Path, typer.Argument(help="Run folder or log file.")],
+    log2: Annotated[Path | None, typer.Argument(help="Second one, on the same clock.")] = None,
+    machine: MachineName = None,
+    tool: ToolName = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Recording to write.")] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve the web viewer.")] = False,
+    port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
+    screenshot: Annotated[
+        Path | None, typer.Option("--screenshot", help="Write a PNG of the viewer, headless.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Write a PNG of all channels instead.")
+    ] = None,
+    effects: EffectFiles = None,
+) -> None:
+    """Look at a run: the machine moving in 3D, joints, pressures, flows and forces, in rerun."""
+    from hydrotele.cli.reviewing import review_logs
+
+    review_logs(log, log2, machine, tool, out, serve, port, screenshot, plot)
+
+
+@app.command("list", epilog="Example:  hydrotele list scenarios --json")
+def list_(
+    what: Annotated[
+        str,
+        typer.Argument(help="machines, joysticks, scenarios, sweeps, effects, environments; all."),
+    ] = "all",
+    effects: EffectFiles = None,
+    json: Json = False,
+) -> None:
+    """List what is shipped: machines, scenarios, sweeps, effects, environments, ..."""
+    from hydrotele.cli.catalogue import list_things
+
+    list_things(what, json)
+
+
+@app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
+def validate(
+    files: Annotated[list[Path], typer.Argument(help="Machines, scenarios, sweeps, logs ...")],
+    effects: EffectFiles = None,
+    json: Json = False,
+) -> None:
+    """Check a machine, a joystick, a scenario, a sweep or a log; say what is wrong and where."""
+    from hydrotele.cli.catalogue import validate_files
+
+    validate_files(files, json)
+
+
+@app.command(epilog="Example:  hydrotele export cat215 --tool bucket --out scene.xml")
+def export(
+    machine: Annotated[str, typer.Argument(help="Shipped machine or joystick, or a folder.")],
+    tool: ToolName = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="MJCF file; default stdout.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", help="Write a PNG of it instead.")
+    ] = None,
+    camera: Annotated[str, typer.Option(help="Camera of the picture.")] = "overview",
+    effects: EffectFiles = None,
+) -> None:
+    """Write the complete MJCF of a machine or joystick, or a picture of it."""
+    from hydrotele.cli.catalogue import export_machine
+
+    export_machine(machine, tool, out, picture, camera)
+
+
+@app.command(epilog="Example:  hydrotele experiments zhu1994 --json")
+def experiments(
+    name: Annotated[str, typer.Argument(help="Series of experiments: zhu1994.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder to write; default runs/NAME, with --json none."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Operators of repeated experiments.")] = 20,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
+    json: Json = False,
+) -> None:
+    """Repeat published machine experiments with a simulated operator, beside what was published."""
+    from hydrotele.cli.experimenting import experiments_to_folder
+
+    experiments_to_folder(name, out, seeds, jobs, json)
+
+
+@app.command(
+    epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json"
+)
+def bench(
+    save: Annotated[Path | None, typer.Option("--save", help="Write the figures.")] = None,
+    compare: Annotated[Path | None, typer.Option("--compare", help="Compare with these.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions.")] = False,
+    json: Json = False,
+) -> None:
+    """Measure speed: mechanism, hydraulics, a whole scenario, batches, start-up."""
+    from hydrotele.cli.bench import run_benchmarks
+
+    run_benchmarks(save, compare, quick, json)
+
+
+@app.command(epilog="Example:  hydrotele demo --out demo")
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("demo"),
+) -> None:
+    """Run an excavator, replay its log, draw the pictures: a tour of what is there."""
+    from hydrotele.cli.demo import run_demo
+
+    run_demo(out)
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+) -> None:
+    if version:
+        import hydrotele
+
+        typer.echo(hydrotele.__version__)
+        raise typer.Exit
+
+
+def main() -> None:
+    """Entry point; exits with 2 for users' errors, 3 for failed runs, 130 or 143 for signals."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # children import nothing from the working folder
+    ended: list[int] = []
+
+    def end(number: int, _: object) -> None:
+        ended.append(128 + number)
+        sys.exit(ended[0])  # so that everything is cleaned up
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        _run()
+    finally:
+        if ended:  # a library on the way may have made another error of it
+            sys.exit(ended[0])
+
+
+def _run() -> None:
+    try:
+        app()
+    except (InputError, OSError) as error:
+        if isinstance(error, OSError):  # a name that is too long, a disk that fails
+            error = InputError(error.filename or "the system", error.strerror or str(error))
+        typer.secho("error ", fg="red", bold=True, err=True, nl=False)
+        typer.echo(str(error), err=True)
+        sys.exit(2)
+    except RuntimeError as error:
+        if type(error).__name__ != "SimulationFailed":
+            raise
+        typer.echo(f"simulation failed: {error}", err=True)
+        sys.exit(3)

@@ -1,1 +1,0 @@
-"""What the commands of `hydrotele` do; `cli.py` only declares them."""

@@ -1,0 +1,207 @@
+"""Force at the tip of an arm, felt through the pressures of its drives.
+
+The static estimate takes the torque of gravity, linear in a few identified parameters, off that of
+the drives (Zhu 1994, 6.1). The dynamic one takes off all that the complete model needs: inertia,
+Coriolis forces, friction, and the closed chains with their cylinders.
+
+Everything passes two filters. A fast one gives positions, rates, accelerations and pressures that
+are equally late, so that their balance holds, and friction is that of the rate of its time. The
+force that is left passes a slow one, since what noise of the angles makes of accelerations grows
+with the fifth power of the frequency.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from hydrotele.control.arm_tables import arm_joints, arm_tables, free_axes
+from hydrotele.control.endpoint_force_step import GOOD, WAITING, Readings, endpoint_force_step
+from hydrotele.control.gravity_model import Gravity, gravity_from_masses
+from hydrotele.control.state_filter import filter_delay, filter_table, noise_gains
+from hydrotele.core.errors import InputError
+from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import noise_rms
+from hydrotele.machine.sensors import SensorSet
+
+Kind = Literal["static", "dynamic"]
+BANDWIDTH = 0.7  # Hz
+FAST = 2.5  # Hz
+_SETTLE = 0.5  # periods of the fast filter
+_TASK = ("r", "theta", "z", "attitude", "head")
+
+
+class EndpointForce:
+    """Online estimate of the force of the environment on the tip of an arm.
+
+    Attributes:
+        axes: axes of the readings.
+        task: what the force acts along: r [N], theta [N m], z [N], attitude, head [N m].
+        bandwidth: of the estimate [Hz].
+        delay: by which it is late, for slow changes [s].
+        force: (m,) last estimate; 0 until every channel has read once.
+        healthy: whether the last readings were finite and the arm was not singular.
+    """
+
+    def __init__(
+        self, machine: Machine, axes: Sequence[str], kind: Kind = "dynamic",
+        period: float = 0.005, *, every: int = 1, sensors: SensorSet | None = None,
+        gravity: Gravity | None = None, bandwidth: float = BANDWIDTH, fast: float = FAST,
+    ):  # fmt: skip
+        """Lay out what every update needs.
+
+        Args:
+            machine: with an arm whose joints are driven by valves.
+            axes: order of the readings, as `Feedback.joint`.
+            kind: `static` knows gravity only, `dynamic` the complete model.
+            period: time between two updates [s].
+            every: updates per sample of the sensors, as `Feedback.every`: the first brings a new
+                sample, the following ones hold it and change nothing.
+            sensors: of the machine, whose noise the dynamic estimate weighs; None for ideal ones.
+            gravity: parameters of the static model; those of the machine's masses if None.
+            bandwidth: of the estimate [Hz].
+            fast: bandwidth of the motion that friction and inertia are computed of [Hz].
+
+        Raises:
+            InputError: a joint is not driven, not by a valve, or not measured; a number makes no
+                sense.
+        """
+        where = f"end-point force of {machine.name}"
+        if kind not in ("static", "dynamic"):
+            raise InputError(where, f"kind must be static or dynamic, got {kind!r}")
+        if not (period > 0.0 and every >= 1 and 0.0 < bandwidth < 0.25 / (period * every)):
+            rate = 1.0 / (period * every) if period > 0.0 and every >= 1 else float("nan")
+            raise InputError(
+                where, f"{bandwidth:g} Hz must be less than a quarter of the sensors' {rate:g} Hz"
+            )
+        self.axes, self.bandwidth, self.healthy = tuple(axes), bandwidth, False
+        self._dynamic, self._count, self._every, self._tick = kind == "dynamic", 0, every, 0
+        self._arm = arm_tables(machine, where)
+        if not self._dynamic:
+            found = gravity or gravity_from_masses(machine)
+            if len(found.value) != len(self._arm.gravity):
+                raise InputError(where, f"gravity needs {len(self._arm.gravity)} parameters")
+            self._arm.gravity[:] = found.value
+        self._readings = _readings(machine, self.axes, period * every, bandwidth, fast, where)
+        noise = noise_gains(self._readings.tables[0])[1]
+        for i, name in enumerate(free_axes(machine, where)):
+            channel = f"{machine.position_kind(name)}.{name}"
+            self._arm.rate_noise[i] = noise * noise_rms(machine, sensors, channel)
+        self.delay = filter_delay(fast) + filter_delay(bandwidth)
+        self.task = _TASK[: len(self._arm.joint)]
+        self.force = np.zeros(len(self.task))
+
+    def update(self, joint: np.ndarray, head: np.ndarray, rod: np.ndarray) -> np.ndarray:
+        """Take in the readings of one moment.
+
+        A reading that is not finite is replaced by the last good one of its channel, and `healthy`
+        is then False.
+
+        Args:
+            joint: (k,) measured joint positions [rad] or [m], in the order of `axes`.
+            head: (k,) head-side pressures [Pa]; ignored where there is no valve.
+            rod: (k,) rod-side pressures [Pa].
+
+        Returns:
+            (m,) force of the environment on the machine along `task`; the same array every time.
+        """
+        held, self._tick = self._tick % self._every, self._tick + 1
+        if held:
+            return self.force
+        status = endpoint_force_step(
+            self._arm, self._readings, self._dynamic, self._count, joint, head, rod, self.force
+        )
+        self._count += status != WAITING
+        self.healthy = status == GOOD
+        return self.force
+
+    def frozen(self, duration: float = 0.5) -> tuple[str, ...]:
+        """Channels whose readings have not changed for a while, as a stuck sensor's.
+
+        Args:
+            duration: for how long [s]. Real sensors never read the same twice for long; ideal ones
+                of a machine at rest do.
+
+        Returns:
+            Names such as `joint.boom`, `pressure_head.boom`.
+        """
+        r, calls = self._readings, duration / self._readings.period
+        kinds = (("joint", r.position), ("pressure_head", r.valve), ("pressure_rod", r.valve))
+        return tuple(
+            f"{kind}.{self.axes[i]}"
+            for row, (kind, used) in enumerate(kinds)
+            for i in sorted(used)
+            if r.still[row, i] >= calls
+        )
+
+
+def _readings(
+    machine: Machine,
+    axes: tuple[str, ...],
+    period: float,
+    bandwidth: float,
+    fast: float,
+    where: str,
+) -> Readings:
+    """Where the readings are and what they go through."""
+    free, valves = free_axes(machine, where), actuator_order(machine)[: len(machine.hydraulic_axes)]
+    if missing := [name for name in free if name not in axes]:
+        raise InputError(where, f"readings of {', '.join(missing)} are missing")
+    n, h, k = len(free), len(valves), len(axes)
+    return Readings(
+        period=period,
+        settle=max(1, round(_SETTLE / (fast * period))),
+        tables=np.array([filter_table(fast, period), filter_table(bandwidth, period)]),
+        position=np.array([axes.index(name) for name in free]),
+        valve=np.array([axes.index(name) for name in valves]),
+        state=np.zeros((n + 2 * h + len(arm_joints(machine)), 4)),
+        outside=np.zeros(n),
+        last=np.full((3, k), np.nan),
+        still=np.zeros((3, k), int),
+    )
+
+
+def endpoint_force_of_log(
+    machine: Machine, log: Log, kind: Kind = "dynamic", gravity: Gravity | None = None,
+    bandwidth: float = BANDWIDTH, fast: float = FAST, sensors: SensorSet | None = None,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """The online estimate over a log, one update per row.
+
+    Args:
+        machine: the machine.
+        log: positions and pressures of all its axes, measured.
+        kind: see `EndpointForce`.
+        gravity: see `EndpointForce`.
+        bandwidth: see `EndpointForce`.
+        fast: see `EndpointForce`.
+        sensors: see `EndpointForce`.
+
+    Returns:
+        `r` [N], `theta` [N m], `z` [N], `attitude` [N m] ... and `healthy` [1], (n,) each.
+
+    Raises:
+        InputError: a channel is missing, or the arm cannot be felt.
+    """
+    axes = tuple(machine.axes)
+    joint = np.column_stack([log[f"{machine.position_kind(a)}.{a}"] for a in axes])
+    head, rod = np.zeros_like(joint), np.zeros_like(joint)
+    for i, name in enumerate(axes):
+        if name in machine.hydraulic_axes:
+            head[:, i], rod[:, i] = log[f"pressure_head.{name}"], log[f"pressure_rod.{name}"]
+    felt = EndpointForce(
+        machine,
+        axes,
+        kind,
+        1.0 / log.rate,
+        sensors=sensors,
+        gravity=gravity,
+        bandwidth=bandwidth,
+        fast=fast,
+    )
+    out, healthy = np.empty((len(log), len(felt.task))), np.empty(len(log))
+    for row in range(len(log)):
+        out[row] = felt.update(joint[row], head[row], rod[row])
+        healthy[row] = felt.healthy
+    return {**dict(zip(felt.task, out.T, strict=True)), "healthy": healthy}

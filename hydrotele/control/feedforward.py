@@ -1,0 +1,94 @@
+"""Computed forces: what inverse dynamics asks of the drives along a plan."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.control.plan import Plan
+from hydrotele.core.errors import InputError
+from hydrotele.identify.chain import load_chain
+from hydrotele.identify.projection import project
+from hydrotele.identify.regressor import regressor
+from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.smoothed import Smoothed
+from hydrotele.identify.zero_phase import zero_phase
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.scenario.scenario import Servo
+from hydrotele.simulate.plant import build_plant, rest_state
+
+NOMINAL = "nominal"
+
+
+_SMOOTH = 8.0  # Hz: a table's steps and corners above it are no forces to ask for
+
+
+class ForceReferences(NamedTuple):
+    """Forces of the drives along a plan, (n, k) each.
+
+    Attributes:
+        known: whether they were computed.
+        force: [N] or [N m]; 0 where not computed.
+        rate: its rate of change, ahead of time by the servo's lead [N/s] or [N m/s].
+    """
+
+    known: bool
+    force: np.ndarray
+    rate: np.ndarray
+
+
+def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferences:
+    """Forces along a plan, by the machine that the servo names.
+
+    Args:
+        machine: the scenario's own, without planted effects.
+        plan: joint references; all axes must be under feedback.
+        servo: `force_model` names the machine, `lead` [s] makes up for the spool's lag.
+
+    Returns:
+        The references.
+
+    Raises:
+        InputError: no such machine, other axes, or an axis without reference.
+
+    Source: Abdellatif 2008, section 5 (computed-force feedforward).
+    """
+    if servo.force_model is None:
+        nothing = np.zeros_like(plan.reference)
+        return ForceReferences(False, nothing, nothing)
+    where = "servo.force_model"
+    if servo.force_model != NOMINAL:
+        machine = load_machine(servo.force_model, machine.tool)
+    if not np.all(plan.closed):
+        open_ones = ", ".join(a for a, c in zip(plan.axes, plan.closed, strict=True) if not c)
+        raise InputError(where, f"needs a reference of every axis; {open_ones} has none")
+    plant = build_plant(machine, ground=False)
+    if tuple(plant.axes) != tuple(plan.axes):
+        raise InputError(where, f"{machine.name} has the axes {', '.join(plant.axes)}")
+    joints = [machine.axes[a].joint for a in plan.axes]
+    start = rest_state(plant, dict(zip(joints, plan.reference[0], strict=True)))
+    chain = dataclasses.replace(load_chain(plant.model), start=start.qpos.copy())
+    setup = machine_setup(machine, chain)
+    step = float(plan.time[1] - plan.time[0])
+    motion = _smooth(plan.reference, step)
+    found = project(chain, setup.given, plan.reference, motion.rate, motion.acceleration)
+    table = regressor(
+        chain, found, bodies=setup.bodies, rubbing=setup.rubbing, offsets=setup.offsets or {}
+    )
+    force = table.matrix @ table.nominal
+    force += np.einsum("nkv,nv->nk", found.share, chain.damping * found.rate)
+    ahead = np.minimum(plan.time + servo.lead, plan.time[-1])
+    change = np.gradient(force, step, axis=0)
+    rate = np.column_stack([np.interp(ahead, plan.time, column) for column in change.T])
+    return ForceReferences(True, force, rate)
+
+
+def _smooth(reference: np.ndarray, step: float) -> Smoothed:
+    """Motion (n, k) of a reference; one that is too short for the filter as it is."""
+    if len(reference) > 5.0 / (_SMOOTH * step):
+        return zero_phase(reference, step, _SMOOTH)
+    rate = np.gradient(reference, step, axis=0)
+    unknown = np.full_like(reference, np.nan)
+    acceleration = np.gradient(rate, step, axis=0)
+    return Smoothed(reference, rate, acceleration, unknown, unknown, unknown)

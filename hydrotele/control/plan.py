@@ -1,0 +1,304 @@
+"""Pilots: what the machine is asked to do, over the whole run, as arrays.
+
+A plan holds either open-loop commands or joint references for every axis at every control tick.
+"""
+
+import dataclasses
+import math
+from itertools import zip_longest
+
+import numpy as np
+
+from hydrotele.control.limits import check_command, check_reference, cut_short
+from hydrotele.control.resolved_motion import ResolvedMotion, arm_axes, pose_to_joints
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import (
+    ConstantPilot,
+    FourierPilot,
+    LinesPilot,
+    Move,
+    Pilot,
+    TablePilot,
+    Waypoint,
+    WaypointsPilot,
+)
+from hydrotele.scenario.teleoperation import TeleopPilot
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What is asked of every axis at every control tick.
+
+    Attributes:
+        time: (n,) [s].
+        axes: axis names, in the order of the columns.
+        command: (n, k) open-loop commands [1] (or in the drive's unit).
+        reference: (n, k) joint references [rad] or [m].
+        rate: (n, k) their rates [rad/s] or [m/s].
+        closed: (k,) whether the axis follows its reference.
+        pose: (n, 4 or 5) desired r, theta, z, attitude and head angle of the tip, or None.
+        notes: what was clamped or could not be followed.
+    """
+
+    time: np.ndarray
+    axes: tuple[str, ...]
+    command: np.ndarray
+    reference: np.ndarray
+    rate: np.ndarray
+    closed: np.ndarray
+    pose: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+
+def make_plan(
+    machine: Machine, axes: tuple[str, ...], pilot: Pilot, start: dict[str, float], time: np.ndarray
+) -> Plan:
+    """Turn a pilot into arrays.
+
+    Args:
+        machine: the machine.
+        axes: axis names in column order.
+        pilot: the scenario's pilot.
+        start: joint name -> position at t = 0 [rad] or [m].
+        time: (n,) control ticks [s].
+
+    Returns:
+        The plan.
+
+    Raises:
+        InputError: the pilot names an unknown axis, starts out of reach, or asks for more than a
+            joint's range or a drive's largest command.
+    """
+    plan = _plan(machine, axes, pilot, start, time)
+    for column, name in enumerate(axes):
+        if plan.closed[column]:
+            check_reference(machine, name, plan.time, plan.reference[:, column])
+        else:
+            check_command(machine, name, plan.command[:, column])
+    return plan
+
+
+def _plan(
+    machine: Machine, axes: tuple[str, ...], pilot: Pilot, start: dict[str, float], time: np.ndarray
+) -> Plan:
+    n, k = len(time), len(axes)
+    home = np.array([start.get(machine.axes[a].joint, 0.0) for a in axes])
+    plan = Plan(
+        time, axes, np.zeros((n, k)), np.tile(home, (n, 1)), np.zeros((n, k)), np.zeros(k, bool)
+    )
+    match pilot:
+        case ConstantPilot():
+            for name, value in pilot.commands.items():
+                plan.command[:, _column(axes, name, "pilot.commands")] = value
+            return plan
+        case TablePilot():
+            return _table(plan, pilot)
+        case FourierPilot():
+            return _fourier(plan, pilot)
+        case LinesPilot():
+            return _lines(plan, machine, pilot)
+        case WaypointsPilot():
+            return _waypoints(plan, machine, pilot)
+        case TeleopPilot():
+            return _teleoperated(plan, machine, pilot)
+
+
+def _teleoperated(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
+    """References that are written while it runs; buttons command the axes that they name."""
+    closed = np.array([machine.axes[a].force is None for a in plan.axes])
+    for button in sorted(pilot.buttons, key=lambda button: button.at):
+        column = _column(plan.axes, button.axis, "pilot.buttons")
+        if button.axis in arm_axes(machine):
+            raise InputError("pilot.buttons", f"{button.axis} is moved by the joystick")
+        plan.command[plan.time >= button.at, column] = button.command
+        closed[column] = False
+    pose = np.zeros((len(plan.time), max(4, len(arm_axes(machine)))))
+    return dataclasses.replace(plan, closed=closed, pose=pose)
+
+
+def _column(axes: tuple[str, ...], name: str, where: str) -> int:
+    if name not in axes:
+        raise InputError(where, f"{name!r} is no axis of the machine; {suggest(name, axes)}")
+    return axes.index(name)
+
+
+def _table(plan: Plan, pilot: TablePilot) -> Plan:
+    times = np.array(pilot.time)
+    closed = plan.closed.copy()
+    for name, values in pilot.columns.items():
+        column = _column(plan.axes, name, "pilot.columns")
+        if pilot.interpolate == "linear":
+            wanted = np.interp(plan.time, times, values)
+        else:
+            row = np.searchsorted(times, plan.time * (1 + 1e-12) + 1e-9, side="right") - 1
+            wanted = np.array(values)[np.clip(row, 0, len(values) - 1)]
+        if pilot.of == "command":
+            plan.command[:, column] = wanted
+        else:
+            plan.reference[:, column] = wanted
+            if pilot.interpolate == "linear":
+                plan.rate[:, column] = np.gradient(wanted, plan.time)
+    return dataclasses.replace(plan, closed=closed | (pilot.of == "joint"))
+
+
+def _fourier(plan: Plan, pilot: FourierPilot) -> Plan:
+    """References fade from the start: `start + s(t) (wave - start)` with a quintic s."""
+    s, ds = quintic(plan.time, pilot.fade)
+    omega = 2.0 * math.pi / pilot.period
+    for name, harmonics in pilot.axes.items():
+        column = _column(plan.axes, name, "pilot.axes")
+        wave = np.full_like(plan.time, harmonics.mean)
+        slope = np.zeros_like(plan.time)
+        pairs = zip_longest(harmonics.sin, harmonics.cos, fillvalue=0.0)
+        for order, (a, b) in enumerate(pairs, start=1):
+            phase = order * omega * plan.time
+            wave += a * np.sin(phase) + b * np.cos(phase)
+            slope += order * omega * (a * np.cos(phase) - b * np.sin(phase))
+        begin = plan.reference[0, column]
+        plan.reference[:, column] = begin + s * (wave - begin)
+        plan.rate[:, column] = s * slope + ds * (wave - begin)
+    return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool))
+
+
+def quintic(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Smooth step from 0 to 1 with zero speed and acceleration at both ends, and its rate.
+
+    Args:
+        time: (n,) [s].
+        duration: [s]; less than a microsecond gives a step that is done at once.
+
+    Returns:
+        (s (n,) [1], ds/dt (n,) [1/s]).
+
+    >>> quintic(np.array([0.0, 1.0, 2.0, 3.0]), 2.0)[0]
+    array([0. , 0.5, 1. , 1. ])
+    """
+    if duration < 1.0e-6:
+        return np.ones_like(time), np.zeros_like(time)
+    x = np.clip(time / duration, 0.0, 1.0)
+    return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2 / duration
+
+
+def _trapezoid(time: np.ndarray, distance: float, speed: float, acceleration: float):
+    """Speed (n,) of a move of this distance with a trapezoidal profile, and its duration."""
+    ramp = min(speed / acceleration, math.sqrt(distance / acceleration))
+    cruise = distance / (ramp * acceleration) - ramp
+    rise = np.clip(time / ramp, 0, 1) - np.clip((time - ramp - cruise) / ramp, 0, 1)
+    return acceleration * ramp * rise, 2 * ramp + cruise
+
+
+def _lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
+    motion = ResolvedMotion.begin(machine, dict(zip(plan.axes, plan.reference[0], strict=True)))
+    rates = _rate_commands(plan.time, pilot)
+    dt = np.diff(plan.time, prepend=plan.time[0])
+    pose = np.empty((len(plan.time), len(motion.pose)))
+    wanted = np.cumsum(rates * dt[:, None], axis=0)
+    wanted[:, : len(motion.pose)] += motion.pose
+    blocked = 0
+    for row in range(len(plan.time)):
+        if pilot.mode == "rate":
+            motion, joints, speeds = motion.rate_step(rates[row], dt[row])
+        else:
+            motion, joints, speeds = motion.position_step(wanted[row], rates[row])
+        blocked += motion.blocked
+        pose[row] = motion.pose
+        for name, value in joints.items():
+            column = plan.axes.index(name)
+            plan.reference[row, column] = value
+            plan.rate[row, column] = speeds[name]
+    notes = cut_short(plan.time, lines_duration(pilot))
+    if blocked:
+        seconds = blocked * (plan.time[1] - plan.time[0])
+        notes += (f"resolved motion stood at the edge of the workspace for {seconds:.3g} s",)
+    closed = np.ones(len(plan.axes), bool)
+    return dataclasses.replace(plan, closed=closed, pose=pose, notes=notes)
+
+
+def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
+    rates = np.zeros((len(time), 5))
+    begin = pilot.settle
+    for move in pilot.moves:
+        way = np.array([move.r, move.theta, move.z, move.attitude, move.head])
+        size = float(np.hypot(move.r, move.z)) or float(np.abs(way).max())
+        if size == 0.0:
+            begin += move.pause
+            continue
+        speed, duration = _trapezoid(time - begin, size, move.speed, pilot.acceleration)
+        rates += speed[:, None] * way / size
+        begin += duration + move.pause
+    return rates
+
+
+def lines_duration(pilot: LinesPilot) -> float:
+    """Time that a lines pilot needs for all its moves and pauses [s]."""
+    total = pilot.settle
+    for move in pilot.moves:
+        total += move.pause + _move_duration(move, pilot.acceleration)
+    return total
+
+
+def _move_duration(move: Move, acceleration: float) -> float:
+    size = math.hypot(move.r, move.z) or max(abs(move.theta), abs(move.attitude), abs(move.head))
+    return _trapezoid(np.zeros(1), size, move.speed, acceleration)[1] if size else 0.0
+
+
+def _waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
+    begin = pilot.settle
+    here = dict(zip(plan.axes, plan.reference[0], strict=True))
+    for number, point in enumerate(pilot.points):
+        inside = (plan.time >= begin) & (plan.time <= begin + point.duration)
+        s, ds = quintic(plan.time[inside] - begin, point.duration)
+        where = f"pilot.points.{number}"
+        target = _waypoint_joints(machine, plan.axes, here, point, where)
+        for name, value in target.items():
+            check_reference(machine, name, np.array([begin]), np.array([value]))
+        if point.pose:
+            path, speeds = _pose_path(machine, plan.axes, here, target, s, ds, where)
+        else:
+            span = np.array([target[a] - here[a] for a in plan.axes])
+            path = np.array([here[a] for a in plan.axes]) + s[:, None] * span
+            speeds = ds[:, None] * span
+        plan.reference[inside], plan.rate[inside] = path, speeds
+        begin += point.duration
+        plan.reference[plan.time > begin] = [target[a] for a in plan.axes]
+        begin += point.pause
+        here = target
+    notes = cut_short(plan.time, begin)
+    return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool), notes=notes)
+
+
+def _waypoint_joints(machine, axes, here: dict, point: Waypoint, where: str) -> dict[str, float]:
+    target = dict(here)
+    if point.pose:
+        target |= pose_to_joints(machine, point.pose, here, f"{where}.pose")
+    for name, value in point.joints.items():
+        target[axes[_column(axes, name, f"{where}.joints")]] = value
+    return target
+
+
+def _pose_path(machine, axes, here, target, s, ds, where: str) -> tuple[np.ndarray, np.ndarray]:
+    order = arm_axes(machine)
+    first = np.array(ResolvedMotion.begin(machine, here).pose)
+    last = np.array(ResolvedMotion.begin(machine, target).pose)
+    path = np.tile([here[a] for a in axes], (len(s), 1))
+    speeds = np.zeros_like(path)
+    for a in axes:
+        if a not in order:
+            path[:, axes.index(a)] += s * (target[a] - here[a])
+            speeds[:, axes.index(a)] = ds * (target[a] - here[a])
+    motion = ResolvedMotion.begin(machine, here)
+    for row, (part, rate) in enumerate(zip(s, ds, strict=True)):
+        motion, joints, velocity = motion.position_step(
+            first + part * (last - first), rate * (last - first)
+        )
+        if motion.blocked:
+            raise InputError(
+                f"{where}.pose", f"its straight way leaves the workspace after {100 * part:.0f} %;"
+                " go there by another waypoint, or give joints",
+            )  # fmt: skip
+        for name, value in joints.items():
+            path[row, axes.index(name)] = value
+            speeds[row, axes.index(name)] = velocity[name]
+    return path, speeds

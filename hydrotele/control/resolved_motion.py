@@ -1,0 +1,224 @@
+"""Resolved motion in cylindrical coordinates (r, theta, z, attitude, head), by rate or position.
+
+Inverse kinematics gives the joint references and the inverse Jacobian their rates, so that no error
+is integrated. A step that would leave the reach or a joint's range is not made: the reference stays
+and `blocked` says so, until the command comes back to where it stands.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
+from hydrotele.kinematics.arm import Unreachable, inverse
+from hydrotele.kinematics.from_machine import arm_geometry, feller_geometry
+from hydrotele.kinematics.task import (
+    REACHED,
+    task_forward,
+    task_inverse,
+    task_numbers,
+    task_rates,
+)
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Pose
+
+COORDINATES = ("r", "theta", "z", "attitude", "head")
+_NEAR = 0.02  # m or rad, about one control period of motion: a blocked reference must not jump
+
+
+@compiled
+def follow_pose(g, ranges, wanted, rate, blocked, pose, q, speed):
+    """Move joint references to a pose, or hold them where it cannot be reached.
+
+    Args:
+        g: (9,) of `kinematics.task.task_numbers`.
+        ranges: (k, 2) joint ranges [rad].
+        wanted: (5,) pose asked for: r [m], theta [rad], z [m], attitude [rad], head [rad].
+        rate: (5,) its rate [m/s], [rad/s].
+        blocked: whether the last step was held, scalar; then only a pose near the held one frees.
+        pose: (5,) pose of the references, updated.
+        q: (k,) joint references, updated [rad].
+        speed: (k,) their rates, written; 0 while held [rad/s].
+
+    Returns:
+        Whether the references were held, as a scalar.
+
+    Source: Zhu 1994, chapter 2.
+    """
+    k = len(q)
+    found = np.empty(k)
+    held = False
+    if blocked:
+        for i in range(max(k, 3)):
+            if i < k and not abs(wanted[i] - pose[i]) <= _NEAR:
+                held = True
+    held = held or task_inverse(g, wanted, q[0], found) != 0
+    if not held:
+        for i in range(k):
+            if not ranges[i, 0] <= found[i] <= ranges[i, 1]:
+                held = True
+    held = held or task_rates(g, found, wanted, rate, speed) != 0
+    if held:
+        speed[:] = 0.0
+        return True
+    q[:] = found
+    pose[:] = wanted
+    if k < 4:
+        pose[3] = found[1] + found[2]
+    return False
+
+
+@dataclasses.dataclass(frozen=True)
+class ResolvedMotion:
+    """State of the resolved-motion controller.
+
+    Attributes:
+        numbers: (9,) the arm, of `kinematics.task.task_numbers`.
+        axes: k axis names from swing outwards, 3 to 5.
+        ranges: (k, 2) joint ranges [rad], same order.
+        joints: (k,) joint references [rad], same order.
+        pose: desired r [m], theta [rad], z [m], attitude [rad] and, with a head, its angle [rad].
+        blocked: whether the last step was stopped at the edge of the workspace.
+    """
+
+    numbers: np.ndarray
+    axes: tuple[str, ...]
+    ranges: np.ndarray
+    joints: tuple[float, ...]
+    pose: tuple[float, ...]
+    blocked: bool = False
+
+    @staticmethod
+    def begin(machine: Machine, joints: dict[str, float]) -> "ResolvedMotion":
+        """Start at the given axis positions [rad].
+
+        Raises:
+            InputError: the machine has no arm.
+        """
+        numbers, axes, ranges = arm_facts(machine)
+        q = tuple(float(joints[a]) for a in axes)
+        pose = np.zeros(5)
+        task_forward(numbers, np.array(q), pose)
+        return ResolvedMotion(numbers, axes, ranges, q, tuple(pose[: max(4, len(axes))].tolist()))
+
+    def rate_step(self, rate, dt: float) -> tuple["ResolvedMotion", dict, dict]:
+        """Move by a rate command held for dt.
+
+        Args:
+            rate: (4,) or (5,) dr/dt [m/s], dtheta/dt [rad/s], dz/dt [m/s], dattitude/dt [rad/s],
+                dhead/dt [rad/s].
+            dt: [s].
+
+        Returns:
+            (next state, axis -> position [rad], axis -> velocity [rad/s]).
+        """
+        wanted = tuple(p + v * dt for p, v in zip(self.pose, rate, strict=False))
+        return self.position_step(wanted, rate)
+
+    def position_step(self, wanted, rate) -> tuple["ResolvedMotion", dict, dict]:
+        """Move to a pose, with its rate for feedforward.
+
+        Args:
+            wanted: (4,) or (5,) r [m], theta [rad], z [m], attitude [rad], head [rad].
+            rate: its time derivative.
+
+        Returns:
+            (next state, axis -> position [rad], axis -> velocity [rad/s]).
+        """
+        pose, q, speed = _five(self.pose), np.array(self.joints), np.zeros(len(self.axes))
+        blocked = follow_pose(
+            self.numbers, self.ranges, _five(wanted), _five(rate), self.blocked, pose, q, speed
+        )
+        state = dataclasses.replace(
+            self, joints=tuple(q.tolist()), pose=tuple(pose[: len(self.pose)].tolist()),
+            blocked=bool(blocked),
+        )  # fmt: skip
+        return (
+            state,
+            dict(zip(self.axes, state.joints, strict=True)),
+            dict(zip(self.axes, speed.tolist(), strict=True)),
+        )
+
+
+def _five(values) -> np.ndarray:
+    out = np.zeros(5)
+    out[: min(5, len(values))] = values[:5]
+    return out
+
+
+def arm_axes(machine: Machine) -> tuple[str, ...]:
+    """Axis names of the arm's joints, from swing outwards.
+
+    Raises:
+        InputError: the machine has no arm, or a joint of its arm is not driven.
+    """
+    arm = machine.arm
+    if arm is None:
+        raise InputError(f"machine {machine.name}", "has no arm for resolved motion or poses")
+    by_joint = {axis.joint: name for name, axis in machine.axes.items()}
+    joints = [j for j in (arm.swing, arm.boom, arm.stick, arm.tool, arm.head) if j]
+    if missing := [j for j in joints if j not in by_joint]:
+        raise InputError(f"machine {machine.name}: arm", f"{missing} are not driven by an axis")
+    return tuple(by_joint[j] for j in joints)
+
+
+def arm_facts(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
+    """Numbers (9,) of the arm, its k axis names from swing outwards, joint ranges (k, 2) [rad].
+
+    Raises:
+        InputError: the machine has no arm, or a joint of its arm is not driven.
+    """
+    axes = arm_axes(machine)
+    limits = [machine.joints[machine.axes[a].joint].range for a in axes]
+    ranges = np.array([limit or (-math.inf, math.inf) for limit in limits])
+    headed = machine.arm is not None and machine.arm.head is not None
+    geometry = feller_geometry(machine) if headed else arm_geometry(machine)
+    return task_numbers(geometry), axes, ranges
+
+
+def pose_to_joints(
+    machine: Machine, pose: Pose, here: dict[str, float], where: str = "pose"
+) -> dict[str, float]:
+    """Axis positions that bring the tip to a pose.
+
+    Args:
+        machine: the machine.
+        pose: the pose; without `attitude` the tool keeps that of `here`.
+        here: axis -> present position [rad].
+        where: key path of the pose, for messages.
+
+    Returns:
+        Axis -> position [rad].
+
+    Raises:
+        InputError: the pose is out of reach or beyond a joint's range.
+    """
+    numbers, axes, ranges = arm_facts(machine)
+    attitude, head = pose.attitude, pose.head
+    if attitude is None:
+        attitude = sum(here[a] for a in axes[1:4])
+    if head is None:
+        head = here[axes[4]] if len(axes) == 5 else 0.0
+    joints, wanted = np.zeros(len(axes)), np.array([pose.r, pose.theta, pose.z, attitude, head])
+    if task_inverse(numbers, wanted, pose.theta, joints) != REACHED:
+        raise InputError(where, _why_not(machine, wanted[: len(axes)]))
+    for name, q, (low, high) in zip(axes, joints.tolist(), ranges, strict=True):
+        if not low <= q <= high:
+            raise InputError(
+                where,
+                f"needs {name} at {math.degrees(q):.1f} deg, which its joint allows only from"
+                f" {math.degrees(low):.1f} to {math.degrees(high):.1f} deg",
+            )
+    return dict(zip(axes, joints.tolist(), strict=True))
+
+
+def _why_not(machine: Machine, pose: np.ndarray) -> str:
+    if len(pose) == 5:
+        return f"no joint angles bring the tool to r {pose[0]:.6g} m, z {pose[2]:.6g} m"
+    try:
+        inverse(arm_geometry(machine), pose.tolist())
+    except Unreachable as error:
+        return str(error)
+    return "is out of reach"

@@ -1,0 +1,138 @@
+"""State-variable filter: a signal's low-pass with its first two derivatives, causal.
+
+All signals that a balance needs go through the same filter, so that they are equally late: a sum of
+signals and derivatives that is zero stays zero. Between two readings a signal is taken as a
+straight line, which is exact for what ramps, and finite for one that is held.
+"""
+
+import math
+
+import numpy as np
+from scipy.linalg import expm
+
+from hydrotele.core.compiled import compiled, lean
+
+LOW, RATE, CHANGE, LAST = range(4)  # columns of a filter's state
+_NEGLIGIBLE = 1.0e-12
+_REAL, _SQUARE, _CUBE = 2.0, 2.0, 1.0  # Butterworth's polynomial of third order
+
+
+def filter_table(bandwidth: float, period: float) -> np.ndarray:
+    """One step of the filter as a table.
+
+    `y''' = w^3 (u - y) - 2 w^2 y' - 2 w y''` (Butterworth), solved exactly for u that runs straight
+    from the last reading to the new one.
+
+    Args:
+        bandwidth: w / (2 pi), scalar [Hz], > 0.
+        period: time between two calls, scalar [s], > 0.
+
+    Returns:
+        (3, 5): new y, y', y'' from the old three, the last and the new reading.
+
+    Source: Butterworth's filter; Franklin, Powell and Workman 1998, Digital control, section 6.3
+    (triangle hold).
+
+    >>> filter_table(1.0, 0.01)[:, 3:].sum(axis=1).round(4) + 0.0  # a step of both readings
+    array([0.    , 0.0119, 2.3279])
+    """
+    w = 2.0 * math.pi * bandwidth
+    block = np.zeros((5, 5))
+    block[0, 1] = block[1, 2] = block[3, 4] = 1.0
+    block[2] = -_CUBE * w**3, -_SQUARE * w**2, -_REAL * w, _CUBE * w**3, 0.0
+    scale = np.diag([1.0, w, w**2, 1.0, 1.0])  # or the exponential would lose digits
+    block[3, 4] = 1.0 / period
+    step = scale @ expm(np.linalg.inv(scale) @ block @ scale * period) @ np.linalg.inv(scale)
+    table = step[:3].copy()
+    table[:, 3] -= step[:3, 4]
+    return table
+
+
+def filter_delay(bandwidth: float) -> float:
+    """Delay [s] that the filter gives slow changes, for its bandwidth [Hz]: 2 / w."""
+    return _SQUARE / (2.0 * math.pi * bandwidth)
+
+
+def butterworth(bandwidth: float, s: np.ndarray) -> np.ndarray:
+    """Transfer function of the filter for readings that run straight from one to the next.
+
+    Args:
+        bandwidth: w / (2 pi), scalar [Hz], > 0.
+        s: (...) complex frequencies [rad/s].
+
+    Returns:
+        (...) `w^3 / (s^3 + 2 w s^2 + 2 w^2 s + w^3)` [1].
+
+    Source: Butterworth's filter of third order.
+
+    >>> abs(butterworth(1.0, np.array([2j * np.pi]))).round(4)
+    array([0.7071])
+    """
+    w = 2.0 * math.pi * bandwidth
+    return _CUBE * w**3 / (s**3 + _REAL * w * s**2 + _SQUARE * w**2 * s + _CUBE * w**3)
+
+
+def noise_gains(table: np.ndarray) -> np.ndarray:
+    """Standard deviations of y, y', y'' for white readings of standard deviation 1.
+
+    Args:
+        table: (3, 5) of `filter_table`.
+
+    Returns:
+        (3,) [1], [1/s], [1/s^2].
+
+    Source: response to a single reading.
+    """
+    state, last, total = np.zeros(3), 1.0, table[:, 4] ** 2
+    state += table[:, 4]
+    while np.any(state**2 > _NEGLIGIBLE * total):
+        state = table @ (*state, last, 0.0)
+        total, last = total + state**2, 0.0
+    return np.sqrt(total)
+
+
+@lean
+def filter_step(table, state, reading):
+    """Take in the next reading of one signal.
+
+    Args:
+        table: (3, 5) of `filter_table`.
+        state: (4,) of the signal: LOW, RATE, CHANGE, LAST reading; updated.
+        reading: u, scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `filter_table`.
+    """
+    low, rate, change, last = state[LOW], state[RATE], state[CHANGE], state[LAST]
+    for i in range(3):
+        state[i] = (
+            table[i, 0] * low
+            + table[i, 1] * rate
+            + table[i, 2] * change
+            + table[i, 3] * last
+            + table[i, 4] * reading
+        )
+    state[LAST] = reading
+
+
+@compiled
+def filtered(table, readings):
+    """A whole signal through the filter, which stands at the first reading.
+
+    Args:
+        table: (3, 5) of `filter_table`.
+        readings: (r,) signal.
+
+    Returns:
+        (r, 3) low-pass LOW, its RATE and its CHANGE.
+
+    Source: `filter_table`.
+    """
+    state, out = np.zeros(4), np.zeros((len(readings), 3))
+    state[LOW] = state[LAST] = readings[0]
+    for row in range(len(readings)):
+        filter_step(table, state, readings[row])
+        out[row] = state[:3]
+    return out

@@ -1,0 +1,259 @@
+"""Forces on an arm from outside: what its motion needs, less what its drives give."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.core.compiled import lean
+from hydrotele.dynamics.forces import gather_forces
+from hydrotele.dynamics.integrate import place_mechanism
+from hydrotele.dynamics.mechanism import DAMPING, Mechanism
+from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Motion
+from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
+from hydrotele.kinematics.task import task_jacobian
+
+_AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
+_ODDS = 8.0
+_SINGULAR = 1.0e-6  # pivot against the largest entry
+
+
+class Body(NamedTuple):
+    """What is needed of `dynamics.model.Model`, whose attributes these are.
+
+    Every array that Python hands over costs a tenth of a microsecond.
+    """
+
+    mech: Mechanism
+    user: np.ndarray
+    hydraulic: int
+    gear: np.ndarray
+    transmission: np.ndarray
+
+
+class Work(NamedTuple):
+    """What is needed of `dynamics.model.Space`, whose attributes these are."""
+
+    motion: Motion
+    drive: np.ndarray
+    row: np.ndarray
+
+
+class Arm(NamedTuple):
+    """An arm in its machine, without transmissions: m joints, n independent coordinates.
+
+    Attributes:
+        model: the machine.
+        space: its work space.
+        z: (2 n + 4 h,) state of the model: positions, rates, and four numbers per valve, of which
+            the last two are its pressures [Pa].
+        joint: (m,) independent coordinate of every joint, swing first.
+        task: (9,) of `kinematics.task.task_numbers`.
+        gravity: (p,) parameters of the static model [N m].
+        acceleration: (n,) of the independent coordinates.
+        rate_noise: (n,) standard deviation of the independent coordinates' rates.
+        angle: (m,) work space.
+        table: (m, m) work space.
+        work: (n,) work space.
+    """
+
+    model: Body
+    space: Work
+    z: np.ndarray
+    joint: np.ndarray
+    task: np.ndarray
+    gravity: np.ndarray
+    acceleration: np.ndarray
+    rate_noise: np.ndarray
+    angle: np.ndarray
+    table: np.ndarray
+    work: np.ndarray
+
+
+@lean
+def dynamic_balance(arm, outside):
+    """Forces from outside by the complete model: inertia, gravity, friction, closed chains.
+
+    `tau = B' (M (B q'' + d) + h + D q') - sum r_i (F_i - f_i(v_i))`
+
+    Args:
+        arm: Arm; z and acceleration are read.
+        outside: (n,) written: forces on the independent coordinates [N m] or [N].
+
+    Returns:
+        Nothing.
+
+    Source: Zhu 1994, 6.2, with the projection of `dynamics.integrate`.
+    """
+    model, m = arm.model, arm.space.motion
+    n, nt = len(outside), m.joint.shape[1]
+    place_mechanism(model, arm.space, arm.z)
+    gather_forces(model.mech, m)
+    for f in range(n):
+        outside[f] = 0.0
+    for j in range(nt):
+        need = m.joint[BIAS, j] + model.mech.joint[DAMPING, j] * m.joint[RATE, j]
+        for k in range(nt):
+            way = m.joint[DRIFT, k]
+            for f in range(n):
+                way += m.basis[k, f] * arm.acceleration[f]
+            need += m.mass[j, k] * way
+        for f in range(n):
+            outside[f] += m.basis[j, f] * need
+    _subtract_drives(arm, True, outside)
+
+
+@lean
+def static_balance(arm, outside):
+    """Forces from outside by the static model of gravity alone.
+
+    `tau = Y(q) P - sum r_i F_i`
+
+    Args:
+        arm: Arm; z and gravity are read.
+        outside: (n,) written: forces on the independent coordinates [N m]; those of joints that
+            are not the arm's without gravity.
+
+    Returns:
+        Nothing.
+
+    Source: Zhu 1994, 6.6.
+    """
+    place_mechanism(arm.model, arm.space, arm.z)
+    for f in range(len(outside)):
+        outside[f] = 0.0
+    for i in range(len(arm.joint)):
+        outside[arm.joint[i]] = static_torque(arm.z, arm.joint, arm.gravity, i)
+    _subtract_drives(arm, False, outside)
+
+
+@lean
+def moving(velocity, variance):
+    """Probability that a drive moves, given what is read of its velocity.
+
+    Standing and moving are equally likely beforehand, and a moving drive has any velocity of a
+    range that is ODDS sqrt(2 pi) times as wide as the noise.
+
+    Args:
+        velocity: scalar [m/s] or [rad/s].
+        variance: of its noise, scalar [m^2/s^2] or [rad^2/s^2]; 0 where it is known.
+
+    Returns:
+        Probability, scalar [1].
+
+    Source: Bayes' rule.
+
+    >>> [round(moving(v, 1.0), 3) for v in (0.0, 2.0, 4.0)]
+    [0.111, 0.48, 0.997]
+    """
+    if not variance > 0.0:
+        return 1.0
+    return 1.0 / (1.0 + _ODDS * math.exp(-0.5 * velocity * velocity / variance))
+
+
+@lean
+def _subtract_drives(arm, rubbing, outside):
+    """Take what the drives give off the forces outside."""
+    model, sp, n = arm.model, arm.space, len(outside)
+    for i in range(model.hydraulic):
+        u, a = i * SLOTS, 2 * n + 4 * i
+        give = model.user[u + _AH] * arm.z[a + 2] - model.user[u + _AR] * arm.z[a + 3]
+        if rubbing:
+            v, noise = 0.0, 0.0
+            for f in range(n):
+                v += sp.row[i, f] * arm.z[n + f]
+                noise += (sp.row[i, f] * arm.rate_noise[f]) ** 2
+            give -= moving(v, noise) * actuator_friction(model.user, u, v)
+        for f in range(n):
+            outside[f] -= sp.row[i, f] * give
+
+
+@lean
+def static_torque(q, joint, gravity, i):
+    """Torque that gravity asks of a joint of the arm.
+
+    Every bending link has two parameters, of the cosine and of the sine of its attitude, which act
+    on all joints before it; the seventh turns with the head of a feller-buncher.
+
+    Args:
+        q: (>= n,) positions of the independent coordinates [rad].
+        joint: (m,) independent coordinate of every joint, swing first.
+        gravity: (2 (m - 1),) parameters of 3 or 4 joints, (7,) of 5: C2, S2, C23, S23, C234,
+            S234 and C5 [N m].
+        i: index of the joint.
+
+    Returns:
+        Torque, scalar [N m].
+
+    Source: Zhu 1994, 6.8 and 6.9.
+    """
+    if i == 0:
+        return 0.0
+    bending, angle, total = min(4, len(joint)), 0.0, 0.0
+    for k in range(1, bending):
+        angle += q[joint[k]]
+        if k >= i:
+            total += gravity[2 * k - 2] * math.cos(angle) + gravity[2 * k - 1] * math.sin(angle)
+    if len(joint) < 5:
+        return total
+    head = q[joint[4]]
+    if i == 4:
+        return -gravity[6] * math.sin(head) * math.sin(angle)
+    return total + gravity[6] * math.cos(head) * math.cos(angle)
+
+
+@lean
+def tip_force(arm, outside, out):
+    """Force at the tip that gives the forces outside.
+
+    Args:
+        arm: Arm; z is read, table and work are destroyed.
+        outside: (n,) forces on the independent coordinates from outside [N m] or [N].
+        out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m]; left alone
+            where the Jacobian is singular.
+
+    Returns:
+        Whether it was written.
+
+    Source: Zhu 1994, 6.6: `F = J^-T tau`.
+    """
+    m, most = len(out), 0.0
+    for i in range(m):
+        arm.angle[i] = arm.z[arm.joint[i]]
+    task_jacobian(arm.task, arm.angle, arm.table)
+    for i in range(m):
+        arm.work[i] = outside[arm.joint[i]]
+        for j in range(i):
+            arm.table[i, j], arm.table[j, i] = arm.table[j, i], arm.table[i, j]
+        for j in range(m):
+            most = max(most, abs(arm.table[i, j]))
+    if not _eliminated(arm.table, arm.work, m, _SINGULAR * most):
+        return False
+    for i in range(m):
+        out[i] = arm.work[i]
+    return True
+
+
+@lean
+def _eliminated(table, right, m, least):
+    """Solve by elimination, in place; False where a pivot is less than the least."""
+    for i in range(m):
+        best = i
+        for r in range(i + 1, m):
+            if abs(table[r, i]) > abs(table[best, i]):
+                best = r
+        if not abs(table[best, i]) > least:
+            return False
+        for j in range(m):
+            table[i, j], table[best, j] = table[best, j], table[i, j]
+        right[i], right[best] = right[best], right[i]
+        for r in range(i + 1, m):
+            part = table[r, i] / table[i, i]
+            right[r] -= part * right[i]
+            for j in range(i, m):
+                table[r, j] -= part * table[i, j]
+    for i in range(m - 1, -1, -1):
+        for j in range(i + 1, m):
+            right[i] -= table[i, j] * right[j]
+        right[i] /= table[i, i]
+    return True

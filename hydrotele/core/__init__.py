@@ -1,0 +1,1 @@
+"""What knows no machine: errors, files, YAML with line numbers, output, compiled functions."""

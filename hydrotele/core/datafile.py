@@ -1,0 +1,276 @@
+"""YAML files into validated frozen facts: units in key names, errors that name file, line and key.
+
+A key may carry its unit as a suffix (`angle_deg`, `area_head_in2`, `relief_pressure_bar`); it is
+converted to SI here, at the boundary, and nowhere else.
+"""
+
+import difflib
+import math
+import re
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import pydantic
+import yaml
+
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_text
+from hydrotele.core.limits import beyond, limit
+
+LARGEST = 1.0e20  # of any SI number of a file, so that products of a few stay finite
+Number = Annotated[float, pydantic.Field(ge=-LARGEST, le=LARGEST)]
+Vector = tuple[Number, Number, Number]
+Positive = Annotated[float, pydantic.Field(gt=0, le=LARGEST)]
+NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST)]
+Name = Annotated[str, pydantic.Field(pattern=r"^[a-z][a-z0-9_]*$")]
+
+PSI = 6894.757293168361  # Pa, exact pound-force and inch
+
+UNIT_SUFFIXES = {
+    "_deg": math.pi / 180.0,
+    "_mm": 1.0e-3,
+    "_in2": 0.0254**2,
+    "_cm2": 1.0e-4,
+    "_psi": PSI,
+    "_bar": 1.0e5,
+    "_hz": 1.0,
+    "_l_min": 1.0e-3 / 60.0,
+    "_ms": 1.0e-3,
+}
+"""Suffix of a key -> factor to SI; `_hz` of an angular frequency counts 2 pi."""
+
+ANGULAR_FREQUENCIES = ("bandwidth",)
+
+
+def to_si(value: Any, factor: float) -> Any:
+    """Multiply a number, or every number of nested lists, by a factor; leave the rest alone.
+
+    Raises:
+        ValueError: the value is a text, which no unit suits.
+    """
+    if isinstance(value, str):
+        raise ValueError(f"{value!r} is a text, not a number")
+    if isinstance(value, list):
+        return [to_si(item, factor) for item in value]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return value
+    try:
+        return value * factor
+    except OverflowError:  # an integer beyond any float
+        return math.inf
+
+
+def split_unit(key: str) -> tuple[str, float | None]:
+    """Stem of a key and the factor of its unit suffix to SI, `None` without one.
+
+    >>> split_unit("accuracy_mm")
+    ('accuracy', 0.001)
+    """
+    for suffix, factor in UNIT_SUFFIXES.items():
+        if key.endswith(suffix):
+            stem = key.removesuffix(suffix)
+            turns = suffix == "_hz" and stem in ANGULAR_FREQUENCIES
+            return stem, 2.0 * math.pi if turns else factor
+    return key, None
+
+
+def suggest(name: object, valid) -> str:
+    """A sentence with the closest valid name, if there is one, and all valid names."""
+    names = sorted(map(str, valid))
+    close = difflib.get_close_matches(str(name), names, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    return f"{hint}valid: {', '.join(names) or '(none)'}"
+
+
+class Facts(pydantic.BaseModel):
+    """Base of everything read from YAML: frozen, finite, SI, no unknown keys."""
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _convert_units_and_refuse_unknown_keys(cls, data):
+        if not isinstance(data, dict):
+            return data
+        fields = cls.model_fields
+        result: dict[str, Any] = {}
+        for key, value in data.items():
+            name, factor = split_unit(str(key))
+            if key in fields:
+                name = key
+            elif factor is not None and name in fields:
+                value = to_si(value, factor)
+            else:
+                raise ValueError(f"unknown key {key!r}; {suggest(key, fields)}")
+            if name in result:
+                raise ValueError(f"{name!r} is given twice, as {key!r} and another unit")
+            result[name] = value
+        return result
+
+
+_BASE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml: ten times as fast
+
+
+class _Loader(_BASE):
+    """SafeLoader that reads 28.0e6 as a number, as YAML 1.2 does, and refuses repeated keys."""
+
+    def __init__(self, stream):
+        super().__init__(stream)
+        self.deep_construct = True  # refuses an alias inside its own anchor
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key_node, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, Hashable):
+                continue  # SafeLoader itself refuses it, with the line
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} stands twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d[\d_]*)(\.\d*)?[eE][-+]?\d+$"),
+    list("-+0123456789"),
+)
+
+
+def _load(text: str) -> tuple[Any, Any]:
+    """Node and value of a YAML text, after `_check_size`."""
+    _check_size(text)
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        return node, (loader.construct_document(node) if node else None)
+    finally:
+        loader.dispose()
+
+
+def _check_size(text: str) -> None:
+    """Refuse what is too deep or too large once its aliases are replaced by what they stand for.
+
+    The parser's events come one by one, so that nothing is built for what is refused: libyaml's
+    composer has no bound of its own on either.
+    """
+    opened: list[tuple[str | None, int]] = []  # anchor of what is open, values before it
+    sizes: dict[str, int] = {}
+    values, most_values, most_depth = 0, limit("FILE_VALUES"), limit("FILE_DEPTH")
+    for event in yaml.parse(text, Loader=_BASE):
+        anchor = getattr(event, "anchor", None)
+        if isinstance(event, yaml.AliasEvent):
+            values += sizes.get(str(anchor), 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            values += 1
+            if anchor:
+                sizes[anchor] = 1
+        elif isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
+            opened.append((anchor, values))
+            values += 1
+        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
+            anchor, before = opened.pop()
+            if anchor:
+                sizes[anchor] = values - before
+        if values > most_values or len(opened) > most_depth:
+            said = beyond("FILE_DEPTH", len(opened)) or beyond("FILE_VALUES", values)
+            raise yaml.MarkedYAMLError(problem=f"it has {said}", problem_mark=event.start_mark)
+
+
+def _key_lines(root) -> dict[tuple, int]:
+    """Line of every key; what an alias repeats has the line of the key that holds the alias."""
+    lines: dict[tuple, int] = {(): root.start_mark.line + 1}
+    opened: set = set()
+    waiting: list[tuple[Any, tuple]] = [(root, ())]
+    for node, path in waiting:  # grows on the way
+        if node in opened:
+            continue
+        opened.add(node)
+        children: list[tuple] = []
+        if isinstance(node, yaml.MappingNode):
+            children = [(str(key.value), key, value) for key, value in node.value]
+        elif isinstance(node, yaml.SequenceNode):
+            children = [(index, value, value) for index, value in enumerate(node.value)]
+        for name, marked, child in children:
+            lines[(*path, name)] = marked.start_mark.line + 1
+            waiting.append((child, (*path, name)))
+    return lines
+
+
+# What PyYAML's constructors raise at an explicit tag that does not suit its scalar.
+_BAD_SCALARS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
+
+
+def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
+    """Read a YAML mapping together with the line of every key.
+
+    Args:
+        path: the file.
+
+    Returns:
+        (data, key path -> line number from 1).
+
+    Raises:
+        InputError: the file is missing, not YAML, or not a mapping.
+    """
+    path = Path(path)
+    text = read_text(path)
+    try:
+        node, data = _load(text)
+    except (yaml.YAMLError, RecursionError, *_BAD_SCALARS) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        nested = isinstance(error, RecursionError)
+        untold = "it is nested too deeply" if nested else "a value does not suit its !!tag"
+        problem = getattr(error, "problem", None) or str(error if error.args[1:] else untold)
+        raise InputError(f"{path}{line}", f"is not valid YAML: {problem}") from None
+    if not isinstance(data, dict) or node is None:
+        raise InputError(str(path), "must be a mapping of keys to values")
+    return data, _key_lines(node)
+
+
+def read_value(text: str) -> Any:
+    """A single YAML value, read as in files.
+
+    Raises:
+        yaml.YAMLError: the text is no YAML.
+    """
+    return _load(text)[1]
+
+
+Model = TypeVar("Model", bound=Facts)
+
+
+def parse(model: type[Model], data: dict, source: str, lines: dict[tuple, int]) -> Model:
+    """Validate data against a Facts class.
+
+    Args:
+        model: the class.
+        data: what was read.
+        source: file name for messages.
+        lines: key path -> line, as from `read_yaml`; may be empty.
+
+    Returns:
+        The validated instance.
+
+    Raises:
+        InputError: names file, line, key path and what is allowed.
+    """
+    try:
+        return model.model_validate(data)
+    except pydantic.ValidationError as error:
+        problems = []
+        first_line = None
+        for item in error.errors():
+            path = tuple(item["loc"])
+            line = next((lines[path[:k]] for k in range(len(path), -1, -1) if path[:k] in lines), 0)
+            first_line = first_line or line
+            message = item["msg"].removeprefix("Value error, ")
+            problems.append(f"{'.'.join(map(str, path)) or '(top)'}: {message}")
+        where = f"{source}:{first_line}" if first_line else source
+        raise InputError(where, "; ".join(problems[:5])) from None

@@ -1,0 +1,373 @@
+"""How well a guess explains the fit runs: prediction errors, slopes, and a step to a better one.
+
+Errors are whitened with gains that are kept while a guess moves, so that they are smooth functions
+of its deviations d. The loss is `sum e(d)^2 + d'd` (a unit-normal prior); a hypothesis is charged
+`log det(1 + S'S)` for the room that its parameters take (Laplace's approximation of the evidence).
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.estimate.hypothesis import Guess
+from hydrotele.estimate.levels import find_levels
+from hydrotele.estimate.track import (
+    COARSE,
+    STEP,
+    Levels,
+    Track,
+    fine_enough,
+    known_levels,
+    track_run,
+)
+from hydrotele.logs.load import Dataset, RunData
+from hydrotele.machine.machine import Machine
+
+_CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
+_STEPS = 6
+MIDDLE = 2.0e-3  # s, step at which guesses are fitted
+_MANY = 10  # numbers of a base from which their slopes are taken at a coarser step
+BLOCK = 2.0  # s of a run that count as one witness: longer than what a model lacks remembers
+_ROUNDS = 2  # of linearisation for the levels of the first base; later ones start from near by
+_NEW = 6  # numbers more than the base before had, for whose directions its own ones do
+_UNKNOWN = 2500.0  # information of a new one, until it is known: it shows by its fiftieth
+_MOVE = 1.0  # of the errors, by which they are moved for the slopes of many numbers
+_CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A guess fitted with kept gains.
+
+    Attributes:
+        guess: the guess.
+        loss: `sum e^2 + d'd`.
+        gain: fall of the loss against the guess without its last part.
+        charge: what the last part's parameters cost.
+        information: (P, P) `S'S + 1` of all parts.
+    """
+
+    guess: Guess
+    loss: float
+    gain: float
+    charge: float
+    information: np.ndarray
+
+    @property
+    def score(self) -> float:
+        """Twice the log of the evidence gained."""
+        return self.gain - self.charge
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A guess with noise levels of its own.
+
+    Attributes:
+        guess: the guess.
+        tracks: its tracks of the fit runs, linearised.
+        loss: -2 log of their likelihood times the prior of levels and deviations.
+    """
+
+    guess: Guess
+    tracks: tuple[Track, ...]
+    loss: float
+
+    def blocks(self, seconds: float = BLOCK) -> np.ndarray:
+        """(B,) -2 log likelihood of stretches of the runs, without constant."""
+        return np.concatenate([_blocks(track, seconds) for track in self.tracks])
+
+
+class Evidence:
+    """Runs of a dataset, tracks of a base guess, and workers to try other guesses."""
+
+    def __init__(
+        self, data: Dataset, runs: Sequence[RunData], jobs: int = 2, step: float = STEP,
+        lacking: bool = False,
+    ):  # fmt: skip
+        """Take the runs to judge by and the largest step [s]; `close` ends the workers.
+
+        With `lacking`, or where a channel's accuracy is not stated, noise levels are found from
+        the data for every base (`estimate.levels`); otherwise they are those that are stated.
+        """
+        self.step, self.lacking = step, lacking or not known_levels(data)
+        self.data, self.runs = dataclasses.replace(data, fit=tuple(runs)), tuple(runs)
+        self._pool = ThreadPoolExecutor(jobs)
+        self.tracks: tuple[Track, ...] = ()
+        self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
+        self._slopes = dict[float, np.ndarray]()
+        self._information = list[str](), np.zeros((0, 0))
+
+    def close(self) -> None:
+        """End the workers."""
+        self._pool.shutdown()
+
+    def track(self, machine: Machine, runs: Sequence[RunData] | None = None) -> tuple[Track, ...]:
+        """Tracks with gains of their own and the levels that the machine states."""
+        runs = self.runs if runs is None else runs
+        return tuple(
+            self._pool.map(lambda run: track_run(machine, self.data, run, None, self.step), runs)
+        )
+
+    def judged(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
+        """A guess with noise levels of its own, found from those of the base.
+
+        With `same`, the base is nearly the same machine: its Jacobians are used again, which is
+        enough on the way to a fit, not for comparing it. With `reopened`, unknown inputs that the
+        base has no need of are tried again: a guess with fewer parts may need them.
+        """
+        machine = guess.machine(self.data.machine)
+        if not self.lacking:
+            tracks = self.track(machine)
+        else:
+            rounds = 1 + reopened if self.tracks else _ROUNDS
+            tracks = find_levels(
+                self.data, machine, self.tracks, self._pool.map, self.step, rounds, same, reopened
+            )
+        loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
+        return Judged(guess, tracks, loss + _prior(guess))
+
+    def judged_from(self, guess: Guess, levels: Levels) -> Judged:
+        """A guess with noise levels found from given ones instead of from those of the base.
+
+        What the base needs where it does not follow the readings at all may hide what a guess does.
+        Unknown inputs that the given levels lack are tried, too.
+        """
+        machine = guess.machine(self.data.machine)
+        tracks = self.map(
+            lambda near: track_run(
+                machine, self.data, near.run, None, self.step, levels, None, True, near.rest
+            ),
+            self.tracks,
+        )
+        tracks = find_levels(
+            self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True
+        )
+        loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
+        return Judged(guess, tracks, loss + _prior(guess))
+
+    def set_base(self, guess: Guess | Judged) -> Judged:
+        """Compute gains anew for a guess; later errors are whitened with them."""
+        judged = guess if isinstance(guess, Judged) else self.judged(guess)
+        self.tracks, self._base = judged.tracks, judged.guess
+        self._steps, self._slopes = {}, {}
+        return judged
+
+    @property
+    def base_loss(self) -> float:
+        """-2 log likelihood of the base with its own gains, without constant."""
+        return sum(track.loss for track in self.tracks)
+
+    @property
+    def base_errors(self) -> np.ndarray:
+        """(E,) whitened errors of the base, all runs."""
+        return np.concatenate([flat(track.whitened) for track in self.tracks])
+
+    def errors(
+        self, guess: Guess, step: float | None = None, tracks: Sequence[Track] | None = None
+    ) -> np.ndarray:
+        """(E,) whitened errors of a guess with the base's gains, in all or some of its tracks.
+
+        What another step than the evidence's own changes for the base is taken out, lest an effect
+        be preferred because it makes up for the integrator.
+        """
+        step, machine = step or self.step, guess.machine(self.data.machine)
+        tracks = self.tracks if tracks is None else tracks
+        return np.concatenate(
+            [self._errors(machine, t, step) + self._made_by(step, t) for t in tracks]
+        )
+
+    def step_effect(self, guess: Guess, step: float) -> np.ndarray:
+        """(E,) what another step than the evidence's own changes for a guess near the base."""
+        machine = guess.machine(self.data.machine)
+        return np.concatenate(
+            [self._errors(machine, t, step) - self._errors(machine, t, self.step)
+             for t in self.tracks]
+        )  # fmt: skip
+
+    def _errors(self, machine: Machine, track: Track, step: float) -> np.ndarray:
+        return flat(track_run(machine, self.data, track.run, track, step).whitened)
+
+    def _made_by(self, step: float, track: Track) -> np.ndarray | float:
+        """What the evidence's own step takes back from the errors of the base in a track."""
+        if step == self.step:
+            return 0.0
+        key = f"{track.run.name} {len(track.whitened)}", step
+        if key not in self._steps:
+            machine = self._base.machine(self.data.machine)
+            self._steps[key] = flat(track.whitened) - self._errors(machine, track, step)
+        return self._steps[key]
+
+    def step_of(self, guess: Guess, step: float) -> float:
+        """Largest step that a guess takes where others take `step` [s].
+
+        Guesses are compared at equal steps, lest a finer one be taken for a better machine.
+        """
+        return fine_enough(guess.machine(self.data.machine), step)
+
+    def map(self, function: Callable, items: Sequence) -> list:
+        """Apply a function to items on the workers."""
+        return list(self._pool.map(function, items))
+
+    def slopes(
+        self, guess: Guess, errors: np.ndarray, parallel: bool = True, step: float | None = None,
+        first: int = 0,
+    ) -> np.ndarray:  # fmt: skip
+        """(E, P - first) change of the errors per deviation, from the given one on."""
+        nudges = guess.nudges()
+
+        def column(index: int) -> np.ndarray:
+            moved = guess.deviation
+            nudge = nudges[index]
+            moved[index] += nudge
+            return (self.errors(guess.at(moved), step) - errors) / nudge
+
+        columns = range(first, len(guess.deviation))
+        found = self.map(column, columns) if parallel else [column(i) for i in columns]
+        return np.column_stack(found) if found else np.zeros((len(errors), 0))
+
+    @property
+    def slope_step(self) -> float:
+        """Largest step for slopes of the base's numbers [s]: coarser where they are many."""
+        return COARSE if len(self._base.deviation) > _MANY else MIDDLE
+
+    def base_slopes(self, step: float | None = None, parallel: bool = True) -> np.ndarray:
+        """(E, P) slopes of the base, kept until there is another base.
+
+        Many numbers together may hardly show, as a scale of all areas, flows and masses, although
+        each alone does; the differences of the single slopes are then their errors. So slopes are
+        taken a second time along the principal directions of the first ones, or of those of the
+        base before, if it had nearly the same numbers.
+        """
+        step = step or self.step
+        if step not in self._slopes:
+            errors, names = self.errors(self._base, step), self._base.names
+            if len(names) <= _MANY:
+                self._slopes[step] = self.slopes(self._base, errors, parallel, step)
+                return self._slopes[step]
+            information = self._known_information(names)
+            if information is None:
+                rough = self.slopes(self._base, errors, parallel, step)
+                information = rough.T @ rough + np.eye(len(names))
+            found = self._along(information, errors, parallel, step)
+            self._information = names, found.T @ found + np.eye(len(names))
+            self._slopes[step] = found
+        return self._slopes[step]
+
+    def _known_information(self, names: list[str]) -> np.ndarray | None:
+        """(P, P) information of numbers by the base before; None if it had too few of them."""
+        known, information = self._information
+        there = [known.index(name) for name in names if name in known]
+        if len(names) - len(there) > _NEW:
+            return None
+        own = [k for k, name in enumerate(names) if name in known]
+        found = np.diag(np.full(len(names), _UNKNOWN))
+        found[np.ix_(own, own)] = information[np.ix_(there, there)]
+        return found
+
+    def _along(
+        self, information: np.ndarray, errors: np.ndarray, parallel: bool, step: float
+    ) -> np.ndarray:
+        """(E, P) slopes of the base from differences along the directions of an information."""
+        base, sizes, ways = self._base, *np.linalg.eigh(information)
+        here = base.deviation
+        moves = (_MOVE / np.sqrt(sizes)) * ways
+        for way in moves.T:  # to the side where bounds leave more room
+            ahead, back = (base.at(here + s * way).deviation - here for s in (1.0, -1.0))
+            way[:] = ahead if ahead @ ahead >= back @ back else back
+
+        def change(way: np.ndarray) -> np.ndarray:
+            return self.errors(base.at(here + way), step) - errors
+
+        changes = self.map(change, list(moves.T)) if parallel else [change(way) for way in moves.T]
+        return (np.linalg.pinv(moves.T) @ np.array(changes)).T
+
+    def base_slopes_of(self, tracks: Sequence[Track]) -> np.ndarray:
+        """(E, P) slopes of the base in some of its tracks, or in the first rows of them."""
+        whole, parts, at = self.base_slopes(self.slope_step), {}, 0
+        for track in self.tracks:
+            parts[track.run.name] = whole[at : at + track.whitened.size]
+            at += track.whitened.size
+        return np.concatenate([parts[t.run.name][: t.whitened.size] for t in tracks])
+
+    def fit(
+        self, guess: Guess, before: float, parallel: bool = True, steps: int = _STEPS,
+        step: float | None = None, kept: np.ndarray | None = None,
+    ) -> Fit:  # fmt: skip
+        """Gauss-Newton with halved steps, from the guess.
+
+        Args:
+            guess: where to start.
+            before: loss of the guess without its last part, for the gain.
+            parallel: whether this may use the workers (not from within one).
+            steps: largest number of Gauss-Newton steps.
+            step: largest step of the integrator [s]; the evidence's own if None.
+            kept: (E, K) slopes of the first K deviations, which are then not computed anew.
+
+        Returns:
+            The fit.
+        """
+        first = 0 if kept is None else kept.shape[1]
+
+        def slopes_at(there: Guess, errors: np.ndarray) -> np.ndarray:
+            fresh = self.slopes(there, errors, parallel, step, first)
+            return fresh if kept is None else np.hstack([kept, fresh])
+
+        errors = self.errors(guess, step)
+        loss = _loss(errors, guess)
+        slopes = slopes_at(guess, errors)
+        for _ in range(steps):
+            d = guess.deviation
+            move = -np.linalg.solve(slopes.T @ slopes + np.eye(len(d)), slopes.T @ errors + d)
+            better = None
+            for shrink in (1.0, 0.5, 0.2, 0.05):
+                moved = guess.at(d + shrink * move)
+                tried = self.errors(moved, step)
+                if (lower := _loss(tried, moved)) < loss - 1e-9:
+                    better = (moved, tried, lower)
+                    break
+            if better is None:
+                break
+            fall = loss - better[2]
+            guess, errors, loss = better
+            if fall < _CLOSE:
+                break
+            slopes = slopes_at(guess, errors)
+        information = slopes.T @ slopes + np.eye(slopes.shape[1])
+        last = guess.parts[-1][0].size if guess.parts else 0
+        return Fit(guess, loss, before - loss, charge(information, last), information)
+
+
+def charge(information: np.ndarray, last: int) -> float:
+    """Occam's charge of the last parameters, given the others: `log det` of their information."""
+    if last == 0:
+        return 0.0
+    whole = np.linalg.slogdet(information)[1]
+    rest = np.linalg.slogdet(information[:-last, :-last])[1] if last < len(information) else 0.0
+    return float(whole - rest)
+
+
+def flat(whitened: np.ndarray) -> np.ndarray:
+    """Whitened errors (n, c) as one row (n c,), 0 where missing."""
+    return np.clip(np.nan_to_num(whitened.ravel(), nan=0.0), -_CLIP, _CLIP)
+
+
+def _loss(errors: np.ndarray, guess: Guess) -> float:
+    return float(errors @ errors) + _prior(guess)
+
+
+def _prior(guess: Guess) -> float:
+    return float(guess.deviation @ guess.deviation)
+
+
+def _blocks(track: Track, seconds: float) -> np.ndarray:
+    """-2 log likelihood of stretches of a run; the last, shorter one joins the one before."""
+    there = np.isfinite(track.whitened)
+    width = np.where(there, track.gains.spread, 1.0)
+    rows = np.where(there, track.whitened**2 + 2.0 * np.log(width), 0.0).sum(axis=1)
+    count = max(1, int(len(rows) * track.run.period / seconds))
+    edges = np.linspace(0, len(rows), count + 1).astype(int)
+    return np.add.reduceat(rows, edges[:-1])

@@ -1,0 +1,324 @@
+"""Extended Kalman filter on the reduced model: one-step prediction errors, whitened.
+
+A run is crossed row by row. Readings are taken one after the other, so that a missing one is simply
+left out. A second pass with another model may keep the gains and whiteners of the first: then the
+whitened errors are smooth functions of the model's numbers, and their change is a signature.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.core.compiled import compiled, lean
+from hydrotele.dynamics.integrate import (
+    advance,
+    load_position,
+    place,
+    read_channels,
+    supply_of,
+)
+from hydrotele.dynamics.mechanism import JOINT
+from hydrotele.estimate.late import begin_late, move_late, nudge_late, spread_late
+from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
+from hydrotele.hydraulics.laws import softening
+from hydrotele.hydraulics.pump import STALLED
+
+_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
+_AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
+_BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
+_ASYMMETRY, _DELIVERY = int(Slot.COULOMB_ASYMMETRY), int(Slot.DELIVERY)
+
+
+class Gains(NamedTuple):
+    """What a pass of the filter keeps for later passes; n rows, c channels, nz states.
+
+    Attributes:
+        slope: (n, c, nz) d reading / d state.
+        gain: (n, c, nz) correction of the state per prediction error.
+        spread: (n, c) predicted standard deviation of the prediction error [channel's unit].
+    """
+
+    slope: np.ndarray
+    gain: np.ndarray
+    spread: np.ndarray
+
+
+@lean
+def _slopes(model, sp, z, nudge, slope, moved):
+    """Slopes of the readings in a state that was just read."""
+    first = 2 * (len(model.mech.free) + len(model.transmission))
+    slope[:] = 0.0
+    n = len(model.mech.free)
+    for c in range(len(model.kind)):
+        i = model.drive[c]
+        if model.kind[c] == 0:
+            for f in range(n):
+                slope[c, f] = model.scale[c] * sp.motion.basis[model.mech.drive[i, JOINT], f]
+        elif model.kind[c] == 1:
+            if model.gear[i] >= 0:
+                slope[c, n + model.gear[i]] = model.scale[c]
+            else:
+                for f in range(n):
+                    slope[c, f] = model.scale[c] * sp.row[i, f]
+        elif model.kind[c] < 4:
+            air, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
+            soft = softening(sp.act[4 * i + model.kind[c]], air, onset)
+            slope[c, first + 4 * i + model.kind[c]] = model.scale[c] * soft
+    for c in range(len(model.kind)):
+        if model.kind[c] != 4:
+            continue
+        for s in range(first, len(z)):
+            if s < first + 4 * model.hydraulic and (s - first) % 4 == 1:
+                continue
+            for r in range(len(z)):
+                moved[r] = z[r]
+            moved[s] += nudge[s]
+            above = supply_of(model, sp, moved)
+            moved[s] -= 2.0 * nudge[s]
+            below = supply_of(model, sp, moved)
+            slope[c, s] = model.scale[c] * (above - below) / (2.0 * nudge[s])
+
+
+@compiled
+def filter_run(
+    model, sp, late, z, spread, command, known, reading, noise, drift, startle, period, steps,
+    coarse, nudge, own, slope, gain, width, fresh, given, columns, decay, whitened, predicted,
+    corrected, initial, flow,
+):  # fmt: skip
+    """Cross a run.
+
+    Args:
+        model: Model.
+        sp: Space.
+        late: Late; its q readings follow the model's states, and are set here at first; m unknown
+            inputs are the last of the nz states.
+        z: (nz,) state before the first row's readings; overwritten.
+        spread: (nz, nz) its covariance; overwritten.
+        command: (n, nu) commands.
+        known: (n,) whether the row's command is known.
+        reading: (n, c) readings, NaN where missing [channel's unit].
+        noise: (c,) variance of a reading.
+        drift: (nz,) variance that a row adds to the state.
+        startle: (nz,) variance that a row with unknown command adds.
+        period: scalar [s].
+        steps: steps per row of the mean.
+        coarse: steps per row of the covariance.
+        nudge: (nz,) differences for derivatives.
+        own: (ng,) states that the gains know; of those that they lack, a transmission's follow
+            the load. All states where `fresh`.
+        slope: (n, c, ng), gain: (n, c, ng), width: (n, c): see `Gains`; written if `fresh`, else
+            used.
+        gain: see slope.
+        width: see slope.
+        fresh: whether to compute gains; False keeps those in `gain`.
+        given: whether `flow` holds transition Jacobians already; only where `fresh`.
+        columns: (n, m, nz - q - m) what each unknown input, of size 1, adds to the model's states
+            over a row.
+        decay: by which factor inputs fall over a row.
+        whitened: (n, c) written; NaN where missing.
+        predicted: (n, c) written: readings predicted from the rows before.
+        corrected: (n, nz - q - m) written: the model's states after the row's readings.
+        initial: (nz, nz) written if `fresh`: covariance before the first row's readings.
+        flow: (n, nz, nz) written if `fresh` and not `given`: d (state before the next row's
+            readings) / d (state after this row's), the latter along the first index; (0, nz, nz)
+            keeps none.
+
+    Returns:
+        -2 log likelihood without its constant; infinite if the states broke down.
+
+    Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings.
+    """
+    rows, channels, full = reading.shape[0], reading.shape[1], len(z)
+    inputs, h, few = columns.shape[1], period / steps, len(own)
+    begin = full - inputs  # of the inputs
+    size = begin - len(late.channel)
+    trail = np.zeros((steps + 1, channels))
+    rough = np.zeros((coarse + 1, channels))
+    if size == begin:  # nothing is late
+        trail, rough = trail[:0], rough[:0]
+    reached = np.zeros((full + 1, full))
+    moved, work = np.zeros(size), np.zeros((full, full))
+    delta, pull = np.zeros(few), np.zeros(full)
+    place(model, sp, z)
+    first = np.int64(0)  # numba compiles a function anew for a written number
+    read_channels(model, sp, z, first, steps, h, trail[:0], predicted[0])
+    begin_late(late, size, predicted[0], z)
+    if fresh:
+        _slopes(model, sp, z[:size], nudge, slope[0], moved)
+        spread_late(late, size, slope[0], spread)
+        initial[:] = spread
+    loss = 0.0
+    for row in range(rows):
+        read_channels(model, sp, z, row, steps, h, trail[:0], predicted[row])
+        if fresh:
+            _slopes(model, sp, z[:size], nudge, slope[row], moved)
+        for c in range(channels):
+            if late.first[c] >= 0:
+                predicted[row, c] = z[size + late.first[c]]
+                if fresh:
+                    slope[row, c, :] = 0.0
+                    slope[row, c, size + late.first[c]] = 1.0
+        delta[:] = 0.0
+        for c in range(channels):
+            if math.isnan(reading[row, c]):
+                whitened[row, c] = math.nan
+                continue
+            hc = slope[row, c]
+            error = reading[row, c] - predicted[row, c]
+            for s in range(few):
+                error -= hc[s] * delta[s]
+            if fresh:
+                total = noise[c]
+                pull[:] = 0.0
+                for k in range(full):  # a reading depends on few states
+                    if hc[k] != 0.0:
+                        for s in range(full):
+                            pull[s] += spread[k, s] * hc[k]
+                for s in range(full):
+                    total += hc[s] * pull[s]
+                width[row, c] = math.sqrt(total)
+                for s in range(full):
+                    gain[row, c, s] = pull[s] / total
+                for s in range(full):
+                    part = gain[row, c, s]
+                    for k in range(full):
+                        spread[s, k] -= part * pull[k]
+            for s in range(few):
+                delta[s] += gain[row, c, s] * error
+            whitened[row, c] = error / width[row, c]
+            loss += whitened[row, c] ** 2 + 2.0 * math.log(width[row, c])
+        _correct(model, sp, z, own, delta)
+        for s in range(size):
+            corrected[row, s] = z[s]
+        if not math.isfinite(loss):
+            return math.inf
+        if row == rows - 1:
+            break
+        if fresh:
+            if given:
+                reached[:full] = flow[row]
+            else:
+                for s in range(full, -1, -1):  # the state itself is the last row
+                    moves = s < size or s == full
+                    for r in range(full):
+                        reached[s, r] = z[r] if moves else reached[full, r]
+                    if s < size:
+                        reached[s, s] += nudge[s]
+                    if moves:
+                        advance(model, sp, reached[s], command, row, period, coarse, rough)
+                        move_late(model, late, size, rough, period / coarse, reached[s])
+                    elif begin <= s < full:
+                        for r in range(size):
+                            reached[s, r] += nudge[s] * columns[row, s - begin, r]
+                        reached[s, s] += decay * nudge[s]
+                    else:
+                        nudge_late(late, s - size, nudge[s], reached[s, size:begin])
+                for s in range(full):
+                    for r in range(full):
+                        reached[s, r] = (reached[s, r] - reached[full, r]) / nudge[s]
+                if len(flow) > 0:
+                    for s in range(full):
+                        for r in range(full):
+                            flow[row, s, r] = reached[s, r]
+            _carry(reached, spread, work, drift)
+            if not known[row]:
+                for s in range(full):
+                    spread[s, s] += startle[s]
+        advance(model, sp, z, command, row, period, steps, trail)
+        move_late(model, late, size, trail, h, z)
+        for i in range(inputs):
+            for r in range(size):
+                z[r] += columns[row, i, r] * z[begin + i]
+            z[begin + i] *= decay
+    return loss
+
+
+@lean
+def _correct(model, sp, z, own, delta):
+    """Add a correction to a state; drives that it does not know follow their loads."""
+    n, t = len(model.mech.free), len(model.transmission)
+    if len(own) == len(z):
+        for s in range(len(z)):
+            z[s] += delta[s]
+        for i in range(model.hydraulic):
+            if model.user[i * SLOTS + _KIND] == _PUMPED:
+                _keep_side(z, 2 * (n + t) + 4 * i, delta[2 * (n + t) + 4 * i])
+        if model.memory is not None:
+            _bound_memory(model, z)
+        return
+    for sign in (-1.0, 1.0):
+        place(model, sp, z)
+        for i in range(len(model.gear)):
+            gear = model.gear[i]
+            if gear < 0 or _among(own, n + gear):
+                continue
+            z[n + gear] += sign * load_position(model, sp, i)
+            for f in range(n):
+                z[n + t + n + gear] += sign * sp.row[i, f] * z[n + t + f]
+        if sign < 0.0:
+            for s in range(len(own)):
+                z[own[s]] += delta[s]
+    if model.memory is not None:
+        _bound_memory(model, z)
+
+
+@lean
+def _bound_memory(model, z):
+    """Keep bristles within their breakaway force, and a pump between no flow and all of it."""
+    act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
+    for i in range(len(model.gear)):
+        u = i * SLOTS
+        if model.user[u + _BRISTLE_STIFFNESS] > 0.0:
+            at, unequal = int(model.user[u + _BRISTLE]), model.user[u + _ASYMMETRY]
+            act[at] = min(1.0 + unequal, max(unequal - 1.0, act[at]))
+    if model.hydraulic > 0 and model.user[_DELIVERY] > 0.0:
+        at = int(model.user[_DELIVERY])
+        act[at] = min(1.0, max(0.0, act[at]))
+
+
+@lean
+def _keep_side(z, at, moved):
+    """Undo what readings cannot say of a pump drive: that its relays switched, or its load pulls.
+
+    The commands alone tell the side of the valve, and whether it is shut.
+    """
+    before = z[at] - moved
+    if before == 0.0:
+        z[at] = 0.0
+    elif z[at] * before <= 0.0:
+        z[at] = math.copysign(STALLED, before)
+    z[at + 1] = max(0.0, z[at + 1])
+
+
+@lean
+def _among(numbers, number):
+    """Whether a number is one of (n,) numbers."""
+    for other in numbers:
+        if other == number:
+            return True
+    return False
+
+
+@lean
+def _carry(columns, spread, work, drift):
+    """`P = F P F' + Q`, kept symmetric; the rows of `columns` are F's columns."""
+    size = len(drift)
+    for a in range(size):  # work = F P, then P = work F'; the innermost index is contiguous
+        work[a] = 0.0
+    for k in range(size):
+        for a in range(size):
+            part = columns[k, a]
+            if part != 0.0:
+                for b in range(size):
+                    work[a, b] += part * spread[k, b]
+    for a in range(size):
+        spread[a] = 0.0
+        for k in range(size):
+            part = work[a, k]
+            for b in range(a + 1):
+                spread[a, b] += part * columns[k, b]
+    for a in range(size):
+        for b in range(a):
+            spread[b, a] = spread[a, b]
+        spread[a, a] += drift[a]

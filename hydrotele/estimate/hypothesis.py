@@ -1,0 +1,170 @@
+"""A hypothesis: an effect at a place, its numbers counted in typical deviations from nominal."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hydrotele.effects import EFFECTS, Parameter
+from hydrotele.machine.machine import Machine
+
+_CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
+WIDE = 0.3  # of it: for a first look, where friction that sticks or slips makes slopes steep
+_SMOOTH = ("timing", "sensor")  # laws whose effects have a slope at nominal, besides their starts
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect at a place of the given machine, with p parameters.
+
+    Deviations are `(value - nominal) / scale`, so that the prior is a unit normal. `change` makes
+    the machine that has it from parameter values; by default the library's effect of that name.
+    """
+
+    name: str
+    location: str
+    parameters: dict[str, Parameter]
+    change: Callable[[Machine, Mapping[str, float]], Machine] | None = None
+
+    def machine(self, nominal: Machine, deviation: np.ndarray) -> Machine:
+        """The machine that has it, at a deviation (p,)."""
+        values = self.values(deviation)
+        if self.change:
+            return self.change(nominal, values)
+        return EFFECTS[self.name].apply(nominal, self.location, values)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters p."""
+        return len(self.parameters)
+
+    @property
+    def low(self) -> np.ndarray:
+        """(p,) smallest deviation."""
+        return np.array([(p.low - p.nominal) / p.scale for p in self.parameters.values()])
+
+    @property
+    def high(self) -> np.ndarray:
+        """(p,) largest deviation."""
+        return np.array([(p.high - p.nominal) / p.scale for p in self.parameters.values()])
+
+    @property
+    def least(self) -> np.ndarray:
+        """(p,) deviation worth naming."""
+        return np.array([p.least / p.scale for p in self.parameters.values()])
+
+    @property
+    def starts(self) -> list[np.ndarray]:
+        """Deviations (p,) from which to search: nominal, and where the effect says so."""
+        tables = [p.starts for p in self.parameters.values()]
+        if not any(tables):
+            return [np.zeros(self.size)]
+        known = EFFECTS.get(self.name)
+        slope = [np.zeros(self.size)] if known and known.law in _SMOOTH else []
+        return slope + [
+            np.array([
+                (p.starts[k] - p.nominal) / p.scale if k < len(p.starts) else 0.0
+                for p in self.parameters.values()
+            ])
+            for k in range(max(map(len, tables)))
+        ]  # fmt: skip
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Name and location."""
+        return self.name, self.location
+
+    def values(self, deviation: np.ndarray) -> dict[str, float]:
+        """Parameter values at a deviation (p,)."""
+        return {
+            key: float(np.clip(p.nominal + d * p.scale, p.low, p.high))
+            for (key, p), d in zip(self.parameters.items(), deviation, strict=True)
+        }
+
+    def sides(self, index: int, size: float) -> list[float]:
+        """Steps of a parameter from nominal to either side, as far as its bounds allow."""
+        steps = (min(size, self.high[index]), max(-size, self.low[index]))
+        return [float(step) for step in steps if step != 0.0]
+
+    def held(self, deviation: np.ndarray) -> "Hypothesis":
+        """The same with its numbers fixed at a deviation (p,): none is left to fit."""
+        return replace(
+            self, parameters={}, change=lambda nominal, _: self.machine(nominal, deviation)
+        )
+
+    def nudges(self, deviation: np.ndarray, size: float = _CURVE) -> np.ndarray:
+        """(p,) signed steps for slopes at a deviation, away from the nearer bound."""
+        step = np.minimum(size, 0.1 * (self.high - self.low))
+        return np.where(deviation + step > self.high, -step, step)
+
+
+def hypotheses(machine: Machine, names: Sequence[str] = ()) -> list[Hypothesis]:
+    """All hypotheses about a machine.
+
+    Args:
+        machine: the given machine.
+        names: effects to restrict them to; all if empty.
+
+    Returns:
+        One per effect and location that has parameters, without those that are optional.
+    """
+    found = []
+    for effect in EFFECTS.values():
+        if names and effect.name not in names:
+            continue
+        for location in effect.locations(machine):
+            table = effect.parameters(machine, location)
+            parameters = {key: p for key, p in table.items() if not p.optional}
+            if parameters:
+                found.append(Hypothesis(effect.name, location, parameters))
+    return found
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Hypotheses taken together, each at a deviation (p,)."""
+
+    parts: tuple[tuple[Hypothesis, np.ndarray], ...] = ()
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """(P,) all deviations, in order."""
+        return np.concatenate([d for _, d in self.parts]) if self.parts else np.zeros(0)
+
+    @property
+    def hypotheses(self) -> list[Hypothesis]:
+        """What is taken together."""
+        return [hypothesis for hypothesis, _ in self.parts]
+
+    @property
+    def names(self) -> list[str]:
+        """(P,) names of all numbers, in order."""
+        return [f"{h.name}.{h.location}.{key}" for h in self.hypotheses for key in h.parameters]
+
+    def at(self, deviation: np.ndarray) -> "Guess":
+        """The same hypotheses at other deviations (P,), kept inside their bounds."""
+        parts, first = [], 0
+        for hypothesis, old in self.parts:
+            part = deviation[first : first + len(old)]
+            parts.append((hypothesis, np.clip(part, hypothesis.low, hypothesis.high)))
+            first += len(old)
+        return Guess(tuple(parts))
+
+    def plus(self, hypothesis: Hypothesis, deviation: np.ndarray) -> "Guess":
+        """With one more hypothesis."""
+        return Guess((*self.parts, (hypothesis, deviation)))
+
+    def without(self, index: int) -> "Guess":
+        """Without the hypothesis at an index."""
+        return Guess(self.parts[:index] + self.parts[index + 1 :])
+
+    def nudges(self, size: float = _CURVE) -> np.ndarray:
+        """(P,) signed steps for slopes, of a size in typical deviations."""
+        steps = [h.nudges(d, size) for h, d in self.parts]
+        return np.concatenate(steps) if steps else np.zeros(0)
+
+    def machine(self, nominal: Machine) -> Machine:
+        """The machine that has all these effects."""
+        for hypothesis, deviation in self.parts:
+            nominal = hypothesis.machine(nominal, deviation)
+        return nominal

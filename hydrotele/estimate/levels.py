@@ -1,0 +1,374 @@
+"""Noise levels from the data: of every channel's readings, and of what the model lacks.
+
+What a model lacks is counted as unknown inputs of its balances (`estimate.inputs`): force, flow
+into the chambers, command. All levels are those of the largest likelihood (Kristensen, Madsen and
+Jorgensen 2004, Automatica 40(2), section 3: grey-box models whose diffusion terms show where they
+lack something). An accuracy that a machine states is a prior for its channel. So likelihoods and
+intervals count what a model lacks, and a channel without a stated accuracy costs that channel its
+prior and nothing else.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from hydrotele.dynamics.model import state_names
+from hydrotele.estimate.inputs import Input, decay, input_columns, input_sizes, possible_inputs
+from hydrotele.estimate.linear import LinearRun, Smoothed, linear_run, smooth
+from hydrotele.estimate.stretches import busiest_rows
+from hydrotele.estimate.track import (
+    DRIFT,
+    STARTLE,
+    STEP,
+    Levels,
+    Track,
+    by_kind,
+    row_noise,
+    state_drift,
+    track_run,
+)
+from hydrotele.logs.load import Dataset, RunData
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import channel_sensor, converter
+
+WHITE = ("rate", "drive_rate", "spool", "speed", "pressure_head", "pressure_rod")
+"""Kinds of states to which white noise is added, too: ripple and what the rows are too slow for.
+
+Where friction holds a drive fast, as that of a pump drive does, nothing but its position itself can
+say that it moved all the same: see `_white_states`.
+"""
+_MOST = 1.0e4  # times its floor that white noise can reach
+_RIPPLE = 10.0  # times its floor from which white noise counts as there
+LEAST = 1.0e-4  # of an input's largest size: below it an input is none
+_STATED = 0.5  # prior standard deviation of log(noise / stated): a data sheet is good to a factor
+_LACK = 4.0  # prior standard deviation of log(size / least): says next to nothing
+_NOISIER = 1.25  # times the rough noise that a channel's noise can be: what is slow is no noise
+_QUIETER = 0.7  # times the stated or the rough noise, whichever is smaller: readings that scatter
+# less than they do are no sensor, but a lack that is faster than the unknown inputs
+_QUIETER_UNSTATED = 0.3  # times the rough noise, where fast motion may be most of it
+_ROWS = 3000  # of all runs together that tell the levels; more say the same again
+_ITERATIONS = 12  # of a round: what is left of the way is small against a round's own linearisation
+_SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
+_LOOSE = {"rate": 0.02, "drive_rate": 0.02, "spool": 0.02, "pressure_head": 1e5,
+          "pressure_rod": 1e5, "speed": 2.0}  # fmt: skip
+_LOOSE_POSITION = 1e-4
+# What 20 ms may add to a state at first, so that a model that lacks something follows the readings.
+
+
+def rough_noise(data: Dataset) -> np.ndarray:
+    """(c,) noise of one logged reading, from third differences of the runs [channel's unit].
+
+    They take out what moves slowly against the rows; what moves faster makes it too large. Never
+    less than a converter's step over sqrt(12).
+    """
+    found = np.zeros(len(data.channels))
+    for c, channel in enumerate(data.channels):
+        values = np.concatenate([
+            np.diff(run.reading[:, c], n=3) * (1.0 if run.behind is None else run.behind[c] ** 0.5)
+            for run in data.fit
+        ])  # fmt: skip
+        values = values[np.isfinite(values)]
+        spread = 1.4826 * np.median(np.abs(values)) if len(values) else 0.0
+        if spread == 0.0 and len(values):  # more than half of the readings repeat
+            spread = float(np.std(values))
+        found[c] = max(spread / np.sqrt(20.0), _rounding(data, channel), 1e-12)
+    return found
+
+
+def _rounding(data: Dataset, channel: str) -> float:
+    """Standard deviation of a converter's rounding [channel's unit]."""
+    sensors = data.machine.sensors.get(data.sensors) if data.sensors else None
+    step = converter(channel_sensor(data.machine, sensors, channel), channel).step
+    return step / 12.0**0.5
+
+
+class Prior(NamedTuple):
+    """What is known of the levels before they are found.
+
+    Attributes:
+        noise: (c,) most likely noise [channel's unit].
+        width: (c,) standard deviation of its logarithm.
+        low: (c,) least noise.
+        high: (c,) largest noise.
+    """
+
+    noise: np.ndarray
+    width: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def noise_prior(data: Dataset) -> Prior:
+    """Prior of the readings' noise: what the machine states, and what the readings allow."""
+    rough, stated = rough_noise(data), np.isfinite(data.noise)
+    noise = np.where(stated, data.noise, rough)
+    width = np.where(stated, _STATED, 2.0 * _STATED)
+    rounding = np.array([_rounding(data, channel) for channel in data.channels])
+    quieter = np.where(stated, _QUIETER, _QUIETER_UNSTATED)
+    low = np.maximum(quieter * np.minimum(noise, rough), rounding)  # an encoder's error at rest
+    return Prior(noise, width, low, _NOISIER * rough)
+
+
+def find_levels(
+    data: Dataset, machine: Machine, start: Sequence[Track] = (), each: Callable = map,
+    step: float = STEP, rounds: int = 3, same: bool = False,
+    reopened: bool = False,
+) -> tuple[Track, ...]:  # fmt: skip
+    """Levels of the largest posterior probability, given a machine.
+
+    Args:
+        data: the dataset; its `noise` is what the machine states, NaN where nothing.
+        machine: the machine.
+        start: tracks of a machine like it, with levels to begin with; without them every unknown
+            input is tried.
+        each: such as `map`, perhaps on several workers.
+        step: largest step of the integrator [s].
+        rounds: how often levels are found, each time about the tracks of the time before.
+        same: whether `start` is of nearly the same machine, so that its Jacobians will do.
+        reopened: whether inputs that `start` lacks are tried again.
+
+    Returns:
+        Tracks of the fit runs with these levels, linearised.
+    """
+    prior = noise_prior(data)
+    if start:
+        levels = start[0].levels
+        levels = _reopened(levels, machine) if reopened else _possible(levels, machine)
+        tracks = _crossed(data, machine, levels, start, each, step, same)
+    else:
+        noise = np.clip(prior.noise, prior.low, prior.high)
+        held = [n for n in _white_states(machine, state_names(machine)) if n.startswith("position")]
+        rough = Levels(noise, drift={**_LOOSE, **dict.fromkeys(held, _LOOSE_POSITION)})
+        tracks = _crossed(data, machine, rough, (), each, step)
+        inputs = possible_inputs(machine)
+        levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
+        tracks = _crossed(data, machine, levels, tracks, each, step)
+    best = tracks
+    for index in range(rounds):
+        before = _whole(tracks)
+        levels = _pruned(_most_likely(data, machine, levels, prior, tracks, each), machine)
+        tracks = _crossed(data, machine, levels, tracks, each, step, bool(start) or index > 0)
+        if _whole(tracks) < _whole(best):  # where a filter hardly follows, its linear form misleads
+            best = tracks
+        if _whole(tracks) > before - _SETTLED:
+            break
+    return best
+
+
+def _whole(tracks: Sequence[Track]) -> float:
+    """-2 log likelihood of tracks times the prior of their levels; without constants."""
+    return sum(track.loss for track in tracks) + tracks[0].levels.penalty
+
+
+def _reopened(levels: Levels, machine: Machine) -> Levels:
+    """Levels with every possible input, those that were none at a small size."""
+    inputs = possible_inputs(machine)
+    known = dict(zip(levels.inputs, levels.sizes, strict=True))
+    small = 10.0 * LEAST * input_sizes(machine, inputs)
+    sizes = [max(known.get(i, 0.0), s) for i, s in zip(inputs, small, strict=True)]
+    return dataclasses.replace(levels, inputs=inputs, sizes=np.array(sizes))
+
+
+def _possible(levels: Levels, machine: Machine) -> Levels:
+    """Levels without inputs that a machine cannot have."""
+    there = possible_inputs(machine)
+    kept = np.array([i in there for i in levels.inputs], bool)
+    inputs = tuple(i for i in levels.inputs if i in there)
+    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept])
+
+
+def _pruned(levels: Levels, machine: Machine) -> Levels:
+    """Levels without the inputs that are none."""
+    kept = levels.sizes > 2.0 * LEAST * input_sizes(machine, levels.inputs)
+    inputs = tuple(i for i, keep in zip(levels.inputs, kept, strict=True) if keep)
+    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept])
+
+
+def _crossed(
+    data: Dataset, machine: Machine, levels: Levels, near: Sequence[Track], each: Callable,
+    step: float, same: bool = False,
+) -> tuple[Track, ...]:  # fmt: skip
+    """Linearised tracks with some levels; what inputs do is taken from tracks nearby.
+
+    Where these are of the same machine with these inputs or more, so are the transition Jacobians,
+    which cost most of a pass.
+    """
+
+    def cross(index: int) -> Track:
+        run, columns, flow = data.fit[index], None, None
+        rest = near[index].rest if near else None
+        if same:
+            columns, flow = _without_pruned(near[index], levels.inputs)
+        elif near and levels.inputs:
+            columns = columns_of(machine, near[index], levels.inputs)
+        return track_run(machine, data, run, None, step, levels, columns, True, rest, flow)
+
+    return tuple(each(cross, range(len(data.fit))))
+
+
+def _without_pruned(track: Track, inputs: Sequence[Input]) -> tuple[np.ndarray, np.ndarray]:
+    """What inputs do, and transition Jacobians, of a track that may know more inputs."""
+    before = list(track.levels.inputs)
+    if len(before) == len(inputs):
+        return track.columns, track.flow
+    kept = [before.index(i) for i in inputs]
+    first = track.flow.shape[1] - len(before)
+    there = np.concatenate([np.arange(first), first + np.array(kept, dtype=int)])
+    return (
+        np.ascontiguousarray(track.columns[:, kept]),
+        np.ascontiguousarray(track.flow[:, there[:, None], there]),
+    )
+
+
+def columns_of(machine: Machine, near: Track, inputs: Sequence[Input]) -> np.ndarray:
+    """(n, m, nz) what inputs do in a machine, from a linearised track of one like it."""
+    names, before = state_names(machine), list(near.names[: near.states.shape[1]])
+    if names == before:
+        return input_columns(
+            machine, near.states, near.flow, near.run.period, inputs, near.run.command
+        )
+    there = [before.index(n) for n in names if n in before]
+    here = [s for s, n in enumerate(names) if n in before]
+    states = np.zeros((len(near.states), len(names)))
+    flow = np.tile(np.eye(len(names)), (len(states), 1, 1))
+    states[:, here] = near.states[:, there]
+    flow[np.ix_(range(len(states)), here, here)] = near.flow[
+        np.ix_(range(len(states)), there, there)
+    ]
+    return input_columns(machine, states, flow, near.run.period, inputs, near.run.command)
+
+
+def _most_likely(
+    data: Dataset, machine: Machine, levels: Levels, prior: Prior, tracks: Sequence[Track],
+    each: Callable,
+) -> Levels:  # fmt: skip
+    """Levels of the largest posterior probability in the linearised runs."""
+    names, c, m = list(tracks[0].names), len(data.channels), len(levels.inputs)
+    white = _white_states(machine, names)
+    places, floor = [names.index(n) for n in white], by_kind(white, DRIFT)
+    w = c + m
+    rows = max(_ROWS // len(tracks), _ROWS // 8)
+    runs = [(_part(track, names, rows), track.run) for track in tracks]
+    weight = sum(len(t.run.command) for t in tracks) / sum(len(r.error) for r, _ in runs)
+    largest = input_sizes(machine, levels.inputs)
+    first = len(names) - m
+
+    def of(x: np.ndarray) -> Levels:
+        drift = dict(zip(white, np.exp(x[w:]), strict=True))
+        return dataclasses.replace(levels, noise=np.exp(x[:c]), sizes=np.exp(x[c:w]), drift=drift)
+
+    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+        now, slope = of(x), np.zeros(len(x))
+
+        def one(pair: tuple) -> tuple[float, np.ndarray, np.ndarray]:
+            run: RunData = pair[1]
+            drift, noise = state_drift(names, now, run.period), row_noise(now, run) ** 2
+            found = smooth(pair[0], noise, drift)
+            return found.loss, noise * found.noise_slope, drift * found.drift_slope
+
+        total = 0.0
+        for value, per_noise, per_drift in each(one, runs):
+            total += value
+            slope[:c] += 2.0 * per_noise
+            slope[c:w] += 2.0 * per_drift[first:]
+            slope[w:] += 2.0 * per_drift[places]
+        off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
+        slope[:c] += 2.0 * off / prior.width / weight
+        slope[c:] += 2.0 * lack / _LACK / weight
+        return total + float(off @ off + lack @ lack) / weight, slope
+
+    low = np.log(np.concatenate([prior.low, LEAST * largest, floor]))
+    high = np.log(np.concatenate([prior.high, largest, _MOST * floor]))
+    began = np.array([levels.drift.get(n, 0.0) for n in white])
+    start = np.log(np.concatenate([
+        levels.noise, np.maximum(levels.sizes, 3 * LEAST * largest), np.maximum(began, 1.5 * floor),
+    ]))  # fmt: skip
+    found = minimize(
+        loss, np.clip(start, low, high), jac=True, method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": _ITERATIONS, "ftol": 1e-6},
+    )  # fmt: skip
+    x = found.x
+    off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
+    return dataclasses.replace(of(x), penalty=float(off @ off + lack @ lack))
+
+
+def _white_states(machine: Machine, names: Sequence[str]) -> list[str]:
+    """States of a track to which white noise is added."""
+    held = {f"position.{a.joint}" for a in machine.axes.values() if a.pump}
+    return [n for n in names if n.partition(".")[0] in WHITE or n in held]
+
+
+def _part(track: Track, names: list[str], rows: int) -> LinearRun:
+    """The stretch of a run in which the commands change most, linearised."""
+    return linear_run(track, by_kind(names, STARTLE) ** 2, busiest_rows(track.run, rows))
+
+
+def smoothed_inputs(track: Track, answer: tuple[LinearRun, Smoothed] | None = None) -> np.ndarray:
+    """Unknown inputs of a track as the smoother tells them.
+
+    Args:
+        track: with m inputs.
+        answer: of `smoothed`, where it is there already.
+
+    Returns:
+        (n, m) inputs [N], [N m], [m^3/s] or [1].
+    """
+    run, told = answer or smoothed(track)
+    m, size = len(track.levels.inputs), run.slope.shape[2]
+    fade, held = decay(track.run.period), np.zeros(m)
+    found = np.zeros((len(run.error), m))
+    for row in range(len(found)):  # what the track's own filter took them to be
+        found[row] = held
+        held = fade * (held + run.correction[row, size - m :])
+    return found + told.deviation[:, size - m :]
+
+
+def smoothed(track: Track) -> tuple[LinearRun, Smoothed]:
+    """A track's linear run, and what its smoother says of it, states included."""
+    names = list(track.names)
+    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    drift = state_drift(names, track.levels, track.run.period)
+    return run, smooth(run, row_noise(track.levels, track.run) ** 2, drift, True)
+
+
+def undisturbed_loss(track: Track) -> float:
+    """-2 log likelihood to expect of a track whose unknown inputs were nothing, noise as found."""
+    names, m = list(track.names), len(track.levels.inputs)
+    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    drift = state_drift(names, track.levels, track.run.period)
+    initial = run.initial.copy()
+    first = len(names) - m
+    drift[first:], initial[first:] = 0.0, 0.0
+    noise = row_noise(track.levels, track.run) ** 2
+    width = smooth(run._replace(initial=initial), noise, drift).width
+    there = np.isfinite(track.whitened)
+    return float(np.sum(1.0 + 2.0 * np.log(width[there])))
+
+
+def rippled(levels: Levels) -> bool:
+    """Whether white process noise is more than what an integrator leaves."""
+    return any(rippled_at(levels, name) for name in levels.drift)
+
+
+def rippled_at(levels: Levels, state: str, times: float = _RIPPLE) -> bool:
+    """Whether a state's white process noise, as of `rate.swing`, is more than an integrator's."""
+    return levels.drift.get(state, 0.0) > times * DRIFT[state.partition(".")[0]]
+
+
+def input_excess(track: Track) -> float:
+    """Twice the log likelihood that a track's unknown inputs bring, all else the same."""
+    if not track.levels.inputs:
+        return 0.0
+    names, m = list(track.names), len(track.levels.inputs)
+    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    drift = state_drift(names, track.levels, track.run.period)
+    noise = row_noise(track.levels, track.run) ** 2
+    loss = smooth(run, noise, drift).loss
+    drift[len(names) - m :] = 0.0
+    initial = run.initial.copy()
+    initial[len(names) - m :] = 0.0
+    return smooth(run._replace(initial=initial), noise, drift).loss - loss

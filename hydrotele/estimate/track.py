@@ -1,0 +1,290 @@
+"""Runs of a dataset through the filter: where it starts, what it trusts, what it yields."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
+from hydrotele.estimate.filter import Gains, filter_run
+from hydrotele.estimate.inputs import Input, decay, input_drift
+from hydrotele.estimate.late import late_readings
+from hydrotele.estimate.start import find_rest, start_state
+from hydrotele.hydraulics.parameters import actuator_order, longest_step
+from hydrotele.hydraulics.slots import SLOTS, Slot
+from hydrotele.logs.load import Dataset, RunData
+from hydrotele.machine.machine import Machine
+
+STEP = (
+    1.0e-3  # s: 2 ms leaves errors of 1000 in the loss where the pump is starved, 1 ms none of 100
+)
+COARSE = 4.0e-3  # s, for a first look at a candidate
+_TANGENT = 5.0e-3  # s, for the transition Jacobians: a covariance need not be exact
+_STIFF = 1.0e-3  # s, where a transmission's spring is: with the oil it may ring at 150 Hz
+
+
+@dataclass(frozen=True)
+class Levels:
+    """How large everything is that a model does not predict.
+
+    Attributes:
+        noise: (c,) standard deviation of a logged reading [channel's unit], see `row_noise`.
+        inputs: the m unknown inputs.
+        sizes: (m,) their stationary standard deviations [N], [N m], [m^3/s] or [1].
+        drift: kind of state -> standard deviation of what 20 ms add to it, where that is not the
+            floor that `DRIFT` states.
+        penalty: -2 log prior of the levels.
+    """
+
+    noise: np.ndarray
+    inputs: tuple[Input, ...] = ()
+    sizes: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    drift: Mapping[str, float] = field(default_factory=dict)
+    penalty: float = 0.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """One run crossed by one model.
+
+    Attributes:
+        run: the run.
+        levels: the noise levels that it was crossed with.
+        loss: -2 log likelihood without its constant.
+        whitened: (n, c) prediction errors over their predicted spread, NaN where missing.
+        predicted: (n, c) one-step predictions [channel's unit].
+        states: (n, nz) states after each row's readings.
+        gains: gains and whiteners used.
+        names: the states that the gains know, those of readings on their way and of unknown inputs
+            included.
+        start: (nz,) state before the first reading.
+        rest: (t,) where the drives of transmissions rested in their backlash, see `start_state`;
+            NaN where they have none.
+        columns: (n, m, nz) what unit inputs add to the model's states over a row.
+        initial: (nz, nz) covariance before the first reading, of all states; 0 with kept gains.
+        flow: (n, nz, nz) transition Jacobians as of `filter_run`; empty unless asked for.
+    """
+
+    run: RunData
+    levels: Levels
+    loss: float
+    whitened: np.ndarray
+    predicted: np.ndarray
+    states: np.ndarray
+    gains: Gains
+    names: tuple[str, ...]
+    start: np.ndarray
+    rest: np.ndarray
+    columns: np.ndarray
+    initial: np.ndarray
+    flow: np.ndarray
+
+
+_NUDGE = {
+    "position": 1e-6, "drive": 1e-6, "rate": 1e-5, "drive_rate": 1e-5, "spool": 1e-5,
+    "spool_rate": 1e-3, "pressure_head": 100.0, "pressure_rod": 100.0,
+    "speed": 1e-3, "pressure_load": 100.0,
+    "bristle": 1e-3, "delivery": 1e-4, "added_delivery": 1e-4, "late": 1.0, "input": 1.0,
+}  # fmt: skip
+# What 20 ms may add to a state beyond the model: integrator error, not physics.
+DRIFT = {
+    "position": 2e-6, "drive": 2e-6, "rate": 2e-4, "drive_rate": 2e-4, "spool": 1e-4,
+    "spool_rate": 1e-2, "pressure_head": 5e3, "pressure_rod": 5e3,
+    "speed": 2e-2, "pressure_load": 5e3, "bristle": 5e-3, "delivery": 1e-3,
+    "added_delivery": 1e-3,
+}  # fmt: skip
+DRIFT_TIME = 0.02  # s over which a process noise adds its standard deviation, as of a random walk
+STARTLE = {
+    "spool": 0.2,
+    "spool_rate": 5.0,
+    "pressure_head": 2e6,
+    "pressure_rod": 2e6,
+    "rate": 0.02,
+    "speed": 20.0,
+    "pressure_load": 2e6,
+    "bristle": 0.5,
+    "delivery": 0.2,
+    "added_delivery": 0.1,
+}
+
+_DOUBT = 3.0  # times a reading's noise: lacks of pressure below it are taken for noise
+_LOOK = 3.0  # s at a run's start that tell where drives rested in their backlash
+
+
+def by_kind(names: list[str], table: Mapping[str, float]) -> np.ndarray:
+    """(nz,) numbers of a table by state or kind of state; 0 for what it lacks."""
+    return np.array([table.get(name, table.get(name.partition(".")[0], 0.0)) for name in names])
+
+
+def fine_enough(machine: Machine, step: float) -> float:
+    """A step [s], made smaller where a machine needs it.
+
+    A pump's own circuit is stiff, and its piston light: with stiff lines they ring at 200 Hz and
+    more, which steps of some milliseconds make unstable.
+    """
+    springs = any(axis.transmission for axis in machine.axes.values())
+    rigid = [longest_step(machine, name) for name, axis in machine.axes.items() if axis.pump]
+    return min(step, _STIFF if springs else step, *rigid)
+
+
+def first_rows(track: Track, rows: int) -> Track:
+    """The first rows of a track, for a look at less than its run; without transition Jacobians."""
+    part = slice(0, rows)
+    run = track.run.part(0, min(rows, len(track.run.command)))
+    gains = Gains(*(np.ascontiguousarray(table[part]) for table in track.gains))
+    return dataclasses.replace(
+        track, run=run, gains=gains, whitened=track.whitened[part],
+        predicted=track.predicted[part], states=track.states[part], columns=track.columns[part],
+        flow=track.flow[:0],
+    )  # fmt: skip
+
+
+def known_levels(data: Dataset) -> bool:
+    """Whether the machine states the accuracy of every channel."""
+    return bool(np.all(np.isfinite(data.noise)))
+
+
+def row_noise(levels: Levels, run: RunData) -> np.ndarray:
+    """(c,) standard deviation of a reading of a run, which may be a mean of logged ones."""
+    return levels.noise if run.behind is None else levels.noise / np.sqrt(run.behind)
+
+
+def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
+    """(nz,) variance that a row adds to the states of a track by these names."""
+    drift = period / DRIFT_TIME * by_kind(names, {**DRIFT, **levels.drift}) ** 2
+    m = len(levels.inputs)
+    drift[len(names) - m :] = input_drift(levels.sizes, period)
+    return drift
+
+
+def track_run(
+    machine: Machine, data: Dataset, run: RunData, kept: Track | None = None,
+    step: float = STEP, levels: Levels | None = None, columns: np.ndarray | None = None,
+    linearise: bool = False, rest: np.ndarray | None = None, flow: np.ndarray | None = None,
+) -> Track:  # fmt: skip
+    """Cross a run with a machine.
+
+    Args:
+        machine: the machine to try.
+        data: the dataset that the run belongs to.
+        run: the run.
+        kept: a track whose gains, whiteners, levels and start are kept; None computes them anew.
+        step: largest step of the integrator [s].
+        levels: noise levels; without them those that the machine states, and no inputs.
+        columns: (n, m, nz) what unit inputs add to the states over a row.
+        linearise: whether to keep the transition Jacobians; only without `kept`.
+        rest: (t,) where drives rest in their backlash, from a track of a machine like it; it is
+            looked for where this is None, of another machine, or NaN for a drive with backlash.
+        flow: (n, nz, nz) transition Jacobians of the same machine near by, used instead of new
+            ones, which cost most of a pass; only without `kept`.
+
+    Returns:
+        The track.
+    """
+    model = following_model(machine, data)
+    names = state_names(machine)
+    if kept is not None:
+        levels, columns = kept.levels, _for_states(kept, names)
+    levels = levels or Levels(data.noise)
+    noise = row_noise(levels, run)
+    if columns is None:
+        columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
+    play = model.transmission[:, BACKLASH] > 0.0
+    if kept is not None and len(kept.rest) == len(play):
+        rest = kept.rest
+    known = rest is not None and len(rest) == len(play) and bool(np.isfinite(rest[play]).all())
+    if kept is None and not known:
+        rows = min(max(2, round(_LOOK / run.period)), len(run.command))
+        first, part = run.part(0, rows), columns[:rows]
+        rest = find_rest(
+            lambda r: _cross(machine, model, data, first, None, step, r, levels, part, noise).loss,
+            play,
+        )
+    elif rest is None or not known:
+        rest = np.zeros(len(play))
+    rest = np.where(play, rest, np.nan)
+    return _cross(machine, model, data, run, kept, step, rest, levels, columns, noise, linearise,
+                  flow)  # fmt: skip
+
+
+def following_model(machine: Machine, data: Dataset) -> Model:
+    """Reduced model whose chambers give off air only where readings can tell that they lack oil.
+
+    An estimate below atmosphere by less than a few times the noise is mostly just that; taken for a
+    chamber with air it would be a thousand times as soft, and stay there. A chamber whose pressure
+    no sensor reads is taken for filled.
+    """
+    model, user = reduced_model(machine, data.channels), None
+    noise = dict(zip(data.channels, data.noise, strict=True))
+    for i, name in enumerate(actuator_order(machine)[: model.hydraulic]):
+        read = [noise.get(f"pressure_{side}.{name}", np.nan) for side in ("head", "rod")]
+        user = model.user.copy() if user is None else user
+        user[i * SLOTS + Slot.AIR_ONSET] = np.inf if np.isnan(read).any() else _DOUBT * max(read)
+    return model if user is None else model._replace(user=user)
+
+
+def _for_states(kept: Track, names: list[str]) -> np.ndarray:
+    """Columns of a kept track for a model with other states: 0 for those that it lacked."""
+    before = list(kept.names[: len(kept.start)])
+    if before == names:
+        return kept.columns
+    columns = np.zeros((*kept.columns.shape[:2], len(names)))
+    for s, name in enumerate(before):
+        if name in names:
+            columns[:, :, names.index(name)] = kept.columns[:, :, s]
+    return columns
+
+
+def _cross(
+    machine: Machine, model: Model, data: Dataset, run: RunData, kept: Track | None, step: float,
+    rest: np.ndarray, levels: Levels, columns: np.ndarray, noise: np.ndarray,
+    linearise: bool = False, given: np.ndarray | None = None,
+) -> Track:  # fmt: skip
+    step, coarse = fine_enough(machine, step), fine_enough(machine, _TANGENT)
+    space = model_space(model)
+    space.time[1] = run.start
+    names, late = state_names(machine), late_readings(model, run.period)
+    rows, c, size, m = len(run.command), len(data.channels), len(names), len(levels.inputs)
+    start, spread = start_state(machine, data, run, model, names, np.nan_to_num(rest))
+    shown = [data.channels[k] for k in late.channel]
+    names += [
+        f"late.{channel}.{i - late.first[k]}"
+        for i, (channel, k) in enumerate(zip(shown, late.channel, strict=True))
+    ]
+    names += [f"input.{i.name}" for i in levels.inputs]
+    full = len(names)
+    if kept is None:
+        gains = Gains(np.zeros((rows, c, full)), np.zeros((rows, c, full)), np.zeros((rows, c)))
+    else:
+        gains = kept.gains
+        if not set(kept.names) <= set(names):  # the model lacks a transmission or a lag of theirs
+            there = [s for s, name in enumerate(kept.names) if name in names]
+            gains = Gains(
+                np.ascontiguousarray(gains.slope[:, :, there]),
+                np.ascontiguousarray(gains.gain[:, :, there]), gains.spread,
+            )  # fmt: skip
+    known = tuple(n for n in kept.names if n in names) if kept else tuple(names)
+    whitened, predicted = np.empty((rows, c)), np.empty((rows, c))
+    states = np.empty((rows, size))
+    state, covariance = np.zeros(full), np.zeros((full, full))
+    state[:size], covariance[:size, :size] = start, spread
+    at = np.arange(full - m, full)
+    covariance[at, at] = levels.sizes**2
+    initial = np.zeros((full, full))
+    if given is not None and given.shape[1] != full:  # another number of readings on their way
+        given = None
+    flow = np.empty((rows if linearise else 0, full, full)) if given is None else given
+    loss = filter_run(
+        model, space, late, state, covariance, run.command, run.command_known, run.reading,
+        noise**2, state_drift(names, levels, run.period),
+        by_kind(names, STARTLE) ** 2, run.period,
+        max(1, round(run.period / step)), max(1, round(run.period / coarse)),
+        by_kind(names, _NUDGE), np.array([names.index(name) for name in known]), *gains,
+        kept is None, given is not None, columns, decay(run.period), whitened, predicted, states,
+        initial, flow,
+    )  # fmt: skip
+    return Track(
+        run, levels, loss, whitened, predicted, states, gains, known, start, rest, columns,
+        initial, flow,
+    )  # fmt: skip

@@ -1,0 +1,179 @@
+"""From paths to runs: which files belong to one run, and whether they are of this machine.
+
+Supported: `.parquet` and `.csv` logs; folders of them; run folders as `hydrotele run` writes them
+(`measured.parquet` is read, `truth.parquet` never), and folders of such folders. A run in several
+files is told by file names `<run>.<part>.parquet`, or by the metadata `run`; either way only if no
+two of the files hold the same sensor channel, since repeated runs often share a name.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from hydrotele.core.errors import InputError
+from hydrotele.logs.log import Log, load_log
+from hydrotele.logs.log_checks import CommandRange
+from hydrotele.machine.machine import Machine
+
+MEASURED = "measured"  # stem of the log in a run folder, beside `truth`
+_KINDS = (".parquet", ".csv")
+
+
+class RunFiles(NamedTuple):
+    """The logs of one run, without truth; more than one where it lies in several files."""
+
+    name: str
+    logs: tuple[Log, ...]
+
+
+def read_runs(
+    paths: Sequence[str | Path], machine: Machine, aliases: Mapping[str, str], force: bool
+) -> tuple[RunFiles, ...]:
+    """Read all logs and sort them into runs by name.
+
+    Args:
+        paths: files and folders.
+        machine: the machine they should be of.
+        aliases: a file's own column name -> channel.
+        force: accept logs whose metadata names another machine or tool.
+
+    Returns:
+        The runs, sorted by name.
+
+    Raises:
+        InputError: a file is unusable, is of another machine, or a run is there twice.
+    """
+    groups: dict[str, list[Log]] = {}
+    named = [pair for path in paths for pair in _files(Path(path))]
+    if not named:
+        raise InputError("the data", "no file was given: name a folder with logs, or logs")
+    if twice := {str(f) for i, (_, f) in enumerate(named) if f in [g for _, g in named[:i]]}:
+        raise InputError(min(twice), "is given twice: name it once")
+    logs = []
+    for name, file in named:
+        log = load_log(
+            file, aliases=aliases, maximum_dropped=1.0, missing=True,
+            commands=command_ranges(machine),
+        ).without_truth()  # fmt: skip
+        if not force:
+            _check_machine(log, machine)
+        logs.append((name, log))
+    for name, log in logs:
+        groups.setdefault(name.partition(".")[0], []).append(log)
+    runs = []
+    for stem, found in groups.items():
+        names = [name for name, _ in logs if name.partition(".")[0] == stem]
+        if len(found) == 1 or _apart(found):
+            runs.append((stem if len(found) > 1 else names[0], tuple(found)))
+        else:
+            runs += [(name, (log,)) for name, log in zip(names, found, strict=True)]
+    runs = _joined_by_metadata(runs)
+    for i, (name, found) in enumerate(runs):
+        for other, others in runs[:i]:
+            if other == name:
+                message = f"run {name!r} is there twice, also as {others[0].source}: rename one"
+                raise InputError(found[0].source, message)
+    return tuple(RunFiles(*run) for run in sorted(runs, key=lambda run: run[0]))
+
+
+def command_ranges(machine: Machine) -> dict[str, CommandRange]:
+    """What the command columns of a machine's logs hold, where it is no fraction in [-1, 1]."""
+    return {
+        f"command.{name}": CommandRange(axis.command_unit, *axis.command_range)
+        for name, axis in machine.axes.items()
+        if axis.command_range != (-1.0, 1.0)
+    }
+
+
+def _files(path: Path) -> list[tuple[str, Path]]:
+    """(run name, file) of every log behind a path."""
+    if not path.exists():
+        raise InputError(path, "is not there: name a folder with logs, or logs")
+    if path.is_file():
+        return [(path.stem if path.stem != MEASURED else path.resolve().parent.name, path)]
+    if not path.is_dir():
+        raise InputError(path, "is neither a file nor a folder: name a folder with logs, or logs")
+    seen = sorted(p for p in path.iterdir() if not p.name.startswith("."))
+    if record := _record(path):
+        return [(path.resolve().name, record)]
+    files = [(p.stem, p) for p in seen if p.is_file() and p.suffix.lower() in _KINDS]
+    if not files:
+        files = [(p.name, f) for p in seen if p.is_dir() and (f := _record(p))]
+    if not files:
+        raise InputError(path, "the folder holds no log: put .parquet or .csv files there")
+    return files
+
+
+def _record(folder: Path) -> Path | None:
+    """The log of a run folder; None where the folder is something else."""
+    kinds = (folder / f"{MEASURED}{kind}" for kind in _KINDS)
+    return next((file for file in kinds if file.is_file()), None)
+
+
+def _sensors(log: Log) -> set[str]:
+    others = ("command.", "reference.", "valid")
+    return {name for name in log.columns if not name.startswith(others)}
+
+
+def _apart(logs: Sequence[Log]) -> bool:
+    """Whether no two logs hold the same sensor channel, and every one holds some or commands."""
+    channels = [channel for log in logs for channel in _sensors(log)]
+    return len(channels) == len(set(channels))
+
+
+def _joined_by_metadata(runs: list[tuple[str, tuple[Log, ...]]]) -> list:
+    groups: dict[str, list[tuple[str, tuple[Log, ...]]]] = {}
+    for name, logs in runs:
+        groups.setdefault(logs[0].metadata.get("run", name), []).append((name, logs))
+    joined = []
+    for run, members in groups.items():
+        logs = tuple(log for _, found in members for log in found)
+        joined += [(run, logs)] if len(members) > 1 and _apart(logs) else members
+    return joined
+
+
+def _check_machine(log: Log, machine: Machine) -> None:
+    stated = log.metadata.get("machine", machine.name)
+    words, own = set(stated.lower().split("_")), set(machine.name.lower().split("_"))
+    if not (words <= own or own <= words):  # `volvo_ec20` is an ec20
+        raise InputError(
+            log.source,
+            f"is a log of the machine {stated!r}, the model is {machine.name!r}: choose the model"
+            " of that machine, leave the log out, or force it if only the name differs",
+        )
+    tool = log.metadata.get("tool", machine.tool)
+    if tool != machine.tool:
+        raise InputError(
+            log.source,
+            f"was logged with the tool {tool!r}, the model carries {machine.tool!r}: load the model"
+            f" with tool {tool!r}, leave the log out, or force it if only the name differs",
+        )
+
+
+def check_commands(run: RunFiles, machine: Machine) -> None:
+    """Refuse a run without the command of every driven axis, or with one in another unit.
+
+    Raises:
+        InputError: names file and axis, and what to write.
+    """
+    for name, axis in machine.axes.items():
+        channel, unit = f"command.{name}", axis.force.command_unit if axis.force else "1"
+        holders = [log for log in run.logs if channel in log]
+        if not holders:
+            has = ", ".join(dict.fromkeys(c for log in run.logs for c in log.columns))
+            raise InputError(
+                ", ".join(log.source for log in run.logs),
+                f"needs the column {channel}, which drives {name}; it has {has or 'none'}. Log what"
+                f" was sent to it [{unit}], with 0 all along if it was never driven",
+            )
+        for log in holders:
+            if log.units[channel] != unit:
+                raise InputError(
+                    f"{log.source}, column {channel!r}",
+                    f"is in {log.units[channel]!r}, the drive takes {unit!r}: convert the column"
+                    + (
+                        f", or state axes.{name}.command_unit and command_range in the machine file"
+                        if axis.valve
+                        else ""
+                    ),
+                )

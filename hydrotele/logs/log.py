@@ -1,0 +1,330 @@
+"""Log: time and named columns with units and provenance. The wall between running and learning.
+
+Parquet in and out, CSV in. Whatever is read is checked, so that a Log can be trusted: its channels
+are known, in SI, finite and of one length, and its time rises.
+"""
+
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from hydrotele.core.errors import InputError
+from hydrotele.core.limits import check_limit
+from hydrotele.core.output import replacing
+from hydrotele.logs.csv_import import read_csv
+from hydrotele.logs.log_checks import (
+    CommandRange,
+    Table,
+    check_values,
+    checked,
+    in_range,
+    lacks,
+    lost_samples,
+    with_valid,
+)
+from hydrotele.machine import signals
+
+LEFT_OUT = "none"  # the alias of columns that are no channel and not wanted
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """One run of a machine, measured or simulated. The arrays are copied and read-only.
+
+    Attributes:
+        time: (n,) float64 [s], strictly rising.
+        columns: channel name (see `signals`) -> (n,) float64 in the unit that `units` gives.
+        units: channel name -> SI unit; the same keys as `columns`.
+        metadata: provenance; structures as JSON text.
+        source: the file it was read from, or what made it.
+
+    Raises:
+        ValueError: a column is not as long as time, has no unit, is not a valid channel or has a
+            unit that its kind does not allow.
+        TypeError: a metadata key or value is not a string.
+    """
+
+    time: np.ndarray
+    columns: Mapping[str, np.ndarray]
+    units: Mapping[str, str]
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    source: str = "memory"
+
+    def __post_init__(self) -> None:
+        """Copy, freeze and check."""
+        object.__setattr__(self, "time", _frozen(self.time))
+        object.__setattr__(self, "columns", {k: _frozen(v) for k, v in self.columns.items()})
+        object.__setattr__(self, "units", dict(self.units))
+        object.__setattr__(self, "metadata", dict(self.metadata))
+        if self.time.ndim != 1 or self.columns.keys() != self.units.keys():
+            raise ValueError("time must be (n,), and columns and units must have the same keys")
+        for name, values in self.columns.items():
+            allowed = signals.allowed_units(name)
+            if name == "time" or values.shape != self.time.shape or self.units[name] not in allowed:
+                expected = f"{self.time.shape} in {' or '.join(allowed)}"
+                raise ValueError(
+                    f"{name}: expected {expected}, got {values.shape} in {self.units[name]!r}"
+                )
+        if not all(isinstance(text, str) for item in self.metadata.items() for text in item):
+            raise TypeError("metadata must be strings: write structures with json.dumps")
+
+    def __len__(self) -> int:
+        """Return the number of rows n."""
+        return len(self.time)
+
+    def __contains__(self, name: object) -> bool:
+        """Tell whether the channel is there."""
+        return name == "time" or name in self.columns
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return a channel, (n,) in its unit, or `time`.
+
+        Raises:
+            InputError: the log has no such channel; lists what it has.
+        """
+        if name not in self:
+            raise InputError(self.source, lacks([name], self.columns))
+        return self.time if name == "time" else self.columns[name]
+
+    @property
+    def name(self) -> str:
+        """The run's name: the file name without its ending."""
+        return Path(self.source).stem
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes of the measured channels, in order of appearance."""
+        channels = map(signals.parse_channel, self.columns)
+        return tuple(dict.fromkeys(c.axis for c in channels if c.axis and not c.truth))
+
+    @property
+    def rate(self) -> float:
+        """The sample rate [Hz], from the median step."""
+        return float(1.0 / np.median(np.diff(self.time)))
+
+    @property
+    def gaps(self) -> np.ndarray:
+        """The rows (k,) before which samples are missing, or whose time is off by half a step."""
+        return np.flatnonzero(lost_samples(self.time)) + 1
+
+    def without_truth(self) -> "Log":
+        """Return the log with measured channels only, which is all that learning code may see."""
+        kept = [name for name in self.columns if not signals.parse_channel(name).truth]
+        return replace(
+            self, columns={k: self.columns[k] for k in kept}, units={k: self.units[k] for k in kept}
+        )
+
+
+def load_log(
+    path: str | os.PathLike,
+    *,
+    aliases: Mapping[str, str] | None = None,
+    required: Sequence[str] = (),
+    minimum_rows: int = 10,
+    maximum_dropped: float = 0.0,
+    missing: bool = False,
+    commands: Mapping[str, CommandRange] | None = None,
+) -> Log:
+    """Read and check one run, `.parquet` or `.csv`.
+
+    Args:
+        path: the file.
+        aliases: the file's own column name -> channel name, with a minus before it where the sign
+            is the other way round, `a * b` stands for the product of two columns without unit, and
+            `none` for a column to leave out; names that the file lacks are ignored, and so are all
+            of them for logs that hydrotele wrote.
+        required: channels that must be there, after renaming.
+        minimum_rows: fewer rows are refused.
+        maximum_dropped: fraction of the samples [1] that may be missing or come off time by more
+            than half a step; `Log.gaps` says where they are.
+        missing: accept NaN, null and empty cells in every column but time; they become NaN.
+        commands: command channel -> what its column holds, where that is no fraction in [-1, 1];
+            ignored for logs that hydrotele wrote.
+
+    Raises:
+        InputError: the file cannot be used; names file, column and row, and what to do.
+    """
+    path = Path(path)
+    table = _read(path, missing)
+    if "hydrotele" not in table.metadata:
+        table = with_valid(_renamed(table, aliases or {}))
+        table = in_range(table, commands or {})
+    names = table.names
+    rows, needed = len(table.values[0]) if names else 0, max(minimum_rows, 2)
+    if rows < needed:
+        raise InputError(path, f"the run is too short: {rows} rows, {needed} are needed")
+    table = checked(table, required, maximum_dropped, missing)
+    columns = dict(zip(names, table.values, strict=True))
+    units = dict(zip(names, map(str, table.units), strict=True))
+    time = columns.pop("time")
+    del units["time"]
+    return Log(time, columns, units, table.metadata, str(path))
+
+
+def _renamed(table: Table, aliases: Mapping[str, str]) -> Table:
+    for product, channel in aliases.items():
+        factors = product.split(" * ")
+        if len(factors) == 2 and set(factors) <= set(table.names):
+            a, b = (table.values[table.names.index(name)] for name in factors)
+            table = table._replace(
+                names=[*table.names, channel], values=[*table.values, a * b],
+                units=[*table.units, "1"],
+            )  # fmt: skip
+    names = [aliases.get(name, name) for name in table.names]
+    kept = [place for place, name in enumerate(names) if name != LEFT_OUT]
+    signs = [-1.0 if names[place].startswith("-") else 1.0 for place in kept]
+    return table._replace(
+        names=[names[place].removeprefix("-") for place in kept],
+        values=[sign * table.values[place] for sign, place in zip(signs, kept, strict=True)],
+        units=[table.units[place] for place in kept],
+    )
+
+
+def load_logs(
+    path: str | os.PathLike,
+    *,
+    aliases: Mapping[str, str] | None = None,
+    required: Sequence[str] = (),
+    minimum_rows: int = 10,
+    maximum_dropped: float = 0.0,
+) -> tuple[Log, ...]:
+    """Read one file, or every `.parquet` and `.csv` of a folder, sorted by name.
+
+    The arguments are those of `load_log`.
+
+    Raises:
+        InputError: as `load_log` for the first bad file; also for a folder without logs, or with
+            one run twice.
+    """
+    path = Path(path)
+    files = [path]
+    if path.is_dir():
+        seen = [p for p in path.iterdir() if not p.name.startswith(".")]
+        files = sorted(p for p in seen if p.suffix.lower() in (".parquet", ".csv"))
+    if not files:
+        raise InputError(path, "the folder holds no log: put .parquet or .csv files there")
+    for stem, count in Counter(file.stem for file in files).items():
+        if count > 1:
+            raise InputError(path, f"run {stem!r} is there {count} times: keep one file of it")
+    return tuple(
+        load_log(
+            file,
+            aliases=aliases,
+            required=required,
+            minimum_rows=minimum_rows,
+            maximum_dropped=maximum_dropped,
+        )
+        for file in files
+    )
+
+
+def save_log(log: Log, path: str | os.PathLike) -> None:
+    """Write a log as Parquet, all or nothing: `path` holds the old file or the whole new one.
+
+    Raises:
+        InputError: the values are not finite or time does not rise, the name does not end in
+            .parquet, or the folder cannot be written. Nothing is written then.
+    """
+    path = Path(path)
+    names, values = ["time", *log.columns], [log.time, *log.columns.values()]
+    table = Table(str(path), names, values, ["s", *log.units.values()], log.metadata)
+    check_values(table, maximum_dropped=np.inf)
+    content = _parquet_bytes(table)
+    with replacing(path, ".parquet") as part, open(part, "xb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _parquet_bytes(table: Table) -> memoryview:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    fields = [
+        pa.field(name, pa.float64(), nullable=False, metadata={"unit": str(unit)})
+        for name, unit in zip(table.names, table.units, strict=True)
+    ]
+    schema = pa.schema(fields, metadata=dict(table.metadata))
+    arrays = [pa.array(values) for values in table.values]
+    stream = pa.BufferOutputStream()
+    pq.write_table(
+        pa.Table.from_arrays(arrays, schema=schema),
+        stream,
+        compression="zstd",
+        use_dictionary=False,  # measured floats hardly repeat
+        write_page_checksum=True,  # a flipped bit is then found on reading
+    )
+    return memoryview(stream.getvalue())
+
+
+def _read(path: Path, missing: bool) -> Table:
+    if not path.is_file():
+        raise InputError(path, "is not a file: give the path of a .parquet or .csv log")
+    if path.suffix.lower() == ".csv":
+        return read_csv(path, missing)
+    if path.suffix.lower() == ".parquet":
+        return _read_parquet(path, missing)
+    raise InputError(path, f"a log ends in .parquet or .csv, not in {path.suffix!r}")
+
+
+def _read_parquet(path: Path, missing: bool) -> Table:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names, values, units = [], [], []
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            schema, rows = file.schema_arrow, file.metadata.num_rows
+            specs = [s for s in schema if not s.name.startswith("__index_level_")]  # pandas' labels
+            for spec in specs:
+                _check_numbers(path, spec)
+            check_limit(path, "LOG_VALUES", rows * len(specs))
+            for spec in specs:  # one by one, so that only one is there twice
+                read = file.read(columns=[spec.name])  # and columns whose names begin so
+                column = read.column(read.schema.get_all_field_indices(spec.name)[0])
+                names.append(spec.name)
+                values.append(_numbers(f"{path}, column {spec.name!r}", column, missing))
+                units.append(_decoded(spec.metadata).get("unit") or None)
+        metadata = {k: v for k, v in _decoded(schema.metadata).items() if k != "pandas"}
+    except InputError:
+        raise
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            path, f"is not a readable Parquet file, copy it again ({reason})"
+        ) from error
+    return Table(str(path), names, values, units, metadata)
+
+
+def _check_numbers(path: Path, spec) -> None:
+    import pyarrow as pa
+
+    number = pa.types.is_floating(spec.type) or pa.types.is_integer(spec.type)
+    if not (number or (pa.types.is_boolean(spec.type) and spec.name in ("valid", "mask"))):
+        message = f"holds {spec.type}, not numbers: write it as float64 or remove it"
+        raise InputError(f"{path}, column {spec.name!r}", message)
+
+
+def _numbers(where: str, column, missing: bool) -> np.ndarray:
+    """A Parquet column as (n,) float64, null as NaN."""
+    if column.null_count and not missing:
+        row = int(np.flatnonzero(column.is_null().to_numpy())[0])
+        raise InputError(f"{where}, row {row}", "is null: remove the row or fill it in")
+    with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaN
+        return column.to_numpy().astype(np.float64)
+
+
+def _decoded(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
+    return {
+        k.decode(errors="replace"): v.decode(errors="replace") for k, v in (metadata or {}).items()
+    }
+
+
+def _frozen(values: np.ndarray) -> np.ndarray:
+    copy = np.array(values, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy

@@ -1,0 +1,232 @@
+"""The rows of one run, from one file or several, on one uniform clock; cut where rows lack long.
+
+A file says with its column `valid` which rows may not be used, such as those in contact.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.logs.clock import Clock, fit_clock
+from hydrotele.logs.files import RunFiles
+from hydrotele.logs.log import Log
+from hydrotele.logs.mask import Masked, unmasked
+from hydrotele.logs.offset import clock_offset
+
+LONGEST_GAP = 1.0  # [s] without rows, after which the commands' history is lost and a run is cut
+LONGEST_MASK = 0.2  # [s] masked, after which nobody knows the state and a run is cut
+_FINEST = 5  # times as many ticks as the commands' file has rows
+_SLOW = 20.0  # [Hz] below it a row lasts as long as a valve takes
+_OFF = 0.05  # of a row's period that a reading may be off its tick
+
+
+class Rows(NamedTuple):
+    """A run on a uniform clock.
+
+    Attributes:
+        start: time of the first row [s].
+        period: time between rows [s].
+        command: (n, nu) commands, held from row to row.
+        known: (n,) whether the command of the row was logged.
+        reading: (n, c) readings, NaN where missing.
+        valid: (n,) whether the row may be used; its readings are NaN where not.
+    """
+
+    start: float
+    period: float
+    command: np.ndarray
+    known: np.ndarray
+    reading: np.ndarray
+    valid: np.ndarray
+
+
+def run_rows(
+    run: RunFiles, axes: Sequence[str], channels: Sequence[str], masks: Sequence[Masked] = ()
+) -> tuple[tuple[Rows, ...], tuple[str, ...]]:
+    """Put a run on one clock.
+
+    The file that holds the commands gives the clock. Files of other rates, or whose rows fall
+    between its rows, make the clock up to five times finer, so that every reading stands at its
+    own time; rows in between have NaN.
+
+    Args:
+        run: its files.
+        axes: the nu axes.
+        channels: the c channels.
+        masks: stretches that may not be used, besides what the files say.
+
+    Returns:
+        (its pieces, cut where more than a second lacks or more than 0.2 s are masked; notes).
+
+    Raises:
+        InputError: time stamps follow no clock.
+    """
+    commands = [f"command.{axis}" for axis in axes]
+    logs = sorted(run.logs, key=lambda log: -sum(c in log for c in commands))
+    found = [fit_clock(log.time, _name(run, log)) for log in logs]
+    notes = [note for _, several in found for note in several]
+    clocks = [found[0][0]]
+    for log, (clock, _) in zip(logs[1:], found[1:], strict=True):
+        offset, note = _offset(run, logs[0], clocks[0], log, clock, commands)
+        clocks.append(clock._replace(start=clock.start + offset))
+        notes += note
+    period, fine, off = _common_period(clocks)
+    if off > _OFF * clocks[0].period:
+        notes.append(f"{run.name}: its files share no clock; readings are up to {1e3 * off:.2g} ms"
+                     " off their time.")  # fmt: skip
+    ticks = [_ticks(clock, clocks[0].start, period) for clock in clocks]
+    every = np.unique(np.concatenate(ticks))
+    command = _spread(logs, clocks, ticks, every, commands)
+    commanded = np.isin(every, ticks[0])
+    own = [place for place, name in enumerate(commands) if name in logs[0]]
+    commanded &= np.isfinite(command[:, own]).all(axis=1)
+    reading = _spread(logs, clocks, ticks, every, channels)
+    pieces = np.split(np.arange(len(every)), 1 + np.flatnonzero(
+        np.diff(every) * period > LONGEST_GAP))  # fmt: skip
+    if lost := [every[p[0]] - every[p[0] - 1] for p in pieces[1:]]:
+        seconds = ", ".join(f"{n * period:.3g} s" for n in lost)
+        notes.append(f"{run.name}: nothing was logged for {seconds}; the run was cut there.")
+    fine *= clocks[0].hold
+    rows = tuple(
+        _dense(clocks[0].start, period, fine, every[p], command[p], commanded[p], reading[p])
+        for p in pieces
+    )
+    notes += _unread(run, logs, channels)
+    if missing := sum(int((~r.known).sum()) for r in rows):
+        share = 100 * missing / sum(len(r.known) for r in rows)
+        notes.append(f"{run.name}: {missing} rows ({share:.2g} %) were not logged; they count as"
+                     " missing and their commands as held.")  # fmt: skip
+    if (rate := 1.0 / clocks[0].period) < _SLOW:
+        notes.append(f"{run.name}: is logged at {rate:.3g} Hz; its commands count as held between"
+                     " rows, and delays and lags are known to a row at best.")  # fmt: skip
+    rows = tuple(_masked(run, logs, clocks, piece, masks) for piece in rows)
+    if masked := sum(float((~r.valid).sum()) * r.period for r in rows):
+        rows = tuple(part for piece in rows for part in _cut_masked(piece))
+        notes.append(f"{run.name}: {masked:.3g} s are masked; their readings are not used, and the"
+                     f" run was cut where that lasts more than {LONGEST_MASK:g} s.")  # fmt: skip
+    return rows, tuple(notes)
+
+
+def _masked(run: RunFiles, logs, clocks, rows: Rows, masks: Sequence[Masked]) -> Rows:
+    """Rows with the readings of those that may not be used taken out."""
+    time = rows.start + rows.period * np.arange(len(rows.command))
+    valid = unmasked(masks, run.name, time)
+    for log, clock in zip(logs, clocks, strict=True):
+        if "valid" in log:
+            stamps = clock.start + clock.period * clock.tick
+            latest = np.searchsorted(stamps, time + 0.5 * rows.period, side="right") - 1
+            valid &= (log["valid"][clock.row] == 1.0)[np.maximum(latest, 0)]
+    reading = np.where(valid[:, None], rows.reading, np.nan)
+    return rows._replace(valid=valid, reading=reading)
+
+
+def _cut_masked(rows: Rows) -> list[Rows]:
+    """Pieces of a run between its long masked stretches."""
+    edges = np.flatnonzero(np.diff(rows.valid, prepend=True, append=True))
+    begin, end = edges[::2], edges[1::2]
+    long = (end - begin) * rows.period > LONGEST_MASK
+    starts = [0, *end[long].tolist()]
+    ends = [*begin[long].tolist(), len(rows.valid)]
+    return [cut(rows, a, b) for a, b in zip(starts, ends, strict=True) if a < b]
+
+
+def cut(rows: Rows, first: int, last: int) -> Rows:
+    """Rows first .. last - 1 of a run, with their own start."""
+    part = slice(int(first), int(last))
+    return Rows(
+        rows.start + int(first) * rows.period, rows.period, rows.command[part], rows.known[part],
+        rows.reading[part], rows.valid[part],
+    )  # fmt: skip
+
+
+def _unread(run: RunFiles, logs: Sequence[Log], channels: Sequence[str]) -> list[str]:
+    """Note on cells that hold no number."""
+    counts = {
+        name: int(np.isnan(log[name]).sum())
+        for log in logs for name in log.columns
+        if name in channels or name.startswith("command.")
+    }  # fmt: skip
+    said = ", ".join(f"{count} of {name}" for name, count in counts.items() if count)
+    return [f"{run.name}: {said} are NaN or empty; they count as missing."] if said else []
+
+
+def _name(run: RunFiles, log: Log) -> str:
+    return run.name if len(run.logs) == 1 else log.name
+
+
+def _offset(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock, commands):
+    """Offset of the clock of a further file [s], and what to say about it."""
+    both = [name for name in commands if name in main and name in log]
+    named = f"{run.name}: {log.source}"
+    offset = None
+    if both:
+        offset = clock_offset(
+            clock, np.column_stack([main[c] for c in both])[clock.row],
+            other, np.column_stack([log[c] for c in both])[other.row],
+        )  # fmt: skip
+    if offset is None:
+        why = "its commands do not tell" if both else "it holds no command"
+        return 0.0, [
+            f"{named}: {why} how its clock stands to that of {main.source}, which was believed; an"
+            " offset would show as one delay of all its channels."
+        ]
+    if abs(offset) <= _OFF * clock.period:
+        return offset, []
+    return offset, [
+        f"{named}: its clock was set by {offset:+.6g} s, which brings its commands onto those of"
+        f" {main.source}."
+    ]
+
+
+def _common_period(clocks: Sequence[Clock]) -> tuple[float, int, float]:
+    """Longest period that has a tick for every row, the refinement, and the largest miss [s]."""
+    tried = []
+    for fine in range(1, _FINEST + 1):
+        period = clocks[0].period / fine
+        off = 0.0
+        for clock in clocks[1:]:
+            ahead = (clock.start - clocks[0].start + clock.tick * clock.period) / period
+            twice = (np.diff(np.rint(ahead)) == 0).any()
+            off = max(off, np.abs(ahead - np.rint(ahead)).max() * period, twice * clock.period)
+        tried.append((float(off), fine, period))
+        if off <= _OFF * clocks[0].period:
+            break
+    off, fine, period = min(tried)
+    return period, fine, off
+
+
+def _ticks(clock: Clock, start: float, period: float) -> np.ndarray:
+    return np.rint((clock.start - start + clock.tick * clock.period) / period).astype(int)
+
+
+def _spread(logs, clocks, ticks, every, names) -> np.ndarray:
+    """Columns (n, k) of all files at the common ticks."""
+    values = np.full((len(every), len(names)), np.nan)
+    for column, name in enumerate(names):
+        holder = next((i for i, log in enumerate(logs) if name in log), None)
+        if holder is not None:
+            rows = np.searchsorted(every, ticks[holder])
+            values[rows, column] = logs[holder][name][clocks[holder].row]
+    return values
+
+
+def _dense(start, period, fine, tick, command, commanded, reading) -> Rows:
+    """Rows at every tick; a command holds, and is known, until the next row of its file is due."""
+    n = int(tick[-1] - tick[0]) + 1
+    place = tick - tick[0]
+    full = np.full((n, reading.shape[1]), np.nan)
+    full[place] = reading
+    held = np.full((n, command.shape[1]), np.nan)
+    held[place] = command
+    for column in held.T:
+        good = np.flatnonzero(np.isfinite(column))
+        latest = np.searchsorted(good, np.arange(n), side="right") - 1
+        column[:] = column[good[np.maximum(latest, 0)]] if len(good) else 0.0
+    own = np.flatnonzero(commanded)
+    age = np.full(n, n)
+    if len(own):
+        latest = np.searchsorted(place[own], np.arange(n), side="right") - 1
+        age = np.where(latest >= 0, np.arange(n) - place[own][np.maximum(latest, 0)], n)
+    first = start + float(tick[0]) * period
+    return Rows(first, period, held, age < fine, full, np.ones(n, dtype=bool))

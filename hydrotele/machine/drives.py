@@ -1,0 +1,457 @@
+"""Facts of the drives: cylinders, motors, force drives, their valves, friction and transmission."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hydrotele.core.datafile import Facts, Name, NonNegative, Positive, Vector
+
+
+class Pin(Facts):
+    """A point [m] fixed to a link (or to the world)."""
+
+    link: Name
+    position: Vector
+
+
+class Friction(Facts):
+    """Friction numbers of `hydraulics.friction`: [N] or [N m], velocities [m/s] or [rad/s].
+
+    An asymmetry a makes the dry or the viscous part (1 + a) times as large in the positive
+    direction and (1 - a) times in the negative one. With a `presliding_stiffness` [N/m] or
+    [N m/rad] the dry part is a spring below breakaway (`hydraulics.presliding`), whose damper is
+    `presliding_damping` [N s/m] or [N m s/rad], and `smoothing_velocity` smooths it no longer.
+    """
+
+    coulomb: NonNegative = 0.0
+    stribeck_extra: NonNegative = 0.0
+    stribeck_velocity: Positive = 0.02
+    viscous: NonNegative = 0.0
+    smoothing_velocity: Positive = 0.005
+    coulomb_asymmetry: Annotated[float, Field(gt=-1, lt=1)] = 0.0
+    viscous_asymmetry: Annotated[float, Field(gt=-1, lt=1)] = 0.0
+    presliding_stiffness: NonNegative = 0.0
+    presliding_damping: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.presliding_damping and not self.presliding_stiffness:
+            raise ValueError("presliding_damping needs a presliding_stiffness")
+        return self
+
+    @property
+    def presliding(self) -> bool:
+        """Whether the dry part has bristles: a stiffness, and a force to break away from."""
+        return self.presliding_stiffness > 0.0 and self.coulomb + self.stribeck_extra > 0.0
+
+
+class Bar(Facts):
+    """Tube or rod of a cylinder: com is its distance [m] from its own pin."""
+
+    mass: Positive
+    com: float
+    inertia: tuple[Positive, Positive, Positive]
+
+
+class Cylinder(Facts):
+    """A hydraulic cylinder between two pins; x = pin-to-pin length - closed_length, 0 .. stroke.
+
+    `hose_compliance` [m^3/Pa] is the swelling of the hose at each chamber.
+    """
+
+    base_pin: Pin
+    rod_pin: Pin
+    closed_length: Positive
+    stroke: Positive
+    area_head: Positive
+    area_rod: Positive
+    dead_volume: Positive
+    leakage: NonNegative
+    hose_compliance: NonNegative = 0.0
+    friction: Friction = Friction()
+    tube: Bar
+    rod: Bar
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.area_rod > self.area_head:
+            raise ValueError(f"area_rod {self.area_rod:g} exceeds area_head {self.area_head:g}")
+        if self.stroke >= self.closed_length:
+            raise ValueError(
+                f"a stroke of {self.stroke:g} m does not fit into a closed_length of"
+                f" {self.closed_length:g} m"
+            )
+        return self
+
+    @property
+    def areas(self) -> tuple[float, float]:
+        """Head-side and rod-side piston area [m^2]."""
+        return self.area_head, self.area_rod
+
+    def volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Head and rod chamber volumes [m^3] at piston displacements x [m], any shape.
+
+        Beyond an end of the stroke they stay what they are at that end.
+        """
+        inside = np.clip(x, 0.0, self.stroke)
+        left = self.stroke - inside
+        return self.dead_volume + self.area_head * inside, self.dead_volume + self.area_rod * left
+
+
+class Motor(Facts):
+    """A hydraulic motor on a joint: displacement [m^3/rad], constant chamber volumes [m^3]."""
+
+    displacement: Positive
+    dead_volume: Positive
+    leakage: NonNegative
+    hose_compliance: NonNegative = 0.0
+    friction: Friction = Friction()
+
+    @property
+    def areas(self) -> tuple[float, float]:
+        """Displacement of port A and of port B [m^3/rad], in the place of piston areas."""
+        return self.displacement, self.displacement
+
+    def volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Constant chamber volumes [m^3], in the shape of the motor angles x [rad]."""
+        constant = np.full_like(x, self.dead_volume)
+        return constant, constant
+
+
+class ForceDrive(Facts):
+    """A plain force or torque drive: `gain command = load + friction + offset` [N] or [N m]."""
+
+    gain: float
+    command_unit: Literal["1", "V", "N"] = "1"
+    command_limit: Positive = 1.0
+    friction: Friction = Friction()
+    offset: float = 0.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.gain == 0.0:
+            raise ValueError("gain: 0 is a drive that no command moves; leave the axis out instead")
+        return self
+
+
+class FlowCurve(Facts):
+    """Opening [1] over spool travel beyond the dead band [1], linear between 2 to 8 knots.
+
+    Travel goes from 0 to 1; opening begins at 0, never falls, and is 1 where the rated flow is.
+    """
+
+    travel: tuple[float, ...]
+    opening: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _check(self):
+        travel, opening = self.travel, self.opening
+        if not 2 <= len(travel) <= 8 or len(opening) != len(travel):
+            raise ValueError(
+                f"needs 2 to 8 knots of travel and as many of opening; has {len(travel)} and"
+                f" {len(opening)}"
+            )
+        if travel[0] != 0.0 or travel[-1] != 1.0 or np.any(np.diff(travel) <= 0.0):
+            raise ValueError(f"travel {travel} must rise from 0 to 1")
+        if opening[0] != 0.0 or np.any(np.diff(opening) < 0.0) or opening[-1] == 0.0:
+            raise ValueError(f"opening {opening} must begin at 0, never fall, and end above 0")
+        return self
+
+
+class Metering(Facts):
+    """One direction of a spool: its dead band, the gains of its two edges, its flow curve.
+
+    `inlet` and `outlet` [1] scale the flow gain from the pump into the fed chamber (P-A or P-B) and
+    from the other one to tank (B-T or A-T). Without a dead band of its own it has the valve's.
+    """
+
+    deadband: Annotated[float, Field(ge=0, lt=1)] | None = None
+    inlet: Positive = 1.0
+    outlet: Positive = 1.0
+    curve: FlowCurve | None = None
+
+
+class Valve(Facts):
+    """A spool valve: rated_flow [m^3/s] at rated_pressure_drop [Pa], bandwidth [rad/s].
+
+    `slew_limit` [1/s] is the fastest that its spool can move. With `compensation: pressure` the
+    drop over the inlet edge never exceeds `compensated_drop` [Pa] (the rated one, if not given), so
+    that the flow follows the opening whatever the load, as long as the supply suffices.
+    `positive` and `negative` say how the two directions of travel differ; a positive command feeds
+    the head side.
+    """
+
+    rated_flow: Positive
+    rated_pressure_drop: Positive = 7.0e6
+    deadband: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    bandwidth: Positive
+    damping: Positive = 0.9
+    slew_limit: Positive | None = None
+    compensation: Literal["none", "pressure"] = "none"
+    compensated_drop: Positive | None = None
+    positive: Metering = Metering()
+    negative: Metering = Metering()
+    port_relief: Positive = 32.0e6
+    smoothing: Positive = 5.0e4
+    port_relief_gain: NonNegative = 1.0e-9
+    makeup_gain: NonNegative = 5.0e-9
+
+    @property
+    def deadbands(self) -> tuple[float, float]:
+        """Dead band in the positive and in the negative direction [1]."""
+        own = (self.positive.deadband, self.negative.deadband)
+        forward, backward = (self.deadband if d is None else d for d in own)
+        return forward, backward
+
+    @property
+    def held_drop(self) -> float:
+        """Pressure drop that the compensator holds over the inlet edge [Pa], 0 without one."""
+        if self.compensation == "none":
+            return 0.0
+        return self.compensated_drop or self.rated_pressure_drop
+
+
+class ElectricMotor(Facts):
+    """A brushed DC motor on a bridge, and what keeps it and its pump from turning.
+
+    `voltage` [V] of the bridge at full duty, `resistance` [ohm], `emf` [V s/rad] which is also its
+    torque per current [N m/A], `inertia` [kg m^2] of rotor and pump; drag torques [N m]: `drag`
+    always, `breakaway` more at rest, gone with `breakaway_speed` [rad/s], and `viscous`
+    [N m s/rad].
+    """
+
+    voltage: Positive
+    resistance: Positive
+    emf: Positive
+    inertia: Positive
+    drag: NonNegative = 0.0
+    breakaway: NonNegative = 0.0
+    breakaway_speed: Positive = 10.0
+    viscous: NonNegative = 0.0
+
+
+_USUAL_PRESSURE = 2.0e7  # Pa, that a pump's own circuit stands where no motor limits it
+
+
+class Accumulator(Facts):
+    """A gas accumulator in the place of a tank, with the cylinder fully retracted.
+
+    `pressure` [Pa] above the atmosphere's, `gas_volume` [m^3] at that pressure, and the resistance
+    of its line [Pa s/m^3] while the cylinder extends and retracts.
+    """
+
+    pressure: Positive
+    gas_volume: Positive
+    line_extending: Positive
+    line_retracting: Positive
+
+
+class Pump(Facts):
+    """A pump of the axis' own, driven in one direction; a switched valve picks the side.
+
+    The command is the duty of the motor with the sign of the side, or, without a `motor`, the speed
+    over `rated_speed` [rad/s]. `displacement` [m^3/rad], `leakage` [m^3/(s Pa)] back to the line
+    that it draws from, `torque_loss` [1] as a part of displacement times pressure. Of the oil
+    between pump and piston: `bulk_modulus` [Pa] without air, `compliance_head` and `compliance_rod`
+    [m^3/Pa] of hoses and walls, `air_head` and `air_rod` [m^3] at the atmosphere's pressure.
+    """
+
+    displacement: Positive
+    leakage: NonNegative = 0.0
+    torque_loss: NonNegative = 0.0
+    rated_speed: Positive
+    bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
+    compliance_head: NonNegative = 0.0
+    compliance_rod: NonNegative = 0.0
+    air_head: NonNegative = 0.0
+    air_rod: NonNegative = 0.0
+    accumulator: Accumulator
+    motor: ElectricMotor | None = None
+
+    @property
+    def rated_flow(self) -> float:
+        """Flow at the rated speed [m^3/s]."""
+        return self.displacement * self.rated_speed
+
+    @property
+    def stall_pressure(self) -> float:
+        """Pressure difference that holds the motor at full duty [Pa]; 20 MPa without a motor.
+
+        `(k U / R - drag) / (D (1 + loss))`; gear pumps of any make stand 20 MPa.
+        """
+        motor = self.motor
+        if motor is None:
+            return _USUAL_PRESSURE
+        torque = motor.emf * motor.voltage / motor.resistance - motor.drag
+        return max(torque, 0.0) / (self.displacement * (1.0 + self.torque_loss))
+
+
+class LoadCylinder(Facts):
+    """A cylinder that resists extension: its oil leaves over a relief valve.
+
+    `area` [m^2]; `relief_pressure` [Pa], and how much it rises with the flow, `override`
+    [Pa s/m^3]; `stiffness` [N/m] of its oil; `void` [m] of the travel in which the oil does not
+    yet fill the chamber, with air at `void_pressure` [Pa] in it. Its packings rub with `friction`
+    [1] of its force; `return_force` [N] resists on the way back besides.
+    """
+
+    area: Positive
+    relief_pressure: NonNegative
+    override: NonNegative = 0.0
+    stiffness: Positive
+    void: NonNegative = 0.0
+    void_pressure: Positive = 2.0e4
+    friction: NonNegative = 0.0
+    return_force: NonNegative = 0.0
+
+
+class Counterbalance(Facts):
+    """A load-holding valve at a chamber: oil leaves only when p + pilot_ratio p_pilot > setting.
+
+    `setting` [Pa]; p_pilot is the pressure of the other chamber; `override` [1] is the fraction of
+    the setting beyond it at which the valve is fully open. Oil enters freely through its check.
+    """
+
+    setting: Positive
+    pilot_ratio: NonNegative = 3.0
+    override: Positive = 0.2
+
+
+class LoadHolding(Facts):
+    """Counterbalance valves at the head and the rod side of a drive."""
+
+    head: Counterbalance | None = None
+    rod: Counterbalance | None = None
+
+
+class EndStop(Facts):
+    """What a drive meets at the ends of its travel: a spring [N/m] or [N m/rad] and a damper.
+
+    The damper [N s/m] or [N m s/rad] works only while the spring is pressed, and never pulls.
+    """
+
+    stiffness: Positive
+    damping: NonNegative
+
+
+class FourBar(Facts):
+    """Names of the links between cylinder and joint of a four-bar linkage."""
+
+    rocker: Name
+    coupler: Name
+
+
+class Transmission(Facts):
+    """What gives between drive and load: a spring with a gap, and the drive's own inertia.
+
+    The drive acts on its own inertia [kg] or [kg m^2]; spring [N/m] or [N m/rad] and damper
+    [N s/m] or [N m s/rad] carry the force on to the load; inside the gap, `backlash` [m] or [rad]
+    wide from end to end, only the damper does. Friction and oil act on the drive side, and a
+    cylinder's length sensor reads it; the joint's own sensor reads the load.
+    """
+
+    inertia: Positive
+    stiffness: Positive
+    damping: NonNegative = 0.0
+    backlash: NonNegative = 0.0
+
+
+class Axis(Facts):
+    """One driven joint with exactly one of cylinder, motor or force.
+
+    `command_delay` [s] passes before a command reaches the valve or the drive. A valve's commands
+    are fractions in [-1, 1]; where logs have them in another unit, `command_range: [low, high]`
+    [command_unit] says which values stand for -1 and 1, such as [-10, 10] V or [4, 20] mA. Without
+    an `end_stop` the machine's own estimate holds (`Machine.end_stop`).
+    """
+
+    joint: Name
+    cylinder: Cylinder | None = None
+    motor: Motor | None = None
+    force: ForceDrive | None = None
+    valve: Valve | None = None
+    pump: Pump | None = None
+    four_bar: FourBar | None = None
+    command_delay: NonNegative = 0.0
+    command_unit: str = "1"
+    command_range: tuple[float, float] = (-1.0, 1.0)
+    transmission: Transmission | None = None
+    load_holding: LoadHolding = LoadHolding()
+    end_stop: EndStop | None = None
+
+    @model_validator(mode="after")
+    def _check(self):
+        drives = [d for d in ("cylinder", "motor", "force") if getattr(self, d) is not None]
+        if len(drives) != 1:
+            raise ValueError(f"needs exactly one of cylinder, motor, force; has {drives or 'none'}")
+        fed = (self.valve is not None) + (self.pump is not None)
+        if fed != (self.force is None):
+            raise ValueError(
+                "a cylinder or motor needs a valve or a pump of its own; a plain force drive has"
+                " none"
+            )
+        if self.pump:
+            self._check_pumped()
+        if self.force and self.load_holding != LoadHolding():
+            raise ValueError("a plain force drive has no oil for load_holding valves to hold")
+        if self.command_range[0] == self.command_range[1]:
+            raise ValueError("command_range must be [low, high], the commands of -1 and 1")
+        stated = self.command_unit != "1" or self.command_range != (-1.0, 1.0)
+        if stated and self.force:
+            raise ValueError(
+                "command_unit and command_range are those of a valve; a plain force drive has"
+                " force.command_unit and force.command_limit"
+            )
+        if self.command_unit != "1" and self.command_range == (-1.0, 1.0):
+            raise ValueError(
+                f"command_unit {self.command_unit!r} needs the command_range [low, high] of its"
+                " values, such as [-10, 10]"
+            )
+        if self.four_bar and not self.cylinder:
+            raise ValueError("a four_bar linkage is moved by a cylinder")
+        return self
+
+    def _check_pumped(self) -> None:
+        if self.cylinder is None or self.four_bar or self.transmission:
+            raise ValueError("a pump drives a cylinder without four_bar and transmission")
+        if self.load_holding != LoadHolding():
+            raise ValueError("load_holding valves stand behind a valve, not behind a pump")
+        if self.cylinder.hose_compliance:
+            raise ValueError(
+                "give pump.compliance_head and pump.compliance_rod instead of"
+                " cylinder.hose_compliance"
+            )
+        if self.cylinder.friction.presliding_stiffness:
+            raise ValueError(
+                "the friction of an axis with a pump of its own holds a piston rigidly: leave out"
+                " cylinder.friction.presliding_stiffness"
+            )
+        if self.end_stop is None:
+            raise ValueError("an axis with a pump states its end_stop: no relief pressure says it")
+
+    @property
+    def hydraulic(self) -> bool:
+        """Whether the axis has chambers: behind a valve, or behind a pump of its own."""
+        return self.valve is not None or self.pump is not None
+
+    @property
+    def rated_flow(self) -> float:
+        """Flow of the valve at its rated drop, or of the axis' own pump [m^3/s]."""
+        source = self.valve or self.pump
+        assert source is not None
+        return source.rated_flow
+
+    @property
+    def hydraulic_drive(self) -> Cylinder | Motor:
+        """The cylinder or the motor of a hydraulic axis."""
+        drive = self.cylinder or self.motor
+        assert drive is not None
+        return drive
+
+    @property
+    def drive(self) -> Cylinder | Motor | ForceDrive:
+        """The cylinder, the motor or the force drive."""
+        drive = self.cylinder or self.motor or self.force
+        assert drive is not None
+        return drive

@@ -1,0 +1,172 @@
+"""Facts of a joystick: workspace, sensing, flotor, coils, the hand on it, gains. All SI, frozen.
+
+`models/joystick/joystick.yaml` holds the shipped one; a user's is a file of the same form.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from hydrotele.core.datafile import (
+    Facts,
+    Name,
+    NonNegative,
+    Positive,
+    Vector,
+    parse,
+    read_yaml,
+    suggest,
+)
+from hydrotele.core.errors import InputError
+from hydrotele.core.resources import models_folder
+
+JOYSTICK_FILE = "joystick.yaml"
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class Workspace(Facts):
+    """How far the handle goes from its centre, either way: translation [m], rotation [rad]."""
+
+    translation: Positive
+    rotation: Positive
+
+
+class OpticalSensing(Facts):
+    """Resolution of the handle's pose: translation [m], rotation [rad]; 0 is ideal."""
+
+    translation: NonNegative
+    rotation: NonNegative
+
+
+class FlotorFacts(Facts):
+    """The moving part in the coils' frame: mass [kg], com [m], inertia [kg m^2], handle [m]."""
+
+    mass: Positive
+    com: Vector
+    inertia: tuple[Positive, Positive, Positive]
+    handle: Vector
+
+
+class CoilFacts(Facts):
+    """Three stations on a radius [m], each with two coils: [N/A], [A]."""
+
+    radius: Positive
+    force_per_ampere: Positive
+    max_current: Positive
+
+
+class DiodeFacts(Facts):
+    """The position-sensing diodes: distance from the coils' centre [m], step of a reading [m]."""
+
+    distance: Positive
+    step: NonNegative
+
+
+class AloneFacts(Facts):
+    """Second-order systems of the axes x, y, z, rx, ry, rz without a hand: [rad/s], ratio [1]."""
+
+    frequency: Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
+    ratio: Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
+
+
+class HandFacts(Facts):
+    """The hand on the handle: mass [kg], damping and stiffness [N s/m], [N/m]; rotations [N m]."""
+
+    mass: NonNegative
+    damping: NonNegative
+    stiffness: NonNegative
+    rotation_damping: NonNegative = 0.0
+    rotation_stiffness: NonNegative = 0.0
+
+
+class DetentFacts(Facts):
+    """Edge of the dead band that can be felt: drop [N] or [N m], slope outside [N/m]."""
+
+    drop: NonNegative
+    outside: NonNegative
+
+
+class AxisGains(Facts):
+    """Stiffness feedback of one joystick axis, [N, m] or [N m, rad].
+
+    `force_limit` [N] or [N m] is the machine's force at which the stiffness reaches `most`.
+    """
+
+    nominal: Positive
+    least: NonNegative
+    most: Positive
+    damping: NonNegative
+    deadband: NonNegative
+    force_limit: Positive
+    detent: DetentFacts | None = None
+
+    @model_validator(mode="after")
+    def _check(self):
+        if not self.least <= self.nominal <= self.most:
+            raise ValueError(
+                f"stiffnesses must be ordered, least {self.least:g} <= nominal {self.nominal:g}"
+                f" <= most {self.most:g}"
+            )
+        if self.detent and self.detent.drop > self.nominal * self.deadband:
+            raise ValueError(
+                f"a drop of {self.detent.drop:g} is more than the {self.nominal * self.deadband:g}"
+                " that the spring has at the edge of the dead band"
+            )
+        return self
+
+
+class Joystick(Facts):
+    """A six-DOF levitated joystick. `mount` [m] is its place in the cab, `control_rate` [Hz]."""
+
+    name: Name
+    description: str = ""
+    source: str = ""
+    mjcf: str
+    folder: str = ""
+    workspace: Workspace
+    sensing: OpticalSensing
+    diodes: DiodeFacts
+    control_rate: Annotated[Positive, Field(ge=1.0, le=1.0e5)]
+    flotor: FlotorFacts
+    coils: CoilFacts
+    alone: AloneFacts
+    hand: HandFacts
+    mount: Vector
+    gains: dict[Name, dict[Name, AxisGains]] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _check(self):
+        for name, axes in self.gains.items():
+            if set(axes) != set(AXES):
+                raise ValueError(f"gains.{name} needs {', '.join(AXES)}; has {', '.join(axes)}")
+        return self
+
+
+def shipped_joysticks() -> list[str]:
+    """Names of the joysticks that come with the package."""
+    return sorted(p.parent.name for p in models_folder().glob(f"*/{JOYSTICK_FILE}"))
+
+
+def load_joystick(name_or_path: str | Path = "joystick") -> Joystick:
+    """Read a joystick.
+
+    Args:
+        name_or_path: `joystick` for the shipped one, a YAML file, or a folder with joystick.yaml.
+
+    Returns:
+        The validated facts.
+
+    Raises:
+        InputError: there is no such file, or names file, line and key of what is wrong.
+    """
+    path = Path(name_or_path)
+    if str(name_or_path) in shipped_joysticks():
+        path = models_folder() / path / JOYSTICK_FILE
+    elif path.is_dir():
+        path = path / JOYSTICK_FILE
+    if not path.is_file():
+        known = suggest(str(name_or_path), shipped_joysticks())
+        raise InputError(f"joystick {str(name_or_path)!r}", f"no such file; {known}")
+    data, lines = read_yaml(path)
+    return parse(Joystick, data | {"folder": str(path.parent.resolve())}, str(path), lines)

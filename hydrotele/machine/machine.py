@@ -1,0 +1,333 @@
+"""A machine as data: links, joints, drives, valves, sensors and home position, all SI and frozen.
+
+The numbers stand in `models/<machine>/machine.yaml`, the tree and the shapes in its MJCF. A link's
+position and inertia may stand in either of them, never in both.
+"""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hydrotele.core.datafile import Facts, Name, NonNegative, Positive, Vector, suggest
+from hydrotele.machine.drives import Axis, EndStop, LoadCylinder, Pin
+from hydrotele.machine.sensors import SensorError, SensorSet
+from hydrotele.terms.facts import Term
+
+
+class Joint(Facts):
+    """One degree of freedom: `range` [rad] or [m], `damping` [N m s/rad] or [N s/m]."""
+
+    name: Name
+    type: Literal["hinge", "slide"] = "hinge"
+    axis: Vector = (0.0, 0.0, 1.0)
+    range: tuple[float, float] | None = None
+    damping: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if abs(np.linalg.norm(self.axis) - 1.0) > 1e-6:
+            raise ValueError(f"axis {self.axis} must have unit length")
+        if self.range and self.range[0] >= self.range[1]:
+            raise ValueError(f"range {self.range} must be [low, high] with low < high")
+        return self
+
+
+class Link(Facts):
+    """A rigid body in its parent's frame: position [m], mass [kg], inertia about com [kg m^2]."""
+
+    parent: Name = "world"
+    position: Vector = (0.0, 0.0, 0.0)
+    joint: Joint | None = None
+    mass: Positive
+    com: Vector = (0.0, 0.0, 0.0)
+    inertia: tuple[Positive, Positive, Positive]
+
+    @model_validator(mode="after")
+    def _check(self):
+        a, b, c = sorted(self.inertia)
+        if a + b < c * (1 - 1e-9):
+            raise ValueError(
+                f"inertia {self.inertia} is impossible for a rigid body: the largest moment exceeds"
+                " the sum of the other two"
+            )
+        return self
+
+
+class Closure(Facts):
+    """A pin that closes a loop: the two points coincide."""
+
+    a: Pin
+    b: Pin
+
+
+UNLIMITED_FLOW = 1.0e3  # m^3/s, beyond any demand: the flow of a supply without a limit
+_STOP_GIVES = 1.0e-3  # m: what tube, gland and pins stretch under a cylinder's largest force
+_STOP_TURNS = 2.0e-3  # rad: the same of a slewing or rotating drive
+_STOP_RETARDATION = 5.0e-3  # s: 75 rad/s of a boom on its stop then decay within two swings
+
+
+class Supply(Facts):
+    """Pump and tank shared by all valves; pressures [Pa], flow [m^3/s], bulk modulus [Pa].
+
+    `constant_flow`: the pump gives `pump_flow`; what the valves do not draw goes over the relief
+    valve. `load_sensing`: it holds the highest load pressure plus `load_sensing_margin`, as far as
+    `pump_flow` and `relief_pressure` allow. `constant_pressure`: it holds `relief_pressure`
+    whatever is drawn. `pump_droop` [m^3/(s Pa)] is by how much its flow falls with its pressure.
+    With a `time_constant` [s] the pump's displacement follows what the valves draw with a
+    first-order lag, as a swash plate does; 0: at once. `dissolved_air` is the volume of air, at
+    atmosphere, per volume of oil that the oil gives off where it is drawn below atmosphere (mineral
+    oil: 0.07 .. 0.10).
+    """
+
+    kind: Literal["constant_flow", "load_sensing", "constant_pressure"] = "constant_flow"
+    relief_pressure: Positive
+    tank_pressure: NonNegative
+    pump_flow: Positive = UNLIMITED_FLOW
+    pump_droop: NonNegative = 0.0
+    load_sensing_margin: Positive = 2.0e6
+    time_constant: NonNegative = 0.0
+    bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
+    dissolved_air: Annotated[float, Field(ge=0.001, le=0.5)] = 0.09
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.kind == "constant_pressure":
+            if self.pump_flow != UNLIMITED_FLOW or self.pump_droop:
+                raise ValueError(
+                    "a constant_pressure supply has no pump_flow and no pump_droop: leave them out,"
+                    " or choose kind constant_flow or load_sensing"
+                )
+            if self.time_constant:
+                raise ValueError(
+                    "a constant_pressure supply gives any flow at once: leave out time_constant, or"
+                    " choose kind constant_flow or load_sensing"
+                )
+        elif self.pump_flow >= UNLIMITED_FLOW:
+            raise ValueError(f"pump_flow is missing; a {self.kind} supply needs it")
+        if self.pump_droop * self.relief_pressure >= self.pump_flow:
+            raise ValueError(
+                f"pump_droop {self.pump_droop:g} m^3/(s Pa) leaves nothing of pump_flow"
+                f" {self.pump_flow:g} m^3/s at relief_pressure {self.relief_pressure:g} Pa"
+            )
+        if self.tank_pressure >= self.relief_pressure:
+            raise ValueError(
+                f"tank_pressure {self.tank_pressure:g} Pa is not below relief_pressure"
+                f" {self.relief_pressure:g} Pa; are both in Pa?"
+            )
+        return self
+
+
+class Arm(Facts):
+    """Names of the joints of a swing-boom-stick(-tool(-head)) arm and the point it moves.
+
+    `tool` moves in the arm's plane as a bucket or a feller-buncher's tilt does; `head` turns on it
+    about an axis in that plane, perpendicular to it.
+    """
+
+    swing: Name
+    boom: Name
+    stick: Name
+    tool: Name | None = None
+    head: Name | None = None
+    tip: Pin
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.head and not self.tool:
+            raise ValueError("a head turns on a tool joint: give arm.tool, such as the tilt")
+        return self
+
+
+class Machine(Facts):
+    """Everything the simulator, the controller and the learning code know of a machine."""
+
+    name: Name
+    description: str = ""
+    source: str = ""
+    mjcf: str | None = None
+    folder: str = ""
+    tool: Name = "none"
+    tools: tuple[str, ...] = ("none",)
+    gravity: Vector = (0.0, 0.0, -9.81)
+    links: dict[Name, Link]
+    axes: dict[Name, Axis]
+    closures: dict[Name, Closure] = {}
+    supply: Supply | None = None
+    loads: dict[Name, LoadCylinder] = {}
+    sensors: dict[Name, SensorSet] = {}
+    sensor_errors: dict[str, SensorError] = {}
+    home: dict[Name, float] = {}
+    arm: Arm | None = None
+    log_columns: dict[str, str] = {}
+    removed_bodies: tuple[str, ...] = ()
+    uncertainty: dict[str, NonNegative] = {}
+    terms: tuple[Term, ...] = ()
+
+    @property
+    def joints(self) -> dict[str, Joint]:
+        """Joints of the links by name, in tree order."""
+        return {link.joint.name: link.joint for link in self.links.values() if link.joint}
+
+    @property
+    def hydraulic_axes(self) -> dict[str, Axis]:
+        """Axes with a valve, or with a pump of their own."""
+        return {name: axis for name, axis in self.axes.items() if axis.hydraulic}
+
+    @property
+    def valve_axes(self) -> dict[str, Axis]:
+        """Axes with a valve."""
+        return {name: axis for name, axis in self.axes.items() if axis.valve}
+
+    def highest_pressure(self, axis: str) -> float:
+        """What a hydraulic axis can be fed with [Pa]: the relief's setting, or its pump's stall."""
+        pump = self.axes[axis].pump
+        if pump:
+            return pump.stall_pressure
+        assert self.supply
+        return self.supply.relief_pressure
+
+    def return_pressure(self, axis: str) -> float:
+        """Pressure to which a hydraulic axis' oil returns [Pa]: tank or its pump's accumulator."""
+        pump = self.axes[axis].pump
+        if pump:
+            return pump.accumulator.pressure
+        assert self.supply
+        return self.supply.tank_pressure
+
+    def link_of(self, joint: str) -> str:
+        """Name of the link that a joint moves."""
+        return next(n for n, li in self.links.items() if li.joint and li.joint.name == joint)
+
+    def position_kind(self, axis: str) -> str:
+        """`angle` for a hinge axis, `position` for a slide."""
+        return "angle" if self.joints[self.axes[axis].joint].type == "hinge" else "position"
+
+    def end_stop(self, axis: str) -> EndStop | None:
+        """What the drive of an axis meets at the ends of its travel; None where it has no ends.
+
+        Where the machine does not say, the drive's largest force presses the stop in by 1 mm, or
+        2 mrad, which is what tube, gland and pins of a heavy cylinder stretch under it.
+        """
+        facts = self.axes[axis]
+        joint = self.joints[facts.joint]
+        if facts.cylinder is None and joint.range is None:
+            return None
+        if facts.end_stop or (facts.force and not facts.force.gain):
+            return facts.end_stop
+        if facts.force:
+            most = abs(facts.force.gain) * facts.force.command_limit
+        else:
+            assert self.supply
+            most = self.supply.relief_pressure * facts.hydraulic_drive.areas[0]
+        turns = facts.cylinder is None and joint.type == "hinge"
+        stiffness = most / (_STOP_TURNS if turns else _STOP_GIVES)
+        return EndStop(stiffness=stiffness, damping=_STOP_RETARDATION * stiffness)
+
+    @property
+    def sensed_channels(self) -> tuple[str, ...]:
+        """Channels that sensors of this machine can show."""
+        names = [f"{self.position_kind(axis)}.{axis}" for axis in self.axes]
+        names += [f"length.{name}" for name, axis in self.axes.items() if axis.cylinder]
+        for side in ("head", "rod"):
+            names += [f"pressure_{side}.{axis}" for axis in self.hydraulic_axes]
+        return (*names, "pressure_supply") if self.valve_axes else tuple(names)
+
+    @model_validator(mode="after")
+    def _check(self):
+        _refuse_names(self.links)
+        known = {"world", *self.links}
+        for name, link in self.links.items():
+            _expect(link.parent, known - {name}, f"links.{name}.parent")
+        _refuse_cycles(self.links)
+        joints = self.joints
+        for name, axis in self.axes.items():
+            _expect(axis.joint, joints, f"axes.{name}.joint")
+            if axis.cylinder:
+                _expect(axis.cylinder.base_pin.link, known, f"axes.{name}.cylinder.base_pin.link")
+                _expect(axis.cylinder.rod_pin.link, known, f"axes.{name}.cylinder.rod_pin.link")
+            if axis.four_bar:
+                _expect(axis.four_bar.rocker, known, f"axes.{name}.four_bar.rocker")
+                _expect(axis.four_bar.coupler, known, f"axes.{name}.four_bar.coupler")
+        for name, closure in self.closures.items():
+            for end in (closure.a, closure.b):
+                _expect(end.link, known, f"closures.{name}")
+        for joint in self.home:
+            _expect(joint, joints, "home")
+            low, high = joints[joint].range or (-np.inf, np.inf)
+            if not low <= self.home[joint] <= high:
+                raise ValueError(
+                    f"home.{joint}: {self.home[joint]:g} is outside its range {low:g} .. {high:g}"
+                )
+        if self.arm:
+            for part in ("swing", "boom", "stick", "tool", "head"):
+                joint = getattr(self.arm, part)
+                if joint is not None:
+                    _expect(joint, joints, f"arm.{part}")
+            _expect(self.arm.tip.link, known, "arm.tip.link")
+        for channel in self.sensor_errors:
+            _expect(channel, self.sensed_channels, "sensor_errors")
+        _check_terms(self.terms, self.axes, self.supply)
+        for name, sensors in self.sensors.items():
+            for channel in sensors.channels:
+                _expect(channel, self.sensed_channels, f"sensors.{name}.channels")
+        for name, axis in self.axes.items():
+            if axis.pump and self.joints[axis.joint].type != "slide":
+                raise ValueError(f"axes.{name}.pump: its cylinder lies along a slide joint")
+        for name in self.loads:
+            _expect(name, [n for n, a in self.axes.items() if a.pump], "loads")
+        if self.valve_axes and self.supply is None:
+            raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
+        if len(self.hydraulic_axes) > 8:
+            raise ValueError("at most 8 valves can share one supply")
+        return self
+
+
+def _expect(name: str, valid, where: str) -> None:
+    if name not in valid:
+        raise ValueError(f"{where}: {name!r} is not known; {suggest(name, valid)}")
+
+
+def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply | None) -> None:
+    seen, limited = set(), supply is not None and supply.kind != "constant_pressure"
+    for k, term in enumerate(terms):
+        _expect(term.axis, axes, f"terms.{k}.axis")
+        if term.balance.startswith("flow") and not axes[term.axis].hydraulic:
+            raise ValueError(f"terms.{k}: axis {term.axis} has no chambers for a {term.balance}")
+        if term.balance == "flow_supply" and not (axes[term.axis].valve and limited):
+            raise ValueError(
+                f"terms.{k}: flow_supply adds to the flow of a pump that valves share: name an axis"
+                " with a valve, of a machine whose supply is constant_flow or load_sensing"
+            )
+        for variable, axis in term.of.items():
+            _expect(axis, axes, f"terms.{k}.of.{variable}")
+            if variable not in ("position", "velocity", "command") and not axes[axis].hydraulic:
+                raise ValueError(f"terms.{k}.of: axis {axis} has no {variable}")
+        key = (term.name, term.axis, term.balance)
+        if key in seen:
+            raise ValueError(
+                f"terms.{k}: {term.name} already adds to {term.balance} of {term.axis};"
+                " give the second one another name"
+            )
+        seen.add(key)
+
+
+def _refuse_names(links: dict[str, Link]) -> None:
+    if "world" in links:
+        raise ValueError("links.world: this name is that of the fixed frame; choose another one")
+    owner: dict[str, str] = {}
+    for name, link in links.items():
+        if link.joint and (first := owner.setdefault(link.joint.name, name)) != name:
+            raise ValueError(
+                f"links.{name}.joint: {link.joint.name!r} is already the joint of link {first!r}"
+            )
+
+
+def _refuse_cycles(links: dict[str, Link]) -> None:
+    for start in links:
+        seen, link = {start}, links[start].parent
+        while link != "world":
+            if link in seen:
+                raise ValueError(f"links.{start}: its parents form a cycle ({', '.join(seen)})")
+            seen.add(link)
+            link = links[link].parent

@@ -1,0 +1,294 @@
+"""Machine files: `load_machine` reads machine.yaml and its MJCF tree, `save_machine` writes one.
+
+A user's machine is a folder with `machine.yaml` (and usually an MJCF beside it); nothing in the
+package has to change for it. What the YAML does not say of a link is taken from the MJCF body of
+the same name; saying the same number twice is refused.
+"""
+
+import math
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import yaml
+
+from hydrotele.core.assets import copy_mjcf
+from hydrotele.core.datafile import PSI, parse, read_yaml, split_unit, suggest, to_si
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_xml
+from hydrotele.core.resources import models_folder
+from hydrotele.machine.machine import Machine
+from hydrotele.terms.law import LAWS
+
+MACHINE_FILE = "machine.yaml"
+
+
+def machine_path(name_or_path: str | Path) -> Path:
+    """File of a shipped machine (by name) or of a user's (folder or YAML file).
+
+    A bare name means the shipped machine, whatever the working folder holds; `./name` the folder.
+
+    Raises:
+        InputError: there is no such machine; lists those that are shipped.
+    """
+    path = Path(name_or_path)
+    if path.suffix in (".yaml", ".yml"):
+        if path.is_file():
+            return path
+        raise InputError(path, "no such machine file")
+    if str(name_or_path) in shipped_machines():
+        return models_folder() / path / MACHINE_FILE
+    if (path / MACHINE_FILE).is_file():
+        return path / MACHINE_FILE
+    raise InputError(
+        f"machine {str(name_or_path)!r}",
+        f"is neither a folder with {MACHINE_FILE} nor a shipped machine;"
+        f" {suggest(str(name_or_path), shipped_machines())}",
+    )
+
+
+def shipped_machines() -> list[str]:
+    """Names of the machines that come with the package."""
+    return sorted(p.parent.name for p in models_folder().glob(f"*/{MACHINE_FILE}"))
+
+
+def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
+    """Read a machine and one of its tools.
+
+    Args:
+        name_or_path: name of a shipped machine, a folder, or a machine file.
+        tool: name of the tool; default is the file's `tool`, or `none`.
+
+    Returns:
+        The frozen, validated machine, every link complete.
+
+    Raises:
+        InputError: names file, line, key path, and what is allowed.
+    """
+    path = machine_path(name_or_path)
+    data, lines = read_yaml(path)
+    tools = data.pop("tools", None) or {"none": {}}
+    _check_tools(tools, path, lines)
+    tool = tool or data.get("tool") or "none"
+    if not isinstance(tool, str) or tool not in tools:
+        raise InputError(_place(path, lines, "tools"), f"no tool {tool!r}; {suggest(tool, tools)}")
+    lines = _merge_tool(data, tool, tools[tool] or {}, path, lines)
+    data |= {"tool": tool, "tools": sorted(tools), "folder": str(path.parent.resolve())}
+    others = [fragment for name, fragment in tools.items() if name != tool and fragment]
+    kept = _bodies_of([data])
+    if data.get("resolved") and not (path.parent / str(data.get("mjcf"))).exists():
+        data["folder"] = str(models_folder().resolve())
+    elif not data.get("resolved"):
+        data["removed_bodies"] = [name for name in _bodies_of(others) if name not in kept]
+    _complete_links(data, path, lines)
+    _resolve_drives(data, path, lines)
+    return parse(Machine, data, str(path), lines)
+
+
+def save_machine(machine: Machine, path: str | Path) -> None:
+    """Write a machine as one YAML file in SI, complete with its tool, readable by `load_machine`.
+
+    Args:
+        machine: the machine.
+        path: file to write. A shipped MJCF is referred to by its place among the shipped models, so
+            that the file works with any installation. A user's is copied beside it as
+            `<stem>.tree.xml`, with its meshes, textures and height fields in `<stem>_assets`, so
+            that the folder can be handed on, unless it includes further documents. So is a user's
+            file that defines laws of its terms, which say so.
+    """
+    machine = _with_law_files(machine, Path(path).parent)
+    data = machine.model_dump(mode="json", exclude_defaults=True)
+    tool = data.pop("tool", "none")
+    for key in ("folder", "tools"):
+        data.pop(key, None)
+    data |= {"tool": tool, "tools": {tool: {}}, "resolved": True}
+    if machine.mjcf:
+        mjcf = Path(machine.folder, machine.mjcf).resolve()
+        shipped = models_folder().resolve()
+        copy = Path(path).with_suffix(".tree.xml")
+        if mjcf.is_relative_to(shipped):
+            data["mjcf"] = str(mjcf.relative_to(shipped))
+        elif copy_mjcf(mjcf, copy, f"{Path(path).stem}_assets"):
+            data["mjcf"] = copy.name
+        else:
+            data["mjcf"] = str(mjcf)
+    Path(path).write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
+
+
+def _with_law_files(machine: Machine, folder: Path) -> Machine:
+    """The machine with the sources of its terms' laws named; files are copied into the folder."""
+    terms = []
+    for term in machine.terms:
+        source = LAWS[term.law].source
+        file = Path(source)
+        if source and file.is_file():
+            source = file.name
+            if not (folder / source).exists() or not file.samefile(folder / source):
+                shutil.copyfile(file, folder / source)
+        terms.append(term.model_copy(update={"source": source}))
+    return machine.model_copy(update={"terms": tuple(terms)})
+
+
+def _place(path: Path, lines, *keys: str) -> str:
+    """File, line and key path, for messages."""
+    line = next((lines[keys[:k]] for k in range(len(keys), 0, -1) if keys[:k] in lines), 0)
+    return f"{path}{f':{line}' if line else ''}: {'.'.join(keys)}"
+
+
+def _check_tools(tools, path: Path, lines) -> None:
+    if not isinstance(tools, dict) or not all(isinstance(name, str) for name in tools):
+        raise InputError(_place(path, lines, "tools"), "must map names of tools to what they add")
+    for name, fragment in tools.items():
+        if not isinstance(fragment, (dict, type(None))):
+            message = "must map sections (links, axes, home, ...) to what the tool adds"
+            raise InputError(_place(path, lines, "tools", name), message)
+
+
+def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dict:
+    """Add a tool's sections to the machine's; returns the lines of the result."""
+    for section, entries in fragment.items():
+        old, new = ("tools", tool, str(section)), (str(section),)
+        lines = lines | {new + p[len(old) :]: n for p, n in lines.items() if p[: len(old)] == old}
+        if isinstance(entries, dict) and isinstance(data.get(section), dict):
+            if section in ("links", "axes", "closures"):
+                for twice in entries.keys() & data[section]:
+                    message = "is already there without the tool; give it another name"
+                    raise InputError(_place(path, lines, *old, str(twice)), message)
+            entries = {**data[section], **entries}
+        data[section] = entries
+    return lines
+
+
+def _entries(data: dict, section: str) -> dict:
+    """A section's named entries; empty where the section is none, which validation will refuse."""
+    entries = data.get(section)
+    if not isinstance(entries, dict):
+        return {}
+    return {name: facts for name, facts in entries.items() if isinstance(name, str)}
+
+
+def _bodies_of(fragments) -> tuple[str, ...]:
+    names = []
+    for fragment in fragments:
+        names += _entries(fragment, "links")
+        for axis, facts in _entries(fragment, "axes").items():
+            if isinstance(facts, dict) and "cylinder" in facts:
+                names += [f"{axis}_tube", f"{axis}_rod"]
+    return tuple(dict.fromkeys(names))
+
+
+def _complete_links(data: dict, path: Path, lines) -> None:
+    """Fill in what the MJCF says of each link; refuse what stands in both."""
+    if data.pop("resolved", False):
+        return
+    if not data.get("mjcf"):
+        return
+    mjcf = path.parent / str(data["mjcf"])
+    try:
+        read_xml(mjcf)
+    except InputError as error:
+        message = f"{mjcf} cannot be read: {error.message}"
+        raise InputError(_place(path, lines, "mjcf"), message) from None
+    try:
+        spec = mujoco.MjSpec.from_file(str(mjcf))
+    except (OSError, ValueError) as error:
+        message = f"{mjcf} cannot be read: {error}"
+        raise InputError(_place(path, lines, "mjcf"), message) from None
+    for name, link in _entries(data, "links").items():
+        body = spec.body(name)
+        if body is None or name == "world" or not isinstance(link, dict):
+            continue
+        where = _place(path, lines, "links", name)
+        known = _facts_of_body(body, spec.compiler.degree, f"{where}: body {name!r} of {mjcf.name}")
+        data["links"][name] = _join(link, known, where, mjcf.name)
+
+
+def _join(link: dict, known: dict, where: str, mjcf: str) -> dict:
+    """What YAML and MJCF say of one link; a number may stand in one of them only."""
+    joint, known_joint = link.get("joint"), known.get("joint")
+    twice = {key for key in link if split_unit(str(key))[0] in known} - {"joint"}
+    if isinstance(joint, dict) and known_joint:
+        twice |= {f"joint.{key}" for key in joint if split_unit(str(key))[0] in known_joint}
+        known = known | {"joint": known_joint | joint}
+        link = {key: value for key, value in link.items() if key != "joint"}
+    if twice:
+        message = f"{', '.join(sorted(twice))} also stands in {mjcf}; keep it in one place"
+        raise InputError(where, message)
+    return known | link
+
+
+def _facts_of_body(body, degrees: bool, where: str) -> dict:
+    """Parent, position, inertia and joint of an MJCF body, with its default classes applied."""
+    facts: dict = {"parent": body.parent.name}
+    if np.any(body.pos):
+        facts["position"] = body.pos.tolist()
+    if body.explicitinertial:
+        turned = (
+            np.any(body.iquat[1:]) or body.ialt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT
+        )
+        if turned or np.all(np.isfinite(body.fullinertia)):
+            raise InputError(where, "give its inertial as diaginertia in the axes of the body")
+        facts |= {"mass": body.mass, "com": body.ipos.tolist(), "inertia": body.inertia.tolist()}
+    if not body.joints:
+        return facts
+    if len(body.joints) > 1 or not body.joints[0].name:
+        raise InputError(where, f"needs one joint with a name, has {len(body.joints)} joints")
+    joint = body.joints[0]
+    kind = mujoco.mjtJoint(joint.type).name.removeprefix("mjJNT_").lower()
+    facts["joint"] = {"name": joint.name, "type": kind, "axis": joint.axis.tolist()}
+    if np.any(joint.range):
+        factor = math.pi / 180.0 if degrees and kind == "hinge" else 1.0
+        facts["joint"]["range"] = (factor * joint.range).tolist()
+    if damping := float(np.ravel(joint.damping)[0]):
+        facts["joint"]["damping"] = damping
+    return facts
+
+
+def _resolve_drives(data: dict, path: Path, lines) -> None:
+    """Turn polar pins into points and motor torque per psi into displacement."""
+    for name, axis in _entries(data, "axes").items():
+        if not isinstance(axis, dict):
+            continue
+        cylinder, motor = axis.get("cylinder"), axis.get("motor")
+        for part in ("base_pin", "rod_pin"):
+            if isinstance(cylinder, dict) and isinstance(cylinder.get(part), dict):
+                where = _place(path, lines, "axes", name, "cylinder", part)
+                cylinder[part] = _resolve_pin(cylinder[part], data, where)
+        if isinstance(motor, dict) and "torque_per_psi" in motor:
+            motor = dict(motor)
+            where = _place(path, lines, "axes", name, "motor", "torque_per_psi")
+            torque = _number(motor.pop("torque_per_psi"), where)
+            ratio = _number(motor.pop("gear_ratio", 1.0), where)
+            axis["motor"] = motor | {"displacement": torque * ratio / PSI}
+
+
+def _resolve_pin(pin: dict, data: dict, where: str) -> dict:
+    """The point at `distance` and `angle` from the joint of link `from`, in the x-z plane."""
+    if "distance" not in pin:
+        return pin
+    pin = dict(pin)
+    origin = [0.0, 0.0, 0.0]
+    if "from" in pin:
+        child, links = pin.pop("from"), _entries(data, "links")
+        if child not in list(links):
+            raise InputError(where, f"from: {child!r} is no link; {suggest(child, links)}")
+        link = links[child] if isinstance(links[child], dict) else {}
+        origin = link.get("position") or to_si(link.get("position_mm"), 1.0e-3) or origin
+        if not isinstance(origin, list) or len(origin) != 3:
+            raise InputError(where, f"links.{child}.position must be three numbers")
+    x, y, z = (_number(value, f"{where}: links.position") for value in origin)
+    distance = _number(pin.pop("distance"), f"{where}.distance")
+    angle = math.radians(_number(pin.pop("angle_deg", 0.0), f"{where}.angle_deg"))
+    pin["position"] = [x + distance * math.cos(angle), y, z + distance * math.sin(angle)]
+    return pin
+
+
+def _number(value, where: str) -> float:
+    try:
+        number = float("nan" if isinstance(value, (str, bool)) else value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(where, f"must be a finite number, not {value!r}")
+    return number

@@ -1,1 +1,0 @@
-"""Prediction errors of a machine along measured runs, and effects fitted to them."""

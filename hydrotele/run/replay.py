@@ -1,0 +1,225 @@
+"""Open-loop replay: a log's commands drive the model from its initial state; how far is it off?"""
+
+import dataclasses
+import math
+import time as clock
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import json_value
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import noise_rms, sensor_set
+from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.signals import usual_unit
+from hydrotele.simulate.drive_side import flexible_axes
+from hydrotele.simulate.plant import Plant, build_plant, initial_state
+from hydrotele.simulate.readout import late_channels, true_channels
+from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
+from hydrotele.simulate.sensors import defective
+from hydrotele.simulate.stepping import Stepper
+
+PREDICTED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
+
+
+@dataclasses.dataclass(frozen=True)
+class ChannelDifference:
+    """How far a simulated channel is from the measured one.
+
+    Attributes:
+        rms: RMS difference [unit].
+        max: largest difference [unit].
+        unit: SI unit.
+        range: main relief pressure for pressures, stroke for lengths, else the span of the measured
+            values [unit].
+        noise_rms: standard deviation of one reading of the log's sensors [unit], 0 if ideal.
+    """
+
+    rms: float
+    max: float
+    unit: str
+    range: float
+    noise_rms: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """Result of a replay: the simulated log, the differences, and how fast it went."""
+
+    measured: Log
+    simulated: Log
+    channels: dict[str, ChannelDifference]
+    realtime_factor: float
+
+
+def replay_log(
+    log: Log,
+    machine: Machine,
+    timestep: float = 1.0e-3,
+    progress: Callable[[float, float], None] | None = None,
+) -> Replay:
+    """Drive a machine with a log's commands.
+
+    Starts from the log's `initial_state` metadata if it has one, else from its first row: measured
+    positions, measured pressures, zero velocity, closed spools. Before it the machine stood still
+    with the commands of rest, which matters where commands are delayed. There is a ground to touch
+    only if the log's metadata says `ground: yes`, as logs of scenarios with a ground do.
+
+    What is compared is what the machine's sensors would read without noise, with their offsets,
+    scales and delays; in a log of the truth, with `truth.*` columns, the true values themselves.
+
+    Args:
+        log: the log; needs the command and the position of every axis.
+        machine: the machine.
+        timestep: largest physics step [s]; a whole number of steps fits between two rows.
+        progress: called now and then with (simulated seconds, total seconds).
+
+    Returns:
+        The replay.
+
+    Raises:
+        InputError: a command or position column is missing, samples are missing, something stood
+            around the machine, or the start cannot be assembled.
+        SimulationFailed: states became infinite or not a number.
+    """
+    if not 1e-6 <= timestep < math.inf:
+        raise InputError("timestep", f"must be at least 1e-6 s, not {timestep:g}")
+    if len(log.gaps):
+        where = f"{log.source}, row {log.gaps[0]}"
+        raise InputError(where, "samples are missing: cut the log there")
+    if things := log.metadata.get("things"):
+        message = f"the machine worked beside a {things}, and a replay has nothing around it"
+        raise InputError(log.source, message)
+    period = float(log.time[-1] - log.time[0]) / (len(log) - 1)
+    steps = max(1, math.ceil(period / timestep - 1e-6))
+    plant = build_plant(machine, period / steps, ground=log.metadata.get("ground") == "yes")
+    missing = [c for c in _needed(plant) if c not in log]
+    if missing:
+        raise InputError(
+            log.source,
+            f"a replay of {machine.name} needs {', '.join(missing)}; the log has"
+            f" {', '.join(sorted(log.columns))}",
+        )
+    data = initial_state(plant, _start(plant, log))
+    commands = np.column_stack([log[f"command.{a}"] for a in plant.axes])
+    begin = clock.perf_counter()
+    record = _drive(plant, data, log.time, commands, steps, progress)
+    factor = (log.time[-1] - log.time[0]) / max(clock.perf_counter() - begin, 1e-9)
+    values, units = true_channels(plant, record)
+    if not any(name.startswith("truth.") for name in log.columns):
+        values |= defective(machine, values | late_channels(plant, record))
+    simulated = Log(
+        time=log.time, columns=values, units=units, source=f"replay of {log.source}",
+        metadata={"machine": machine.name, "tool": machine.tool, "run": f"replay {log.name}"},
+    )  # fmt: skip
+    return Replay(log, simulated, _differences(log, simulated, machine), factor)
+
+
+def _needed(plant: Plant) -> list[str]:
+    positions = [f"{plant.machine.position_kind(a)}.{a}" for a in plant.axes]
+    return [f"command.{a}" for a in plant.axes] + positions
+
+
+def _start(plant: Plant, log: Log) -> dict[str, Any]:
+    if "initial_state" in log.metadata:
+        return _stated_start(plant, log)
+    axes = list(plant.axes)
+    state: dict[str, Any] = {
+        "order": axes,
+        "angle": [_first(plant, log, f"{plant.machine.position_kind(a)}.{a}") for a in axes],
+    }
+    valves = axes[: plant.hydraulic]
+    names = [f"pressure_{side}.{a}" for side in ("head", "rod") for a in valves]
+    if valves and all(n in log for n in names):
+        for side in ("pressure_head", "pressure_rod"):  # a lack at rest is the reading's noise
+            state[side] = [max(0.0, _first(plant, log, f"{side}.{a}")) for a in valves]
+    return state
+
+
+def _first(plant: Plant, log: Log, channel: str) -> float:
+    """True value behind the first reading of a channel, as its scale and offset have it."""
+    error = plant.machine.sensor_errors.get(channel, SensorError())
+    return (float(log[channel][0]) - error.offset) / error.scale
+
+
+def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
+    try:
+        state = json_value(log.metadata["initial_state"])
+        order = list(state["order"])
+        if sorted(order) != sorted(plant.axes):
+            raise ValueError(f"its order {order} is not that of the axes {list(plant.axes)}")
+        start: dict[str, Any] = {"order": order, "angle": _vector(state, "angle", len(order))}
+        for key in ("velocity", "spool", "spool_rate", "pressure_head", "pressure_rod"):
+            if key in state:
+                size = len(order) if key == "velocity" else plant.hydraulic
+                start[key] = _vector(state, key, size, len(order))
+        joints = dict(state.get("joints", {}))
+        start["joints"] = {name: float(_vector(joints, name)) for name in joints}
+        for key in ("drive", "drive_velocity"):
+            sides = dict(state.get(key, {}))
+            known = flexible_axes(plant.machine)
+            start[key] = {name: float(_vector(sides, name)) for name in sides if name in known}
+        for key in ("bristle", "delivery", "added_delivery"):
+            owners = dict(state.get(key, {}))
+            start[key] = {name: float(_vector(owners, name)) for name in owners}
+    except (ValueError, KeyError, TypeError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        where = f"{log.source}: metadata initial_state"
+        raise InputError(where, f"is not usable: {reason}") from None
+    return start
+
+
+def _vector(state: dict, key: str, *sizes: int) -> np.ndarray:
+    """Finite numbers of a state, of one of these sizes; a scalar where no size is given."""
+    values = np.asarray(state[key], dtype=float)
+    if values.shape not in ([(size,) for size in sizes] or [()]) or not np.isfinite(values).all():
+        raise ValueError(f"{key} must be {sizes[0] if sizes else 1} finite numbers")
+    return values
+
+
+def _drive(plant: Plant, data, times, commands, steps, progress) -> Record:
+    recorder = Recorder(plant, len(times))
+    recorder.command[:] = commands
+    begin_leapfrog(plant.model, data)
+    stepper = Stepper(plant, data, steps)
+    for row, time in enumerate(times):
+        recorder.take(row, time, data, stepper.past)
+        if progress and row % 100 == 0:
+            progress(time - times[0], times[-1] - times[0])
+        stepper.advance(commands[row])
+    if progress:
+        progress(times[-1] - times[0], times[-1] - times[0])
+    return recorder.record()
+
+
+def _differences(log: Log, simulated: Log, machine: Machine) -> dict[str, ChannelDifference]:
+    name = log.metadata.get("sensors", "")
+    sensors = sensor_set(machine, name) if name in machine.sensors else None
+    table = {}
+    for channel in log.columns:
+        kind = channel.partition(".")[0]
+        if kind not in PREDICTED or channel not in simulated:
+            continue
+        error = simulated[channel] - log[channel]
+        span = _span(machine, channel) or float(np.ptp(log[channel]))
+        table[channel] = ChannelDifference(
+            rms=float(np.sqrt(np.mean(error**2))),
+            max=float(np.abs(error).max()),
+            unit=log.units.get(channel) or usual_unit(channel),
+            range=span,
+            noise_rms=noise_rms(machine, sensors, channel),
+        )
+    return table
+
+
+def _span(machine: Machine, channel: str) -> float | None:
+    """Full scale: the main relief pressure for pressures, the stroke for lengths."""
+    kind, _, axis = channel.partition(".")
+    if kind.startswith("pressure") and machine.supply:
+        return machine.supply.relief_pressure
+    if kind == "length" and axis in machine.axes and machine.axes[axis].cylinder:
+        return machine.axes[axis].cylinder.stroke  # type: ignore[union-attr]
+    return None

@@ -1,0 +1,274 @@
+"""The one loop: a scenario runs, and two logs come out, `measured` and `truth`."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+import hydrotele
+from hydrotele.control.plan import Plan, make_plan
+from hydrotele.control.resolved_motion import pose_to_joints
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
+from hydrotele.effects import apply_effect
+from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.logs.log import Log
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.noise import sensor_set
+from hydrotele.run.session import Prepared, Session
+from hydrotele.run.summary import summarise
+from hydrotele.scenario.scenario import Scenario, own_machine
+from hydrotele.simulate.audit import audit
+from hydrotele.simulate.drive_side import flexible_axes
+from hydrotele.simulate.feedback import Feedback, feedback
+from hydrotele.simulate.plant import Plant, build_plant, rest_state
+from hydrotele.simulate.readout import late_channels, true_channels
+from hydrotele.simulate.record import Record
+from hydrotele.simulate.sensors import measure
+from hydrotele.teleop.person import Hand
+from hydrotele.teleop.station import Station
+from hydrotele.teleop.station_log import StationLog
+
+AUDIT_SECONDS = 5.0
+_PROGRESS_ROWS = 50
+_DEEPEST_START = 0.05  # m: contact is soft, so a tool may rest a little in the ground
+Progress = Callable[[float, float], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Everything a run yields.
+
+    Attributes:
+        scenario: what was asked.
+        plant: what was simulated; its machine has the planted effects.
+        plan: what was asked of every axis.
+        measured: what the sensors say.
+        truth: what was true, with `initial_state` in its metadata.
+        summary: versions, speed, pins, balances, tracking.
+        station: the operator's, of a teleoperated run.
+    """
+
+    scenario: Scenario
+    plant: Plant
+    plan: Plan
+    measured: Log
+    truth: Log
+    summary: dict[str, Any]
+    station: Station | None = None
+
+
+def scenario_model(scenario: Scenario) -> Machine:
+    """The machine of a scenario as its model has it, without the planted effects.
+
+    Raises:
+        InputError: unknown machine or tool.
+    """
+    return load_machine(own_machine(scenario) or scenario.machine, scenario.tool)
+
+
+def scenario_machine(scenario: Scenario) -> Machine:
+    """The machine of a scenario that is simulated, with its planted effects.
+
+    Raises:
+        InputError: unknown machine, tool, effect or location.
+    """
+    machine = scenario_model(scenario)
+    for planted in scenario.effects:
+        machine = apply_effect(machine, planted.name, planted.location, planted.parameters)
+    return machine
+
+
+def prepare(scenario: Scenario) -> Prepared:
+    """Compile the machine of a scenario, put it at its start and plan the run.
+
+    Raises:
+        InputError: the scenario asks for what the machine has not.
+    """
+    machine = scenario_machine(scenario)
+    sensors = sensor_set(machine, scenario.sensors)
+    plant = build_plant(machine, scenario.timestep, scenario.ground, scenario.surroundings)
+    data, start = _start(plant, scenario)
+    times = np.arange(scenario.ticks) / scenario.control_rate
+    plan = make_plan(machine, plant.axes, scenario.pilot, start, times)
+    seen = feedback(plant, sensors, scenario.seed, scenario.ticks, scenario.control_rate)
+    if sensors and round(scenario.control_rate / scenario.log_rate) % seen.every:
+        message = f"sample at {sensors.rate:g} Hz; log_rate {scenario.log_rate:g} Hz must divide it"
+        raise InputError(f"sensors {scenario.sensors}", message)
+    return Prepared(plant, data, plan, seen)
+
+
+def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
+    """Simulate a scenario.
+
+    Args:
+        scenario: the scenario.
+        progress: called now and then with (simulated seconds, total seconds).
+
+    Returns:
+        The run.
+
+    Raises:
+        InputError: the scenario asks for what the machine has not.
+        SimulationFailed: states became infinite or not a number.
+    """
+    session = begin(scenario)
+    stride = _PROGRESS_ROWS * session.every
+    while session.tick < scenario.ticks:
+        if progress and session.tick % stride == 0:
+            progress(session.time, scenario.duration)
+        session.advance()
+    if progress:
+        progress(scenario.duration, scenario.duration)
+    return finished(session, scenario)
+
+
+def begin(scenario: Scenario, hand: Hand | None = None) -> Session:
+    """Everything of a run before its first tick.
+
+    Args:
+        scenario: what is asked.
+        hand: where a live operator wants the handle.
+
+    Raises:
+        InputError: the scenario asks for what the machine has not.
+    """
+    return Session(prepare(scenario), scenario, scenario_model(scenario), hand)
+
+
+def finished(session: Session, scenario: Scenario) -> Run:
+    """The run of a session that has gone far enough.
+
+    Args:
+        session: after its last tick.
+        scenario: what was asked, of the duration that it went.
+
+    Raises:
+        InputError: it is too short for a log.
+    """
+    looped, plant = session.finish(), session.plant
+    plan, record = looped.plan, looped.record
+    truth, measured = _logs(plant, scenario, record, session.seen)
+    summary = summarise(plant, scenario, plan, record, looped.pins, looped.wall)
+    if looped.station:
+        measured = _with_station(measured, looped.station.log, scenario)
+        truth = _with_station(truth, looped.station.log, scenario)
+        summary["teleoperation"] = looped.station.summary()
+        summary["notes"] += looped.station.notes
+    summary["notes"] += [f"{said} at {time:.2f} s" for time, said in looped.events]
+    steps = round(1.0 / (scenario.control_rate * scenario.timestep))
+    window = looped.commands[: round(AUDIT_SECONDS * scenario.control_rate)]
+    controls = np.concatenate([session.line.controls(command, steps) for command in window])
+    summary["balance"] = audit(plant, session.start, controls)
+    return Run(scenario, plant, plan, measured, truth, summary, looped.station)
+
+
+def _with_station(log: Log, station: StationLog, scenario: Scenario) -> Log:
+    """A log with what the operator's station measured and made."""
+    every = round(scenario.control_rate / scenario.log_rate)
+    columns, units = station.channels(every, scenario.rows)
+    return dataclasses.replace(
+        log, columns={**log.columns, **columns}, units={**log.units, **units}
+    )
+
+
+def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> tuple[Log, Log]:
+    """What was true and what the sensors say; the latter with the errors that were fed back."""
+    machine = plant.machine
+    values, units = true_channels(plant, record)
+    truth = _log(scenario, machine, record.time, values, units, "ideal")
+    state = json.dumps(_initial_state(plant, record))
+    things = json.dumps([thing.model_dump() for thing in scenario.surroundings])
+    known = {"initial_state": state} | ({"surroundings": things} if scenario.surroundings else {})
+    truth = dataclasses.replace(truth, metadata={**truth.metadata, **known})
+    per_row = round(scenario.control_rate / scenario.log_rate) // seen.every
+    errors = {name: e[::per_row][: scenario.rows] for name, e in seen.errors.items()}
+    visible = {c: v for c, v in values.items() if not c.startswith(("truth.", "command."))}
+    sensors = sensor_set(machine, scenario.sensors)
+    readings = {c: v for c, v in values.items() if c.startswith("command.")}
+    visible |= late_channels(plant, record)
+    readings |= measure(machine, sensors, scenario.seed, visible, errors)
+    units = {c: units[c] for c in readings}
+    return truth, _log(scenario, machine, record.time, readings, units, scenario.sensors)
+
+
+def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, float]]:
+    machine = plant.machine
+    joints = {name: machine.home.get(name, 0.0) for name in machine.joints}
+    for name, value in scenario.start.joints.items():
+        if name not in joints:
+            raise InputError(
+                "start.joints", f"{name!r} is no joint of the machine; {suggest(name, joints)}"
+            )
+        joints[name] = value
+    if scenario.start.pose:
+        here = {a: joints[machine.axes[a].joint] for a in plant.axes}
+        there = pose_to_joints(machine, scenario.start.pose, here, "start.pose")
+        if twice := scenario.start.joints.keys() & {machine.axes[a].joint for a in there}:
+            raise InputError("start", f"{', '.join(sorted(twice))} follow from the pose; give one")
+        joints |= {machine.axes[a].joint: value for a, value in there.items()}
+    for name, joint in machine.joints.items():
+        if joint.range and not joint.range[0] <= joints[name] <= joint.range[1]:
+            low, high = joint.range
+            raise InputError(
+                "start", f"{name} {joints[name]:.4g} is outside its range {low:.4g} .. {high:.4g}"
+            )
+    data = rest_state(plant, joints)
+    mujoco.mj_fwdPosition(plant.model, data)
+    depth = -min((data.contact[k].dist for k in range(data.ncon)), default=0.0)
+    if depth > _DEEPEST_START:
+        things = "the ground or what stands around" if plant.surroundings else "the ground"
+        raise InputError("start", f"the machine would stand {depth:.2f} m deep in {things}")
+    return data, joints
+
+
+def _log(scenario, machine, time, values, units, sensors: str) -> Log:
+    metadata = {
+        "machine": machine.name,
+        "tool": machine.tool,
+        "sample_rate_hz": f"{scenario.log_rate:g}",
+        "sensors": sensors,
+        "run": scenario.name,
+        "seed": str(scenario.seed),
+        "ground": "yes" if scenario.ground else "no",
+        "hydrotele": hydrotele.__version__,
+        "command": "held" if scenario.control_rate == scenario.log_rate else "mean over the row",
+    }
+    if scenario.surroundings:
+        metadata["things"] = ", ".join(thing.kind for thing in scenario.surroundings)
+    return Log(time=time, columns=values, units=units, metadata=metadata, source=scenario.name)
+
+
+def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
+    act = record.act[0, : ACTIVATIONS * plant.hydraulic].reshape(plant.hydraulic, ACTIVATIONS)
+    keys = ("spool", "spool_rate", "pressure_head", "pressure_rod")
+    driven = {axis.joint for axis in plant.machine.axes.values()}
+    free = [n for n in plant.machine.joints if n not in driven]
+    flexible = {n: plant.axes.index(n) for n in flexible_axes(plant.machine)}
+    qpos, qvel = record.qpos[0], record.qvel[0]
+    drives = {
+        "drive": {n: float(qpos[plant.drive_qpos[i]]) for n, i in flexible.items()},
+        "drive_velocity": {n: float(qvel[plant.drive_dof[i]]) for n, i in flexible.items()},
+    }
+    return {
+        "order": list(plant.axes),
+        "angle": record.qpos[0, plant.qpos].tolist(),
+        "velocity": record.qvel[0, plant.dof].tolist(),
+        **{key: act[:, column].tolist() for column, key in enumerate(keys)},
+        "joints": {n: float(record.qpos[0, plant.model.joint(n).qposadr[0]]) for n in free},
+        **(drives if flexible else {}),
+        **_remembered(plant, record),
+    }
+
+
+def _remembered(plant: Plant, record: Record) -> dict[str, dict[str, float]]:
+    """What bristles and a slow pump remember at a record's start, by kind and owner."""
+    found: dict[str, dict[str, float]] = {}
+    for name, place in plant.memory.items():
+        kind, _, owner = name.partition(".")
+        found.setdefault(kind, {})[owner] = float(record.act[0, place])
+    return found

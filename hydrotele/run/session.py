@@ -1,0 +1,198 @@
+"""A run under way: one control tick at a time, for as long as whoever drives it wants.
+
+Everything a tick writes has room for the scenario's whole duration; a run that ends earlier is cut
+to the rows that it has.
+"""
+
+import dataclasses
+import time as clock
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from hydrotele.control.feedforward import force_references
+from hydrotele.control.plan import Plan
+from hydrotele.control.servo import drive_references, servo_numbers, servo_step
+from hydrotele.core.errors import InputError
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Scenario
+from hydrotele.scenario.teleoperation import TeleopPilot
+from hydrotele.simulate.audit import full_state
+from hydrotele.simulate.closure import pin_opening
+from hydrotele.simulate.feedback import Feedback
+from hydrotele.simulate.plant import Plant
+from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
+from hydrotele.simulate.stepping import DelayLine, Stepper
+from hydrotele.simulate.surroundings import Surroundings
+from hydrotele.teleop.person import Hand
+from hydrotele.teleop.station import Station
+
+
+class Prepared(NamedTuple):
+    """A scenario before its first step."""
+
+    plant: Plant
+    data: mujoco.MjData
+    plan: Plan
+    seen: Feedback
+
+
+class Looped(NamedTuple):
+    """What the ticks leave.
+
+    Attributes:
+        plan: what was asked of every axis.
+        record: states at the log's rows.
+        commands: (n, nu) by control tick.
+        pins: largest pin opening [m].
+        wall: time [s] from the second control tick on, since the first one loads compiled code.
+        station: the operator's, of a teleoperated run.
+        events: (time [s], what happened around the machine).
+    """
+
+    plan: Plan
+    record: Record
+    commands: np.ndarray
+    pins: float
+    wall: float
+    station: Station | None
+    events: tuple[tuple[float, str], ...]
+
+
+class Session:
+    """A scenario that is being run.
+
+    Attributes:
+        plant: what is simulated.
+        data: its state; staggered, see `simulate.record`.
+        scenario: what was asked.
+        seen: what the machine's sensors say.
+        station: the operator's, of a teleoperated run.
+        start: full physics state before the first tick.
+        line: commands on their way at the start.
+        tick: number of the next control tick.
+        every: control ticks per row of the logs.
+    """
+
+    def __init__(
+        self, prepared: Prepared, scenario: Scenario, nominal: Machine, hand: Hand | None = None
+    ) -> None:
+        """Make room for the whole run.
+
+        Args:
+            prepared: of the scenario.
+            scenario: what is asked.
+            nominal: its machine without planted effects.
+            hand: where a live operator wants the handle.
+
+        Raises:
+            InputError: servo, forces or station do not suit the machine.
+        """
+        plant, data, plan, seen = prepared
+        begin_leapfrog(plant.model, data)
+        self.plant, self.data, self.seen, self.scenario = plant, data, seen, scenario
+        self.start, self.line = full_state(plant.model, data), DelayLine(plant, data.ctrl)
+        self._plan, self._dt = plan, 1.0 / scenario.control_rate
+        self.every = round(scenario.control_rate / scenario.log_rate)
+        self._numbers = servo_numbers(plant.machine, plant.axes, scenario.servo, self._dt)
+        self._drives = drive_references(plant.machine, plan, scenario.servo)
+        self._forces = force_references(nominal, plan, scenario.servo)
+        k, ticks = len(plant.axes), scenario.ticks
+        self._load, self._command, self._commands = np.zeros(k), np.zeros(k), np.zeros((ticks, k))
+        self._recorder = Recorder(plant, scenario.rows)
+        self._stepper = Stepper(plant, data, round(self._dt / scenario.timestep))
+        self.station = None
+        if isinstance(scenario.pilot, TeleopPilot):
+            self.station = Station(plant, scenario, plan, self._drives, seen, hand)
+        self._around = Surroundings(plant.machine, plant.model, scenario.surroundings)
+        self._worst, self._begin = 0.0, 0.0
+        self.tick = 0
+
+    @property
+    def time(self) -> float:
+        """Simulated time of the next tick [s]."""
+        return self.tick / self.scenario.control_rate
+
+    def advance(self) -> None:
+        """Go on by one control tick.
+
+        Raises:
+            SimulationFailed: states became infinite or not a number.
+        """
+        tick, data, seen, command = self.tick, self.data, self.seen, self._command
+        plan, drives, forces, numbers = self._plan, self._drives, self._forces, self._numbers
+        past = self._stepper.past
+        if tick % self.every == 0 and tick // self.every < len(self._recorder.time):
+            self._recorder.take(tick // self.every, tick * self._dt, data, past)
+        seen.update(tick, data, past)
+        if tick == 0:
+            held = numbers[:, 1] * seen.head - numbers[:, 2] * seen.rod
+            self._load[:] = held - forces.force[0]
+        command[:] = plan.command[tick]
+        tripped = self.station is not None and self.station.tick(tick, data, seen)
+        servo_step(
+            numbers, plan.closed, drives.velocity[tick], drives.arm[tick],
+            drives.volume_head[tick], drives.volume_rod[tick],
+            plan.reference[tick - tick % seen.every], seen.joint, seen.rate, seen.head, seen.rod,
+            seen.supply, self._load, forces.known, forces.force[tick], forces.rate[tick], command,
+        )  # fmt: skip
+        if tripped:
+            command[:] = 0.0
+        self._commands[tick] = command
+        self._begin = self._begin if tick else clock.perf_counter()
+        self._stepper.advance(command)
+        if self.scenario.surroundings:
+            self._around.update(tick * self._dt, data, self._dt)
+        self._worst = max(self._worst, pin_opening(self.plant.model, data))
+        self.tick = tick + 1
+
+    def set_command(self, axis: str, value: float) -> None:
+        """Command an axis that the joystick does not move, from the next tick on.
+
+        Args:
+            axis: one that a button of the scenario names.
+            value: the command [1], or in the drive's unit.
+        """
+        self._plan.command[self.tick :, self.plant.axes.index(axis)] = value
+
+    def command_of(self, tick: int) -> np.ndarray:
+        """Commands (nu,) of a tick that is over [1], or in the drives' units."""
+        return self._commands[tick]
+
+    @property
+    def events(self) -> list[tuple[float, str]]:
+        """What has happened around the machine: (time [s], sentence)."""
+        return self._around.events
+
+    def finish(self) -> Looped:
+        """End the run here; everything is cut to its whole rows.
+
+        Raises:
+            InputError: there are fewer than the ten rows that a log needs.
+        """
+        wall = clock.perf_counter() - self._begin
+        self._around.restore()
+        rows = min(self.tick // self.every, self.scenario.rows)
+        if rows < 10:
+            message = f"ended after {self.time:.2f} s: too short for a log, nothing is written"
+            raise InputError(self.scenario.name, message)
+        whole = self._commands[: rows * self.every].reshape(rows, self.every, -1)
+        self._recorder.command[:rows] = whole.mean(axis=1)
+        station, plan = self.station, self._plan
+        if self.tick < self.scenario.ticks:
+            plan = _cut_plan(plan, self.tick)
+            if station:
+                station.log.cut(self.tick)
+        record = self._recorder.record(rows)
+        commands = self._commands[: self.tick]
+        events = tuple(self._around.events)
+        return Looped(plan, record, commands, self._worst, wall, station, events)
+
+
+def _cut_plan(plan: Plan, ticks: int) -> Plan:
+    pose = None if plan.pose is None else plan.pose[:ticks]
+    return dataclasses.replace(
+        plan, time=plan.time[:ticks], command=plan.command[:ticks],
+        reference=plan.reference[:ticks], rate=plan.rate[:ticks], pose=pose,
+    )  # fmt: skip

@@ -1,0 +1,104 @@
+"""Numbers of the joystick's axes: gains, of the joystick and the scenario, and what each moves."""
+
+import numpy as np
+
+from hydrotele.core.datafile import parse, split_unit, suggest
+from hydrotele.core.errors import InputError
+from hydrotele.machine.joystick import AXES, AxisGains, Joystick
+from hydrotele.scenario.teleoperation import Coupling, Regulate, Steer, TeleopPilot, Track
+
+# columns, SI; GAIN is the rate of a coordinate per displacement beyond the dead band [1/s], or its
+# place per displacement
+(NOMINAL, LEAST, MOST, SLOPE, DAMPING, LIMIT, DEADBAND, DROP, OUTSIDE, REACH, COORDINATE, SIGN,
+ GAIN, RATIO, COUPLING, COUPLING_DAMPING, REFLECTED_MOST) = range(17)  # fmt: skip
+LEVER = 0.1  # m, a hand's: makes rotational gains of translational ones
+_SOFT = {"rate": 40.0, "position": 400.0}  # N/m, N per metre of machine or of handle
+_DAMPED = 0.1  # s, of that coupling
+
+
+def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, ...]) -> np.ndarray:
+    """Numbers of every joystick axis.
+
+    Args:
+        joystick: the joystick.
+        pilot: the scenario's.
+        coordinates: task coordinates of the arm.
+
+    Returns:
+        (6, 17), columns above.
+
+    Raises:
+        InputError: gains that make no sense, a coordinate that the arm has not, one joystick axis
+            for two coordinates, an operator's goal that he cannot move.
+    """
+    if pilot.gains not in joystick.gains:
+        message = f"{pilot.gains!r}; {suggest(pilot.gains, joystick.gains)}"
+        raise InputError("pilot.gains", message)
+    table = np.zeros((6, 17))
+    table[:, COORDINATE] = -1.0
+    soft = _SOFT[pilot.mode] if pilot.coupling is None else pilot.coupling
+    damped = _DAMPED * soft if pilot.coupling_damping is None else pilot.coupling_damping
+    for number, name in enumerate(AXES):
+        law = _gains(joystick, pilot, name)
+        reach = joystick.workspace.translation if number < 3 else joystick.workspace.rotation
+        detent = law.detent if pilot.detent and pilot.mode == "rate" else None  # no dead band else
+        table[number, : COORDINATE] = (
+            law.nominal, law.least, law.most, (law.most - law.nominal) / law.force_limit,
+            law.damping, law.force_limit, law.deadband, detent.drop if detent else 0.0,
+            detent.outside if detent else -1.0, reach,
+        )  # fmt: skip
+        lever = 1.0 if number < 3 else LEVER
+        table[number, RATIO:] = (
+            lever * pilot.ratio, lever**2 * soft, lever**2 * damped,
+            pilot.force_limit or law.force_limit,
+        )  # fmt: skip
+    _place_coordinates(pilot, table, coordinates)
+    _check_goals(pilot, table, coordinates)
+    return table
+
+
+def _place_coordinates(pilot: TeleopPilot, table: np.ndarray, coordinates) -> None:
+    """Let every coordinate hang on its joystick axis."""
+    where = "pilot.coordinates"
+    if strange := set(pilot.coordinates) - set(coordinates):
+        message = f"{', '.join(sorted(strange))}: the arm has {', '.join(coordinates)}"
+        raise InputError(where, message)
+    for number, coordinate in enumerate(coordinates):
+        coupling = pilot.coordinates.get(coordinate, Coupling())
+        axis, sign = coupling.placed(coordinate)
+        row = table[AXES.index(axis)]
+        if row[COORDINATE] >= 0.0:
+            raise InputError(where, f"joystick axis {axis} moves two of them")
+        gain = coupling.scale
+        if pilot.mode == "rate":
+            if row[DEADBAND] >= row[REACH] and coordinate in pilot.coordinates:
+                message = f"the dead band of {axis} reaches beyond its stop: it cannot be moved"
+                raise InputError(f"{where}.{coordinate}", message)
+            gain = coupling.speed / max(row[REACH] - row[DEADBAND], 1e-9)
+        row[[COORDINATE, SIGN, GAIN]] = number, sign, gain
+
+
+def _gains(joystick: Joystick, pilot: TeleopPilot, name: str) -> AxisGains:
+    """Gains of a joystick axis with what the scenario says otherwise."""
+    usual = joystick.gains[pilot.gains][name].model_dump()
+    own = {str(axis): gains for axis, gains in pilot.stiffness.items()}.get(name, {})
+    said = {split_unit(key)[0] for key in own}
+    kept = {key: value for key, value in usual.items() if key not in said}
+    return parse(AxisGains, kept | own, f"pilot.stiffness.{name}", {})
+
+
+def _check_goals(pilot: TeleopPilot, table: np.ndarray, coordinates: tuple[str, ...]) -> None:
+    """Refuse an operator whose goal is none of the arm's coordinates, or one he cannot move."""
+    goals: dict[str, str] = {}
+    match pilot.operator:
+        case Regulate() | Track():
+            goals = {pilot.operator.target.coordinate: "pilot.operator.target.coordinate"}
+        case Steer():
+            goals = {name: f"pilot.operator.points.{name}" for name in pilot.operator.points}
+    for name, where in goals.items():
+        if name not in coordinates:
+            raise InputError(where, f"{name!r}: the arm has {', '.join(coordinates)}")
+        row = table[table[:, COORDINATE] == coordinates.index(name)][0]
+        if pilot.mode == "rate" and row[DEADBAND] >= row[REACH]:
+            axis = AXES[int(np.flatnonzero(table[:, COORDINATE] == row[COORDINATE])[0])]
+            raise InputError(where, f"the dead band of {axis} reaches beyond its stop")

@@ -1,0 +1,247 @@
+"""One axis of a teleoperated scenario as a linear loop, from the numbers that are simulated.
+
+Hand and flotor are `(M_m + M_h) s + B_h + K_h / s`; the coils add spring and damper of the
+scenario's gains, sampled: a control period T holds them for T / 2 on average, the damper differs
+over another T. A person who answers a directly reflected force with a force lets his place go: the
+spring of his arm follows the handle, `K_h (1 - exp(-s t)) / s` with the reflex' time and half a
+decision's. Under rate control the handle beyond its dead band asks for `k_v x`, so that the tip
+follows `k_v V_h / s` (`teleop.linear_machine`); under position control its place, filtered. The
+task pushes back; the force at the tip comes back through the estimator's two filters, held for a
+sample of the sensors, through the line with its delay, times the ratio.
+
+Left out: dead bands, stops, limits of force and acceleration, loss of contact, sensor noise.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hydrotele.control.resolved_motion import COORDINATES
+from hydrotele.control.state_filter import butterworth
+from hydrotele.core.errors import InputError
+from hydrotele.machine.joystick import AXES, Joystick
+from hydrotele.scenario.scenario import Servo
+from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track
+from hydrotele.teleop.axis_table import (
+    COORDINATE,
+    COUPLING,
+    COUPLING_DAMPING,
+    DAMPING,
+    DEADBAND,
+    GAIN,
+    LEAST,
+    LIMIT,
+    MOST,
+    NOMINAL,
+    RATIO,
+    REACH,
+    REFLECTED_MOST,
+)
+from hydrotele.teleop.linear_machine import Clocks, TipDrive, drive_control, drive_follows
+from hydrotele.teleop.master import Master
+from hydrotele.teleop.person import DECISIONS, REFLEX
+from hydrotele.teleop.slave import SMOOTH
+from hydrotele.teleop.switching import Spring
+from hydrotele.teleop.two_port import Impedance, TwoPort
+
+_WHERE = "linear case"
+FAST = 2.0  # of the estimate's bandwidth: that of the motion it is computed of (`station`)
+STRUCTURES = ("rate_force", "position_force", "rate_position", "position_position")
+
+
+@dataclass(frozen=True)
+class LinearCase:
+    """A teleoperated axis with hand, machine and task; as `teleop.case.Case` to an analysis.
+
+    Attributes:
+        pilot: the scenario's.
+        row: (17,) the joystick axis' numbers, as of `teleop.master.Master.axis`.
+        master: flotor [kg] or its moment about the handle [kg m^2].
+        held: the hand as mass, damper and spring.
+        tip: the machine.
+        servo: its gains.
+        clocks: control and sensors.
+        task: impedance of the environment along the coordinate.
+        delay_forward: from the master to the machine [s].
+        delay_back: from the machine to the master [s].
+    """
+
+    pilot: TeleopPilot
+    row: np.ndarray
+    master: Impedance
+    held: Impedance
+    tip: TipDrive
+    servo: Servo
+    clocks: Clocks
+    task: Impedance
+    delay_forward: float = 0.0
+    delay_back: float = 0.0
+
+    @property
+    def ratio(self) -> float:
+        """Of the reflected force at the hand to the machine's [N/N], [N m/(N m)]."""
+        return float(self.row[RATIO])
+
+    @property
+    def force_limit(self) -> float:
+        """Machine's force beyond which nothing more is reflected [N], [N m]."""
+        return float(self.row[REFLECTED_MOST])
+
+    @property
+    def deadband(self) -> float:
+        """Displacement of the handle in which nothing is asked for [m], [rad]."""
+        return float(self.row[DEADBAND])
+
+    @property
+    def reach(self) -> float:
+        """Displacement of the handle at its stop [m], [rad]."""
+        return float(self.row[REACH])
+
+    @property
+    def spring(self) -> Spring:
+        """The joystick axis under stiffness feedback, without the hand."""
+        r = self.row
+        return Spring(
+            self.master.mass, float(r[DAMPING]), float(r[NOMINAL]), float(r[LEAST]), float(r[MOST])
+        )
+
+    @property
+    def leans(self) -> bool:
+        """Whether the hand answers a directly reflected force with a force, not with a place."""
+        pressing = isinstance(self.pilot.operator, Regulate | Track)
+        return pressing and self.pilot.reflection != "coordinating_force"
+
+    def with_delay(self, delay: float) -> "LinearCase":
+        """The same with a delay [s] each way."""
+        return replace(self, delay_forward=delay, delay_back=delay)
+
+    def hand(self, s: np.ndarray) -> np.ndarray:
+        """Impedance of the hand [N s/m], [N m s/rad] at complex frequencies [rad/s]."""
+        if not self.leans:
+            return self.held(s)
+        late = REFLEX + 0.5 / DECISIONS + 0.5 * self.clocks.control
+        own = self.held.stiffness / s * np.exp(-late * s)
+        return self.held(s) - own
+
+    def port(self, structure: str, reflected: float = 1.0) -> TwoPort:
+        """The two-port of a structure with this case's numbers.
+
+        Args:
+            structure: `rate_force`, `position_force`, `rate_position` or `position_position`.
+            reflected: factor on what comes back, and on the coupling's own part [1].
+
+        Returns:
+            The two-port.
+
+        Raises:
+            InputError: the structure is not known here.
+        """
+        if structure not in STRUCTURES:
+            raise InputError(_WHERE, f"{structure!r}; a scenario has {', '.join(STRUCTURES)}")
+        rate, feels_force = structure.startswith("rate"), structure.endswith("force")
+        slave = Impedance(self.tip.mass)
+
+        def nothing(s: np.ndarray) -> np.ndarray:
+            return np.zeros_like(s)
+
+        def control(s: np.ndarray) -> np.ndarray:
+            return drive_control(self.tip, self.servo, self.clocks, s)
+
+        def forward(s: np.ndarray) -> np.ndarray:
+            follows = drive_follows(self.tip, self.servo, self.clocks, s)
+            return (self.tip.mass * s + control(s)) * follows * self._asked(rate, s)
+
+        def back(s: np.ndarray) -> np.ndarray:
+            return reflected * self.ratio * self._felt(s)
+
+        def coupled(s: np.ndarray) -> np.ndarray:
+            return -reflected * self._coupling(rate, s)
+
+        def own(s: np.ndarray) -> np.ndarray:
+            line = np.exp(-s * (self.delay_forward + self.delay_back)) * self._asked(rate, s)
+            linked = 0.0 if feels_force else reflected * self._coupling(rate, s) * line
+            return self._centred(rate, s) + linked
+
+        return TwoPort(
+            self.master, slave, own, control, forward, back if feels_force else nothing, nothing,
+            nothing if feels_force else coupled, self.delay_forward, self.delay_back,
+        )  # fmt: skip
+
+    def _asked(self, rate: bool, s: np.ndarray) -> np.ndarray:
+        """Velocity asked of the tip per velocity of the handle."""
+        if rate:
+            return self.row[GAIN] / s
+        return self.row[GAIN] * (SMOOTH / (s + SMOOTH)) ** 2
+
+    def _centred(self, rate: bool, s: np.ndarray) -> np.ndarray:
+        """Spring and damper of the coils, sampled; no spring under position control."""
+        held = np.exp(-0.5 * self.clocks.control * s)
+        return held * ((self.row[NOMINAL] if rate else 0.0) / s + self.row[DAMPING] * held)
+
+    def _coupling(self, rate: bool, s: np.ndarray) -> np.ndarray:
+        """Force on the hand per velocity of the machine that is missing, of coordinating force."""
+        scale = 1.0 if rate else 1.0 / self.row[GAIN]
+        held = np.exp(-0.5 * (self.clocks.control + self.clocks.samples) * s)
+        return scale * held * (self.row[COUPLING] / s + self.row[COUPLING_DAMPING])
+
+    def _felt(self, s: np.ndarray) -> np.ndarray:
+        """Force that is reflected per force of the task: filters, sample, and control period."""
+        held = np.exp(-0.5 * self.clocks.control * s)
+        if self.pilot.force == "true":
+            return held
+        hertz = self.pilot.bandwidth / (2.0 * math.pi)
+        late = butterworth(hertz, s) * butterworth(FAST * hertz, s)
+        return held * np.exp(-0.5 * self.clocks.samples * s) * late
+
+
+def linear_case(
+    pilot: TeleopPilot, joystick: Joystick, numbers: Master, tip: TipDrive, servo: Servo,
+    clocks: Clocks, task: Impedance,
+) -> LinearCase:  # fmt: skip
+    """The linear case of one coordinate.
+
+    Args:
+        pilot: the scenario's.
+        joystick: the joystick.
+        numbers: of the master's control.
+        tip: the machine along the coordinate.
+        servo: its gains.
+        clocks: control and sensors.
+        task: what the tip presses on.
+
+    Returns:
+        The case.
+
+    Raises:
+        InputError: no joystick axis moves the coordinate.
+    """
+    place = np.flatnonzero(numbers.axis[:, COORDINATE] == COORDINATES.index(tip.coordinate))
+    if not len(place):
+        raise InputError(_WHERE, f"no joystick axis moves {tip.coordinate}")
+    axis, hand, channel = int(place[0]), joystick.hand, pilot.channel
+    turns = AXES[axis].startswith("r")
+    flotor = float(numbers.turning[axis - 3]) if turns else float(numbers.mass[0])
+    held = Impedance(hand.mass, hand.damping, hand.stiffness)
+    if turns:
+        held = Impedance(0.0, hand.rotation_damping, hand.rotation_stiffness)
+    return LinearCase(
+        pilot, numbers.axis[axis].copy(), Impedance(flotor), held, tip, servo, clocks, task,
+        channel.delay_forward, channel.delay_back,
+    )  # fmt: skip
+
+
+def local_ratio(case: LinearCase, displacement: float) -> float:
+    """What stiffness feedback reflects of small changes of force at a held displacement.
+
+    Args:
+        case: the case.
+        displacement: of the handle, scalar [m], [rad].
+
+    Returns:
+        `K_r |x|`, hand force per machine force [N/N]; K_r is the stiffness per force.
+
+    Source: derivative of `K(f) x` by f; Zhu 1994, 4.1.
+    """
+    spring = case.spring
+    return (spring.most - spring.nominal) / float(case.row[LIMIT]) * math.fabs(displacement)

@@ -1,0 +1,381 @@
+"""The master's control: read the joystick, reflect the machine's force, drive the coils.
+
+Every axis of the joystick is a spring and damper to its centre, made by the coils about the handle
+(remote centre of compliance), whose stiffness or force follows what comes back from the machine.
+One kernel makes all structures, 200 times a second; `teleop.handle` holds the same laws of one axis
+for people.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.core.compiled import compiled
+from hydrotele.machine.joystick import Joystick
+from hydrotele.scenario.teleoperation import TeleopPilot
+from hydrotele.teleop.axis_table import (
+    COORDINATE,
+    COUPLING,
+    COUPLING_DAMPING,
+    DAMPING,
+    DEADBAND,
+    DROP,
+    GAIN,
+    LEAST,
+    LIMIT,
+    MOST,
+    NOMINAL,
+    OUTSIDE,
+    RATIO,
+    REFLECTED_MOST,
+    SIGN,
+    SLOPE,
+    axis_table,
+)
+from hydrotele.teleop.coils import three_stations
+from hydrotele.teleop.compliance import GRAVITY, holding_wrench, turn_matrix
+from hydrotele.teleop.flat import flat_state, flattened
+
+NONE, STIFFNESS, DIRECT, COORDINATING, FOUR_CHANNEL, IMPEDANCE = range(6)
+KINDS = ("none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance")
+RATE, POSITION = range(2)
+# rows of `Packet`
+FORCE, PLACE, SPEED, WANTED, WANTED_SPEED, TASK_STIFFNESS, TASK_DAMPING = range(7)
+_OBSERVER = 60.0  # rad/s of the hand force's estimate: a third of what 200 Hz samples
+_CHANGE = 20.0  # rad/s up to which a force is differentiated: sensors are slower than the joystick
+WINDUP = 0.1  # m or rad at the machine by which four channels under rate control may be apart
+
+
+class Master(NamedTuple):
+    """Numbers of the master's control.
+
+    Attributes:
+        axis: (6, 17) of every joystick axis, columns above; SI. GAIN is the coordinate's rate per
+            displacement beyond the dead band [1/s], or its place per displacement.
+        mass: (1,) of the flotor [kg].
+        turning: (3,) its moments about the handle [kg m^2].
+        below: (3,) its centre of mass from the coils' frame [m].
+        handle: (3,) the handle's point from the coils' frame [m].
+        gravity: (3,) [m/s^2].
+        to_currents: (6, 6) inverse of the coils' map [A/N], [A/(N m)].
+        most: (1,) largest current [A].
+        step: (6,) resolution of the sensing [m], [rad].
+        kind: (2,) structure and mode.
+    """
+
+    axis: np.ndarray
+    mass: np.ndarray
+    turning: np.ndarray
+    below: np.ndarray
+    handle: np.ndarray
+    gravity: np.ndarray
+    to_currents: np.ndarray
+    most: np.ndarray
+    step: np.ndarray
+    kind: np.ndarray
+
+
+class MasterState(NamedTuple):
+    """What the master knows and does, rewritten every period.
+
+    Attributes:
+        handle: (6,) measured displacement [m] and rotation vector [rad].
+        speed: (6,) its rate.
+        push: (6,) force of the coils on the handle [N], [N m].
+        stiffness: (6,) of every axis [N/m], [N m/rad].
+        hand: (6,) estimated force of the hand [N], [N m].
+        momentum: (6,) of the estimate.
+        integral: (6,) of the rate asked for, for four channels under rate control [m], [rad].
+        before: (6,) slow force from the machine, for its rate of change [N], [N m].
+        currents: (6,) [A].
+        extra: (6,) further force on the handle, such as that of tip-over protection [N], [N m].
+        limited: (1,) share by which the currents had to be made smaller; 1 if not, 0 where they
+            are off because the reading is no number.
+        energy: (2,) gone into the handle from the hand [J]: now, and its least so far.
+    """
+
+    handle: np.ndarray
+    speed: np.ndarray
+    push: np.ndarray
+    stiffness: np.ndarray
+    hand: np.ndarray
+    momentum: np.ndarray
+    integral: np.ndarray
+    before: np.ndarray
+    currents: np.ndarray
+    extra: np.ndarray
+    limited: np.ndarray
+    energy: np.ndarray
+
+
+def master(
+    joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, ...]
+) -> tuple[Master, MasterState]:
+    """Numbers and first state of the master's control.
+
+    Args:
+        joystick: the joystick.
+        pilot: the scenario's.
+        coordinates: task coordinates of the arm.
+
+    Returns:
+        The numbers, and a state at the centre.
+
+    Raises:
+        InputError: gains that make no sense, a coordinate that the arm has not, one joystick axis
+            for two coordinates.
+    """
+    f, coils = joystick.flotor, joystick.coils
+    com, handle, inertia = np.array(f.com), np.array(f.handle), np.diag(f.inertia)
+    arm = com - handle
+    turning = np.diag(inertia) + f.mass * (arm @ arm - arm**2)
+    lorentz = three_stations(coils.radius, coils.force_per_ampere, coils.max_current)
+    numbers = Master(
+        axis=axis_table(joystick, pilot, coordinates),
+        mass=np.array([f.mass]),
+        turning=turning,
+        below=com,
+        handle=handle,
+        gravity=np.array(GRAVITY),
+        to_currents=np.linalg.inv(lorentz.wrench_map),
+        most=np.array([coils.max_current]),
+        step=np.array([joystick.sensing.translation] * 3 + [joystick.sensing.rotation] * 3),
+        kind=np.array([KINDS.index(pilot.reflection), RATE if pilot.mode == "rate" else POSITION]),
+    )
+    state = flat_state(MasterState, [(6,)] * 10 + [(1,), (2,)])
+    state.limited[:] = 1.0
+    return flattened(numbers), state
+
+
+@compiled
+def unpack_master(flat):
+    """The parts of `flat_view(Master)`.
+
+    Args:
+        flat: (160,) array.
+
+    Returns:
+        Master, views of it.
+
+    Source: order and shapes of Master.
+    """
+    return Master(
+        flat[0:102].reshape(6, 17), flat[102:103], flat[103:106], flat[106:109], flat[109:112],
+        flat[112:115], flat[115:151].reshape(6, 6), flat[151:152], flat[152:158], flat[158:160],
+    )  # fmt: skip
+
+
+@compiled
+def unpack_master_state(flat):
+    """The parts of `flat_view(MasterState)`.
+
+    Args:
+        flat: (63,) array.
+
+    Returns:
+        MasterState, views of it.
+
+    Source: order and shapes of MasterState.
+    """
+    return MasterState(
+        flat[0:6], flat[6:12], flat[12:18], flat[18:24], flat[24:30], flat[30:36], flat[36:42],
+        flat[42:48], flat[48:54], flat[54:60], flat[60:61], flat[61:63],
+    )  # fmt: skip
+
+
+@compiled
+def read_handle(numbers, qpos, period, s):
+    """Measure the handle as finely as the sensing allows, and its rate by differences.
+
+    What the hand has put into it follows from the kinetic energy and the work of the coils, without
+    the lag of the hand's estimated force.
+
+    Args:
+        numbers: Master.
+        qpos: (7,) of the flotor: position [m] and quaternion.
+        period: since the last reading, scalar [s]; 0 for the first one.
+        s: MasterState; `handle`, `speed` and `energy` are written.
+
+    Returns:
+        Nothing.
+
+    Source: Zhu 1994, chapter 5 (optical sensing).
+    """
+    w = qpos[3]
+    size = np.sqrt(qpos[4] ** 2 + qpos[5] ** 2 + qpos[6] ** 2)
+    factor = 2.0 if w >= 0.0 else -2.0
+    if size > 1e-9:
+        factor = factor * np.arctan2(size, abs(w)) / size
+    for i in range(6):
+        value = qpos[i] if i < 3 else factor * qpos[i + 1]
+        if numbers.step[i] > 0.0:
+            value = np.rint(value / numbers.step[i]) * numbers.step[i]
+        speed = (value - s.handle[i]) / period if period > 0.0 else 0.0
+        if period > 0.0:
+            own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
+            gained = 0.5 * own * (speed**2 - s.speed[i] ** 2)
+            s.energy[0] += gained - _given(numbers, s, i) * (value - s.handle[i])
+        s.speed[i], s.handle[i] = speed, value
+    s.energy[1] = min(s.energy[1], s.energy[0])
+
+
+@compiled
+def _given(numbers, s, i):
+    """What coils and weight together have put on an axis of the handle since the last reading."""
+    given = s.limited[0] * s.push[i]
+    if i < 3:  # what is missing of the flotor's weight
+        given += (1.0 - s.limited[0]) * numbers.mass[0] * numbers.gravity[i]
+    return given
+
+
+@compiled
+def reflect(numbers, packet, fresh, period, s):
+    """Force on the handle of every axis, by the structure that was chosen.
+
+    Args:
+        numbers: Master.
+        packet: (7, k) what came from the machine: force on its tip, its place and speed, those of
+            its reference, stiffness and damping of its task; task units.
+        fresh: share of the packet that counts, scalar: 1, falling to 0 when the line is silent.
+        period: scalar [s].
+        s: MasterState; `push`, `stiffness`, `integral` and `before` are written.
+
+    Returns:
+        Nothing.
+
+    Source: Zhu 1994, 3.14, 3.59-3.62, 3.75, 4.1, Fig. 6.51.
+    """
+    kind, mode = numbers.kind[0], numbers.kind[1]
+    for i in range(6):
+        row, x, v = numbers.axis[i], s.handle[i], s.speed[i]
+        c, sign, gain = int(row[COORDINATE]), row[SIGN], row[GAIN]
+        stiff, rub, push = row[NOMINAL], row[DAMPING], 0.0
+        way = 1.0 if x > 0.0 else (-1.0 if x < 0.0 else 0.0)
+        if c >= 0 and kind != NONE:
+            force = fresh * sign * packet[FORCE, c]
+            if not np.isfinite(force):
+                force = 0.0
+            kept = min(row[REFLECTED_MOST], max(-row[REFLECTED_MOST], force))
+            if mode == POSITION and kind != STIFFNESS and kind != IMPEDANCE:
+                stiff = 0.0  # under position control the slave's place is the spring's rest
+            if kind == STIFFNESS:
+                kept = min(row[LIMIT], max(-row[LIMIT], force))
+                stiff = min(row[MOST], max(row[LEAST], stiff - row[SLOPE] * kept * way))
+            elif kind == DIRECT:
+                push += row[RATIO] * kept
+            elif kind == COORDINATING:
+                share = sign / gain if mode == POSITION else sign
+                behind = share * (packet[WANTED, c] - packet[PLACE, c])
+                slower = share * (packet[WANTED_SPEED, c] - packet[SPEED, c])
+                push -= fresh * (row[COUPLING] * behind + row[COUPLING_DAMPING] * slower)
+            elif kind == FOUR_CHANNEL:
+                push += _four_channels(row, mode, x, v, kept, sign, packet, c, fresh, period, s, i)
+            elif kind == IMPEDANCE:
+                felt = fresh * row[RATIO] * gain
+                stiff = min(row[MOST], max(row[LEAST], stiff + felt * packet[TASK_STIFFNESS, c]))
+                rub += min(rub, felt * packet[TASK_DAMPING, c])  # more makes a sampled flotor shake
+        s.stiffness[i] = stiff
+        beyond = abs(x) - row[DEADBAND]
+        if row[OUTSIDE] >= 0.0 and beyond > 0.0:
+            stiff_out = row[OUTSIDE] + max(stiff - row[NOMINAL], 0.0)
+            push -= way * (max(stiff * row[DEADBAND] - row[DROP], 0.0) + stiff_out * beyond)
+        else:
+            push -= stiff * x
+        total = push - rub * v + fresh * s.extra[i]
+        s.push[i] = (
+            total if np.isfinite(total) else -row[NOMINAL] * x - row[DAMPING] * v
+        )  # the plain spring
+
+
+@compiled
+def _four_channels(row, mode, x, v, force, sign, packet, c, fresh, period, s, i):
+    """Force back and velocity back of the four-channel structures, and the master's own part.
+
+    Under rate control `C2 = s / k_v` differentiates the force, below 20 rad/s.
+    """
+    gain, spring, damper = row[GAIN], row[COUPLING], row[COUPLING_DAMPING]
+    place, speed = sign * packet[PLACE, c], sign * packet[SPEED, c]
+    reflected = row[RATIO] * force
+    if mode == POSITION:
+        return reflected - fresh * (spring * (x - place / gain) + damper * (v - speed / gain))
+    asked = s.integral[i] + period * gain * x
+    s.integral[i] = min(place + WINDUP, max(place - WINDUP, asked))
+    change = _CHANGE * (reflected - s.before[i])
+    s.before[i] += period * change
+    apart = spring * (s.integral[i] - place) + damper * (gain * x - speed)
+    return change / gain - fresh * apart
+
+
+@compiled
+def drive_coils(numbers, quaternion, period, s):
+    """Coil currents that put `push` on the handle, the flotor's weight taken off; hand's force.
+
+    Currents beyond the largest make the whole wrench smaller, in its direction.
+
+    Args:
+        numbers: Master.
+        quaternion: (4,) of the flotor.
+        period: scalar [s].
+        s: MasterState; `currents`, `limited`, `hand` and `momentum` are written.
+
+    Returns:
+        Nothing.
+
+    Source: Zhu 1994, 5.1.3; momentum observer after De Luca and Mattone 2005.
+    """
+    turn, wrench = np.empty((3, 3)), np.empty(6)
+    turn_matrix(quaternion, turn)
+    holding_wrench(
+        numbers.mass[0], numbers.below, numbers.handle, s.push, turn, numbers.gravity, wrench
+    )
+    largest = numbers.most[0]
+    for i in range(6):
+        s.currents[i] = 0.0
+        for j in range(6):
+            s.currents[i] += numbers.to_currents[i, j] * wrench[j]
+        if not np.isfinite(s.currents[i]):
+            s.currents[i] = 0.0
+        largest = max(largest, abs(s.currents[i]))
+    s.limited[0] = numbers.most[0] / largest
+    for i in range(6):
+        s.currents[i] *= s.limited[0]
+        own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
+        s.hand[i] = _OBSERVER * (own * s.speed[i] - s.momentum[i])
+        s.momentum[i] += period * (_given(numbers, s, i) + s.hand[i])
+
+
+@compiled
+def _blind(s):
+    """No currents, no command, nothing learnt; the next good reading starts from rest."""
+    for i in range(6):
+        s.handle[i], s.speed[i], s.push[i] = 0.0, 0.0, 0.0
+        s.hand[i], s.momentum[i], s.currents[i] = 0.0, 0.0, 0.0
+    s.limited[0] = 0.0
+
+
+@compiled
+def master_step(numbers, qpos, packet, fresh, period, first, s):
+    """One period of the master: read the handle, reflect, drive the coils.
+
+    A reading that is no number switches the coils off and leaves the machine without a command.
+
+    Args:
+        numbers: Master.
+        qpos: (7,) of the flotor: position [m] and quaternion.
+        packet: (7, k) see `reflect`.
+        fresh: see `reflect`, scalar.
+        period: scalar [s].
+        first: whether it is the first one, scalar.
+        s: MasterState, written.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    if not np.isfinite(qpos).all():
+        _blind(s)
+        return
+    read_handle(numbers, qpos, 0.0 if first or s.limited[0] == 0.0 else period, s)
+    reflect(numbers, packet, fresh, period, s)
+    drive_coils(numbers, qpos[3:7], period, s)

@@ -1,0 +1,332 @@
+"""The slave's side of teleoperation: packets of the master into joint references, safely.
+
+Under rate control the handle beyond its dead band asks for a rate of the task coordinates, under
+position control for their place; bounds of speed and acceleration keep the references continuous.
+With four channels a virtual mass stands between, which the hand's and the task's force move,
+because a valve-controlled machine does not yield by itself.
+"""
+
+import numpy as np
+
+from hydrotele.control.resolved_motion import COORDINATES, arm_facts, follow_pose
+from hydrotele.core.compiled import compiled
+from hydrotele.kinematics.task import task_forward
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.teleoperation import Coupling, TeleopPilot
+from hydrotele.teleop.axis_table import (
+    COORDINATE,
+    COUPLING,
+    COUPLING_DAMPING,
+    DEADBAND,
+    GAIN,
+    LEVER,
+    RATIO,
+    REACH,
+    REFLECTED_MOST,
+    SIGN,
+)
+from hydrotele.teleop.flat import flat_state, flattened
+from hydrotele.teleop.master import (
+    FORCE,
+    FOUR_CHANNEL,
+    PLACE,
+    POSITION,
+    RATE,
+    SPEED,
+    WANTED,
+    WANTED_SPEED,
+    WINDUP,
+    Master,
+)
+from hydrotele.teleop.slave_table import (
+    ACCELERATION,
+    AGE,
+    AXIS,
+    BLOCKED,
+    DAMPER,
+    EDGE,
+    FASTEST,
+    FOLLOWING,
+    LEAD,
+    LEVERAGE,
+    SCALE,
+    SHARE,
+    SILENCE,
+    SILENT,
+    SPRING,
+    STOP,
+    STRONGEST,
+    TRIPPED,
+    VIRTUAL_MASS,
+    WAY,
+    Slave,
+    SlaveState,
+)
+
+SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
+_BRAKE = 0.8  # of the acceleration: the rest makes up for the filter's lag
+AHEAD = 0.02  # s over which the change of a rate is averaged before it is looked ahead
+_BLEND = 30.0  # rad/s, of measured task rates from held angles
+
+
+def slave(
+    machine: Machine, pilot: TeleopPilot, numbers: Master, joints: np.ndarray, lead: float = 0.0
+) -> tuple[Slave, SlaveState]:
+    """Numbers and first state of the slave's side.
+
+    Args:
+        machine: the machine, with an arm.
+        pilot: the scenario's.
+        numbers: of the master.
+        joints: (k,) where its arm stands, from swing outwards [rad].
+        lead: by which the drives' velocities are asked for earlier [s].
+
+    Returns:
+        Both.
+
+    Raises:
+        InputError: the machine has no arm.
+    """
+    arm, _, ranges = arm_facts(machine)
+    k, pose = len(joints), np.zeros(5)
+    task_forward(arm, joints, pose)
+    table = np.zeros((k, 11))
+    table[:, 0] = -1.0
+    for axis, row in enumerate(numbers.axis):
+        if row[COORDINATE] >= 0.0:
+            lever = 1.0 if axis < 3 else LEVER**2
+            name = COORDINATES[int(row[COORDINATE])]
+            speed = pilot.coordinates.get(name, Coupling()).speed  # pyright: ignore - a Coordinate
+            table[int(row[COORDINATE])] = (
+                axis, row[SIGN], row[GAIN], row[DEADBAND], row[REACH], row[COUPLING],
+                row[COUPLING_DAMPING], row[RATIO], lever, speed, row[REFLECTED_MOST],
+            )  # fmt: skip
+    safety = pilot.safety
+    limits = np.array(
+        [safety.silence, safety.following_error, pilot.acceleration, pilot.virtual_mass, lead]
+    )
+    state = flat_state(SlaveState, [(5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,)])
+    state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
+    return flattened(Slave(arm, ranges, pose, table, limits, numbers.kind)), state
+
+
+@compiled
+def measure_task(numbers, joint, fresh, elapsed, s):
+    """Pose and rate of the tip from measured joint angles.
+
+    Args:
+        numbers: Slave.
+        joint: (k,) measured [rad].
+        fresh: whether there is a new sample, scalar.
+        elapsed: since the last one, scalar [s].
+        s: SlaveState; `measured` is written.
+
+    Returns:
+        Nothing.
+
+    Source: `kinematics.task`; first-order filter.
+    """
+    if not fresh:
+        return
+    pose = np.empty(5)
+    task_forward(numbers.arm, joint, pose)
+    for i in range(5):
+        if not np.isfinite(pose[i]):
+            return
+    share = min(1.0, _BLEND * elapsed)
+    for i in range(5):
+        if elapsed > 0.0:
+            s.measured[1, i] += share * ((pose[i] - s.measured[0, i]) / elapsed - s.measured[1, i])
+        s.measured[0, i] = pose[i]
+
+
+@compiled
+def ask(numbers, packet, arrived, force, period, s):
+    """Joint references of this period from what the master says.
+
+    Args:
+        numbers: Slave.
+        packet: (3, 6) handle's displacement [m], [rad], its rate, the hand's force [N], [N m].
+        arrived: whether a packet came this period, scalar.
+        force: (k,) of the environment on the tip, task coordinates [N], [N m].
+        period: scalar [s].
+        s: SlaveState; references and flags are written.
+
+    Returns:
+        Nothing.
+
+    Source: Zhu 1994, chapters 2 and 3; see this module's docstring.
+    """
+    k = len(s.joint)
+    if arrived:
+        for r in range(3):
+            for i in range(6):
+                s.command[r, i] = packet[r, i] if np.isfinite(packet[r, i]) else 0.0
+        s.flags[AGE] = 0.0
+    else:
+        s.flags[AGE] += period
+    s.flags[SILENT] = 1.0 if s.flags[AGE] > numbers.limits[SILENCE] else 0.0
+    wanted, rate = np.zeros(5), np.zeros(5)
+    for c in range(5):
+        wanted[c] = s.pose[c]
+        if c >= k or (c == 3 and k < 4):
+            continue
+        row = numbers.table[c]
+        goal = 0.0
+        if row[AXIS] >= 0.0 and s.flags[SILENT] == 0.0:
+            i = int(row[AXIS])
+            x, v, hand = s.command[0, i], s.command[1, i], s.command[2, i]
+            goal = _wanted_rate(
+                numbers, row, c, row[WAY] * x, row[WAY] * v, row[WAY] * hand, force[c], period, s
+            )
+        else:
+            s.asked[c], s.force_integral[c] = s.pose[c] - numbers.start[c], 0.0
+        goal = min(row[FASTEST], max(-row[FASTEST], goal))
+        change = numbers.limits[ACCELERATION] * period
+        rate[c] = min(s.rate[c] + change, max(s.rate[c] - change, goal))
+        wanted[c] += period * rate[c]
+    before = s.joint_rate.copy()
+    held = follow_pose(
+        numbers.arm,
+        numbers.ranges,
+        wanted,
+        rate,
+        s.flags[BLOCKED] > 0.0,
+        s.pose,
+        s.joint,
+        s.joint_rate,
+    )
+    lead = numbers.limits[LEAD]
+    for i in range(k):
+        share = min(1.0, period / AHEAD)
+        change = (s.joint_rate[i] - before[i]) / period
+        late = s.ahead[i] - before[i]
+        s.ahead[i] = s.joint_rate[i] + late + share * (lead * change - late)
+    s.flags[BLOCKED] = 1.0 if held else 0.0
+    for c in range(5):
+        s.rate[c] = 0.0 if held else rate[c]
+        if held:
+            s.asked[c], s.force_integral[c] = s.pose[c] - numbers.start[c], 0.0
+
+
+@compiled
+def _wanted_rate(numbers, row, c, x, v, hand, force, period, s):
+    """Rate that the handle asks a coordinate for."""
+    if numbers.kind[0] == FOUR_CHANNEL:
+        return _virtual_rate(numbers, row, c, x, v, hand, force, period, s)
+    if numbers.kind[1] == POSITION:
+        return _placed_rate(numbers, row, c, x, period, s)
+    beyond = min(row[STOP], abs(x)) - row[EDGE]
+    if beyond <= 0.0:
+        return 0.0
+    return row[SCALE] * beyond if x > 0.0 else -row[SCALE] * beyond
+
+
+@compiled
+def _placed_rate(numbers, row, c, x, period, s):
+    """Rate of a coordinate under position control: a critically damped filter of the handle.
+
+    A long way is gone at the largest speed, and braked as the acceleration allows.
+    """
+    gap = row[SCALE] * x - (s.pose[c] - numbers.start[c])
+    size = abs(gap)
+    speed = min(
+        row[FASTEST],
+        0.5 * SMOOTH * size,
+        np.sqrt(2.0 * _BRAKE * numbers.limits[ACCELERATION] * size),
+    )
+    speed = speed if gap > 0.0 else -speed
+    return s.rate[c] + 2.0 * SMOOTH * period * (speed - s.rate[c])
+
+
+@compiled
+def _virtual_rate(numbers, row, c, x, v, hand, force, period, s):
+    """Rate of the virtual slave of four channels, which hand, task and the master's place move.
+
+    Under position control `M z'' = hand + ratio F + K (x - z) + B (x' - z')` with z = y / scale,
+    under rate control `M y'' = k_v int hand + ratio F + K (k_v int x - y) + B (k_v x - y')`.
+    """
+    gain, spring, damper = row[SCALE], row[SPRING], row[DAMPER]
+    mass = numbers.limits[VIRTUAL_MASS] * row[LEVERAGE]
+    scale = gain if numbers.kind[1] == POSITION else 1.0
+    place, speed = (s.pose[c] - numbers.start[c]) / scale, s.rate[c] / scale
+    felt = (
+        row[SHARE] * min(row[STRONGEST], max(-row[STRONGEST], force)) if np.isfinite(force) else 0.0
+    )
+    ahead, ahead_speed, push = x, v, hand
+    if numbers.kind[1] == RATE:
+        most = row[SHARE] * row[STRONGEST] + mass * numbers.limits[ACCELERATION]
+        total = s.force_integral[c] + period * gain * hand
+        s.force_integral[c] = min(most, max(-most, total))
+        asked = s.asked[c] + period * gain * x
+        s.asked[c] = min(place + WINDUP, max(place - WINDUP, asked))
+        ahead, ahead_speed, push = s.asked[c], gain * x, s.force_integral[c]
+    push += felt + spring * (ahead - place) + damper * (ahead_speed - speed)
+    return scale * (speed + period * push / mass)
+
+
+@compiled
+def watch(numbers, joint, s):
+    """Close the valves for good where a joint does not follow its reference.
+
+    Args:
+        numbers: Slave.
+        joint: (k,) measured [rad]; one that is not finite trips, too.
+        s: SlaveState; `flags` is written.
+
+    Returns:
+        Nothing.
+
+    Source: following-error monitor, as drives have it.
+    """
+    for i in range(len(joint)):
+        if not abs(joint[i] - s.joint[i]) <= numbers.limits[FOLLOWING]:
+            s.flags[TRIPPED] = 1.0
+
+
+@compiled
+def report(numbers, force, s, packet):
+    """What the master is told: force, places and speeds against the start.
+
+    Args:
+        numbers: Slave.
+        force: (k,) at the tip, task coordinates [N], [N m].
+        s: SlaveState.
+        packet: (7, k) written, all but the last two rows.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    for c in range(len(force)):
+        packet[FORCE, c] = force[c]
+        packet[PLACE, c] = s.measured[0, c] - numbers.start[c]
+        packet[SPEED, c] = s.measured[1, c]
+        packet[WANTED, c] = s.pose[c] - numbers.start[c]
+        packet[WANTED_SPEED, c] = s.rate[c]
+    if numbers.kind[0] == FOUR_CHANNEL:
+        for c in range(len(force)):
+            packet[PLACE, c], packet[SPEED, c] = packet[WANTED, c], packet[WANTED_SPEED, c]
+
+
+@compiled
+def slave_step(numbers, packet, arrived, force, joint, period, s):
+    """One period of the slave's side: references of the joints, and whether they are followed.
+
+    Args:
+        numbers: Slave.
+        packet: (3, 6) see `ask`.
+        arrived: see `ask`, scalar.
+        force: (k,) see `ask`.
+        joint: (k,) measured [rad].
+        period: scalar [s].
+        s: SlaveState, written.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    ask(numbers, packet, arrived, force, period, s)
+    watch(numbers, joint, s)

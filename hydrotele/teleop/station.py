@@ -1,0 +1,309 @@
+"""A teleoperated run: operator, joystick, line and resolved motion, one control period at a time.
+
+Signals go once around: the machine's sensors tell the force at its tip; a packet with it comes to
+the master, late; the joystick reflects it; the operator feels, sees and pushes; where the handle is
+goes to the machine in another packet, late; there it becomes joint references.
+"""
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from hydrotele.control.drive_rows import drive_tables
+from hydrotele.control.endpoint_force import EndpointForce
+from hydrotele.control.plan import Plan
+from hydrotele.control.resolved_motion import COORDINATES, arm_facts
+from hydrotele.control.servo import DriveReferences
+from hydrotele.control.task_impedance import TaskImpedance
+from hydrotele.core.errors import InputError
+from hydrotele.kinematics.task import task_forward
+from hydrotele.machine.joystick import load_joystick
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import sensor_set
+from hydrotele.machine.sensors import SensorSet
+from hydrotele.scenario.scenario import Scenario
+from hydrotele.scenario.teleoperation import Fault, TeleopPilot
+from hydrotele.simulate.feedback import Feedback
+from hydrotele.simulate.joystick import Flotor
+from hydrotele.simulate.plant import Plant
+from hydrotele.simulate.record import contact_force, surrounding_bodies
+from hydrotele.teleop.axis_table import DEADBAND, REACH
+from hydrotele.teleop.flat import flat_view
+from hydrotele.teleop.master import TASK_DAMPING, TASK_STIFFNESS, master
+from hydrotele.teleop.person import Hand, Person
+from hydrotele.teleop.round_trip import to_the_hand, to_the_machine
+from hydrotele.teleop.slave import slave
+from hydrotele.teleop.slave_table import BLOCKED, SILENT, TRIPPED
+from hydrotele.teleop.station_log import StationLog
+from hydrotele.teleop.tip_over import push_back
+
+_FADE = 0.2  # s in which the reflected force dies out when the line is silent
+
+
+class Station:
+    """Operator's station of a run.
+
+    Attributes:
+        coordinates: task coordinates of the arm.
+        log: what it saw and did, by control tick.
+        notes: what the user should know: trips, silence, edges.
+        tripped: whether the valves were closed for good.
+    """
+
+    def __init__(
+        self, plant: Plant, scenario: Scenario, plan: Plan, drives: DriveReferences,
+        seen: Feedback, hand: Hand | None = None,
+    ) -> None:  # fmt: skip
+        """Put everything in place.
+
+        Args:
+            plant: the simulated machine.
+            scenario: with a teleoperated pilot.
+            plan: references of the run, written tick by tick.
+            drives: those of the drives, written tick by tick.
+            seen: what the machine's sensors say.
+            hand: where a live operator wants the handle.
+
+        Raises:
+            InputError: joystick, gains or arm do not fit each other, a live operator without hand.
+        """
+        pilot = scenario.pilot
+        assert isinstance(pilot, TeleopPilot)
+        machine = plant.machine
+        self._plant, self._pilot, self._plan, self._drives = plant, pilot, plan, drives
+        self._scale, self._period = scenario.servo.feedforward, 1.0 / scenario.control_rate
+        joystick = load_joystick(_beside(scenario, pilot.joystick))
+        _, axes, _ = arm_facts(machine)
+        self.columns = np.array([plan.axes.index(a) for a in axes])
+        self.coordinates = COORDINATES[: len(axes)]
+        self._master, self._m = master(joystick, pilot, self.coordinates)
+        start = plan.reference[0, self.columns]
+        self._slave, self._s = slave(machine, pilot, self._master, start, scenario.servo.lead)
+        self._line = _Line(pilot, scenario, len(axes))
+        self._flotor = Flotor(joystick, period=self._period)
+        self._qpos = self._flotor.data.qpos
+        self._mount = np.array(joystick.mount)
+        self._swing = int(plant.dof[self.columns[0]]) if pilot.mount == "cab" else -1
+        self._grid, self._table = drive_tables(machine, plan.axes)
+        self._sensors = sensor_set(machine, scenario.sensors)
+        self._feel = _estimator(machine, plan.axes, pilot, seen, self._period, self._sensors)
+        self._around = surrounding_bodies(plant)
+        self._task, self._pose = _task(pilot, seen, self._period, len(axes)), np.zeros(5)
+        self._force = np.zeros(len(axes))
+        self._elapsed = 0.0
+        self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
+        self.person = Person(
+            pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed,
+            hand,
+        )  # fmt: skip
+        self._master_flat, self._m_flat = flat_view(self._master), flat_view(self._m)
+        self._slave_flat, self._s_flat = flat_view(self._slave), flat_view(self._s)
+        self._hand_flat = flat_view(self.person.muscles)
+        self.notes: list[str] = []
+        self._said: set[str] = set()
+        self.tripped = False
+        self._faults = [_Fault(fault, plan.axes) for fault in pilot.faults]
+
+    @property
+    def span(self) -> np.ndarray:
+        """(2, 6) edge of the dead band and stop of every axis of the joystick [m], [rad]."""
+        return self._master.axis[:, [DEADBAND, REACH]].T
+
+    def tick(self, tick: int, data: mujoco.MjData, seen: Feedback) -> bool:
+        """Go once around; references and drive references of this tick are written.
+
+        Args:
+            tick: the control tick.
+            data: the plant's state.
+            seen: the sensors' readings of now.
+
+        Returns:
+            Whether the valves are to be closed.
+        """
+        for fault in self._faults:
+            fault.freeze(tick * self._period, seen)
+        fresh = tick % seen.every == 0
+        self._felt(data, seen, fresh)
+        if self._pilot.tip_over:
+            push_back(
+                self._pilot.tip_over, self._master, self._line.packet, self._slave.start,
+                self._m.handle, self._m.speed, self._m.extra,
+            )  # fmt: skip
+        if tick % self.person.every == 0:
+            self.person.decide(tick)
+        person, line = self.person, self._line
+        to_the_hand(
+            tick, fresh, self._elapsed, self.tripped, seen.joint, self._force, self.columns,
+            self._slave_flat, self._s_flat, line.back, line.packet, line.lost, line.state,
+            self._master_flat, self._m_flat, self._qpos, self._hand_flat, person.past,
+            person.tremor, line.forward,
+        )  # fmt: skip
+        self._elapsed = seen.period
+        self._move_flotor(data)
+        self.log.take(tick, self._force, person.muscles.force, data.ncon > 0)
+        self._ask(tick, seen)
+        self._check(tick, seen)
+        return self.tripped
+
+    def _felt(self, data: mujoco.MjData, seen: Feedback, fresh: bool) -> None:
+        """Force at the tip, and what the task is like if that is reflected."""
+        if self._feel and fresh:
+            self._force = self._feel.update(seen.joint, seen.head, seen.rod)
+        if self._pilot.force == "true":
+            self._force = self._true_force(data)
+        if self._task:
+            if fresh:
+                task_forward(self._slave.arm, seen.joint[self.columns], self._pose)
+                self._task.update(self._force, self._pose[: len(self._force)])
+            self._line.back[:, TASK_STIFFNESS] = self._task.stiffness
+            self._line.back[:, TASK_DAMPING] = self._task.damping
+
+    def _move_flotor(self, data: mujoco.MjData) -> None:
+        """One period of the joystick, shaken by the cab if it stands there."""
+        currents, muscles = self._m.currents, self.person.muscles.force
+        if self._swing < 0:
+            self._flotor.step(currents, muscles)
+            return
+        w, a = float(data.qvel[self._swing]), float(data.qacc[self._swing])
+        self._flotor.shaken_step(currents, muscles, self._mount, w, a)
+
+    def _ask(self, tick: int, seen: Feedback) -> None:
+        """Turn the packet that arrives into references."""
+        plan, drives, line = self._plan, self._drives, self._line
+        to_the_machine(
+            tick, seen.joint, self._force, self.columns, self._slave_flat, self._s_flat,
+            line.forward, line.lost, line.state, self._grid, self._table, self._scale,
+            plan.reference[tick], plan.rate[tick], drives.velocity[tick], drives.arm[tick],
+            drives.volume_head[tick], drives.volume_rod[tick],
+        )  # fmt: skip
+        if plan.pose is not None:
+            plan.pose[tick] = self._s.pose[: plan.pose.shape[1]]
+
+    def summary(self) -> dict[str, float | int | bool | None]:
+        """Figures of the run: energy at the handle, currents, how far it was used, trips."""
+        handle, energy = np.abs(self.log.master("handle")), self._m.energy
+        return {
+            "handle_energy_J": float(energy[0]),
+            "handle_least_energy_J": float(energy[1]),
+            "largest_handle_displacement_m": float(handle[:, :3].max()),
+            "largest_handle_rotation_rad": float(handle[:, 3:].max()),
+            "largest_coil_current_A": float(np.abs(self.log.master("currents")).max()),
+            "periods_with_limited_currents": int((self.log.master("limited") < 1.0).sum()),
+            "largest_tip_force_N": float(np.abs(self.log.force[:, [0, 2]]).max()),
+            "tripped": self.tripped,
+        }
+
+    def _check(self, tick: int, seen: Feedback) -> None:
+        """Close the valves where something is not as it must be; say why, once."""
+        now, s = tick * self._period, self._s
+        if s.flags[BLOCKED] and "edge" not in self._said:
+            self._say("edge", f"resolved motion stood at the edge of the workspace at {now:.2f} s")
+        if s.flags[SILENT] and "silent" not in self._said:
+            self._say("silent", f"no packet came for a while at {now:.2f} s: rates went to zero")
+        why = ""
+        if s.flags[TRIPPED]:
+            error = np.abs(seen.joint[self.columns] - s.joint)
+            name = self._plan.axes[self.columns[int(np.argmax(np.nan_to_num(error, nan=np.inf)))]]
+            why = f"{name} does not follow its reference"
+        elif self._feel and self._sensors and tick % 20 == 0:
+            frozen = self._feel.frozen(self._pilot.safety.frozen)
+            why = f"the sensor {frozen[0]} always reads the same" if frozen else ""
+        if why and not self.tripped:
+            self.tripped = True
+            self._say("trip", f"valves closed for good at {now:.2f} s: {why}")
+
+    def _say(self, key: str, sentence: str) -> None:
+        self._said.add(key)
+        self.notes.append(sentence)
+
+    def _true_force(self, data: mujoco.MjData) -> np.ndarray:
+        """The simulator's own contact force in task coordinates, without moments of the tool."""
+        force = np.zeros(len(self.coordinates))
+        if not data.ncon:
+            return force
+        x, y, z = contact_force(self._plant.model, data, self._around)
+        r, theta = self._s.measured[0, :2]
+        c, s = math.cos(theta), math.sin(theta)
+        force[:3] = x * c + y * s, r * (y * c - x * s), z
+        return force
+
+
+class _Fault:
+    """A sensor that freezes."""
+
+    def __init__(self, fault: Fault, axes: tuple[str, ...]) -> None:
+        kind, _, axis = fault.channel.partition(".")
+        if axis not in axes:
+            raise InputError("pilot.faults", f"{fault.channel!r}: axes are {', '.join(axes)}")
+        kinds = {"angle": "joint", "pressure_head": "head", "pressure_rod": "rod"}
+        if kind not in kinds:
+            raise InputError("pilot.faults", f"{fault.channel!r}: kinds are {', '.join(kinds)}")
+        self._at, self._name, self._column = fault.at, kinds[kind], axes.index(axis)
+        self._value: float | None = None
+
+    def freeze(self, time: float, seen: Feedback) -> None:
+        """Put the frozen reading in the place of the live one."""
+        readings = getattr(seen, self._name)
+        if time < self._at:
+            return
+        if self._value is None:
+            self._value = float(readings[self._column])
+        readings[self._column] = self._value
+        if self._name == "joint":
+            seen.rate[self._column] = 0.0
+
+
+def _estimator(
+    machine: Machine,
+    axes: tuple[str, ...],
+    pilot: TeleopPilot,
+    seen: Feedback,
+    period: float,
+    sensors: SensorSet | None,
+) -> EndpointForce | None:
+    """What tells the force at the tip, and that a sensor is frozen; none where neither is asked."""
+    if pilot.force == "true" and sensors is None:
+        return None
+    kind = "static" if pilot.force == "true" else pilot.force
+    return EndpointForce(
+        machine, axes, kind, period * seen.every, sensors=sensors,
+        bandwidth=_hertz(pilot), fast=2.0 * _hertz(pilot),
+    )  # fmt: skip
+
+
+def _hertz(pilot: TeleopPilot) -> float:
+    return pilot.bandwidth / (2.0 * math.pi)
+
+
+def _task(pilot: TeleopPilot, seen: Feedback, period: float, k: int) -> TaskImpedance | None:
+    """What identifies the task where that is reflected."""
+    if pilot.reflection != "impedance":
+        return None
+    bands = (2.0 * _hertz(pilot), _hertz(pilot))
+    return TaskImpedance(k, period * seen.every, bands, late=pilot.force != "true")
+
+
+def _beside(scenario: Scenario, name: str) -> str:
+    """A joystick's file, counted from the scenario's."""
+    path = Path(scenario.folder, name)
+    return str(path) if name != "joystick" and path.is_file() else name
+
+
+class _Line:
+    """Delay lines, and the packets that will be lost."""
+
+    def __init__(self, pilot: TeleopPilot, scenario: Scenario, k: int) -> None:
+        channel, period = pilot.channel, 1.0 / scenario.control_rate
+        for name in ("delay_forward", "delay_back"):
+            if (delay := getattr(channel, name)) >= scenario.duration:
+                message = f"{delay:g} s is as long as the run ({scenario.duration:g} s)"
+                raise InputError(f"pilot.channel.{name}", message)
+        rng = np.random.default_rng([scenario.seed, 404])
+        self.lost = rng.random((scenario.ticks, 2)) < channel.lost
+        self.lost[: round(channel.lost_from / period)] = False
+        self.forward = np.zeros((1 + round(channel.delay_forward / period), 3, 6))
+        self.back = np.zeros((1 + round(channel.delay_back / period), 7, k))
+        self.packet = np.zeros((7, k))
+        self.state = np.array([0.0, 1.0, period, pilot.safety.silence, _FADE])

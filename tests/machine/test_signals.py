@@ -1,0 +1,151 @@
+"""Channel names, units and their limits."""
+
+import ast
+import doctest
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hydrotele.core import errors
+from hydrotele.core.errors import InputError
+from hydrotele.machine import signals
+
+AXES = st.from_regex(r"[a-z][a-z0-9_]{0,8}", fullmatch=True)
+
+
+def test_doctests_run():
+    assert doctest.testmod(signals).failed == 0
+
+
+def test_imports_nothing_of_ours():
+    tree = ast.parse(Path(str(signals.__file__)).read_text())
+    names = [alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names]
+    names += [str(n.module) for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
+    assert not [name for name in names if name.startswith("hydrotele")]
+
+
+@given(
+    st.booleans().flatmap(
+        lambda t: st.tuples(
+            st.sampled_from(list(signals.TRUTH if t else signals.MEASURED)), st.just(t)
+        )
+    ),
+    AXES,
+)
+def test_every_kind_survives_naming_and_parsing(kind_and_truth, axis):
+    kind, truth = kind_and_truth
+    axes = (signals.TRUTH if truth else signals.MEASURED)[kind].axes
+    axis = {"free": axis, "xyz": "z", "none": ""}[axes]
+    name = signals.channel_name(kind, axis, truth=truth)
+    assert signals.parse_channel(name) == (kind, axis, truth)
+    assert signals.parse_channel(name).name == name
+    assert signals.usual_unit(name) in signals.allowed_units(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("angel.boom", "angle.boom"),
+        ("boom.angle", "angle.boom"),
+        ("angle_boom", "angle.boom"),
+        ("Angle.Boom", "angle.boom"),
+        ("presure_head.stick", "pressure_head.stick"),
+        ("truth.flowhead.boom", "truth.flow_head.boom"),
+        ("supply_pressure", "pressure_supply"),
+        ("position", "position.boom"),
+        ("angle.Boom", "lower case"),
+        ("angle.boom.x", "lower case"),
+        ("time.boom", "write time"),
+        ("pressure_supply.boom", "write pressure_supply"),
+        ("truth.tip.w", "x, y and z"),
+        ("truth.command.boom", "truth.flow_head.<axis>"),
+        ("acceleration.boom", "truth.acceleration.<axis>"),
+        ("", "angle.<axis>"),
+    ],
+)
+def test_a_wrong_name_is_answered_with_the_right_one(name, hint):
+    with pytest.raises(ValueError, match=".") as caught:
+        signals.parse_channel(name)
+    assert hint in str(caught.value)
+
+
+@given(st.text(max_size=30))
+def test_any_text_parses_or_is_a_value_error(name):
+    signals.close_matches(name)
+    try:
+        assert signals.parse_channel(name).name == name
+    except ValueError:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("name", "units"),
+    [
+        ("command.boom", ("1", "V", "N")),
+        ("angle.swing", ("rad",)),
+        ("position.carriage", ("m",)),
+        ("pressure_supply", ("Pa",)),
+        ("velocity.joint1", ("rad/s", "m/s")),
+        ("force.slide", ("N",)),
+        ("truth.force.swing", ("N", "N m")),
+        ("truth.acceleration.boom", ("rad/s^2", "m/s^2")),
+        ("truth.contact_force.x", ("N",)),
+        ("truth.flow_supply", ("m^3/s",)),
+    ],
+)
+def test_allowed_units(name, units):
+    assert signals.allowed_units(name) == units
+
+
+def test_usual_unit_follows_the_joint():
+    assert signals.usual_unit("reference.slide") == "rad"
+    assert signals.usual_unit("reference.slide", ["position.slide"]) == "m"
+    assert signals.usual_unit("truth.velocity.slide", ["truth.position.slide"]) == "m/s"
+    assert signals.usual_unit("command.slide", ["position.slide"]) == "1"
+
+
+@pytest.mark.parametrize(
+    ("unit", "si", "factor"),
+    [
+        ("deg", "rad", math.pi / 180),
+        ("°/s", "rad/s", math.pi / 180),
+        ("psi", "Pa", 0.45359237 * 9.80665 / 0.0254**2),  # pound, standard gravity, inch: all exact
+        ("bar", "Pa", 1e5),
+        ("l/min", "m^3/s", 1 / 60000),
+        ("kN·m", "N m", 1e3),
+        ("m³/s", "m^3/s", 1.0),
+        ("furlong", "furlong", 1.0),
+    ],
+)
+def test_conversion_to_si(unit, si, factor):
+    assert signals.to_si(unit)[0] == si
+    assert signals.to_si(unit)[1] == pytest.approx(factor, rel=1e-14)  # rounding of one division
+
+
+def test_every_foreign_unit_ends_in_a_unit_that_some_channel_has():
+    known = {
+        u for table in (signals.MEASURED, signals.TRUTH) for k in table.values() for u in k.units
+    }
+    assert {si for si, _ in signals.FOREIGN_UNITS.values()} <= known
+    assert not known & signals.FOREIGN_UNITS.keys()
+
+
+def test_limits_are_wider_where_the_unit_is_stated():
+    for unit in ("rad", "rad/s", "m", "m/s", "Pa", "N"):
+        stated = signals.magnitude_limits("angle.boom", unit)
+        unstated = signals.magnitude_limits("angle.boom", unit, stated=False)
+        assert stated.smallest <= unstated.smallest
+        assert stated.largest >= unstated.largest
+
+
+def test_input_error_says_where_and_survives_pickling():
+    import pickle
+
+    error = InputError("a.csv, row 3", "is NaN: remove the row")
+    assert str(error) == "a.csv, row 3: is NaN: remove the row"
+    copy = pickle.loads(pickle.dumps(error))
+    assert (copy.where, copy.message) == (error.where, error.message)
+    assert issubclass(errors.InputError, ValueError)

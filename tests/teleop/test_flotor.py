@@ -1,0 +1,58 @@
+"""A flotor's ten numbers from what its sensors and currents say."""
+
+import numpy as np
+import pytest
+
+from hydrotele.core.errors import InputError
+from hydrotele.machine.joystick import load_joystick
+from hydrotele.teleop.compliance import Flotor
+from hydrotele.teleop.flotor import identify_flotor
+from hydrotele.teleop.levitate import levitation
+from hydrotele.teleop.levitation import fly, wobble
+
+GUESS = Flotor(0.9, np.zeros(3), 2e-3 * np.eye(3))  # of the control while nothing is known
+
+
+def with_com(com):
+    """The shipped joystick with its flotor's centre of mass elsewhere [m]."""
+    shipped = load_joystick()
+    flotor = shipped.flotor.model_copy(update={"com": com})
+    return shipped.model_copy(update={"flotor": flotor})
+
+
+@pytest.mark.parametrize("diodes", [False, True])
+def test_planted_numbers_are_found(diodes):
+    """12 s of wobbling under a control that takes the flotor for another one."""
+    joystick = with_com((0.002, -0.001, 0.02))
+    control = levitation(joystick, GUESS)
+    flight = fly(joystick, wobble(joystick, 12.0), control=control, diodes=diodes)
+    assert not flight.limited.any() and np.abs(flight.pose[:, :3]).max() < 5e-3
+    found = identify_flotor(
+        flight.place, flight.quaternion, flight.currents, control.period, control.coils
+    )
+    truth = np.array([0.85, 0.002, -0.001, 0.02, 1.2e-3, 1.2e-3, 1.5e-3, 0.0, 0.0, 0.0])
+    assert (np.abs(found.value - truth) < found.interval).all()
+    # asked for: 0.5 %, 0.5 mm and 5 %; what is told is finer by an order of magnitude and more
+    asked = np.array([5e-3 * 0.85, *[5e-4] * 3, *[0.05 * 1.2e-3] * 6])
+    assert (found.interval < 0.2 * asked).all()
+    assert found.body().inertia[0, 1] == found.value[7]
+
+
+def test_motions_that_tell_too_little_are_refused():
+    joystick = with_com((0.0, 0.0, 0.02))
+    control = levitation(joystick)
+    period, coils = control.period, control.coils
+    still = fly(joystick, np.zeros((500, 6)))
+    with pytest.raises(InputError, match="does not tell"):  # noise of hovering tells nothing
+        identify_flotor(still.place, still.quaternion, still.currents, period, coils)
+    with pytest.raises(InputError, match="does not tell"):
+        identify_flotor(
+            np.tile([0.0, 0.0, -0.12], (500, 1)), np.tile([1.0, 0, 0, 0], (500, 1)),
+            still.currents, period, coils,
+        )  # fmt: skip
+    with pytest.raises(InputError, match="at least"):
+        identify_flotor(still.place[:50], still.quaternion[:50], still.currents[:50], period, coils)
+    spoilt = still.place.copy()
+    spoilt[7] = np.nan
+    with pytest.raises(InputError, match="must be numbers"):
+        identify_flotor(spoilt, still.quaternion, still.currents, period, coils)

@@ -1,0 +1,92 @@
+"""The simulated operator: he sees late, stays within his strength, and is the same every time."""
+
+import numpy as np
+import pytest
+
+from hydrotele.machine.joystick import load_joystick
+from hydrotele.scenario.teleoperation import TeleopPilot
+from hydrotele.teleop.axis_table import NOMINAL, REACH
+from hydrotele.teleop.master import master
+from hydrotele.teleop.muscles import pull
+from hydrotele.teleop.person import Person
+
+STICK, PERIOD, TICKS = load_joystick(), 0.005, 400
+CARRIED = 9.81 * STICK.hand.mass
+STEER = {"kind": "steer", "time": [0.0], "points": {"z": [1.0]}}
+FOLLOW = {"kind": "follow", "time": [0.0, 0.5, 1.0], "path": {"z": [0.0, 0.004, 0.002]}}
+
+
+class Views:
+    """What there is to see: arrays that a test writes."""
+
+    def __init__(self):
+        self.touching = np.zeros(TICKS, bool)
+        self.values = {"handle": np.zeros((TICKS, 6)), "hand": np.zeros((TICKS, 6)),
+                       "measured": np.zeros((TICKS, 2, 5))}  # fmt: skip
+
+    def master(self, name):
+        return self.values[name]
+
+    slave = master
+
+
+def person(operator, seed=1, views=None, **changed):
+    pilot = TeleopPilot.model_validate({"kind": "teleop", "operator": operator, **changed})
+    numbers = master(STICK, pilot, ("r", "theta", "z", "attitude"))[0]
+    return Person(pilot, STICK, numbers, views or Views(), TICKS, PERIOD, seed), numbers
+
+
+@pytest.mark.parametrize("mode", ["rate", "position"])
+def test_he_acts_on_what_he_saw_a_reaction_time_ago(mode):
+    """The tip jumps at tick 200; his hand knows after 0.25 s and at the next decision."""
+    wanted = []
+    for jump in (0.0, 0.5):
+        views = Views()
+        views.values["measured"][:, 0, 2] = 0.6
+        views.values["measured"][200:, 0, 2] += jump
+        him, _ = person(STEER, views=views, mode=mode)
+        wanted.append([])
+        for tick in range(0, TICKS, him.every):
+            him.decide(tick)
+            wanted[-1].append(him.muscles.wanted[2])
+    same = np.equal(*wanted)
+    first = np.flatnonzero(~same)[0] * him.every
+    assert 250 <= first <= 250 + him.every
+
+
+def test_his_hand_stays_within_the_way_of_the_handle():
+    views = Views()
+    views.values["measured"][:, 0, 2] = -50.0
+    him, numbers = person(STEER, views=views, mode="position", perception={"skill": 50.0})
+    for tick in range(0, TICKS, him.every):
+        him.decide(tick)
+        assert abs(him.muscles.wanted[2]) <= numbers.axis[2, REACH]
+
+
+def test_he_follows_a_path():
+    him, _ = person(FOLLOW)
+    for tick, place in ((0, 0.0), (52, 0.00208), (100, 0.004), (200, 0.002), (300, 0.002)):
+        him.decide(tick)
+        assert him.muscles.wanted[2] == pytest.approx(place)
+
+
+def test_muscles_hold_a_spring_and_do_not_exceed_their_strength():
+    """What the spring asks for plus tremor, five times its 0.05 N; never more than the largest."""
+    him, numbers = person(FOLLOW)
+    him.muscles.wanted[2] = 0.004
+    handle = np.array([0.0, 0, 0.004, 0, 0, 0])
+    for tick in range(60):
+        him.past[:] = handle
+        pull(him.muscles, him.past, him.tremor, handle, tick, PERIOD)
+    spring = numbers.axis[2, NOMINAL] + STICK.hand.stiffness
+    assert him.muscles.force[2] - CARRIED == pytest.approx(spring * 0.004, abs=0.25)
+    him.muscles.wanted[:] = 100.0
+    for tick in range(400):
+        pull(him.muscles, him.past, him.tremor, handle, tick, PERIOD)
+    assert np.all(np.abs(him.muscles.force - him.muscles.weight) <= him.muscles.most + 1e-12)
+
+
+def test_same_seed_same_person():
+    one, two, other = (person(STEER, seed)[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.tremor, two.tremor)
+    assert not np.array_equal(one.tremor, other.tremor)

@@ -1,0 +1,334 @@
+"""Teleoperated runs: every reflection in both modes, energy, faults, lost packets, bad input."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from hydrotele.cli.running import run_to_folder
+from hydrotele.core.errors import InputError
+from hydrotele.logs.log import load_log, save_log
+from hydrotele.machine.joystick import load_joystick
+from hydrotele.run.replay import replay_log
+from hydrotele.run.run import begin, run_scenario
+from hydrotele.scenario.scenario import Scenario
+from hydrotele.teleop.axis_table import COUPLING, COUPLING_DAMPING, DAMPING, REFLECTED_MOST
+from hydrotele.teleop.master import master
+
+PERIOD = 0.005
+REFLECTIONS = (
+    "none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance"
+)  # fmt: skip
+PLATE = {"kind": "plate", "position": [6.0, -0.11, 0.3], "size": [0.8, 0.9]}
+DOWN = {"kind": "follow", "time": [0.0, 0.3, 0.6, 4.0], "path": {"z": [0, 0, -0.0025, -0.0025]}}
+SPEEDS = {"r": 0.3, "theta": 0.1, "z": 0.3, "attitude": 0.3}
+
+
+def scenario(duration=4.0, plate=None, z=0.40, sensors="ideal", **pilot) -> Scenario:
+    """The bucket above a plate; the hand goes down if it is not told otherwise."""
+    scales = {"r": 100.0, "theta": 20.0, "z": 100.0, "attitude": 5.0}
+    return Scenario.model_validate({
+        "name": "station", "machine": "cat215", "tool": "bucket", "duration": duration,
+        "sensors": sensors, "surroundings": [PLATE | plate] if plate is not None else [],
+        "start": {"pose": {"r": 6.0, "z": z, "attitude": -1.745}},
+        "pilot": {
+            "kind": "teleop", "force": "true", "mount": "table", "operator": DOWN,
+            "coordinates": {
+                name: {"speed": SPEEDS[name], "scale": scales[name]} for name in SPEEDS
+            },
+        } | pilot,
+    })  # fmt: skip
+
+
+def numbers_of(run):
+    return master(load_joystick(), run.scenario.pilot, run.station.coordinates)[0]
+
+
+def check_sound(run, speeds=SPEEDS):
+    """Finite, no trip, and task references that keep to speed and acceleration."""
+    log = run.station.log
+    assert np.isfinite(run.plan.reference).all() and not run.station.tripped
+    pose, rate = log.slave("pose"), log.slave("rate")
+    for c, name in enumerate(run.station.coordinates):
+        assert np.abs(np.diff(pose[:, c])).max() <= speeds[name] * PERIOD + 1e-9
+        assert np.abs(np.diff(rate[:, c])).max() <= 1.0 * PERIOD + 1e-9
+    for values in run.measured.columns.values():
+        assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1])
+@pytest.mark.parametrize("mode", ["rate", "position"])
+@pytest.mark.parametrize("reflection", REFLECTIONS)
+def test_every_structure_goes_down_and_presses(reflection, mode, delay):
+    """From free motion into the plate: it touches, and nothing leaves its bounds."""
+    channel = {"delay_forward": delay, "delay_back": delay}
+    run = run_scenario(scenario(
+        3.0, plate={}, z=0.36, reflection=reflection, mode=mode, channel=channel, force="dynamic"
+    ))  # fmt: skip
+    check_sound(run)
+    assert run.summary["largest_contact_force_N"] > 1e3
+    for key in ("handle_energy_J", "handle_least_energy_J"):
+        assert np.isfinite(run.summary["teleoperation"][key])
+
+
+def test_direct_force_is_ratio_times_force():
+    """The coils push ratio times the force at the tip, less spring and damper of the handle."""
+    run = run_scenario(scenario(plate={}, reflection="direct_force", ratio=1e-4))
+    log, row = run.station.log, numbers_of(run).axis[2]
+    counted = np.clip(log.force[:, 2], -row[REFLECTED_MOST], row[REFLECTED_MOST])
+    wanted = 1e-4 * counted - row[0] * log.master("handle")[:, 2]
+    wanted -= row[DAMPING] * log.master("speed")[:, 2]
+    np.testing.assert_allclose(log.master("push")[:, 2], wanted, atol=1e-9)
+    assert log.force[-100:, 2].mean() > 1e3  # the environment pushes up
+
+
+def test_coordinating_force_is_the_coupling_times_what_the_machine_lags():
+    run = run_scenario(scenario(plate={}, reflection="coordinating_force"))
+    log, row = run.station.log, numbers_of(run).axis[2]
+    start = log.slave("pose")[0, 2]
+    pose, seen = log.slave("pose")[:, 2] - start, log.slave("measured")[:, :, 2]
+    behind, slower = pose - (seen[:, 0] - start), log.slave("rate")[:, 2] - seen[:, 1]
+    wanted = -row[COUPLING] * behind - row[COUPLING_DAMPING] * slower
+    wanted -= row[0] * log.master("handle")[:, 2] + row[DAMPING] * log.master("speed")[:, 2]
+    np.testing.assert_allclose(log.master("push")[:, 2], wanted, atol=1e-9)
+    assert -(row[COUPLING] * behind)[-1] > 0.0  # reference below the machine: the hand is lifted
+
+
+def test_four_channels_under_position_control_are_transparent_at_rest():
+    """Hand = ratio x force, place = scale x handle, in the mean over 1.5 s in contact.
+
+    10 %: the machine still swings on the plate by 10 % of its force. 10 mm of 300 mm: two steps of
+    the handle's tremor of 50 um, times 100.
+    """
+    hand = {"kind": "follow", "time": [0.0, 0.5, 3.5, 9.0], "path": {"z": [0, 0, -0.003, -0.003]}}
+    run = run_scenario(scenario(
+        9.0, plate={"stiffness": 1e5, "damping": 3e4}, z=0.5, reflection="four_channel",
+        mode="position", ratio=2e-5, operator=hand,
+    ))  # fmt: skip
+    log, late = run.station.log, slice(-300, None)
+    force = log.force[late, 2].mean()
+    assert force > 5e3
+    assert log.master("hand")[late, 2].mean() == pytest.approx(-2e-5 * force, rel=0.1)
+    pose = log.slave("pose")[:, 2]
+    place = (pose[late] - pose[0]).mean()
+    assert place == pytest.approx(100.0 * log.master("handle")[late, 2].mean(), abs=0.01)
+
+
+def test_four_channels_under_rate_control_leave_a_constant_force_unfelt():
+    """Some 14 kN would be 3 N by the ratio; the hand rests at the centre and feels nothing.
+
+    0.1 N is the mean of its tremor, and of what the force still swings.
+    """
+    hand = {"kind": "follow", "time": [0.0, 0.5, 3.5, 4.5, 9.0],
+            "path": {"z": [0, 0, -0.0012, 0, 0]}}  # fmt: skip
+    run = run_scenario(scenario(
+        9.0, plate={}, z=0.5, reflection="four_channel", operator=hand
+    ))  # fmt: skip
+    log, late = run.station.log, slice(-300, None)
+    assert log.force[late, 2].mean() > 1e4
+    assert abs(log.master("hand")[late, 2].mean()) < 0.1
+
+
+@pytest.mark.parametrize(("sensors", "near"), [("ideal", 0.05), ("khoshzaban1992", 0.3)])
+def test_impedance_finds_the_plates_stiffness(sensors, near):
+    """The task at the tip is the plate's spring behind a firm contact.
+
+    5 %: contact and lever of the bucket; 30 %: noise of angles hides some of a way of 30 mm.
+    """
+    hand = {"kind": "follow", "time": [0.0, 2.0, 4.0, 6.0, 8.0],
+            "path": {"z": [-0.0013, -0.0016, -0.0013, -0.0016, -0.0013]}}  # fmt: skip
+    asked = scenario(
+        8.0, plate={}, z=0.42, sensors=sensors, reflection="impedance", mode="position",
+        ratio=2e-6, operator=hand, force="dynamic",
+    )  # fmt: skip
+    run = run_scenario(asked.model_copy(update={
+        "servo": asked.servo.model_copy(update={"position_gain": 8.0, "deadband_compensation": 0.8})
+    }))  # fmt: skip
+    row = numbers_of(run).axis[2]
+    felt = run.station.log.master("stiffness")[-1, 2] - row[0]
+    assert felt == pytest.approx(2e-6 * 100.0 * 1.0e6, rel=near)
+
+
+def worked(duration, **pilot):
+    """The energy that the hand truly gave the handle, and what the observer says, by tick [J].
+
+    Of MuJoCo: muscles, the hand's spring and damper and its own mass, times the handle's velocity.
+    """
+    session = begin(scenario(duration, **pilot))
+    flotor, joystick = session.station._flotor, load_joystick()
+    hand, data = joystick.hand, flotor.data
+    true, told, before = [0.0], [0.0], np.zeros(3)
+    while session.tick < session.scenario.ticks:
+        place = data.qpos[:3].copy()
+        session.advance()
+        speed = (data.qpos[:3] - place) / PERIOD
+        force = session.station.person.muscles.force[:3] - hand.stiffness * place
+        force -= hand.damping * speed + hand.mass * (speed - before) / PERIOD
+        force[2] -= 9.81 * hand.mass
+        true.append(true[-1] + PERIOD * float(force @ speed))
+        told.append(float(session.station._m.energy[0]))
+        before = speed
+    return np.array(true[:-1]), np.array(told[1:]), session.station  # read before it moves on
+
+
+@pytest.mark.parametrize("reflection", ["none", "stiffness", "direct_force"])
+def test_energy_at_the_handle_is_the_hands_work(reflection):
+    """Within a tenth of the largest: speeds are differences over 5 ms."""
+    true, told, station = worked(4.0, plate={}, reflection=reflection, z=0.36)
+    assert told[-1] == station.summary()["handle_energy_J"]
+    assert told.min() >= station.summary()["handle_least_energy_J"]
+    assert np.abs(told - true).max() < 0.1 * np.abs(true).max()
+    if reflection == "none":
+        assert told.min() > -1e-5  # a spring and a damper are passive
+
+
+def test_a_joystick_that_shakes_the_hand_is_seen_as_active():
+    """Direct force of a bouncing machine: energy comes out, as much as MuJoCo says.
+
+    25 %: it bounces against its stops within a few periods, and turns, which counts, too.
+    """
+    hand = {"kind": "follow", "time": [0, 0.5, 1, 2, 2.5, 4],
+            "path": {"y": [0, 0, 0.004, 0.004, -0.004, -0.004],
+                     "z": [0, 0, -0.0025, -0.0025, 0, 0]}}  # fmt: skip
+    true, told, _ = worked(4.0, plate={}, reflection="direct_force", z=0.36, operator=hand)
+    assert true[-1] < -0.05 and told[-1] == pytest.approx(true[-1], rel=0.25)
+
+
+@pytest.mark.parametrize("force", ["dynamic", "true"])
+@pytest.mark.parametrize("channel", ["angle.boom", "pressure_head.boom", "pressure_rod.stick"])
+def test_frozen_sensor_closes_the_valves(channel, force):
+    """Within `safety.frozen`, a tenth of a second between looks, and a sample."""
+    run = run_scenario(scenario(
+        3.0, sensors="khoshzaban1992", force=force, faults=[{"channel": channel, "at": 1.0}], z=1.4,
+        operator={"kind": "follow", "time": [0, 3], "path": {"z": [0.003, 0.003]}},
+    ))  # fmt: skip
+    assert run.station.tripped
+    commands = np.column_stack([run.measured[f"command.{a}"] for a in run.plant.axes])
+    moving = np.flatnonzero(np.any(commands != 0.0, axis=1))
+    assert run.measured.time[moving[-1]] < 1.0 + 0.5 + 0.1 + 0.05
+    assert any("closed for good" in note for note in run.summary["notes"])
+
+
+def test_frozen_ideal_angle_trips_by_its_following_error():
+    run = run_scenario(scenario(
+        5.0, faults=[{"channel": "angle.boom", "at": 0.5}], z=1.4,
+        safety={"following_error": 0.1},
+        operator={"kind": "follow", "time": [0, 5], "path": {"z": [0.0045, 0.0045]}},
+    ))  # fmt: skip
+    assert any("boom does not follow" in note for note in run.summary["notes"])
+
+
+@pytest.mark.parametrize("mode", ["rate", "position"])
+def test_a_dead_line_stops_the_machine_softly(mode):
+    """All packets lost from 1 s on: references stand after the silence and the braking."""
+    run = run_scenario(scenario(
+        3.0, z=1.4, mode=mode, channel={"lost": 1.0, "lost_from": 1.0}, reflection="stiffness",
+        operator={"kind": "follow", "time": [0, 3], "path": {"z": [0.003, 0.003]}},
+    ))  # fmt: skip
+    check_sound(run)
+    rate = run.station.log.slave("rate")[:, 2]
+    stopped = round((1.0 + 0.15 + SPEEDS["z"] / 1.0) / PERIOD) + 2
+    assert np.all(rate[stopped:] == 0.0)
+    assert any("no packet came" in note for note in run.summary["notes"])
+
+
+def test_half_of_the_packets_do_as_well():
+    """A held packet now and then is no jump; the tip comes 2 cm near where it comes with all."""
+    hand = {"kind": "follow", "time": [0, 3], "path": {"z": [0.003, 0.003]}}
+    whole, half = (
+        run_scenario(scenario(3.0, z=1.4, operator=hand, channel={"lost": lost}))
+        for lost in (0.0, 0.5)
+    )
+    check_sound(half)
+    ends = [run.station.log.slave("pose")[-1, 2] for run in (whole, half)]
+    assert ends[0] == pytest.approx(ends[1], abs=0.02)
+
+
+def test_steered_out_of_reach_it_stands_at_the_edge():
+    hand = {"kind": "follow", "time": [0, 4.5, 5, 8], "path": {"x": [0.005, 0.005, -0.004, -0.004]}}
+    asked = scenario(8.0, operator=hand, reflection="none")
+    data = asked.model_dump(mode="json")
+    data["start"] = {"pose": {"r": 7.4, "z": 1.4, "attitude": -1.2}}
+    run = run_scenario(Scenario.model_validate(data))
+    assert any("edge of the workspace" in note for note in run.summary["notes"])
+    assert not run.station.tripped
+    pose = run.station.log.slave("pose")[:, 0]
+    assert np.abs(np.diff(pose)).max() < SPEEDS["r"] * PERIOD + 1e-9
+    assert pose[-1] < pose.max() - 0.2
+
+
+def test_channels_survive_a_file(tmp_path):
+    """Names, units and values of what the station measured come back."""
+    run = run_scenario(scenario(1.0))
+    save_log(run.measured, tmp_path / "log.parquet")
+    back = load_log(tmp_path / "log.parquet")
+    new = [c for c in run.measured.columns if c.startswith(("handle", "hand_", "coil", "tip_"))]
+    assert len(new) >= 6 * 5 + 3 * 4
+    for name in new:
+        assert back.units[name] == run.measured.units[name]
+        np.testing.assert_allclose(back[name], run.measured[name], rtol=1e-9, atol=1e-12)
+
+
+def test_replay_works_in_the_open_and_refuses_what_stands_around():
+    free = run_scenario(scenario(1.0, z=1.4))
+    replayed = replay_log(free.measured, free.plant.machine)
+    assert replayed.channels["angle.boom"].rms < 1e-3
+    beside = run_scenario(scenario(1.0, plate={}))
+    for log in (beside.measured, beside.truth):
+        with pytest.raises(InputError, match="beside a plate"):
+            replay_log(log, beside.plant.machine)
+
+
+BAD = {
+    "reflection": ({"reflection": "haptic"}, "pilot.*reflection.*'stiffness'"),
+    "mode": ({"mode": "speed"}, "pilot.*mode"),
+    "coordinate": ({"coordinates": {"height": {}}}, "pilot.*coordinates.*height"),
+    "lost": ({"channel": {"lost": 1.5}}, "lost"),
+    "delay": ({"channel": {"delay_back": -0.1}}, "delay_back"),
+    "long delay": ({"channel": {"delay_back": 2.0}}, "delay_back: 2 s is as long as the run"),
+    "joystick": ({"joystick": "mine.yaml"}, "joystick 'mine.yaml'"),
+    "gains": ({"gains": "digger"}, "pilot.gains.*excavator"),
+    "bandwidth": ({"bandwidth_hz": 6.0}, "bandwidth"),
+    "nan": ({"ratio": float("nan")}, "ratio"),
+    "stiffness": ({"stiffness": {"z": {"least": 5e3}}}, "pilot.stiffness.z.*ordered"),
+    "arm button": ({"buttons": [{"at": 0, "axis": "boom", "command": 1}]}, "boom is moved by"),
+    "button": ({"buttons": [{"at": 0, "axis": "saw", "command": 1}]}, "'saw' is no axis"),
+    "fault": ({"faults": [{"channel": "angle.saw", "at": 1}]}, "axes are swing"),
+    "fault kind": ({"faults": [{"channel": "speed.boom", "at": 1}]}, "kinds are angle"),
+    "time": ({"operator": DOWN | {"time": [0, 2, 1, 3]}}, "time must start at 0 and rise"),
+    "path": ({"operator": DOWN | {"path": {"z": [0.0]}}}, "path.z has 1 values"),
+    "steer": (
+        {"operator": {"kind": "steer", "time": [0, 1], "points": {"z": [1.0]}}},
+        "points.z has 1 values",
+    ),
+    "head": (
+        {"operator": {"kind": "steer", "time": [0], "points": {"head": [1.0]}}},
+        "points.head.*the arm has r, theta, z, attitude",
+    ),
+    "target": (
+        {"operator": {"kind": "regulate", "target": {"time": [0, 2, 1], "force": [1, 1, 1]}}},
+        "time must start at 0 and rise",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_scenarios_are_refused_by_key_and_write_nothing(name, tmp_path):
+    """Key and allowed values are named (`main` ends with code 2 then), and there is no folder."""
+    changed, said = BAD[name]
+    data = json.loads(scenario(1.0).model_dump_json())
+    data["pilot"] |= changed
+    data.pop("folder")
+    (tmp_path / "bad.yaml").write_text(json.dumps(data).replace("NaN", ".nan"))
+    out = tmp_path / "out"
+    with pytest.raises(InputError) as error:
+        run_to_folder(str(tmp_path / "bad.yaml"), out, {}, False, True)
+    assert re.search(said, str(error.value)) and not out.exists()
+
+
+def test_a_machine_without_an_arm_has_no_station():
+    data = scenario(1.0).model_dump(mode="json")
+    data |= {"machine": "emps", "tool": None, "start": {}}
+    with pytest.raises(InputError, match="has no arm"):
+        run_scenario(Scenario.model_validate(data))
