@@ -17,7 +17,7 @@ from eha_runs import LOADS, differences, load_run
 from hydrotele.effects.effect import changed
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
-from hydrotele.logs.load import load_dataset
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 

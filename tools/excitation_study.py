@@ -23,11 +23,11 @@ from hydrotele.identify.excitation import (
     informative_base,
 )
 from hydrotele.identify.identification import identify
-from hydrotele.identify.parameter_rows import parameter_rows
 from hydrotele.identify.record import force_noise, records
+from hydrotele.identify.result import parameter_rows
 from hydrotele.identify.setup import machine_setup
+from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
-from hydrotele.logs.load import make_dataset
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario

@@ -23,8 +23,8 @@ from hydrotele.identify.record import records
 from hydrotele.identify.setup import machine_setup
 from hydrotele.kinematics.arm import forward_cartesian, inverse
 from hydrotele.kinematics.from_machine import arm_geometry
+from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
-from hydrotele.logs.load import make_dataset
 from hydrotele.machine.drives import Axis, ForceDrive, Friction
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine, save_machine

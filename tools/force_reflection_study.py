@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from study import options, publish
 
-from hydrotele.cli.analysing_scenario import analyse_scenario
+from hydrotele.cli.analysing import analyse_scenario
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 
@@ -189,7 +189,7 @@ def held_table(found: list) -> list[str]:
 
 def draw(bare: list, path: Path) -> None:
     """Limits, predicted and simulated; contact forces of both structures."""
-    from hydrotele.show.report_figure import drawing, png
+    from hydrotele.show.report_html import drawing, png
 
     with drawing(3.2) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.6))

@@ -21,10 +21,10 @@ import numpy as np
 
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, hypotheses
-from hydrotele.gap.pruning import ENTER
 from hydrotele.gap.residuals import LIMITS, residual_tests
+from hydrotele.gap.rivals import ENTER
 from hydrotele.gap.screening import screen
-from hydrotele.logs.load import load_dataset
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.machine.machine_file import load_machine
 from tools.blind.run_trial import ROOT
 from tools.blind.trials import Place, Series, begin_series, load_series, write_json

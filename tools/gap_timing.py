@@ -11,7 +11,7 @@ import dataclasses
 from pathlib import Path
 
 from hydrotele.gap.find import find_gap
-from hydrotele.logs.load import Dataset, RunData, load_dataset
+from hydrotele.logs.dataset import Dataset, RunData, load_dataset
 from hydrotele.machine.machine_file import load_machine
 
 LENGTHS = (10.0, 20.0, 40.0)  # s

@@ -20,8 +20,8 @@ from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identification import identify
 from hydrotele.identify.record import records
 from hydrotele.identify.setup import Setup, machine_setup
+from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
-from hydrotele.logs.load import make_dataset
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario

@@ -20,8 +20,8 @@ from hydrotele.identify.identification import identify
 from hydrotele.identify.record import Record, records
 from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import machine_setup
+from hydrotele.logs.dataset import load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
-from hydrotele.logs.load import load_dataset, make_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario

@@ -24,8 +24,8 @@ from hydrotele.identify.regressor import regressor
 from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.kinematics.arm import inverse
 from hydrotele.kinematics.from_machine import arm_geometry
+from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
-from hydrotele.logs.load import make_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario

@@ -16,7 +16,7 @@ import yaml
 
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
-from hydrotele.logs.load import load_dataset
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.machine.machine_file import load_machine
 
 NAMES = {

@@ -17,7 +17,7 @@ import numpy as np
 
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.equations import build_equations, stacked
-from hydrotele.identify.estimators import estimate
+from hydrotele.identify.estimation import estimate
 from hydrotele.identify.identifiability import identifiability
 from hydrotele.identify.motion import Processing, resolution
 from hydrotele.identify.projection import project
@@ -25,8 +25,8 @@ from hydrotele.identify.record import Record, records
 from hydrotele.identify.reference_size import reference_sizes
 from hydrotele.identify.regressor import regressor
 from hydrotele.identify.setup import Setup, machine_setup
+from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
-from hydrotele.logs.load import make_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import Run, run_scenario

@@ -27,7 +27,7 @@ from hydrotele.estimate.free_run import (
 )
 from hydrotele.gap.customary import customary
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.logs.load import Dataset, RunData, load_dataset
+from hydrotele.logs.dataset import Dataset, RunData, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE
 from hydrotele.machine.signals import usual_unit

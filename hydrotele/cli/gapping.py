@@ -14,11 +14,10 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.customary import said
-from hydrotele.gap.gap_json import finite, gap_document
+from hydrotele.gap.description import effect_title, headline, verdict_words
 from hydrotele.gap.patched import has_patch, write_patch
-from hydrotele.gap.result import Gap
-from hydrotele.gap.words import effect_title, headline, verdict_words
-from hydrotele.logs.load import Dataset, load_dataset
+from hydrotele.gap.result import Gap, finite, gap_document
+from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.simulate.native import stop_profiling_clock
 
 _COLOURS = {

@@ -14,16 +14,15 @@ from hydrotele.core.output import check_target, whole_folder
 from hydrotele.identify.chain import Chain, load_chain
 from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.estimation import Estimator
-from hydrotele.identify.friction_shape import identify_with_shapes
 from hydrotele.identify.hydraulic import Hydraulics, identify_hydraulics
+from hydrotele.identify.identification import identify_with_shapes
 from hydrotele.identify.identified_machine import identified_machine
 from hydrotele.identify.identify_json import identify_document
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.parameter_rows import MEANING, counts, parameter_rows
 from hydrotele.identify.record import records
-from hydrotele.identify.result import Identification
+from hydrotele.identify.result import MEANING, Identification, counts, parameter_rows
 from hydrotele.identify.setup import Model, cylinder_bars, machine_setup
-from hydrotele.logs.load import Dataset, load_dataset
+from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
 from hydrotele.simulate.native import stop_profiling_clock

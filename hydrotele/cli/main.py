@@ -1,4 +1,13 @@
-"""Command line: one thin function per command. Heavy imports stay inside the functions."""
+"""Command line: one thin function per command. Heavy imports stay inside the functions.
+
+Options that several commands share.
+
+What `hydrotele compare` takes on the command line.
+
+What `hydrotele drive` takes on the command line.
+
+What `hydrotele sweep` takes on the command line.
+"""
 
 import os
 import signal
@@ -8,9 +17,209 @@ from typing import Annotated
 
 import typer
 
-from hydrotele.cli import compare_command, drive_command, sweep_command
-from hydrotele.cli.options import EffectFiles
 from hydrotele.core.errors import InputError
+
+
+def _load(files: list[Path] | None) -> list[Path] | None:
+    """Load the files before anything looks for an effect or a law."""
+    if files:
+        from hydrotele.effects import load_effects
+
+        for file in files:
+            load_effects(file)
+    return files
+
+
+EffectFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--effects",
+        metavar="FILE.py",
+        callback=_load,
+        help="Python file with effects or laws of your own, which is run; may be repeated.",
+    ),
+]
+
+
+COMPARE_EPILOG = """\b
+Examples:  hydrotele compare cat215 gap_site_a --data measured/site_a
+           hydrotele compare ec20 --data long.parquet --baseline table --baseline mlp --out compared
+           hydrotele compare cat215 --data logs --heldout run_7 --horizons 2,20 --json
+
+\b
+Every model is started at many rows of a run that it was not fitted to, from its estimate of the
+state there, runs freely on the commands, and is compared with the readings on its way. Beside that
+stands its error from one row to the next. Horizons longer than a run are left out.
+
+\b
+Black boxes, fitted on the other runs (--baseline, may be repeated):
+  table   delay and static table from command to speed, per axis
+  arx     linear model of readings and past commands
+  mlp     neural network of the same; needs pip install 'hydrotele[baselines]'
+"""
+
+
+def compare(
+    machine: Annotated[
+        list[str],
+        typer.Argument(
+            help="Shipped machines, folders with machine.yaml, folders of gap or identify."
+        ),
+    ],
+    data: Annotated[
+        list[Path], typer.Option("--data", "-d", help="Folder of logs, log file or run folder.")
+    ],
+    tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machines.")] = None,
+    heldout: Annotated[
+        str | None, typer.Option(help="Run to judge on, not fitted; default test*, or the last.")
+    ] = None,
+    sensors: Annotated[str | None, typer.Option(help="Sensors of the machines.")] = None,
+    horizons: Annotated[
+        str, typer.Option(help="Seconds of the free runs; the run's end always counts.")
+    ] = "1,5,10,30",
+    baseline: Annotated[
+        list[str] | None, typer.Option("--baseline", help="Black box: table, arx or mlp.")
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="Judge on the fitted runs, too.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for compare.json and a picture.")
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Accept logs that name another machine or tool.")
+    ] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
+    ] = False,
+) -> None:
+    """Compare models by free runs on measured commands: RMS errors per channel and horizon."""
+    from hydrotele.cli.comparing import compare_models
+    from hydrotele.cli.words import numbers_of
+
+    compare_models(
+        machine, data, tool, heldout, sensors, numbers_of("--horizons", horizons), baseline or [],
+        every, out, json, force,
+    )  # fmt: skip
+
+
+DRIVE_EPILOG = """\b
+Examples:  hydrotele drive   |   hydrotele drive fell_tree --device gamepad
+           hydrotele drive --device scripted:moves.csv --no-viewer --speed 0
+
+\b
+Keyboard: every press moves an axis on by a quarter of its way, where it stays; space centres all.
+  Up, Down: out, in        Left, Right: swing      Page Up, Page Down: raise, lower
+  End, Home: curl in, out  Insert, Delete: head    7, 6 and 9, 8: further axes (grab, saw) up, down
+  F10, closing the window or Ctrl-C: end and write the logs
+
+\b
+Gamepad: left stick out/in and swing, right stick raise/lower and tool, shoulders head, cross pad
+further axes, B all off, Start ends. SpaceMouse: push the way the tip shall go; its buttons switch
+the first two further axes, both together all off.
+"""
+
+
+def drive(
+    scenario: Annotated[
+        str | None, typer.Argument(help="Teleoperated scenario; default the machine's own.")
+    ] = None,
+    machine: Annotated[
+        str | None, typer.Option("--machine", "-m", help="Machine; default cat215.")
+    ] = None,
+    tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")] = None,
+    device: Annotated[
+        str, typer.Option("--device", "-d", help="keyboard, gamepad, spacemouse or scripted:FILE.")
+    ] = "keyboard",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write; default runs/SCENARIO.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Override key=value; may be repeated.")
+    ] = None,
+    viewer: Annotated[bool, typer.Option(help="Open MuJoCo's viewer.")] = True,
+    duration: Annotated[
+        float | None, typer.Option(help="Longest drive in seconds; default 600.")
+    ] = None,
+    speed: Annotated[
+        float, typer.Option(help="Simulated per real time; 0: as fast as it goes.")
+    ] = 1.0,
+    review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
+    effects: EffectFiles = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
+    ] = False,
+) -> None:
+    """Drive a machine yourself, in real time; write a folder as run does."""
+    from hydrotele.cli.driving import Wishes, drive_to_folder
+    from hydrotele.cli.words import chosen, overrides_of
+
+    drive_to_folder(
+        Wishes(
+            scenario,
+            overrides_of(set_ or []) | chosen(machine, tool),
+            device,
+            out,
+            viewer,
+            duration,
+            speed,
+            review,
+            json,
+        )  # fmt: skip
+    )
+
+
+SWEEP_EPILOG = """\b
+Examples:  hydrotele sweep servo_gains   |   hydrotele sweep my_sweep.yaml --jobs 8 --out runs/a
+           hydrotele sweep my_sweep.yaml --dask tcp://10.0.0.5:8786
+
+\b
+A sweep file:
+  scenario: zhu_up                                  # shipped, or a file beside this one
+  set: {effects: [{name: payload, location: tool, parameters: {mass: 0}}]}
+  grid: {servo.position_gain: [3, 4, 5]}            # keys of run --set; every combination
+  sample:                                           # each of them with every sample
+    count: 20
+    seed: 1
+    keys: {effects.0.parameters.mass: {uniform: [0, 1500]}}   # log_uniform, normal, choice
+  repeat: 2                                         # with the scenario's seed counted up
+  figures: [tracking.tip_z.rms, largest_pin_opening_mm]       # to draw; default: some
+  logs: false                                       # keep every run's folder
+
+\b
+Stopped by Ctrl-C or killed: the same command goes on with the missing runs. Exit status 0 also
+where some runs failed (they are listed, and stand in the table with their reason); 3 where all did.
+"""
+
+
+def sweep(
+    file: Annotated[str, typer.Argument(help="Sweep file (.yaml), or a shipped sweep.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write; default runs/NAME.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", "-j", min=1, help="Processes; default one per core.")
+    ] = None,
+    dask: Annotated[
+        str | None, typer.Option(help="Scheduler of a dask cluster (address or scheduler file).")
+    ] = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Throw away what an earlier sweep left in the folder.")
+    ] = False,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Do failed runs again.")
+    ] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Exit with status 3 where any run failed.")
+    ] = False,
+    effects: EffectFiles = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
+    ] = False,
+) -> None:
+    """Do many runs of a scenario, varied by a grid or random samples, into one table."""
+    from hydrotele.cli.sweeping import Wishes, sweep_to_folder
+
+    sweep_to_folder(file, out, Wishes(jobs, dask, fresh, retry_failed, strict, json))
+
 
 app = typer.Typer(
     name="hydrotele",
@@ -72,9 +281,9 @@ def run(
     run_to_folder(scenario, out, overrides_of(set_ or []) | chosen(machine, tool), review, json)
 
 
-app.command(epilog=drive_command.EPILOG)(drive_command.drive)
-app.command(epilog=sweep_command.EPILOG)(sweep_command.sweep)
-app.command(epilog=compare_command.EPILOG)(compare_command.compare)
+app.command(epilog=DRIVE_EPILOG)(drive)
+app.command(epilog=SWEEP_EPILOG)(sweep)
+app.command(epilog=COMPARE_EPILOG)(compare)
 
 
 @app.command(
@@ -262,7 +471,7 @@ def analyse_teleop(
     json: Json = False,
 ) -> None:
     """Two-port of a teleoperator: what is felt, passivity, stability with delay, margins."""
-    from hydrotele.cli.analysing_scenario import analyse_any_to_folder
+    from hydrotele.cli.analysing import analyse_any_to_folder
     from hydrotele.cli.words import overrides_of
 
     pairs = overrides_of(set_ or [])

@@ -50,20 +50,20 @@ def review_logs(
 
 def _show(recording: Path, serve: bool, port: int, screenshot: Path | None, quiet: bool) -> None:
     if screenshot:
-        from hydrotele.show.screenshot import take_screenshot
+        from hydrotele.show.viewer import take_screenshot
 
         notes.print("taking a screenshot ...", style="dim")
         take_screenshot(recording, screenshot)
         out.print(f"written to [bold]{screenshot}[/]")
     elif serve:
-        from hydrotele.show.serve import serve_recording
+        from hydrotele.show.viewer import serve_recording
 
         tell = "open {} in a browser on this machine; Ctrl-C stops serving"
         serve_recording(recording, port, lambda url: out.print(tell.format(url), soft_wrap=True))
     elif quiet:
         out.print(f"written to [bold]{recording}[/]")
     else:
-        from hydrotele.show.serve import open_viewer
+        from hydrotele.show.viewer import open_viewer
 
         if open_viewer(recording):
             message = "no viewer could be opened here; try --serve or --screenshot PNG"

@@ -6,10 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.arm_tables import arm_joints, arm_tables, free_axes, gravity_size
 from hydrotele.control.recursive import RecursiveLeastSquares
 from hydrotele.control.state_filter import LOW, RATE, filter_table, filtered
-from hydrotele.control.tip_balance import dynamic_balance, static_torque
+from hydrotele.control.tip_balance import (
+    arm_joints,
+    arm_tables,
+    dynamic_balance,
+    free_axes,
+    gravity_size,
+    static_torque,
+)
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage

@@ -6,8 +6,15 @@ a part of its way, where it stays until the space bar centres everything.
 
 from collections import deque
 
-from hydrotele.devices.reading import Reading, Switches
-from hydrotele.devices.tables import CENTRE_KEY, KEYS, NUDGE, QUIT_KEY, SWITCH_KEYS
+from hydrotele.devices.reading import (
+    CENTRE_KEY,
+    KEYS,
+    NUDGE,
+    QUIT_KEY,
+    SWITCH_KEYS,
+    Reading,
+    Switches,
+)
 from hydrotele.machine.joystick import AXES
 
 

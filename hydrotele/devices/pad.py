@@ -4,8 +4,7 @@ import os
 from typing import Any
 
 from hydrotele.core.errors import InputError
-from hydrotele.devices.reading import Reading, Switches, outside
-from hydrotele.devices.tables import LAYOUTS, SPACEMOUSE_NAMES, Layout
+from hydrotele.devices.reading import LAYOUTS, SPACEMOUSE_NAMES, Layout, Reading, Switches, outside
 from hydrotele.machine.joystick import AXES
 
 

@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import compiled, lean
-from hydrotele.dynamics.bars import move_bars, place_bars
-from hydrotele.dynamics.closures import close_chains, drift_chains
+from hydrotele.dynamics.closures import close_chains, drift_chains, move_bars, place_bars
 from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.linear import factorise, solve
 from hydrotele.dynamics.mechanism import BAR, CLOSED, DAMPING, JOINT

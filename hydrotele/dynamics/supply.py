@@ -3,7 +3,7 @@
 from hydrotele.core.compiled import lean
 from hydrotele.dynamics.model import COMMAND, GIVEN, V, X
 from hydrotele.hydraulics.circuit import circuit_supply, delivered_share, open_ports
-from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state
+from hydrotele.hydraulics.drive import add_to_commands, drive_state
 from hydrotele.hydraulics.laws import pressure_with_air, pressure_without_air
 from hydrotele.hydraulics.slots import SLOTS, Slot
 from hydrotele.terms.law import Drives

@@ -14,7 +14,7 @@ import numpy as np
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.free_run import Prepare, Runner
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.signals import parse_channel
 
 AHEAD = 0.1  # s over which a rate is learned: a difference of two rows would be noise

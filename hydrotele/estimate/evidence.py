@@ -23,7 +23,7 @@ from hydrotele.estimate.track import (
     known_levels,
     track_run,
 )
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that

@@ -18,7 +18,7 @@ from hydrotele.dynamics.integrate import advance, read_channels
 from hydrotele.dynamics.model import Model, model_space, reduced_model
 from hydrotele.dynamics.transducers import follow_trail
 from hydrotele.estimate.track import DRIFT_TIME, STEP, Levels, fine_enough, track_run
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import parse_channel
 

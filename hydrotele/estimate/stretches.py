@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from hydrotele.logs.averaging import averaged
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.rows import Rows
 
 _RATE, _PER_CYCLE = 100.0, 6.0  # Hz; rows per cycle of the fastest valve

@@ -2,6 +2,10 @@
 
 A balance is computed from smoothed signals, without any simulation of the machine; its noise is
 what the sensors' noise, and what smoothing takes from the signals, would make of it.
+
+A log's signals for the balances: on one clock, smoothed, and once more with other noise.
+
+How much later a signal comes than another, window by window.
 """
 
 from collections.abc import Iterator, Mapping
@@ -10,24 +14,246 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from hydrotele.dynamics.integrate import arriving
 from hydrotele.dynamics.mechanism import JOINT
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.gap.balance_laws import chamber_residuals, load_forces, pump_lacks, supply_pressures
-from hydrotele.gap.balance_signals import (
-    Signals,
-    joint_motion,
-    read_signals,
-    spool_positions,
-)
-from hydrotele.gap.balance_timing import window_lags
+from hydrotele.hydraulics.laws import spool_step
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
 from hydrotele.hydraulics.pump import load_force, load_pressure_step
 from hydrotele.hydraulics.slots import PUMP
+from hydrotele.identify import smoothing
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.kinematics.triangle import LoopOpen
+from hydrotele.logs.clock import fit_clock
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import usual_unit
+from hydrotele.machine.noise import noise_rms, sensor_set
+from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.signals import parse_channel, usual_unit
+
+DRAWS = 16  # a standard deviation from 16 draws, averaged over a second, is known to some 5 %
+_LEAST_READINGS = 10  # readings that a channel needs
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Signals of one run; the first of the d sets is the measured one, the others have more noise.
+
+    Attributes:
+        time: (n,) uniform clock [s].
+        period: time between samples [s].
+        command: axis -> (n,) valve command or drive input held from row to row [1], [V] or [N].
+        reading: channel -> (n,) readings corrected by the machine's sensor errors, NaN where
+            missing [channel's unit].
+        noise: channel -> standard deviation of one reading [channel's unit].
+        smoothed: channel -> (d, 3, n) value, rate and acceleration.
+    """
+
+    time: np.ndarray
+    period: float
+    command: Mapping[str, np.ndarray]
+    reading: Mapping[str, np.ndarray]
+    noise: Mapping[str, float]
+    smoothed: Mapping[str, np.ndarray]
+
+    def has(self, *channels: str) -> bool:
+        """Whether all these channels were measured."""
+        return all(channel in self.smoothed for channel in channels)
+
+
+def read_signals(
+    machine: Machine, log: Log, sensors: str | None, noise: Mapping[str, float] | None = None
+) -> Signals:
+    """Signals of a log.
+
+    Args:
+        machine: the machine, whose sensor errors are taken out of the readings.
+        log: the run; rows may be missing.
+        sensors: name of the machine's sensors; None to find the noise from the data.
+        noise: channel -> standard deviation of one reading, in place of the sensors'.
+
+    Returns:
+        The signals of all channels that have enough samples.
+
+    Raises:
+        InputError: the time stamps follow no clock, or the machine has no such sensors.
+    """
+    clock, _ = fit_clock(log.time, log.source)
+    rows = int(clock.tick[-1]) + 1
+    time = clock.start + clock.period * np.arange(rows)
+    stated = None if sensors is None else sensor_set(machine, sensors)
+    command, reading, found, smoothed = {}, {}, {}, {}
+    told = noise or {}
+    for k, (name, values) in enumerate(log.columns.items()):
+        channel = parse_channel(name)
+        if channel.truth or (channel.axis and channel.axis not in machine.axes):
+            continue
+        on_clock = np.full(rows, np.nan)
+        on_clock[clock.tick] = values[clock.row]
+        if channel.kind == "command":
+            command[channel.axis] = on_clock[_last_known(on_clock)]
+        if channel.kind not in ("angle", "position", "length") and "pressure" not in channel.kind:
+            continue
+        error = machine.sensor_errors.get(name, SensorError())
+        on_clock = _corrected(on_clock, error, clock.period)
+        known = on_clock[np.isfinite(on_clock)]
+        sigma = told.get(name) or noise_rms(machine, stated, name)
+        sigma = sigma / error.scale or None
+        if len(known) < _LEAST_READINGS or (sigma is None and np.ptp(known) == 0.0):
+            continue
+        motion = smoothing.smooth(on_clock[:, None], clock.period, sigma)
+        best = np.stack([motion.value, motion.rate, motion.acceleration])[None, :, :, 0]
+        draws = smoothing.error_draws(motion, DRAWS, k)[..., 0]
+        reading[name], found[name] = on_clock, float(motion.noise[0])
+        smoothed[name] = np.concatenate([best, best + draws])
+    return Signals(time, clock.period, command, reading, found, smoothed)
+
+
+def joint_motion(machine: Machine, signals: Signals, axis: str) -> np.ndarray | None:
+    """Motion of an axis' joint from its own sensor or else from its cylinder's length.
+
+    Args:
+        machine: the machine.
+        signals: of a run.
+        axis: name.
+
+    Returns:
+        (d, 3, n) position [rad] or [m], rate and acceleration; None where nothing tells it.
+    """
+    own = f"{machine.position_kind(axis)}.{axis}"
+    if signals.has(own):
+        return signals.smoothed[own]
+    cylinder = machine.axes[axis].cylinder
+    if cylinder is None or not signals.has(f"length.{axis}"):
+        return None
+    linkage = axis_linkage(machine, axis)
+    length, speed, change = np.moveaxis(signals.smoothed[f"length.{axis}"], 1, 0)
+    try:
+        angle = linkage.angle(length + cylinder.closed_length)
+    except LoopOpen:
+        return None
+    lever, step = linkage.rate(angle), 1.0e-5  # rad or m: truncation 1e-10, cancellation 1e-11
+    bend = (linkage.rate(angle + step) - linkage.rate(angle - step)) / (2.0 * step)
+    rate = speed / lever
+    return np.stack([angle, rate, (change - bend * rate**2) / lever], axis=1)
+
+
+def spool_positions(machine: Machine, signals: Signals, axis: str) -> np.ndarray:
+    """Spool of an axis at every row: its equation needs the command only.
+
+    Args:
+        machine: the machine; a command delay is taken into account.
+        signals: of a run that has the command.
+        axis: name.
+
+    Returns:
+        (n,) [1]; at the first row it stands at the first command.
+    """
+    valve, delay = machine.axes[axis].valve, machine.axes[axis].command_delay
+    assert valve is not None
+    command = np.clip(signals.command[axis], -1.0, 1.0)
+    spool = np.empty(len(command))
+    position, rate = float(command[0]), 0.0
+    parts = max(1, round(signals.period / 1.0e-3)) if delay else 1
+    part = signals.period / parts
+    for row in range(len(command)):
+        spool[row] = position
+        for i in range(parts):
+            target = arriving(command, row, i * part, (i + 1) * part, signals.period, delay)
+            position, rate = spool_step(
+                position, rate, target, valve.bandwidth, valve.damping, part,
+                valve.slew_limit or 0.0,
+            )  # fmt: skip
+    return spool
+
+
+def _last_known(values: np.ndarray) -> np.ndarray:
+    """Row of the last known value at or before every row; the first row is known."""
+    return np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+
+
+def _corrected(values: np.ndarray, error: SensorError, period: float) -> np.ndarray:
+    values = (values - error.offset) / error.scale
+    if not error.late:
+        return values
+    # a first-order lag delays motions slower than itself by its time constant
+    rows, lag = np.arange(len(values)), (error.delay + error.time_constant) / period
+    return np.interp(rows + lag, rows, values, right=np.nan)
+
+
+_WINDOW = 8.0  # s: holds several reversals of a machine at work
+_LARGEST = 0.5  # s: lag that is searched
+_LEAST_CORRELATION = 0.5  # correlation below which a window tells nothing
+
+
+def window_lags(
+    expected: np.ndarray, measured: np.ndarray, period: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Lag of a measured behind an expected signal in windows, with its noise.
+
+    The lag is where the cross-correlation of the two, without their means, has its peak, refined by
+    a parabola.
+
+    Args:
+        expected: (d, n) [u]; the first row as found, the others with other noise.
+        measured: (d, n) [u].
+        period: time between samples [s].
+
+    Returns:
+        ((n,) lag, positive if measured comes later, (n,) standard deviation) [s], constant in each
+        window and NaN in windows without a clear peak; None where no window has one.
+    """
+    rows = expected.shape[1]
+    count = max(1, int(rows * period / _WINDOW))
+    edges = np.linspace(0, rows, count + 1).astype(int)
+    lag, noise = np.full(rows, np.nan), np.full(rows, np.nan)
+    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+        lags = np.array(
+            [
+                peak_lag(e[begin:end], m[begin:end], period)
+                for e, m in zip(expected, measured, strict=True)
+            ]
+        )
+        if np.isfinite(lags[0]) and np.isfinite(lags[1:]).sum() > len(lags) // 2:
+            lag[begin:end] = lags[0]
+            noise[begin:end] = np.sqrt(np.nanmean((lags[1:] - lags[0]) ** 2))
+    return (lag, noise) if np.isfinite(lag).any() else None
+
+
+def peak_lag(expected: np.ndarray, measured: np.ndarray, period: float) -> float:
+    """Lag of one signal behind another.
+
+    Args:
+        expected: (n,) [u].
+        measured: (n,) [u].
+        period: time between samples [s].
+
+    Returns:
+        Lag [s], positive if measured comes later; NaN where the two are not alike.
+
+    >>> time = 0.02 * np.arange(400)
+    >>> round(peak_lag(np.sin(time), np.sin(time - 0.05), 0.02), 3)
+    0.05
+    """
+    reach = min(round(_LARGEST / period), len(expected) // 4)
+    if reach < 2:
+        return float("nan")
+    fixed = expected[reach:-reach] - expected[reach:-reach].mean()
+    near = np.lib.stride_tricks.sliding_window_view(measured, len(fixed))  # (2 reach + 1, .)
+    near = near - near.mean(axis=1, keepdims=True)
+    size = np.sqrt((fixed @ fixed) * np.einsum("ij,ij->i", near, near))
+    if not size.min() > 0.0:
+        return float("nan")
+    likeness = near @ fixed / size
+    best = int(likeness.argmax())
+    if likeness[best] < _LEAST_CORRELATION or not 0 < best < len(likeness) - 1:
+        return float("nan")
+    before, top, after = likeness[best - 1 : best + 2]
+    shift = 0.5 * (before - after) / (before - 2.0 * top + after)
+    return float((best + shift - reach) * period)
+
 
 # Hz: below the 2.5 Hz at which an excavator rings on its oil and accelerations drown in the noise
 BAND = 1.5

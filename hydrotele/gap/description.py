@@ -1,16 +1,421 @@
-"""A learned law as numbers to show, and what is left unexplained: which balance, where, when."""
+"""A learned law as numbers to show, and what is left unexplained: which balance, where, when.
 
+The verdict in plain words, as the console, the report and the README say it.
+"""
+
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from hydrotele.effects import EFFECTS
 from hydrotele.estimate.inputs import SUPPLY, Input, input_units
+from hydrotele.gap.customary import amount, said
 from hydrotele.gap.discover import Discovery, Learned
 from hydrotele.gap.law_tables import THROUGH
-from hydrotele.gap.result import Lack, LearnedLaw, Prediction, Unknown
-from hydrotele.gap.words import lack_words, learned_words
+from hydrotele.gap.result import (
+    SURE,
+    Alternative,
+    Candidate,
+    Estimate,
+    Gap,
+    GapSize,
+    Lack,
+    LearnedLaw,
+    NamedEffect,
+    Prediction,
+    Unknown,
+)
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import OF_A_DRIVE
+
+_PLACES = {"tool": "at the tool", "base": "of the base", "all": "of all axes"}
+_SIDES = {"head": "head side", "rod": "rod side"}
+_COUNTS = ("no place", "one place", "two places", "three places", "four places")
+_QUANTITIES = {
+    "command": "command",
+    "angle": "angle",
+    "position": "position",
+    "length": "piston position",
+    "velocity": "velocity",
+    "pressure_head": "head side pressure",
+    "pressure_rod": "rod side pressure",
+    "pressure_supply": "supply pressure",
+}
+_LACKS = {
+    "force": "a force on the {axis} drive",
+    "flow_head": "an oil flow into the {axis} head side",
+    "flow_rod": "an oil flow into the {axis} rod side",
+    "flow_through": "an oil flow from the {axis} head side to its rod side",
+    "command": "a signal added to the {axis} command",
+    "flow_supply": "a flow of the pump",
+}
+_VARIABLES = {
+    "time": "time", "position": "position", "velocity": "velocity", "command": "command",
+    "spool": "spool position", "pump_speed": "pump speed", "force": "load",
+    "pressure_head": "head side pressure", "pressure_rod": "rod side pressure",
+    "pressure_supply": "supply pressure",
+}  # fmt: skip
+_TOLD = 3  # calibrated numbers that the verdict tells
+_SLIGHT = 0.1  # of the noise: a gap below it hardly shows in single predictions
+
+_LAWS = {
+    "force": "the balance of forces",
+    "flow": "the balance of oil flows",
+    "valve": "the flow through the valve",
+    "supply": "the pump and its relief valve",
+    "flow_head": "the balance of oil flows on the head side",
+    "flow_rod": "the balance of oil flows on the rod side",
+    "closure": "the geometry of the linkage",
+    "motion": "how the axis moves",
+    "geometry": "the geometry of the linkage",
+    "timing": "the timing of the signals",
+    "sensor": "what the sensors read",
+}
+
+
+def law_words(law: str) -> str:
+    """What a law is about, in plain words."""
+    return _LAWS.get(law, f"the law `{law}`")
+
+
+def channel_words(channel: str) -> str:
+    """A channel in plain words.
+
+    >>> channel_words("pressure_rod.boom"), channel_words("pressure_supply")
+    ('boom rod side pressure', 'supply pressure')
+    """
+    kind, _, axis = channel.partition(".")
+    return f"{axis} {_QUANTITIES.get(kind, kind.replace('_', ' '))}".strip()
+
+
+def variable_words(variable: str) -> str:
+    """A variable of a learned law in plain words.
+
+    >>> variable_words("pressure_rod.swing")
+    'rod side pressure of the swing'
+    """
+    name, _, axis = variable.partition(".")
+    words = _VARIABLES.get(name, name.replace("_", " "))
+    return f"{words} of the {axis}" if axis else words
+
+
+def learned_words(
+    balance: str, axis: str, variable: str, size: float, unit: str, resembles: str,
+    other: str = "", window: Sequence[float] = (),
+) -> str:  # fmt: skip
+    """What a learned law does, in a sentence or two.
+
+    >>> learned_words("force", "boom", "position", 9e3, "N", "", "velocity.swing")
+    'A force on the boom drive, 9 kN RMS, that varies with position and the velocity of the swing.'
+    """
+    how = f"that varies with the {variable_words(variable)}"
+    if other:
+        how += f" and the {variable_words(other)}"
+    how = how.replace("the position", "position").replace("the time", "time")
+    if window:
+        how += f", from {window[0]:.3g} to {window[1]:.3g} s"
+    text = f"{_capital(_LACKS[balance].format(axis=axis))}, {amount(size, unit)} RMS, {how}."
+    return f"{text} It resembles {resembles.replace('_', ' ')}." if resembles else text
+
+
+def learned_title(law: LearnedLaw) -> str:
+    """On what a learned law acts and on what it depends, in a few words."""
+    what = _LACKS[law.balance].format(axis=law.axis).partition(" ")[2]
+    where = f", at the median {variable_words(law.other)}" if law.other else ""
+    return _capital(f"{what} over {variable_words(law.variable)}{where}")
+
+
+def lack_words(lack: Lack) -> str:
+    """What a model lacks in one balance.
+
+    >>> lack_words(Lack("flow_head", "boom", 2e-4, "m^3/s", 0.05))
+    'The model lacks an oil flow into the boom head side of 12 L/min (standard deviation).'
+    """
+    what = _LACKS[lack.balance].format(axis=lack.axis)
+    return f"The model lacks {what} of {amount(lack.size, lack.unit)} (standard deviation)."
+
+
+def number_title(key: str) -> str:
+    """A calibrated number in plain words.
+
+    >>> number_title("valve_gain.boom.ratio"), number_title("area.boom.area_head")
+    ('valve gain of the boom: ratio', 'area of the boom: head')
+    """
+    kind, place, *rest = key.split(".")
+    where = _PLACES.get(place, f"of the {place.replace('_', ' ')}")
+    what = " ".join(rest).removeprefix(f"{kind}_").replace("_", " ")
+    title = f"{kind.replace('_', ' ')} {where}"
+    return f"{title}: {what}" if what and what != kind.replace("_", " ") else title
+
+
+def most_moved(gap: Gap) -> list[str]:
+    """Keys of the calibrated numbers, those whose interval lies farthest from the given first."""
+
+    def moved(key: str) -> float:
+        e = gap.calibration[key]
+        half = 0.5 * (e.high - e.low)
+        return abs(e.value - e.nominal) / half if half > 0 else 0.0
+
+    return sorted(gap.calibration, key=moved, reverse=True)
+
+
+def effect_title(effect: NamedEffect | Alternative | Candidate) -> str:
+    """Name and place of an effect.
+
+    >>> effect_title(Alternative("pressure_offset", "boom.head", 0.5))
+    'pressure offset of the boom head side'
+    """
+    place = _PLACES.get(effect.location)
+    if place is None:
+        words = effect.location.replace(".", " ").replace("_", " ").replace("/", " ").split()
+        place = "of the " + " ".join(_SIDES.get(word, word) for word in words)
+    return f"{effect.name.replace('_', ' ')} {place}" if effect.location else effect.name
+
+
+def parameter_words(name: str, estimate: Estimate) -> str:
+    """A parameter with its interval and what the model has.
+
+    >>> parameter_words("mass", Estimate(251.2, "kg", 247.9, 254.5, 0.0))
+    'mass 251.2 kg (95 % sure between 247.9 and 254.5 kg; the model has 0 kg)'
+    """
+    s = said(estimate, name)
+    sure = f"95 % sure between {s.low} and {s.high} {s.unit}"
+    if "-" in (s.low, s.high):
+        sure = "no interval can be given"
+    model = "" if s.nominal == "-" else f"; the model has {s.nominal} {s.unit}"
+    return f"{name.replace('_', ' ')} {s.value} {s.unit} ({sure}{model})"
+
+
+def chance_words(probability: float) -> str:
+    """A probability in percent, never rounded to certainty.
+
+    >>> chance_words(0.62), chance_words(0.99999)
+    ('62 %', 'over 99.9 %')
+    """
+    if not math.isfinite(probability):
+        return "not known"
+    if probability > 0.999:
+        return "over 99.9 %"
+    return "under 0.1 %" if probability < 0.001 else f"{100 * probability:.3g} %"
+
+
+def share_words(share: float) -> str:
+    """A share of the gap in percent, `-` where it is not known.
+
+    >>> share_words(0.634), share_words(math.nan)
+    ('63 %', '-')
+    """
+    return f"{100 * share:.0f} %" if math.isfinite(share) else "-"
+
+
+def gap_closed(size: GapSize) -> float:
+    """Part of the gap that the patch closes, at most 1; NaN where none is known above the noise."""
+    if size.noise_floor is None:
+        return math.nan
+    above = size.before - size.noise_floor
+    return min((size.before - size.after) / above, 1.0) if above > 0 else math.nan
+
+
+def headline(gap: Gap) -> str:
+    """The verdict in one line."""
+    if gap.verdict == "no_gap":
+        within = " within the uncertainty of its numbers" if gap.calibration else ""
+        return f"Model and machine agree{within}"
+    if gap.verdict == "partly":
+        return _capital("; ".join([*map(_brief, gap.effects), "the rest has no known cause"]))
+    if gap.verdict == "unknown" or not gap.effects:
+        known = " and ".join(effect_title(effect) for effect in gap.effects)
+        also = f", besides {known}" if known else ""
+        return f"Model and machine disagree in a way that no known effect explains{also}"
+    titles = [effect_title(effect) for effect in gap.effects]
+    if gap.verdict == "ambiguous":
+        unsure = _unsure(gap)
+        rivals = [effect_title(a) for a in unsure.alternatives]
+        titles = [t for t in titles if t != effect_title(unsure)]
+        either = "Either " + " or ".join([effect_title(unsure), *rivals])
+        return ", and ".join([either, *titles])
+    return _capital("; ".join(map(_brief, gap.effects)))
+
+
+def verdict_words(gap: Gap) -> tuple[str, ...]:
+    """The verdict in a few sentences, one text per thought."""
+    if gap.verdict == "no_gap":
+        rest = _calibrated(gap) or ("Nothing in the model needs to change.",)
+        return (_agreement(gap), *rest)
+    if gap.verdict == "unknown":
+        return (
+            *_unknown(gap), *_effects(gap), *_calibrated(gap), *_shrinking(gap), *_experiment(gap)
+        )  # fmt: skip
+    count = len(gap.effects)
+    where = _COUNTS[count] if count < len(_COUNTS) else f"{count} places"
+    first = f"The machine differs from its model in {where}."
+    if gap.verdict == "ambiguous":
+        first = f"{first[:-1]}, but these data do not settle which effect it is."
+    if gap.verdict == "partly":
+        first = f"{first[:-1]} that can be named, and in a way that no known effect explains."
+    rivals = _rivals(gap)
+    rest = (*_calibrated(gap), *_shrinking(gap), *rivals, *_leftover(gap), *_experiment(gap))
+    return (first, *_effects(gap), *rest)
+
+
+def failed_tests(gap: Gap) -> list[str]:
+    """Names of the residual tests that the final model does not pass."""
+    return [name for name, test in gap.tests.items() if not test.get("passed", True)]
+
+
+def _unsure(gap: Gap) -> NamedEffect:
+    """The effect with alternatives, or the least sure one."""
+    with_rivals = [effect for effect in gap.effects if effect.alternatives]
+    return min(with_rivals or gap.effects, key=lambda effect: effect.probability)
+
+
+def _brief(effect: NamedEffect) -> str:
+    numbers = [(name, said(e, name)) for name, e in effect.parameters.items()]
+    facts = ", ".join(f"{name.replace('_', ' ')} {s.value} {s.unit}" for name, s in numbers)
+    return f"{effect_title(effect)}: {facts}" if facts else effect_title(effect)
+
+
+def _effects(gap: Gap) -> tuple[str, ...]:
+    return tuple(_effect(effect, _run(gap)) for effect in gap.effects)
+
+
+def _effect(effect: NamedEffect, run: str) -> str:
+    facts = ", ".join(parameter_words(n, e) for n, e in effect.parameters.items())
+    known = EFFECTS.get(effect.name)
+    what = f"{effect_title(effect)} ({known.sentence})" if known else effect_title(effect)
+    text = _capital(f"{what}: {facts}. Probability {chance_words(effect.probability)}.")
+    if math.isfinite(effect.share):
+        text += f" Without it {share_words(effect.share)} of the gap on {run} comes back."
+    return text
+
+
+def _calibrated(gap: Gap) -> tuple[str, ...]:
+    if not gap.calibration:
+        return ()
+    told = [
+        f"{number_title(key)} {s.value} {s.unit} (model {s.nominal})"
+        for key in most_moved(gap)[:_TOLD]
+        for s in [said(gap.calibration[key], key.rpartition(".")[2])]
+    ]
+    count = len(gap.calibration)
+    many = f"{count} uncertain numbers were" if count > 1 else "One uncertain number was"
+    most = f"most moved: {', '.join(told)}"
+    return (f"{many} calibrated within what the machine file allows; {most}.",)
+
+
+def _agreement(gap: Gap) -> str:
+    size = gap.size
+    if gap.calibration:
+        return (
+            "There is no gap but for numbers that are known to a few per cent only. With these"
+            f" calibrated, the model's predictions on {_run(gap)}, which was not fitted, are off by"
+            f" {_times(size.after, size)} instead of {size.before:.2f}."
+        )
+    return (
+        f"There is no gap: on {_run(gap)}, which was not fitted, the model's predictions are off"
+        f" by {_times(size.before, size)}."
+    )
+
+
+def _shrinking(gap: Gap) -> tuple[str, ...]:
+    size, closed = gap.size, gap_closed(gap.size)
+    parts = len(gap.effects) + len(gap.learned) + bool(gap.calibration)
+    if not parts:
+        return ()
+    text = (
+        f"With {'it' if parts == 1 else 'all of this'} in the model, the prediction errors on"
+        f" {_run(gap)}, which was not fitted, go from {size.before:.2f} to"
+        f" {_times(size.after, size)}"
+    )
+    if size.noise_floor is None:
+        return (f"{text}.",)
+    if size.before - size.noise_floor < _SLIGHT:
+        return (f"{text}. The effect is weak: it hardly shows in this run.",)
+    return (f"{text}: {100 * max(closed, 0.0):.0f} % of the gap is closed.",)
+
+
+def _times(value: float, size: GapSize) -> str:
+    if size.noise_floor is None:
+        return f"{value:.2f} times the sensors' noise"
+    return (
+        f"{value:.2f} times what the sensors alone explain (a perfect model has"
+        f" {size.noise_floor:.2f})"
+    )
+
+
+def _rivals(gap: Gap) -> tuple[str, ...]:
+    texts = []
+    for effect in gap.effects:
+        form = bool(effect.other_forms) and effect.mechanism_probability >= SURE
+        rivals = effect.other_forms if form else effect.alternatives
+        if not rivals or (effect.probability >= SURE if form else gap.verdict == "named"):
+            continue
+        told = [f"{effect_title(a)} ({chance_words(a.probability)})" for a in rivals]
+        others = f"{effect_title(effect)} from {_listed(told, 'or')}"
+        if form:
+            text = f"Its form is open: these data do not tell {others}."
+        else:
+            text = (
+                f"These data cannot tell {others}: they would look the same to the sensors there"
+                " are."
+            )
+        texts.append(f"{text} The patched model has the first of them.")
+    return tuple(texts)
+
+
+def _leftover(gap: Gap) -> tuple[str, ...]:
+    failed = failed_tests(gap)
+    located = _located(gap) if gap.unknown else ()
+    if not failed:
+        return located
+    tests = "test" if len(failed) == 1 else "tests"
+    left = f"Not everything is explained: what is left fails the {tests} {_listed(failed, 'and')}."
+    return (left, *located)
+
+
+def _unknown(gap: Gap) -> tuple[str, ...]:
+    size = gap.size
+    first = (
+        "Model and machine disagree, and no effect that this program knows explains it: on"
+        f" {_run(gap)} the predictions are off by {_times(size.before, size)}."
+    )
+    return (first, *_located(gap))
+
+
+def _located(gap: Gap) -> tuple[str, ...]:
+    """Where the unexplained part sits, and which laws were learned of it."""
+    unknown = gap.unknown
+    if unknown is None:
+        return ()
+    where = (
+        f"What fails is {law_words(unknown.law)}, seen most in the {channel_words(unknown.channel)}"
+    )
+    if unknown.depends_on:
+        on = _listed([channel_words(name) for name in unknown.depends_on], "and")
+        where += f"; it changes with the {on}"
+    count = len(gap.learned)
+    many = "One law was" if count == 1 else f"{count} laws were"
+    learned = f"{many} learned from the data for it and written into the patched machine."
+    return (f"{where}.", unknown.description, *([learned] if gap.learned else []))
+
+
+def _experiment(gap: Gap) -> tuple[str, ...]:
+    reason = (gap.next_experiment or {}).get("reason")
+    return (f"Next experiment: {reason}",) if reason else ()
+
+
+def _run(gap: Gap) -> str:
+    return f"run {gap.before[0].run}" if gap.before else "the held-out run"
+
+
+def _listed(words: list[str], joint: str) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
 
 _POINTS = 41  # at which a learned law is shown
 _WINDOW = 1.0  # s, of the windows in which a lack shows

@@ -17,13 +17,11 @@ from hydrotele.estimate.stretches import busiest, thinned
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.belief import believed, believed_part, left_over
-from hydrotele.gap.constancy import constancy
+from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, discover
 from hydrotele.gap.experiment import next_experiment
-from hydrotele.gap.floor import perfect_tracks
-from hydrotele.gap.free_calibration import calibrate_freely
-from hydrotele.gap.residuals import residual_tests, rms
+from hydrotele.gap.residuals import constancy, perfect_tracks, residual_tests, rms
 from hydrotele.gap.result import (
     SURE,
     Alternative,
@@ -39,7 +37,7 @@ from hydrotele.gap.result import (
 )
 from hydrotele.gap.rivals import chances
 from hydrotele.gap.search import Found, lacking, search
-from hydrotele.logs.load import Dataset
+from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import parse_channel
 

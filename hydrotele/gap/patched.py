@@ -5,9 +5,8 @@ from pathlib import Path
 import yaml
 
 from hydrotele.gap.customary import said
-from hydrotele.gap.gap_json import effect_document, finite, gap_document
-from hydrotele.gap.result import Estimate, Gap
-from hydrotele.gap.words import effect_title, learned_title, number_title
+from hydrotele.gap.description import effect_title, learned_title, number_title
+from hydrotele.gap.result import Estimate, Gap, effect_document, finite, gap_document
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
 
 EFFECTS_FILE = "effects.yaml"

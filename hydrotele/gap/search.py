@@ -26,20 +26,22 @@ from hydrotele.gap.calibrating import (
     promoted,
     uncalibrated,
 )
-from hydrotele.gap.pruning import (
+from hydrotele.gap.rivals import (
     ENTER,
     TOLD,
+    Rival,
+    better,
+    find_rivals,
     idle,
+    is_case_of,
     moved_last,
+    plain_form,
     pruned,
     told,
     without_needless,
     worth_naming,
 )
-from hydrotele.gap.pulses import timed
-from hydrotele.gap.rattling import rattling, shaken
-from hydrotele.gap.rivals import Rival, better, find_rivals, is_case_of, plain_form
-from hydrotele.gap.screening import Screened, screen
+from hydrotele.gap.screening import Screened, rattling, screen, shaken, timed
 from hydrotele.gap.settling import fitted, loss_of, polished, settle, strained, widened
 from hydrotele.gap.without_inputs import WithoutInputs, without_inputs
 

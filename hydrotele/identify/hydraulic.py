@@ -20,7 +20,7 @@ from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.intervals import spreads
 from hydrotele.estimate.stretches import busiest
 from hydrotele.estimate.track import Levels, known_levels, track_run
-from hydrotele.logs.load import Dataset
+from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
 
 HYDRAULIC = (

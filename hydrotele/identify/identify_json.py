@@ -4,8 +4,7 @@ from typing import Any
 
 from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.hydraulic import Hydraulics
-from hydrotele.identify.parameter_rows import WEAK, counts, parameter_rows
-from hydrotele.identify.result import Identification
+from hydrotele.identify.result import WEAK, Identification, counts, parameter_rows
 
 
 def identify_document(

@@ -3,26 +3,319 @@
 All rows of a log at once, compiled. Loops are closed by Newton's method from the row before; rates
 and accelerations follow from the closures' Jacobian; forces of passive joints are carried to the
 drives by virtual work.
+
+Vectors of three and rotations as tuples of numbers, which compiled code keeps off the heap.
+
+Least squares of a few columns without memory of its own, for row after row of a log.
+
+Motion of a joint tree: frames, joint velocities of points, closures, wrenches of bodies.
 """
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from hydrotele.core.compiled import compiled, lean
 from hydrotele.core.errors import InputError
 from hydrotele.identify.chain import Chain
-from hydrotele.identify.small_least_squares import factor, least
-from hydrotele.identify.space import dot, less, vector
-from hydrotele.identify.tree_motion import (
-    gaps,
-    move_tree,
-    new_frames,
-    parting,
-    point_column,
-    wrenches,
-)
+
+
+@lean
+def vector(rows, k):
+    """Row k of (n, 3) rows as a tuple (x, y, z)."""
+    return rows[k, 0], rows[k, 1], rows[k, 2]
+
+
+@lean
+def put(rows, k, a):
+    """Write a tuple (x, y, z) into row k of (n, 3) rows."""
+    rows[k, 0], rows[k, 1], rows[k, 2] = a
+
+
+@lean
+def add(a, b):
+    """Sum of two vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@lean
+def less(a, b):
+    """Difference of two vectors."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@lean
+def times(s, a):
+    """A vector times a number."""
+    return s * a[0], s * a[1], s * a[2]
+
+
+@lean
+def dot(a, b):
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@lean
+def cross(a, b):
+    """Vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@lean
+def swept(w, dw, arm):
+    """Acceleration `dw x r + w x (w x r)` of a point at an arm r of a turning body."""
+    return add(cross(dw, arm), cross(w, cross(w, arm)))
+
+
+@lean
+def rotation(rows, k):
+    """Matrix k of (n, 3, 3) as three row vectors."""
+    m = rows[k]
+    return (
+        (m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2])
+    )  # fmt: skip
+
+
+@lean
+def put_rotation(rows, k, r):
+    """Write three row vectors into matrix k of (n, 3, 3)."""
+    m = rows[k]
+    m[0, 0], m[0, 1], m[0, 2] = r[0]
+    m[1, 0], m[1, 1], m[1, 2] = r[1]
+    m[2, 0], m[2, 1], m[2, 2] = r[2]
+
+
+@lean
+def turned(r, a):
+    """A vector turned by a rotation."""
+    return dot(r[0], a), dot(r[1], a), dot(r[2], a)
+
+
+@lean
+def turned_back(r, a):
+    """A vector turned by the inverse of a rotation."""
+    return add(add(times(a[0], r[0]), times(a[1], r[1])), times(a[2], r[2]))
+
+
+@lean
+def after(r, s):
+    """The rotation that first does s, then r."""
+    return turned_back(s, r[0]), turned_back(s, r[1]), turned_back(s, r[2])
+
+
+@lean
+def about(axis, angle):
+    """Rotation about a unit axis by an angle [rad] (Rodrigues)."""
+    c, s = math.cos(angle), math.sin(angle)
+    x, y, z = axis
+    d = 1.0 - c
+    return (
+        (c + x * x * d, x * y * d - z * s, x * z * d + y * s),
+        (y * x * d + z * s, c + y * y * d, y * z * d - x * s),
+        (z * x * d - y * s, z * y * d + x * s, c + z * z * d),
+    )
+
+
+_STIFF = 1e-7  # least ratio of a column's own part to the largest column; below, rank is lacking
+
+
+@lean
+def factor(matrix, columns, q, r):
+    """QR of chosen columns by modified Gram-Schmidt, twice; False if they lack rank."""
+    rows, count, size = len(matrix), len(columns), 0.0
+    for j in range(count):
+        total = 0.0
+        for m in range(rows):
+            q[m, j] = matrix[m, columns[j]]
+            total += q[m, j] ** 2
+        size = max(size, math.sqrt(total))
+    for j in range(count):
+        for i in range(j):
+            r[i, j] = 0.0
+        for _ in range(2):
+            for i in range(j):
+                along = 0.0
+                for m in range(rows):
+                    along += q[m, i] * q[m, j]
+                r[i, j] += along
+                for m in range(rows):
+                    q[m, j] -= along * q[m, i]
+        total = 0.0
+        for m in range(rows):
+            total += q[m, j] ** 2
+        r[j, j] = math.sqrt(total)
+        if not r[j, j] > _STIFF * size:
+            return False
+        for m in range(rows):
+            q[m, j] /= r[j, j]
+    return True
+
+
+@lean
+def least(q, r, count, right, column, answer, k):
+    """Least squares after `_factor`, of one column of the right side into one of the answer."""
+    for j in range(count - 1, -1, -1):
+        total = 0.0
+        for m in range(len(right)):
+            total += q[m, j] * right[m, column]
+        for i in range(j + 1, count):
+            total -= r[j, i] * answer[i, k]
+        answer[j, k] = total / r[j, j]
+
+
+_PAIRS = np.array([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)])
+
+
+class Frames(NamedTuple):
+    """Where bodies are and how they move, all in the world; b bodies, v joints.
+
+    Attributes:
+        place: (b, 3) origins.
+        turn: (b, 3, 3) orientations.
+        spin: (b, 3) angular velocities.
+        spin_rate: (b, 3) their rates.
+        pull: (b, 3) accelerations of the origins.
+        axis: (v, 3) joint axes.
+        anchor: (v, 3) points on them.
+    """
+
+    place: np.ndarray
+    turn: np.ndarray
+    spin: np.ndarray
+    spin_rate: np.ndarray
+    pull: np.ndarray
+    axis: np.ndarray
+    anchor: np.ndarray
+
+
+@compiled
+def new_frames(tree):
+    """Room for the frames of a tree."""
+    b, v = len(tree.parent), len(tree.zero)
+    return Frames(
+        np.empty((b, 3)), np.empty((b, 3, 3)), np.empty((b, 3)), np.empty((b, 3)),
+        np.empty((b, 3)), np.empty((v, 3)), np.empty((v, 3)),
+    )  # fmt: skip
+
+
+@lean
+def move_tree(tree, q, rate, acceleration, ground, frames):
+    """Place and move all bodies, from (v,) positions, rates, accelerations; ground: (3,)."""
+    put(frames.place, 0, (0.0, 0.0, 0.0))
+    put(frames.spin, 0, (0.0, 0.0, 0.0))
+    put(frames.spin_rate, 0, (0.0, 0.0, 0.0))
+    put(frames.pull, 0, (ground[0], ground[1], ground[2]))
+    put_rotation(frames.turn, 0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    for b in range(1, len(tree.parent)):
+        up = tree.parent[b]
+        t, w, dw = rotation(frames.turn, up), vector(frames.spin, up), vector(frames.spin_rate, up)
+        arm = turned(t, vector(tree.offset, b))
+        p = add(vector(frames.place, up), arm)
+        a = add(vector(frames.pull, up), swept(w, dw, arm))
+        t = after(t, rotation(tree.turn, b))
+        for j in range(tree.first[b], tree.first[b + 1]):
+            own, center = vector(tree.axis, j), vector(tree.anchor, j)
+            way, arm = turned(t, own), turned(t, center)
+            put(frames.axis, j, way)
+            put(frames.anchor, j, add(p, arm))
+            step, turning = q[j] - tree.zero[j], cross(w, way)
+            if tree.slides[j]:
+                arm = times(step, way)
+                a = add(a, swept(w, dw, arm))
+                a = add(a, add(times(2.0 * rate[j], turning), times(acceleration[j], way)))
+                p = add(p, arm)
+                continue
+            a = add(a, swept(w, dw, arm))
+            dw = add(dw, add(times(acceleration[j], way), times(rate[j], turning)))
+            w = add(w, times(rate[j], way))
+            t = after(t, about(own, step))
+            back = times(-1.0, turned(t, center))
+            a = add(a, swept(w, dw, back))
+            p = add(add(p, arm), back)
+        put(frames.place, b, p)
+        put_rotation(frames.turn, b, t)
+        put(frames.spin, b, w)
+        put(frames.spin_rate, b, dw)
+        put(frames.pull, b, a)
+
+
+@lean
+def point_column(tree, frames, j, point):
+    """Velocity of a point per unit rate of a joint that moves it."""
+    way = vector(frames.axis, j)
+    return way if tree.slides[j] else cross(way, less(point, vector(frames.anchor, j)))
+
+
+@lean
+def gaps(tree, frames, gap, slope):
+    """How far closures gape (3 c, 1), and its slopes (3 c, v)."""
+    slope[:, :] = 0.0
+    gap[:, 0] = 0.0
+    for c in range(len(tree.ends)):
+        for side in range(2):
+            body, sign = tree.ends[c, side], 1.0 - 2.0 * side
+            arm = turned(rotation(frames.turn, body), vector(tree.points[c], side))
+            point = add(vector(frames.place, body), arm)
+            for k in range(3):
+                gap[3 * c + k, 0] += sign * point[k]
+            for j in range(len(frames.axis)):
+                if tree.above[body, j]:
+                    column = point_column(tree, frames, j, point)
+                    for k in range(3):
+                        slope[3 * c + k, j] += sign * column[k]
+
+
+@lean
+def parting(tree, frames, out):
+    """Acceleration (3 c, 1) with which closures part."""
+    out[:, 0] = 0.0
+    for c in range(len(tree.ends)):
+        for side in range(2):
+            body, sign = tree.ends[c, side], 1.0 - 2.0 * side
+            arm = turned(rotation(frames.turn, body), vector(tree.points[c], side))
+            w, dw = vector(frames.spin, body), vector(frames.spin_rate, body)
+            part = add(vector(frames.pull, body), swept(w, dw, arm))
+            for k in range(3):
+                out[3 * c + k, 0] += sign * part[k]
+
+
+@lean
+def wrenches(frames, body, forces, torques):
+    """Force and torque (3, 10) at a body's origin per unit of an inertial parameter, in the world.
+
+    `f = m a + alpha x s + w x (w x s)` and `n = I alpha + w x I w + s x a` with s = m c.
+    """
+    t, a = rotation(frames.turn, body), vector(frames.pull, body)
+    w, dw = vector(frames.spin, body), vector(frames.spin_rate, body)
+    for k in range(3):
+        forces[k, 0], torques[k, 0] = a[k], 0.0
+        way = (t[0][k], t[1][k], t[2][k])
+        f, n = swept(w, dw, way), cross(way, a)
+        for m in range(3):
+            forces[m, 1 + k], torques[m, 1 + k] = f[m], n[m]
+    v, dv = turned_back(t, w), turned_back(t, dw)
+    for p in range(6):
+        i, j = _PAIRS[p, 0], _PAIRS[p, 1]
+        x, y, z = 0.0, 0.0, 0.0  # I w, with a unit at (i, j) and (j, i)
+        dx, dy, dz = 0.0, 0.0, 0.0
+        if i == 0:
+            x, dx = v[j], dv[j]
+        elif i == 1:
+            y, dy = v[j], dv[j]
+        else:
+            z, dz = v[j], dv[j]
+        if i != j:
+            if j == 1:
+                y, dy = v[i], dv[i]
+            else:
+                z, dz = v[i], dv[i]
+        n = turned(t, add((dx, dy, dz), cross(v, (x, y, z))))
+        for m in range(3):
+            forces[m, 4 + p], torques[m, 4 + p] = 0.0, n[m]
+
 
 _CLOSED = 1e-11  # m, gap of a loop that counts as closed: rounding at a machine's size
 _ROUNDS = 50

@@ -9,7 +9,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import DriveLinkage, axis_linkage
 from hydrotele.kinematics.triangle import LoopOpen
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorError

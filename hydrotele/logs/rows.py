@@ -1,18 +1,196 @@
 """The rows of one run, from one file or several, on one uniform clock; cut where rows lack long.
 
 A file says with its column `valid` which rows may not be used, such as those in contact.
+
+The offset between the clocks of two files of one run, from the commands that both logged.
+
+Stretches of runs that may not be used: contact, maintenance, whatever the model leaves out.
 """
 
+import csv
+import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.signal import correlate
 
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_text
 from hydrotele.logs.clock import Clock, fit_clock
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log
-from hydrotele.logs.mask import Masked, unmasked
-from hydrotele.logs.offset import clock_offset
+
+_LEAST_OVERLAP = 5.0  # [s] that both must have in common
+_ALIKE = 0.95  # correlation of commands that are the same signal, sampled twice
+_EQUAL = 1.0e-6  # relative: commands that went through single precision are still the same numbers
+_SAME = 0.99  # fraction of the rows that must be equal for the same rows in two files
+
+
+def clock_offset(
+    clock: Clock, command: np.ndarray, other: Clock, other_command: np.ndarray
+) -> float | None:
+    """What must be added to the times of the other file [s].
+
+    The coarse offset is where the two command histories correlate best. If the files then hold the
+    same rows, their stamps give it exactly; else it is where the commands, joined by straight
+    lines, differ least.
+
+    Args:
+        clock: (n rows) the clock that counts.
+        command: (n, k) commands of its rows.
+        other: (m rows) the clock to be set.
+        other_command: (m, k) the same commands in the other file.
+
+    Returns:
+        The offset [s], None where the commands do not tell (constant, or not the same signal).
+    """
+    step = min(clock.period, other.period)
+    a, b = _held(clock, command, step), _held(other, other_command, step)
+    least = round(_LEAST_OVERLAP / step)
+    if min(len(a), len(b)) < least or not np.ptp(a, axis=0).any():
+        return None
+    alike, lags = _correlation(a - a.mean(axis=0), b - a.mean(axis=0), least)
+    best = alike.max()
+    if not best >= _ALIKE:
+        return None
+    near = np.flatnonzero(alike > best - 1.0e-6)
+    stated = (other.start - clock.start) / step  # of several equal offsets the smallest counts
+    lag = int(lags[near[np.argmin(np.abs(lags[near] - stated))]])
+    coarse = clock.start + lag * step - other.start
+    exact = _same_rows(clock, command, other, other_command, coarse)
+    return exact if exact is not None else _refined(clock, command, other, other_command, coarse)
+
+
+def _held(clock: Clock, values: np.ndarray, step: float) -> np.ndarray:
+    """Values (n, k) on a uniform clock, each held until the next one."""
+    time = clock.tick * clock.period
+    at = np.arange(round(time[-1] / step) + 1) * step
+    return values[np.searchsorted(time, at + 1e-6 * step, side="right") - 1]
+
+
+def _correlation(a: np.ndarray, b: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation of a[i + lag] and b[i] over their overlap, by lag; 0 for too short overlaps."""
+    columns = range(a.shape[1])
+    ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
+    product = sum(correlate(a[:, k], b[:, k], method="fft") for k in columns)
+    power_a = sum(correlate(a[:, k] ** 2, ones_b, method="fft") for k in columns)
+    power_b = sum(correlate(ones_a, b[:, k] ** 2, method="fft") for k in columns)
+    overlap = np.rint(correlate(ones_a, ones_b, method="fft"))
+    lags = np.arange(-(len(b) - 1), len(a))
+    enough = overlap >= max(least, 0.5 * min(len(a), len(b)))
+    power = np.sqrt(np.maximum(power_a * power_b, 0.0))
+    enough &= power > 1e-6 * power.max()
+    return np.where(enough, product / np.where(enough, power, 1.0), 0.0), lags
+
+
+def _same_rows(clock: Clock, command, other: Clock, other_command, coarse: float) -> float | None:
+    if abs(clock.period / other.period - 1.0) > 1e-3:
+        return None
+    size = np.abs(command).max()
+    first = round((other.start + coarse - clock.start) / clock.period)
+    for shift in (first, first - 1, first + 1):
+        _, mine, theirs = np.intersect1d(clock.tick, other.tick + shift, return_indices=True)
+        if not len(mine):
+            continue
+        equal = np.abs(command[mine] - other_command[theirs]).max(axis=1) <= _EQUAL * size
+        if equal.mean() >= _SAME and np.ptp(command[mine], axis=0).any():
+            own = clock.start + clock.tick[mine] * clock.period
+            return float(np.median(own - (other.start + other.tick[theirs] * other.period)))
+    return None
+
+
+def _refined(clock: Clock, command, other: Clock, other_command, coarse: float) -> float:
+    own = clock.start + clock.tick * clock.period
+    time = other.start + other.tick * other.period
+
+    def difference(offset: float) -> float:
+        inside = (own >= time[0] + offset) & (own <= time[-1] + offset)
+        return sum(
+            float(np.mean((np.interp(own[inside], time + offset, theirs) - mine[inside]) ** 2))
+            for mine, theirs in zip(command.T, other_command.T, strict=True)
+        )
+
+    width = 2.0 * max(clock.period, other.period)
+    found = minimize_scalar(difference, bounds=(coarse - width, coarse + width), method="bounded",
+                            options={"xatol": 1e-3 * clock.period})  # fmt: skip
+    return float(found.x)  # type: ignore[union-attr]
+
+
+_HEADER = ("run", "begin", "end")
+
+
+class Masked(NamedTuple):
+    """From begin to end [s] of a run's own time stamps; the run "" stands for every run."""
+
+    run: str
+    begin: float
+    end: float
+
+
+def read_mask(path: str | Path) -> tuple[Masked, ...]:
+    """Stretches of a CSV file with the columns `run,begin,end`, times in seconds.
+
+    Args:
+        path: the file; an empty run means every run, an empty time the run's own start or end.
+
+    Raises:
+        InputError: the file is not there, or a line is no stretch; names the line.
+    """
+    path = Path(path)
+    lines = read_text(path).splitlines()
+    found, header = [], False
+    for number, cells in enumerate(csv.reader(lines), start=1):
+        cells = [cell.strip() for cell in cells]
+        if not any(cells) or cells[0].startswith("#"):
+            continue
+        if not header:
+            header = True
+            if tuple(cells) != _HEADER:
+                raise InputError(f"{path}:{number}", "must begin with the header run,begin,end")
+            continue
+        try:
+            run, begin, end = cells
+            stretch = Masked(run, float(begin or -math.inf), float(end or math.inf))
+        except ValueError:
+            message = f"is {','.join(cells)!r}: write run,begin,end, such as dig_1,12.5,14.0"
+            raise InputError(f"{path}:{number}", message) from None
+        if not stretch.begin < stretch.end:
+            raise InputError(f"{path}:{number}", f"ends at {stretch.end:g} s, before its beginning")
+        found.append(stretch)
+    if not found:
+        raise InputError(path, "masks nothing: write run,begin,end and one stretch per line")
+    return tuple(found)
+
+
+def check_runs(masks: Sequence[Masked], runs: Sequence[str]) -> None:
+    """Refuse stretches of runs that are not there.
+
+    Raises:
+        InputError: names the run and those that are there.
+    """
+    for mask in masks:
+        if mask.run and mask.run not in runs:
+            raise InputError(
+                f"mask of run {mask.run!r}", f"is not there; {suggest(mask.run, runs)}"
+            )
+
+
+def unmasked(masks: Sequence[Masked], run: str, time: np.ndarray) -> np.ndarray:
+    """Whether each row (n,) of a run, at its time (n,) [s], is outside all stretches.
+
+    >>> unmasked([Masked("", 1.0, 2.0)], "dig_1", np.array([0.5, 1.0, 1.5, 2.0])).tolist()
+    [True, False, False, True]
+    """
+    valid = np.ones(len(time), dtype=bool)
+    for mask in masks:
+        if mask.run in ("", run):
+            valid &= (time < mask.begin) | (time >= mask.end)
+    return valid
+
 
 LONGEST_GAP = 1.0  # [s] without rows, after which the commands' history is lost and a run is cut
 LONGEST_MASK = 0.2  # [s] masked, after which nobody knows the state and a run is cut

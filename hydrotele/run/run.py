@@ -30,8 +30,7 @@ from hydrotele.simulate.readout import late_channels, true_channels
 from hydrotele.simulate.record import Record
 from hydrotele.simulate.sensors import measure
 from hydrotele.teleop.person import Hand
-from hydrotele.teleop.station import Station
-from hydrotele.teleop.station_log import StationLog
+from hydrotele.teleop.station import Station, StationLog
 
 AUDIT_SECONDS = 5.0
 _PROGRESS_ROWS = 50

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from hydrotele.gap.customary import customary
-from hydrotele.show.report_figure import drawing, png
+from hydrotele.show.report_html import drawing, png
 
 MEASURED = "#262b33"
 _COLOURS = ("#e07b00", "#1769aa", "#2e8b57", "#b5281c", "#7b4fa3", "#8c6d31")

@@ -5,9 +5,18 @@ from pathlib import Path
 
 import hydrotele
 from hydrotele.experiments.finding import Finding, Panel
-from hydrotele.show.report_figure import drawing, png
-from hydrotele.show.report_html import Cell, Markup, page, picture, section, table, tag
-from hydrotele.show.report_style import STYLE
+from hydrotele.show.report_html import (
+    STYLE,
+    Cell,
+    Markup,
+    drawing,
+    page,
+    picture,
+    png,
+    section,
+    table,
+    tag,
+)
 
 _COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0")
 _MOST = 4000  # points of a curve: more are not seen

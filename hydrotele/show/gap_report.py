@@ -1,39 +1,361 @@
-"""`report.html` of a Gap: one page that needs nothing else, for the screen and for paper."""
+"""`report.html` of a Gap: one page that needs nothing else, for the screen and for paper.
+
+The tables of a gap report: channels, laws, ranking and residual tests.
+
+The pictures of a gap report: heat map of prediction errors, and predictions over readings.
+"""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import yaml
 
 import hydrotele
-from hydrotele.gap.customary import said
-from hydrotele.gap.gap_json import finite
-from hydrotele.gap.patched import has_patch
-from hydrotele.gap.result import Gap
-from hydrotele.gap.words import (
+from hydrotele.effects import EFFECTS
+from hydrotele.gap.customary import amount, customary, said
+from hydrotele.gap.description import (
     chance_words,
     channel_words,
     effect_title,
     gap_closed,
     headline,
+    lack_words,
     law_words,
     learned_title,
+    most_moved,
+    number_title,
     share_words,
+    variable_words,
     verdict_words,
 )
-from hydrotele.show.gap_figures import draw_heat_map, draw_law, draw_overlay
-from hydrotele.show.gap_tables import (
-    calibration_table,
-    channel_table,
-    lack_table,
-    law_table,
-    noise_table,
-    ranking_table,
-    test_table,
+from hydrotele.gap.patched import has_patch
+from hydrotele.gap.result import Candidate, Gap, LearnedLaw, Prediction, finite
+from hydrotele.machine.signals import usual_unit
+from hydrotele.show.channels import padded_range, shown_unit
+from hydrotele.show.gap_windows import channel_rms, most_changed, windowed
+from hydrotele.show.report_html import (
+    STYLE,
+    Cell,
+    Markup,
+    bar,
+    drawing,
+    dumbbell,
+    interval,
+    page,
+    picture,
+    png,
+    section,
+    table,
+    tag,
+    text,
 )
-from hydrotele.show.gap_windows import most_changed
-from hydrotele.show.report_html import Markup, interval, page, picture, section, table, tag, text
-from hydrotele.show.report_style import STYLE
+
+_CANDIDATES = 12
+_DARKEST = 10.0  # times noise, where the colour of a cell is darkest
+
+_GIVEN = '<i class="b"></i>model as given'
+_PATCHED = '<i class="a"></i>patched model'
+
+
+def channel_table(before: Prediction, after: Prediction | None) -> Markup:
+    """Size of the prediction errors per channel, before and after."""
+    old = channel_rms(before)
+    new = channel_rms(after) if after else np.full(len(old), np.nan)
+    known = [v for v in (*old, *new) if math.isfinite(v)]
+    low, high = 0.95 * min([1.0, *known]), 1.05 * max([1.2, *known])
+    rows = []
+    for channel, b, a in zip(before.channels, old, new, strict=True):
+        known = math.isfinite(b)
+        drawn = dumbbell(float(b), float(a) if after else None, low, high) if known else ""
+        sizes = [f"{b:.2f}" if known else "not measured"]
+        sizes += [f"{a:.2f}" if known else ""] if after else []
+        rows.append((channel_words(channel), *sizes, drawn))
+    columns = ("as given", "patched") if after else ("as given",)
+    key = f"{_GIVEN}{_PATCHED if after else ''}&nbsp;&nbsp;&nbsp;dashed: a perfect model"
+    head = ("channel", *columns, "error / sensor noise")
+    whole = table(head, rows, numbers=" " + "n" * len(columns))
+    return Markup(whole + tag("p", Markup(key), class_="key"))
+
+
+def law_table(
+    laws: Mapping[str, Mapping[str, Mapping[str, float]]], units: Mapping[str, str], changed: bool
+) -> Markup:
+    """Balance residuals by law and place, in multiples of what noise alone would give."""
+    places = list(dict.fromkeys(place for by_place in laws.values() for place in by_place))
+    keys = ("before", "after") if changed else ("before",)
+    said = {"before": "as given", "after": "patched"}
+    head = ["law", *(Markup(tag("b", p) + tag("small", said[k])) for p in places for k in keys)]
+    rows = []
+    for law, by_place in laws.items():
+        cells: list[object] = [Markup(tag("b", law) + tag("small", law_words(law)))]
+        for place in places:
+            for key in keys:
+                cells.append(_law_cell(by_place.get(place), key, units.get(law, "1")))
+        rows.append(cells)
+    note = "RMS of what does not add up, over what sensor noise alone would give."
+    numbers = " " + "n" * (len(head) - 1)
+    return Markup(table(head, rows, "laws", numbers) + tag("p", note, class_="key"))
+
+
+def _law_cell(residual: Mapping[str, float] | None, key: str, unit: str) -> Cell:
+    if residual is None or not math.isfinite(residual.get(key, math.nan)):
+        return Cell("", "r")
+    value, noise = residual[key], residual.get("noise", math.nan)
+    small = tag("small", amount(value, unit))
+    if not (math.isfinite(noise) and noise > 0):
+        return Cell(Markup("-" + small), "r")
+    ratio = value / noise
+    return Cell(Markup(f"{ratio:.1f} ×" + small), "r", f"background:{_heat(ratio)}")
+
+
+def _heat(ratio: float) -> str:
+    """From white at noise through amber to red."""
+    part = min(max(math.log(max(ratio, 1e-9) / 1.2) / math.log(_DARKEST / 1.2), 0.0), 1.0)
+    stops = ((255, 255, 255), (253, 226, 170), (240, 160, 110))
+    low, high = (stops[0], stops[1]) if part < 0.5 else (stops[1], stops[2])
+    mix = 2 * part if part < 0.5 else 2 * part - 1
+    return "#" + "".join(f"{round(a + mix * (b - a)):02x}" for a, b in zip(low, high, strict=True))
+
+
+def calibration_table(gap: Gap) -> Markup:
+    """Calibrated numbers with their intervals, those that moved most first."""
+    rows = []
+    for key in most_moved(gap):
+        estimate = gap.calibration[key]
+        s = said(estimate, key)
+        rows.append((number_title(key), s.nominal, s.value, f"{s.low} to {s.high}", s.unit,
+                     interval(estimate)))  # fmt: skip
+    head = ("number", "model had", "found", "95 % interval", "unit", "model and found, to scale")
+    return table(head, rows, numbers=" nnn")
+
+
+def lack_table(gap: Gap) -> Markup:
+    """Unknown forces, flows and commands that remain, the largest first."""
+    rows = [
+        (lack_words(lack), f"{100 * lack.part:.2g} %", bar(lack.part / gap.lacks[0].part))
+        for lack in gap.lacks if lack.part > 0
+    ]  # fmt: skip
+    head = ("", "of full force, rated flow or full command", "")
+    return table(head, rows, numbers=" n ")
+
+
+def noise_table(gap: Gap) -> Markup:
+    """Standard deviation of a reading per channel: found, and stated by the machine."""
+    rows = []
+    for channel, (found, stated) in gap.noise.items():
+        unit = usual_unit(channel)
+        known = math.isfinite(stated)
+        ratio = f"{found / stated:.2f}" if known and stated > 0 else "-"
+        rows.append((channel_words(channel), amount(found, unit),
+                     amount(stated, unit) if known else "not stated", ratio))  # fmt: skip
+    return table(("channel", "found", "stated", "found / stated"), rows, numbers=" nnn")
+
+
+def ranking_table(gap: Gap) -> Markup:
+    """Single effects by what naming them would gain."""
+    shown = gap.ranking[:_CANDIDATES]
+    best = max((c.gain - c.charge for c in shown), default=1.0)
+    named = {(effect.name, effect.location) for effect in gap.effects}
+    rows = []
+    for place, candidate in enumerate(shown, 1):
+        title: object = effect_title(candidate)
+        if (candidate.name, candidate.location) in named:
+            title = tag("b", title)
+        net = candidate.gain - candidate.charge
+        values = ", ".join(_value(gap, candidate, name) for name in candidate.parameters)
+        rows.append((place, title, values, f"{net:,.0f}", bar(net / best if best > 0 else 0.0)))
+    head = ("", "effect", "best value", "net gain", "")
+    more = len(gap.ranking) - len(shown)
+    note = tag("p", f"{more} more gain less.", class_="key") if more > 0 else Markup("")
+    return Markup(table(head, rows, numbers="n  n ") + note)
+
+
+def _value(gap: Gap, candidate: Candidate, name: str) -> str:
+    value, label = candidate.parameters[name], name.replace("_", " ")
+    effect = EFFECTS.get(candidate.name)
+    facts = effect.parameters(gap.machine, candidate.location) if effect else {}
+    if name not in facts:
+        return f"{label} {value:.3g}"
+    return f"{label} {amount(value, facts[name].unit, name)}"
+
+
+def test_table(tests: Mapping[str, Mapping[str, Any]]) -> Markup:
+    """Residual tests of the final model."""
+    rows = []
+    for name, test in tests.items():
+        passed = bool(test.get("passed"))
+        mark = tag("span", "passed" if passed else "failed", class_="yes" if passed else "no")
+        rows.append((name, _plain(test.get("value")), _plain(test.get("limit")), mark))
+    return table(("test", "value", "limit", ""), rows, numbers=" nn ")
+
+
+def _plain(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, int | float) and math.isfinite(value) else "-"
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MEASURED, NOMINAL, PATCHED = "#262b33", "#e07b00", "#1769aa"
+_ADDED = {"force": "force", "command": "command"} | dict.fromkeys(
+    ("flow_head", "flow_rod", "flow_through", "flow_supply"), "flow"
+)
+_ZOOM = 2.0  # s
+_LOUDEST = 6.0  # times noise, where the colours of the heat map end at the latest
+
+
+def draw_heat_map(before: Prediction, after: Prediction, changed: bool) -> bytes:
+    """Channels over time: size of the whitened errors in windows, before and after.
+
+    Args:
+        before: predictions of the given model.
+        after: predictions of the patched model.
+        changed: whether they are two models; otherwise only the first is drawn.
+
+    Returns:
+        A PNG.
+    """
+    pairs = [("model as given", before), *([("patched model", after)] if changed else [])]
+    labels = [channel_words(channel) for channel in before.channels]
+    loudest = np.nanpercentile(windowed(before).rms, 99.5)
+    top = float(np.clip(np.ceil(loudest), 2.0, _LOUDEST))
+    with drawing(0.24 * len(labels) + 1.3) as figure:
+        rows = figure.subplots(1, len(pairs), sharey=True, squeeze=False)[0]
+        meshes = []
+        for axes, (title, prediction) in zip(rows, pairs, strict=True):
+            found = windowed(prediction)
+            places = np.arange(len(labels) + 1)
+            size = np.ma.masked_invalid(found.rms.T)
+            mesh = axes.pcolormesh(
+                found.edges, places, size, cmap=_colours(top), vmin=0.0, vmax=top, linewidth=0
+            )
+            meshes.append(mesh)
+            axes.set_title(title)
+            axes.set_xlabel("time [s]")
+            axes.set_yticks(places[:-1] + 0.5, labels)
+            axes.set_ylim(len(labels), 0)
+            axes.set_facecolor("0.85")
+            axes.grid(False)
+            axes.tick_params(left=False)
+        bar = figure.colorbar(meshes[0], ax=rows.tolist(), pad=0.015, aspect=26, extend="max")
+        bar.set_label("error / sensor noise")
+        bar.outline.set_visible(False)  # pyright: ignore - stubs lack the outline's type
+        return png(figure)
+
+
+def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: bool) -> bytes:
+    """One channel: readings and predictions, their differences, and a zoom on the worst window.
+
+    Args:
+        before: predictions of the given model.
+        after: predictions of the patched model.
+        channel: the channel.
+        changed: whether they are two models; otherwise only the first is drawn.
+
+    Returns:
+        A PNG.
+    """
+    column = before.channels.index(channel)
+    unit, factor = shown_unit(usual_unit(channel))
+    measured = factor * before.measured[:, column]
+    lines = [("model as given", NOMINAL, factor * before.predicted[:, column])]
+    if changed:
+        lines.append(("patched model", PATCHED, factor * after.predicted[:, column]))
+    low, high = _worst(before, column)
+    with drawing(3.0) as figure:
+        places = figure.subplots(2, 2, height_ratios=(1.7, 1.0), width_ratios=(1.55, 1.0))
+        for side, span in enumerate(((before.time[0], before.time[-1]), (low, high))):
+            inside = (before.time >= span[0]) & (before.time <= span[1])
+            upper, lower = places[0, side], places[1, side]
+            _signals(upper, before.time, measured, lines, inside, dots=side == 1)
+            _errors(lower, before.time, measured, lines, inside)
+            upper.tick_params(labelbottom=False)
+            for axes in (upper, lower):
+                axes.set_xlim(*span)
+            lower.set_xlabel("time [s]")
+        places[0, 0].axvspan(low, high, color="0.5", alpha=0.15, lw=0)
+        places[1, 0].axvspan(low, high, color="0.5", alpha=0.15, lw=0)
+        places[0, 0].set_title(channel_words(channel))
+        places[0, 0].set_ylabel(unit)
+        places[0, 1].set_title(f"worst window, {low:.1f} to {high:.1f} s")
+        places[1, 0].set_ylabel(f"reading -\nprediction\n[{unit}]")
+        figure.align_ylabels()
+        return png(figure)
+
+
+def draw_law(law: LearnedLaw) -> bytes:
+    """A learned law over its variable, with a band of two standard deviations.
+
+    Args:
+        law: the law.
+
+    Returns:
+        A PNG.
+    """
+    points, values, spread = (np.array(v) for v in (law.points, law.values, law.spread))
+    along, per_point = customary(law.variable_unit, float(np.max(np.abs(points))))
+    unit, per_value = customary(law.unit, float(np.max(np.abs(values))))
+    with drawing(2.6) as figure:
+        axes = figure.subplots()
+        low, high = per_value * (values - 2.0 * spread), per_value * (values + 2.0 * spread)
+        axes.fill_between(per_point * points, low, high, color=PATCHED, alpha=0.2, lw=0)
+        axes.plot(per_point * points, per_value * values, color=PATCHED, lw=1.6)
+        axes.axhline(0.0, color="0.6", lw=0.8)
+        axes.set_xlabel(f"{variable_words(law.variable)} [{along}]")
+        axes.set_ylabel(f"added {_ADDED[law.balance]} [{unit}]")
+        return png(figure)
+
+
+def _signals(axes: "Axes", time, measured, lines, inside, dots: bool) -> None:
+    style = {"ls": "none", "marker": "o", "ms": 2.6} if dots else {"lw": 2.2, "alpha": 0.55}
+    axes.plot(time, measured, color=MEASURED, label="measured", zorder=1, **style)  # pyright: ignore - matplotlib's stubs take no mixed keywords
+    for name, colour, values in lines:
+        axes.plot(time, values, color=colour, lw=1.3 if dots else 0.9, label=name)
+    values = [measured, *(values for _, _, values in lines)]
+    _limit(axes, [v[inside] for v in values])
+    if not dots:
+        axes.legend(
+            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.1,
+            fontsize=8.5, handlelength=1.4, columnspacing=1.0,
+        )  # fmt: skip
+
+
+def _errors(axes: "Axes", time, measured, lines, inside) -> None:
+    axes.axhline(0.0, color="0.6", lw=0.8)
+    for _, colour, values in lines:
+        axes.plot(time, measured - values, color=colour, lw=0.9)
+    _limit(axes, [(measured - values)[inside] for _, _, values in lines])
+    axes.locator_params(axis="y", nbins=4)
+
+
+def _limit(axes: "Axes", values: list[np.ndarray]) -> None:
+    finite = [v[np.isfinite(v)] for v in values]
+    axes.set_ylim(padded_range(finite, ""))
+
+
+def _worst(prediction: Prediction, column: int) -> tuple[float, float]:
+    """Two seconds around the worst window of a channel [s]."""
+    found = windowed(prediction)
+    worst = int(np.argmax(np.nan_to_num(found.rms[:, column])))
+    middle = 0.5 * (found.edges[worst] + found.edges[worst + 1])
+    first, last = float(prediction.time[0]), float(prediction.time[-1])
+    low = max(first, min(middle - 0.5 * _ZOOM, last - _ZOOM))
+    return low, min(last, low + _ZOOM)
+
+
+def _colours(top: float):
+    """White for noise alone, then through amber to dark red at `top` times noise."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    stops = ((0.0, "#f9fafb"), (1.0, "#f3f5f7"), (1.35, "#f3ecdc"), (1.5, "#fbd68b"))
+    rest = ("#ee8a2d", "#b5281c", "#5f0f1d")
+    steps = [(1.5 + (top - 1.5) * (k + 1) / len(rest), rest[k]) for k in range(len(rest))]
+    scaled = [(level / top, colour) for level, colour in (*stops, *steps)]
+    return LinearSegmentedColormap.from_list("gap", scaled)
+
 
 _CHANNELS = 4
 _CHIPS = {

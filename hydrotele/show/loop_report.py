@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.show.report_figure import drawing, png
-from hydrotele.show.report_html import page, picture, section, table, tag
-from hydrotele.show.report_style import STYLE
+from hydrotele.show.report_html import STYLE, drawing, page, picture, png, section, table, tag
 from hydrotele.teleop.analysis import stability_map
 from hydrotele.teleop.findings import said_size
 from hydrotele.teleop.loop_findings import ScenarioFindings

@@ -1,23 +1,264 @@
-"""The report of a sweep: what was varied, how far every number spreads, and what does it."""
+"""The report of a sweep: what was varied, how far every number spreads, and what does it.
 
+The pictures of a sweep: what each varied key does to each number, and maps of two of them.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import hydrotele
 from hydrotele.core.output import replacing
-from hydrotele.show.report_html import Cell, Markup, page, picture, section, table, tag
-from hydrotele.show.report_style import STYLE
-from hydrotele.show.sweep_figures import (
-    Study,
-    draw_heat_maps,
-    draw_main_effects,
-    key_label,
-    levels,
-    map_keys,
-    numeric,
-    shown,
+from hydrotele.show.report_html import (
+    STYLE,
+    Cell,
+    Markup,
+    drawing,
+    page,
+    picture,
+    png,
+    section,
+    table,
+    tag,
 )
+
+DOT, MEAN, FAILED = "#9db4c8", "#1769aa", "#b5281c"
+_ACROSS, _MAPS = 4, 3
+_MOST_BINS, _PER_BIN = 8, 5
+_WIDE = 30.0  # times: numbers that far apart are drawn on a logarithmic scale
+_ANNOTATED = 60  # cells of a map; in more of them numbers cannot be read
+
+
+class Study(NamedTuple):
+    """What a report of a sweep shows.
+
+    Attributes:
+        name: of the sweep.
+        description: what it is for.
+        scenario: the base scenario.
+        columns: of its table, by name.
+        units: column -> unit.
+        grid: keys with given values.
+        sampled: keys with random values.
+        logarithmic: those of them that are spread by their logarithm.
+        figures: numbers to show.
+        failed: (run, reason).
+    """
+
+    name: str
+    description: str
+    scenario: str
+    columns: Mapping[str, Sequence[Any]]
+    units: Mapping[str, str]
+    grid: tuple[str, ...]
+    sampled: tuple[str, ...]
+    logarithmic: tuple[str, ...]
+    figures: tuple[str, ...]
+    failed: Sequence[tuple[int, str]]
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """The keys along which numbers are drawn; the seed where nothing else is varied."""
+        keys = [key for key in (*self.grid, *self.sampled) if len(levels(self.columns[key])) > 1]
+        return tuple(keys) or ("seed",)
+
+
+class Shown(NamedTuple):
+    """A number as it is shown: label with its unit, values (n,) with NaN where there is none."""
+
+    label: str
+    values: np.ndarray
+
+
+def levels(values: Sequence[Any]) -> list[Any]:
+    """The different values, numbers by size, everything else in order of appearance."""
+    found = list({json.dumps(value): value for value in values}.values())
+    return sorted(found) if numeric(found) else found
+
+
+def numeric(values: Sequence[Any]) -> bool:
+    """Whether all values are numbers."""
+    return all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
+
+
+def shown(study: Study, name: str) -> Shown:
+    """A number in the unit that people use: mm, deg, kN where they are large."""
+    given = study.columns[name]
+    values = np.array([math.nan if v is None else float(v) for v in given])
+    unit = study.units.get(name, "1")
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    factor = 1.0
+    if unit == "m" and largest < 2.0:
+        unit, factor = "mm", 1e3
+    elif unit == "rad":
+        unit, factor = "deg", 180.0 / math.pi
+    elif unit == "N" and largest >= 2e3:
+        unit, factor = "kN", 1e-3
+    stem = name.removesuffix(f"_{study.units.get(name)}").replace("_", " ").replace(".", " ")
+    return Shown(f"{stem} [{unit}]" if unit != "1" else stem, factor * values)
+
+
+def key_label(study: Study, key: str) -> str:
+    """A key with its unit."""
+    return f"{key} [{study.units[key]}]" if key in study.units else key
+
+
+def draw_main_effects(study: Study) -> bytes:
+    """Every number over every varied key: all runs as dots, means as a line.
+
+    Args:
+        study: what to draw.
+
+    Returns:
+        A PNG.
+    """
+    keys, across = study.varied, min(_ACROSS, len(study.varied))
+    per_figure = math.ceil(len(keys) / across)
+    rows = per_figure * len(study.figures)
+    with drawing(0.3 + 2.35 * rows) as figure:
+        axes = figure.subplots(rows, across, squeeze=False)
+        for number, name in enumerate(study.figures):
+            one = shown(study, name)
+            block = axes[number * per_figure : (number + 1) * per_figure].ravel()
+            for place, key in zip(block, keys, strict=False):
+                _draw_effect(place, study, key, one)
+                place.sharey(block[0]) if place is not block[0] else None
+            for place in block[len(keys) :]:
+                place.set_visible(False)
+            for row in axes[number * per_figure : (number + 1) * per_figure]:
+                row[0].set_ylabel(_folded(one.label))
+        return png(figure)
+
+
+def _draw_effect(place, study: Study, key: str, one: Shown) -> None:
+    values = study.columns[key]
+    steps = levels(values)
+    spots = _spots(values, steps)
+    known = np.isfinite(one.values)
+    place.plot(spots[known], one.values[known], "o", color=DOT, ms=3.2, alpha=0.75, mew=0)
+    x, mean = _means(key in study.sampled and numeric(steps), spots[known], one.values[known])
+    place.plot(x, mean, "-o", color=MEAN, lw=1.6, ms=4.2)
+    lost = spots[~known]
+    if len(lost):
+        place.plot(lost, np.full(len(lost), 0.03), "x", color=FAILED, ms=5, clip_on=False,
+                   transform=place.get_xaxis_transform())  # fmt: skip
+    if not numeric(steps):
+        place.set_xticks(range(len(steps)), [_short(step) for step in steps])
+        place.set_xlim(-0.5, len(steps) - 0.5)
+    elif key in study.logarithmic or (len(steps) > 2 and _is_wide(spots)):
+        place.set_xscale("log")
+    if _is_wide(one.values[known]):
+        place.set_yscale("log")
+    place.set_xlabel(key_label(study, key))
+
+
+def _spots(values: Sequence[Any], steps: list[Any]) -> np.ndarray:
+    """Where values stand along an axis: numbers by size, others side by side."""
+    if numeric(steps):
+        return np.array([float(value) for value in values])
+    texts = [json.dumps(step) for step in steps]
+    return np.array([float(texts.index(json.dumps(value))) for value in values])
+
+
+def _means(binned: bool, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means of y at every x, or over bins of neighbouring x where few runs share one.
+
+    Runs of the same x stay in one bin, so that every bin has its share of all other keys.
+    """
+    there = np.unique(x)
+    if not binned or len(x) >= _PER_BIN * len(there):
+        return there, np.array([y[x == value].mean() for value in there])
+    bins = min(_MOST_BINS, len(there) // 2, len(x) // _PER_BIN)
+    if bins < 2:
+        return np.empty(0), np.empty(0)
+    parts = [np.isin(x, part) for part in np.array_split(there, bins)]
+    return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
+
+
+def _is_wide(values: np.ndarray) -> bool:
+    return len(values) > 0 and values.min() > 0.0 and values.max() > _WIDE * values.min()
+
+
+def map_keys(study: Study) -> tuple[str, str] | None:
+    """The two keys of a grid of two."""
+    keys = [key for key in study.grid if len(levels(study.columns[key])) > 1]
+    return (keys[0], keys[1]) if len(keys) == 2 else None
+
+
+def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
+    """Every number over two keys, the mean of all runs of a cell.
+
+    Args:
+        study: what to draw.
+        keys: along y and x.
+
+    Returns:
+        A PNG.
+    """
+    down, right = (levels(study.columns[key]) for key in keys)
+    rows, across = math.ceil(len(study.figures) / _MAPS), min(_MAPS, len(study.figures))
+    with drawing(rows * min(max(2.6, 0.9 + 0.32 * len(down)), 6.0)) as figure:
+        axes = figure.subplots(rows, across, squeeze=False)
+        for place, name in zip(axes.ravel(), study.figures, strict=False):
+            one = shown(study, name)
+            cells = _cells(study, keys, one.values)
+            place.grid(False)
+            place.set_facecolor("0.85")
+            scale = "log" if _is_wide(cells[np.isfinite(cells)]) else "linear"
+            image = place.imshow(cells, aspect="auto", origin="lower", cmap="viridis", norm=scale)
+            figure.colorbar(image, ax=place, pad=0.02)
+            place.set_title(_folded(one.label))
+            place.set_xticks(range(len(right)), [_short(v) for v in right])
+            place.set_yticks(range(len(down)), [_short(v) for v in down])
+            place.set_xlabel(key_label(study, keys[1]))
+            place.set_ylabel(key_label(study, keys[0]))
+            if cells.size <= _ANNOTATED:
+                _annotate(place, cells, image)
+        for place in axes.ravel()[len(study.figures) :]:
+            place.set_visible(False)
+        return png(figure)
+
+
+def _cells(study: Study, keys: tuple[str, str], values: np.ndarray) -> np.ndarray:
+    """Means (levels of the first key, levels of the second), NaN where no run succeeded."""
+    texts = [[json.dumps(v) for v in levels(study.columns[key])] for key in keys]
+    cells = np.full((len(texts[0]), len(texts[1])), np.nan)
+    places = [np.array([t.index(json.dumps(v)) for v in study.columns[key]])
+              for t, key in zip(texts, keys, strict=True)]  # fmt: skip
+    for i, j in np.ndindex(*cells.shape):
+        here = values[(places[0] == i) & (places[1] == j)]
+        here = here[np.isfinite(here)]
+        cells[i, j] = here.mean() if len(here) else np.nan
+    return cells
+
+
+def _annotate(place, cells: np.ndarray, image) -> None:
+    for (i, j), value in np.ndenumerate(cells):
+        dark = np.isfinite(value) and image.norm(value) < 0.6
+        text = f"{value:.3g}" if np.isfinite(value) else "failed"
+        place.text(j, i, text, ha="center", va="center", fontsize=8,
+                   color="white" if dark else "#1d232b")  # fmt: skip
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= 18 else f"{text[:17]}..."
+
+
+def _folded(label: str) -> str:
+    """A long label on two lines."""
+    if len(label) <= 26:
+        return label
+    gaps = [i for i, letter in enumerate(label) if letter == " "]
+    middle = min(gaps, key=lambda i: abs(i - len(label) / 2))
+    return f"{label[:middle]}\n{label[middle + 1 :]}"
+
 
 __all__ = ["Study", "write_sweep_report"]
 

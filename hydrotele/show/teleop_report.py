@@ -1,17 +1,25 @@
-"""`report.html` of a teleoperator's analysis: one page that needs nothing else."""
+"""`report.html` of a teleoperator's analysis: one page that needs nothing else.
+
+The pictures of a teleoperator's analysis: two-port, what is felt, passivity, stability.
+"""
 
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 import hydrotele
-from hydrotele.show.report_html import Cell, Markup, page, picture, section, table, tag
-from hydrotele.show.report_style import STYLE
-from hydrotele.show.teleop_figures import (
-    draw_felt,
-    draw_hybrid,
-    draw_nyquist,
-    draw_scattering,
-    draw_stiffness,
-    plain_name,
+from hydrotele.show.report_html import (
+    STYLE,
+    Cell,
+    Markup,
+    drawing,
+    page,
+    picture,
+    png,
+    section,
+    table,
+    tag,
 )
 from hydrotele.teleop.findings import (
     Findings,
@@ -21,8 +29,246 @@ from hydrotele.teleop.findings import (
     said_size,
     why_unstable,
 )
-from hydrotele.teleop.switching import Spring
+from hydrotele.teleop.switching import Spring, growth_map
 from hydrotele.teleop.two_port import Impedance
+
+_INK, _SOFT = "#262b33", "#8a94a0"
+_GOOD, _SURE, _BAD = "#cfe3f4", "#7fb2dd", "#f6ddd3"
+_LOOKS = {
+    "position_position": ("#1769aa", "-"), "rate_position": ("#1769aa", (0, (4, 1.6))),
+    "position_force": ("#e07b00", "-"), "rate_force": ("#e07b00", (0, (4, 1.6))),
+    "four_channel_position": ("#23794a", "-"), "four_channel_rate": ("#23794a", (0, (4, 1.6))),
+}  # fmt: skip
+_HYBRID = (
+    ("h11: felt with a free slave [N s/m]", "h12: force back over force of the task [1]"),
+    ("h21: slave's velocity over the hand's [1]", "h22: slave's yielding [m/(N s)]"),
+)
+_NYQUIST = (-3.0, 1.5, -2.25, 2.25)
+
+
+def plain_name(structure: str) -> str:
+    """A structure as people say it.
+
+    >>> plain_name("four_channel_rate")
+    'four-channel rate'
+    """
+    return structure.replace("four_channel_", "four-channel ").replace("_", "-")
+
+
+def draw_hybrid(found: Findings) -> bytes:
+    """Magnitudes of the hybrid matrix.
+
+    Args:
+        found: the findings.
+
+    Returns:
+        A PNG.
+    """
+    with drawing(6.2) as figure:
+        axes = figure.subplots(2, 2, sharex=True)
+        for row in range(2):
+            for column in range(2):
+                panel = axes[row, column]
+                panel.set_title(_HYBRID[row][column])
+                if row != column:
+                    panel.axhline(1.0, color=_SOFT, lw=1.2, dashes=(1, 1.5))
+                for one in found.analyses:
+                    _line(panel, one, np.abs(one.hybrid[:, row, column]))
+                _logarithmic(panel, 1e-4, 1e5)
+        for panel in axes[1]:
+            panel.set_xlabel("frequency [Hz]")
+        _legend(figure, axes[0, 0])
+        return png(figure)
+
+
+def draw_felt(found: Findings) -> bytes:
+    """Transmitted impedance against the task's: magnitude and phase."""
+    with drawing(4.2) as figure:
+        left, right = figure.subplots(1, 2, sharex=True)
+        first = found.analyses[0]
+        hertz = first.frequencies / (2.0 * np.pi)
+        left.plot(
+            hertz, np.abs(first.task), color=_INK, lw=4.0, alpha=0.25, label="the task itself"
+        )
+        right.plot(hertz, np.degrees(np.angle(first.task)), color=_INK, lw=4.0, alpha=0.25)
+        for one in found.analyses:
+            _line(left, one, np.abs(one.transmitted))
+            _line(right, one, np.degrees(np.unwrap(np.angle(one.transmitted))))
+        _logarithmic(left, 1e-1, 1e7)
+        left.set_title("felt impedance [N s/m]")
+        right.set_title("its phase [deg]")
+        right.set_ylim(-360.0, 180.0)
+        right.set_yticks(range(-360, 181, 90))
+        for panel in (left, right):
+            panel.set_xlabel("frequency [Hz]")
+        _legend(figure, left)
+        return png(figure)
+
+
+def draw_scattering(found: Findings) -> bytes:
+    """Norm of the scattering matrix; above 1 the two-port can give energy."""
+    with drawing(3.4) as figure:
+        panel = figure.subplots()
+        top = max(float(one.scattering.max()) for one in found.analyses)
+        panel.axhspan(1.0, 1.3 * top, color=_BAD, alpha=0.5, lw=0)
+        panel.axhline(1.0, color=_INK, lw=1.0)
+        for one in found.analyses:
+            _line(panel, one, one.scattering)
+        panel.set_xscale("log")
+        panel.set_yscale("log")
+        panel.set_ylim(0.8, 1.3 * top)
+        panel.set_xlabel("frequency [Hz]")
+        panel.set_title("norm of the scattering matrix [1]: above 1 it is not passive")
+        _legend(figure, panel)
+        return png(figure)
+
+
+def draw_nyquist(found: Findings) -> bytes:
+    """Loop gain with the task and without, around -1."""
+    with drawing(3.1 * _rows(found)) as figure:
+        for panel, one in zip(_panels(figure, found), found.analyses, strict=False):
+            colour = _LOOKS[one.structure][0]
+            for curve, look, name in (
+                (one.loop, {"color": colour, "lw": 1.4}, "with the task"),
+                (one.loop_free, {"color": _SOFT, "lw": 1.1}, "free"),
+            ):
+                panel.plot(np.real(curve), np.imag(curve), label=name, **look)
+                panel.plot(np.real(curve), -np.imag(curve), **(look | {"alpha": 0.35}))
+            panel.plot(-1.0, 0.0, "+", color="#b5281c", ms=10, mew=2)
+            panel.axis(_NYQUIST)
+            panel.set_aspect("equal")
+            panel.set(xlabel="real part [1]", ylabel="imaginary part [1]")
+            said = "stable" if one.stable else why_unstable(one).removeprefix("no, ")
+            panel.set_title(f"{plain_name(one.structure)}: {said}")
+            panel.legend(loc="upper right", fontsize=8, frameon=False)
+        return png(figure)
+
+
+def draw_maps(found: Findings) -> bytes:
+    """Where every structure is stable, over delay and factor on what comes back."""
+    with drawing(2.9 * _rows(found)) as figure:
+        seen = {one.structure: one.seen for one in found.agreements}
+        for panel, (name, cells) in zip(_panels(figure, found), found.maps.items(), strict=False):
+            _cells(panel, 1e3 * found.delays, found.factors, cells, (_BAD, _SURE))
+            panel.set_yscale("log")
+            _root_scale(panel, 1e3 * found.delays)
+            panel.plot(1e3 * found.case.delay, 1.0, "o", color=_INK, ms=6, clip_on=False)
+            if name in seen:
+                row, column = np.nonzero(seen[name] != cells)
+                panel.plot(
+                    1e3 * found.delays[column], found.factors[row], "x", color="#b5281c", ms=5
+                )
+            panel.set_title(plain_name(name))
+            panel.set_xlabel("delay each way [ms]")
+            panel.set_ylabel("reflected, times nominal")
+            panel.grid(False)
+        _key(figure)
+        return png(figure)
+
+
+def draw_stiffness(spring: Spring, held: Spring) -> bytes:
+    """Margin of the theorem, and what the worst switching of the stiffness leaves stable.
+
+    Args:
+        spring: the joystick let go.
+        held: the same in the hand, whose mass and least stiffness the maps are drawn for.
+
+    Returns:
+        A PNG.
+    """
+    damping = np.linspace(0.0, 1.25 * max(held.enough_damping, held.damping), 91)
+    stiffest = np.geomspace(held.least or 1e-2 * held.most, 4.0 * held.most, 91)
+    growth = growth_map(held.mass, held.least, damping, stiffest)
+    margin = damping[None, :] ** 2 - 4.0 * held.mass * stiffest[:, None]
+    with drawing(4.0) as figure:
+        left, right = figure.subplots(1, 2, sharey=True)
+        _margin(figure, left, damping, stiffest, margin)
+        kinds = np.where(margin > 0.0, 2, np.where(growth < 1.0, 1, 0))
+        _cells(right, damping, stiffest, kinds, (_BAD, _GOOD, _SURE))
+        right.set_title("stable by the theorem (dark), at the worst switching (light), not (red)")
+        edge = 2.0 * np.sqrt(held.mass * stiffest)
+        for panel in (left, right):
+            panel.plot(edge, stiffest, color=_INK, lw=1.6)
+            panel.plot(held.damping, held.most, "o", color=_INK, ms=7)
+            panel.annotate("this case,\nheld", (held.damping, held.most), (9, -4),
+                           textcoords="offset points", fontsize=8.5, va="top")  # fmt: skip
+            panel.set(yscale="log", xlim=(0.0, damping[-1]), xlabel="damping B [N s/m]")
+            panel.set_ylim(stiffest[0], stiffest[-1])
+            panel.grid(False)
+        left.set_ylabel("largest stiffness [N/m]")
+        return png(figure)
+
+
+def _margin(figure: Any, panel: Any, damping: np.ndarray, stiffest: np.ndarray, margin: np.ndarray):
+    """Margin in thousands, the same colours on both sides of 0."""
+    reach = float(np.percentile(np.abs(margin), 80.0)) / 1e3
+    shown = panel.pcolormesh(
+        damping, stiffest, margin / 1e3, cmap="RdBu", vmin=-reach, vmax=reach, shading="nearest"
+    )
+    figure.colorbar(shown, ax=panel, extend="both", pad=0.02)
+    panel.set_title("margin B² - 4 M K [1000 (N s/m)²]")
+
+
+def _cells(panel: Any, x: np.ndarray, y: np.ndarray, kinds: np.ndarray, colours: tuple) -> None:
+    """Cells of a few kinds, each with its colour."""
+    from matplotlib.colors import ListedColormap
+
+    panel.pcolormesh(
+        x, y, kinds.astype(int), cmap=ListedColormap(list(colours)), vmin=0,
+        vmax=len(colours) - 1, shading="nearest", rasterized=True,
+    )  # fmt: skip
+
+
+def _root_scale(panel: Any, delays: np.ndarray) -> None:
+    """An axis that has more room for short delays."""
+    panel.set_xscale("function", functions=(lambda x: np.sqrt(np.maximum(x, 0.0)), np.square))
+    panel.set_xlim(0.0, delays[-1])
+    ticks = [tick for tick in (0, 5, 20, 50, 100, 200, 500, 1000, 2000) if tick <= delays[-1]]
+    panel.set_xticks(ticks, [str(tick) for tick in ticks])
+
+
+def _line(panel: Any, one: Any, values: np.ndarray) -> None:
+    colour, style = _LOOKS[one.structure]
+    hertz = one.frequencies / (2.0 * np.pi)
+    panel.plot(hertz, values, color=colour, ls=style, lw=1.4, label=plain_name(one.structure))
+
+
+def _logarithmic(panel: Any, least: float, most: float) -> None:
+    """Logarithmic axes that leave out rounding and resonances without bound."""
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    low, high = panel.get_ylim()
+    panel.set_ylim(max(low, least), min(high, most))
+
+
+def _legend(figure: Any, panel: Any) -> None:
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=8.5)
+
+
+def _key(figure: Any) -> None:
+    """What the maps' colours and the point mean."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    point = Line2D([], [], color=_INK, marker="o", ls="")
+    figure.legend(
+        [Patch(color=_SURE), Patch(color=_BAD), point], ["stable", "unstable", "this case"],
+        loc="outside upper left", ncols=3, frameon=False, fontsize=8.5,
+    )  # fmt: skip
+
+
+def _rows(found: Findings) -> int:
+    return -(-len(found.analyses) // 3)
+
+
+def _panels(figure: Any, found: Findings) -> list:
+    """Three panels a row; those that are not used stay empty."""
+    panels = list(figure.subplots(_rows(found), 3, squeeze=False).flat)
+    for panel in panels[len(found.analyses) :]:
+        panel.set_axis_off()
+    return panels[: len(found.analyses)]
+
 
 _CHANNELS = {
     "position_position": "the slave's position comes back (coordinating force)",

@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hydrotele.simulate.library import mujoco_library
+from hydrotele.simulate.layout import mujoco_library
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 

@@ -2,14 +2,31 @@
 
 Offsets follow from MuJoCo's own description of its structs (`mujoco.introspect`) and the C layout
 rules, and are checked against addresses and values that the bindings expose.
+
+MuJoCo's shared library, for what its Python bindings do not show.
 """
 
 import ctypes
 import functools
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from mujoco.introspect import ast_nodes, structs
+
+
+@functools.cache
+def mujoco_library() -> ctypes.CDLL:
+    """The library that the bindings use, loaded once.
+
+    Raises:
+        RuntimeError: it does not lie where the package has it.
+    """
+    found = next(Path(mujoco.__file__).parent.glob("*mujoco.*[0-9]*"), None)
+    if found is None:
+        raise RuntimeError(f"MuJoCo {mujoco.__version__} has no shared library in its package")
+    return ctypes.CDLL(str(found))
+
 
 _PRIMITIVES = {
     "int": 4, "float": 4, "double": 8, "mjtNum": 8, "char": 1, "unsigned char": 1, "mjtByte": 1,

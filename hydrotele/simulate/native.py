@@ -37,8 +37,7 @@ from hydrotele.hydraulics.circuit import (
     pumped_force,
     step_circuit,
 )
-from hydrotele.hydraulics.drive_side import settled_friction
-from hydrotele.hydraulics.drive_terms import add_to_commands, drive_state
+from hydrotele.hydraulics.drive import add_to_commands, drive_state, settled_friction
 from hydrotele.hydraulics.parameters import MARKER
 from hydrotele.hydraulics.presliding import (
     bristle_friction,
@@ -46,8 +45,7 @@ from hydrotele.hydraulics.presliding import (
     settled_bristle_friction,
 )
 from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS
-from hydrotele.simulate.layout import field_offsets, option_offset, verify_layout
-from hydrotele.simulate.library import mujoco_library
+from hydrotele.simulate.layout import field_offsets, mujoco_library, option_offset, verify_layout
 from hydrotele.simulate.pointers import floats, pointer
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND, COUNT, FORCE, added_with_slope

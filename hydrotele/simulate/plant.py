@@ -1,4 +1,17 @@
-"""The plant: a Machine compiled to MuJoCo with its hydraulics, and its complete states."""
+"""The plant: a Machine compiled to MuJoCo with its hydraulics, and its complete states.
+
+Bristles of presliding friction in a compiled machine: what inertia they hold at home.
+
+An explicit step follows a drive on its bristles only as long as these are not too stiff for the
+inertia that it moves; `presliding.bristle_rate` limits them by the number that is written here.
+
+Stiffness and damping of end stops, written into the joint limits of a compiled machine.
+
+A limit of MuJoCo is a soft constraint whose force solves `(A + R) f = a_ref - a_0` with the inverse
+inertia A felt there. With `R = 1 / (h b)`, `a_ref = -v / h - k r / (h b)` and `b = c + h k` that is
+`f = -k r' - c v'` with depth r' and velocity v' at the end of the step h: a spring k and a damper c
+by the implicit Euler rule, stable however light the load and stiff the stop.
+"""
 
 import dataclasses
 import functools
@@ -13,19 +26,91 @@ from hydrotele.hydraulics.parameters import actuator_order, memory_names
 from hydrotele.hydraulics.slots import Slot
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.surroundings import Thing
-from hydrotele.simulate.bristles import set_bristles, write_bristles
-from hydrotele.simulate.closure import (
-    close_loops,
-    holding_forces,
-    independent_dofs,
-    motion_basis,
-)
+from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
 from hydrotele.simulate.document import Mjcf
-from hydrotele.simulate.drive_side import drive_joint, flexible_axes, wind_up
+from hydrotele.simulate.drive_side import drive_joint, flexible_axes, load_joint, wind_up
 from hydrotele.simulate.mechanism import add_element, assemble, mjcf_document
 from hydrotele.simulate.native import install_hydraulics
-from hydrotele.simulate.stops import set_stops, write_stops
 from hydrotele.simulate.term_readout import terms_at_rest
+
+
+def set_bristles(machine: Machine, model: mujoco.MjModel) -> None:
+    """Tell a compiled machine what its drives with presliding friction move.
+
+    Args:
+        machine: the machine.
+        model: its model; `actuator_user` is written where there are bristles.
+
+    Raises:
+        InputError: the linkages do not close at home.
+
+    Source: `(J M^-1 J')^-1` of a drive's Jacobian J, in independent coordinates; the drive side's
+        own inertia where there is a transmission.
+    """
+    order = actuator_order(machine)
+    axes = [machine.axes[name] for name in order]
+    if not any(axis.drive.friction.presliding for axis in axes):
+        return
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    close_loops(machine, model, data, {})
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_fullM(model, data, mass)
+    basis = motion_basis(machine, model, data)
+    yielding = np.linalg.inv(basis.T @ mass @ basis)
+    for i, (name, axis) in enumerate(zip(order, axes, strict=True)):
+        if axis.drive.friction.presliding:
+            lever = basis[model.joint(drive_joint(machine, name)).dofadr[0]]
+            moved = 1.0 / float(lever @ yielding @ lever)
+            own = axis.transmission.inertia if axis.transmission else moved
+            model.actuator_user[i, Slot.BRISTLE_INERTIA] = own
+
+
+def write_bristles(root, machine: Machine, model: mujoco.MjModel) -> None:
+    """Write what `set_bristles` gave a model into the MJCF document of the same machine."""
+    for i, name in enumerate(actuator_order(machine)):
+        if machine.axes[name].drive.friction.presliding:
+            root.find("actuator", name).user = model.actuator_user[i]
+
+
+_IMPEDANCE = 1.0e-4, 0.9999  # range of d that MuJoCo keeps to
+_TRANSITION = (0.001, 0.5, 2.0)  # of the impedance, which is the same at every depth
+
+
+def stop_joints(machine: Machine) -> dict[str, str]:
+    """Axis -> name of the joint whose limits are the ends of its travel."""
+    return {name: load_joint(machine, name) for name in machine.axes if machine.end_stop(name)}
+
+
+def set_stops(machine: Machine, model: mujoco.MjModel) -> None:
+    """Give the limits of a compiled machine the stiffness and damping of its end stops.
+
+    MuJoCo computes `R = (1 - d) / d A_0` from the impedance d and the inverse inertia A_0 at its
+    reference pose, and `a_ref = -B v - K d r` from `solref = (-K d^2, -B d)`.
+
+    Args:
+        machine: the machine.
+        model: its model; `jnt_solref` and `jnt_solimp` are written.
+
+    Source: MuJoCo documentation, "Computation", constraint model.
+    """
+    h = model.opt.timestep
+    for axis, name in stop_joints(machine).items():
+        stop, joint = machine.end_stop(axis), model.joint(name).id
+        assert stop
+        both = stop.damping + h * stop.stiffness
+        weight = model.dof_invweight0[model.jnt_dofadr[joint]]
+        d = float(np.clip(weight / (weight + 1.0 / (h * both)), *_IMPEDANCE))
+        model.jnt_solref[joint] = -stop.stiffness / (h * both) * d, -d / h
+        model.jnt_solimp[joint] = d, d, *_TRANSITION
+
+
+def write_stops(root, machine: Machine, model: mujoco.MjModel) -> None:
+    """Write what `set_stops` gave a model into the MJCF document of the same machine."""
+    for name in stop_joints(machine).values():
+        joint, numbers = root.find("joint", name), model.joint(name).id
+        joint.solreflimit = model.jnt_solref[numbers]
+        joint.solimplimit = model.jnt_solimp[numbers]
+
 
 REST_PRESSURE = 2.0e6  # Pa, in the chamber that carries no load when a machine stands
 

@@ -15,7 +15,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from hydrotele.core.compiled import compiled
-from hydrotele.simulate.library import mujoco_library
+from hydrotele.simulate.layout import mujoco_library
 
 
 @intrinsic

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.machine.machine import Machine
-from hydrotele.simulate.names import TIP_SITE
+from hydrotele.simulate.document import TIP_SITE
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.surroundings import is_thing
 

@@ -10,7 +10,7 @@ import itertools
 import mujoco
 import numpy as np
 
-from hydrotele.simulate.past import Past
+from hydrotele.simulate.feedback import Past
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import split_delay
 

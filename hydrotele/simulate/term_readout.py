@@ -11,7 +11,7 @@ from hydrotele.hydraulics.circuit import (
     delivered_share,
     open_ports,
 )
-from hydrotele.hydraulics.drive_terms import drive_state
+from hydrotele.hydraulics.drive import drive_state
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Drives

@@ -6,27 +6,28 @@ machine), the edge (into the soil, along the floor), the floor's underside and t
 zones below). Such an element holds a bucket that rests, gives back no more than the spring holds
 (some joules) and otherwise only takes energy: with a damper in parallel it may be held over a step
 of 5 ms against a machine of 20 t.
+
+How much loose soil a tilted bucket holds, and where its centre lies.
+
+Forces of soil on a blade: Coulomb's wedge ahead of it, Prandtl's zones under it.
+
+A blade drawn through soil shears off a wedge along a plane that rises from its edge. Forces on that
+wedge (weight, cohesion and friction on the plane, adhesion and friction on the blade) give the
+Fundamental Equation of Earthmoving (Reece 1964; McKyes and Ali 1977; McKyes 1985)
+`P = w (g d^2 N_g + c d N_c + c_a d N_ca) + Q N_q`, P inclined by delta against the blade's normal.
+The plane is the one with the least N_g. Luengo, Singh and Cannon (1998) tilt it by the slope of the
+surface and load it with the weight Q of what the bucket has swept up. All angles in radians.
 """
 
 import math
 
 from hydrotele.core.compiled import lean
-from hydrotele.soil.bucket import held_soil
-from hydrotele.soil.cutting import (
-    acting_rake,
-    acting_slope,
-    adhesion_factor,
-    bearing_pressure,
-    cohesion_factor,
-    failure_plane,
-    surcharge_factor,
-    wedge_weight_factor,
-)
-from hydrotele.soil.numbers import (
+from hydrotele.soil.facts import (
     ADHESION,
     CARRIED,
     CELL,
     COHESION,
+    CORNERS,
     DAMPING,
     DENSITY,
     DEPTH,
@@ -44,6 +45,7 @@ from hydrotele.soil.numbers import (
     HEEL_X,
     HEEL_Z,
     HIGH,
+    INNER_WIDTH,
     LAST_HEEL_R,
     LAST_HEEL_Z,
     LAST_R,
@@ -55,7 +57,9 @@ from hydrotele.soil.numbers import (
     MASS_Z,
     MOMENT,
     OUT,
+    OUTLINE,
     PLACED,
+    REPOSE,
     SIZE,
     SLIDE,
     STIFFNESS,
@@ -64,13 +68,273 @@ from hydrotele.soil.numbers import (
     TOOL_FRICTION,
     WIDTH,
 )
-from hydrotele.soil.terrain import (
-    cell_of,
-    cut_cells_,
-    lay_down_,
-    slide_cells_,
-    surface_height,
-)
+from hydrotele.soil.terrain import cell_of, cut_cells_, lay_down_, slide_cells_, surface_height
+
+
+@lean
+def held_soil(n, attitude, level, out):
+    """Volume of soil that rests in the bucket: below a surface at the angle of repose from its rim.
+
+    The surface rises from the lower rim into the bucket. With the mouth tilted less than the angle
+    of repose the bucket is full and a heap lies on top, at the angle of repose from both rims. Soil
+    ahead of the mouth props what lies behind it: the surface then begins where it meets the mouth.
+
+    Args:
+        n: (k,) of `soil_numbers`.
+        attitude: of the bucket, scalar [rad].
+        level: height of the soil ahead of the mouth over the edge, scalar [m].
+        out: (4,) written: volume [m^3]; centre outwards and up from the edge [m]; how far out the
+            lower rim lies from the edge [m].
+
+    Returns:
+        Nothing.
+
+    Source: geometry; the heap as in SAE J296, with the angle of repose for its 1:1.
+    """
+    c, s = math.cos(attitude), math.sin(attitude)
+    count = int(n[CORNERS])
+    last = OUTLINE + 2 * (count - 1)
+    rim_r, rim_z = c * n[last] - s * n[last + 1], s * n[last] + c * n[last + 1]
+    low_r, low_z = (0.0, 0.0) if rim_z >= 0.0 else (rim_r, rim_z)
+    out[3] = low_r
+    chord = math.sqrt(rim_r * rim_r + rim_z * rim_z)
+    tilt = math.atan2(abs(rim_z), rim_r)  # of the mouth against level
+    repose = math.atan(n[REPOSE])
+    heaped = tilt < repose
+    slope = n[REPOSE] if rim_z >= 0.0 else -n[REPOSE]
+    if rim_z > 0.0 and level > 0.0:
+        share = min(level / rim_z, 1.0)
+        low_r, low_z = share * rim_r, share * rim_z
+    area, moment_r, moment_z = 0.0, 0.0, 0.0
+    first_r, first_z, before_r, before_z, any_point = 0.0, 0.0, 0.0, 0.0, False
+    r0, z0 = rim_r, rim_z
+    over0 = z0 - low_z - slope * (r0 - low_r)
+    for i in range(count):
+        x, y = n[OUTLINE + 2 * i], n[OUTLINE + 2 * i + 1]
+        r1, z1 = c * x - s * y, s * x + c * y
+        over1 = z1 - low_z - slope * (r1 - low_r)
+        for part in range(2):  # where the side crosses the surface, then its end if below
+            if part == 0:
+                if heaped or (over0 <= 0.0) == (over1 <= 0.0):
+                    continue
+                t = over0 / (over0 - over1)
+                pr, pz = r0 + t * (r1 - r0), z0 + t * (z1 - z0)
+            else:
+                if not heaped and over1 > 0.0:
+                    continue
+                pr, pz = r1, z1
+            if any_point:
+                cross = before_r * pz - pr * before_z
+                area += cross
+                moment_r += cross * (before_r + pr)
+                moment_z += cross * (before_z + pz)
+            else:
+                first_r, first_z, any_point = pr, pz, True
+            before_r, before_z = pr, pz
+        r0, z0, over0 = r1, z1, over1
+    cross = before_r * first_z - first_r * before_z
+    area += cross
+    moment_r += cross * (before_r + first_r)
+    moment_z += cross * (before_z + first_z)
+    area, moment_r, moment_z = 0.5 * area, moment_r / 6.0, moment_z / 6.0
+    if area < 0.0:
+        area, moment_r, moment_z = -area, -moment_r, -moment_z
+    if heaped:
+        near, far = repose - tilt, repose + tilt
+        heap = 0.5 * chord * chord * math.sin(near) * math.sin(far) / math.sin(near + far)
+        height = 2.0 * heap / chord
+        area += heap
+        moment_r += heap * 0.5 * rim_r
+        moment_z += heap * (0.5 * rim_z + height / 3.0)
+    out[0] = area * n[INNER_WIDTH]
+    out[1] = moment_r / area if area > 1e-9 else 0.0
+    out[2] = moment_z / area if area > 1e-9 else 0.0
+
+
+STEEPEST_RAKE = 0.5 * math.pi  # a wedge of soil sticks to a steeper blade and is the blade then
+FLATTEST_RAKE = math.radians(15.0)
+WIDEST_FAN = math.radians(150.0)  # rake + delta + phi beyond which Coulomb's plane fails
+STEEPEST_SLOPE = 0.6  # of the friction angle
+_LEAST_SQUARE = 0.05  # keeps the wedge from jamming where blade and surface are nearly parallel
+
+
+@lean
+def failure_plane(rake, slope, friction, tool_friction):
+    """Angle between surface and the plane on which the wedge shears off: that of least N_g.
+
+    Setting the derivative of `N_g(cot beta)` to zero leaves a quadratic equation.
+
+    Args:
+        rake: between blade and surface, scalar [rad].
+        slope: of the surface, positive where it rises ahead of the blade, scalar [rad].
+        friction: phi, scalar [rad].
+        tool_friction: delta, scalar [rad].
+
+    Returns:
+        beta, scalar [rad], within 5 .. 85 deg.
+
+    Source: McKyes 1985, chapter 3; Coulomb's passive wedge.
+
+    >>> import math
+    >>> smooth_wall = failure_plane(math.pi / 2, 0.0, math.radians(30), 0.0)
+    >>> round(math.degrees(smooth_wall), 6)  # 45 - phi / 2
+    30.0
+    """
+    fan = rake + tool_friction + friction
+    square = (math.sin(tool_friction + friction) * math.sin(rake + tool_friction - slope)) / (
+        math.sin(rake) * math.sin(friction + slope)
+    )
+    root = math.sqrt(max(square, _LEAST_SQUARE))
+    plane = math.atan2(math.sin(fan), root - math.cos(fan))
+    return min(max(plane, math.radians(5.0)), math.radians(85.0))
+
+
+@lean
+def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
+    """N_g: force on the blade by the weight of the wedge, per specific weight, width and depth^2.
+
+    Args:
+        rake: between blade and surface, scalar [rad].
+        slope: of the surface, scalar [rad].
+        friction: phi, scalar [rad].
+        tool_friction: delta, scalar [rad].
+        plane: beta, scalar [rad].
+
+    Returns:
+        N_g, scalar [1]; depth counts at right angles to the surface.
+
+    Source: McKyes 1985, chapter 3; Luengo et al. 1998.
+
+    >>> import math
+    >>> phi = math.radians(30)
+    >>> N = wedge_weight_factor(math.pi / 2, 0.0, phi, 0.0, math.radians(30))
+    >>> round(2.0 * N, 6)  # Rankine's tan^2(45 + phi / 2)
+    3.0
+    """
+    top = 1.0 / math.tan(rake) + 1.0 / math.tan(plane)
+    return 0.5 * top * surcharge_factor(rake, slope, friction, tool_friction, plane)
+
+
+@lean
+def surcharge_factor(rake, slope, friction, tool_friction, plane):
+    """N_q: force on the blade per weight that rests on the wedge.
+
+    Args:
+        rake: between blade and surface, scalar [rad].
+        slope: of the surface, scalar [rad].
+        friction: phi, scalar [rad].
+        tool_friction: delta, scalar [rad].
+        plane: beta, scalar [rad].
+
+    Returns:
+        N_q, scalar [1].
+
+    Source: Luengo et al. 1998.
+    """
+    return math.sin(plane + friction + slope) / math.sin(rake + tool_friction + friction + plane)
+
+
+@lean
+def cohesion_factor(rake, friction, tool_friction, plane):
+    """N_c: force on the blade by cohesion on the plane, per cohesion, width and depth.
+
+    Args:
+        rake: between blade and surface, scalar [rad].
+        friction: phi, scalar [rad].
+        tool_friction: delta, scalar [rad].
+        plane: beta, scalar [rad].
+
+    Returns:
+        N_c, scalar [1].
+
+    Source: McKyes 1985, chapter 3, simplified.
+    """
+    fan = rake + tool_friction + friction + plane
+    return math.cos(friction) / (math.sin(plane) * math.sin(fan))
+
+
+@lean
+def adhesion_factor(rake, friction, tool_friction, plane):
+    """N_ca: force on the blade by adhesion to it, per adhesion, width and depth.
+
+    Args:
+        rake: between blade and surface, scalar [rad].
+        friction: phi, scalar [rad].
+        tool_friction: delta, scalar [rad].
+        plane: beta, scalar [rad].
+
+    Returns:
+        N_ca, scalar [1]; the adhesion itself, along the blade, comes on top.
+
+    Source: McKyes 1985, chapter 3, simplified.
+    """
+    fan = rake + tool_friction + friction + plane
+    return -math.cos(rake + friction + plane) / (math.sin(rake) * math.sin(fan))
+
+
+@lean
+def bearing_pressure(overburden, cohesion, friction, tilt):
+    """Pressure at which soil yields under a smooth face that is pushed into it.
+
+    `p + c cot phi = (q + c cot phi) tan^2(45 deg + phi/2) e^(2 theta tan phi)`: a level face turns
+    the principal stresses by theta = 90 deg (Prandtl and Reissner's strip footing, N_q = 18.4 for
+    30 deg), an upright one not at all (Rankine's passive wall).
+
+    Args:
+        overburden: q, beside the face, scalar [Pa].
+        cohesion: c, scalar [Pa].
+        friction: phi, above 0, scalar [rad].
+        tilt: of the face against the surface, 0 .. pi/2, scalar [rad].
+
+    Returns:
+        p, scalar [Pa].
+
+    Source: Prandtl 1920, Reissner 1924; tilted faces Sokolovskii 1960. The weight below the face
+    (N_gamma) is left out, which is small for narrow edges and on the safe side.
+    """
+    sine, t = math.sin(friction), math.tan(friction)
+    factor = (1.0 + sine) / (1.0 - sine) * math.exp(2.0 * (0.5 * math.pi - tilt) * t)
+    return (overburden + cohesion / t) * factor - cohesion / t
+
+
+@lean
+def acting_rake(rake, slope, friction, tool_friction):
+    """Rake against the surface that the wedge feels, kept where the equation holds.
+
+    A wedge of soil sticks to a blade that is steeper than upright, or too steep for its friction
+    (Hettiaratchi and Reece 1975), and acts as the blade; below 15 deg the blade acts as at 15 deg.
+
+    Args:
+        rake: of the blade against the horizontal, scalar [rad].
+        slope: of the surface, scalar [rad].
+        friction: phi, scalar [rad].
+        tool_friction: delta, scalar [rad].
+
+    Returns:
+        rake, scalar [rad].
+
+    Source: see above.
+    """
+    steepest = min(STEEPEST_RAKE, WIDEST_FAN - friction - tool_friction)
+    return min(max(rake + slope, FLATTEST_RAKE), steepest)
+
+
+@lean
+def acting_slope(slope, friction):
+    """Slope of the surface, kept where a plane can form.
+
+    Args:
+        slope: of the surface, scalar [rad].
+        friction: phi, scalar [rad].
+
+    Returns:
+        slope within 0.6 phi of level, scalar [rad].
+
+    Source: Coulomb's forces grow without bound as the slope nears phi.
+    """
+    limit = STEEPEST_SLOPE * friction
+    return min(max(slope, -limit), limit)
+
 
 AHEAD = 1.5  # cells from the edge to where the depth of a cut is read: what no cut has touched yet
 PLAY = 0.02  # m, how far the edge goes back before it pushes soil the other way

@@ -8,7 +8,7 @@ bank swells. What leaves the profile at its ends is told, so that no mass is los
 import math
 
 from hydrotele.core.compiled import lean
-from hydrotele.soil.numbers import CELL, CUT_SLOPE, REPOSE, START, SWELL, WIDTH
+from hydrotele.soil.facts import CELL, CUT_SLOPE, REPOSE, START, SWELL, WIDTH
 
 SETTLED = 1e-4  # m, a step between cells beyond the stable one that is left alone
 

@@ -3,8 +3,7 @@
 import math
 
 from hydrotele.core.compiled import lean
-from hydrotele.soil.facts import GRAVITY
-from hydrotele.soil.numbers import FORCE_R, FORCE_Z, MASS, MASS_R, MOMENT
+from hydrotele.soil.facts import FORCE_R, FORCE_Z, GRAVITY, MASS, MASS_R, MOMENT
 
 
 @lean

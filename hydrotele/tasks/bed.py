@@ -13,8 +13,7 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.task import task_jacobian
-from hydrotele.soil.facts import Soil
-from hydrotele.soil.numbers import OUT, OUTLINE, STATE, WIDTH, soil_numbers
+from hydrotele.soil.facts import OUT, OUTLINE, STATE, WIDTH, Soil, soil_numbers
 from hydrotele.soil.shape import CAT215, Bucket
 from hydrotele.soil.step import soil_step
 from hydrotele.soil.wrench import bucket_wrench
@@ -81,7 +80,7 @@ def loose_of(w):
 
 @compiled
 def bucket_of(w):
-    """State of the bucket (STATE,), live; see `soil.numbers`.
+    """State of the bucket (STATE,), live; see `soil.facts`.
 
     Args:
         w: World.
@@ -96,7 +95,7 @@ def bucket_of(w):
 
 @compiled
 def result_of(w):
-    """What the last step gave (OUT,), live; see `soil.numbers`.
+    """What the last step gave (OUT,), live; see `soil.facts`.
 
     Args:
         w: World.
@@ -111,7 +110,7 @@ def result_of(w):
 
 @compiled
 def soil_of(w):
-    """Numbers of the episode's soil, live; see `soil.numbers`.
+    """Numbers of the episode's soil, live; see `soil.facts`.
 
     Args:
         w: World.

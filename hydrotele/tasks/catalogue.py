@@ -3,11 +3,11 @@
 import numpy as np
 
 from hydrotele.machine.machine import Machine
-from hydrotele.tasks.force_task import HOLD_FORCE
-from hydrotele.tasks.grade_task import GRADE
-from hydrotele.tasks.line_task import STRAIGHT_LINE
-from hydrotele.tasks.place_task import PLACE_LOG
-from hydrotele.tasks.reach_task import REACH_FELLER
+from hydrotele.tasks.force import HOLD_FORCE
+from hydrotele.tasks.grade import GRADE
+from hydrotele.tasks.line import STRAIGHT_LINE
+from hydrotele.tasks.place import PLACE_LOG
+from hydrotele.tasks.reach import REACH_FELLER
 from hydrotele.tasks.task import Task
 from hydrotele.tasks.track import track_fields
 

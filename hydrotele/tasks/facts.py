@@ -13,9 +13,9 @@ from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import channel_sensor, converter, sensor_set
 from hydrotele.machine.sensors import SensorSet
+from hydrotele.simulate.document import TIP_SITE
 from hydrotele.simulate.feedback import samples_every
 from hydrotele.simulate.layout import field_offsets, verify_layout
-from hydrotele.simulate.names import TIP_SITE
 from hydrotele.simulate.pointers import function_address
 from hydrotele.tasks.kinds import KINDS
 from hydrotele.tasks.memory import ACTIONS, FACTS, VALVE

@@ -1,18 +1,34 @@
-"""Grading: a low bank of soil with mounds is cut down to a plane, and the soil carried away."""
+"""Grading: a low bank of soil with mounds is cut down to a plane, and the soil carried away.
+
+What `Grade` is.
+"""
 
 import math
 
+import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
-from hydrotele.soil.numbers import FORCE_R, FORCE_Z, MASS
+from hydrotele.soil.facts import FORCE_R, FORCE_Z, MASS, SOILS
 from hydrotele.soil.terrain import surface_height
-from hydrotele.tasks.bed import CELL, CELLS, START, lay_bed, result_of, soil_of, surface_of
+from hydrotele.tasks.bed import (
+    CELL,
+    CELLS,
+    START,
+    TERRAIN,
+    bed_numbers,
+    lay_bed,
+    result_of,
+    soil_of,
+    surface_of,
+)
 from hydrotele.tasks.chance import between, draw
-from hydrotele.tasks.memory import ARM
+from hydrotele.tasks.memory import ARM, NUMBERS
 from hydrotele.tasks.observation import Field, reach
+from hydrotele.tasks.starts import draw_start
+from hydrotele.tasks.task import Task
 
 NEAR, FAR = 3.8, 5.8  # m, radii between which the ground is graded
 POINTS = 20  # means of the profile that are observed
@@ -201,3 +217,52 @@ def judge_grade(f, e, w):
     if spoiled:
         return reward + FAILURE, True
     return (reward + SUCCESS, True) if graded else (reward, False)
+
+
+GRADE_SOILS = ("soft", "sandy_loam", "firm")
+"""Names of the soils that episodes have, in the order of their numbers."""
+
+_LEAST_POSE = (5.6, -0.5, 1.25, math.radians(-110.0))  # r [m], theta [rad], z [m], attitude [rad]
+_LARGEST_POSE = (6.4, 0.5, 1.5, math.radians(-90.0))
+
+
+def _start(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
+    """The bucket over the far end of the stretch, ready to dig, above the highest ground."""
+    return draw_start(machine, chance, _LEAST_POSE, _LARGEST_POSE)
+
+
+def _numbers(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
+    """Soils, bucket and profile; the last one is the number of soils."""
+    bed = bed_numbers([SOILS[name] for name in GRADE_SOILS]).tolist()
+    return (*bed, *[0.0] * (NUMBERS - 1 - len(bed)), float(len(GRADE_SOILS)))
+
+
+GRADE = Task(
+    name="Grade",
+    kind="grade",
+    sentence=(
+        "An excavator's bucket cuts a low bank of soft, loamy or firm soil down to a plane of given"
+        " height and slope, 3.8 to 5.8 m before it, and carries the soil away; the swing is"
+        " locked, its action does nothing."
+    ),
+    reward=(
+        "1 for every 0.01 m by which the root mean square error of the profile shrinks, less 0.05"
+        " per second; 5 for an error below 0.03 m for a second, -5 for the edge 0.5 m below the"
+        " plane, and both end the episode."
+    ),
+    machine="cat215",
+    tool="bucket",
+    action="resolved_motion",
+    duration=60.0,
+    start=_start,
+    fields=grade_fields,
+    measures=(
+        ("profile_rms", "m"), ("carried_mass", "kg"), ("soil_force", "N"), ("soil", "1"),
+        ("success", "1"), ("spoiled", "1"),
+    ),
+    numbers=_numbers,
+    terrain=TERRAIN,
+    pose_rates=(0.5, 0.3, 0.4, 0.5, 0.25),
+    swing_locked=True,
+)  # fmt: skip
+"""Ground graded to a plane."""

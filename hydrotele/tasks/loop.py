@@ -1,33 +1,328 @@
 """An environment step in native code: actions, control, physics, sensors, reward, a new episode.
 
 MuJoCo calls `advance` for every simulation from its own threads; nothing of Python runs in it.
+
+Actions of an agent into commands of valves and drives, once per control period.
+
+Rates are bounded in their change, since a machine of 20 t follows no jump: joint rates move joint
+references, pose rates those of the arm by resolved motion, and the joint servo follows them.
+
+Sensors of an episode: true values at one time, late, with defects and errors, converted.
+
+The simulation of an episode as its task sees it: MuJoCo's arrays by name.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
 # numba's intrinsics are called without their typing context, and carray is its documented API.
+
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numba import carray, types
 
+from hydrotele.control.drive_rows import POINTS, drive_row
+from hydrotele.control.resolved_motion import follow_pose
+from hydrotele.control.servo import servo_step
 from hydrotele.core.compiled import callback, compiled
+from hydrotele.hydraulics.circuit import SCRATCH
+from hydrotele.hydraulics.slots import SLOTS
 from hydrotele.kinematics.task import task_forward
 from hydrotele.simulate.fleet import STATE
-from hydrotele.simulate.pointers import call_set_state, call_step, floats, pointer
-from hydrotele.tasks.act import act
+from hydrotele.simulate.pointers import call_set_state, call_step, field, floats, pointer
+from hydrotele.simulate.readout import state_supply
+from hydrotele.simulate.sensors import convert
 from hydrotele.tasks.chance import draw
 from hydrotele.tasks.kinds import begin_task, judge_task, observe_task, tick_task
 from hydrotele.tasks.memory import (
+    ARM,
     AXES,
+    CHANNELS,
     DISABLED,
     FACTS,
+    JOINT_RATE,
     MEASURES,
     MEMORY,
     NEXT_STEP,
     RESET,
+    RESOLVED_MOTION,
     SAME_STEP,
+    VALVE,
 )
-from hydrotele.tasks.sense import sense
-from hydrotele.tasks.world import world
+
+_AHEAD = 0.2  # rad or m by which a reference may lead its joint: a stalled arm winds nothing up
+
+
+@compiled
+def _asked(f, action, a):
+    """An action as it counts."""
+    return 0.0 if a == f.locked else min(1.0, max(-1.0, action[a]))
+
+
+@compiled
+def _towards(now, goal, change):
+    return min(now + change, max(now - change, goal))
+
+
+@compiled
+def _joint_rates(f, e, action, first):
+    """Move the references of axes by their own rates; actions from `first` on."""
+    for a in range(first, f.actions):
+        i = f.driven_axis[a]
+        goal = _asked(f, action, a) * f.fastest[i]
+        rate = _towards(e.reference_rate[i], goal, f.acceleration * f.period)
+        place = e.reference[i] + f.period * rate
+        low = max(f.ranges[i, 0], e.joint[i] - _AHEAD)
+        high = min(f.ranges[i, 1], e.joint[i] + _AHEAD)
+        if place < low or place > high:
+            place, rate = min(high, max(low, e.reference[i])), 0.0
+        e.reference[i], e.reference_rate[i] = place, rate
+
+
+@compiled
+def _pose_rates(f, e, action):
+    """Move the references of the arm by rates of its pose."""
+    k, wanted = f.arm_axes, np.empty(ARM)
+    for c in range(ARM):
+        goal = 0.0
+        if c < k:
+            goal = _asked(f, action, c) * f.fastest_pose[c]
+        e.pose_rate[c] = _towards(e.pose_rate[c], goal, f.accelerations[c] * f.period)
+        wanted[c] = e.pose[c] + f.period * e.pose_rate[c]
+    far = False
+    for i in range(k):
+        far = far or abs(e.reference[i] - e.joint[i]) > _AHEAD
+    held = far or follow_pose(
+        f.arm, f.ranges[:k], wanted, e.pose_rate, False, e.pose, e.reference[:k],
+        e.reference_rate[:k],
+    )  # fmt: skip
+    e.blocked = 1 if held else 0
+    if held:
+        e.pose_rate[:] = 0.0
+        e.reference_rate[:k] = 0.0
+    if far:  # the arm is stopped by something: go on from where it stands
+        for i in range(k):
+            e.reference[i] = _towards(e.joint[i], e.reference[i], _AHEAD)
+        task_forward(f.arm, e.reference[:k], e.pose)
+
+
+@compiled
+def act(f, e, action):
+    """Commands of this control period.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `command` and, unless actions are valves, references are written.
+        action: (actions,) of the agent, full at +-1; beyond they count as full.
+
+    Returns:
+        Nothing.
+
+    Source: `control.resolved_motion`, `control.servo`.
+    """
+    if f.mode == VALVE:
+        for a in range(f.actions):
+            i = f.driven_axis[a]
+            e.command[i] = _asked(f, action, a) * f.limit[i]
+        return
+    if f.mode == RESOLVED_MOTION:
+        _pose_rates(f, e, action)
+        _joint_rates(f, e, action, f.arm_axes)
+    elif f.mode == JOINT_RATE:
+        _joint_rates(f, e, action, 0)
+    k = f.axes
+    table = floats(f.table, k * POINTS * 3).reshape((k, POINTS, 3))
+    drive_row(
+        f.grid[:k], table, e.reference[:k], e.reference_rate[:k], f.feedforward, e.drive[0, :k],
+        e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
+    )  # fmt: skip
+    none = np.zeros(k)
+    servo_step(
+        f.servo[:k], f.closed[:k], e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
+        e.sampled_reference[:k], e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply,
+        e.load[:k], False, none, none, e.command[:k],
+    )  # fmt: skip
+
+
+@compiled
+def true_positions(f, e, w):
+    """Bring an episode's true axis positions up to date.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `position` is written.
+        w: World, staggered as `simulate.record` says.
+
+    Returns:
+        Nothing.
+
+    Source: `simulate.record.aligned_positions`.
+    """
+    for i in range(f.axes):
+        e.position[i] = w.qpos[f.qpos[i]] - f.timestep * w.qvel[f.dof[i]]
+
+
+@compiled
+def _sensed(f, e, w, out):
+    """What stands before the sensors: positions [rad], [m], head and rod pressures, supply [Pa]."""
+    k = f.axes
+    for i in range(k):
+        out[i] = e.position[i]
+    for i in range(f.hydraulic):
+        out[k + 2 * i], out[k + 2 * i + 1] = w.act[4 * i + 2], w.act[4 * i + 3]
+    if f.hydraulic > 0:
+        scratch = np.empty(SCRATCH)
+        user = floats(f.users + 8 * e.variant * k * SLOTS, k * SLOTS)
+        out[k + 2 * f.hydraulic] = state_supply(user, f.hydraulic, w.act, scratch)
+
+
+@compiled
+def _late(f, e, sim, values):
+    """Put values into the ring of the past; take out those that the sensors see now."""
+    length = f.delayed_sensor
+    ring = floats(f.sensed + 8 * sim * length * CHANNELS, length * CHANNELS)
+    lags = floats(f.lags + 8 * e.variant * CHANNELS, CHANNELS)
+    now = e.tick % length
+    for c in range(CHANNELS):
+        ring[now * CHANNELS + c] = values[c]
+    for c in range(CHANNELS):
+        lag = min(lags[c], 1.0 * e.tick)
+        if lag > 0.0:
+            whole = int(lag)
+            part = lag - whole
+            new = ring[((now - whole) % length) * CHANNELS + c]
+            old = ring[((now - whole - 1) % length) * CHANNELS + c] if part > 0.0 else new
+            values[c] = new + part * (old - new)
+
+
+@compiled
+def sense(f, e, w, sim):
+    """Read the sensors, if a reading is due; otherwise they are held.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; readings are written.
+        w: World.
+        sim: number of the simulation, scalar.
+
+    Returns:
+        Nothing.
+
+    Source: as `simulate.feedback` for scenario runs; late readings are linear between control
+        periods, and before the start everything stood as at the start.
+    """
+    true_positions(f, e, w)
+    due = e.tick % f.every == 0
+    if not due and f.delayed_sensor == 0:
+        return
+    values = np.zeros(CHANNELS)
+    _sensed(f, e, w, values)
+    if f.delayed_sensor > 0:
+        _late(f, e, sim, values)
+    if not due:
+        return
+    k, many = f.axes, f.axes + 2 * f.hydraulic
+    scales = floats(f.scales + 8 * e.variant * CHANNELS, CHANNELS)
+    offsets = floats(f.offsets + 8 * e.variant * CHANNELS, CHANNELS)
+    for c in range(many + (1 if f.hydraulic > 0 else 0)):
+        value = scales[c] * values[c] + offsets[c]
+        if f.noisy:
+            value += f.accuracy[c] * (2.0 * draw(e) - 1.0)
+            value = convert(value, f.converters[0, c], f.converters[1, c], f.converters[2, c])
+        values[c] = value
+    span = f.every * f.period
+    for i in range(k):
+        e.rate[i] = (values[i] - e.joint[i]) / span if e.tick > 0 else 0.0
+        e.joint[i] = values[i]
+        e.sampled_reference[i] = e.reference[i]
+    for i in range(f.hydraulic):
+        e.head[i], e.rod[i] = values[k + 2 * i], values[k + 2 * i + 1]
+    e.supply = values[many] if f.hydraulic > 0 else 0.0
+
+
+assert CHANNELS >= 3 * AXES + 1
+
+
+class World(NamedTuple):
+    """Live arrays of one simulation.
+
+    Attributes:
+        qpos: (nq,) positions; staggered, see `simulate.record`.
+        qvel: (nv,) velocities.
+        act: (na,) activations.
+        ctrl: (k,) commands that act.
+        tip: (3,) place of the arm's tip at the time of the activations [m].
+        xfrc: (6 nbody,) forces and torques from outside on bodies, world frame [N], [N m].
+        xpos: (3 nbody,) places of bodies [m], of the last physics step.
+        xipos: (3 nbody,) places of their centres of mass [m].
+        xquat: (4 nbody,) quaternions of the bodies.
+        xmat: (9 nbody,) their rotation matrices.
+        eq_active: (neq,) uint8, which equalities act; part of the state.
+        eq_data: (neq eq_width,) numbers of the equalities for the rest of this call.
+        eq_rows: the same from the next call on; empty unless the task writes them.
+        terrain: (width,) what the episode keeps of its ground, empty without.
+        measures: (MEASURES,) figures of this step, for `info`.
+        model: address of mjModel.
+        data: address of mjData.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    act: np.ndarray
+    ctrl: np.ndarray
+    tip: np.ndarray
+    xfrc: np.ndarray
+    xpos: np.ndarray
+    xipos: np.ndarray
+    xquat: np.ndarray
+    xmat: np.ndarray
+    eq_active: np.ndarray
+    eq_data: np.ndarray
+    eq_rows: np.ndarray
+    terrain: np.ndarray
+    measures: np.ndarray
+    model: int
+    data: int
+
+
+@compiled
+def world(f, m, d, sim):
+    """The World of a simulation.
+
+    Args:
+        f: record of FACTS.
+        m: address of its mjModel, scalar.
+        d: address of its mjData, scalar.
+        sim: its number, scalar.
+
+    Returns:
+        The World.
+
+    Source: `simulate.layout`.
+    """
+    place = carray(pointer(d + f.at_site), (1,), np.int64)[0]
+    active = carray(pointer(d + f.at_eq_active), (1,), np.int64)[0]
+    numbers = f.neq * f.eq_width
+    site = f.tip_site if f.tip_site >= 0 else 0
+    return World(
+        field(d, f.at_qpos, f.nq),
+        field(d, f.at_qvel, f.nv),
+        field(d, f.at_act, f.na),
+        field(d, f.at_ctrl, f.axes),
+        floats(place + 24 * site, 3),
+        field(d, f.at_xfrc, 6 * f.nbody),
+        field(d, f.at_xpos, 3 * f.nbody),
+        field(d, f.at_xipos, 3 * f.nbody),
+        field(d, f.at_xquat, 4 * f.nbody),
+        field(d, f.at_xmat, 9 * f.nbody),
+        carray(pointer(active), (f.neq,), np.uint8),
+        field(m, f.at_eq_data, numbers),
+        floats(f.eq_rows + 8 * sim * numbers, numbers if f.eq_rows else 0),
+        floats(f.terrain + 8 * sim * f.width, f.width),
+        floats(f.measures + 8 * sim * MEASURES, MEASURES),
+        m,
+        d,
+    )
+
 
 _WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
 _FIRST_BAD, _LAST_BAD = int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC)

@@ -1,6 +1,8 @@
 """A pose that the head of a feller-buncher is brought to and kept at, by all five axes of its arm.
 
 The pose is drawn until the straight way to it lies in the workspace.
+
+What `ReachFeller` is.
 """
 
 import math
@@ -10,9 +12,12 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Servo
 from hydrotele.tasks.chance import between
 from hydrotele.tasks.memory import ARM
 from hydrotele.tasks.observation import Field, pose_fields, reach
+from hydrotele.tasks.starts import draw_start
+from hydrotele.tasks.task import Task
 from hydrotele.tasks.workspace import path_effort, pose_read, turned
 
 NEAR, LEVEL, KEEP = 0.05, 0.03, 0.5  # m, rad, s: what counts as reached
@@ -151,3 +156,30 @@ def judge_reach(f, e, w):
     done = g[_HELD] >= KEEP - 0.5 * step
     w.measures[0], w.measures[1], w.measures[2] = distance, angle, 1.0 if done else 0.0
     return reward + (SUCCESS if done else 0.0), done
+
+
+def _start(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
+    """The head in the air before the machine, about level."""
+    return draw_start(
+        machine, chance, (5.0, -0.5, 0.8, -0.4, -0.3), (8.0, 0.5, 3.0, 0.4, 0.3)
+    )  # fmt: skip
+
+
+REACH_FELLER = Task(
+    name="ReachFeller",
+    kind="reach",
+    sentence="A feller-buncher brings its head to a pose with all five axes and keeps it there.",
+    reward=(
+        "1 for every metre nearer (a radian of attitude or head counts as one), less 0.01 for every"
+        " step, and 10 once it was within 0.05 m and 0.03 rad for 0.5 s, which ends the episode."
+    ),
+    machine="cat325",
+    tool=None,
+    duration=20.0,
+    start=_start,
+    fields=reach_fields,
+    measures=(("distance", "m"), ("attitude_error", "rad"), ("success", "1")),
+    servo=Servo(axis_gains={"swing": 1.0, "boom": 2.0}),  # heavy on soft oil
+    pose_rates=(0.5, 0.2, 0.5, 0.2, 0.2),
+)
+"""A pose of a feller-buncher's head."""

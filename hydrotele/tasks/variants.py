@@ -17,8 +17,8 @@ from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.scenario.surroundings import Thing
+from hydrotele.simulate.document import TIP_SITE
 from hydrotele.simulate.fleet import STATE
-from hydrotele.simulate.names import TIP_SITE
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import begin_leapfrog, split_delay
 from hydrotele.tasks.memory import AXES, CHANNELS

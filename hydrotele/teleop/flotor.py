@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.estimators import estimate
+from hydrotele.identify.estimation import estimate
 from hydrotele.teleop.coils import Coils
 from hydrotele.teleop.compliance import GRAVITY, Flotor, rotation_between, turn_matrix
 

@@ -19,9 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.control.arm_tables import arm_tables
 from hydrotele.control.resolved_motion import COORDINATES, arm_axes
-from hydrotele.control.tip_balance import Arm
+from hydrotele.control.tip_balance import Arm, arm_tables
 from hydrotele.core.errors import InputError
 from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.integrate import place_mechanism

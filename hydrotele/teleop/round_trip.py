@@ -8,9 +8,14 @@ import numpy as np
 from hydrotele.control.drive_rows import drive_row
 from hydrotele.core.compiled import compiled
 from hydrotele.teleop.master import master_step, unpack_master, unpack_master_state
-from hydrotele.teleop.muscles import pull, unpack_muscles
-from hydrotele.teleop.slave import measure_task, report, slave_step
-from hydrotele.teleop.slave_table import unpack_slave, unpack_slave_state
+from hydrotele.teleop.person import pull, unpack_muscles
+from hydrotele.teleop.slave import (
+    measure_task,
+    report,
+    slave_step,
+    unpack_slave,
+    unpack_slave_state,
+)
 
 QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
 
@@ -48,7 +53,7 @@ def to_the_hand(
     Returns:
         Nothing.
 
-    Source: `teleop.master`, `teleop.slave`, `teleop.muscles`.
+    Source: `teleop.master`, `teleop.slave`, `teleop.person`.
     """
     k = len(columns)
     slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)

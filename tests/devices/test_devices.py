@@ -5,11 +5,10 @@ import sys
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.devices.choose import open_device
+from hydrotele.devices.choose import load_script, open_device
 from hydrotele.devices.keyboard import Keyboard
 from hydrotele.devices.pad import Pad
-from hydrotele.devices.script import load_script
-from hydrotele.devices.tables import CENTRE_KEY, KEYS, LAYOUTS, QUIT_KEY, SWITCH_KEYS
+from hydrotele.devices.reading import CENTRE_KEY, KEYS, LAYOUTS, QUIT_KEY, SWITCH_KEYS
 from hydrotele.machine.joystick import AXES
 
 

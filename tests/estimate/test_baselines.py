@@ -6,7 +6,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.baselines import BASELINES, fit_baseline
 from hydrotele.estimate.free_run import free_run_errors
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 

@@ -10,7 +10,7 @@ from hydrotele.dynamics.model import model_space, predicted_channels, reduced_mo
 from hydrotele.effects import apply_effect
 from hydrotele.estimate.track import track_run
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 

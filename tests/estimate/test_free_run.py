@@ -15,7 +15,7 @@ from hydrotele.estimate.free_run import (
     machine_runner,
     window_starts,
 )
-from hydrotele.logs.load import RunData, load_dataset
+from hydrotele.logs.dataset import RunData, load_dataset
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario

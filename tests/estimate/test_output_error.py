@@ -7,22 +7,20 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.hypothesis import Guess
-from hydrotele.estimate.open_numbers import (
+from hydrotele.estimate.output_error import (
     TRAVEL,
+    _covariance,
+    _normal_equations,
+    fit_free_runs,
     flow_table,
+    free_run_windows,
     linkage,
     open_numbers,
     stretched,
     timing,
 )
-from hydrotele.estimate.output_error import (
-    _covariance,
-    _normal_equations,
-    fit_free_runs,
-    free_run_windows,
-)
 from hydrotele.kinematics.from_machine import axis_linkage, range_at_drive
-from hydrotele.logs.load import RunData, load_dataset
+from hydrotele.logs.dataset import RunData, load_dataset
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.drives import FlowCurve, Metering
 from hydrotele.machine.machine_file import load_machine

@@ -9,7 +9,9 @@ from typer.testing import CliRunner
 from hydrotele.cli import experimenting
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
-from hydrotele.experiments import felling, forces, motion
+from hydrotele.experiments import zhu1994 as felling
+from hydrotele.experiments import zhu1994 as forces
+from hydrotele.experiments import zhu1994 as motion
 from hydrotele.experiments.finding import Finding, Panel
 
 

@@ -18,7 +18,7 @@ from hydrotele.gap.result import (
     Prediction,
     Unknown,
 )
-from hydrotele.logs.load import RunData
+from hydrotele.logs.dataset import RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.signals import usual_unit

@@ -16,9 +16,8 @@ from hydrotele.dynamics.model import (
     state_size,
 )
 from hydrotele.effects.effect import changed
-from hydrotele.gap.balance_timing import peak_lag, window_lags
-from hydrotele.gap.balances import balances, pump_lack
-from hydrotele.gap.law_regression import lack_regression
+from hydrotele.gap.balances import balances, peak_lag, pump_lack, window_lags
+from hydrotele.gap.discover import lack_regression
 from hydrotele.gap.law_tables import Table
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.drives import Transmission

@@ -14,11 +14,10 @@ from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import columns_of
 from hydrotele.estimate.responses import error_responses
 from hydrotele.estimate.track import track_run
-from hydrotele.gap.discover import _better, _busy_window, _law, _Seen
+from hydrotele.gap.discover import Regression, _better, _busy_window, _law, _Seen, at_a_glance
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.law_regression import Regression, at_a_glance
 from hydrotele.gap.law_tables import Table, paired_tables, possible_tables
-from hydrotele.logs.load import load_dataset
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario

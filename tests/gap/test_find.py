@@ -14,7 +14,7 @@ import yaml
 from hydrotele.estimate.stretches import busiest
 from hydrotele.gap.find import find_gap, without_details
 from hydrotele.gap.result import Estimate, NamedEffect
-from hydrotele.logs.load import Dataset, load_dataset
+from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.logs.log import Log, load_log, save_log
 from hydrotele.machine.machine_file import load_machine
 

@@ -4,8 +4,8 @@ import numpy as np
 
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.calibration import numbers
-from hydrotele.gap.free_calibration import calibrate_freely
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.gap.calibrating import calibrate_freely
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_pump_drive import CHANNELS, NOISE, PERIOD, simulated

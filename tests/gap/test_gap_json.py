@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from hydrotele.gap.gap_json import gap_document
+from hydrotele.gap.result import gap_document
 
 _KEYS = {
     "verdict", "effects", "calibration", "learned", "unknown", "lacks", "noise", "gap", "tests",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.gap.find import find_gap
-from hydrotele.logs.load import load_dataset
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario

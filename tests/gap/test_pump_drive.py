@@ -13,7 +13,7 @@ from hydrotele.estimate.calibration import numbers
 from hydrotele.estimate.levels import rough_noise
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.find import find_gap
-from hydrotele.logs.load import load_dataset
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario

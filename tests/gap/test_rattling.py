@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-import hydrotele.gap.rattling as gap_rattling
+import hydrotele.gap.screening as gap_rattling
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, hypotheses

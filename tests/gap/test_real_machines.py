@@ -12,9 +12,9 @@ from hydrotele.cli.main import app
 from hydrotele.estimate.baselines import fit_baseline
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.stretches import busiest
+from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.free_calibration import calibrate_freely
-from hydrotele.logs.load import load_dataset
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.machine.machine_file import load_machine
 from tools.real_machines import FIRST_THREE_QUARTERS, PUSH, ec20_splits, force_error, pushed
 

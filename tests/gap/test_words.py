@@ -7,8 +7,8 @@ import pytest
 
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.customary import amount, said
+from hydrotele.gap.description import effect_title, gap_closed, headline, verdict_words
 from hydrotele.gap.result import Alternative, Estimate, GapSize, NamedEffect
-from hydrotele.gap.words import effect_title, gap_closed, headline, verdict_words
 from hydrotele.machine.machine_file import load_machine
 
 

@@ -11,8 +11,8 @@ from hydrotele.identify.identification import identify
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import beginning, records
 from hydrotele.identify.setup import machine_setup
+from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
-from hydrotele.logs.load import make_dataset
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.estimators import autoregression, estimate
+from hydrotele.identify.estimation import autoregression, estimate
 
 TRUTH = np.array([95.0, 200.0, 20.0, -3.0])
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.periodic import periodic
+from hydrotele.identify.motion import periodic
 from hydrotele.identify.smoothing import smooth
 from hydrotele.identify.zero_phase import zero_phase
 

@@ -9,14 +9,13 @@ import pytest
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import Estimator
-from hydrotele.identify.friction_shape import identify_with_shapes
 from hydrotele.identify.identifiability import FULL, WEAK
-from hydrotele.identify.identification import identify
+from hydrotele.identify.identification import identify, identify_with_shapes
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.parameter_rows import counts, parameter_rows
 from hydrotele.identify.record import records
+from hydrotele.identify.result import counts, parameter_rows
 from hydrotele.identify.setup import machine_setup
-from hydrotele.logs.load import load_dataset
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log, save_log
 from hydrotele.machine.machine_file import load_machine
 

@@ -8,7 +8,7 @@ import pytest
 from hydrotele.effects.effect import changed
 from hydrotele.identify.chain import load_chain
 from hydrotele.identify.consistent import Freedom, consistent
-from hydrotele.identify.estimators import Estimate
+from hydrotele.identify.estimation import Estimate
 from hydrotele.identify.identifiability import identifiability
 from hydrotele.identify.identified_machine import identified_machine
 from hydrotele.identify.projection import project

@@ -8,8 +8,8 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.identify.record import records
 from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
-from hydrotele.logs.load import make_dataset
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.sensors import SensorError

@@ -10,13 +10,12 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import changed
 from hydrotele.hydraulics.laws import friction
 from hydrotele.identify.chain import load_chain
-from hydrotele.identify.estimators import estimate
+from hydrotele.identify.estimation import estimate
 from hydrotele.identify.identifiability import identifiability
-from hydrotele.identify.machine_friction import drive_friction, pin_friction
 from hydrotele.identify.projection import project
 from hydrotele.identify.reference_size import reference_sizes
 from hydrotele.identify.regressor import Rubbing, regressor
-from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.setup import drive_friction, machine_setup, pin_friction
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.integrator_chain import transition
-from hydrotele.identify.smoothing import error_draws, smooth
+from hydrotele.identify.smoothing import error_draws, smooth, transition
 
 DT = 0.02
 

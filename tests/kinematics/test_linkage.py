@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.linalg import null_space
 from scipy.optimize import root
 
-from hydrotele.kinematics.linkage import FourBar, LoopOpen, TwoBar, two_bar_from_points
+from hydrotele.kinematics.linkages import FourBar, LoopOpen, TwoBar, two_bar_from_points
 
 BOOM = TwoBar(0.625, 2.000, math.radians(78.6), 1)
 STICK = TwoBar(2.444, 0.720, math.radians(10.3), -1)

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.clock import fit_clock
+from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
-from hydrotele.logs.load import Dataset, load_dataset, make_dataset
 from hydrotele.logs.log import Log, load_log, save_log
-from hydrotele.logs.offset import clock_offset
+from hydrotele.logs.rows import clock_offset
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.noise import IDEAL, noise_rms
 from hydrotele.machine.signals import usual_unit

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from hydrotele.logs.dataset import split
 from hydrotele.logs.rows import Rows
-from hydrotele.logs.split import split
 
 
 def rows(command):

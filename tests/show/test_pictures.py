@@ -11,8 +11,7 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.show.overlay import plot_log, plot_overlay
 from hydrotele.show.picture import render_picture
 from hydrotele.show.recording import write_recording
-from hydrotele.show.screenshot import take_screenshot, view_reports
-from hydrotele.show.serve import web_viewer
+from hydrotele.show.viewer import take_screenshot, view_reports, web_viewer
 
 
 def _pixels(path) -> np.ndarray:

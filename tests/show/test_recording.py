@@ -139,7 +139,7 @@ def test_importing_the_room_does_not_import_rerun():
     import sys
 
     code = (
-        "import sys, hydrotele.show.recording, hydrotele.show.overlay, hydrotele.show.screenshot;"
+        "import sys, hydrotele.show.recording, hydrotele.show.overlay, hydrotele.show.viewer;"
         "assert not {'rerun', 'matplotlib'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hydrotele.show.sweep_figures import _means
+from hydrotele.show.sweep_report import _means
 
 
 def test_bins_have_their_share_of_every_other_key():

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.resources import models_folder
-from hydrotele.soil.bucket import held_soil
-from hydrotele.soil.facts import SOILS
-from hydrotele.soil.numbers import level_profile, soil_numbers
+from hydrotele.soil.facts import SOILS, level_profile, soil_numbers
 from hydrotele.soil.shape import CAT215, outline_from_edge
+from hydrotele.soil.step import held_soil
 
 DEGREE = math.pi / 180.0
 SOIL = SOILS["sandy_loam"]

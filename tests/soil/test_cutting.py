@@ -12,21 +12,22 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from hydrotele import soil
-from hydrotele.soil import bucket, cutting, step, terrain, wrench
-from hydrotele.soil.cutting import (
+from hydrotele.soil import step, terrain, wrench
+from hydrotele.soil import step as bucket
+from hydrotele.soil import step as cutting
+from hydrotele.soil.facts import SOILS, Soil, soil_numbers
+from hydrotele.soil.shape import CAT215
+from hydrotele.soil.step import (
     acting_rake,
     acting_slope,
     adhesion_factor,
     bearing_pressure,
     cohesion_factor,
+    cutting_force,
     failure_plane,
     surcharge_factor,
     wedge_weight_factor,
 )
-from hydrotele.soil.facts import SOILS, Soil
-from hydrotele.soil.numbers import soil_numbers
-from hydrotele.soil.shape import CAT215
-from hydrotele.soil.step import cutting_force
 
 DEGREE = math.pi / 180.0
 PLACES = {"n", "out", "state"}  # packed arrays: `numbers` lists their units

@@ -10,13 +10,14 @@ from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.kinematics.task import task_forward, task_inverse, task_jacobian, task_numbers
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.soil.facts import GRAVITY, SOILS
-from hydrotele.soil.numbers import (
+from hydrotele.soil.facts import (
     CARRIED,
     FORCE_R,
     FORCE_Z,
+    GRAVITY,
     MASS,
     OUT,
+    SOILS,
     bucket_state,
     level_profile,
     soil_mass,

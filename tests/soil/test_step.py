@@ -14,12 +14,12 @@ from numba import (
 )
 
 from hydrotele.core.compiled import callback
-from hydrotele.soil.facts import GRAVITY, SOILS
-from hydrotele.soil.numbers import (
+from hydrotele.soil.facts import (
     CARRIED,
     CELL,
     FORCE_R,
     FORCE_Z,
+    GRAVITY,
     HEEL,
     HEEL_X,
     HEEL_Z,
@@ -30,6 +30,7 @@ from hydrotele.soil.numbers import (
     MOMENT,
     OUT,
     SLIDE,
+    SOILS,
     STATE,
     STIFFNESS,
     SWELL,

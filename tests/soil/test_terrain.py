@@ -7,8 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hydrotele.soil.facts import SOILS
-from hydrotele.soil.numbers import CELL, START, bucket_state, level_profile, soil_mass, soil_numbers
+from hydrotele.soil.facts import (
+    CELL,
+    SOILS,
+    START,
+    bucket_state,
+    level_profile,
+    soil_mass,
+    soil_numbers,
+)
 from hydrotele.soil.shape import CAT215
 from hydrotele.soil.terrain import (
     SETTLED,

@@ -99,7 +99,7 @@ def test_a_cluster_gives_the_same_table(done, tmp_path):
 def test_a_cluster_that_is_not_there_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     from hydrotele.core.errors import InputError
-    from hydrotele.sweep import cluster
+    from hydrotele.sweep import sweep as cluster
     from hydrotele.sweep.facts import load_sweep
     from hydrotele.sweep.sweep import How, run_sweep
 

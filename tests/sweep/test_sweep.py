@@ -22,13 +22,11 @@ from hydrotele.simulate.record import SimulationFailed
 from hydrotele.sweep import running
 from hydrotele.sweep.checking import check_points, open_base, scenario_of
 from hydrotele.sweep.facts import load_sweep
-from hydrotele.sweep.folder import sweep_folder
 from hydrotele.sweep.journal import FAILED, OK, Entry, Journal
 from hydrotele.sweep.numbers import numbers_of, possible_numbers
 from hydrotele.sweep.points import overrides, points
 from hydrotele.sweep.running import Task, perform
-from hydrotele.sweep.sweep import How, run_sweep
-from hydrotele.sweep.workers import outcomes
+from hydrotele.sweep.sweep import How, outcomes, run_sweep, sweep_folder
 from tests.sweep.conftest import rows_of, write_sweep
 
 
@@ -79,7 +77,7 @@ def test_the_table_states_units(done):
 
 def test_a_finished_sweep_is_reported_without_running_anything(done, tmp_path, monkeypatch):
     file, out = copied(done, tmp_path)
-    monkeypatch.setattr("hydrotele.sweep.workers._Worker", None)  # must not be started
+    monkeypatch.setattr("hydrotele.sweep.sweep._Worker", None)  # must not be started
     code, said, _ = invoke("sweep", file, "--out", out, "--json")
     facts = json.loads(said)
     assert code == 0 and facts["runs"] == 8 and facts["done_now"] == facts["failed"] == 0

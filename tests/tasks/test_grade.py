@@ -8,14 +8,15 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.task import REACHED, task_inverse
-from hydrotele.soil.facts import GRAVITY, SOILS
-from hydrotele.soil.numbers import (
+from hydrotele.soil.facts import (
     CARRIED,
     DENSITY,
     FORCE_R,
     FORCE_Z,
+    GRAVITY,
     MASS,
     OUT,
+    SOILS,
     STATE,
     SWELL,
     soil_mass,
@@ -33,6 +34,7 @@ from hydrotele.tasks.grade import (
     ERROR,
     FAILURE,
     FAR,
+    GRADE_SOILS,
     GRADED,
     MIDDLE,
     NEAR,
@@ -45,7 +47,6 @@ from hydrotele.tasks.grade import (
     TIME_COST,
     grade_radii,
 )
-from hydrotele.tasks.grade_task import GRADE_SOILS
 from hydrotele.tasks.memory import DISABLED
 from hydrotele.tasks.task import Options
 

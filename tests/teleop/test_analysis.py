@@ -15,12 +15,11 @@ from hydrotele.teleop.analysis import (
     loop_gain,
     stability_map,
 )
-from hydrotele.teleop.case import Case
+from hydrotele.teleop.case import Case, load_teleop_case
+from hydrotele.teleop.confirm import grows, kicked, step_of, swept
 from hydrotele.teleop.findings import find, findings_document, why_unstable
 from hydrotele.teleop.stability import stable, unstable_held
 from hydrotele.teleop.switching import Spring, worst_growth
-from hydrotele.teleop.teleop_case import load_teleop_case
-from hydrotele.teleop.two_mass import grows, kicked, step_of, swept
 from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance, characteristic, transmitted
 
 CASE = Case(

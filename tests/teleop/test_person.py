@@ -7,8 +7,7 @@ from hydrotele.machine.joystick import load_joystick
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.teleop.axis_table import NOMINAL, REACH
 from hydrotele.teleop.master import master
-from hydrotele.teleop.muscles import pull
-from hydrotele.teleop.person import Person
+from hydrotele.teleop.person import Person, pull
 
 STICK, PERIOD, TICKS = load_joystick(), 0.005, 400
 CARRIED = 9.81 * STICK.hand.mass

@@ -10,10 +10,9 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.teleop.flat import flat_view, flattened
 from hydrotele.teleop.master import master
-from hydrotele.teleop.muscles import Muscles
+from hydrotele.teleop.person import Muscles
 from hydrotele.teleop.round_trip import QUIET, SHARE, to_the_hand, to_the_machine
-from hydrotele.teleop.slave import slave
-from hydrotele.teleop.slave_table import AGE
+from hydrotele.teleop.slave import AGE, slave
 
 CAT, STICK, PERIOD, FADE = load_machine("cat215", "bucket"), load_joystick(), 0.005, 0.2
 AXES = tuple(CAT.axes)

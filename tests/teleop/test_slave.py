@@ -10,8 +10,16 @@ from hydrotele.scenario.scenario import Pose
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.teleop.flat import flat_view
 from hydrotele.teleop.master import master
-from hydrotele.teleop.slave import measure_task, slave, slave_step
-from hydrotele.teleop.slave_table import BLOCKED, SILENT, TRIPPED, unpack_slave, unpack_slave_state
+from hydrotele.teleop.slave import (
+    BLOCKED,
+    SILENT,
+    TRIPPED,
+    measure_task,
+    slave,
+    slave_step,
+    unpack_slave,
+    unpack_slave_state,
+)
 
 CAT, STICK, PERIOD = load_machine("cat215", "bucket"), load_joystick(), 0.005
 NAMES = ("r", "theta", "z", "attitude")

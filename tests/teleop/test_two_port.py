@@ -7,9 +7,8 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.case import Case
-from hydrotele.teleop.confirm import agreement
+from hydrotele.teleop.confirm import agreement, grows, kicked, swept
 from hydrotele.teleop.stability import stable, unstable_held, unstable_poles
-from hydrotele.teleop.two_mass import grows, kicked, swept
 from hydrotele.teleop.two_port import (
     STRUCTURES,
     Gains,

@@ -13,7 +13,7 @@ from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.hydraulics.laws import ATMOSPHERE
-from hydrotele.logs.load import load_dataset
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log, save_log
 from hydrotele.machine.machine_file import load_machine
 from tools.blind.forms import FORMS

@@ -5,7 +5,7 @@ import numpy as np
 from hydrotele.dynamics.integrate import advance, place, read_channels, write_trail
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.estimate.track import STEP, fine_enough, track_run
-from hydrotele.logs.load import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 
 HORIZON = 5.0  # s

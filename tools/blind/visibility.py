@@ -15,7 +15,7 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorError
 from hydrotele.simulate.drive_side import flexible_axes
-from hydrotele.simulate.past import Past
+from hydrotele.simulate.feedback import Past
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.readout import true_channels
 from hydrotele.simulate.record import Recorder, begin_leapfrog

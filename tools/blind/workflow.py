@@ -13,8 +13,8 @@ import math
 import resource
 
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.gap_json import gap_document
-from hydrotele.logs.load import load_dataset
+from hydrotele.gap.result import gap_document
+from hydrotele.logs.dataset import load_dataset
 from hydrotele.machine.machine_file import load_machine
 from tools.blind.open_loop import HORIZON, open_loop_error
 
