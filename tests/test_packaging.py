@@ -75,7 +75,7 @@ def test_installed_wheel_finds_its_machines_from_any_folder(wheel, tmp_path):
     site = tmp_path / "site"
     pip("install", "--quiet", "--no-deps", "--no-index", "--target", site, wheel)
     script = (
-        "from hydrotele import resources\n"
+        "from hydrotele.core import resources\n"
         "print(resources.__file__)\n"
         "print(*sorted(p.name for p in resources.models_folder().glob('*/machine.yaml')))\n"
         "print(resources.models_folder())\n"
@@ -85,7 +85,7 @@ def test_installed_wheel_finds_its_machines_from_any_folder(wheel, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(site)}
     lines = run(sys.executable, "-c", script, cwd=elsewhere, env=environment).splitlines()
     assert lines == [
-        str(site / "hydrotele" / "resources.py"),
+        str(site / "hydrotele" / "core" / "resources.py"),
         " ".join(["machine.yaml"] * len(list((ROOT / "models").glob("*/machine.yaml")))),
         str(site / "hydrotele" / "models"),
     ]

@@ -29,7 +29,7 @@ from tools.study import options, publish
 
 CHILD = """
 import resource, sys, time
-from hydrotele import cli
+from hydrotele.cli import main as cli
 started = time.perf_counter()
 sys.argv = ["hydrotele", *sys.argv[1:]]
 try:

@@ -250,7 +250,7 @@ def test_a_kill_in_the_middle_leaves_no_file_of_that_name(tmp_path):
         "save_log(make_log(), sys.argv[1])\n"
     )
     path = tmp_path / "run.parquet"
-    paths = [str(ROOT), str(ROOT / "tests")]
+    paths = [str(ROOT), str(Path(__file__).parent)]
     done = subprocess.run([sys.executable, "-c", code, str(path), *paths], capture_output=True)
     assert done.returncode == -signal.SIGKILL, done.stderr.decode()
     assert not path.exists()

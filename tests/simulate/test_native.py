@@ -233,7 +233,7 @@ def test_a_command_that_is_no_number_counts_as_mujoco_counts_it(name):
 WRITTEN_OVER = """
 import mujoco, numpy as np
 from hydrotele.hydraulics.circuit import Slot
-from hydrotele.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 random = np.random.default_rng(0)
 INDICES = [Slot.FIRST, Slot.COUNT, Slot.MEMORY, Slot.BRISTLE, Slot.DELIVERY, Slot.CURVES]
