@@ -1,15 +1,21 @@
 """How numerical functions are compiled: by numba, cached on disk, without checks for division by 0.
 
 numba looks only at the file of a function to see whether its cache is good. Compiled code here
-calls compiled code of other files, so the cache of each state of the sources has its own folder.
+contains functions and constants of other files, so each module has a cache folder for each state
+of its own source and of all sources of the package that it imports, directly or not. A module that
+changes leaves the caches of the others alone, and checkouts with the same sources share them.
 A cache is code: it lies in the user's cache folder, and no one else may write there.
 """
 
 import contextlib
+import functools
 import hashlib
+import logging
 import os
+import re
 import shutil
 import stat
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +23,8 @@ from typing import Any
 
 from numba import cfunc, njit
 from numba.core import config as _numba_config
+from numba.core import event
+from numba.core.caching import UserProvidedCacheLocator
 
 _CONFIG: Any = _numba_config  # its settings are made at run time
 _UNUSED = 30 * 24 * 3600.0  # s, after which the cache of other sources is removed
@@ -50,7 +58,7 @@ def inlined(function):
 
 
 def _compile(function, **options):
-    with _caching() as cache:
+    with _caching(function.__module__) as cache:
         return njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
 
 
@@ -58,14 +66,14 @@ def callback(signature):
     """Decorator that compiles a function for C to call, cached on disk where that is possible."""
 
     def decorate(function):
-        with _caching() as cache:
+        with _caching(function.__module__) as cache:
             return cfunc(signature, cache=cache, error_model="numpy")(function)
 
     return decorate
 
 
 def cache_folder() -> Path | None:
-    """Folder of the compiled code, `$XDG_CACHE_HOME/hydrotele/...`, made for its owner only.
+    """Folder of the compiled code, `$XDG_CACHE_HOME/hydrotele/compiled`, made for its owner only.
 
     None where there is none: no home, a file system without space or for reading, or a folder that
     somebody else owns or may write to.
@@ -73,15 +81,12 @@ def cache_folder() -> Path | None:
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     if not os.path.isabs(home):
         return None
-    folder = Path(home, "hydrotele", f"compiled_{_digest()}")
+    folder = Path(home, "hydrotele", "compiled")
     try:
-        new = not folder.exists()
         folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
         if not all(map(_private, (folder, folder.parent))) or not os.access(folder, os.W_OK):
             return None
-        if new:
-            _remove_unused(folder)
     except OSError:
         return None
     return folder
@@ -93,32 +98,125 @@ def _private(folder: Path) -> bool:
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not shared
 
 
-def _digest() -> str:
-    """Of all sources with compiled code: one of them that changes asks for another cache."""
-    package = Path(__file__).parent.parent
-    texts = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
-    used = [text for text in texts if b"hydrotele.core.compiled" in text or b"numba" in text]
-    return hashlib.sha256(b"".join(used)).hexdigest()[:16]
-
-
-def _remove_unused(own: Path) -> None:
-    for folder in own.parent.glob("compiled_*"):
-        if folder != own and time.time() - folder.stat().st_mtime > _UNUSED:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
 _FOLDER = cache_folder()
-if _FOLDER:
-    with contextlib.suppress(OSError):
-        os.utime(_FOLDER)  # it is in use
+_PACKAGE = Path(__file__).parent.parent
+_IMPORT = re.compile(rb"^\s*(?:from|import) +(hydrotele[\w.]*)(?: +import +([^#\n]*))?", re.M)
+
+
+@functools.cache
+def _source(module: str) -> bytes | None:
+    """Source of a module of this package; None where the name is none."""
+    package, *parts = module.split(".")
+    if package != _PACKAGE.name:
+        return None
+    place = _PACKAGE.joinpath(*parts)
+    for path in (place.with_suffix(".py"), place / "__init__.py"):
+        with contextlib.suppress(OSError):
+            return path.read_bytes()
+    return None
+
+
+@functools.cache
+def _imports(module: str) -> frozenset[str]:
+    """Modules of this package that a module's source imports."""
+    found = set()
+    for place, names in _IMPORT.findall(_source(module) or b""):
+        package = place.decode()
+        found.add(package)
+        for name in re.findall(r"\w+", names.decode()):
+            if _source(f"{package}.{name}") is not None:
+                found.add(f"{package}.{name}")
+    return frozenset(found)
+
+
+@functools.cache
+def digest(module: str) -> str:
+    """Of a module's source and those that it imports: one that changes asks for another cache."""
+    reached, open_ones = {module}, [module]
+    while open_ones:
+        more = _imports(open_ones.pop()) - reached
+        reached |= more
+        open_ones += more
+    text = hashlib.sha256()
+    for name in sorted(reached):
+        text.update(name.encode() + b"\0" + (_source(name) or b"") + b"\0")
+    return text.hexdigest()[:16]
+
+
+class Locator(UserProvidedCacheLocator):
+    """Tells numba where compiled code lies; its folder is named after the sources' content."""
+
+    def __init__(self, py_func, py_file):
+        super().__init__(py_func, py_file)
+        self._cache_path = _CONFIG.CACHE_DIR
+
+    def get_source_stamp(self):
+        """The folder is of one state of the sources, so there is nothing to compare."""
+        return ""
 
 
 @contextlib.contextmanager
-def _caching() -> Iterator[bool]:
-    """Whether there is a cache; functions that are decorated meanwhile find it."""
-    given = _CONFIG.CACHE_DIR
-    _CONFIG.CACHE_DIR = str(_FOLDER or "")
+def _caching(module: str) -> Iterator[bool]:
+    """Whether there is a cache; functions of a module that are decorated meanwhile find it."""
+    names = ("CACHE_DIR", "CACHE_LOCATOR_CLASSES")
+    given = {name: getattr(_CONFIG, name, "") for name in names}
+    own = _folder_of(module) if _FOLDER and _source(module) is not None else None
+    _CONFIG.CACHE_DIR = str(own or "")
+    _CONFIG.CACHE_LOCATOR_CLASSES = f"{__name__}.{Locator.__name__}" if own else ""
     try:
-        yield _FOLDER is not None
+        yield own is not None
     finally:
-        _CONFIG.CACHE_DIR = given
+        for name, value in given.items():
+            setattr(_CONFIG, name, value)
+
+
+@functools.cache
+def _folder_of(module: str) -> Path | None:
+    """A module's folder in the cache, which is thereby in use; old ones of the module go."""
+    assert _FOLDER
+    folder = _FOLDER / f"{module}_{digest(module)}"
+    try:
+        if not folder.exists():
+            folder.mkdir(mode=0o700)
+            for old in _FOLDER.glob(f"{module}_{'?' * 16}"):
+                if time.time() - old.stat().st_mtime > _UNUSED:
+                    shutil.rmtree(old, ignore_errors=True)
+        os.utime(folder)
+    except OSError:
+        return folder if folder.is_dir() else None
+    return folder
+
+
+class _Announcement(event.Listener):
+    """Logs that code is being compiled once that has taken a moment, and how far it is."""
+
+    def __init__(self) -> None:
+        self._depth, self._count, self._began, self._told = 0, 0, 0.0, 0.0
+
+    def on_start(self, event: event.Event) -> None:
+        """A function is compiled, perhaps for another one that is."""
+        self._depth, self._count = self._depth + 1, self._count + 1
+        if self._depth == 1:
+            timer = threading.Timer(_PATIENCE, self._announce, [self._count])
+            timer.daemon = True
+            timer.start()
+        elif self._told and time.monotonic() - self._told > _HEARTBEAT:
+            self._told = time.monotonic()
+            passed = self._told - self._began
+            _LOG.warning("compiled %d functions in %.0f s", self._count, passed)
+
+    def on_end(self, event: event.Event) -> None:
+        """It is done."""
+        self._depth -= 1
+
+    def _announce(self, count: int) -> None:
+        if self._depth and not self._told and self._count >= count:
+            self._told = time.monotonic()
+            self._began = self._told - _PATIENCE
+            _LOG.warning("compiling numerical code once, up to a minute; it is kept for later")
+
+
+_LOG = logging.getLogger("hydrotele")
+_PATIENCE = 1.0  # s of compiling before it is said
+_HEARTBEAT = 10.0  # s
+event.register("numba:compile", _Announcement())

@@ -167,26 +167,31 @@ class Evidence:
         return np.concatenate([flat(track.whitened) for track in self.tracks])
 
     def errors(
-        self, guess: Guess, step: float | None = None, tracks: Sequence[Track] | None = None
-    ) -> np.ndarray:
+        self, guess: Guess, step: float | None = None, tracks: Sequence[Track] | None = None,
+        parallel: bool = False,
+    ) -> np.ndarray:  # fmt: skip
         """(E,) whitened errors of a guess with the base's gains, in all or some of its tracks.
 
         What another step than the evidence's own changes for the base is taken out, lest an effect
-        be preferred because it makes up for the integrator.
+        be preferred because it makes up for the integrator. With `parallel` the workers take a run
+        each, which must not be asked for from within one.
         """
         step, machine = step or self.step, guess.machine(self.data.machine)
         tracks = self.tracks if tracks is None else tracks
-        return np.concatenate(
-            [self._errors(machine, t, step) + self._made_by(step, t) for t in tracks]
-        )
+
+        def one(track: Track) -> np.ndarray:
+            return self._errors(machine, track, step) + self._made_by(step, track)
+
+        return np.concatenate(self.map(one, tracks) if parallel else [one(t) for t in tracks])
 
     def step_effect(self, guess: Guess, step: float) -> np.ndarray:
         """(E,) what another step than the evidence's own changes for a guess near the base."""
         machine = guess.machine(self.data.machine)
-        return np.concatenate(
-            [self._errors(machine, t, step) - self._errors(machine, t, self.step)
-             for t in self.tracks]
-        )  # fmt: skip
+
+        def one(track: Track) -> np.ndarray:
+            return self._errors(machine, track, step) - self._errors(machine, track, self.step)
+
+        return np.concatenate(self.map(one, self.tracks))
 
     def _errors(self, machine: Machine, track: Track, step: float) -> np.ndarray:
         return flat(track_run(machine, self.data, track.run, track, step).whitened)
@@ -244,7 +249,8 @@ class Evidence:
         """
         step = step or self.step
         if step not in self._slopes:
-            errors, names = self.errors(self._base, step), self._base.names
+            errors = self.errors(self._base, step, parallel=parallel)
+            names = self._base.names
             if len(names) <= _MANY:
                 self._slopes[step] = self.slopes(self._base, errors, parallel, step)
                 return self._slopes[step]
@@ -316,7 +322,7 @@ class Evidence:
             fresh = self.slopes(there, errors, parallel, step, first)
             return fresh if kept is None else np.hstack([kept, fresh])
 
-        errors = self.errors(guess, step)
+        errors = self.errors(guess, step, parallel=parallel)
         loss = _loss(errors, guess)
         slopes = slopes_at(guess, errors)
         for _ in range(steps):
@@ -325,7 +331,7 @@ class Evidence:
             better = None
             for shrink in (1.0, 0.5, 0.2, 0.05):
                 moved = guess.at(d + shrink * move)
-                tried = self.errors(moved, step)
+                tried = self.errors(moved, step, parallel=parallel)
                 if (lower := _loss(tried, moved)) < loss - 1e-9:
                     better = (moved, tried, lower)
                     break

@@ -21,6 +21,7 @@ _SECOND = 2  # rivals that are settled like the effect itself
 _RIVALS = 3  # candidates that are judged in the place of a named effect
 _HOPELESS = 500.0  # loss above the effect's beyond which a rival is let go; or this share of what
 _FAR = 0.5  # the effect brings
+_BEHIND = 100.0  # loss above the effect's, of a rival that is not worth another round
 _SAME = 0.1  # squares of whitened errors by which two guesses differ that say the same
 _DRAWS = 4000  # of the Bayesian bootstrap
 
@@ -162,7 +163,7 @@ def find_rivals(
     for place, (judged, cost) in enumerate(looked):
         fit = None
         if place < _SECOND and judged.loss < hopeless:
-            judged, fit = settle(evidence, judged)
+            judged, fit = settle(evidence, judged, now.loss + _BEHIND)
             cost = charge(fit.information, judged.guess.parts[-1][0].size)
         found.append(Rival(judged.guess.parts[-1][0], judged, cost, fit))
     evidence.set_base(now)

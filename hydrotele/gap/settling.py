@@ -42,12 +42,23 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
     return sorted(evidence.map(fit, pool), key=lambda found: -found.score)
 
 
-def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
-    """Fit with levels and gains computed anew until they no longer matter."""
+def settle(
+    evidence: Evidence, judged: Judged, wanted: float = np.inf
+) -> tuple[Judged, Fit]:  # fmt: skip
+    """Fit with levels and gains computed anew until they no longer matter.
+
+    Args:
+        evidence: the runs; the guess becomes the base.
+        judged: the guess to begin with.
+        wanted: a loss; what would not come down to it at the present pace is left as it is.
+
+    Returns:
+        The guess, judged, and its last fit.
+    """
     begin = judged
     fit, last, guess, kept = None, None, judged.guess, None
     group = calibration_of(guess)
-    for _ in range(_SETTLES):
+    for left in reversed(range(_SETTLES)):
         evidence.set_base(judged)
         if group and kept is None:
             kept = evidence.base_slopes(evidence.slope_step)
@@ -66,6 +77,8 @@ def settle(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:
             break
         if group and fall < _IDLE:
             break
+        if judged.loss - max(fall, 0.0) * left > wanted:
+            return evidence.set_base(judged), fit
         kept = kept if fall < _STALE else None
     assert fit
     found = evidence.judged(guess)

@@ -1,11 +1,16 @@
-"""Compiled functions: what those without counted references may do, and that they leak nothing."""
+"""Compiled functions: what those without counted references may do, their caches, what is said."""
 
+import os
+import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numba.core.errors import TypingError
 
+import hydrotele
 from hydrotele.core.compiled import lean
 
 
@@ -41,3 +46,52 @@ def test_lean_functions_that_create_or_return_arrays_are_refused():
         _creates(3)
     with pytest.raises(TypingError, match="array passed into"):
         _returns_part(np.ones(3))
+
+
+PACKAGE = Path(hydrotele.__file__).parent
+ROOT = PACKAGE.parent
+
+
+def _run(root, cache, code):
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONPATH": str(root), "XDG_CACHE_HOME": str(cache)},
+    )  # fmt: skip
+    return done.stdout.split(), done.stderr
+
+
+def test_a_changed_module_drops_the_caches_of_those_that_use_it_and_no_others(tmp_path):
+    cache, code = tmp_path / "cache", (
+        "from hydrotele.core.compiled import digest\\n"
+        "import made, other\\n"
+    )  # fmt: skip
+    package = tmp_path / "hydrotele"
+    shutil.copytree(PACKAGE / "core", package / "core")
+    (package / "__init__.py").write_text("")
+    (package / "constant.py").write_text("HALF = 0.5\n")
+    head = "from hydrotele.core.compiled import compiled\n"
+    law = "@compiled\ndef law(x):\n    return {} * x\n"
+    (package / "made.py").write_text(
+        head + "from hydrotele.constant import HALF\n\n" + law.format("HALF")
+    )
+    (package / "other.py").write_text(head + "\n" + law.format("3.0"))
+    code = "from hydrotele.made import law; from hydrotele.other import law as other\n"
+    code += "print(law(4.0), other(4.0), len(law.stats.cache_hits), len(other.stats.cache_hits))"
+    assert _run(tmp_path, cache, code)[0] == ["2.0", "12.0", "0", "0"]
+    assert _run(tmp_path, cache, code)[0] == ["2.0", "12.0", "1", "1"]
+    (package / "constant.py").write_text("HALF = 0.25\n")
+    assert _run(tmp_path, cache, code)[0] == ["1.0", "12.0", "0", "1"]
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(package, elsewhere / "hydrotele")
+    assert _run(elsewhere, cache, code)[0] == ["1.0", "12.0", "1", "1"]
+
+
+def test_the_first_compilation_is_announced(tmp_path):
+    code = (
+        "from hydrotele.core import compiled as c; c._PATIENCE = 0.0\n"
+        "import numpy as np\n"
+        "@c.compiled\n"
+        "def law(x):\n    return np.linalg.solve(np.eye(3), x)\n"
+        "law(np.ones(3))"
+    )
+    assert "compiling numerical code once" in _run(ROOT, tmp_path, code)[1]
