@@ -1,4 +1,9 @@
-"""Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo."""
+"""Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo.
+
+The names in `__all__` are the public ones, each imported when it is first used; what is in the
+modules below may move. `docs/api.md` lists them; `hydrotele/__init__.pyi` tells them to
+type checkers.
+"""
 
 import contextlib
 import os
@@ -24,3 +29,38 @@ def _ignore_configuration() -> None:
 
 
 _ignore_configuration()
+
+
+_PUBLIC = {
+    "control.endpoint_force": ("endpoint_force_of_log",),
+    "control.gravity_model": ("identify_gravity",),
+    "core.errors": ("InputError",),
+    "effects": ("EFFECTS", "apply_effect", "load_effects"),
+    "gap.find": ("find_gap",),
+    "gap.patched": ("write_patch",),
+    "gap.result": ("Gap", "gap_document"),
+    "identify.identification": ("identify_dynamics",),
+    "logs.dataset": ("Dataset", "load_dataset"),
+    "logs.log": ("Log", "load_log", "load_logs", "save_log"),
+    "machine.machine": ("Machine",),
+    "machine.machine_file": ("load_machine", "save_machine", "shipped_machines"),
+    "run.replay": ("Replay", "replay_log"),
+    "run.run": ("Run", "run_scenario"),
+    "scenario.scenario": ("Scenario", "load_scenario", "shipped_scenarios"),
+    "simulate.plant": ("Plant", "build_plant", "initial_state", "rest_state"),
+    "tasks.controllers.catalogue": ("make_controller",),
+}
+_MODULE = {name: module for module, names in _PUBLIC.items() for name in names}
+__all__ = sorted(_MODULE)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str):
+    if name not in _MODULE:
+        raise AttributeError(f"module 'hydrotele' has no attribute {name!r}")
+    found = getattr(import_module(f"hydrotele.{_MODULE[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

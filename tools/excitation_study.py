@@ -22,7 +22,7 @@ from hydrotele.identify.excitation import (
     information,
     informative_base,
 )
-from hydrotele.identify.identification import identify
+from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import force_noise, records
 from hydrotele.identify.result import parameter_rows
 from hydrotele.identify.setup import machine_setup
@@ -62,7 +62,7 @@ def spreads(scenario: Scenario, trials: int) -> dict[str, float]:
         data = make_dataset(sorted(logs), machine, SENSORS, HELD_OUT)
         fit, heldout, _ = records(data)
         setup = machine_setup(machine, closed_chain(machine))
-        rows = parameter_rows(identify(fit, heldout, setup))
+        rows = parameter_rows(identify_dynamics(fit, heldout, setup))
         found.append({row.name: row.std for row in rows if row.std is not None})
     names = set.intersection(*(set(f) for f in found))
     return {n: float(np.mean([f[n] for f in found])) for n in sorted(names)}

@@ -17,7 +17,7 @@ import yaml
 
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.effects.effect import changed
-from hydrotele.identify.identification import identify
+from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.identified_machine import identified_machine
 from hydrotele.identify.record import records
 from hydrotele.identify.setup import machine_setup
@@ -158,7 +158,7 @@ def main() -> None:
             for name, rows in parts
         ]  # fmt: skip
         fit, heldout, _ = records(make_dataset(files, model, SENSORS, "b"))
-        found = identify(fit, heldout, machine_setup(model, closed_chain(model)))
+        found = identify_dynamics(fit, heldout, machine_setup(model, closed_chain(model)))
         better, _ = identified_machine(model, found, {})
         (folder / "identified").mkdir()
         save_machine(better, folder / "identified" / "machine.yaml")

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from hydrotele.cli.identifying import closed_chain
-from hydrotele.identify.identification import identify
+from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import records
 from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.logs.dataset import make_dataset
@@ -55,7 +55,7 @@ def one_trial(seed: int, number: int, sensors: str) -> dict[str, Any]:
     dataset = make_dataset(sorted(logs), machine, sensors, HELD_OUT)
     fit, heldout, _ = records(dataset)
     setup = machine_setup(machine, closed_chain(machine))
-    found = identify(fit, heldout, wrong_setup(setup, rng))
+    found = identify_dynamics(fit, heldout, wrong_setup(setup, rng))
     known = np.concatenate([setup.chain.inertia[setup.chain.bodies.index(b)] for b in setup.bodies]
                            + [list(one.nominal.values()) for one in setup.rubbing]
                            + [np.zeros(len(setup.chain.drives))])  # fmt: skip

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.cli.identifying import closed_chain
-from hydrotele.identify.identification import identify
+from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import Record, records
 from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import machine_setup
@@ -43,7 +43,9 @@ def judged(machine: Machine, fit: Sequence[Record], heldout: Record, rng) -> Err
     state = rng.bit_generator.state
     for model in ("complete", "reduced"):
         rng.bit_generator.state = state  # both start from the same wrong machine
-        found.append(identify(fit, heldout, wrong_setup(machine_setup(machine, chain, model), rng)))
+        found.append(
+            identify_dynamics(fit, heldout, wrong_setup(machine_setup(machine, chain, model), rng))
+        )
     complete, reduced = found
     return {drive: _errors(complete, reduced, drive) for drive in complete.heldout}
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.estimation import Estimator
-from hydrotele.identify.identification import identify
+from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.projection import project
 from hydrotele.identify.record import records
@@ -84,7 +84,7 @@ def one_trial(seed: int, number: int, cycles: int) -> dict[str, list[list[float]
     out = {}
     for way, (method, pairs) in WAYS.items():
         how = Processing(method, period=PERIOD)
-        found = identify(fit, heldout, wrong, how, Estimator(pairs=pairs))
+        found = identify_dynamics(fit, heldout, wrong, how, Estimator(pairs=pairs))
         errors = [matrix @ (found.value - truth) for matrix, truth in laps]
         out[way] = [np.sqrt(np.mean(e**2, axis=0)).tolist() for e in errors]
     return out

@@ -191,28 +191,33 @@ class _Announcement(event.Listener):
     """Logs that code is being compiled once that has taken a moment, and how far it is."""
 
     def __init__(self) -> None:
-        self._depth, self._count, self._began, self._told = 0, 0, 0.0, 0.0
+        self._depth, self._count = 0, 0
+        self._began, self._spent = 0.0, 0.0  # s: start of the outermost, all compiled before it
+        self._told: float | None = None  # s of compiling at the last message
 
     def on_start(self, event: event.Event) -> None:
         """A function is compiled, perhaps for another one that is."""
         self._depth, self._count = self._depth + 1, self._count + 1
         if self._depth == 1:
-            timer = threading.Timer(_PATIENCE, self._announce, [self._count])
-            timer.daemon = True
-            timer.start()
-        elif self._told and time.monotonic() - self._told > _HEARTBEAT:
-            self._told = time.monotonic()
-            passed = self._told - self._began
-            _LOG.warning("compiled %d functions in %.0f s", self._count, passed)
+            self._began = time.monotonic()
+            if self._told is None:
+                timer = threading.Timer(_PATIENCE, self._announce, [self._began])
+                timer.daemon = True
+                timer.start()
+        spent = self._spent + time.monotonic() - self._began
+        if self._told is not None and spent - self._told > _HEARTBEAT:
+            self._told = spent
+            _LOG.warning("compiled %d functions in %.0f s", self._count, spent)
 
     def on_end(self, event: event.Event) -> None:
         """It is done."""
         self._depth -= 1
+        if self._depth == 0:
+            self._spent += time.monotonic() - self._began
 
-    def _announce(self, count: int) -> None:
-        if self._depth and not self._told and self._count >= count:
-            self._told = time.monotonic()
-            self._began = self._told - _PATIENCE
+    def _announce(self, began: float) -> None:
+        if self._depth and self._told is None and began == self._began:
+            self._told = self._spent + _PATIENCE
             _LOG.warning("compiling numerical code once, up to a minute; it is kept for later")
 
 

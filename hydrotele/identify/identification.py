@@ -328,7 +328,7 @@ class Fitted:
         return _whole(self.told, self.data.table.nominal, self.estimate)
 
 
-def identify(
+def identify_dynamics(
     fit: Sequence[Record], heldout: Record, setup: Setup,
     processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
@@ -522,7 +522,7 @@ def identify_with_shapes(
             setup = sharp
             said = "Dry friction changes sign at once in these data, more sharply than given."
             notes = (*notes, said)
-    found = identify(fit, heldout, setup, processing, estimator, notes=notes)
+    found = identify_dynamics(fit, heldout, setup, processing, estimator, notes=notes)
     return replace(found, seconds=time.perf_counter() - started)
 
 

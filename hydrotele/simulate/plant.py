@@ -20,6 +20,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
+from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air
 from hydrotele.hydraulics.parameters import actuator_order, memory_names
@@ -27,7 +28,7 @@ from hydrotele.hydraulics.slots import Slot
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
-from hydrotele.simulate.document import Mjcf
+from hydrotele.simulate.document import TIP_SITE, Mjcf
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, load_joint, wind_up
 from hydrotele.simulate.mechanism import add_element, assemble, mjcf_document
 from hydrotele.simulate.native import install_hydraulics
@@ -147,6 +148,43 @@ class Plant:
     rod_qpos: np.ndarray
     hydraulic: int
     memory: Mapping[str, int] = dataclasses.field(default_factory=dict)
+
+    def spools(self, data: mujoco.MjData) -> np.ndarray:
+        """(h,) positions of the spools, -1 to 1, in the order of `axes`; h hydraulic axes.
+
+        Of a drive with a pump of its own it is the pump's speed [rad/s]. See `docs/api.md` for the
+        layout of `data.act`.
+        """
+        return self._activations(data)[:, 0]
+
+    def pressures(self, data: mujoco.MjData) -> np.ndarray:
+        """(h, 2) pressures of head side and rod side [Pa], in the order of `axes`.
+
+        Of a motor they are those of its two ports.
+        """
+        return self._activations(data)[:, 2:]
+
+    def _activations(self, data: mujoco.MjData) -> np.ndarray:
+        count = ACTIVATIONS * self.hydraulic
+        return np.array(data.act[:count]).reshape(self.hydraulic, ACTIVATIONS)
+
+    def tip(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        """Where the arm's tip is.
+
+        Args:
+            data: with `mj_kinematics` or a step done; after `mj_step` the position is that at the
+                beginning of the last step.
+
+        Returns:
+            (3,) position in the world [m] and (3, 3) rotation from the tip's frame to the world.
+
+        Raises:
+            InputError: the machine has no arm.
+        """
+        if not self.machine.arm:
+            raise InputError(f"machine {self.machine.name}", "has no arm, and so no tip")
+        site = data.site(TIP_SITE)
+        return site.xpos.copy(), site.xmat.reshape(3, 3).copy()
 
     @property
     def mjcf(self) -> str:

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import METHODS, Estimator
-from hydrotele.identify.identification import identify
+from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import beginning, records
 from hydrotele.identify.setup import machine_setup
@@ -36,7 +36,7 @@ def repeated():
 @pytest.fixture(scope="module")
 def found(repeated):
     processing = Processing(period=PERIOD)
-    return {m: identify(*repeated, processing, Estimator(m)) for m in METHODS}
+    return {m: identify_dynamics(*repeated, processing, Estimator(m)) for m in METHODS}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -62,7 +62,7 @@ def test_weights_make_the_intervals_narrower(found):
 
 def test_the_bias_taken_off_is_what_noise_of_positions_does_to_friction(repeated, found):
     corrected = found["weighted"]
-    kept = identify(*repeated, Processing(period=PERIOD), Estimator(pairs=0))
+    kept = identify_dynamics(*repeated, Processing(period=PERIOD), Estimator(pairs=0))
     assert not kept.bias.any()
     where = [corrected.names[b] for b in corrected.told.base].index("stribeck.boom_rod")
     # noise hides on which side of zero a slow rate is; more than the interval's half
@@ -73,21 +73,21 @@ def test_the_bias_taken_off_is_what_noise_of_positions_does_to_friction(repeated
 def test_instruments_ask_for_a_repeated_motion(repeated):
     fit, heldout, setup = repeated
     with pytest.raises(InputError, match="need the period"):
-        identify(fit, heldout, setup, Processing(), Estimator("instruments"))
+        identify_dynamics(fit, heldout, setup, Processing(), Estimator("instruments"))
     with pytest.raises(InputError, match="repeat"):
-        identify(fit, heldout, setup, Processing(period=0.1), Estimator("instruments"))
+        identify_dynamics(fit, heldout, setup, Processing(period=0.1), Estimator("instruments"))
     once = [beginning(fit[0], 25.0)]
     with pytest.raises(InputError, match="does not repeat"):
-        identify(once, heldout, setup, Processing(period=PERIOD), Estimator("instruments"))
+        identify_dynamics(once, heldout, setup, Processing(period=PERIOD), Estimator("instruments"))
 
 
 @pytest.mark.parametrize("method", ["gauss_markov", "instruments"])
 def test_a_motion_with_another_period_is_refused(repeated, method):
     fit, heldout, setup = repeated
     with pytest.raises(InputError, match="does not repeat after 13 s"):
-        identify(fit, heldout, setup, Processing(period=13.0), Estimator(method))
+        identify_dynamics(fit, heldout, setup, Processing(period=13.0), Estimator(method))
     with pytest.raises(InputError, match="does not repeat after 13 s"):
-        identify(fit, heldout, setup, Processing("periodic", period=13.0))
+        identify_dynamics(fit, heldout, setup, Processing("periodic", period=13.0))
 
 
 def test_intervals_of_repeated_experiments_cover_the_truth():

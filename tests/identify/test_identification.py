@@ -10,7 +10,7 @@ from hydrotele.cli.identifying import closed_chain
 from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identifiability import FULL, WEAK
-from hydrotele.identify.identification import identify, identify_with_shapes
+from hydrotele.identify.identification import identify_dynamics, identify_with_shapes
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import records
 from hydrotele.identify.result import counts, parameter_rows
@@ -35,7 +35,7 @@ def clean():
 
 @pytest.fixture(scope="module")
 def found(clean):
-    return identify(*clean)
+    return identify_dynamics(*clean)
 
 
 @needs_measured
@@ -68,7 +68,9 @@ def test_a_wrong_machine_is_found_out_and_mended(clean, found):
         dataclasses.replace(r, nominal={k: 0.5 * v for k, v in r.nominal.items()})
         for r in setup.rubbing
     )
-    again = identify(fit, heldout, dataclasses.replace(setup, chain=wrong, rubbing=rubbing))
+    again = identify_dynamics(
+        fit, heldout, dataclasses.replace(setup, chain=wrong, rubbing=rubbing)
+    )
     for drive, judged in again.heldout.items():
         assert judged.rms < 0.4 * judged.nominal_rms, drive
         assert judged.rms < 1.1 * found.heldout[drive].rms, drive  # weak ones stay wrong
@@ -79,7 +81,7 @@ def test_the_complete_model_is_at_least_as_good_as_the_reduced_one(clean, found)
     """As Khoshzaban's cross-validation: 3720, 5860, 8700 against 4720, 5500, 11900."""
     fit, heldout, setup = clean
     links = tuple(b for b in setup.bodies if not b.endswith(("_tube", "_rod")))
-    reduced = identify(fit, heldout, dataclasses.replace(setup, bodies=links))
+    reduced = identify_dynamics(fit, heldout, dataclasses.replace(setup, bodies=links))
     better = [found.heldout[d].rms / reduced.heldout[d].rms for d in found.heldout]
     # the links take most of the bars over; the held-out run's 80 periods know a ratio to 8 %
     assert max(better) < 1.08
@@ -91,7 +93,7 @@ def test_with_perfect_sensors_tubes_and_rods_show():
     fit, heldout, _ = records(load_dataset([MEASURED / "nominal_truth"], machine, "ideal"))
     chain = closed_chain(machine)
     complete, reduced = (
-        identify(fit, heldout, machine_setup(machine, chain, model)).heldout
+        identify_dynamics(fit, heldout, machine_setup(machine, chain, model)).heldout
         for model in ("complete", "reduced")
     )
     for drive in complete:
@@ -109,7 +111,7 @@ def test_without_pressures_of_one_side_the_others_are_still_told(clean):
         force[:, 1] = np.nan
         return dataclasses.replace(record, force=force)
 
-    found = identify([without(r) for r in fit], without(heldout), setup)
+    found = identify_dynamics([without(r) for r in fit], without(heldout), setup)
     rows = {row.name: row for row in parameter_rows(found)}
     assert set(found.heldout) == {"swing", "stick_rod"}
     assert rows["coulomb.boom_rod"].value is None and rows["offset.boom_rod"].value is None
@@ -126,7 +128,7 @@ def test_a_drive_that_rests_has_no_friction_to_tell(clean):
         position[:, 1] = 0.45 + noise
         return dataclasses.replace(record, position=position)
 
-    found = identify([resting(r) for r in fit], resting(heldout), setup)
+    found = identify_dynamics([resting(r) for r in fit], resting(heldout), setup)
     assert "boom stood still" in found.status
     rows = {row.name: row for row in parameter_rows(found)}
     assert all(rows[f"{kind}.boom_rod"].value is None for kind in ("coulomb", "viscous"))
@@ -143,7 +145,7 @@ def test_missing_samples_are_bridged(clean, found):
         position[lost], force[lost] = np.nan, np.nan
         return dataclasses.replace(record, position=position, force=force)
 
-    again = identify([dropped(r) for r in fit], dropped(heldout), setup)
+    again = identify_dynamics([dropped(r) for r in fit], dropped(heldout), setup)
     for drive, judged in again.heldout.items():
         assert judged.rms < 1.1 * found.heldout[drive].rms, drive
 
@@ -159,7 +161,7 @@ def test_readings_of_a_saturated_sensor_are_left_out(clean, tmp_path):
     data = load_dataset(tmp_path, load_machine("cat215"))
     assert any("pressure_head.boom does not get beyond" in note for note in data.notes)
     fit, heldout, _ = records(data)
-    found = identify(fit, heldout, clean[2])
+    found = identify_dynamics(fit, heldout, clean[2])
     # chi^2 of 25 degrees of freedom exceeds 44.3 in 1 % of all cases
     assert 20 < len(found.told.base) <= 25 and found.distance(found.nominal)[0] < 44.3
 
@@ -169,7 +171,7 @@ def test_unknown_forces_everywhere_are_refused(clean):
     fit, heldout, setup = clean
     blind = [dataclasses.replace(r, force=np.full_like(r.force, np.nan)) for r in fit]
     with pytest.raises(InputError, match="no drive has a known force"):
-        identify(blind, heldout, setup)
+        identify_dynamics(blind, heldout, setup)
 
 
 @needs_real
@@ -224,7 +226,7 @@ def test_pressures_that_are_read_half_as_often_are_enough(clean, found):
         force[1::2] = np.nan
         return dataclasses.replace(record, force=force)
 
-    again = identify([slower(r) for r in fit], slower(heldout), setup)
+    again = identify_dynamics([slower(r) for r in fit], slower(heldout), setup)
     truth = again.told.combination @ again.nominal
     away = np.abs(again.estimate.value - truth) / again.estimate.std
     # as above; bridged samples carry twice the noise's variance
@@ -237,7 +239,7 @@ def test_a_short_run_is_left_out_with_a_note(clean):
     short = dataclasses.replace(
         fit[0], name="blink", position=fit[0].position[:60], force=fit[0].force[:60]
     )
-    found = identify([*fit[1:], short], heldout, setup)
+    found = identify_dynamics([*fit[1:], short], heldout, setup)
     assert any("blink is too short" in note for note in found.notes)
 
 
@@ -252,4 +254,4 @@ def test_options_without_sense_are_refused(options):
 @needs_measured
 def test_a_band_beyond_the_samples_is_refused(clean):
     with pytest.raises(InputError, match="too wide"):
-        identify(*clean, Processing(band=40.0))
+        identify_dynamics(*clean, Processing(band=40.0))

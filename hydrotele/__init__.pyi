@@ -1,0 +1,29 @@
+"""The public names of hydrotele and where they are, for type checkers."""
+
+from .control.endpoint_force import endpoint_force_of_log
+from .control.gravity_model import identify_gravity
+from .core.errors import InputError
+from .effects import EFFECTS, apply_effect, load_effects
+from .gap.find import find_gap
+from .gap.patched import write_patch
+from .gap.result import Gap, gap_document
+from .identify.identification import identify_dynamics
+from .logs.dataset import Dataset, load_dataset
+from .logs.log import Log, load_log, load_logs, save_log
+from .machine.machine import Machine
+from .machine.machine_file import load_machine, save_machine, shipped_machines
+from .run.replay import Replay, replay_log
+from .run.run import Run, run_scenario
+from .scenario.scenario import Scenario, load_scenario, shipped_scenarios
+from .simulate.plant import Plant, build_plant, initial_state, rest_state
+from .tasks.controllers.catalogue import make_controller
+
+__version__: str
+__all__ = [
+    "EFFECTS", "Dataset", "Gap", "InputError", "Log", "Machine", "Plant", "Replay", "Run",
+    "Scenario", "apply_effect", "build_plant", "endpoint_force_of_log", "find_gap", "gap_document",
+    "identify_dynamics", "identify_gravity", "initial_state", "load_dataset", "load_effects",
+    "load_log", "load_logs", "load_machine", "load_scenario", "make_controller", "replay_log",
+    "rest_state", "run_scenario", "save_log", "save_machine", "shipped_machines",
+    "shipped_scenarios", "write_patch",
+]  # fmt: skip

@@ -1,0 +1,63 @@
+"""The public names: what `import hydrotele` offers, how fast, and what it is documented to be."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import hydrotele
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_every_public_name_is_there_and_has_a_docstring():
+    for name in hydrotele.__all__:
+        assert getattr(hydrotele, name).__doc__, name
+    assert set(hydrotele.__all__) <= set(dir(hydrotele))
+    with pytest.raises(AttributeError, match="no attribute 'load_machin'"):
+        getattr(hydrotele, "load_machin")  # noqa: B009
+
+
+def test_type_checkers_are_told_of_the_same_names_in_the_same_places():
+    tree = ast.parse((ROOT / "hydrotele" / "__init__.pyi").read_text())
+    told = {
+        alias.name: node.module for node in tree.body if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }  # fmt: skip
+    assert told == vars(hydrotele)["_MODULE"]
+
+
+def test_the_page_lists_all_of_them():
+    page = (ROOT / "docs" / "api.md").read_text()
+    assert set(hydrotele.__all__) <= set(re.findall(r"\w+", page))
+
+
+def test_nothing_heavy_is_imported_before_it_is_used():
+    code = "import sys, hydrotele; print(*{'numpy', 'numba', 'mujoco'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_pressures_spools_and_tip_are_those_that_the_log_has():
+    plant = hydrotele.build_plant(hydrotele.load_machine("cat215", "bucket"))
+    data = hydrotele.rest_state(plant)
+    data.ctrl[:] = [0.1, 0.5, -0.4, 0.3]
+    mujoco.mj_step(plant.model, data, nstep=200)
+    assert np.array_equal(np.sign(plant.spools(data)), np.sign(data.ctrl))
+    areas = np.array([plant.machine.axes[a].hydraulic_drive.areas for a in plant.axes])
+    force = areas[:, 0] * plant.pressures(data)[:, 0] - areas[:, 1] * plant.pressures(data)[:, 1]
+    friction = np.array([plant.machine.axes[a].drive.friction.coulomb for a in plant.axes])
+    mujoco.mj_forward(plant.model, data)
+    # The actuator's force is that of the pressures less friction; none adds more than breakaway.
+    assert np.all(np.abs(data.actuator_force - force) < 3.0 * friction + 0.1 * np.abs(force))
+    place, rotation = plant.tip(data)
+    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)  # rounding
+    assert np.allclose(place, data.body("bucket").xpos, atol=2.0)  # m: no bucket is longer
+    with pytest.raises(hydrotele.InputError, match="no arm"):
+        rig = hydrotele.build_plant(hydrotele.load_machine("rig"))
+        rig.tip(hydrotele.rest_state(rig))
