@@ -32,8 +32,7 @@ _ignore_configuration()
 
 
 _PUBLIC = {
-    "control.endpoint_force": ("endpoint_force_of_log",),
-    "control.gravity_model": ("identify_gravity",),
+    "control.endpoint_force": ("endpoint_force_of_log", "identify_gravity"),
     "core.errors": ("InputError",),
     "effects": ("EFFECTS", "apply_effect", "load_effects"),
     "gap.find": ("find_gap",),

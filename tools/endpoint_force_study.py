@@ -13,8 +13,15 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hydrotele.control.endpoint_force import BANDWIDTH, FAST, EndpointForce, endpoint_force_of_log
-from hydrotele.control.gravity_model import Gravity, gravity_from_masses, identify_gravity
+from hydrotele.control.endpoint_force import (
+    BANDWIDTH,
+    FAST,
+    EndpointForce,
+    Gravity,
+    endpoint_force_of_log,
+    gravity_from_masses,
+    identify_gravity,
+)
 from hydrotele.control.state_filter import LOW, filter_delay, filter_table, filtered
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine

@@ -14,12 +14,12 @@ from hydrotele.tasks.controllers.catalogue import CONTROLLERS, REFERENCES, make_
 from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.evaluation import SUCCESS, Scores, evaluate
 from hydrotele.tasks.memory import DISABLED
-from hydrotele.tasks.spread import usual_spread
 from hydrotele.tasks.task import REAL, Options
+from hydrotele.tasks.variants import usual_spread
 
 HEAD = """Mean ± standard error over episodes that all controllers share (same seeds and machines);
 `reference` knows the nominal machine and what the observation says. Randomised machines have the
-effects of `hydrotele.tasks.spread.usual_spread`: other dead bands, flows and bandwidths of the
+effects of `hydrotele.tasks.variants.usual_spread`: other dead bands, flows and bandwidths of the
 valves, friction, stiffness of the oil, delay of the commands, payload.
 """
 

@@ -24,8 +24,8 @@ from hydrotele.identify.excitation import (
 )
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import force_noise, records
+from hydrotele.identify.regressor import machine_setup
 from hydrotele.identify.result import parameter_rows
-from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine

@@ -20,7 +20,7 @@ from hydrotele.effects.effect import changed
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.identified_machine import identified_machine
 from hydrotele.identify.record import records
-from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.regressor import machine_setup
 from hydrotele.kinematics.arm import forward_cartesian, inverse
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.logs.dataset import make_dataset

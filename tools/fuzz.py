@@ -34,9 +34,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from hydrotele.core.resources import models_folder, scenarios_folder
+from hydrotele.core.files import models_folder, scenarios_folder
 from hydrotele.logs.log import Log, load_log, save_log
-from hydrotele.teleop.case import SHIPPED
+from hydrotele.teleop.analysis import SHIPPED
 
 SECONDS, MEMORY, LETTERS = 60.0, 4_000_000_000, 2048  # limits of a case
 _FINE = (0, 2, 3)  # done, the user's mistake, a simulation that left the finite numbers

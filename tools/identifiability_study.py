@@ -16,8 +16,7 @@ import numpy as np
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identifiability import identifiability
 from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import Regressor, Rubbing, regressor
-from hydrotele.identify.setup import pin_friction
+from hydrotele.identify.regressor import Regressor, Rubbing, pin_friction, regressor
 from hydrotele.machine.machine_file import load_machine
 from tools.study import options, publish
 

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import records
-from hydrotele.identify.setup import Setup, machine_setup
+from hydrotele.identify.regressor import Setup, machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine

@@ -18,8 +18,8 @@ import numpy as np
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import Record, records
+from hydrotele.identify.regressor import machine_setup
 from hydrotele.identify.result import Identification
-from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine import Machine

@@ -18,9 +18,8 @@ from hydrotele.identify.chain import Chain, load_chain
 from hydrotele.identify.identification import identify_with_shapes
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import Record, records
-from hydrotele.identify.regressor import Rubbing
+from hydrotele.identify.regressor import Rubbing, Setup, machine_setup
 from hydrotele.identify.result import Identification, parameter_rows
-from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine

@@ -20,8 +20,7 @@ from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.projection import project
 from hydrotele.identify.record import records
-from hydrotele.identify.regressor import regressor
-from hydrotele.identify.setup import Setup, machine_setup
+from hydrotele.identify.regressor import Setup, machine_setup, regressor
 from hydrotele.kinematics.arm import inverse
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.logs.dataset import make_dataset

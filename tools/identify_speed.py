@@ -19,8 +19,7 @@ import numpy as np
 
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import regressor
-from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.regressor import machine_setup, regressor
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario

@@ -14,14 +14,20 @@ from hydrotele.machine.joystick import AXES, load_joystick
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.simulate.joystick import Flotor as Simulated
+from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.teleop.compliance import Flotor
 from hydrotele.teleop.flotor import FlotorFit, identify_flotor
 from hydrotele.teleop.handle import Detent
-from hydrotele.teleop.levitate import levitation
-from hydrotele.teleop.levitation import Flight, designed_step, fly, rotation_vector, wobble
+from hydrotele.teleop.levitation import (
+    Flight,
+    designed_step,
+    fly,
+    levitation,
+    rotation_vector,
+    sensed_spread,
+    wobble,
+)
 from hydrotele.teleop.master import master, master_step
-from hydrotele.teleop.optics import sensed_spread
 from tools.study import options, publish, side_by_side
 
 JOYSTICK = load_joystick()
@@ -186,7 +192,7 @@ def detent() -> list[str]:
     assert gains.detent
     law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
     numbers, s = seated(gains="feller", detent=True)
-    flotor = Simulated(JOYSTICK, hand=False)
+    flotor = SimulatedFlotor(JOYSTICK, hand=False)
     flotor.model.jnt_stiffness[:3], flotor.model.dof_damping[:3] = 2e4, 100.0
     lines = [
         "## Detent", "",
@@ -219,7 +225,7 @@ def stops() -> list[str]:
         np.array([0.0, 0.0, 9.81 * JOYSTICK.flotor.mass, 0.0, 0.0, 0.0])
     ).value  # fmt: skip
     for axis, name in enumerate(AXES):
-        flotor, push = Simulated(JOYSTICK, hand=False), np.zeros(6)
+        flotor, push = SimulatedFlotor(JOYSTICK, hand=False), np.zeros(6)
         push[axis] = 20.0 if axis < 3 else 2.0
         flotor.model.dof_damping[:] = [20.0] * 3 + [0.2] * 3
         for _ in range(600):
@@ -245,7 +251,7 @@ def swing() -> tuple[np.ndarray, np.ndarray]:
 def held(spin: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Handle (n, 6) with a hand that only rests on it, in the cab."""
     numbers, s = seated()
-    flotor, muscles, pose = Simulated(JOYSTICK), np.zeros(6), np.empty((len(spin), 6))
+    flotor, muscles, pose = SimulatedFlotor(JOYSTICK), np.zeros(6), np.empty((len(spin), 6))
     muscles[2] = 9.81 * JOYSTICK.hand.mass
     for k in range(len(spin)):
         pose[k, :3] = flotor.data.qpos[:3]

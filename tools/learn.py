@@ -28,8 +28,8 @@ from hydrotele.tasks.core import TaskCore, set_up
 from hydrotele.tasks.evaluation import Scores, compare, evaluate
 from hydrotele.tasks.facts import Setup
 from hydrotele.tasks.memory import DISABLED
-from hydrotele.tasks.spread import usual_spread
 from hydrotele.tasks.task import Options
+from hydrotele.tasks.variants import usual_spread
 
 try:
     import torch

@@ -24,7 +24,7 @@ from hydrotele.estimate.output_error import fit_free_runs, open_numbers
 from hydrotele.estimate.stretches import busiest_rows
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
-from hydrotele.identify.zero_phase import zero_phase
+from hydrotele.identify.smoothing import zero_phase
 from hydrotele.logs.dataset import Dataset, RunData, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine

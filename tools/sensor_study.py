@@ -18,13 +18,11 @@ import numpy as np
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.equations import build_equations, stacked
 from hydrotele.identify.estimation import estimate
-from hydrotele.identify.identifiability import identifiability
+from hydrotele.identify.identifiability import identifiability, reference_sizes
 from hydrotele.identify.motion import Processing, resolution
 from hydrotele.identify.projection import project
 from hydrotele.identify.record import Record, records
-from hydrotele.identify.reference_size import reference_sizes
-from hydrotele.identify.regressor import regressor
-from hydrotele.identify.setup import Setup, machine_setup
+from hydrotele.identify.regressor import Setup, machine_setup, regressor
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine import Machine

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from study import options, publish, side_by_side
 
-from hydrotele.teleop.case import Case, load_teleop_case
+from hydrotele.teleop.analysis import Case, load_teleop_case
 from hydrotele.teleop.confirm import agreement, sweep
 from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance
 

@@ -18,11 +18,14 @@ from hydrotele.core.output import check_target, whole_folder
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.run.run import scenario_model
 from hydrotele.scenario.scenario import Scenario, load_scenario, shipped_scenarios
-from hydrotele.teleop.case import LONGEST, TeleopCase, known_structures, load_teleop_case
+from hydrotele.teleop.analysis import LONGEST, TeleopCase, known_structures, load_teleop_case
 from hydrotele.teleop.findings import (
     Findings,
+    ScenarioFindings,
     find,
+    find_loop,
     findings_document,
+    loop_document,
     said_delay,
     said_error,
     said_factor,
@@ -30,7 +33,6 @@ from hydrotele.teleop.findings import (
     why_unstable,
 )
 from hydrotele.teleop.linear_case import joystick_of, scenario_case
-from hydrotele.teleop.loop_findings import ScenarioFindings, find_loop, loop_document
 
 _LEGEND = (
     "margin: factor on what comes back (force, or the slave's motion) up to which it stays stable;"
@@ -293,7 +295,7 @@ def _print_loop_springs(found: ScenarioFindings) -> None:
 
 
 def _write_loop(folder: Path, found: ScenarioFindings, document: dict) -> None:
-    from hydrotele.show.loop_report import draw_loop_map, write_loop_report
+    from hydrotele.show.teleop_report import draw_loop_map, write_loop_report
 
     text = json.dumps(document, indent=2, allow_nan=False)
     (folder / "analysis.json").write_text(text + "\n", encoding="utf-8")

@@ -9,7 +9,7 @@ from hydrotele.core.datafile import read_yaml, suggest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
 from hydrotele.machine.machine_file import load_machine, machine_path, shipped_machines
-from hydrotele.simulate.document import Mjcf
+from hydrotele.simulate.mechanism import Mjcf
 
 _KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environments")
 

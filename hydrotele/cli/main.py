@@ -7,11 +7,14 @@ What `hydrotele compare` takes on the command line.
 What `hydrotele drive` takes on the command line.
 
 What `hydrotele sweep` takes on the command line.
+
+Words of the command line into overrides of a scenario.
 """
 
 import os
 import signal
 import sys
+from json import dumps as json_text
 from pathlib import Path
 from typing import Annotated
 
@@ -93,7 +96,8 @@ def compare(
 ) -> None:
     """Compare models by free runs on measured commands: RMS errors per channel and horizon."""
     from hydrotele.cli.comparing import compare_models
-    from hydrotele.cli.words import numbers_of
+
+    pass
 
     compare_models(
         machine, data, tool, heldout, sensors, numbers_of("--horizons", horizons), baseline or [],
@@ -150,7 +154,8 @@ def drive(
 ) -> None:
     """Drive a machine yourself, in real time; write a folder as run does."""
     from hydrotele.cli.driving import Wishes, drive_to_folder
-    from hydrotele.cli.words import chosen, overrides_of
+
+    pass
 
     drive_to_folder(
         Wishes(
@@ -276,7 +281,8 @@ def run(
 ) -> None:
     """Simulate a scenario; write both logs, the rerun recording, the summary and the MJCF."""
     from hydrotele.cli.running import run_to_folder
-    from hydrotele.cli.words import chosen, overrides_of
+
+    pass
 
     run_to_folder(scenario, out, overrides_of(set_ or []) | chosen(machine, tool), review, json)
 
@@ -430,7 +436,7 @@ def excite(
     json: Json = False,
 ) -> None:
     """Design the motion that tells a machine's parameters best, within its limits."""
-    from hydrotele.cli.exciting import excite_to_file
+    from hydrotele.cli.identifying import excite_to_file
 
     excite_to_file(machine, tool, sensors, out, period, harmonics, starts, seed, cycles, json)
 
@@ -472,7 +478,8 @@ def analyse_teleop(
 ) -> None:
     """Two-port of a teleoperator: what is felt, passivity, stability with delay, margins."""
     from hydrotele.cli.analysing import analyse_any_to_folder
-    from hydrotele.cli.words import overrides_of
+
+    pass
 
     pairs = overrides_of(set_ or [])
     analyse_any_to_folder(file, out, structure, delay, confirm, coordinate, pairs, json)
@@ -633,3 +640,49 @@ def _run() -> None:
             raise
         typer.echo(f"simulation failed: {error}", err=True)
         sys.exit(3)
+
+
+def overrides_of(items: list[str]) -> dict[str, str]:
+    """Key path -> YAML text of every `key=value`.
+
+    Raises:
+        InputError: it is none.
+    """
+    pairs = {}
+    for item in items:
+        key, sign, value = item.partition("=")
+        if not sign or not key:
+            raise InputError(f"--set {item}", "must be key=value, for example servo.lead=0.04")
+        pairs[key] = value
+    return pairs
+
+
+def chosen(machine: str | None, tool: str | None) -> dict[str, str]:
+    """Overrides of a scenario's machine; a path counts from here, not from the scenario's file."""
+    from hydrotele.machine.machine_file import shipped_machines
+
+    pairs = {}
+    if machine is not None:
+        named = machine in shipped_machines()
+        pairs["machine"] = json_text(machine if named else str(Path(machine).resolve()))
+    if tool is not None:
+        pairs["tool"] = json_text(tool)
+    return pairs
+
+
+def numbers_of(option: str, text: str) -> list[float]:
+    """Positive numbers of an option, separated by commas.
+
+    Raises:
+        InputError: there is none, or one is no positive number.
+
+    >>> numbers_of("--horizons", "1, 5,30")
+    [1.0, 5.0, 30.0]
+    """
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(0.0 < number < float("inf") for number in numbers):
+        raise InputError(f"{option} {text}", "must be positive numbers, for example 1,5,30")
+    return numbers

@@ -9,10 +9,8 @@ from hydrotele.control.plan import Plan
 from hydrotele.core.errors import InputError
 from hydrotele.identify.chain import load_chain
 from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import regressor
-from hydrotele.identify.setup import machine_setup
-from hydrotele.identify.smoothed import Smoothed
-from hydrotele.identify.zero_phase import zero_phase
+from hydrotele.identify.regressor import machine_setup, regressor
+from hydrotele.identify.smoothing import Smoothed, zero_phase
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Servo

@@ -11,13 +11,12 @@ import numpy as np
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import lean
 from hydrotele.core.errors import InputError
-from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.integrate import place_mechanism
 from hydrotele.dynamics.mechanism import DAMPING, HOME, Mechanism, coordinate_names
 from hydrotele.dynamics.model import model_space, reduced_model, state_size
-from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Motion
+from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Motion, gather_forces
 from hydrotele.hydraulics.circuit import actuator_friction
-from hydrotele.hydraulics.slots import SLOTS, Slot
+from hydrotele.hydraulics.parameters import SLOTS, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.machine import Machine
 

@@ -15,8 +15,7 @@ import pydantic
 import yaml
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import read_text
-from hydrotele.core.limits import beyond, limit
+from hydrotele.core.files import beyond, limit, read_text
 
 LARGEST = 1.0e20  # of any SI number of a file, so that products of a few stay finite
 Number = Annotated[float, pydantic.Field(ge=-LARGEST, le=LARGEST)]

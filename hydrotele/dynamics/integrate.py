@@ -1,13 +1,23 @@
-"""The reduced model in time: kick, drift, kick, with the circuit of the MuJoCo plant between."""
+"""The reduced model in time: kick, drift, kick, with the circuit of the MuJoCo plant between.
+
+What drives share in the reduced model: supply, pressures that are felt, laws that terms add.
+
+Sensors with a first-order lag, along what an ideal sensor would show over a row of a log.
+"""
 
 import math
 
 import numpy as np
 
 from hydrotele.core.compiled import compiled, lean
-from hydrotele.dynamics.closures import close_chains, drift_chains, move_bars, place_bars
-from hydrotele.dynamics.forces import gather_forces
-from hydrotele.dynamics.linear import factorise, solve
+from hydrotele.dynamics.closures import (
+    close_chains,
+    drift_chains,
+    factorise,
+    move_bars,
+    place_bars,
+    solve,
+)
 from hydrotele.dynamics.mechanism import BAR, CLOSED, DAMPING, JOINT
 from hydrotele.dynamics.model import (
     BACKLASH,
@@ -23,18 +33,209 @@ from hydrotele.dynamics.model import (
     V,
     X,
 )
-from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_ROW, RATE, Q, move_links, place_links
+from hydrotele.dynamics.motion import (
+    BIAS,
+    DRIFT,
+    LENGTH_ROW,
+    RATE,
+    Q,
+    gather_forces,
+    move_links,
+    place_links,
+)
 from hydrotele.dynamics.motion import LENGTH as BAR_LENGTH
-from hydrotele.dynamics.supply import add_commands, feel, keep, supply_of, term_force
-from hydrotele.dynamics.transducers import follow_trail, show_late
+from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate
 from hydrotele.hydraulics.circuit import (
-    SLOTS,
-    Slot,
     actuator_stop,
+    add_to_commands,
+    circuit_supply,
+    delivered_share,
+    drive_state,
     force_after_friction,
+    open_ports,
     step_circuit,
 )
-from hydrotele.hydraulics.presliding import bristle_friction, bristle_rate
+from hydrotele.hydraulics.laws import pressure_with_air, pressure_without_air
+from hydrotele.hydraulics.parameters import SLOTS, Slot
+from hydrotele.machine.noise import first_order
+from hydrotele.terms.law import Drives
+from hydrotele.terms.table import COMMAND as ON_COMMAND
+from hydrotele.terms.table import FORCE as ON_FORCE
+from hydrotele.terms.table import added_with_slope
+
+_AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
+
+
+@lean
+def feel(model, sp, z):
+    """Write the activations of a state with the pressures that are felt into `sp.act`.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state.
+
+    Returns:
+        Nothing.
+
+    Source: `laws.pressure_with_air`.
+    """
+    first = 2 * (len(model.mech.free) + len(model.transmission))
+    for k in range(len(sp.act)):
+        sp.act[k] = z[first + k]
+    for i in range(model.hydraulic):
+        release, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
+        for k in range(4 * i + 2, 4 * i + 4):
+            sp.act[k] = pressure_with_air(sp.act[k], release, onset)
+
+
+@lean
+def keep(model, sp, z):
+    """Write `sp.act` back into a state, the inverse of `feel`.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state, of which the activations are written.
+
+    Returns:
+        Nothing.
+
+    Source: `laws.pressure_without_air`.
+    """
+    first = 2 * (len(model.mech.free) + len(model.transmission))
+    for k in range(len(sp.act)):
+        z[first + k] = sp.act[k]
+    for i in range(model.hydraulic):
+        release, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
+        for k in range(4 * i + 2, 4 * i + 4):
+            z[first + k] = pressure_without_air(sp.act[k], release, onset)
+
+
+@lean
+def supply_of(model, sp, z):
+    """Supply pressure in a state, scalar [Pa]; `sp.act` is written, see `feel`.
+
+    Source: nominal model, "Supply".
+    """
+    user, count, act = model.user, model.hydraulic, sp.act
+    feel(model, sp, z)
+    open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
+    if model.memory is None:
+        return circuit_supply(user, 0, count, sp.scratch)
+    return circuit_supply(user, 0, count, sp.scratch, delivered_share(user, 0, act))
+
+
+@lean
+def term_force(model, sp, z, i, velocity):
+    """Force that the terms add to a drive, and its slope with respect to the drive's velocity.
+
+    Args:
+        model: Model.
+        sp: Space after `place`; its time, positions, pressures and commands.
+        z: (nz,) state.
+        i: index of the drive.
+        velocity: of the drive, scalar [m/s] or [rad/s].
+
+    Returns:
+        (force [N] or [N m], d force / d velocity); of a force drive with the terms of its command.
+    """
+    count = model.hydraulic
+    supply = supply_of(model, sp, z) if count > 0 else 0.0
+    s = drive_state(
+        model.user, i, count, sp.act, supply, sp.time[0], sp.drive[X, i], velocity,
+        sp.drive[COMMAND, i], model.gain[i],
+    )  # fmt: skip
+    drives = Drives(count, sp.act, sp.drive[X], sp.drive[V], sp.drive[COMMAND])
+    force, slope = added_with_slope(model.terms, ON_FORCE, i, s, drives)
+    if i >= count:
+        more, steep = added_with_slope(model.terms, ON_COMMAND, i, s, drives)
+        force += model.gain[i] * more
+        slope += model.gain[i] * steep
+    return force, slope
+
+
+@lean
+def add_commands(model, sp, h):
+    """Write the commands that the valves are given: what arrives and what the terms add.
+
+    Args:
+        model: Model.
+        sp: Space with positions at the end of the step, velocities over it, time and activations
+            at its start.
+        h: step, scalar [s].
+
+    Returns:
+        Nothing.
+    """
+    drive = sp.drive
+    add_to_commands(
+        model.user, model.terms, model.hydraulic, sp.act, drive[COMMAND], drive[X], drive[V], h,
+        sp.time[0], sp.scratch, drive[GIVEN],
+    )  # fmt: skip
+
+
+@lean
+def show_late(model, c):
+    """Whether a channel shows the past: through a delay or a first-order lag.
+
+    Args:
+        model: Model.
+        c: channel.
+
+    Returns:
+        bool.
+
+    Source: nominal model, "Sensors".
+    """
+    return model.lag[c] > 0.0 or model.time_constant[c] > 0.0
+
+
+@lean
+def follow_channel(trail, c, ratio, shown):
+    """Replace what an ideal sensor shows over a row by what one with a first-order lag shows.
+
+    Args:
+        trail: (k + 1, c) as `integrate.advance` writes it, of k steps; column c is replaced
+            [channel's unit].
+        c: channel.
+        ratio: length of a step over the time constant, scalar [1].
+        shown: what the sensor shows at the row's start, scalar [channel's unit].
+
+    Returns:
+        What it shows at the row's end, scalar [channel's unit].
+
+    Source: `noise.first_order`, between steps straight.
+    """
+    before = trail[0, c]
+    trail[0, c] = shown
+    for k in range(1, len(trail)):
+        now = trail[k, c]
+        shown = first_order(shown, before, now, ratio)
+        trail[k, c] = shown
+        before = now
+    return shown
+
+
+@lean
+def follow_trail(model, trail, h, shown):
+    """`follow_channel` for every channel with a first-order lag.
+
+    Args:
+        model: Model.
+        trail: (k + 1, c) as `integrate.advance` writes it, of k steps; changed in place.
+        h: step, scalar [s].
+        shown: (c,) what the sensors show at the row's start, then at its end; changed in place.
+
+    Returns:
+        Nothing.
+
+    Source: `follow_channel`.
+    """
+    for c in range(len(model.time_constant)):
+        if model.time_constant[c] > 0.0:
+            shown[c] = follow_channel(trail, c, h / model.time_constant[c], shown[c])
+
 
 _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)

@@ -6,8 +6,7 @@ import numpy as np
 
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import pin_axis
-from hydrotele.kinematics.loops import following_joints
-from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine import Machine, following_joints
 
 WELD, HINGE, SLIDE, TUBE, ROD, PIN = range(6)
 _KINDS = {"hinge": HINGE, "slide": SLIDE}

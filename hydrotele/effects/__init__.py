@@ -1,10 +1,10 @@
-"""Physical effects that a machine can have and its model can lack, one file each.
+"""Physical effects that a machine can have and its model can lack, a file per group.
 
 One type for three uses: planted in a scenario, tried as a hypothesis, written into a patched
 machine.
 
 To add an effect, write one file here that defines `EFFECT = Effect(...)` (or `EFFECTS`, a tuple of
-a tight family); it is found by itself. Such a file says
+related ones); it is found by itself. Such a file says
 
 1. the fixed name, one sentence, and the law of the model that the effect changes;
 2. `locations(machine)`: where it can sit, nothing where the machine has no such part;

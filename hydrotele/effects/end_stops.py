@@ -1,7 +1,6 @@
 """End stops that are harder or softer than in the model."""
 
-from hydrotele.effects._sizes import drive_turns
-from hydrotele.effects.effect import Effect, Parameter, Values, changed
+from hydrotele.effects.effect import Effect, Parameter, Values, changed, drive_turns
 from hydrotele.machine.drives import EndStop
 from hydrotele.machine.machine import Machine
 

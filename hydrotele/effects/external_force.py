@@ -1,8 +1,16 @@
 """Forces on a drive that the model lacks: constant, for a while, or growing with the speed."""
 
-from hydrotele.effects._sizes import axes, force_unit, largest_force, speed_unit, usual_speed
 from hydrotele.effects._terms import term_number, with_terms
-from hydrotele.effects.effect import Effect, Parameter, Values
+from hydrotele.effects.effect import (
+    Effect,
+    Parameter,
+    Values,
+    axes,
+    force_unit,
+    largest_force,
+    speed_unit,
+    usual_speed,
+)
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Term
 

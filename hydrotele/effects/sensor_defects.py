@@ -2,8 +2,7 @@
 
 import math
 
-from hydrotele.effects._sizes import axes, hydraulics, linkages
-from hydrotele.effects.effect import Effect, Parameter, Values
+from hydrotele.effects.effect import Effect, Parameter, Values, axes, hydraulics, linkages
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 

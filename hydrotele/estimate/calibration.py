@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from hydrotele.effects import EFFECTS, Effect, Parameter
-from hydrotele.effects._sizes import across, linkages
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import across, changed, linkages
 from hydrotele.estimate.hypothesis import Hypothesis
 from hydrotele.machine.machine import Machine
 

@@ -18,13 +18,19 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled, lean
-from hydrotele.dynamics.integrate import advance, load_position, place, read_channels, supply_of
+from hydrotele.dynamics.integrate import (
+    advance,
+    follow_channel,
+    load_position,
+    place,
+    read_channels,
+    supply_of,
+)
 from hydrotele.dynamics.mechanism import JOINT
 from hydrotele.dynamics.model import Model
-from hydrotele.dynamics.transducers import follow_channel
 from hydrotele.hydraulics.laws import softening
+from hydrotele.hydraulics.parameters import SLOTS, Kind, Slot
 from hydrotele.hydraulics.pump import STALLED
-from hydrotele.hydraulics.slots import SLOTS, Kind, Slot
 
 _CHANGE = 0.1  # s in which a channel may change as much as its value is unknown at a run's start
 

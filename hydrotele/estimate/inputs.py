@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
+from hydrotele.dynamics.closures import solve
 from hydrotele.dynamics.integrate import accelerate, advance, place
-from hydrotele.dynamics.linear import solve
 from hydrotele.dynamics.model import X, model_space, reduced_model
 from hydrotele.effects.effect import changed
 from hydrotele.hydraulics.parameters import (

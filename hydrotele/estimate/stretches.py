@@ -4,9 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from hydrotele.logs.averaging import averaged
 from hydrotele.logs.dataset import Dataset, RunData
-from hydrotele.logs.rows import Rows
+from hydrotele.logs.rows import Rows, averaged
 
 _RATE, _PER_CYCLE = 100.0, 6.0  # Hz; rows per cycle of the fastest valve
 _SHORT = 2.0  # s, of a run that is kept as it is

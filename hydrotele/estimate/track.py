@@ -15,8 +15,7 @@ from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model
 from hydrotele.estimate.filter import Gains, filter_run, late_readings
 from hydrotele.estimate.inputs import Input, decay, input_drift
 from hydrotele.hydraulics.circuit import circuit_scratch, open_ports, wanted_share
-from hydrotele.hydraulics.parameters import DELIVERY, actuator_order, longest_step
-from hydrotele.hydraulics.slots import SLOTS, Slot
+from hydrotele.hydraulics.parameters import DELIVERY, SLOTS, Slot, actuator_order, longest_step
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 

@@ -3,11 +3,10 @@
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.integrate import load_position, place
 from hydrotele.dynamics.mechanism import BAR, DAMPING
 from hydrotele.dynamics.model import X
-from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_BIAS, LENGTH_ROW, RATE
+from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_BIAS, LENGTH_ROW, RATE, gather_forces
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,

@@ -19,15 +19,14 @@ from hydrotele.dynamics.mechanism import JOINT
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.gap.balance_laws import chamber_residuals, load_forces, pump_lacks, supply_pressures
 from hydrotele.hydraulics.laws import spool_step
-from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
+from hydrotele.hydraulics.parameters import PUMP, actuator_numbers, actuator_order
 from hydrotele.hydraulics.pump import load_force, load_pressure_step
-from hydrotele.hydraulics.slots import PUMP
 from hydrotele.identify import smoothing
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.kinematics.triangle import LoopOpen
-from hydrotele.logs.clock import fit_clock
+from hydrotele.kinematics.linkages import LoopOpen
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
+from hydrotele.logs.rows import fit_clock
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorError

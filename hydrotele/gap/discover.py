@@ -24,9 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.dynamics.integrate import place
+from hydrotele.dynamics.integrate import place, supply_of
 from hydrotele.dynamics.model import X, model_space
-from hydrotele.dynamics.supply import supply_of
 from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import Evidence, Judged, flat
 from hydrotele.estimate.free_run import free_run_errors, machine_runner

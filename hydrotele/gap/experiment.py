@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hydrotele.core.resources import models_folder
+from hydrotele.core.files import models_folder
 from hydrotele.kinematics import five_dof
 from hydrotele.kinematics.arm import forward
 from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry

@@ -8,20 +8,26 @@ import numpy as np
 
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.calibration import CALIBRATION
-from hydrotele.estimate.evidence import Evidence, Judged
+from hydrotele.estimate.evidence import Evidence, Judged, spreads
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.estimate.inputs import input_sizes, input_units
-from hydrotele.estimate.intervals import spreads
 from hydrotele.estimate.levels import rippled, undisturbed_loss
 from hydrotele.estimate.stretches import busiest, thinned
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances
-from hydrotele.gap.belief import believed, believed_part, left_over
 from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, discover
 from hydrotele.gap.experiment import next_experiment
-from hydrotele.gap.residuals import constancy, perfect_tracks, residual_tests, rms
+from hydrotele.gap.residuals import (
+    believed,
+    believed_part,
+    constancy,
+    left_over,
+    perfect_tracks,
+    residual_tests,
+    rms,
+)
 from hydrotele.gap.result import (
     SURE,
     Alternative,

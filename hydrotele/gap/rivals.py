@@ -12,9 +12,8 @@ from hydrotele.effects import EFFECTS
 from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, charge
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
-from hydrotele.gap.calibrating import free_of_calibration
+from hydrotele.gap.calibrating import fitted, free_of_calibration, settle, strained
 from hydrotele.gap.screening import Screened
-from hydrotele.gap.settling import fitted, settle, strained
 
 _PLAINER = 0.2  # of an effect's probability from which a rival with fewer numbers takes its place
 _SECOND = 2  # rivals that are settled like the effect itself

@@ -6,6 +6,10 @@ its activations `spool, spool_rate, p_head, p_rod` at `act[4 i ...]`, counted fr
 hydraulic axis; what bristles and a slow pump remember comes after all of these. An axis with a pump
 of its own (`Kind.PUMPED`, see `pump`) has the speed of its pump and the pressure of its load
 cylinder in the places of spool and spool rate.
+
+What the terms of a machine see and add: the state of a drive, and commands with their terms.
+
+Friction on a drive side so light that an explicit step would throw it through rest and back.
 """
 
 import math
@@ -17,6 +21,7 @@ from hydrotele.hydraulics.actuator import (
     actuator_friction,
     actuator_friction_slope,
     actuator_stop,
+    bristle_friction,
     force_after_friction,
     pumped_force,
     pumped_rates,
@@ -29,14 +34,13 @@ from hydrotele.hydraulics.laws import (
     softening,
     spool_step,
 )
-from hydrotele.hydraulics.presliding import bristle_friction
+from hydrotele.hydraulics.parameters import PUMP, SLOTS, Kind, Slot
 from hydrotele.hydraulics.pump import (
     load_pressure_step,
     pump_flows,
     pump_speed_step,
     switched_speed,
 )
-from hydrotele.hydraulics.slots import PUMP, SLOTS, Kind, Slot
 from hydrotele.hydraulics.supply import (
     ADDED_LAG,
     circuit_supply,
@@ -51,7 +55,7 @@ from hydrotele.hydraulics.supply import (
 )
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
 from hydrotele.terms.law import Drives, DriveState
-from hydrotele.terms.table import FLOW_SUPPLY, added, added_flows
+from hydrotele.terms.table import COMMAND, FLOW_SUPPLY, added, added_flows
 
 __all__ = [
     "ACTIVATIONS", "MAX_AXES", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
@@ -444,3 +448,112 @@ def axis_state(user, i, supply, act, x, v, share=0.0):
 def circuit_scratch() -> np.ndarray:
     """Work space for `step_circuit`, shape (SCRATCH,)."""
     return np.zeros(SCRATCH)
+
+
+_STEPS = 60  # bisections alone reach rounding in that many
+_ROUNDING = 1.0e-13
+
+
+@lean
+def settled_friction(user, u, velocity, push, inertia, dt):
+    """Friction at the end of a step of a body that nothing else holds.
+
+    Solves `v' = v + dt / J (F - F_f(v'))` by Newton's method inside a bracket.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        u: place of this actuator in `user`.
+        velocity: v at the start of the step, scalar [m/s] or [rad/s].
+        push: F, all other force, scalar [N] or [N m].
+        inertia: J, scalar [kg] or [kg m^2], > 0.
+        dt: step, scalar [s], > 0.
+
+    Returns:
+        F_f(v'), scalar [N] or [N m].
+
+    Source: implicit Euler rule.
+    """
+    per_force = dt / inertia
+    free = velocity + per_force * push  # friction pulls towards rest from here
+    low, high = min(0.0, free), max(0.0, free)
+    v = free
+    for _ in range(_STEPS):
+        resisting = actuator_friction(user, u, v)
+        excess = v - free + per_force * resisting
+        if excess > 0.0:
+            high = v
+        else:
+            low = v
+        if high - low <= _ROUNDING * abs(free):
+            break
+        slope = 1.0 + per_force * actuator_friction_slope(user, u, v)
+        guess = v - excess / slope if slope > 0.0 else high
+        if slope > 0.0 and abs(guess - v) <= _ROUNDING * abs(free):
+            break
+        v = guess if low < guess < high else 0.5 * (low + high)
+    return actuator_friction(user, u, v)
+
+
+_AH_DRIVE, _AR_DRIVE, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
+
+
+@lean
+def drive_state(user, i, count, act, supply, time, x, v, command, gain):
+    """State of one drive, as laws of terms see it.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        i: index of the actuator.
+        count: number of hydraulic axes, which come first.
+        act: (>= 4 count,) activations.
+        supply: supply pressure, scalar [Pa].
+        time: scalar [s].
+        x: position of the drive, scalar [m] or [rad].
+        v: its velocity, scalar [m/s] or [rad/s].
+        command: as it arrives, scalar [1] or [V].
+        gain: force per command of a force drive, scalar [N/V] or [N m/V].
+
+    Returns:
+        DriveState.
+    """
+    u, a = i * SLOTS, 4 * i
+    if i >= count:
+        force = gain * command - user[u + _OFFSET]
+        return DriveState(time, x, v, 0.0, 0.0, 0.0, 0.0, supply, command, force)
+    force = user[u + _AH_DRIVE] * act[a + 2] - user[u + _AR_DRIVE] * act[a + 3]
+    return DriveState(
+        time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3], supply, command, force
+    )
+
+
+@lean
+def add_to_commands(user, terms, count, act, command, length, velocity, dt, time, scratch, out):
+    """Commands of the valves with their terms, at the middle of a step.
+
+    Positions and time are those of the middle; spools and pressures those of the start, before the
+    spool's lag, so that what they make of a command is off by half a step.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        terms: (n,) table of terms.
+        count: number of hydraulic axes, which come first.
+        act: (>= 4 count,) activations at the start of the step.
+        command: (>= count,) commands that arrive [1].
+        length: (>= count,) drive positions at the end of the step [m] or [rad].
+        velocity: (>= count,) drive velocities [m/s] or [rad/s].
+        dt: step, scalar [s].
+        time: at the start of the step, scalar [s].
+        scratch: (SCRATCH,) work space.
+        out: (>= count,) written [1].
+
+    Returns:
+        Nothing.
+    """
+    open_ports(user, act, act, scratch, 0, count, 0.0, act)
+    supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
+    middle = time + 0.5 * dt
+    drives = Drives(count, act, length, velocity, command)
+    for i in range(count):
+        x = length[i] - 0.5 * dt * velocity[i]
+        s = drive_state(user, i, count, act, supply, middle, x, velocity[i], command[i], 0.0)
+        out[i] = command[i] + added(terms, COMMAND, i, s, drives)

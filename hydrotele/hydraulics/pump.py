@@ -16,7 +16,7 @@ import math
 
 from hydrotele.core.compiled import lean
 from hydrotele.hydraulics.laws import ATMOSPHERE
-from hydrotele.hydraulics.slots import PumpSlot
+from hydrotele.hydraulics.parameters import PumpSlot
 
 STALLED = 1.0e-9  # rad/s, of a pump that stands while its valve is open
 _THINNEST = 0.1 * ATMOSPHERE  # Pa absolute: below it the air is not let grow any further

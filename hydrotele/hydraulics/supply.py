@@ -6,7 +6,7 @@ Flat arrays are laid out as in `circuit`; `ports` holds four numbers per axis, s
 import math
 
 from hydrotele.core.compiled import inlined, lean
-from hydrotele.hydraulics.slots import SLOTS, Kind, Slot
+from hydrotele.hydraulics.parameters import SLOTS, Kind, Slot
 from hydrotele.hydraulics.valve import axis_opening, inlet_flow, inlet_gain
 
 _NEWTON_STEPS = 60

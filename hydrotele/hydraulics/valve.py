@@ -10,7 +10,7 @@ import math
 
 from hydrotele.core.compiled import inlined
 from hydrotele.hydraulics.laws import holding_share, orifice, valve_opening
-from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS, Slot
+from hydrotele.hydraulics.parameters import CURVE, CURVE_KNOTS, Slot
 
 _DB, _DBN, _K = int(Slot.DEADBAND), int(Slot.DEADBAND_NEGATIVE), int(Slot.FLOW_GAIN)
 _PA, _BT = int(Slot.METERING_PA), int(Slot.METERING_BT)

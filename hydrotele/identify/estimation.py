@@ -15,11 +15,9 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.gathering import Gathered
-from hydrotele.identify.identifiability import Identifiability, told_in_noise
-from hydrotele.identify.reference_size import reference_sizes
-from hydrotele.identify.regressor import RUBBING, Regressor
-from hydrotele.identify.setup import Setup
+from hydrotele.identify.equations import Gathered
+from hydrotele.identify.identifiability import Identifiability, reference_sizes, told_in_noise
+from hydrotele.identify.regressor import RUBBING, Regressor, Setup
 
 _ESTIMATE = "estimate"
 _NORMAL95 = 1.959964

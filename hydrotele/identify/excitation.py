@@ -10,11 +10,9 @@ from scipy.optimize import minimize
 
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.identify.identifiability import told_in_noise
+from hydrotele.identify.identifiability import reference_sizes, told_in_noise
 from hydrotele.identify.projection import Projection, project
-from hydrotele.identify.reference_size import reference_sizes
-from hydrotele.identify.regressor import regressor
-from hydrotele.identify.setup import Setup
+from hydrotele.identify.regressor import Setup, regressor
 from hydrotele.machine.machine import Machine
 
 _ROWS = 12  # per period of the highest harmonic

@@ -15,9 +15,8 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
-from hydrotele.estimate.evidence import Evidence, Fit
+from hydrotele.estimate.evidence import Evidence, Fit, spreads
 from hydrotele.estimate.hypothesis import Guess, hypotheses
-from hydrotele.estimate.intervals import spreads
 from hydrotele.estimate.stretches import busiest
 from hydrotele.estimate.track import Levels, known_levels, track_run
 from hydrotele.logs.dataset import Dataset

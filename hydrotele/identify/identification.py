@@ -22,7 +22,15 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.equations import Equations, build_equations, low_pass, row_forces
+from hydrotele.identify.equations import (
+    Equations,
+    Gathered,
+    build_equations,
+    cycle_on,
+    gather,
+    low_pass,
+    row_forces,
+)
 from hydrotele.identify.estimation import (
     REPEATED,
     Estimate,
@@ -32,15 +40,12 @@ from hydrotele.identify.estimation import (
     weighted,
     weights,
 )
-from hydrotele.identify.gathering import Gathered, cycle_on, gather
 from hydrotele.identify.identifiability import Identifiability, identifiability
 from hydrotele.identify.motion import Processing, Resolution, adjoint, joint_motion, resolution
 from hydrotele.identify.record import Record, beginning, check_repeats, whole_cycles
-from hydrotele.identify.regressor import Regressor
+from hydrotele.identify.regressor import Regressor, Setup
 from hydrotele.identify.result import Forces, HeldOut, Identification
-from hydrotele.identify.setup import Setup
-from hydrotele.identify.smoothed import Smoothed
-from hydrotele.identify.smoothing import smooth
+from hydrotele.identify.smoothing import Smoothed, smooth
 
 _SLOPES = 8000  # rows of a run that are asked for the forces' slopes
 _BLOCK = 4  # parameters at a time, so that long logs need little memory

@@ -11,9 +11,14 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.projection import Projection
-from hydrotele.identify.smoothed import Smoothed, checked_period, columns_of, per_column
-from hydrotele.identify.smoothing import smooth
-from hydrotele.identify.zero_phase import zero_phase
+from hydrotele.identify.smoothing import (
+    Smoothed,
+    checked_period,
+    columns_of,
+    per_column,
+    smooth,
+    zero_phase,
+)
 
 _PERIODIC = "periodic filter"
 

@@ -8,7 +8,7 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import DriveLinkage, axis_linkage
-from hydrotele.kinematics.triangle import LoopOpen
+from hydrotele.kinematics.linkages import LoopOpen
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms, sensor_set

@@ -10,8 +10,7 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry
 from hydrotele.kinematics.five_dof import FellerGeometry
-from hydrotele.kinematics.linkages import FourBar, TwoBar, two_bar_from_points
-from hydrotele.kinematics.triangle import LoopOpen
+from hydrotele.kinematics.linkages import FourBar, LoopOpen, TwoBar, two_bar_from_points
 from hydrotele.machine.drives import Axis
 from hydrotele.machine.machine import Machine
 

@@ -19,12 +19,10 @@ import numpy as np
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.logs.averaging import averaged
-from hydrotele.logs.cleaning import mend
+from hydrotele.logs.cleaning import check_range, mend
 from hydrotele.logs.files import RunFiles, check_commands, read_runs
 from hydrotele.logs.log import Log
-from hydrotele.logs.rows import Masked, Rows, check_runs, cut, read_mask, run_rows
-from hydrotele.logs.value_range import check_range
+from hydrotele.logs.rows import Masked, Rows, averaged, check_runs, cut, read_mask, run_rows
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import IDEAL, channel_sensor, noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorSet

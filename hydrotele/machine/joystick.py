@@ -19,7 +19,7 @@ from hydrotele.core.datafile import (
     suggest,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.resources import models_folder
+from hydrotele.core.files import models_folder
 
 JOYSTICK_FILE = "joystick.yaml"
 AXES = ("x", "y", "z", "rx", "ry", "rz")

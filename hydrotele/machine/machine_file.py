@@ -13,11 +13,9 @@ import mujoco
 import numpy as np
 import yaml
 
-from hydrotele.core.assets import copy_mjcf
 from hydrotele.core.datafile import PSI, parse, read_yaml, split_unit, suggest, to_si
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import read_xml
-from hydrotele.core.resources import models_folder
+from hydrotele.core.files import copy_mjcf, models_folder, read_xml
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import LAWS
 

@@ -16,10 +16,9 @@ from hydrotele.machine.noise import noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import usual_unit
 from hydrotele.simulate.drive_side import flexible_axes
+from hydrotele.simulate.feedback import defective
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
-from hydrotele.simulate.readout import late_channels, true_channels
-from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
-from hydrotele.simulate.sensors import defective
+from hydrotele.simulate.record import Record, Recorder, begin_leapfrog, late_channels, true_channels
 from hydrotele.simulate.stepping import Stepper
 
 PREDICTED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")

@@ -22,8 +22,7 @@ from hydrotele.core.datafile import (
     suggest,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.limits import beyond
-from hydrotele.core.resources import scenarios_folder
+from hydrotele.core.files import beyond, scenarios_folder
 from hydrotele.logs.log import load_log
 from hydrotele.machine.signals import parse_channel
 from hydrotele.scenario.surroundings import Thing

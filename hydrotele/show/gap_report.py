@@ -35,7 +35,7 @@ from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Candidate, Gap, LearnedLaw, Prediction, finite
 from hydrotele.machine.signals import usual_unit
 from hydrotele.show.channels import padded_range, shown_unit
-from hydrotele.show.gap_windows import channel_rms, most_changed, windowed
+from hydrotele.show.gap_recording import channel_rms, most_changed, windowed
 from hydrotele.show.report_html import (
     STYLE,
     Cell,

@@ -1,13 +1,163 @@
-"""The shapes of a machine's bodies as a few coloured meshes, from the MuJoCo model."""
+"""The shapes of a machine's bodies as a few coloured meshes, from the MuJoCo model.
 
-from collections.abc import Callable, Mapping
+Triangle meshes of primitive shapes, as pure functions.
+
+Each is centred at the origin, its axis along z, and wound so that normals point outwards.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from hydrotele.show import shapes
-from hydrotele.show.shapes import Mesh
+from hydrotele.show import looks as shapes
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh.
+
+    Attributes:
+        vertices: (v, 3) [m].
+        normals: (v, 3) unit vectors.
+        triangles: (t, 3) places in `vertices`.
+    """
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    triangles: np.ndarray
+
+
+def box(half_sizes) -> Mesh:
+    """A box: half_sizes (3,) [m]; flat faces.
+
+    >>> box((1, 2, 3)).vertices.max(axis=0).tolist()
+    [1.0, 2.0, 3.0]
+    """
+    vertices, normals, triangles = [], [], []
+    for axis in range(3):
+        u, v = np.roll(np.eye(3), axis, axis=1)[1:]
+        for sign in (1.0, -1.0):
+            out = sign * np.roll(np.eye(3), axis, axis=1)[0]
+            corners = [out - u - v, out + u - v, out + u + v, out - u + v]
+            start = len(vertices)
+            order = (0, 1, 2, 0, 2, 3) if sign > 0 else (0, 2, 1, 0, 3, 2)
+            vertices += corners
+            normals += [out] * 4
+            triangles += [[start + k for k in order[:3]], [start + k for k in order[3:]]]
+    return Mesh(np.array(vertices) * np.asarray(half_sizes), np.array(normals), np.array(triangles))
+
+
+def lathe(radii, heights, slopes, segments: int = 24) -> Mesh:
+    """A surface of revolution about z.
+
+    Args:
+        radii: (k,) [m], from the lower end to the upper one.
+        heights: (k,) [m].
+        slopes: (k, 2) radial and axial part of the normal there; a sharp edge is two equal points.
+        segments: number of pieces around.
+
+    Returns:
+        The mesh, k (segments + 1) vertices.
+    """
+    around = np.linspace(0.0, 2.0 * np.pi, segments + 1)
+    ring = np.stack([np.cos(around), np.sin(around)], axis=1)
+    radii, heights, slopes = (np.asarray(a, float) for a in (radii, heights, slopes))
+    vertices = np.empty((len(radii), segments + 1, 3))
+    vertices[..., :2] = radii[:, None, None] * ring
+    vertices[..., 2] = heights[:, None]
+    normals = np.empty_like(vertices)
+    normals[..., :2] = slopes[:, 0, None, None] * ring
+    normals[..., 2] = slopes[:, 1, None]
+    low = np.arange(len(radii) - 1)[:, None] * (segments + 1) + np.arange(segments)
+    high = low + segments + 1
+    quads = np.stack([low, low + 1, high + 1, low, high + 1, high], axis=-1).reshape(-1, 3)
+    mesh = Mesh(vertices.reshape(-1, 3), normals.reshape(-1, 3), quads)
+    return mesh._replace(triangles=quads[_areas(mesh) > 0.0])
+
+
+def cylinder(radius: float, half_length: float, segments: int = 24) -> Mesh:
+    """A closed cylinder along z [m]."""
+    r, h = radius, half_length
+    return lathe(
+        (0, r, r, r, r, 0),
+        (-h, -h, -h, h, h, h),
+        ((0, -1), (0, -1), (1, 0), (1, 0), (0, 1), (0, 1)),
+        segments,
+    )
+
+
+def capsule(radius: float, half_length: float, segments: int = 16) -> Mesh:
+    """A cylinder along z with a half ball on each end, half_length without them [m]."""
+    rise = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 2)
+    rise = np.sort(np.append(rise, (0.0, 0.0)))
+    slopes = np.stack([np.cos(rise), np.sin(rise)], axis=1)
+    upper = np.arange(len(rise)) >= len(rise) // 2
+    heights = radius * slopes[:, 1] + np.where(upper, half_length, -half_length)
+    return lathe(radius * slopes[:, 0], heights, slopes, segments)
+
+
+def ellipsoid(radii, segments: int = 24) -> Mesh:
+    """An ellipsoid: radii (3,) [m]; a ball has three equal ones."""
+    ball = capsule(1.0, 0.0, segments)
+    normals = ball.normals / np.asarray(radii)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Mesh(ball.vertices * np.asarray(radii), normals, ball.triangles)
+
+
+def flat(corners: np.ndarray) -> Mesh:
+    """Flat triangles: corners (t, 3, 3) [m], counter-clockwise from outside."""
+    corners = np.asarray(corners, float)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    triangles = np.arange(3 * len(corners)).reshape(-1, 3)
+    return Mesh(corners.reshape(-1, 3), np.repeat(normals, 3, axis=0), triangles)
+
+
+def tiles(half_size: float, count: int) -> tuple[Mesh, np.ndarray]:
+    """A flat square of count x count tiles in the plane z = 0.
+
+    Args:
+        half_size: half the side [m].
+        count: tiles along a side.
+
+    Returns:
+        (mesh, (v,) 0 or 1: the colour of the chequerboard at each vertex).
+    """
+    edges = np.linspace(-half_size, half_size, count + 1)
+    i, j = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
+    corners = [
+        np.stack([edges[i + a], edges[j + b], np.zeros((count, count))], axis=-1)
+        for a, b in ((0, 0), (1, 0), (1, 1), (0, 0), (1, 1), (0, 1))
+    ]
+    mesh = flat(np.stack(corners, axis=2).reshape(-1, 3, 3))
+    return mesh, np.repeat(((i + j) % 2).ravel(), 6)
+
+
+def moved(mesh: Mesh, position, rotation) -> Mesh:
+    """A mesh turned by rotation (3, 3) and then moved by position (3,) [m]."""
+    rotation = np.asarray(rotation).reshape(3, 3)
+    return Mesh(
+        mesh.vertices @ rotation.T + np.asarray(position),
+        mesh.normals @ rotation.T,
+        mesh.triangles,
+    )
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one."""
+    starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        np.concatenate([mesh.triangles + s for mesh, s in zip(meshes, starts, strict=True)]),
+    )
+
+
+def _areas(mesh: Mesh) -> np.ndarray:
+    a, b, c = (mesh.vertices[mesh.triangles[:, k]] for k in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
 
 _HIDDEN_GROUP = 3  # MuJoCo viewers hide geoms from this group on: shapes that only collide
 _DEFAULT_COLOUR = (0.5, 0.5, 0.5, 1.0)  # mjModel's, which gives way to a material

@@ -2,22 +2,38 @@
 
 The `.rrd` is written by column after the run. Each log stands under its own root entity; all share
 the timeline `time` [s].
+
+A rerun recording that becomes a file whole or not at all, also where the disk is full.
+
+What a recording shows at first sight: the rerun blueprint.
+
+A machine, the ground and the way of the tool tip as rerun entities.
 """
 
+import contextlib
 import os
 import re
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.output import replacing
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
-from hydrotele.show.channels import colours, common_channels, difference, grouped, shown
-from hydrotele.show.layout import Plot, Scene, blueprint
-from hydrotele.show.looks import bounds
+from hydrotele.show import looks as shapes
+from hydrotele.show.channels import (
+    TITLES,
+    colours,
+    common_channels,
+    difference,
+    grouped,
+    padded_range,
+    shown,
+)
+from hydrotele.show.looks import Look, body_looks, bounds, ground_height
 from hydrotele.show.pose import (
     Poses,
     body_poses,
@@ -26,8 +42,309 @@ from hydrotele.show.pose import (
     model_with_looks,
     points_on_body,
 )
-from hydrotele.show.recording_file import recording_file
-from hydrotele.show.scene import log_ground, log_machine, log_tip
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+_LONGEST_ID = 180  # characters that rerun takes as an application id
+
+
+@contextlib.contextmanager
+def recording_file(path: str | os.PathLike, application: str) -> Iterator["rr.RecordingStream"]:
+    """Record into memory and write the file at the end.
+
+    Rerun's own writer is a thread that nobody hears of when the disk is full.
+
+    Args:
+        path: the file to write, ending in `.rrd`.
+        application: its id; rerun keeps a user's layout per id.
+
+    Yields:
+        The recording to log to.
+
+    Raises:
+        InputError: the name ends otherwise, or the file cannot be written. Nothing is left then.
+    """
+    import rerun as rr
+
+    name = application.encode("ascii", "replace").decode()[:_LONGEST_ID]
+    with replacing(path, ".rrd") as part, rr.RecordingStream(name) as stream:
+        memory = stream.binary_stream()
+        yield stream
+        part.write_bytes(memory.read(flush=True) or b"")
+
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
+# Tab -> kinds of plots in it, from top to bottom.
+_TABS: Mapping[str, tuple[str, ...]] = {
+    "Overview": ("command", "angle", "position", "pressure_head", "pressure_rod"),
+    "Hydraulics": ("pressure_supply", "flow_supply", "flow_head", "flow_rod", "spool"),
+    "Mechanics": ("length", "position", "force", "torque", "contact_force", "tip"),
+    "Teleoperation": ("tip_force", "handle", "hand_force", "handle_stiffness", "tip_pose"),
+    "Rates": ("velocity", "acceleration", "piston_velocity", "spool_rate", "reference"),
+}
+_COMPARED = ("angle", "position", "pressure_head", "pressure_rod", "length")
+_FIXED_RANGES = {"command": (-1.05, 1.05)}
+_SKY = (206, 217, 228)
+_GRID = (120, 125, 130, 90)
+_TRAIL = 5.0  # s
+_FIRST_SHARE = 1.5  # height of the plot with the legend, in heights of others
+
+
+class Plot(NamedTuple):
+    """One time-series view.
+
+    Attributes:
+        kind: kind of its channels.
+        entities: entity paths of its lines.
+        labels: their names in the legend, without units.
+        units: units of its lines, without repetition.
+        values: arrays of its lines [unit].
+        is_difference: whether it shows the difference of two logs.
+    """
+
+    kind: str
+    entities: Sequence[str]
+    labels: Sequence[str]
+    units: Sequence[str]
+    values: Sequence[np.ndarray]
+    is_difference: bool = False
+
+
+class Scene(NamedTuple):
+    """The 3D view.
+
+    Attributes:
+        title: what is seen.
+        contents: entity paths.
+        trails: entities of which only the last seconds are shown.
+        eye: (3,) where it is seen from [m].
+        target: (3,) what it looks at [m].
+        ground: whether there is a ground; otherwise the viewer draws a grid.
+    """
+
+    title: str
+    contents: Sequence[str]
+    trails: Sequence[str]
+    eye: np.ndarray
+    target: np.ndarray
+    ground: bool
+
+
+def blueprint(
+    plots: Sequence[Plot],
+    differences: Sequence[Plot],
+    scene: Scene,
+    minus: str = "",
+) -> "rrb.Blueprint":
+    """Lay out a recording: the machine on the left, tabs of plots on the right, time below.
+
+    Args:
+        plots: one per kind of channel.
+        differences: the same for the difference of two logs; may be empty.
+        scene: the 3D view.
+        minus: what the differences are, such as `measured - simulated`.
+
+    Returns:
+        The blueprint; the time panel starts paused on the timeline `time`.
+    """
+    import rerun.blueprint as rrb
+
+    about = rrb.TextDocumentView(name="About", origin="/about")
+    tabs = [*_tabs(plots, differences, minus), about]
+    return rrb.Blueprint(
+        rrb.Horizontal(_machine_view(scene), rrb.Tabs(*tabs, active_tab=0), column_shares=[11, 9]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="time", play_state="paused", loop_mode="all"),
+        auto_views=False,
+    )
+
+
+def _machine_view(scene: Scene):
+    import rerun.blueprint as rrb
+
+    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-_TRAIL)
+    recent = rrb.VisibleTimeRange("time", start=start, end=rrb.TimeRangeBoundary.cursor_relative())
+    return rrb.Spatial3DView(
+        name=scene.title,
+        origin="/",
+        contents=list(scene.contents),
+        overrides={path: rrb.VisibleTimeRanges([recent]) for path in scene.trails},
+        background=_SKY,
+        line_grid=rrb.LineGrid3D(visible=not scene.ground, spacing=1.0, color=_GRID),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=scene.eye,
+            look_target=scene.target,
+            eye_up=(0, 0, 1),
+        ),
+    )
+
+
+def _tabs(plots: Sequence[Plot], differences: Sequence[Plot], minus: str):
+    by_kind = {plot.kind: plot for plot in plots}
+    gap_of = {plot.kind: plot for plot in differences}
+    tabs = []
+    if differences:
+        kinds = [kind for kind in _COMPARED if kind in gap_of] or list(gap_of)
+        pairs = [(by_kind[kind], gap_of[kind]) for kind in kinds[:3]]
+        views = [plot for pair in pairs for plot in pair]
+        tabs.append(_column("Comparison", views, minus, [2, 1] * len(pairs)))
+    for title, kinds in _TABS.items():
+        if views := [by_kind[kind] for kind in kinds if kind in by_kind]:
+            tabs.append(_column(title, views, minus))
+    if differences:
+        tabs.append(_column("Differences", list(differences), minus))
+    return tabs
+
+
+def _column(
+    title: str, plots: Sequence[Plot], minus: str, shares: Sequence[float] | None = None
+) -> "rrb.Vertical":
+    """Plots below each other; a legend only where it names lines that none above has named."""
+    import rerun.blueprint as rrb
+
+    named: set[str] = set()
+    views, heights = [], []
+    for plot, share in zip(plots, shares or [1.0] * len(plots), strict=True):
+        legend = len(plot.labels) > 1 and not named.issuperset(plot.labels)
+        if legend:
+            named.update(plot.labels, (label.split()[-1] for label in plot.labels))
+        views.append(_view(plot, minus if plot.is_difference else "", legend))
+        heights.append(share * (_FIRST_SHARE if legend else 1.0))
+    return rrb.Vertical(*views, name=title, row_shares=heights)
+
+
+def _view(plot: Plot, minus: str, legend: bool) -> "rrb.TimeSeriesView":
+    import rerun.blueprint as rrb
+
+    units = ", ".join("-" if unit == "1" else unit for unit in plot.units)
+    fixed = None if minus or units != "-" else _FIXED_RANGES.get(plot.kind)
+    note = f", {minus}" if minus else ""
+    return rrb.TimeSeriesView(
+        name=f"{TITLES.get(plot.kind, plot.kind)}{note} [{units}]",
+        origin="/",
+        contents=list(plot.entities),
+        axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+        axis_y=rrb.ScalarAxis(range=fixed or padded_range(plot.values, plot.units[0])),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+    )
+
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+_GHOST_COLOUR = np.array([40.0, 130.0, 255.0])
+_GHOST_TINT = 0.7  # part of the ghost's own colour in what is seen
+_GHOST_OPACITY = 0.35
+_GHOST_INSET = 0.01  # m that it is smaller: where both machines agree, the solid one hides it
+_GROUND_COLOURS = np.array([[134, 122, 104], [144, 131, 112]], dtype=np.uint8)
+_GROUND_HALF_SIZE = 20.0  # m
+_TIP_COLOUR, _GHOST_TIP_COLOUR = (215, 40, 30), (40, 110, 230)
+
+
+def log_machine(
+    stream: "rr.RecordingStream",
+    root: str,
+    model: mujoco.MjModel,
+    poses: Poses,
+    clock: "rr.TimeColumn",
+    ghost: bool = False,
+) -> None:
+    """Log the shapes once, and where the bodies are by column.
+
+    Args:
+        stream: where to.
+        root: entity above the bodies.
+        model: the model with its looks.
+        poses: n poses; one alone is static.
+        clock: n times.
+        ghost: draw only what moves, as tinted glass.
+    """
+    moving = [i for i in range(model.nbody) if model.body_weldid[i] != 0]
+    for look in body_looks(model):
+        if ghost and look.body not in moving:
+            continue
+        part = "shape" if look.opacity == 1.0 else f"glass_{round(100 * look.opacity)}"
+        path = f"{root}/{poses.bodies[look.body]}/{part}"
+        stream.log(path, mesh_entity(look, ghost), static=True)
+    for body, name in enumerate(poses.bodies):
+        if body in moving or not ghost:
+            _log_way(stream, f"{root}/{name}", poses, body, clock, static=body not in moving)
+
+
+def mesh_entity(look: Look, ghost: bool = False) -> "rr.Mesh3D":
+    """A look as a rerun mesh; a ghost is tinted and transparent."""
+    import rerun as rr
+
+    colours, opacity, vertices = look.colours, look.opacity, look.mesh.vertices
+    if ghost:
+        vertices = vertices - _GHOST_INSET * look.mesh.normals
+        colours = (1.0 - _GHOST_TINT) * colours + _GHOST_TINT * _GHOST_COLOUR
+        opacity *= _GHOST_OPACITY
+    return rr.Mesh3D(
+        vertex_positions=vertices.astype(np.float32),
+        vertex_normals=look.mesh.normals.astype(np.float32),
+        triangle_indices=look.mesh.triangles.astype(np.uint32),
+        vertex_colors=np.asarray(colours, dtype=np.uint8),
+        albedo_factor=[1.0, 1.0, 1.0, opacity] if opacity < 1.0 else None,
+    )
+
+
+def log_ground(stream: "rr.RecordingStream", model: mujoco.MjModel) -> bool:
+    """Log a chequered ground with tiles of 2 m; tell whether the model has a ground plane."""
+    height = ground_height(model)
+    if height is None:
+        return False
+    mesh, parity = shapes.tiles(_GROUND_HALF_SIZE, int(_GROUND_HALF_SIZE))
+    mesh = shapes.moved(mesh, (0.0, 0.0, height), np.eye(3))
+    stream.log("ground", mesh_entity(Look(0, 1.0, mesh, _GROUND_COLOURS[parity])), static=True)
+    return True
+
+
+def log_tip(
+    stream: "rr.RecordingStream",
+    root: str,
+    tip: np.ndarray | None,
+    clock: "rr.TimeColumn",
+    ghost: bool = False,
+) -> None:
+    """Log where the tip is (n, 3) [m]: the whole way as a thin line, its latest part, the point.
+
+    `trail` holds one piece per row; the layout decides how many seconds of it are shown.
+    """
+    import rerun as rr
+
+    if tip is None or len(tip) < 2:
+        return
+    colour = _GHOST_TIP_COLOUR if ghost else _TIP_COLOUR
+    pale = [round(0.5 * (c + 220)) for c in colour]
+    thin = rr.LineStrips3D([tip.astype(np.float32)], colors=[pale], radii=[0.005])
+    stream.log(f"{root}/way", thin, static=True)
+    pieces = np.stack([np.concatenate([tip[:1], tip[:-1]]), tip], axis=1)
+    style = rr.LineStrips3D.from_fields(colors=[colour], radii=[0.012 if ghost else 0.02])
+    stream.log(f"{root}/trail", style, static=True)
+    stream.send_columns(f"{root}/trail", [clock], rr.LineStrips3D.columns(strips=pieces))
+    style = rr.Points3D.from_fields(colors=[colour], radii=[0.06 if ghost else 0.07])
+    stream.log(f"{root}/now", style, static=True)
+    stream.send_columns(f"{root}/now", [clock], rr.Points3D.columns(positions=tip))
+
+
+def _log_way(stream, path: str, poses: Poses, body: int, clock, static: bool) -> None:
+    import rerun as rr
+
+    position = poses.position[:, body]
+    quaternion = np.roll(poses.quaternion[:, body], -1, axis=1)  # rerun: x y z w
+    if static or len(position) == 1:
+        turn = rr.Quaternion(xyzw=quaternion[0])
+        stream.log(path, rr.Transform3D(translation=position[0], quaternion=turn), static=True)
+        return
+    columns = rr.Transform3D.columns(translation=position, quaternion=quaternion)
+    stream.send_columns(path, [clock], columns)
+
 
 if TYPE_CHECKING:
     import rerun as rr

@@ -14,8 +14,7 @@ from hydrotele.hydraulics.pump import oil_compliance, switched_speed
 from hydrotele.simulate.closure import pin_count
 from hydrotele.simulate.drive_side import drive_and_load_dofs
 from hydrotele.simulate.plant import Plant
-from hydrotele.simulate.readout import drive_motion, state_flows
-from hydrotele.simulate.record import align_positions
+from hydrotele.simulate.record import align_positions, drive_motion, state_flows
 from hydrotele.simulate.term_readout import added_by_terms
 
 _LOOK_EVERY = 10  # steps, to see whether the machine touches something: a hit lasts longer

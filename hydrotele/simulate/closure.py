@@ -11,10 +11,10 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics import loops
+from hydrotele.machine import machine as loops
 from hydrotele.machine.machine import Machine
-from hydrotele.simulate.document import pin_site
 from hydrotele.simulate.drive_side import drive_and_load_dofs, lock_drives
+from hydrotele.simulate.mechanism import pin_site
 
 _STEP = 0.2  # largest move of an independent joint between two Newton solutions [rad] or [m]
 _CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine

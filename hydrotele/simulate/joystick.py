@@ -19,7 +19,7 @@ GRAVITY = -9.81
 _STEPS = 2  # physics steps per control period of 5 ms: its stiffest spring turns over in 30 ms
 
 
-class Flotor:
+class SimulatedFlotor:
     """The simulated joystick.
 
     Attributes:

@@ -8,29 +8,89 @@ MJCF text with or without what only a picture needs.
 
 Hundreds of geoms that touch nothing double the cost of a step and make assembling slow, so physics
 leaves them out; masses do not come from geoms here.
+
+The complete MJCF of a machine, with the files that it needs.
+
+Names of what is added to a machine's MJCF; a prefix keeps them apart from the user's own.
 """
 
 import warnings
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
-from hydrotele.core.assets import check_assets
 from hydrotele.core.datafile import Vector
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import read_xml
+from hydrotele.core.files import check_assets, read_xml
 from hydrotele.hydraulics.circuit import ACTIVATIONS
-from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
-from hydrotele.hydraulics.slots import SLOTS, Slot
+from hydrotele.hydraulics.parameters import SLOTS, Slot, actuator_numbers, actuator_order
 from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
 from hydrotele.machine.drives import Axis, Cylinder, Pin
 from hydrotele.machine.machine import Link, Machine
 from hydrotele.scenario.surroundings import Thing
-from hydrotele.simulate.document import GROUND, OWN, TIP_SITE, Mjcf, pin_site
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, write_drive_side
 from hydrotele.simulate.surroundings import write_surroundings
 from hydrotele.terms.table import terms_table
+
+OWN = "hydrotele_"
+"""What the names begin with of all that no file of the user names."""
+
+GROUND = f"{OWN}ground"
+"""Name of the ground's geom, texture and material."""
+
+TIP_SITE = f"{OWN}tip"
+"""Name of the site at the arm's tip."""
+
+
+def pin_site(closure: str, end: str) -> str:
+    """Name of the site at an end, a or b, of a closure; a cylinder's is `<axis>_pin`."""
+    return f"{OWN}{closure}_{end}"
+
+
+class Mjcf(NamedTuple):
+    """A complete MJCF.
+
+    Attributes:
+        name: of the machine.
+        text: the document; it names its assets without folder.
+        assets: name -> content of every file that it needs.
+    """
+
+    name: str
+    text: str
+    assets: Mapping[str, bytes]
+
+    def compile(self) -> mujoco.MjModel:
+        """The MuJoCo model.
+
+        Raises:
+            InputError: MuJoCo refuses it.
+        """
+        try:
+            return mujoco.MjModel.from_xml_string(self.text, dict(self.assets))
+        except ValueError as error:
+            message = " ".join(str(error).split())
+            raise InputError(f"machine {self.name}", f"does not compile: {message}") from None
+
+    def save(self, path: Path, beside: Path | None = None) -> None:
+        """Write the document, and its assets into the folder `<stem>_assets` beside it.
+
+        Args:
+            path: file to write.
+            beside: the name that the file will have in the end, if that is another one.
+        """
+        folder = (beside or path).with_suffix("").name + "_assets"
+        text = self.text
+        for name, content in self.assets.items():
+            path.with_name(folder).mkdir(exist_ok=True)
+            path.with_name(folder).joinpath(name).write_bytes(content)
+            text = text.replace(f'="{name}"', f'="{folder}/{name}"')
+        path.write_text(text, encoding="utf-8")
+
 
 Element = ElementTree.Element
 

@@ -24,6 +24,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from hydrotele.core.compiled import callback, compiled, lean
+from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate, settled_bristle_friction
 from hydrotele.hydraulics.circuit import (
     MAX_AXES,
     SCRATCH,
@@ -31,22 +32,24 @@ from hydrotele.hydraulics.circuit import (
     Kind,
     Slot,
     actuator_friction,
+    add_to_commands,
     circuit_supply,
     delivered_share,
+    drive_state,
     open_ports,
     pumped_force,
+    settled_friction,
     step_circuit,
 )
-from hydrotele.hydraulics.drive import add_to_commands, drive_state, settled_friction
-from hydrotele.hydraulics.parameters import MARKER
-from hydrotele.hydraulics.presliding import (
-    bristle_friction,
-    bristle_rate,
-    settled_bristle_friction,
+from hydrotele.hydraulics.parameters import CURVE, CURVE_KNOTS, MARKER
+from hydrotele.simulate.layout import (
+    field_offsets,
+    floats,
+    mujoco_library,
+    option_offset,
+    pointer,
+    verify_layout,
 )
-from hydrotele.hydraulics.slots import CURVE, CURVE_KNOTS
-from hydrotele.simulate.layout import field_offsets, mujoco_library, option_offset, verify_layout
-from hydrotele.simulate.pointers import floats, pointer
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND, COUNT, FORCE, added_with_slope
 from hydrotele.terms.table import MARKER as TERMS

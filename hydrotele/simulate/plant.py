@@ -23,14 +23,12 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air
-from hydrotele.hydraulics.parameters import actuator_order, memory_names
-from hydrotele.hydraulics.slots import Slot
+from hydrotele.hydraulics.parameters import Slot, actuator_order, memory_names
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
-from hydrotele.simulate.document import TIP_SITE, Mjcf
 from hydrotele.simulate.drive_side import drive_joint, flexible_axes, load_joint, wind_up
-from hydrotele.simulate.mechanism import add_element, assemble, mjcf_document
+from hydrotele.simulate.mechanism import TIP_SITE, Mjcf, add_element, assemble, mjcf_document
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.simulate.term_readout import terms_at_rest
 

@@ -9,9 +9,9 @@ from hydrotele.hydraulics.circuit import (
     SCRATCH,
     circuit_supply,
     delivered_share,
+    drive_state,
     open_ports,
 )
-from hydrotele.hydraulics.drive import drive_state
 from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Drives

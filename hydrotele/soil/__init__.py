@@ -9,7 +9,7 @@ environment, one array of numbers for all; nothing is allocated or shared:
 >>> import numpy as np
 >>> from hydrotele.soil.facts import SOILS
 >>> from hydrotele.soil.facts import OUT, FORCE_R, bucket_state, level_profile, soil_numbers
->>> from hydrotele.soil.shape import CAT215
+>>> from hydrotele.soil.facts import CAT215
 >>> from hydrotele.soil.step import soil_step
 >>> numbers = soil_numbers(SOILS["firm"], CAT215, start=3.0, cell=0.05)
 >>> (surface, loose), state, out = level_profile(140), bucket_state(), np.zeros(OUT)

@@ -17,6 +17,8 @@ Fundamental Equation of Earthmoving (Reece 1964; McKyes and Ali 1977; McKyes 198
 `P = w (g d^2 N_g + c d N_c + c_a d N_ca) + Q N_q`, P inclined by delta against the blade's normal.
 The plane is the one with the least N_g. Luengo, Singh and Cannon (1998) tilt it by the slope of the
 surface and load it with the weight Q of what the bucket has swept up. All angles in radians.
+
+Soil and load on a bucket as the wrench about its centre of mass that MuJoCo's bodies take.
 """
 
 import math
@@ -40,6 +42,7 @@ from hydrotele.soil.facts import (
     FORCE_Z,
     FRICTION,
     FRONT,
+    GRAVITY,
     GRAVITY_AT,
     HEEL,
     HEEL_X,
@@ -578,3 +581,30 @@ def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out)
             state[LOW], state[HIGH] = max(low - 1, 0), min(high + 1, count - 1)
         else:
             state[LOW], state[HIGH] = 0.0, 0.0
+
+
+@lean
+def bucket_wrench(out, edge, theta, centre, wrench):
+    """Force and torque of the soil and of the weight that is carried on the bucket's body.
+
+    Args:
+        out: (OUT,) of `soil_step` [N], [N m], [kg], [m].
+        edge: (3,) place of the edge in the world [m].
+        theta: azimuth of the edge seen from the swing axis, scalar [rad].
+        centre: (3,) centre of mass of the bucket's body, `xipos` [m].
+        wrench: (6,) written: force and torque in the world, `xfrc_applied` [N], [N m].
+
+    Returns:
+        Nothing.
+
+    Source: statics; the inertia of what is carried is left out.
+    """
+    c, s = math.cos(theta), math.sin(theta)
+    weight = GRAVITY * out[MASS]
+    fx, fy, fz = c * out[FORCE_R], s * out[FORCE_R], out[FORCE_Z]
+    x, y, z = edge[0] - centre[0], edge[1] - centre[1], edge[2] - centre[2]
+    load_x, load_y = x + c * out[MASS_R], y + s * out[MASS_R]
+    wrench[0], wrench[1], wrench[2] = fx, fy, fz - weight
+    wrench[3] = y * fz - z * fy - load_y * weight + s * out[MOMENT]
+    wrench[4] = z * fx - x * fz + load_x * weight - c * out[MOMENT]
+    wrench[5] = x * fy - y * fx

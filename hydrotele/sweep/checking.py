@@ -20,9 +20,8 @@ from hydrotele.scenario.scenario import (
     read_scenario_file,
     scenario_from,
 )
-from hydrotele.sweep.facts import SweepFile
-from hydrotele.sweep.inputs import Inputs
-from hydrotele.sweep.points import Point, override_text, overrides, points
+from hydrotele.sweep.facts import Point, SweepFile, override_text, overrides, points
+from hydrotele.sweep.running import Inputs
 
 Progress = Callable[[int, int], None]
 _Machines = dict[tuple[str, str | None], Machine]

@@ -43,12 +43,17 @@ from hydrotele.sweep.checking import (
     open_base,
     scenario_of,
 )
-from hydrotele.sweep.facts import SweepFile
-from hydrotele.sweep.inputs import placed, unpack
-from hydrotele.sweep.journal import FAILED, JOURNAL, OK, Entry, Journal
-from hydrotele.sweep.numbers import check_figures, possible_numbers
-from hydrotele.sweep.points import Point, points
-from hydrotele.sweep.running import Keep, Outcome, Task, failed, perform
+from hydrotele.sweep.facts import Point, SweepFile, points
+from hydrotele.sweep.journal import (
+    FAILED,
+    JOURNAL,
+    OK,
+    Entry,
+    Journal,
+    check_figures,
+    possible_numbers,
+)
+from hydrotele.sweep.running import Keep, Outcome, Task, failed, perform, placed, unpack
 from hydrotele.sweep.table import Table, make_table, save_table
 
 _WAIT = 30  # s for the scheduler and the first worker

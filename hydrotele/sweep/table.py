@@ -12,10 +12,8 @@ from typing import Any, NamedTuple
 
 import hydrotele
 from hydrotele.core.output import replacing
-from hydrotele.sweep.facts import Sweep
-from hydrotele.sweep.journal import Entry
-from hydrotele.sweep.numbers import key_unit
-from hydrotele.sweep.points import points
+from hydrotele.sweep.facts import Sweep, points
+from hydrotele.sweep.journal import Entry, key_unit
 
 
 class Table(NamedTuple):

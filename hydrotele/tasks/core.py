@@ -9,8 +9,8 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from hydrotele.control.drive_rows import drive_tables
 from hydrotele.control.resolved_motion import arm_axes
+from hydrotele.control.servo import drive_tables
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.fleet import Fleet

@@ -4,19 +4,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.drive_rows import drive_tables
 from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.control.servo import servo_numbers
+from hydrotele.control.servo import drive_tables, servo_numbers
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import channel_sensor, converter, sensor_set
 from hydrotele.machine.sensors import SensorSet
-from hydrotele.simulate.document import TIP_SITE
 from hydrotele.simulate.feedback import samples_every
-from hydrotele.simulate.layout import field_offsets, verify_layout
-from hydrotele.simulate.pointers import function_address
+from hydrotele.simulate.layout import field_offsets, function_address, verify_layout
+from hydrotele.simulate.mechanism import TIP_SITE
 from hydrotele.tasks.kinds import KINDS
 from hydrotele.tasks.memory import ACTIONS, FACTS, VALVE
 from hydrotele.tasks.observation import Field

@@ -16,7 +16,7 @@ from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 from hydrotele.scenario.surroundings import Plate, Thing
-from hydrotele.simulate.pointers import field
+from hydrotele.simulate.layout import field
 from hydrotele.tasks.chance import between
 from hydrotele.tasks.observation import Field
 from hydrotele.tasks.starts import draw_start

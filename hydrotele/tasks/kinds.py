@@ -5,13 +5,11 @@ is its place in KINDS.
 """
 
 from hydrotele.core.compiled import compiled
-from hydrotele.tasks.bed import tick_bed
 from hydrotele.tasks.force import begin_force, judge_force, observe_force, tick_force
-from hydrotele.tasks.grade import begin_grade, judge_grade, observe_grade
-from hydrotele.tasks.grapple import tick_grapple
+from hydrotele.tasks.grade import begin_grade, judge_grade, observe_grade, tick_bed
 from hydrotele.tasks.line import begin_line, judge_line, observe_line
 from hydrotele.tasks.observation import observe_machine
-from hydrotele.tasks.place import begin_place, judge_place, observe_place
+from hydrotele.tasks.place import begin_place, judge_place, observe_place, tick_grapple
 from hydrotele.tasks.reach import begin_reach, judge_reach, observe_reach
 from hydrotele.tasks.track import begin_track, judge_track, observe_track
 

@@ -17,9 +17,8 @@ from hydrotele.scenario.scenario import Servo
 from hydrotele.tasks.chance import between, draw
 from hydrotele.tasks.memory import ARM
 from hydrotele.tasks.observation import Field, pose_fields, reach
-from hydrotele.tasks.starts import draw_start
+from hydrotele.tasks.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.tasks.task import Task
-from hydrotele.tasks.workspace import path_effort, pose_read, turned
 
 PREVIEWS = (0.1, 0.2, 0.4)  # s ahead
 ACROSS, ALONG, TURNED = 0.1, 0.2, 0.2  # m, m, rad that cost a reward of 1

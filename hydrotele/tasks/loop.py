@@ -20,17 +20,16 @@ import mujoco
 import numpy as np
 from numba import carray, types
 
-from hydrotele.control.drive_rows import POINTS, drive_row
 from hydrotele.control.resolved_motion import follow_pose
-from hydrotele.control.servo import servo_step
+from hydrotele.control.servo import POINTS, drive_row, servo_step
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.hydraulics.circuit import SCRATCH
-from hydrotele.hydraulics.slots import SLOTS
+from hydrotele.hydraulics.parameters import SLOTS
 from hydrotele.kinematics.task import task_forward
+from hydrotele.simulate.feedback import convert
 from hydrotele.simulate.fleet import STATE
-from hydrotele.simulate.pointers import call_set_state, call_step, field, floats, pointer
-from hydrotele.simulate.readout import state_supply
-from hydrotele.simulate.sensors import convert
+from hydrotele.simulate.layout import call_set_state, call_step, field, floats, pointer
+from hydrotele.simulate.record import state_supply
 from hydrotele.tasks.chance import draw
 from hydrotele.tasks.kinds import begin_task, judge_task, observe_task, tick_task
 from hydrotele.tasks.memory import (

@@ -16,9 +16,8 @@ from hydrotele.scenario.scenario import Servo
 from hydrotele.tasks.chance import between
 from hydrotele.tasks.memory import ARM
 from hydrotele.tasks.observation import Field, pose_fields, reach
-from hydrotele.tasks.starts import draw_start
+from hydrotele.tasks.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.tasks.task import Task
-from hydrotele.tasks.workspace import path_effort, pose_read, turned
 
 NEAR, LEVEL, KEEP = 0.05, 0.03, 0.5  # m, rad, s: what counts as reached
 PROGRESS, TIME, SUCCESS = 1.0, 0.01, 10.0  # reward per metre nearer, cost of a step, of success

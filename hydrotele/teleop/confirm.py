@@ -20,10 +20,8 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import stability_map
-from hydrotele.teleop.case import Case
-from hydrotele.teleop.stability import unstable_held
-from hydrotele.teleop.two_port import Impedance, transmitted
+from hydrotele.teleop.analysis import Case, stability_map
+from hydrotele.teleop.two_port import Impedance, transmitted, unstable_held
 
 INT, X, V, A, IMPULSE, FORCE, Y, W, W1, W2 = range(10)
 _KNOWN = np.array([INT, X, V, IMPULSE, Y, W])

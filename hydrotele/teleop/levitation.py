@@ -2,26 +2,279 @@
 
 The flotor hovers, steps and wobbles without a hand; tests, the study and identification look at it
 through what is sensed and which currents flow.
+
+Control of a joystick that stands alone: sensed pose to coil currents, once per period.
+
+Every axis is the second-order system that was designed, about a remote centre of compliance at the
+handle. With a hand on it `teleop.master` puts springs at the handle instead.
+
+Optical sensing of a levitated flotor: three light beams on three two-axis diodes give its pose.
+
+Beams leave the flotor's centre at 120 degrees in one plane; each meets a position-sensing diode on
+the stator, which tells where: sideways and up. Six readings make the six numbers of a pose.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
+from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import Joystick
-from hydrotele.simulate.joystick import Flotor
-from hydrotele.teleop.compliance import turn_matrix
-from hydrotele.teleop.levitate import (
-    FROZEN,
-    Levitation,
-    coils_from_handle,
-    levitation,
-    levitation_step,
-    nothing_remembered,
+from hydrotele.simulate.joystick import SimulatedFlotor
+from hydrotele.teleop.coils import Coils, three_stations
+from hydrotele.teleop.compliance import (
+    Axes,
+    Flotor,
+    Motion,
+    compliance_wrench,
+    rotation_between,
+    turn_matrix,
 )
-from hydrotele.teleop.optics import diode_readings, pose_of_readings
+
+FROZEN = 0.1  # s: a reading with noise is never the same for twenty periods
+_NONE = np.zeros(6)
+
+
+@dataclass(frozen=True)
+class Levitation:
+    """Numbers of the control.
+
+    Attributes:
+        body: what the control takes the flotor for, in the coils' frame.
+        axes: the designed second-order systems.
+        coils: the coils.
+        handle: (3,) centre of compliance in the coils' frame [m].
+        period: of the control [s].
+        frozen: time for which a reading may stay the same to the last digit [s].
+    """
+
+    body: Flotor
+    axes: Axes
+    coils: Coils
+    handle: np.ndarray
+    period: float
+    frozen: float = FROZEN
+
+
+class Remembered(NamedTuple):
+    """What the control keeps from period to period.
+
+    Attributes:
+        place: (3,) last reading of the coils' frame [m]; NaN where there was none.
+        quaternion: (4,) its orientation, scalar first.
+        same: time for which the reading has not changed [s].
+    """
+
+    place: np.ndarray
+    quaternion: np.ndarray
+    same: float
+
+
+class Levitated(NamedTuple):
+    """What the coils get.
+
+    Attributes:
+        currents: (6,) [A].
+        limited: whether they had to be made smaller.
+        blind: whether they are off because the reading is no number, or frozen.
+    """
+
+    currents: np.ndarray
+    limited: bool
+    blind: bool
+
+
+def levitation(
+    joystick: Joystick, body: Flotor | None = None, frozen: float = FROZEN
+) -> Levitation:
+    """Control of a joystick.
+
+    Args:
+        joystick: the joystick.
+        body: what the control takes the flotor for; the true numbers by default.
+        frozen: time for which a reading may stay the same to the last digit [s].
+
+    Returns:
+        The numbers.
+
+    Raises:
+        InputError: numbers that make no sense.
+    """
+    f, c, alone = joystick.flotor, joystick.coils, joystick.alone
+    own = Flotor(f.mass, np.array(f.com), np.diag(f.inertia))
+    return Levitation(
+        body=body or own,
+        axes=Axes(np.array(alone.frequency), np.array(alone.ratio)),
+        coils=three_stations(c.radius, c.force_per_ampere, c.max_current),
+        handle=np.array(f.handle),
+        period=1.0 / joystick.control_rate,
+        frozen=frozen,
+    )
+
+
+def nothing_remembered() -> Remembered:
+    """What the control knows before its first reading."""
+    return Remembered(np.full(3, np.nan), np.full(4, np.nan), 0.0)
+
+
+def levitation_step(
+    control: Levitation, before: Remembered, place: np.ndarray, quaternion: np.ndarray,
+    target: np.ndarray, turned: np.ndarray,
+) -> tuple[Remembered, Levitated]:  # fmt: skip
+    """One period: velocities by differences, wrench, currents.
+
+    A reading that is no number, or has been the same for longer than noise allows, switches the
+    coils off, so that nobody is pushed by what is not measured; the flotor then sinks onto its
+    stops. With good readings it rises again, from rest.
+
+    Args:
+        control: the numbers.
+        before: what was remembered.
+        place: (3,) reading of the coils' frame, from the handle's centre [m].
+        quaternion: (4,) reading of its orientation, scalar first.
+        target: (3,) where the handle should be, from its centre [m].
+        turned: (4,) orientation that the flotor should have, scalar first.
+
+    Returns:
+        What to remember, and the currents.
+
+    Source: Zhu 1994, 5.1.3.
+    """
+    if not (np.isfinite(place).all() and np.isfinite(quaternion).all()):
+        return nothing_remembered(), Levitated(_NONE, True, True)
+    same = np.array_equal(place, before.place) and np.array_equal(quaternion, before.quaternion)
+    after = Remembered(place, quaternion, before.same + control.period if same else 0.0)
+    if after.same > control.frozen:
+        return after, Levitated(_NONE, True, True)
+    velocity, rate = np.zeros(3), np.zeros(3)
+    if np.isfinite(before.place).all():
+        velocity = (place - before.place) / control.period
+        rate = 2.0 * rotation_between(before.quaternion, quaternion)[1] / control.period
+    motion = Motion(place, quaternion, velocity, rate)
+    wrench = compliance_wrench(control.body, control.axes, control.handle, motion, target, turned)
+    found = control.coils.currents(wrench)
+    return after, Levitated(found.value, found.limited, False)
+
+
+def coils_from_handle(handle: np.ndarray, place: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """Place of the coils' frame (3,) [m].
+
+    Args:
+        handle: (3,) the handle's point in the coils' frame [m].
+        place: (3,) of the handle [m].
+        quaternion: (4,) scalar first.
+    """
+    turn = np.empty((3, 3))
+    turn_matrix(quaternion, turn)
+    return place - turn @ handle
+
+
+_WHERE = "optical sensing"
+_ENOUGH, _MOST = 1e-12, 20  # m and rad of a Newton step; 4 steps do within the stops
+_ANGLES = np.pi * np.array([1.0, 3.0, 5.0]) / 3.0  # between the three stations of the coils
+_OUT = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(3)])
+_ASIDE = np.column_stack([-np.sin(_ANGLES), np.cos(_ANGLES), np.zeros(3)])
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def diode_readings(place: np.ndarray, turn: np.ndarray, distance: float) -> np.ndarray:
+    """Where the beams meet the diodes.
+
+    Args:
+        place: (3,) of the flotor's centre from its nominal place [m].
+        turn: (3, 3) rotation matrix, flotor to stator.
+        distance: of the diodes from the centre [m].
+
+    Returns:
+        (6,) readings, sideways and up of one diode after the other [m].
+
+    Raises:
+        InputError: a beam leaves its diode's side.
+
+    Source: Zhu 1994, 5.1.2 (coplanar radial beams at 120 degrees); geometry of a line and a plane.
+
+    >>> import numpy as np
+    >>> readings = diode_readings(np.array([0.0, 0.0, 1e-3]), np.eye(3), 0.0573)
+    >>> readings[1::2].tolist()
+    [0.001, 0.001, 0.001]
+    """
+    return _meet(np.asarray(place, float), turn, distance)[0]
+
+
+def pose_of_readings(readings: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of the flotor from the six readings, by Newton's method from the centre.
+
+    Args:
+        readings: (6,) as of `diode_readings` [m].
+        distance: of the diodes from the centre [m].
+
+    Returns:
+        Place (3,) [m] and rotation matrix (3, 3), flotor to stator; NaN where a reading is no
+        number.
+
+    Raises:
+        InputError: no pose makes these readings.
+
+    Source: `diode_readings`; Newton.
+    """
+    place, turn = np.zeros(3), np.eye(3)
+    if not np.isfinite(readings).all():
+        return np.full(3, np.nan), np.full((3, 3), np.nan)
+    for _ in range(_MOST):
+        now, slope = _meet(place, turn, distance)
+        step = np.linalg.solve(slope, readings - now)
+        place, turn = place + step[:3], _rotation(step[3:]) @ turn
+        if np.abs(step).max() < _ENOUGH:
+            return place, turn
+    raise InputError(_WHERE, f"no pose makes the readings {readings}")
+
+
+def sensed_spread(distance: float, step: float) -> np.ndarray:
+    """What a step of the diodes leaves unknown of the pose at the centre.
+
+    Args:
+        distance: of the diodes from the centre [m].
+        step: of their readings [m].
+
+    Returns:
+        (6,) standard deviations of place [m] and rotation [rad], for errors even over a step.
+
+    Source: linear propagation through `diode_readings`.
+    """
+    _, slope = _meet(np.zeros(3), np.eye(3), distance)
+    inverse = np.linalg.inv(slope)
+    return step / np.sqrt(12.0) * np.sqrt(np.sum(inverse**2, axis=1))
+
+
+def _meet(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
+    """Readings (6,) and their derivatives (6, 6) by place and by a small turn of the stator's."""
+    readings, slope = np.empty(6), np.empty((6, 6))
+    for k, (out, aside) in enumerate(zip(_OUT, _ASIDE, strict=True)):
+        beam = turn @ out
+        along = float(out @ beam)
+        far = distance - float(out @ place)
+        if not (along > 0.0 and far > 0.0):
+            raise InputError(_WHERE, f"the beam of diode {k + 1} misses its side of the stator")
+        length = far / along
+        spot = place + length * beam
+        for j, axis in enumerate((aside, _UP)):
+            row = 2 * k + j
+            readings[row] = axis @ spot
+            slope[row, :3] = axis - out * (axis @ beam) / along
+            slope[row, 3:] = length * np.cross(beam, slope[row, :3])
+    return readings, slope
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a rotation vector."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector / angle if angle > 0.0 else vector
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+
 
 Reading = tuple[np.ndarray, np.ndarray]
 _FINE = 2  # times the physics steps of a run; with Runge and Kutta they make no error to be seen
@@ -124,7 +377,7 @@ def fly(
         What happened.
     """
     control = control or levitation(joystick, frozen=FROZEN if noise > 0.0 else np.inf)
-    flotor = Flotor(joystick, hand=False, period=control.period, fine=_FINE)
+    flotor = SimulatedFlotor(joystick, hand=False, period=control.period, fine=_FINE)
     flotor.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     eye = Eye(joystick, noise=noise, diodes=diodes, seed=seed)
     flotor.place(np.zeros(6) if start is None else start)

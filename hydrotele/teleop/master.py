@@ -31,10 +31,11 @@ from hydrotele.teleop.axis_table import (
     SIGN,
     SLOPE,
     axis_table,
+    flat_state,
+    flattened,
 )
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.compliance import GRAVITY, holding_wrench, turn_matrix
-from hydrotele.teleop.flat import flat_state, flattened
 
 NONE, STIFFNESS, DIRECT, COORDINATING, FOUR_CHANNEL, IMPEDANCE = range(6)
 KINDS = ("none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance")

@@ -31,8 +31,8 @@ from hydrotele.teleop.axis_table import (
     REACH,
     SIGN,
     SLOPE,
+    flattened,
 )
-from hydrotele.teleop.flat import flattened
 from hydrotele.teleop.master import Master
 
 _THROUGH = 1.15  # times the force at a notch's edge, to get over it

@@ -28,8 +28,9 @@ from hydrotele.teleop.axis_table import (
     REACH,
     REFLECTED_MOST,
     SIGN,
+    flat_state,
+    flattened,
 )
-from hydrotele.teleop.flat import flat_state, flattened
 from hydrotele.teleop.master import (
     FORCE,
     FOUR_CHANNEL,

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import hydrotele
 from hydrotele.cli import main as cli
 from hydrotele.core.errors import InputError
-from hydrotele.core.resources import models_folder, scenarios_folder
+from hydrotele.core.files import models_folder, scenarios_folder
 
 ROOT = Path(hydrotele.__file__).parents[1]
 COMMANDS = [c.name or c.callback.__name__.strip("_") for c in cli.app.registered_commands]
@@ -397,7 +397,7 @@ def test_list(what):
 def test_a_joystick_is_validated_and_exported(tmp_path):
     import mujoco
 
-    from hydrotele.core.resources import models_folder
+    from hydrotele.core.files import models_folder
 
     for name in ("joystick.yaml", "joystick.xml"):
         shutil.copy(models_folder() / "joystick" / name, tmp_path / name)

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from hydrotele.control.drive_rows import drive_row, drive_tables
 from hydrotele.control.plan import Plan
-from hydrotele.control.servo import drive_references
+from hydrotele.control.servo import drive_references, drive_row, drive_tables
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Servo
 

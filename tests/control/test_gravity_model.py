@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.control.gravity_model import (
+from hydrotele.control.endpoint_force import (
     gravity_from_masses,
     gravity_rows,
     identify_gravity,

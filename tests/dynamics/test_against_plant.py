@@ -9,7 +9,7 @@ from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.dynamics.model import predicted_channels, state_names
 from hydrotele.effects import apply_effect
 from hydrotele.hydraulics.laws import ATMOSPHERE
-from hydrotele.hydraulics.slots import SLOTS, Slot
+from hydrotele.hydraulics.parameters import SLOTS, Slot
 from hydrotele.machine.drives import EndStop
 from hydrotele.machine.machine_file import save_machine
 from hydrotele.run.run import run_scenario

@@ -5,10 +5,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.integrate import place
 from hydrotele.dynamics.mechanism import INERTIA, MASS, coordinate_names
-from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Q
+from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Q, gather_forces
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 

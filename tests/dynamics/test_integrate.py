@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.dynamics.forces import gather_forces
 from hydrotele.dynamics.integrate import (
     accelerate,
     advance,
@@ -22,7 +21,7 @@ from hydrotele.dynamics.integrate import (
 )
 from hydrotele.dynamics.mechanism import COM, DAMPING, MASS
 from hydrotele.dynamics.model import predicted_channels, state_names
-from hydrotele.dynamics.motion import BIAS, ORIGIN, RATE, TURN
+from hydrotele.dynamics.motion import BIAS, ORIGIN, RATE, TURN, gather_forces
 from hydrotele.effects.effect import changed
 from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
 from hydrotele.logs.log import load_log

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim, lti
 
-from hydrotele.dynamics.integrate import advance, simulate_rows
-from hydrotele.dynamics.transducers import follow_channel
+from hydrotele.dynamics.integrate import advance, follow_channel, simulate_rows
 from hydrotele.machine.noise import first_order
 from hydrotele.machine.sensors import SensorError
 

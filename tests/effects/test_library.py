@@ -208,7 +208,7 @@ def test_patched_machine_is_a_file_that_runs_the_same(machine, tool, tmp_path):
 
 
 NEW = """
-from hydrotele.effects._sizes import valves
+from hydrotele.effects.effect import valves
 from hydrotele.effects.effect import Effect, Parameter, changed
 
 EFFECT = Effect(

@@ -13,8 +13,13 @@ from hydrotele.run.replay import replay_log
 from hydrotele.run.run import prepare, run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.readout import late_channels, true_channels
-from hydrotele.simulate.record import Recorder, begin_leapfrog, split_delay
+from hydrotele.simulate.record import (
+    Recorder,
+    begin_leapfrog,
+    late_channels,
+    split_delay,
+    true_channels,
+)
 from hydrotele.simulate.stepping import Stepper
 
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.effects._drive_side import load_inertia
-from hydrotele.hydraulics.circuit import SLOTS, actuator_friction
-from hydrotele.hydraulics.drive import settled_friction
+from hydrotele.effects.transmission import load_inertia
+from hydrotele.hydraulics.circuit import SLOTS, actuator_friction, settled_friction
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.replay import replay_log
 from hydrotele.run.run import run_scenario

@@ -15,9 +15,8 @@ from gymnasium.wrappers import AddRenderObservation, RenderCollection
 
 import hydrotele.envs
 from hydrotele.core.errors import InputError
-from hydrotele.envs.goals import goal_markers
 from hydrotele.envs.single import MachineEnv
-from hydrotele.envs.stage import Stage
+from hydrotele.envs.stage import Stage, goal_markers
 from hydrotele.envs.vector import MachineVectorEnv
 from hydrotele.show.canvas import Canvas
 

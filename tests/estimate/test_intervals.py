@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.estimate.evidence import Evidence
+from hydrotele.estimate.evidence import Evidence, spreads
 from hydrotele.estimate.hypothesis import Guess, hypotheses
-from hydrotele.estimate.intervals import spreads
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import PERIOD, machine_data
 

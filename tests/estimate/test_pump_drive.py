@@ -12,10 +12,9 @@ from hydrotele.estimate.inputs import Input, input_columns
 from hydrotele.estimate.levels import rough_noise
 from hydrotele.estimate.track import STEP, fine_enough, track_run
 from hydrotele.hydraulics.parameters import longest_step
-from hydrotele.logs.averaging import averaged
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
-from hydrotele.logs.rows import Rows
+from hydrotele.logs.rows import Rows, averaged
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms.facts import Term
 

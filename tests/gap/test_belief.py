@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.gap.belief import believed, believed_part
+from hydrotele.gap.residuals import believed, believed_part
 from hydrotele.gap.result import LearnedLaw, NamedEffect
 
 LEFT = {"": 0.05, "boom": 0.02, "stick": 0.6}

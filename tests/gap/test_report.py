@@ -9,8 +9,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from hydrotele.show.gap_recording import channel_rms, gap_windows, most_changed, windowed
 from hydrotele.show.gap_report import write_report
-from hydrotele.show.gap_windows import channel_rms, gap_windows, most_changed, windowed
 
 _VOID = {"meta", "img", "line", "circle", "rect", "i", "br"}
 

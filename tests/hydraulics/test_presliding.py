@@ -5,7 +5,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hydrotele.effects import EFFECTS, apply_effect, changed
-from hydrotele.hydraulics.actuator import actuator_friction
+from hydrotele.hydraulics.actuator import (
+    actuator_friction,
+    bristle_friction,
+    bristle_rate,
+    bristle_step,
+    settled_bristle_friction,
+    sliding_level,
+)
 from hydrotele.hydraulics.circuit import (
     SCRATCH,
     Slot,
@@ -15,13 +22,6 @@ from hydrotele.hydraulics.circuit import (
     wanted_share,
 )
 from hydrotele.hydraulics.parameters import actuator_numbers, memory_names
-from hydrotele.hydraulics.presliding import (
-    bristle_friction,
-    bristle_rate,
-    bristle_step,
-    settled_bristle_friction,
-    sliding_level,
-)
 from hydrotele.machine.drives import Axis, Friction
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.hydraulics.laws import ATMOSPHERE
+from hydrotele.hydraulics.parameters import PumpSlot
 from hydrotele.hydraulics.pump import (
     accumulator_pressure,
     load_pressure_step,
@@ -14,7 +15,6 @@ from hydrotele.hydraulics.pump import (
     pump_piston_friction,
     pump_speed_step,
 )
-from hydrotele.hydraulics.slots import PumpSlot
 
 ROUNDING = 1e-12
 SEAL = (200.0, 300.0, 4.0e-3, 1.0e5, 0.0, 0.0)  # N, N, m/s, N s/m

@@ -13,8 +13,7 @@ from hydrotele.hydraulics.circuit import (
     step_circuit,
 )
 from hydrotele.hydraulics.laws import holding_share, spool_step, stop_force, valve_opening
-from hydrotele.hydraulics.parameters import actuator_numbers
-from hydrotele.hydraulics.slots import Slot
+from hydrotele.hydraulics.parameters import Slot, actuator_numbers
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine

@@ -10,7 +10,7 @@ from hydrotele.identify.estimation import METHODS, Estimator
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import beginning, records
-from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.regressor import machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine

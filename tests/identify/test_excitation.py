@@ -12,7 +12,7 @@ from hydrotele.identify.excitation import (
     informative_base,
 )
 from hydrotele.identify.record import force_noise
-from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.regressor import machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario

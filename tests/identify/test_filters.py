@@ -5,8 +5,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.motion import periodic
-from hydrotele.identify.smoothing import smooth
-from hydrotele.identify.zero_phase import zero_phase
+from hydrotele.identify.smoothing import smooth, zero_phase
 
 DT = 0.02
 

@@ -7,7 +7,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import changed
 from hydrotele.identify.hydraulic import HYDRAULIC, identify_hydraulics
-from hydrotele.identify.identify_json import identify_document
+from hydrotele.identify.identified_machine import identify_document
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine

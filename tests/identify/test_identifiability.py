@@ -8,8 +8,7 @@ import pytest
 from hydrotele.identify.chain import load_chain
 from hydrotele.identify.identifiability import COMBINATION, FULL, UNIDENTIFIABLE, identifiability
 from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import Rubbing, regressor
-from hydrotele.identify.setup import pin_friction
+from hydrotele.identify.regressor import Rubbing, pin_friction, regressor
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from tests.identify.test_projection import panda

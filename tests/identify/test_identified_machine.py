@@ -12,9 +12,8 @@ from hydrotele.identify.estimation import Estimate
 from hydrotele.identify.identifiability import identifiability
 from hydrotele.identify.identified_machine import identified_machine
 from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import BODY_PARAMETERS, regressor
+from hydrotele.identify.regressor import BODY_PARAMETERS, cylinder_bars, machine_setup, regressor
 from hydrotele.identify.result import Forces, Identification
-from hydrotele.identify.setup import cylinder_bars, machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 

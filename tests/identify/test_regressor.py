@@ -11,11 +11,15 @@ from hydrotele.effects.effect import changed
 from hydrotele.hydraulics.laws import friction
 from hydrotele.identify.chain import load_chain
 from hydrotele.identify.estimation import estimate
-from hydrotele.identify.identifiability import identifiability
+from hydrotele.identify.identifiability import identifiability, reference_sizes
 from hydrotele.identify.projection import project
-from hydrotele.identify.reference_size import reference_sizes
-from hydrotele.identify.regressor import Rubbing, regressor
-from hydrotele.identify.setup import drive_friction, machine_setup, pin_friction
+from hydrotele.identify.regressor import (
+    Rubbing,
+    drive_friction,
+    machine_setup,
+    pin_friction,
+    regressor,
+)
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state

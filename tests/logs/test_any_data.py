@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.logs.averaging import averaged
 from hydrotele.logs.cleaning import refreshed_every, stale
-from hydrotele.logs.clock import fit_clock
 from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log, save_log
-from hydrotele.logs.rows import Masked, Rows, read_mask
+from hydrotele.logs.rows import Masked, Rows, averaged, fit_clock, read_mask
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.machine.sensors import Sensor, SensorSet
 

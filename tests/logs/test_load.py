@@ -11,15 +11,14 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.logs.clock import fit_clock
 from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log, load_log, save_log
-from hydrotele.logs.rows import clock_offset
+from hydrotele.logs.rows import clock_offset, fit_clock
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.noise import IDEAL, noise_rms
 from hydrotele.machine.signals import usual_unit
-from hydrotele.simulate.sensors import measure
+from hydrotele.simulate.feedback import measure
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 MEASURED, REAL = SHARED / "measured", SHARED / "real"

@@ -12,7 +12,7 @@ from hydrotele.machine.noise import channel_sensor, converter, noise_rms, sensor
 from hydrotele.machine.sensors import Sensor
 from hydrotele.run.run import prepare, run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.sensors import _convert_all, measure, sensor_errors
+from hydrotele.simulate.feedback import _convert_all, measure, sensor_errors
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.resources import models_folder
+from hydrotele.core.files import models_folder
 from hydrotele.machine.joystick import AXES, load_joystick, shipped_joysticks
 from hydrotele.simulate.joystick import joystick_spec
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hydrotele.core import datafile
 from hydrotele.core.datafile import PSI, UNIT_SUFFIXES, read_yaml, split_unit, suggest
 from hydrotele.core.errors import InputError
-from hydrotele.core.resources import models_folder
+from hydrotele.core.files import models_folder
 from hydrotele.kinematics.from_machine import check_strokes
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import (

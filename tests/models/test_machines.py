@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.core.resources import models_folder
+from hydrotele.core.files import models_folder
 from hydrotele.machine.machine_file import load_machine, shipped_machines
 from hydrotele.machine.signals import parse_channel
 from hydrotele.simulate.closure import holding_forces, independent_dofs, motion_basis, pin_opening

@@ -11,8 +11,7 @@ import rerun as rr
 
 from hydrotele.core.errors import InputError
 from hydrotele.show.pose import body_poses, logged_joints, model_with_looks
-from hydrotele.show.recording import write_recording
-from hydrotele.show.recording_file import recording_file
+from hydrotele.show.recording import recording_file, write_recording
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.show import shapes
+from hydrotele.show import looks as shapes
 from hydrotele.show.looks import body_looks, geom_colour
 
 _BODIES = {

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hydrotele.machine.joystick import load_joystick
-from hydrotele.simulate.joystick import Flotor, joystick_spec
+from hydrotele.simulate.joystick import SimulatedFlotor, joystick_spec
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.levitation import rotation_vector
 
@@ -23,7 +23,7 @@ def lifting(flotor):
 
 
 def test_coils_push_as_their_map_says():
-    flotor = Flotor(JOYSTICK, hand=False)
+    flotor = SimulatedFlotor(JOYSTICK, hand=False)
     f, c = JOYSTICK.flotor, JOYSTICK.coils
     made = np.empty((6, 6))
     for k in range(6):
@@ -38,7 +38,7 @@ def test_coils_push_as_their_map_says():
 @pytest.mark.parametrize("speed", [0.1, 0.3])
 def test_a_hand_does_not_push_it_through_a_stop(speed):
     """A hit at the speed of a hand goes half as deep as the stop's 5 ms at that speed."""
-    flotor = Flotor(JOYSTICK)
+    flotor = SimulatedFlotor(JOYSTICK)
     flotor.data.qvel[0], deepest = speed, 0.0
     for _ in range(40):
         flotor.step(lifting(flotor), REST)
@@ -55,7 +55,7 @@ def test_random_currents_break_nothing():
     """
     rng = np.random.default_rng(6)
     for hand in (False, True):
-        flotor = Flotor(JOYSTICK, hand=hand)
+        flotor = SimulatedFlotor(JOYSTICK, hand=hand)
         data, most = flotor.data, np.zeros(2)
         for _ in range(2000):
             flotor.step(rng.uniform(-4.0, 4.0, 6), REST)
@@ -72,7 +72,7 @@ def test_stops_hold_20_newton(axis, way):
 
     A stop takes 95 to 99 % of a push at once and the rest over its depth (solimp).
     """
-    flotor, push = Flotor(JOYSTICK, hand=False), np.zeros(6)
+    flotor, push = SimulatedFlotor(JOYSTICK, hand=False), np.zeros(6)
     push[axis] = way * (20.0 if axis < 3 else 2.0)
     currents = lifting(flotor)
     flotor.model.dof_damping[:] = [20.0] * 3 + [0.2] * 3  # so that it comes to rest
@@ -92,7 +92,7 @@ def test_a_turning_cab_does_what_it_does_in_a_whole_model():
     0.07 of the 1.2 m/s^2 that push it aside, 6 %.
     """
     spin, rate, mount = 0.6, 1.5, np.array(JOYSTICK.mount)
-    flotor = Flotor(JOYSTICK, hand=False, fine=8)
+    flotor = SimulatedFlotor(JOYSTICK, hand=False, fine=8)
     currents = lifting(flotor)
     inside = joystick_spec(JOYSTICK, hand=False)
     world, inside.option = mujoco.MjSpec(), mujoco.MjSpec().option

@@ -10,9 +10,8 @@ from hydrotele.run.run import begin, prepare, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
 from hydrotele.scenario.surroundings import LogOnGround
 from hydrotele.show.pose import body_poses, logged_joints, logged_surroundings, model_with_looks
-from hydrotele.simulate.holding import CENTRE, HALF
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.surroundings import log_grip
+from hydrotele.simulate.surroundings import CENTRE, HALF, log_grip
 
 END = np.array([6.03 * np.cos(np.pi / 3), 6.03 * np.sin(np.pi / 3)])  # slewed by 60 deg
 

@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.resources import models_folder
-from hydrotele.soil.facts import SOILS, level_profile, soil_numbers
-from hydrotele.soil.shape import CAT215, outline_from_edge
+from hydrotele.core.files import models_folder
+from hydrotele.soil.facts import CAT215, SOILS, level_profile, outline_from_edge, soil_numbers
 from hydrotele.soil.step import held_soil
 
 DEGREE = math.pi / 180.0

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from hydrotele import soil
-from hydrotele.soil import step, terrain, wrench
+from hydrotele.soil import step, terrain
 from hydrotele.soil import step as bucket
 from hydrotele.soil import step as cutting
-from hydrotele.soil.facts import SOILS, Soil, soil_numbers
-from hydrotele.soil.shape import CAT215
+from hydrotele.soil import step as wrench
+from hydrotele.soil.facts import CAT215, SOILS, Soil, soil_numbers
 from hydrotele.soil.step import (
     acting_rake,
     acting_slope,

@@ -12,6 +12,7 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.soil.facts import (
     CARRIED,
+    CAT215,
     FORCE_R,
     FORCE_Z,
     GRAVITY,
@@ -23,9 +24,7 @@ from hydrotele.soil.facts import (
     soil_mass,
     soil_numbers,
 )
-from hydrotele.soil.shape import CAT215
-from hydrotele.soil.step import soil_step
-from hydrotele.soil.wrench import bucket_wrench
+from hydrotele.soil.step import bucket_wrench, soil_step
 
 AXES = ("swing", "boom", "stick", "bucket")
 DEGREE = math.pi / 180.0

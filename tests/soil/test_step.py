@@ -16,6 +16,7 @@ from numba import (
 from hydrotele.core.compiled import callback
 from hydrotele.soil.facts import (
     CARRIED,
+    CAT215,
     CELL,
     FORCE_R,
     FORCE_Z,
@@ -39,7 +40,6 @@ from hydrotele.soil.facts import (
     soil_mass,
     soil_numbers,
 )
-from hydrotele.soil.shape import CAT215
 from hydrotele.soil.step import soil_step
 
 DEGREE = math.pi / 180.0

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hydrotele.soil.facts import (
+    CAT215,
     CELL,
     SOILS,
     START,
@@ -16,7 +17,6 @@ from hydrotele.soil.facts import (
     soil_mass,
     soil_numbers,
 )
-from hydrotele.soil.shape import CAT215
 from hydrotele.soil.terrain import (
     SETTLED,
     cell_of,

@@ -3,7 +3,7 @@
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.resources import scenarios_folder
+from hydrotele.core.files import scenarios_folder
 from hydrotele.scenario.scenario import shipped_scenarios
 from hydrotele.sweep.checking import check_points, open_base
 from hydrotele.sweep.facts import MOST_RUNS, load_sweep, shipped_sweeps

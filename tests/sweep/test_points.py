@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.sweep.facts import Sweep
-from hydrotele.sweep.points import overrides, points, samples
+from hydrotele.sweep.facts import Sweep, overrides, points, samples
 
 KEYS = {
     "servo.lead": {"uniform": [0.0, 0.2]},

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import hydrotele
-from hydrotele.core.resources import models_folder, scenarios_folder
+from hydrotele.core.files import models_folder, scenarios_folder
 from tests.sweep.conftest import rows_of, write_sweep
 
 ROOT = Path(hydrotele.__file__).parents[1]

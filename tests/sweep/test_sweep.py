@@ -14,17 +14,15 @@ from typer.testing import CliRunner
 
 from hydrotele.cli import main as cli
 from hydrotele.core.errors import InputError
-from hydrotele.core.resources import models_folder, scenarios_folder
+from hydrotele.core.files import models_folder, scenarios_folder
 from hydrotele.logs.log import save_log
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.record import SimulationFailed
 from hydrotele.sweep import running
 from hydrotele.sweep.checking import check_points, open_base, scenario_of
-from hydrotele.sweep.facts import load_sweep
-from hydrotele.sweep.journal import FAILED, OK, Entry, Journal
-from hydrotele.sweep.numbers import numbers_of, possible_numbers
-from hydrotele.sweep.points import overrides, points
+from hydrotele.sweep.facts import load_sweep, overrides, points
+from hydrotele.sweep.journal import FAILED, OK, Entry, Journal, numbers_of, possible_numbers
 from hydrotele.sweep.running import Task, perform
 from hydrotele.sweep.sweep import How, outcomes, run_sweep, sweep_folder
 from tests.sweep.conftest import rows_of, write_sweep

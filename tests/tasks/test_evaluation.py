@@ -11,8 +11,8 @@ from hydrotele.tasks.controllers.catalogue import make_controller
 from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.evaluation import compare, evaluate
 from hydrotele.tasks.memory import DISABLED, NEXT_STEP
-from hydrotele.tasks.spread import usual_spread
 from hydrotele.tasks.task import Options
+from hydrotele.tasks.variants import usual_spread
 
 
 def _core(count=3, autoreset=DISABLED, **choices) -> TaskCore:

@@ -10,6 +10,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.kinematics.task import REACHED, task_inverse
 from hydrotele.soil.facts import (
     CARRIED,
+    CAT215,
     DENSITY,
     FORCE_R,
     FORCE_Z,
@@ -22,14 +23,14 @@ from hydrotele.soil.facts import (
     soil_mass,
     soil_numbers,
 )
-from hydrotele.soil.shape import CAT215
-from hydrotele.soil.wrench import bucket_wrench
-from hydrotele.tasks.bed import CELL, CELLS, START, TERRAIN, bed_numbers
+from hydrotele.soil.step import bucket_wrench
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.controllers.controller import columns
 from hydrotele.tasks.controllers.grade import DUMP, Grade
 from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.grade import (
+    CELL,
+    CELLS,
     DEEPEST,
     ERROR,
     FAILURE,
@@ -42,9 +43,12 @@ from hydrotele.tasks.grade import (
     POINTS,
     SCALE,
     SOIL,
+    START,
     SUCCESS,
+    TERRAIN,
     TILT,
     TIME_COST,
+    bed_numbers,
     grade_radii,
 )
 from hydrotele.tasks.memory import DISABLED

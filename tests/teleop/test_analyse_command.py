@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from hydrotele.cli import main as cli
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.case import SHIPPED, load_teleop_case
+from hydrotele.teleop.analysis import SHIPPED, load_teleop_case
 from hydrotele.teleop.two_port import STRUCTURES
 
 SMALL = "map: {points: 3}\n"  # nine cells

@@ -8,19 +8,27 @@ from scipy.optimize import brentq
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import (
+    Case,
     analyse,
     gain_margin,
     is_passive,
     largest_delay,
+    load_teleop_case,
     loop_gain,
     stability_map,
 )
-from hydrotele.teleop.case import Case, load_teleop_case
 from hydrotele.teleop.confirm import grows, kicked, step_of, swept
 from hydrotele.teleop.findings import find, findings_document, why_unstable
-from hydrotele.teleop.stability import stable, unstable_held
 from hydrotele.teleop.switching import Spring, worst_growth
-from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance, characteristic, transmitted
+from hydrotele.teleop.two_port import (
+    STRUCTURES,
+    Gains,
+    Impedance,
+    characteristic,
+    stable,
+    transmitted,
+    unstable_held,
+)
 
 CASE = Case(
     Impedance(0.8, 0.5), Impedance(2.0, 3.0), Impedance(0.0, 12.0, 150.0),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.teleop.loop_findings import deadband_share
+from hydrotele.teleop.findings import deadband_share
 
 
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 0.9])

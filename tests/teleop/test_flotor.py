@@ -7,8 +7,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.compliance import Flotor
 from hydrotele.teleop.flotor import identify_flotor
-from hydrotele.teleop.levitate import levitation
-from hydrotele.teleop.levitation import fly, wobble
+from hydrotele.teleop.levitation import fly, levitation, wobble
 
 GUESS = Flotor(0.9, np.zeros(3), 2e-3 * np.eye(3))  # of the control while nothing is known
 

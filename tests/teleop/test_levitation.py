@@ -7,8 +7,7 @@ import pytest
 
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.compliance import Flotor
-from hydrotele.teleop.levitate import FROZEN, levitation
-from hydrotele.teleop.levitation import designed_step, fly
+from hydrotele.teleop.levitation import FROZEN, designed_step, fly, levitation
 
 JOYSTICK = load_joystick()
 STEPS = np.array([2e-3] * 3 + [np.deg2rad(3.0)] * 3)

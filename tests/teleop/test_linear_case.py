@@ -11,9 +11,14 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.teleop.linear_case import DEFAULT_TASK, joystick_of, scenario_case
-from hydrotele.teleop.linear_machine import drive_control, drive_follows
-from hydrotele.teleop.loop_findings import find_loop, structure_findings
+from hydrotele.teleop.findings import find_loop, structure_findings
+from hydrotele.teleop.linear_case import (
+    DEFAULT_TASK,
+    drive_control,
+    drive_follows,
+    joystick_of,
+    scenario_case,
+)
 from hydrotele.teleop.two_port import Impedance
 
 SLOW = 1e-4j  # rad/s, far below every corner

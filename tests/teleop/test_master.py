@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import AXES, load_joystick
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.simulate.joystick import Flotor
-from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, SIGN, axis_table
+from hydrotele.simulate.joystick import SimulatedFlotor
+from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, SIGN, axis_table, flat_view
 from hydrotele.teleop.coils import three_stations
-from hydrotele.teleop.flat import flat_view
 from hydrotele.teleop.handle import Detent, StiffnessFeedback
 from hydrotele.teleop.master import (
     drive_coils,
@@ -128,7 +127,7 @@ def test_currents_are_limited_as_a_whole():
 def levitated(push, seconds=1.5, **changed):
     """The joystick in a hand, its control, and what muscles (6,) do beyond carrying the hand."""
     numbers, s = built(**changed)
-    flotor, packet = Flotor(STICK), np.zeros((7, 4))
+    flotor, packet = SimulatedFlotor(STICK), np.zeros((7, 4))
     muscles = np.asarray(push, float) + np.array([0, 0, 9.81 * STICK.hand.mass, 0, 0, 0])
     for tick in range(round(seconds / PERIOD)):
         master_step(numbers, flotor.data.qpos, packet, 1.0, PERIOD, tick == 0, s)
@@ -200,7 +199,7 @@ def test_identified_damping_stays_below_what_a_sampled_flotor_bears():
     numbers, s = built(reflection="impedance")
     packet = np.zeros((7, 4))
     packet[5:] = 1e9
-    flotor = Flotor(STICK)
+    flotor = SimulatedFlotor(STICK)
     muscles = np.array([0, 0, 9.81 * STICK.hand.mass, 0, 0, 0])
     flotor.place(np.array([0.0, 0.0, 2e-3, 0.0, 0.0, 0.0]))
     for tick in range(200):

@@ -5,7 +5,7 @@ import pytest
 
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.simulate.joystick import Flotor
+from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.compliance import holding_wrench
 from hydrotele.teleop.handle import Detent
@@ -63,7 +63,7 @@ def test_a_frozen_reading_pushes_as_before_and_no_harder():
     hand may rest. What stands alone knows by its noise (`teleop.levitate`).
     """
     numbers, s = seated()
-    flotor, muscles = Flotor(JOYSTICK), np.zeros(6)
+    flotor, muscles = SimulatedFlotor(JOYSTICK), np.zeros(6)
     muscles[2] = 9.81 * JOYSTICK.hand.mass
     for k in range(400):
         master_step(numbers, at(3e-3), QUIET, 1.0, PERIOD, k == 0, s)
@@ -96,7 +96,7 @@ def test_the_detent_is_felt_as_it_was_designed(axis, far):
     numbers, s = seated(gains="feller", detent=True)
     gains = JOYSTICK.gains["feller"]["x" if axis == 0 else "rx"]
     law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
-    flotor, joint = Flotor(JOYSTICK, hand=False), 0 if axis == 0 else 3
+    flotor, joint = SimulatedFlotor(JOYSTICK, hand=False), 0 if axis == 0 else 3
     flotor.model.jnt_stiffness[:] = [2e4] * 3 + [200.0]
     flotor.model.dof_damping[:] = [100.0] * 3 + [2.0] * 3
     fine = 16e-3 if axis == 0 else 1.7e-3

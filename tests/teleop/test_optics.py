@@ -8,8 +8,13 @@ from hypothesis import strategies as st
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.compliance import rotation_between, turn_matrix
-from hydrotele.teleop.levitation import quaternion_of, rotation_vector
-from hydrotele.teleop.optics import diode_readings, pose_of_readings, sensed_spread
+from hydrotele.teleop.levitation import (
+    diode_readings,
+    pose_of_readings,
+    quaternion_of,
+    rotation_vector,
+    sensed_spread,
+)
 
 JOYSTICK = load_joystick()
 FAR, STEP = JOYSTICK.diodes.distance, JOYSTICK.diodes.step

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from hydrotele.control.drive_rows import drive_tables
 from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.control.servo import drive_tables
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.teleop.flat import flat_view, flattened
+from hydrotele.teleop.axis_table import flat_view, flattened
 from hydrotele.teleop.master import master
 from hydrotele.teleop.person import Muscles
-from hydrotele.teleop.round_trip import QUIET, SHARE, to_the_hand, to_the_machine
 from hydrotele.teleop.slave import AGE, slave
+from hydrotele.teleop.station import QUIET, SHARE, to_the_hand, to_the_machine
 
 CAT, STICK, PERIOD, FADE = load_machine("cat215", "bucket"), load_joystick(), 0.005, 0.2
 AXES = tuple(CAT.axes)

@@ -8,7 +8,7 @@ from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Pose
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.teleop.flat import flat_view
+from hydrotele.teleop.axis_table import flat_view
 from hydrotele.teleop.master import master
 from hydrotele.teleop.slave import (
     BLOCKED,

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.case import Case
+from hydrotele.teleop.analysis import Case
 from hydrotele.teleop.confirm import agreement, grows, kicked, swept
-from hydrotele.teleop.stability import stable, unstable_held, unstable_poles
 from hydrotele.teleop.two_port import (
     STRUCTURES,
     Gains,
@@ -16,9 +15,12 @@ from hydrotele.teleop.two_port import (
     characteristic,
     hybrid,
     scattering_norm,
+    stable,
     stiffness_margin,
     transmitted,
     two_port,
+    unstable_held,
+    unstable_poles,
 )
 
 MASTER, SLAVE = Impedance(0.8, 0.5), Impedance(2.0, 3.0)

@@ -11,8 +11,8 @@ from hydrotele.machine.machine import Machine, Supply
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms import laws
 from hydrotele.terms.facts import Term
-from hydrotele.terms.formula import formula_arguments
 from hydrotele.terms.law import LAWS, NO_DRIVES, VARIABLES, Drives, DriveState, law
+from hydrotele.terms.laws import formula_arguments
 from hydrotele.terms.table import (
     FLOW_ROD,
     FORCE,

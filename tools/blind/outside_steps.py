@@ -12,7 +12,7 @@ import numpy as np
 from hydrotele.hydraulics.circuit import Slot, circuit_scratch
 from hydrotele.hydraulics.laws import orifice
 from hydrotele.hydraulics.valve import axis_opening
-from hydrotele.simulate.readout import state_supply
+from hydrotele.simulate.record import state_supply
 
 _ATMOSPHERE = 1.013e5  # Pa
 _POLYTROPIC = 1.2

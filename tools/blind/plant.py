@@ -16,8 +16,8 @@ from hydrotele.machine.noise import sensor_set
 from hydrotele.machine.sensors import SensorError
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import PlantedEffect, Scenario
-from hydrotele.simulate.readout import state_supply
-from hydrotele.simulate.sensors import measure
+from hydrotele.simulate.feedback import measure
+from hydrotele.simulate.record import state_supply
 from tools.blind.draw import Planted
 from tools.blind.outside import OUTSIDE
 

@@ -17,8 +17,7 @@ from hydrotele.machine.sensors import SensorError
 from hydrotele.simulate.drive_side import flexible_axes
 from hydrotele.simulate.feedback import Past
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
-from hydrotele.simulate.readout import true_channels
-from hydrotele.simulate.record import Recorder, begin_leapfrog
+from hydrotele.simulate.record import Recorder, begin_leapfrog, true_channels
 from hydrotele.simulate.stepping import DelayLine
 from tools.blind.plant import Recorded, shown
 

@@ -7,8 +7,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.tasks.controllers.controller import Controller, Random, Zero
 from hydrotele.tasks.controllers.grade import grade_controller
 from hydrotele.tasks.controllers.place import place_controller
-from hydrotele.tasks.controllers.press import press_controller
-from hydrotele.tasks.controllers.tip import line_controller, reach_controller
+from hydrotele.tasks.controllers.tip import line_controller, press_controller, reach_controller
 from hydrotele.tasks.controllers.track import track_controller
 from hydrotele.tasks.facts import Setup
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.tasks.controllers.controller import Controller, columns, position_columns, step_time
-from hydrotele.tasks.controllers.rows import inverse_rows
+from hydrotele.tasks.controllers.rows import ValveLaw, inverse_rows
 from hydrotele.tasks.controllers.track import Asked
-from hydrotele.tasks.controllers.valve_law import ValveLaw
 from hydrotele.tasks.facts import ACCELERATION, POSE_ACCELERATIONS, Setup, full_rate
 from hydrotele.tasks.memory import ARM
 

@@ -11,8 +11,7 @@ from hydrotele.tasks.controllers.controller import (
     position_columns,
     step_time,
 )
-from hydrotele.tasks.controllers.rows import forward_rows
-from hydrotele.tasks.controllers.valve_law import ValveLaw
+from hydrotele.tasks.controllers.rows import ValveLaw, forward_rows
 from hydrotele.tasks.facts import (
     ACCELERATION,
     POSE_ACCELERATIONS,

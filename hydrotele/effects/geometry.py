@@ -1,9 +1,25 @@
-"""A link that is longer or shorter than in the model."""
+"""A link that is longer or shorter than in the model.
+
+A cylinder whose base pin sits elsewhere than in the model.
+
+A machine that does not stand level.
+"""
+
+import math
 
 import numpy as np
 
-from hydrotele.effects._sizes import hinges, outboard_child, outboard_point
-from hydrotele.effects.effect import Effect, Parameter, Values, changed
+from hydrotele.effects.effect import (
+    Effect,
+    Parameter,
+    Values,
+    across,
+    changed,
+    hinges,
+    linkages,
+    outboard_child,
+    outboard_point,
+)
 from hydrotele.machine.machine import Machine
 
 
@@ -85,6 +101,69 @@ def _vector(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
 
 
-EFFECT = Effect(
+LINK_LENGTH = Effect(
     "link_length", "a link is longer or shorter", "geometry", _locations, _parameters, _apply
 )
+
+
+def _parameters_pin_offset(machine: Machine, location: str) -> dict[str, Parameter]:
+    """A thousandth of the closed length, 1.5 mm, is the play of a worn pin."""
+    cylinder = machine.axes[location].cylinder
+    assert cylinder
+    size = cylinder.closed_length
+    offset = Parameter("m", 0.0, -0.05 * size, 0.05 * size, 0.005 * size, 0.001 * size)
+    return dict.fromkeys(across(machine, location), offset)
+
+
+def _apply_pin_offset(machine: Machine, location: str, values: Values) -> Machine:
+    """The base pin moves in its link's frame; the closed length, hence x at a length, stays."""
+    cylinder = machine.axes[location].cylinder
+    assert cylinder
+    way = zip("xyz", cylinder.base_pin.position, strict=True)
+    position = tuple(place + values.get(name, 0.0) for name, place in way)
+    return changed(machine, f"axes.{location}.cylinder.base_pin.position", position)
+
+
+PIN_OFFSET = Effect(
+    "pin_offset", "the base pin of a cylinder sits elsewhere", "geometry", linkages,
+    _parameters_pin_offset,
+    _apply_pin_offset,
+)  # fmt: skip
+
+
+def _place(machine: Machine) -> tuple[str, ...]:
+    return ("base",) if any(machine.gravity) else ()
+
+
+def _parameters_base_tilt(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Ground is level to a few degrees; 3 mrad is what a builder's level shows."""
+    tilt = Parameter("rad", 0.0, -0.2, 0.2, 0.03, 0.003)
+    return {"roll": tilt, "pitch": tilt}
+
+
+def _apply_base_tilt(machine: Machine, location: str, values: Values) -> Machine:
+    """Gravity in the frame of a base turned by pitch about y and then by roll about its own x.
+
+    Positive pitch lowers the front (x), positive roll lowers the right-hand side (-y).
+    """
+    roll, pitch = values["roll"], values["pitch"]
+    c, s = math.cos(roll), math.sin(roll)
+    about_x = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    c, s = math.cos(pitch), math.sin(pitch)
+    about_y = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    if roll == 0.0 and pitch == 0.0:
+        return machine
+    gravity = (about_y @ about_x).T @ np.array(machine.gravity)
+    return changed(machine, "gravity", tuple(float(g) for g in gravity))
+
+
+BASE_TILT = Effect(
+    "base_tilt",
+    "the base does not stand level",
+    "force",
+    _place,
+    _parameters_base_tilt,
+    _apply_base_tilt,
+)
+
+EFFECTS = (LINK_LENGTH, PIN_OFFSET, BASE_TILT)

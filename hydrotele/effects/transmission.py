@@ -1,0 +1,228 @@
+"""The drive side of a transmission that an effect adds: how heavy it is, how stiff it may be.
+
+Teeth with a gap between a motor and what it turns.
+
+A spring between a drive and what it moves.
+"""
+
+import math
+
+import numpy as np
+
+from hydrotele.effects.effect import (
+    Effect,
+    Parameter,
+    Values,
+    changed,
+    drive_turns,
+    largest_force,
+    outboard_links,
+    valves,
+)
+from hydrotele.machine.drives import Transmission
+from hydrotele.machine.machine import Machine
+
+_SHARE = 0.03  # of the load's inertia: rotor and gears of a slewing drive, seen at the ring
+_CONTACT = 2.0 * math.pi * 40.0  # rad/s of the drive on closed teeth: six steps of 1 ms a radian
+_FASTEST = 2.0 * math.pi * 150.0  # rad/s of the drive on spring and oil: 1 ms is half its limit
+_DAMPING = 0.3  # damping ratio of the drive on its spring: oil and rubbing teeth
+
+
+def rigid_drive(machine: Machine, axis: str) -> Transmission:
+    """Transmission of a rigid drive that is about to get a gap or a spring.
+
+    Its inertia is the rod's mass, or 3 % of what a motor turns at home; its spring is so stiff that
+    a step of 1 ms just resolves it well (40 Hz).
+    """
+    cylinder = machine.axes[axis].cylinder
+    inertia = cylinder.rod.mass if cylinder else _SHARE * load_inertia(machine, axis)
+    stiffness = inertia * _CONTACT**2
+    return Transmission(
+        inertia=inertia, stiffness=stiffness, damping=damper(inertia, stiffness), backlash=0.0
+    )
+
+
+def damper(inertia: float, stiffness: float) -> float:
+    """Damping of the spring [N s/m] or [N m s/rad]."""
+    return 2.0 * _DAMPING * math.sqrt(stiffness * inertia)
+
+
+def resolved_inertia(machine: Machine, axis: str, inertia: float, stiffness: float) -> float:
+    """Inertia with which spring and oil can be stepped with 1 ms: more of it where they are hard.
+
+    The oil is stiffest with the piston at its end: `beta (A^2 / V)` of both chambers.
+    """
+    drive, cylinder = machine.axes[axis].hydraulic_drive, machine.axes[axis].cylinder
+    assert machine.supply
+    head, rod = drive.areas
+    far = drive.dead_volume + (rod * cylinder.stroke if cylinder else 0.0)
+    oil = machine.supply.bulk_modulus * (head**2 / drive.dead_volume + rod**2 / far)
+    return max(inertia, (stiffness + oil) / _FASTEST**2)
+
+
+def with_transmission(machine: Machine, axis: str, transmission: Transmission) -> Machine:
+    """Machine with a transmission in an axis; what a motor's drive side weighs leaves the link.
+
+    So the whole moment of inertia about a motor's axis stays what it was, as long as the link has
+    that much to give.
+    """
+    facts = machine.axes[axis]
+    before = facts.transmission.inertia if facts.transmission else 0.0
+    machine = changed(machine, f"axes.{axis}.transmission", transmission)
+    if facts.cylinder:
+        return machine
+    name = machine.link_of(facts.joint)
+    link, direction = machine.links[name], int(np.argmax(np.abs(machine.joints[facts.joint].axis)))
+    inertia = list(link.inertia)
+    inertia[direction] -= transmission.inertia - before
+    a, b, c = sorted(inertia)
+    if a <= 0.0 or a + b < c:
+        return machine
+    return changed(machine, f"links.{name}.inertia", tuple(inertia))
+
+
+def load_inertia(machine: Machine, axis: str) -> float:
+    """What the joint of an axis turns [kg m^2] or pushes [kg] at home, without cylinders."""
+    joint = machine.axes[axis].joint
+    first = machine.link_of(joint)
+    carried = outboard_links(machine, first)
+    if machine.joints[joint].type == "slide":
+        return sum(machine.links[name].mass for name in carried)
+    frames = {name: _frame(machine, name) for name in carried}
+    origin, turn = frames[first]
+    way = turn @ np.array(machine.joints[joint].axis)
+    total = 0.0
+    for name, (position, rotation) in frames.items():
+        link = machine.links[name]
+        arm = position + rotation @ np.array(link.com) - origin
+        total += link.mass * float(arm @ arm - (arm @ way) ** 2)
+        total += float(np.array(link.inertia) @ (rotation.T @ way) ** 2)
+    return total
+
+
+def _frame(machine: Machine, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Origin (3,) [m] and rotation (3, 3) of a link at home in the world."""
+    if name == "world":
+        return np.zeros(3), np.eye(3)
+    link = machine.links[name]
+    position, rotation = _frame(machine, link.parent)
+    position = position + rotation @ np.array(link.position)
+    if link.joint:
+        value, axis = machine.home.get(link.joint.name, 0.0), np.array(link.joint.axis)
+        if link.joint.type == "slide":
+            return position + rotation @ axis * value, rotation
+        rotation = rotation @ _turn(axis, value)
+    return position, rotation
+
+
+def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation matrix (3, 3) about a unit axis, by Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+_CLOSED = 1.0e-6  # rad, a gap that is none: a slewing ring's tooth moves 1 um in it
+
+
+def _locations(machine: Machine) -> tuple[str, ...]:
+    return tuple(n for n, a in machine.axes.items() if a.motor and drive_turns(machine, n))
+
+
+def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Half a degree is a worn slewing ring; 1 mrad is a new one, or one reading of a resolver.
+
+    How heavy rotor and gears are, seen at the ring, and how the teeth ring when they meet is known
+    to a factor; both matter only to who follows the rattling from reading to reading.
+    """
+    drive = _drive(machine, location)
+    present, inertia, ratio = drive.backlash, drive.inertia, _ratio(drive)
+    return {
+        "gap": Parameter(
+            "rad", present, 0.0, max(0.05, present), 0.01, 1e-3, starts=(0.003, 0.01, 0.03)
+        ),
+        "drive_inertia": Parameter(
+            "kg m^2", inertia, 0.1 * inertia, 5.0 * inertia, inertia, inertia, optional=True
+        ),
+        "damping_ratio": Parameter(
+            "1", ratio, min(1e-3, ratio), max(2.0, ratio), 0.3, 0.3, optional=True
+        ),
+    }
+
+
+def _drive(machine: Machine, location: str) -> Transmission:
+    return machine.axes[location].transmission or rigid_drive(machine, location)
+
+
+def _ratio(drive: Transmission) -> float:
+    return drive.damping / (2.0 * math.sqrt(drive.stiffness * drive.inertia))
+
+
+def _apply(machine: Machine, location: str, values: Values) -> Machine:
+    """Give the motor an inertia of its own, from the link's, and a stiff spring with a gap."""
+    gap, before = values["gap"], machine.axes[location].transmission
+    if gap < _CLOSED and before is None:
+        return machine
+    drive = _drive(machine, location)
+    inertia = values.get("drive_inertia", drive.inertia)
+    ratio = values.get("damping_ratio", _ratio(drive))
+    stiffness = drive.stiffness * inertia / drive.inertia  # teeth in contact ring as fast as before
+    damping = drive.damping
+    if (inertia, ratio) != (drive.inertia, _ratio(drive)):
+        damping = 2.0 * ratio * math.sqrt(stiffness * inertia)
+    transmission = Transmission(inertia=inertia, stiffness=stiffness, damping=damping, backlash=gap)
+    return with_transmission(machine, location, transmission)
+
+
+BACKLASH = Effect(
+    "backlash", "teeth with a gap between a motor and what it turns", "force", _locations,
+    _parameters, _apply,
+)  # fmt: skip
+
+
+_RIGID = 0.02  # of the least compliance worth naming: stiffer than the parts taken as rigid
+_TURN = 0.015  # rad, deflection of a slewing drive's gears and shafts at full torque
+
+
+def _travel(machine: Machine, location: str) -> float:
+    """Deflection at full force that is usual for a flexible joint [m] or [rad]: 1 % of a stroke."""
+    cylinder = machine.axes[location].cylinder
+    return 0.01 * cylinder.stroke if cylinder else _TURN
+
+
+def _parameters_joint_flexibility(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Deflection over force; least is 2 mm of a 1 m stroke, or 2 mrad, at full pressure."""
+    usual = _travel(machine, location) / largest_force(machine, location)
+    transmission = machine.axes[location].transmission
+    present = 1.0 / transmission.stiffness if transmission else 0.0
+    unit = "rad/(N m)" if drive_turns(machine, location) else "m/N"
+    high = max(4.0 * usual, present)
+    starts = (0.3 * usual, 1.0 * usual, 3.0 * usual)
+    least = 0.15 * usual
+    return {"compliance": Parameter(unit, present, 0.0, high, usual, least, starts)}
+
+
+def _apply_joint_flexibility(machine: Machine, location: str, values: Values) -> Machine:
+    """Put a spring of 1 / compliance in the transmission; a gap that is there stays.
+
+    A cylinder's spring lies in line with it, between piston and rod pin: the length sensor and the
+    oil see the piston. The drive side is as heavy as the rod, or 3 % of a motor's load, and heavier
+    where a stiff spring could not be stepped otherwise.
+    """
+    compliance, before = values["compliance"], machine.axes[location].transmission
+    number = _parameters_joint_flexibility(machine, location)["compliance"]
+    if compliance == number.nominal or (before is None and compliance < _RIGID * number.least):
+        return machine
+    transmission = before or rigid_drive(machine, location)
+    stiffness = 1.0 / max(compliance, _RIGID * number.least)
+    inertia = resolved_inertia(machine, location, transmission.inertia, stiffness)
+    soft = {"stiffness": stiffness, "inertia": inertia, "damping": damper(inertia, stiffness)}
+    return with_transmission(machine, location, transmission.model_copy(update=soft))
+
+
+JOINT_FLEXIBILITY = Effect(
+    "joint_flexibility", "a spring between a drive and what it moves", "force", valves,
+    _parameters_joint_flexibility, _apply_joint_flexibility,
+)  # fmt: skip
+
+EFFECTS = (BACKLASH, JOINT_FLEXIBILITY)
