@@ -1,6 +1,6 @@
 """Scores of controllers in the control tasks: reference, zero and random actions.
 
-With ideal and real sensors, on the nominal machine and on machines of `usual_spread`.
+With ideal and real sensors, on the nominal machine and on machines of `typical_variation`.
 """
 
 import sys
@@ -15,7 +15,7 @@ from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.evaluation import SUCCESS, Scores, evaluate
 from hydrotele.tasks.memory import DISABLED
 from hydrotele.tasks.task import REAL, Options
-from hydrotele.tasks.variants import usual_spread
+from hydrotele.tasks.variants import typical_variation
 
 HEAD = """Mean ± standard error over episodes that all controllers share (same seeds and machines);
 `reference` knows the nominal machine and what the observation says. Randomised machines have the
@@ -45,7 +45,7 @@ def table(name: str, asked) -> list[str]:
     """Lines of the table of a task."""
     task = TASKS[name]
     lines = [f"\n## {name}\n\n{task.sentence} Reward: {task.reward}\n"]
-    spread = usual_spread(load_machine(task.machine, task.tool))
+    spread = typical_variation(load_machine(task.machine, task.tool))
     actions = asked.actions.split(",") if asked.actions else [task.action]
     columns: list[str] = []
     for action in actions:

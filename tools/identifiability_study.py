@@ -16,7 +16,7 @@ import numpy as np
 from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identifiability import identifiability
 from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import Regressor, Rubbing, pin_friction, regressor
+from hydrotele.identify.regressor import FrictionTerm, Regressor, pin_friction, regressor
 from hydrotele.machine.machine_file import load_machine
 from tools.study import options, publish
 
@@ -54,7 +54,7 @@ def complete(motion: list[np.ndarray]) -> Regressor:
     """Regressor of the 82 parameters."""
     chain = closed_chain(load_machine("cat215"))
     found = project(chain, ("swing", "boom", "stick"), *motion)
-    drives = [Rubbing(joint, {"coulomb": 0.0}) for joint in chain.drives]
+    drives = [FrictionTerm(joint, {"coulomb": 0.0}) for joint in chain.drives]
     return regressor(
         chain, found, bodies=[b for b in chain.bodies if b != "chassis"],
         rubbing=[*drives, *pin_friction(chain)],

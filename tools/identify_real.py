@@ -18,7 +18,7 @@ from hydrotele.identify.chain import Chain, load_chain
 from hydrotele.identify.identification import identify_with_shapes
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import Record, records
-from hydrotele.identify.regressor import Rubbing, Setup, machine_setup
+from hydrotele.identify.regressor import FrictionTerm, Setup, machine_setup
 from hydrotele.identify.result import Identification, parameter_rows
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log
@@ -79,7 +79,7 @@ def panda(real: Path) -> None:
     for friction in (False, True):
         kinds = {"coulomb": 0.0, "viscous": 0.0} if friction else {}
         setup = Setup(
-            chain, chain.joints, chain.bodies, tuple(Rubbing(j, kinds) for j in chain.joints),
+            chain, chain.joints, chain.bodies, tuple(FrictionTerm(j, kinds) for j in chain.joints),
             offsets={} if friction else None,
         )  # fmt: skip
         print(f"Panda, {'Coulomb, viscous, offset' if friction else 'no friction'}")

@@ -21,11 +21,11 @@ from hydrotele.teleop.handle import Detent
 from hydrotele.teleop.levitation import (
     Flight,
     designed_step,
-    fly,
+    excitation_path,
     levitation,
+    pose_resolution,
     rotation_vector,
-    sensed_spread,
-    wobble,
+    simulate_levitation,
 )
 from hydrotele.teleop.master import master, master_step
 from tools.study import options, publish, side_by_side
@@ -47,7 +47,7 @@ def step(axis: int, joystick=JOYSTICK, **how) -> Flight:
     """0.6 s after a step of one axis."""
     target = np.zeros((121, 6))
     target[:, axis] = SIZES[axis]
-    return fly(joystick, target, **how)
+    return simulate_levitation(joystick, target, **how)
 
 
 def step_figures(flight: Flight, axis: int) -> tuple[float, float, float]:
@@ -63,7 +63,7 @@ def coils_and_eyes() -> list[str]:
     """Condition of M; resolution of the diodes."""
     coils, diodes = levitation(JOYSTICK).coils, JOYSTICK.diodes
     weight = coils.currents(np.array([0, 0, 9.81 * JOYSTICK.flotor.mass, 0, 0, 0])).value
-    spread = sensed_spread(diodes.distance, diodes.step) * MICRO
+    spread = pose_resolution(diodes.distance, diodes.step) * MICRO
     sensing = JOYSTICK.sensing
     stated = np.array([sensing.translation] * 3 + [sensing.rotation] * 3) / np.sqrt(12.0) * MICRO
     lines = [
@@ -103,7 +103,7 @@ def steps() -> list[str]:
         " [0.001 deg] |", "| --- | ---: | ---: | ---: |",
     ]  # fmt: skip
     for name, diodes in (("rounded pose", False), ("diodes", True)):
-        pose = fly(JOYSTICK, np.zeros((2200, 6)), diodes=diodes).pose[200:] * MICRO
+        pose = simulate_levitation(JOYSTICK, np.zeros((2200, 6)), diodes=diodes).pose[200:] * MICRO
         rms = np.sqrt(np.mean(np.sum(pose[:, :3] ** 2, axis=1)))
         lines.append(
             f"| {name} | {np.linalg.norm(pose[:, :3], axis=1).max():.2f} | {rms:.2f} |"
@@ -121,7 +121,9 @@ def identified(seed: int, diodes: bool = False) -> tuple[FlotorFit, Flight]:
     """12 s of wobbling under a control that takes the flotor for another one."""
     joystick = crooked()
     control = levitation(joystick, GUESS)
-    flight = fly(joystick, wobble(joystick, 12.0, seed), control=control, seed=seed, diodes=diodes)
+    flight = simulate_levitation(
+        joystick, excitation_path(joystick, 12.0, seed), control=control, seed=seed, diodes=diodes
+    )
     fit = identify_flotor(
         flight.place, flight.quaternion, flight.currents, control.period, control.coils
     )
@@ -168,7 +170,9 @@ def identification(results: list[tuple[FlotorFit, FlotorFit]]) -> list[str]:
     for name, body in (("the guess", GUESS), ("what was found", first.body()),
                        ("the truth", None)):  # fmt: skip
         control = levitation(crooked(), body)
-        rest = fly(crooked(), np.zeros((600, 6)), control=control).pose[200:, 2].mean()
+        rest = (
+            simulate_levitation(crooked(), np.zeros((600, 6)), control=control).pose[200:, 2].mean()
+        )
         figures = np.array([
             step_figures(step(axis, crooked(), control=control), axis)
             for axis in range(6)
@@ -269,9 +273,9 @@ def shaking() -> list[str]:
     still = np.zeros_like(spin)
     target = np.zeros((len(spin), 6))
     poses = {
-        "in the cab, no hand": fly(JOYSTICK, target, cab=(spin, change)).pose,
+        "in the cab, no hand": simulate_levitation(JOYSTICK, target, cab=(spin, change)).pose,
         "in the cab, a hand rests on it": held(spin, change),
-        "on a table, no hand": fly(JOYSTICK, target).pose,
+        "on a table, no hand": simulate_levitation(JOYSTICK, target).pose,
         "on a table, a hand rests on it": held(still, still),
     }
     lines = [

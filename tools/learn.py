@@ -29,7 +29,7 @@ from hydrotele.tasks.evaluation import Scores, compare, evaluate
 from hydrotele.tasks.facts import Setup
 from hydrotele.tasks.memory import DISABLED
 from hydrotele.tasks.task import Options
-from hydrotele.tasks.variants import usual_spread
+from hydrotele.tasks.variants import typical_variation
 
 try:
     import torch
@@ -158,7 +158,7 @@ def choices(name: str, variants: int) -> dict[str, Any]:
     """Options of the environment."""
     recipe, task = RECIPES[name], TASKS[name]
     machine = load_machine(task.machine, task.tool)
-    spread = usual_spread(machine) if recipe.randomised else ()
+    spread = typical_variation(machine) if recipe.randomised else ()
     return {**recipe.options, "randomise": spread, "variants": variants}
 
 
@@ -270,7 +270,9 @@ def head(asked: argparse.Namespace) -> str:
     if recipe.corrects:
         does = f"corrects the tuned reference by at most {recipe.share:g} of a full action"
     options = ", ".join(f"{key} {value}" for key, value in recipe.options.items())
-    machines = "of `usual_spread`, other ones for learning and judging" if recipe.randomised else ""
+    machines = (
+        "of `typical_variation`, other ones for learning and judging" if recipe.randomised else ""
+    )
     gains = ", ".join(f"{key} {value:g}" for key, value in recipe.gains.items())
     return (
         f"# Learned against tuned: {asked.task}\n\n`{command} --seed {facts['seed']}`\n\n"

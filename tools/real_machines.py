@@ -20,7 +20,7 @@ import numpy as np
 
 from hydrotele.estimate.baselines import fit_baseline
 from hydrotele.estimate.free_run import Prepare, free_run_errors, machine_runner
-from hydrotele.estimate.output_error import fit_free_runs, open_numbers
+from hydrotele.estimate.output_error import fit_free_runs, uncertain_parameters
 from hydrotele.estimate.stretches import busiest_rows
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
@@ -195,7 +195,7 @@ def ec20_free_runs(data: Dataset, jobs: int) -> None:
     """The shipped machine, fitted to free runs, beside black boxes that saw the same or more."""
     for name, split in ec20_splits(data).items():
         begin = time.perf_counter()
-        fit = fit_free_runs(split, open_numbers(data.machine), jobs=jobs)
+        fit = fit_free_runs(split, uncertain_parameters(data.machine), jobs=jobs)
         seconds = time.perf_counter() - begin
         print(f"EC20, {name}, boom / stick: fitted in {seconds:.0f} s", flush=True)
         models = {"as shipped": machine_runner(data.machine, split)}
@@ -204,7 +204,7 @@ def ec20_free_runs(data: Dataset, jobs: int) -> None:
             for which in ("table", "arx", "mlp"):
                 models[which] = fit_baseline(which, split)
             itself = dataclasses.replace(split, fit=(split.heldout,))  # what the form can reach
-            there = fit_free_runs(itself, open_numbers(data.machine), jobs=jobs)
+            there = fit_free_runs(itself, uncertain_parameters(data.machine), jobs=jobs)
             models["fitted there"] = machine_runner(there.machine, itself)
         for which, prepare in models.items():
             speeds = velocity_fit(prepare, split.heldout, 2.0)

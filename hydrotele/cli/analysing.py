@@ -25,11 +25,11 @@ from hydrotele.teleop.findings import (
     find,
     find_loop,
     findings_document,
+    format_delay,
+    format_error,
+    format_factor,
+    format_number,
     loop_document,
-    said_delay,
-    said_error,
-    said_factor,
-    said_size,
     why_unstable,
 )
 from hydrotele.teleop.linear_case import joystick_of, scenario_case
@@ -135,7 +135,7 @@ def _print(found: Findings) -> None:
     for one in found.analyses:
         rows.add_row(
             one.structure, "yes" if one.stable else f"[red]{why_unstable(one)}[/]",
-            said_factor(one.gain_margin), said_delay(one.largest_delay),
+            format_factor(one.gain_margin), format_delay(one.largest_delay),
             f"{one.scattering.max():.3g}", "yes" if one.passive else "no",
         )  # fmt: skip
     out.print(rows)
@@ -151,7 +151,7 @@ def _print_springs(found: Findings) -> None:
     rows = table("stiffness feedback: B^2 - 4 M K_max, and the worst switching", "joystick", "B",
                  "K_max", "margin", "B asked for", "growth")  # fmt: skip
     for name, one in (("held", found.spring.held(found.case.hand)), ("let go", found.spring)):
-        rows.add_row(name, f"{one.damping:g} N s/m", f"{one.most:g} N/m", said_size(one.margin),
+        rows.add_row(name, f"{one.damping:g} N s/m", f"{one.most:g} N/m", format_number(one.margin),
                      f"{one.enough_damping:.4g}", f"{one.growth:.3g}")  # fmt: skip
     out.print(rows)
     out.print("growth: of half a swing, stable below 1; the theorem asks for more", style="dim")
@@ -161,7 +161,7 @@ def _print_confirmed(found: Findings) -> None:
     rows = table("confirmed in simulation", "structure", "sweep, no delay",
                  "sweep, with delay", "map agrees")  # fmt: skip
     for one in found.agreements:
-        errors = [said_error(s.error) for s in found.sweeps if s.structure == one.structure]
+        errors = [format_error(s.error) for s in found.sweeps if s.structure == one.structure]
         rows.add_row(one.structure, *[*errors, "-"][:2], f"{100.0 * one.share:.1f} %")
     out.print(rows)
     out.print("sweep: largest error of the felt impedance; map: share of its cells", style="dim")
@@ -251,14 +251,14 @@ def analyse_scenario_to_folder(
     if as_json:
         print_json(document)
     else:
-        for label, value, why in said_findings(found):
+        for label, value, why in findings_table(found):
             out.print(f"{label}: [bold]{value}[/] {why}".rstrip())
         _print_loop_springs(found)
         out.print(f"written to [bold]{target}[/]; open {target}/report.html")
     return target
 
 
-def said_findings(found: ScenarioFindings) -> list[tuple[str, str, str]]:
+def findings_table(found: ScenarioFindings) -> list[tuple[str, str, str]]:
     """What was found in words: (what, value, remark)."""
     case, loop, tip = found.case, found.loop, found.case.tip
     pole, turns = loop.pole, tip.coordinate not in ("r", "z")
@@ -269,8 +269,8 @@ def said_findings(found: ScenarioFindings) -> list[tuple[str, str, str]]:
         ("task", f"{case.task.stiffness:.3g} {oil}", f"({found.task_source})"),
         ("loop", loop.structure, "" if loop.own else "in the place of stiffness feedback or none"),
         ("stable", "yes" if loop.stable else f"no, {loop.unstable_poles} poles", ""),
-        ("gain margin", said_factor(loop.gain_margin), f"on a ratio of {case.ratio:.3g}"),
-        ("largest delay", said_delay(loop.largest_delay), "each way"),
+        ("gain margin", format_factor(loop.gain_margin), f"on a ratio of {case.ratio:.3g}"),
+        ("largest delay", format_delay(loop.largest_delay), "each way"),
     ]
     if math.isfinite(loop.frequency):
         rows.append(("swing", f"{loop.frequency:.2f} Hz", "where it becomes unstable"))
@@ -289,7 +289,7 @@ def _print_loop_springs(found: ScenarioFindings) -> None:
     rows = table("stiffness feedback: B^2 - 4 M K_max, and the worst switching", "joystick", "B",
                  "K_max", "margin", "B asked for", "growth")  # fmt: skip
     for name, one in (("held", found.held), ("let go", found.free)):
-        rows.add_row(name, f"{one.damping:g}", f"{one.most:g}", said_size(one.margin),
+        rows.add_row(name, f"{one.damping:g}", f"{one.most:g}", format_number(one.margin),
                      f"{one.enough_damping:.4g}", f"{one.growth:.3g}")  # fmt: skip
     out.print(rows)
 
@@ -301,6 +301,6 @@ def _write_loop(folder: Path, found: ScenarioFindings, document: dict) -> None:
     (folder / "analysis.json").write_text(text + "\n", encoding="utf-8")
     picture = draw_loop_map(found)
     (folder / "stability.png").write_bytes(picture)
-    write_loop_report(found, said_findings(found), picture, folder / "report.html")
+    write_loop_report(found, findings_table(found), picture, folder / "report.html")
     summary = {"kind": _KIND, "name": found.name, "hydrotele": hydrotele.__version__}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

@@ -211,10 +211,10 @@ def _is_joystick(path: Path) -> bool:
 def _check_joystick(path: Path) -> str:
     import numpy as np
 
-    from hydrotele.teleop.levitation import fly
+    from hydrotele.teleop.levitation import simulate_levitation
 
     joystick = load_joystick(path)
-    flight = fly(joystick, np.zeros((round(joystick.control_rate), 6)))
+    flight = simulate_levitation(joystick, np.zeros((round(joystick.control_rate), 6)))
     far = np.abs(flight.pose[:, :3]).max()
     if far > 0.1 * joystick.workspace.translation:
         raise InputError(path, f"its flotor does not hover: it moves by {1e3 * far:.1f} mm in 1 s")

@@ -24,7 +24,7 @@ LONGEST = 600.0  # s of a drive without --duration
 _FRAMES, _LINES = 30.0, 5.0  # Hz of window and status line
 
 
-class Wishes(NamedTuple):
+class DriveOptions(NamedTuple):
     """What the command line asks for."""
 
     scenario: str | None
@@ -38,7 +38,7 @@ class Wishes(NamedTuple):
     json: bool
 
 
-def drive_to_folder(wishes: Wishes) -> Path:
+def drive_to_folder(wishes: DriveOptions) -> Path:
     """Drive a machine live and write everything into a folder, whole or not at all.
 
     Returns:
@@ -69,7 +69,7 @@ def drive_to_folder(wishes: Wishes) -> Path:
     return target
 
 
-def _write(result: Run, target: Path, wishes: Wishes) -> None:
+def _write(result: Run, target: Path, wishes: DriveOptions) -> None:
     with whole_folder(target, "run") as folder:
         write_run(result, folder, wishes.review)
     if wishes.json:
@@ -82,7 +82,7 @@ def _write(result: Run, target: Path, wishes: Wishes) -> None:
     out.print(f"written to [bold]{target}[/]; its scenario.yaml repeats it in hydrotele run")
 
 
-def _scenario(wishes: Wishes) -> Scenario:
+def _scenario(wishes: DriveOptions) -> Scenario:
     """The scenario that is named, or the usual one of the machine."""
     overrides, name = dict(wishes.overrides), wishes.scenario
     duration = LONGEST if wishes.duration is None else wishes.duration
@@ -139,7 +139,9 @@ def first_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 @contextlib.contextmanager
-def _watching(wishes: Wishes, device: Device, interrupted: Callable[[], bool]) -> Iterator[Watch]:
+def _watching(
+    wishes: DriveOptions, device: Device, interrupted: Callable[[], bool]
+) -> Iterator[Watch]:
     """Window and status line of a drive; opened with the first tick."""
     from hydrotele.show.window import Window, check_screen
 

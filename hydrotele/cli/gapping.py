@@ -13,7 +13,7 @@ from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.customary import said
+from hydrotele.gap.customary import in_customary_units
 from hydrotele.gap.description import effect_title, headline, verdict_words
 from hydrotele.gap.patched import has_patch, write_patch
 from hydrotele.gap.result import Gap, finite, gap_document
@@ -126,7 +126,7 @@ def _print(gap: Gap) -> None:
         rows = table("what was found", *_COLUMNS)
         for effect in gap.effects:
             for name, estimate in effect.parameters.items():
-                s = said(estimate, name)
+                s = in_customary_units(estimate, name)
                 between = f"{s.low} .. {s.high}"
                 rows.add_row(effect_title(effect), name, s.nominal, s.value, between, s.unit)
         rows.columns[4].no_wrap = True

@@ -153,12 +153,12 @@ def drive(
     ] = False,
 ) -> None:
     """Drive a machine yourself, in real time; write a folder as run does."""
-    from hydrotele.cli.driving import Wishes, drive_to_folder
+    from hydrotele.cli.driving import DriveOptions, drive_to_folder
 
     pass
 
     drive_to_folder(
-        Wishes(
+        DriveOptions(
             scenario,
             overrides_of(set_ or []) | chosen(machine, tool),
             device,
@@ -221,9 +221,9 @@ def sweep(
     ] = False,
 ) -> None:
     """Do many runs of a scenario, varied by a grid or random samples, into one table."""
-    from hydrotele.cli.sweeping import Wishes, sweep_to_folder
+    from hydrotele.cli.sweeping import SweepOptions, sweep_to_folder
 
-    sweep_to_folder(file, out, Wishes(jobs, dask, fresh, retry_failed, strict, json))
+    sweep_to_folder(file, out, SweepOptions(jobs, dask, fresh, retry_failed, strict, json))
 
 
 app = typer.Typer(

@@ -13,13 +13,13 @@ from hydrotele.show.sweep_report import Study, write_sweep_report
 from hydrotele.sweep.facts import SweepFile, load_sweep
 from hydrotele.sweep.journal import JOURNAL, Entry, finished
 from hydrotele.sweep.sweep import How, Progress, Swept, run_sweep
-from hydrotele.sweep.table import default_figures, spreads
+from hydrotele.sweep.table import default_figures, spread_statistics
 
 _ALL_FAILED = 3
 _LISTED = 10
 
 
-class Wishes(NamedTuple):
+class SweepOptions(NamedTuple):
     """What the command line asks for, beside the file and the folder."""
 
     jobs: int | None
@@ -30,7 +30,7 @@ class Wishes(NamedTuple):
     json: bool
 
 
-def sweep_to_folder(name: str, target: Path | None, wishes: Wishes) -> None:
+def sweep_to_folder(name: str, target: Path | None, wishes: SweepOptions) -> None:
     """Do a sweep and say what came out.
 
     Args:
@@ -77,7 +77,7 @@ def _study(file: SweepFile, swept: Swept, figures: list[str]) -> Study:
 
 
 def _say(file: SweepFile, target: Path, swept: Swept, figures: list[str], as_json: bool) -> None:
-    found = spreads(swept.table, figures)
+    found = spread_statistics(swept.table, figures)
     if as_json:
         print_json({
             "kind": "sweep", "name": file.name, "folder": str(target), "runs": file.sweep.runs,

@@ -43,7 +43,7 @@ from hydrotele.control.tip_balance import (
     static_torque,
     tip_force,
 )
-from hydrotele.core.compiled import compiled, lean
+from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import axis_linkage
@@ -259,7 +259,7 @@ class Readings(NamedTuple):
     still: np.ndarray
 
 
-@lean
+@allocation_free
 def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
     """Take in new readings; force at the tip.
 
@@ -313,13 +313,13 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
     return GOOD if good else BAD
 
 
-@lean
+@allocation_free
 def _stand(state, value):
     """Let a filter stand at a value."""
     state[LOW], state[RATE], state[CHANGE], state[LAST] = value, 0.0, 0.0, value
 
 
-@lean
+@allocation_free
 def _reading(r, c):
     """Place in the arm's state and last good value of a signal: positions, then pressures."""
     n = len(r.position)
@@ -329,7 +329,7 @@ def _reading(r, c):
     return 2 * n + 4 * i + 2 + side, r.last[_HEAD + side, r.valve[i]]
 
 
-@lean
+@allocation_free
 def _take(last, still, used, values):
     """Keep readings that are finite; False if one that is used is not."""
     good = True
@@ -346,7 +346,7 @@ def _take(last, still, used, values):
     return good
 
 
-@lean
+@allocation_free
 def _known(readings):
     """Whether all channels that are used have read once."""
     for i in readings.position:

@@ -16,9 +16,9 @@ from hydrotele.kinematics.arm import Unreachable, inverse
 from hydrotele.kinematics.from_machine import arm_geometry, feller_geometry
 from hydrotele.kinematics.task import (
     REACHED,
+    arm_parameters,
     task_forward,
     task_inverse,
-    task_numbers,
     task_rates,
 )
 from hydrotele.machine.machine import Machine
@@ -175,7 +175,7 @@ def arm_facts(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray
     ranges = np.array([limit or (-math.inf, math.inf) for limit in limits])
     headed = machine.arm is not None and machine.arm.head is not None
     geometry = feller_geometry(machine) if headed else arm_geometry(machine)
-    return task_numbers(geometry), axes, ranges
+    return arm_parameters(geometry), axes, ranges
 
 
 def pose_to_joints(

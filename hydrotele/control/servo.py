@@ -29,7 +29,9 @@ _CENTRE = 0.005  # opening over which the dead-band jump is spread, or noise wou
 _LEAST_PRESSURE = 0.02  # of the supply: a valve never counts as having less to drive its flow
 
 
-def servo_numbers(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: float) -> np.ndarray:
+def servo_parameters(
+    machine: Machine, axes: tuple[str, ...], servo: Servo, dt: float
+) -> np.ndarray:
     """Constants of the servo, one row per axis.
 
     Args:
@@ -122,7 +124,7 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
 
 
 @compiled
-def wanted_opening(
+def feedforward_opening(
     velocity, head, rod, supply, tank, area_head, area_rod, volume_head, volume_rod, flow_gain
 ):
     """Valve opening at which a piston keeps a velocity without its force changing.
@@ -167,7 +169,7 @@ def servo_step(
     """Commands of all axes for one control period.
 
     Args:
-        numbers: (k, 14) of `servo_numbers`.
+        numbers: (k, 14) of `servo_parameters`.
         closed: (k,) whether the axis is under feedback; the others keep `out`.
         velocity: (k,) wanted drive velocity ahead [m/s] or [rad/s].
         arm: (k,) d(drive)/d(joint) at the reference.
@@ -212,7 +214,7 @@ def servo_step(
         wanted -= numbers[i, 13] * (force - model - load[i]) / stiffness
         if computed:
             wanted += force_rate[i] / stiffness
-        opening = wanted_opening(
+        opening = feedforward_opening(
             wanted, head[i], rod[i], supply, numbers[i, 5], area_head, area_rod, volume_head[i],
             volume_rod[i], numbers[i, 3],
         )  # fmt: skip

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from scipy.linalg import expm
 
-from hydrotele.core.compiled import compiled, lean
+from hydrotele.core.compiled import allocation_free, compiled
 
 LOW, RATE, CHANGE, LAST = range(4)  # columns of a filter's state
 _NEGLIGIBLE = 1.0e-12
@@ -91,7 +91,7 @@ def noise_gains(table: np.ndarray) -> np.ndarray:
     return np.sqrt(total)
 
 
-@lean
+@allocation_free
 def filter_step(table, state, reading):
     """Take in the next reading of one signal.
 

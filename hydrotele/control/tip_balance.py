@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.core.compiled import lean
+from hydrotele.core.compiled import allocation_free
 from hydrotele.core.errors import InputError
 from hydrotele.dynamics.integrate import place_mechanism
 from hydrotele.dynamics.mechanism import DAMPING, HOME, Mechanism, coordinate_names
@@ -77,7 +77,7 @@ class Arm(NamedTuple):
     work: np.ndarray
 
 
-@lean
+@allocation_free
 def dynamic_balance(arm, outside):
     """Forces from outside by the complete model: inertia, gravity, friction, closed chains.
 
@@ -110,7 +110,7 @@ def dynamic_balance(arm, outside):
     _subtract_drives(arm, True, outside)
 
 
-@lean
+@allocation_free
 def static_balance(arm, outside):
     """Forces from outside by the static model of gravity alone.
 
@@ -134,7 +134,7 @@ def static_balance(arm, outside):
     _subtract_drives(arm, False, outside)
 
 
-@lean
+@allocation_free
 def moving(velocity, variance):
     """Probability that a drive moves, given what is read of its velocity.
 
@@ -158,7 +158,7 @@ def moving(velocity, variance):
     return 1.0 / (1.0 + _ODDS * math.exp(-0.5 * velocity * velocity / variance))
 
 
-@lean
+@allocation_free
 def _subtract_drives(arm, rubbing, outside):
     """Take what the drives give off the forces outside."""
     model, sp, n = arm.model, arm.space, len(outside)
@@ -175,7 +175,7 @@ def _subtract_drives(arm, rubbing, outside):
             outside[f] -= sp.row[i, f] * give
 
 
-@lean
+@allocation_free
 def static_torque(q, joint, gravity, i):
     """Torque that gravity asks of a joint of the arm.
 
@@ -209,7 +209,7 @@ def static_torque(q, joint, gravity, i):
     return total + gravity[6] * math.cos(head) * math.cos(angle)
 
 
-@lean
+@allocation_free
 def tip_force(arm, outside, out):
     """Force at the tip that gives the forces outside.
 
@@ -241,7 +241,7 @@ def tip_force(arm, outside, out):
     return True
 
 
-@lean
+@allocation_free
 def _eliminated(table, right, m, least):
     """Solve by elimination, in place; False where a pivot is less than the least."""
     for i in range(m):

@@ -39,7 +39,7 @@ def compiled(function):
     return _compile(function)
 
 
-def lean(function):
+def allocation_free(function):
     """Like `compiled`, for a function that creates no arrays and returns none.
 
     References to arrays are then not counted, which takes small functions half their time. A
@@ -49,7 +49,7 @@ def lean(function):
 
 
 def inlined(function):
-    """Like `lean`, for a small function whose code is put into that of every caller.
+    """Like `allocation_free`, for a small function whose code is put into that of every caller.
 
     What a caller does not use of several results, such as a slope, is then not computed, and a
     function whose arguments are constants there costs less.

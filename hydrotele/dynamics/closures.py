@@ -7,7 +7,7 @@ Cholesky for the few unknowns of a machine: quicker than a library call at this 
 
 import math
 
-from hydrotele.core.compiled import lean
+from hydrotele.core.compiled import allocation_free
 from hydrotele.dynamics.mechanism import AXIS, HOME, PARENT, REACH
 from hydrotele.dynamics.motion import (
     ACCELERATION,
@@ -29,7 +29,7 @@ from hydrotele.dynamics.motion import (
 )
 
 
-@lean
+@allocation_free
 def factorise(matrix):
     """Replace a symmetric positive definite matrix by its lower Cholesky factor.
 
@@ -49,7 +49,7 @@ def factorise(matrix):
             matrix[i, j] = math.sqrt(total) if i == j else total / matrix[j, j]
 
 
-@lean
+@allocation_free
 def solve(factor, right):
     """Solve with a Cholesky factor, in place.
 
@@ -73,7 +73,7 @@ def solve(factor, right):
         right[i] /= factor[i, i]
 
 
-@lean
+@allocation_free
 def place_bars(tree, shape, first, frame, jacobian, bar):
     """Places and Jacobians of all bars: x along the bar, y along the pins.
 
@@ -124,7 +124,7 @@ def place_bars(tree, shape, first, frame, jacobian, bar):
                 jacobian[i, k, 5] = wz + nz * turn
 
 
-@lean
+@allocation_free
 def move_bars(tree, first, frame, bar):
     """Rates and accelerations of all placed bars.
 
@@ -188,7 +188,7 @@ _FAR = 20.0  # the same in one call: nobody asks for more
 _TURN = 0.3  # largest move of a bound coordinate in a step of a search [rad] or [m]
 
 
-@lean
+@allocation_free
 def close_chains(mech, m, z):
     """Go to independent positions with all chains closed, and find the rates that follow.
 
@@ -247,7 +247,7 @@ def close_chains(mech, m, z):
     return worst
 
 
-@lean
+@allocation_free
 def drift_chains(mech, m):
     """Bound accelerations at zero independent ones, of links that have been moved.
 
@@ -273,7 +273,7 @@ def drift_chains(mech, m):
         m.joint[DRIFT, mech.bound[b]] = m.normal[len(mech.bound), b]
 
 
-@lean
+@allocation_free
 def _open_pins(tree, shape, first, frame, jacobian, loop):
     """Place the pins of all closures; their openings with Jacobian, and the largest opening."""
     n, worst = loop.shape[1] - 2, 0.0
@@ -289,7 +289,7 @@ def _open_pins(tree, shape, first, frame, jacobian, loop):
     return worst
 
 
-@lean
+@allocation_free
 def _factorise_loops(bound, loop, normal):
     """Factor of `A' A` of the bound columns, made positive by a trace of its size."""
     nb, trace = len(bound), 0.0
@@ -304,7 +304,7 @@ def _factorise_loops(bound, loop, normal):
     factorise(normal)
 
 
-@lean
+@allocation_free
 def _solve_loops(bound, loop, column, normal):
     """Bound part of the answer to a column of the loops, into the last row of `normal`."""
     nb = len(bound)

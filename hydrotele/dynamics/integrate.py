@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from hydrotele.core.compiled import compiled, lean
+from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.dynamics.closures import (
     close_chains,
     drift_chains,
@@ -66,8 +66,8 @@ from hydrotele.terms.table import added_with_slope
 _AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 
 
-@lean
-def feel(model, sp, z):
+@allocation_free
+def set_activations(model, sp, z):
     """Write the activations of a state with the pressures that are felt into `sp.act`.
 
     Args:
@@ -89,9 +89,9 @@ def feel(model, sp, z):
             sp.act[k] = pressure_with_air(sp.act[k], release, onset)
 
 
-@lean
-def keep(model, sp, z):
-    """Write `sp.act` back into a state, the inverse of `feel`.
+@allocation_free
+def store_activations(model, sp, z):
+    """Write `sp.act` back into a state, the inverse of `set_activations`.
 
     Args:
         model: Model.
@@ -112,21 +112,21 @@ def keep(model, sp, z):
             z[first + k] = pressure_without_air(sp.act[k], release, onset)
 
 
-@lean
+@allocation_free
 def supply_of(model, sp, z):
-    """Supply pressure in a state, scalar [Pa]; `sp.act` is written, see `feel`.
+    """Supply pressure in a state, scalar [Pa]; `sp.act` is written, see `set_activations`.
 
     Source: nominal model, "Supply".
     """
     user, count, act = model.user, model.hydraulic, sp.act
-    feel(model, sp, z)
+    set_activations(model, sp, z)
     open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
     if model.memory is None:
         return circuit_supply(user, 0, count, sp.scratch)
     return circuit_supply(user, 0, count, sp.scratch, delivered_share(user, 0, act))
 
 
-@lean
+@allocation_free
 def term_force(model, sp, z, i, velocity):
     """Force that the terms add to a drive, and its slope with respect to the drive's velocity.
 
@@ -155,7 +155,7 @@ def term_force(model, sp, z, i, velocity):
     return force, slope
 
 
-@lean
+@allocation_free
 def add_commands(model, sp, h):
     """Write the commands that the valves are given: what arrives and what the terms add.
 
@@ -175,8 +175,8 @@ def add_commands(model, sp, h):
     )  # fmt: skip
 
 
-@lean
-def show_late(model, c):
+@allocation_free
+def is_lagged(model, c):
     """Whether a channel shows the past: through a delay or a first-order lag.
 
     Args:
@@ -191,7 +191,7 @@ def show_late(model, c):
     return model.lag[c] > 0.0 or model.time_constant[c] > 0.0
 
 
-@lean
+@allocation_free
 def follow_channel(trail, c, ratio, shown):
     """Replace what an ideal sensor shows over a row by what one with a first-order lag shows.
 
@@ -217,7 +217,7 @@ def follow_channel(trail, c, ratio, shown):
     return shown
 
 
-@lean
+@allocation_free
 def follow_trail(model, trail, h, shown):
     """`follow_channel` for every channel with a first-order lag.
 
@@ -241,7 +241,7 @@ _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 
 
-@lean
+@allocation_free
 def place(model, sp, z):
     """Put mechanism and drives at a state: `place_mechanism`, and the pressures that are felt.
 
@@ -256,10 +256,10 @@ def place(model, sp, z):
     Source: `place_mechanism`, `supply.feel`.
     """
     place_mechanism(model, sp, z)
-    feel(model, sp, z)
+    set_activations(model, sp, z)
 
 
-@lean
+@allocation_free
 def place_mechanism(model, sp, z):
     """Put the mechanism at a state: frames, drive positions and their Jacobian rows.
 
@@ -305,7 +305,7 @@ def place_mechanism(model, sp, z):
         sp.drive[X, i] = load_position(model, sp, i) if gear < 0 else z[n + gear]
 
 
-@lean
+@allocation_free
 def load_position(model, sp, i):
     """Position of a drive's load side, scalar [m] or [rad], at the state of the last `place`.
 
@@ -317,7 +317,7 @@ def load_position(model, sp, i):
     return sp.motion.bar[bar, BAR_LENGTH] - mech.shape[1 + mech.links + 2 * bar, CLOSED]
 
 
-@lean
+@allocation_free
 def accelerate(model, sp, z, dt):
     """Linearly implicit acceleration over a kick; leaves the mechanism where `place` put it.
 
@@ -394,7 +394,7 @@ def accelerate(model, sp, z, dt):
     solve(sp.mass, sp.force)
 
 
-@lean
+@allocation_free
 def _drive_velocity(model, sp, z, i):
     """Velocity of a drive, its own where it has a transmission, scalar [m/s] or [rad/s]."""
     n, first = len(model.mech.free), len(model.mech.free) + len(model.transmission)
@@ -406,7 +406,7 @@ def _drive_velocity(model, sp, z, i):
     return v
 
 
-@lean
+@allocation_free
 def _inertia(model, sp, i):
     """Inertia that a drive moves while the others rest, scalar [kg] or [kg m^2]."""
     if model.gear[i] >= 0:
@@ -419,7 +419,7 @@ def _inertia(model, sp, i):
     return least
 
 
-@lean
+@allocation_free
 def _project(facts, tree_mass, joint, basis, half, n, mass, force):
     """Mass matrix and forces of the tree with its dampers, in independent coordinates."""
     nt = len(tree_mass)
@@ -450,7 +450,7 @@ def _project(facts, tree_mass, joint, basis, half, n, mass, force):
                 mass[f, g] += basis[j, f] * total
 
 
-@lean
+@allocation_free
 def arriving(command, row, begin, end, period, delay):
     """Mean of a held and delayed command over part of a row.
 
@@ -484,7 +484,7 @@ def arriving(command, row, begin, end, period, delay):
     return total / (stop - place)
 
 
-@lean
+@allocation_free
 def advance(model, sp, z, command, row, period, steps, trail):
     """Advance a state over one row of a log.
 
@@ -543,7 +543,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
         if model.memory is not None:
             for k in range(4 * count, len(sp.act_dot)):
                 act[k] += h * sp.act_dot[k]
-        keep(model, sp, z)
+        store_activations(model, sp, z)
         sp.time[0] = sp.time[1] + row * period + (step + 1) * h
         kick = h if step < steps - 1 else 0.5 * h
         accelerate(model, sp, z, kick)
@@ -553,7 +553,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
             write_trail(model, sp, z, trail[step + 1])
 
 
-@lean
+@allocation_free
 def _bend(user, act, drive, h, act_dot):
     """Rates of all bristles over a step in which the drives' velocities are held."""
     for i in range(drive.shape[1]):
@@ -563,7 +563,7 @@ def _bend(user, act, drive, h, act_dot):
             act_dot[at] = bristle_rate(user, u, act[at], drive[V, i], drive[INERTIA, i], h)
 
 
-@lean
+@allocation_free
 def _take_commands(model, drive, command, row, begin, end, period):
     """Commands that arrive over part of a row."""
     for i in range(len(model.delay)):
@@ -573,7 +573,7 @@ def _take_commands(model, drive, command, row, begin, end, period):
             drive[COMMAND, i] = arriving(command[:, i], row, begin, end, period, model.delay[i])
 
 
-@lean
+@allocation_free
 def write_trail(model, sp, z, out):
     """Keep what the late channels would show in a state if they were not, after `place`.
 
@@ -589,11 +589,11 @@ def write_trail(model, sp, z, out):
     Source: nominal model, "Sensors".
     """
     for c in range(len(model.kind)):
-        if show_late(model, c):
+        if is_lagged(model, c):
             out[c] = _shown(model, sp, z, c)
 
 
-@lean
+@allocation_free
 def _shown(model, sp, z, c):
     """What an ideal sensor of a channel shows, after `place`."""
     kind, i = model.kind[c], model.drive[c]
@@ -606,7 +606,7 @@ def _shown(model, sp, z, c):
     return sp.act[4 * i + kind]
 
 
-@lean
+@allocation_free
 def read_channels(model, sp, z, row, steps, h, trail, out):
     """What the sensors show in a state, without noise.
 
@@ -628,7 +628,7 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
     """
     place(model, sp, z)
     for c in range(len(model.kind)):
-        if len(trail) > 0 and show_late(model, c):
+        if len(trail) > 0 and is_lagged(model, c):
             back = max(0.0, row * steps - model.lag[c] / h)
             low = int(math.floor(back))
             part = back - low

@@ -7,7 +7,7 @@ import numpy as np
 from hydrotele.dynamics.mechanism import Mechanism, coordinate_names, mechanism
 from hydrotele.dynamics.motion import Motion, motion_space
 from hydrotele.hydraulics.circuit import SCRATCH
-from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
+from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters, extra_state_names
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import parse_channel
@@ -125,7 +125,7 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         count += axis.transmission is not None
     return Model(
         mech=mechanism(machine),
-        user=np.concatenate(list(actuator_numbers(machine).values())),
+        user=np.concatenate(list(actuator_parameters(machine).values())),
         hydraulic=len(machine.hydraulic_axes),
         gain=np.array([axis.force.gain if axis.force else 0.0 for axis in axes]),
         delay=np.array([axis.command_delay for axis in axes], float),
@@ -140,7 +140,7 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         lag=np.array([e.delay for e in errors], float),
         terms=terms_table(machine.terms, order),
         time_constant=np.array([e.time_constant for e in errors], float),
-        memory=len(memory_names(machine)) or None,
+        memory=len(extra_state_names(machine)) or None,
     )
 
 
@@ -170,4 +170,4 @@ def state_names(machine: Machine) -> list[str]:
     for name, axis in machine.hydraulic_axes.items():
         kinds = ("speed", "pressure_load") if axis.pump else ("spool", "spool_rate")
         out += [f"{k}.{name}" for k in (*kinds, "pressure_head", "pressure_rod")]
-    return out + memory_names(machine)
+    return out + extra_state_names(machine)

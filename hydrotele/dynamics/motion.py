@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import lean
+from hydrotele.core.compiled import allocation_free
 from hydrotele.dynamics.mechanism import (
     AXIS,
     COM,
@@ -82,7 +82,7 @@ def motion_space(mech: Mechanism) -> Motion:
     )  # fmt: skip
 
 
-@lean
+@allocation_free
 def cross(ax, ay, az, bx, by, bz):
     """Cross product of two vectors given by their components.
 
@@ -102,7 +102,7 @@ def cross(ax, ay, az, bx, by, bz):
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@lean
+@allocation_free
 def turned(frame, i, x, y, z):
     """A vector given in a frame, in the world's axes.
 
@@ -125,7 +125,7 @@ def turned(frame, i, x, y, z):
     )
 
 
-@lean
+@allocation_free
 def place_origin(tree, shape, frame, jacobian, i):
     """Origin of a frame as a point of its parent, and its Jacobian.
 
@@ -158,7 +158,7 @@ def place_origin(tree, shape, frame, jacobian, i):
         jacobian[i, k, 5] = wz
 
 
-@lean
+@allocation_free
 def move_origin(tree, frame, i):
     """Rates and accelerations of a placed frame as if it were fixed to its parent.
 
@@ -191,7 +191,7 @@ def move_origin(tree, frame, i):
     frame[i, SPIN_RATE], frame[i, SPIN_RATE + 1], frame[i, SPIN_RATE + 2] = ax, ay, az
 
 
-@lean
+@allocation_free
 def _rotate(frame, i, p, x, y, z, angle):
     """Turn frame i against p about an axis."""
     c, s = np.cos(angle), np.sin(angle)
@@ -206,7 +206,7 @@ def _rotate(frame, i, p, x, y, z, angle):
         frame[i, r + 2] = a * r02 + b * r12 + d * r22
 
 
-@lean
+@allocation_free
 def place_links(tree, shape, links, joint, frame, jacobian):
     """Places and Jacobians of the links.
 
@@ -249,7 +249,7 @@ def place_links(tree, shape, links, joint, frame, jacobian):
             jacobian[i, j, 0], jacobian[i, j, 1], jacobian[i, j, 2] = x, y, z
 
 
-@lean
+@allocation_free
 def move_links(tree, links, joint, frame, jacobian):
     """Rates and accelerations of the placed links.
 
@@ -283,7 +283,7 @@ def move_links(tree, links, joint, frame, jacobian):
         frame[i, second + 2] += twice * tz * rate
 
 
-@lean
+@allocation_free
 def gather_forces(mech, m):
     """Mass matrix and bias forces of the tree with its bars (Kane's projection).
 
@@ -320,7 +320,7 @@ def gather_forces(mech, m):
             m.mass[j, i] = mass
 
 
-@lean
+@allocation_free
 def _load_body(shape, frame, jacobian, b, reach, momentum):
     """Momentum per unit rate, and force and torque of inertia and gravity, about the origin."""
     mass = shape[b, MASS]

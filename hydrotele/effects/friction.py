@@ -56,7 +56,7 @@ def _set(machine: Machine, location: str, values: Values) -> Machine:
     return machine
 
 
-def _rubbing(machine: Machine) -> tuple[str, ...]:
+def _friction_places(machine: Machine) -> tuple[str, ...]:
     """Axes that have friction to be unequal."""
     present = {name: machine.axes[name].drive.friction for name in machine.axes}
     return tuple(n for n, f in present.items() if f.coulomb + f.stribeck_extra + f.viscous > 0)
@@ -88,7 +88,7 @@ FRICTION = (
     ),
     Effect(
         "friction_asymmetry", "friction that is larger in one direction of a drive", "force",
-        _rubbing, _asymmetry, _set,
+        _friction_places, _asymmetry, _set,
     ),
 )  # fmt: skip
 
@@ -166,7 +166,7 @@ _WAY, _TURN = 5.0e-5, 2.0e-4  # m, rad: what seals and gears give before they sl
 _RIGID = 0.02  # of the least compliance worth naming: friction as without bristles
 
 
-def _rubbing_presliding(machine: Machine) -> tuple[str, ...]:
+def _presliding_places(machine: Machine) -> tuple[str, ...]:
     """Axes with dry friction to break away from; that of a drive with its own pump is rigid."""
     found = {name: axis.drive.friction for name, axis in machine.axes.items() if not axis.pump}
     return tuple(name for name, f in found.items() if f.coulomb + f.stribeck_extra > 0.0)
@@ -205,7 +205,7 @@ def _set_presliding(machine: Machine, location: str, values: Values) -> Machine:
 
 PRESLIDING = Effect(
     "presliding", "dry friction that gives like a spring before it slides", "force",
-    _rubbing_presliding,
+    _presliding_places,
     _compliance, _set_presliding,
 )  # fmt: skip
 

@@ -24,7 +24,7 @@ from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.fleet import STATE
 from hydrotele.soil.facts import CAT215
 from hydrotele.tasks.core import TaskCore
-from hydrotele.tasks.force import FORCE_READ, force_wanted
+from hydrotele.tasks.force import FORCE_READ, reference_force
 from hydrotele.tasks.grade import CELL, CELLS, FAR, NEAR, START, plane_height
 from hydrotele.tasks.line import SETTLE, line_pose
 from hydrotele.tasks.memory import ARM
@@ -154,7 +154,7 @@ def _force(core: TaskCore, number: int) -> list[Marker]:
     memory, side = core.memory[number], np.array([0.0, 0.5 * _BESIDE, 0.0])
     goal, foot = memory["goal"], memory["tip"] - np.array([0.6, 0.0, 0.0])
     now = float(memory["tick"]) * core.setup.clock.period
-    wanted, _ = force_wanted(goal, now)
+    wanted, _ = reference_force(goal, now)
     up = np.array([0.0, 0.0, _METRES])
     pushes = ((wanted, -side, _GOAL), (float(goal[FORCE_READ]), side, _OFF))
     return [
@@ -260,7 +260,7 @@ class Stage:
         """
         variant = int(self._core.memory["variant"][number])
         if (wanted := self._looks(variant)) is not self._shown:
-            copy_numbers(wanted, self.model)
+            copy_parameters(wanted, self.model)
             self._shown = wanted
         mujoco.mj_setState(self.model, self.data, self._core.simulations.state[number], STATE)
         mujoco.mj_forward(self.model, self.data)
@@ -325,7 +325,7 @@ class Stage:
             self._canvas = None
 
 
-def copy_numbers(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
+def copy_parameters(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
     """Give a model the numbers of another one of the same structure.
 
     Args:

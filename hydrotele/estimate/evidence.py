@@ -49,20 +49,20 @@ class Fit:
         guess: the guess.
         loss: `sum e^2 + d'd`.
         gain: fall of the loss against the guess without its last part.
-        charge: what the last part's parameters cost.
+        occam_penalty: what the last part's parameters cost.
         information: (P, P) `S'S + 1` of all parts.
     """
 
     guess: Guess
     loss: float
     gain: float
-    charge: float
+    occam_penalty: float
     information: np.ndarray
 
     @property
     def score(self) -> float:
         """Twice the log of the evidence gained."""
-        return self.gain - self.charge
+        return self.gain - self.occam_penalty
 
 
 @dataclass(frozen=True)
@@ -347,10 +347,10 @@ class Evidence:
             slopes = slopes_at(guess, errors)
         information = slopes.T @ slopes + np.eye(slopes.shape[1])
         last = guess.parts[-1][0].size if guess.parts else 0
-        return Fit(guess, loss, before - loss, charge(information, last), information)
+        return Fit(guess, loss, before - loss, occam_penalty(information, last), information)
 
 
-def charge(information: np.ndarray, last: int) -> float:
+def occam_penalty(information: np.ndarray, last: int) -> float:
     """Occam's charge of the last parameters, given the others: `log det` of their information."""
     if last == 0:
         return 0.0
@@ -387,7 +387,7 @@ _CHANCE = 3.0  # chi-square per degree of freedom that two degrees exceed in 5 %
 _STRETCHES = 40  # of the runs, if they are not shorter than what unknown inputs remember
 
 
-def spreads(evidence: Evidence, guess: Guess, scatter: float = 1.0) -> np.ndarray:
+def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) -> np.ndarray:
     """Standard deviations of a guess's numbers.
 
     Where errors hang together over time, as those of a law of another form do, stretches of the

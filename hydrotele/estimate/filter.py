@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import compiled, lean
+from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.dynamics.integrate import (
     advance,
     follow_channel,
@@ -35,7 +35,7 @@ from hydrotele.hydraulics.pump import STALLED
 _CHANGE = 0.1  # s in which a channel may change as much as its value is unknown at a run's start
 
 
-class Late(NamedTuple):
+class DelayedReadings(NamedTuple):
     """Readings of late channels, q of them: per channel the next to be shown first.
 
     Attributes:
@@ -58,7 +58,7 @@ class Late(NamedTuple):
     open: np.ndarray
 
 
-def late_readings(model: Model, period: float) -> Late:
+def late_readings(model: Model, period: float) -> DelayedReadings:
     """Readings of the late channels of a model.
 
     Args:
@@ -85,14 +85,14 @@ def late_readings(model: Model, period: float) -> Late:
             loose = min(1.0, constant / _CHANGE) ** 2
             rows.append((c, period, True, float(np.exp(-period / constant)), passed, loose))
     channel, at, lags, stays, moves, loose = zip(*rows, strict=True) if rows else ((),) * 6
-    return Late(
+    return DelayedReadings(
         np.array(channel, np.int64), np.array(at, float), first, np.array(lags, bool),
         np.array(stays, float), np.array(moves, float), np.array(loose, float),
     )  # fmt: skip
 
 
-@lean
-def begin_late(late, size, shown, z):
+@allocation_free
+def begin_delayed(late, size, shown, z):
     """Fill the late readings as if the state had rested so far.
 
     Args:
@@ -110,9 +110,9 @@ def begin_late(late, size, shown, z):
         z[size + e] = shown[late.channel[e]]
 
 
-@lean
-def spread_late(late, size, slope, spread):
-    """Covariance of the late readings after `begin_late`.
+@allocation_free
+def delayed_covariance(late, size, slope, spread):
+    """Covariance of the late readings after `begin_delayed`.
 
     Args:
         late: Late.
@@ -140,8 +140,8 @@ def spread_late(late, size, slope, spread):
         spread[s, s] = total + late.open[e] * total
 
 
-@lean
-def move_late(model, late, size, trail, h, z):
+@allocation_free
+def shift_delayed(model, late, size, trail, h, z):
     """Late readings a row later.
 
     Args:
@@ -173,8 +173,8 @@ def move_late(model, late, size, trail, h, z):
         z[size + e] = model.scale[c] * value + model.offset[c]
 
 
-@lean
-def nudge_late(late, place, change, readings):
+@allocation_free
+def perturb_delayed(late, place, change, readings):
     """Add to the late readings what a change of one of them makes of them a row later.
 
     Args:
@@ -186,7 +186,7 @@ def nudge_late(late, place, change, readings):
     Returns:
         Nothing.
 
-    Source: `move_late`, which is linear in them.
+    Source: `shift_delayed`, which is linear in them.
     """
     readings[place] += late.stays[place] * change
     if place > 0:
@@ -213,7 +213,7 @@ class Gains(NamedTuple):
     spread: np.ndarray
 
 
-@lean
+@allocation_free
 def _slopes(model, sp, z, nudge, slope, moved):
     """Slopes of the readings in a state that was just read."""
     first = 2 * (len(model.mech.free) + len(model.transmission))
@@ -312,10 +312,10 @@ def filter_run(
     place(model, sp, z)
     first = np.int64(0)  # numba compiles a function anew for a written number
     read_channels(model, sp, z, first, steps, h, trail[:0], predicted[0])
-    begin_late(late, size, predicted[0], z)
+    begin_delayed(late, size, predicted[0], z)
     if fresh:
         _slopes(model, sp, z[:size], nudge, slope[0], moved)
-        spread_late(late, size, slope[0], spread)
+        delayed_covariance(late, size, slope[0], spread)
         initial[:] = spread
     loss = 0.0
     for row in range(rows):
@@ -376,13 +376,13 @@ def filter_run(
                         reached[s, s] += nudge[s]
                     if moves:
                         advance(model, sp, reached[s], command, row, period, coarse, rough)
-                        move_late(model, late, size, rough, period / coarse, reached[s])
+                        shift_delayed(model, late, size, rough, period / coarse, reached[s])
                     elif begin <= s < full:
                         for r in range(size):
                             reached[s, r] += nudge[s] * columns[row, s - begin, r]
                         reached[s, s] += decay * nudge[s]
                     else:
-                        nudge_late(late, s - size, nudge[s], reached[s, size:begin])
+                        perturb_delayed(late, s - size, nudge[s], reached[s, size:begin])
                 for s in range(full):
                     for r in range(full):
                         reached[s, r] = (reached[s, r] - reached[full, r]) / nudge[s]
@@ -395,7 +395,7 @@ def filter_run(
                 for s in range(full):
                     spread[s, s] += startle[s]
         advance(model, sp, z, command, row, period, steps, trail)
-        move_late(model, late, size, trail, h, z)
+        shift_delayed(model, late, size, trail, h, z)
         for i in range(inputs):
             for r in range(size):
                 z[r] += columns[row, i, r] * z[begin + i]
@@ -403,7 +403,7 @@ def filter_run(
     return loss
 
 
-@lean
+@allocation_free
 def _correct(model, sp, z, own, delta):
     """Add a correction to a state; drives that it does not know follow their loads."""
     n, t = len(model.mech.free), len(model.transmission)
@@ -432,7 +432,7 @@ def _correct(model, sp, z, own, delta):
         _bound_memory(model, z)
 
 
-@lean
+@allocation_free
 def _bound_memory(model, z):
     """Keep bristles within their breakaway force, and a pump between no flow and all of it."""
     act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
@@ -446,7 +446,7 @@ def _bound_memory(model, z):
         act[at] = min(1.0, max(0.0, act[at]))
 
 
-@lean
+@allocation_free
 def _keep_side(z, at, moved):
     """Undo what readings cannot say of a pump drive: that its relays switched, or its load pulls.
 
@@ -460,7 +460,7 @@ def _keep_side(z, at, moved):
     z[at + 1] = max(0.0, z[at + 1])
 
 
-@lean
+@allocation_free
 def _among(numbers, number):
     """Whether a number is one of (n,) numbers."""
     for other in numbers:
@@ -469,7 +469,7 @@ def _among(numbers, number):
     return False
 
 
-@lean
+@allocation_free
 def _carry(columns, spread, work, drift):
     """`P = F P F' + Q`, kept symmetric; the rows of `columns` are F's columns."""
     size = len(drift)

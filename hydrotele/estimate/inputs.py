@@ -20,8 +20,8 @@ from hydrotele.effects.effect import changed
 from hydrotele.hydraulics.parameters import (
     ADDED_DELIVERY,
     actuator_order,
+    extra_state_names,
     longest_step,
-    memory_names,
 )
 from hydrotele.hydraulics.supply import ADDED_LAG
 from hydrotele.machine.machine import Machine
@@ -65,7 +65,7 @@ def possible_inputs(machine: Machine, axes: Sequence[str] = ()) -> tuple[Input, 
         facts = machine.axes[axis]
         count = 4 if facts.valve else 3 if facts.pump else 1
         found += [Input(balance, axis) for balance in BALANCES[:count]]
-    if ADDED_DELIVERY in memory_names(machine):
+    if ADDED_DELIVERY in extra_state_names(machine):
         found.append(Input(SUPPLY, next(iter(machine.valve_axes))))
     return tuple(found)
 
@@ -198,7 +198,7 @@ def input_columns(
             columns[:, m, rates : 2 * rates] = response[:, i]
         elif balance == SUPPLY:
             assert machine.supply
-            at = first + 4 * model.hydraulic + memory_names(machine).index(ADDED_DELIVERY)
+            at = first + 4 * model.hydraulic + extra_state_names(machine).index(ADDED_DELIVERY)
             follows = 2.0 / period * math.tanh(0.5 * period / ADDED_LAG)  # of its exponential
             columns[:, m, at] = follows / machine.supply.pump_flow
         elif balance == "command":

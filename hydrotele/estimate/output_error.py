@@ -64,7 +64,7 @@ _LONGEST_DELAY = 0.5  # s
 _CLEARANCE = 0.02  # m, by which a closed cylinder is longer than its stroke
 
 
-def states_open_numbers(machine: Machine) -> bool:
+def states_uncertain_parameters(machine: Machine) -> bool:
     """Whether a machine file says how uncertain its flow tables or linkages are.
 
     Args:
@@ -76,7 +76,7 @@ def states_open_numbers(machine: Machine) -> bool:
     return any(key.partition(".")[0] in ("flow_table", "linkage") for key in machine.uncertainty)
 
 
-def open_numbers(machine: Machine) -> Guess:
+def uncertain_parameters(machine: Machine) -> Guess:
     """All that an estimate leaves open of the machine's drives, at nominal.
 
     Args:

@@ -14,7 +14,7 @@ from hydrotele.dynamics.integrate import load_position, place
 from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
 from hydrotele.estimate.filter import Gains, filter_run, late_readings
 from hydrotele.estimate.inputs import Input, decay, input_drift
-from hydrotele.hydraulics.circuit import circuit_scratch, open_ports, wanted_share
+from hydrotele.hydraulics.circuit import circuit_scratch, demanded_share, open_ports
 from hydrotele.hydraulics.parameters import DELIVERY, SLOTS, Slot, actuator_order, longest_step
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
@@ -90,7 +90,7 @@ def _drawn(model: Model, state: np.ndarray) -> float:
     act = state[2 * (len(model.mech.free) + len(model.transmission)) :]
     ports = circuit_scratch()
     open_ports(model.user, act, act, ports, 0, model.hydraulic, 0.0, act)
-    return wanted_share(model.user, 0, model.hydraulic, ports)
+    return demanded_share(model.user, 0, model.hydraulic, ports)
 
 
 def _first_rows(run: RunData, c: int) -> int:

@@ -16,9 +16,9 @@ from hydrotele.hydraulics.circuit import (
     chamber_flows,
     circuit_supply,
     delivered_share,
+    demanded_share,
     open_ports,
     pump_response,
-    wanted_share,
 )
 from hydrotele.hydraulics.laws import port_flow, softening
 from hydrotele.hydraulics.supply import drawn_flow, highest_supply
@@ -127,7 +127,7 @@ def _settle(user, spools, pressures, period, act, ports):
         act[4 * i + 2], act[4 * i + 3] = pressures[i]
     open_ports(user, act, act, ports, 0, count, 0.0, act)
     if user[_LAG] > 0.0:
-        wanted = wanted_share(user, 0, count, ports)
+        wanted = demanded_share(user, 0, count, ports)
         act[at] = pump_response(user, 0, wanted, act[at], period) if period > 0.0 else wanted
 
 

@@ -19,7 +19,7 @@ from hydrotele.dynamics.mechanism import JOINT
 from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.gap.balance_laws import chamber_residuals, load_forces, pump_lacks, supply_pressures
 from hydrotele.hydraulics.laws import spool_step
-from hydrotele.hydraulics.parameters import PUMP, actuator_numbers, actuator_order
+from hydrotele.hydraulics.parameters import PUMP, actuator_order, actuator_parameters
 from hydrotele.hydraulics.pump import load_force, load_pressure_step
 from hydrotele.identify import smoothing
 from hydrotele.kinematics.from_machine import axis_linkage
@@ -469,7 +469,7 @@ def _load(machine: Machine, name: str, motion: np.ndarray, period: float) -> np.
 
     Its pressure follows from the travel alone; in the first row there is none.
     """
-    user, load = actuator_numbers(machine)[name], machine.loads[name]
+    user, load = actuator_parameters(machine)[name], machine.loads[name]
     smooth = machine.axes[name].drive.friction.smoothing_velocity
     forces = np.zeros((len(motion), motion.shape[2]))
     for d, (_, velocity, _) in enumerate(motion):
@@ -483,7 +483,7 @@ def _load(machine: Machine, name: str, motion: np.ndarray, period: float) -> np.
 
 
 def _flow_and_timing(machine: Machine, signals: Signals) -> Found:
-    numbers = actuator_numbers(machine)
+    numbers = actuator_parameters(machine)
     for name, axis in machine.hydraulic_axes.items():
         channels = f"pressure_head.{name}", f"pressure_rod.{name}", "pressure_supply"
         motion = joint_motion(machine, signals, name)
@@ -542,7 +542,7 @@ def _supply_signals(
     commanded = all(name in signals.command for name in names)
     if not (names and commanded and signals.has("pressure_supply", *chambers)):
         return None
-    numbers = actuator_numbers(machine)
+    numbers = actuator_parameters(machine)
     user = np.concatenate([numbers[name] for name in names])
     spools = np.stack([spool_positions(machine, signals, name) for name in names])
     table = np.stack([signals.smoothed[c][:, 0] for c in chambers], axis=1)

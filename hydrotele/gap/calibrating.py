@@ -23,7 +23,7 @@ import numpy as np
 
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.calibration import CALIBRATION, calibration, numbers
-from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, charge
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.output_error import (
@@ -35,9 +35,9 @@ from hydrotele.estimate.output_error import (
     WINDOW,
     FreeRunFit,
     fit_free_runs,
-    open_numbers,
-    states_open_numbers,
+    states_uncertain_parameters,
     table_steps,
+    uncertain_parameters,
 )
 from hydrotele.estimate.stretches import thinned
 from hydrotele.estimate.track import COARSE
@@ -134,7 +134,11 @@ def _open(data: Dataset) -> Guess | None:
         group = calibration(machine)
         return Guess(((group, np.zeros(group.size)),))
     pressures = any(channel.startswith("pressure") for channel in data.channels)
-    return None if pressures or not states_open_numbers(machine) else open_numbers(machine)
+    return (
+        None
+        if pressures or not states_uncertain_parameters(machine)
+        else uncertain_parameters(machine)
+    )
 
 
 def _told(nominal: Machine, fit: FreeRunFit) -> Machine:
@@ -247,7 +251,7 @@ def calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
             slopes = evidence.slopes(guess, evidence.errors(guess, coarse), step=coarse)
         fit = evidence.fit(guess, 0.0, step=step, kept=slopes, steps=3)
         before, judged = judged.loss, evidence.judged(fit.guess)
-        guess, cost = fit.guess, charge(fit.information, group.size)
+        guess, cost = fit.guess, occam_penalty(fit.information, group.size)
         gain = now.loss - judged.loss - cost
         if before - judged.loss < _SETTLED:
             break
@@ -422,7 +426,7 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
     return sorted(evidence.map(fit, pool), key=lambda found: -found.score)
 
 
-def settle(
+def fit_until_settled(
     evidence: Evidence, judged: Judged, wanted: float = np.inf
 ) -> tuple[Judged, Fit]:  # fmt: skip
     """Fit with levels and gains computed anew until they no longer matter.

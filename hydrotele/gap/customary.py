@@ -29,7 +29,7 @@ _HERTZ = ("Hz", 0.5 / math.pi)
 _LEAST_DIGITS, _MOST_DECIMALS = 3, 6
 
 
-class Said(NamedTuple):
+class CustomaryEstimate(NamedTuple):
     """An estimate in customary numbers, as texts without unit, and the unit; `-` if unknown."""
 
     value: str
@@ -71,7 +71,7 @@ def amount(value: float, unit: str, parameter: str = "") -> str:
     return f"{_rounded(value * factor)} {shown}"
 
 
-def said(estimate: Estimate, parameter: str = "") -> Said:
+def in_customary_units(estimate: Estimate, parameter: str = "") -> CustomaryEstimate:
     """An estimate in customary numbers; the interval decides how many digits are worth saying.
 
     >>> said(Estimate(0.0853, "1", 0.0841, 0.0864, 0.04), "deadband")
@@ -82,7 +82,7 @@ def said(estimate: Estimate, parameter: str = "") -> Said:
     unit, factor = customary(estimate.unit, size, parameter)
     width = 0.5 * abs(estimate.high - estimate.low) * factor
     value, low, high = (_number(x * factor, width) for x in numbers[:3])
-    return Said(value, low, high, _rounded(estimate.nominal * factor), unit)
+    return CustomaryEstimate(value, low, high, _rounded(estimate.nominal * factor), unit)
 
 
 def _number(value: float, width: float) -> str:

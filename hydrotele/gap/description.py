@@ -10,7 +10,7 @@ import numpy as np
 
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.inputs import SUPPLY, Input, input_units
-from hydrotele.gap.customary import amount, said
+from hydrotele.gap.customary import amount, in_customary_units
 from hydrotele.gap.discover import Discovery, Learned
 from hydrotele.gap.law_tables import THROUGH
 from hydrotele.gap.result import (
@@ -179,7 +179,7 @@ def parameter_words(name: str, estimate: Estimate) -> str:
     >>> parameter_words("mass", Estimate(251.2, "kg", 247.9, 254.5, 0.0))
     'mass 251.2 kg (95 % sure between 247.9 and 254.5 kg; the model has 0 kg)'
     """
-    s = said(estimate, name)
+    s = in_customary_units(estimate, name)
     sure = f"95 % sure between {s.low} and {s.high} {s.unit}"
     if "-" in (s.low, s.high):
         sure = "no interval can be given"
@@ -187,10 +187,10 @@ def parameter_words(name: str, estimate: Estimate) -> str:
     return f"{name.replace('_', ' ')} {s.value} {s.unit} ({sure}{model})"
 
 
-def chance_words(probability: float) -> str:
+def probability_text(probability: float) -> str:
     """A probability in percent, never rounded to certainty.
 
-    >>> chance_words(0.62), chance_words(0.99999)
+    >>> probability_text(0.62), probability_text(0.99999)
     ('62 %', 'over 99.9 %')
     """
     if not math.isfinite(probability):
@@ -271,7 +271,7 @@ def _unsure(gap: Gap) -> NamedEffect:
 
 
 def _brief(effect: NamedEffect) -> str:
-    numbers = [(name, said(e, name)) for name, e in effect.parameters.items()]
+    numbers = [(name, in_customary_units(e, name)) for name, e in effect.parameters.items()]
     facts = ", ".join(f"{name.replace('_', ' ')} {s.value} {s.unit}" for name, s in numbers)
     return f"{effect_title(effect)}: {facts}" if facts else effect_title(effect)
 
@@ -284,7 +284,7 @@ def _effect(effect: NamedEffect, run: str) -> str:
     facts = ", ".join(parameter_words(n, e) for n, e in effect.parameters.items())
     known = EFFECTS.get(effect.name)
     what = f"{effect_title(effect)} ({known.sentence})" if known else effect_title(effect)
-    text = _capital(f"{what}: {facts}. Probability {chance_words(effect.probability)}.")
+    text = _capital(f"{what}: {facts}. Probability {probability_text(effect.probability)}.")
     if math.isfinite(effect.share):
         text += f" Without it {share_words(effect.share)} of the gap on {run} comes back."
     return text
@@ -296,7 +296,7 @@ def _calibrated(gap: Gap) -> tuple[str, ...]:
     told = [
         f"{number_title(key)} {s.value} {s.unit} (model {s.nominal})"
         for key in most_moved(gap)[:_TOLD]
-        for s in [said(gap.calibration[key], key.rpartition(".")[2])]
+        for s in [in_customary_units(gap.calibration[key], key.rpartition(".")[2])]
     ]
     count = len(gap.calibration)
     many = f"{count} uncertain numbers were" if count > 1 else "One uncertain number was"
@@ -351,7 +351,7 @@ def _rivals(gap: Gap) -> tuple[str, ...]:
         rivals = effect.other_forms if form else effect.alternatives
         if not rivals or (effect.probability >= SURE if form else gap.verdict == "named"):
             continue
-        told = [f"{effect_title(a)} ({chance_words(a.probability)})" for a in rivals]
+        told = [f"{effect_title(a)} ({probability_text(a.probability)})" for a in rivals]
         others = f"{effect_title(effect)} from {_listed(told, 'or')}"
         if form:
             text = f"Its form is open: these data do not tell {others}."

@@ -8,7 +8,7 @@ import numpy as np
 
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.calibration import CALIBRATION
-from hydrotele.estimate.evidence import Evidence, Judged, spreads
+from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.estimate.inputs import input_sizes, input_units
 from hydrotele.estimate.levels import rippled, undisturbed_loss
@@ -41,7 +41,7 @@ from hydrotele.gap.result import (
     Prediction,
     Verdict,
 )
-from hydrotele.gap.rivals import chances
+from hydrotele.gap.rivals import effect_probabilities
 from hydrotele.gap.search import Found, lacking, search
 from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
@@ -122,7 +122,7 @@ def find_gap(
         told = found.judged if discovery.laws else discovery.judged
         evidence.set_base(told)
         scatter = tests.get("constancy", {}).get("value", 1.0)
-        spread = spreads(evidence, told.guess, scatter)
+        spread = standard_deviations(evidence, told.guess, scatter)
         shares = judge.shares(discovery, before, after, floor, evidence.map)
     finally:
         evidence.close()
@@ -357,7 +357,7 @@ def _estimates(hypothesis: Hypothesis, deviation: np.ndarray, spread: np.ndarray
 def _chances(found: Found, index: int, rest: Judged) -> tuple[float, tuple[Alternative, ...]]:
     """Probability of an effect against its rivals and against none, and those of the rivals."""
     rivals = [r for r in found.rivals[index] if np.isfinite(r.judged.loss)]
-    table = chances(found.judged, found.charges[index], rest, rivals)
+    table = effect_probabilities(found.judged, found.charges[index], rest, rivals)
     others = [
         Alternative(r.hypothesis.name, r.hypothesis.location, float(chance))
         for r, chance in zip(rivals, table[2:], strict=True) if chance >= _WORTH_TELLING

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import yaml
 
-from hydrotele.gap.customary import said
+from hydrotele.gap.customary import in_customary_units
 from hydrotele.gap.description import effect_title, learned_title, number_title
 from hydrotele.gap.result import Estimate, Gap, effect_document, finite, gap_document
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
@@ -63,5 +63,5 @@ def _head(gap: Gap) -> list[str]:
 
 
 def _found(estimate: Estimate, name: str) -> str:
-    s = said(estimate, name)
+    s = in_customary_units(estimate, name)
     return f"{s.value} {s.unit} (95 %: {s.low} .. {s.high}), was {s.nominal}"

@@ -10,9 +10,9 @@ import numpy as np
 
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.calibration import CALIBRATION
-from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, charge
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
-from hydrotele.gap.calibrating import fitted, free_of_calibration, settle, strained
+from hydrotele.gap.calibrating import fit_until_settled, fitted, free_of_calibration, strained
 from hydrotele.gap.screening import Screened
 
 _PLAINER = 0.2  # of an effect's probability from which a rival with fewer numbers takes its place
@@ -32,13 +32,13 @@ class Rival:
     Attributes:
         hypothesis: the effect.
         judged: the guess with it, judged.
-        charge: what its parameters cost.
+        occam_penalty: what its parameters cost.
         fit: its last fit; None where it was not settled, for it is far behind.
     """
 
     hypothesis: Hypothesis
     judged: Judged
-    charge: float
+    occam_penalty: float
     fit: Fit | None = None
 
 
@@ -61,11 +61,13 @@ def weights(blocks: Sequence[np.ndarray], charges: Sequence[float], seed: int = 
     count = table.shape[1]
     draws = count * np.random.default_rng(seed).dirichlet(np.ones(count), _DRAWS)
     totals = draws @ (table - table.min(axis=0)).T + np.asarray(charges)
-    chances = np.exp(-0.5 * (totals - totals.min(axis=1, keepdims=True)))
-    return (chances / chances.sum(axis=1, keepdims=True)).mean(axis=0)
+    effect_probabilities = np.exp(-0.5 * (totals - totals.min(axis=1, keepdims=True)))
+    return (effect_probabilities / effect_probabilities.sum(axis=1, keepdims=True)).mean(axis=0)
 
 
-def chances(now: Judged, cost: float, rest: Judged, rivals: Sequence[Rival]) -> np.ndarray:
+def effect_probabilities(
+    now: Judged, cost: float, rest: Judged, rivals: Sequence[Rival]
+) -> np.ndarray:
     """(2 + R,) probabilities of an effect, of none, and of its rivals.
 
     Args:
@@ -76,7 +78,7 @@ def chances(now: Judged, cost: float, rest: Judged, rivals: Sequence[Rival]) -> 
     """
     return weights(
         [now.blocks(), rest.blocks(), *(r.judged.blocks() for r in rivals)],
-        [cost, 0.0, *(r.charge for r in rivals)],
+        [cost, 0.0, *(r.occam_penalty for r in rivals)],
     )
 
 
@@ -123,7 +125,7 @@ def better(
 ) -> Rival | None:
     """The rival that should take an effect's place: likelier, or nearly as likely and plainer."""
     size = now.guess.parts[index][0].size
-    table = chances(now, cost, rest, rivals)
+    table = effect_probabilities(now, cost, rest, rivals)
     found = [
         (chance, rival) for chance, rival in zip(table[2:], rivals, strict=True)
         if rival.fit and chance > (_PLAINER if rival.hypothesis.size < size else 1.0) * table[0]
@@ -155,18 +157,18 @@ def find_rivals(
     evidence.set_base(rest)
     fits = fitted(evidence, rest, pool)
     plausible = [f for f in fits if f.score > 0.0 and not strained(f.guess, -1)][:_RIVALS]
-    looked = [(evidence.judged(fit.guess), fit.charge) for fit in plausible]
+    looked = [(evidence.judged(fit.guess), fit.occam_penalty) for fit in plausible]
     looked = sorted((pair for pair in looked if np.isfinite(pair[0].loss)), key=lambda p: p[0].loss)
     found = []
     hopeless = now.loss + max(_HOPELESS, _FAR * (rest.loss - now.loss))
     for place, (judged, cost) in enumerate(looked):
         fit = None
         if place < _SECOND and judged.loss < hopeless:
-            judged, fit = settle(evidence, judged, now.loss + _BEHIND)
-            cost = charge(fit.information, judged.guess.parts[-1][0].size)
+            judged, fit = fit_until_settled(evidence, judged, now.loss + _BEHIND)
+            cost = occam_penalty(fit.information, judged.guess.parts[-1][0].size)
         found.append(Rival(judged.guess.parts[-1][0], judged, cost, fit))
     evidence.set_base(now)
-    return tuple(sorted(found, key=lambda r: r.judged.loss + r.charge))
+    return tuple(sorted(found, key=lambda r: r.judged.loss + r.occam_penalty))
 
 
 ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines stay below 14.7
@@ -181,7 +183,7 @@ def worth_naming(guess: Guess, index: int, score: float) -> bool:
     return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
 
 
-def told(guess: Guess, fit: Fit, index: int) -> bool:
+def differs_significantly(guess: Guess, fit: Fit, index: int) -> bool:
     """Whether an effect's numbers differ from the model's by more than they are uncertain.
 
     Where a likelihood is full of dents, as with teeth, it may fall by chance with a number moved.
@@ -196,7 +198,9 @@ def told(guess: Guess, fit: Fit, index: int) -> bool:
 def idle(rival: Rival) -> bool:
     """Whether a rival does nothing: what is there without it was settled."""
     guess = rival.judged.guess
-    return rival.fit is not None and not told(guess, rival.fit, len(guess.parts) - 1)
+    return rival.fit is not None and not differs_significantly(
+        guess, rival.fit, len(guess.parts) - 1
+    )
 
 
 def without_needless(
@@ -220,7 +224,7 @@ def pruned(
             return now, fit, tuple(rests)
         worst = rests[int(np.argmin(scores))]
         assert worst
-        now, fit = settle(evidence, worst)
+        now, fit = fit_until_settled(evidence, worst)
 
 
 def _rests(
@@ -242,9 +246,11 @@ def _rests(
         if smaller.parts:
             smaller = evidence.fit(smaller, 0.0, kept=kept, steps=2, step=MIDDLE).guess
         rest = evidence.judged(smaller, reopened=True) if smaller.parts else base
-        cost = charge(moved_last(fit.information, now.guess, index), hypothesis.size)
+        cost = occam_penalty(moved_last(fit.information, now.guess, index), hypothesis.size)
         score = rest.loss - now.loss - cost
-        if not (worth_naming(now.guess, index, score) and told(now.guess, fit, index)):
+        if not (
+            worth_naming(now.guess, index, score) and differs_significantly(now.guess, fit, index)
+        ):
             score = min(score, 0.0)
         rests.append(rest)
         scores.append(score)

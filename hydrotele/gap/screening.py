@@ -289,7 +289,9 @@ def rattling(
     found = []
     for candidate in candidates:
         axis = candidate.location
-        if candidate.name != _TEETH or not all(shaken(evidence, j, axis) for j in (base, ahead)):
+        if candidate.name != _TEETH or not all(
+            has_unexplained_impacts(evidence, j, axis) for j in (base, ahead)
+        ):
             continue
         whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(evidence.data.machine, axis))
         deviation = _likeliest(evidence, whole)
@@ -299,7 +301,7 @@ def rattling(
     return min(found, key=lambda judged: judged.loss, default=None)
 
 
-def shaken(evidence: Evidence, judged: Judged, axis: str) -> bool:
+def has_unexplained_impacts(evidence: Evidence, judged: Judged, axis: str) -> bool:
     """Whether an axis moves as if hit: with white noise on its rate that a guess does not have."""
     joint = evidence.data.machine.axes[axis].joint
     return rippled_at(judged.tracks[0].levels, f"rate.{joint}", _SHAKEN)

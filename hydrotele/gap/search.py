@@ -19,7 +19,7 @@ import numpy as np
 
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.calibration import CALIBRATION, calibration, numbers
-from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, charge
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.levels import input_excess, noise_prior
 from hydrotele.estimate.track import COARSE, Levels, Track, track_run
@@ -27,13 +27,13 @@ from hydrotele.gap.calibrating import (
     calibrated,
     calibration_of,
     ended,
+    fit_until_settled,
     fitted,
     free_of_calibration,
     loss_of,
     mostly_right,
     polished,
     promoted,
-    settle,
     strained,
     uncalibrated,
     widened,
@@ -43,17 +43,17 @@ from hydrotele.gap.rivals import (
     TOLD,
     Rival,
     better,
+    differs_significantly,
     find_rivals,
     idle,
     is_case_of,
     moved_last,
     plain_form,
     pruned,
-    told,
     without_needless,
     worth_naming,
 )
-from hydrotele.gap.screening import Screened, rattling, screen, shaken, timed
+from hydrotele.gap.screening import Screened, has_unexplained_impacts, rattling, screen, timed
 
 _MUCH = 2.0  # RMS of the errors without unknown inputs, over noise, from which much is lacking
 _TRIED = 5  # candidates that are fitted
@@ -152,7 +152,7 @@ def _option(evidence: Evidence, base: Judged, alone: Judged) -> tuple[Judged, fl
     slopes = evidence.base_slopes(evidence.slope_step)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])
     judged = evidence.judged_from(alone.guess, _sensors(evidence))
-    return judged, base.loss - judged.loss - charge(information, len(information))
+    return judged, base.loss - judged.loss - occam_penalty(information, len(information))
 
 
 def _sensors(evidence: Evidence) -> Levels:
@@ -309,12 +309,16 @@ def _grow(
         if best:
             added = best.guess.parts[-1][0]
             tell(f"fit {added.name.replace('_', ' ')}", done + 0.02)
-            grown, settled = settle(evidence, best)
-            worth = now.loss - grown.loss - settled.charge
+            grown, settled = fit_until_settled(evidence, best)
+            worth = now.loss - grown.loss - settled.occam_penalty
             last = len(grown.guess.parts) - 1
             if moved and best.guess.hypotheses == moved[0].hypotheses:
                 worth = max(worth, moved[1])  # what the number cost is paid already
-            if worth < ENTER or strained(grown.guess, -1) or not told(grown.guess, settled, last):
+            if (
+                worth < ENTER
+                or strained(grown.guess, -1)
+                or not differs_significantly(grown.guess, settled, last)
+            ):
                 evidence.set_base(now)
                 candidates = [c for c in candidates if c.key != added.key]
                 ranked = _others(ranked, [added.key])
@@ -332,7 +336,7 @@ def _grow(
             other, gain = calibrated(evidence, now)
             if other and gain > max(worth, ENTER):
                 best = other
-                grown, settled = settle(evidence, other)
+                grown, settled = fit_until_settled(evidence, other)
             elif best:
                 evidence.set_base(grown)
         if best is None:
@@ -340,7 +344,11 @@ def _grow(
             if roomy or wider.hypotheses == now.guess.hypotheses:
                 break
             tell("calibrate with more room", done + 0.04)
-            (now, fit), ranked, roomy = settle(evidence, evidence.judged(wider)), None, True
+            (now, fit), ranked, roomy = (
+                fit_until_settled(evidence, evidence.judged(wider)),
+                None,
+                True,
+            )
             continue
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = first if ranked is None else ranked
@@ -359,13 +367,13 @@ def _toothed(
     """
     own, _ = teeth.guess.parts[-1]
     known = {hypothesis.key for hypothesis in grown.now.guess.hypotheses}
-    if own.key in known or not shaken(evidence, grown.now, own.location):
+    if own.key in known or not has_unexplained_impacts(evidence, grown.now, own.location):
         return grown
     tell("calibrate with teeth", 0.78)
     evidence.set_base(teeth)
     other, _ = calibrated(evidence, teeth)
     if other is not None:
-        now, fit = settle(evidence, other)
+        now, fit = fit_until_settled(evidence, other)
         begin = replace(grown, now=now, fit=fit, early=(), rankings={own.key: grown.first})
         toothed = _grow(evidence, base, begin, candidates, tell)
         if _total(toothed) < _total(grown):
@@ -387,7 +395,7 @@ def _sparse(
     place = next(i for i, h in enumerate(grown.now.guess.hypotheses) if h.name == CALIBRATION)
     guess, fit, now = grown.now.guess.without(place), None, base
     if guess.parts:
-        now, fit = settle(evidence, evidence.judged(guess))
+        now, fit = fit_until_settled(evidence, evidence.judged(guess))
     else:
         evidence.set_base(base)
     begin = replace(grown, now=now, fit=fit, early=(), calibrates=False)
@@ -421,7 +429,7 @@ def _plain(evidence: Evidence, grown: _Grown, candidates: Sequence[Hypothesis]) 
         parts[index] = (plain, np.clip(np.array([start]), plain.low, plain.high))
         keys = {f"{plain.name}.{plain.location}.{key}" for key in plain.parameters}
         guess = uncalibrated(Guess(tuple(parts)), evidence.data.machine, keys)
-        now, fit = settle(evidence, evidence.judged(guess))
+        now, fit = fit_until_settled(evidence, evidence.judged(guess))
         other = replace(grown, now=now, fit=fit)
         if _total(other) < _total(grown):
             return _plain(evidence, other, candidates)
@@ -433,7 +441,7 @@ def _total(grown: _Grown) -> float:
     """Loss of a guess and what all its numbers cost."""
     if grown.fit is None:
         return grown.now.loss
-    return grown.now.loss + charge(grown.fit.information, len(grown.fit.information))
+    return grown.now.loss + occam_penalty(grown.fit.information, len(grown.fit.information))
 
 
 def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -> Found:
@@ -450,19 +458,21 @@ def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -
         charges, rivals = [], []
         for index, (hypothesis, _) in enumerate(now.guess.parts):
             assert fit
-            charges.append(charge(moved_last(fit.information, now.guess, index), hypothesis.size))
+            charges.append(
+                occam_penalty(moved_last(fit.information, now.guess, index), hypothesis.size)
+            )
             ranked, rest = grown.rankings.get(hypothesis.key, first), without[index]
             rivals.append(find_rivals(evidence, now, index, ranked, rest) if rest else ())
         needless = without_needless(now, charges, rivals)
         if needless is not None:
-            now, fit = settle(evidence, evidence.judged(needless))
+            now, fit = fit_until_settled(evidence, evidence.judged(needless))
     rivals = [[r for r in others if not idle(r)] for others in rivals]
     for index, rest in enumerate(without):
         if rest and (rival := better(now, index, charges[index], rest, rivals[index])):
             assert rival.fit
             old = Rival(now.guess.parts[index][0], now, charges[index], fit)
             others = (r for r in rivals[index] if r is not rival)
-            now, fit, charges[index] = rival.judged, rival.fit, rival.charge
+            now, fit, charges[index] = rival.judged, rival.fit, rival.occam_penalty
             rivals[index] = [old, *others]
             # a rival comes last in its guess
             order = [*(i for i in range(len(without)) if i != index), index]
@@ -485,7 +495,7 @@ def _let_go(evidence: Evidence, now: Judged, moved: tuple[Guess, float]) -> tupl
     guess, gain = moved
     judged = evidence.judged(guess)
     if ended(now.guess):
-        judged, _ = settle(evidence, judged)
+        judged, _ = fit_until_settled(evidence, judged)
         evidence.set_base(now)
         gain += max(0.0, now.loss - judged.loss)
     return judged, gain
@@ -562,7 +572,7 @@ def _judged_best(
 ) -> list[tuple[Judged, float]]:
     """Those fits that bring enough with levels of their own, and their scores, best first."""
     judged = [evidence.judged(fit.guess) for fit in fits]
-    scores = [now.loss - j.loss - fit.charge for j, fit in zip(judged, fits, strict=True)]
+    scores = [now.loss - j.loss - fit.occam_penalty for j, fit in zip(judged, fits, strict=True)]
     found = [(j, score) for j, score in zip(judged, scores, strict=True) if score >= ENTER]
     return sorted(found, key=_score)
 
@@ -603,7 +613,7 @@ def _best_pairs(
         before = loss_of(evidence, now.guess, MIDDLE)
         found = evidence.fit(more, before, parallel=False, step=MIDDLE, kept=kept)
         sizes = sum(h.size for h, _ in more.parts[len(now.guess.parts) :])
-        return Fit(found.guess, found.loss, found.gain, charge(found.information, sizes),
+        return Fit(found.guess, found.loss, found.gain, occam_penalty(found.information, sizes),
                    found.information)  # fmt: skip
 
     first = len(now.guess.parts)

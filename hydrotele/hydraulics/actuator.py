@@ -18,7 +18,7 @@ friction", IEEE Trans. Automatic Control 40(3), Eqs 1-4; Dahl 1968, Aerospace Co
 
 import math
 
-from hydrotele.core.compiled import inlined, lean
+from hydrotele.core.compiled import allocation_free, inlined
 from hydrotele.hydraulics.laws import friction, friction_slope, stop_force
 from hydrotele.hydraulics.parameters import PUMP, Kind, Slot
 from hydrotele.hydraulics.pump import load_force, pump_piston_friction, pump_pressure_rates
@@ -61,7 +61,7 @@ def actuator_friction(user, u, velocity):
     )
 
 
-@lean
+@allocation_free
 def actuator_friction_slope(user, u, velocity):
     """Slope of `actuator_friction` with respect to the velocity.
 
@@ -81,7 +81,7 @@ def actuator_friction_slope(user, u, velocity):
     )  # fmt: skip
 
 
-@lean
+@allocation_free
 def actuator_stop(user, u, position, velocity):
     """Force of the ends of an actuator's travel, and its slopes.
 
@@ -104,7 +104,7 @@ def actuator_stop(user, u, position, velocity):
     )
 
 
-@lean
+@allocation_free
 def pumped_volumes(user, u, x):
     """Volumes of both chambers and the oil that the piston has taken from the accumulator.
 
@@ -127,7 +127,7 @@ def pumped_volumes(user, u, x):
     )
 
 
-@lean
+@allocation_free
 def pumped_rates(user, u, speed, p_head, p_rod, x, v, added):
     """`circuit.pressure_rates` of an axis with a pump of its own.
 
@@ -153,7 +153,7 @@ def pumped_rates(user, u, speed, p_head, p_rod, x, v, added):
     )  # fmt: skip
 
 
-@lean
+@allocation_free
 def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
     """Force of an axis with a pump of its own, after its load cylinder and friction.
 
@@ -179,7 +179,7 @@ def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
     return force - pump_piston_friction(user, u + PUMP, seal, v, force + other, p_load, dt)
 
 
-@lean
+@allocation_free
 def force_after_friction(user, u, push, other, act, velocity, dt):
     """Force of an actuator after its friction, and the damping that this adds to an implicit step.
 
@@ -211,7 +211,7 @@ _STIFF, _DAMP = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE_DAMPING)
 _RESOLVED = 0.5  # (w dt)^2 of a drive on its bristles; an explicit step is stable up to 4
 
 
-@lean
+@allocation_free
 def sliding_level(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
     """Dry friction of a drive that slides, without smoothing of its sign.
 
@@ -237,7 +237,7 @@ def sliding_level(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
     return (coulomb + stribeck * math.exp(-ratio * ratio)) * (sign + asymmetry)
 
 
-@lean
+@allocation_free
 def bristle_step(force, velocity, level, stiffness, dt):
     """Force of the bristles after a time at a held velocity, by the exact exponential.
 
@@ -267,13 +267,13 @@ def bristle_step(force, velocity, level, stiffness, dt):
     return level + (force - level) * math.exp(-stiffness * abs(velocity) * dt / abs(level))
 
 
-@lean
+@allocation_free
 def _level(user, u, velocity):
     """`sliding_level` of an actuator."""
     return sliding_level(velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _AC])
 
 
-@lean
+@allocation_free
 def _followed(user, u, inertia, dt):
     """Stiffness of an actuator's bristles that a step can follow, see `bristle_rate`."""
     stiffness = user[u + _STIFF]
@@ -282,7 +282,7 @@ def _followed(user, u, inertia, dt):
     return stiffness
 
 
-@lean
+@allocation_free
 def bristle_rate(user, u, share, velocity, inertia, dt):
     """Mean rate over a step of the bristles' share of the breakaway force.
 
@@ -306,7 +306,7 @@ def bristle_rate(user, u, share, velocity, inertia, dt):
     return (after - share) / dt
 
 
-@lean
+@allocation_free
 def bristle_friction(user, u, share, velocity, inertia, dt):
     """Friction of a drive with bristles, and its slopes.
 
@@ -341,7 +341,7 @@ def bristle_friction(user, u, share, velocity, inertia, dt):
     return force, damping * bent + slope, _followed(user, u, inertia, dt) * bent
 
 
-@lean
+@allocation_free
 def settled_bristle_friction(user, u, share, velocity, push, inertia, dt):
     """`bristle_friction` at the end of a step of a body that nothing else holds.
 

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from hydrotele.core.compiled import inlined, lean
+from hydrotele.core.compiled import allocation_free, inlined
 from hydrotele.hydraulics.actuator import (
     actuator_friction,
     actuator_friction_slope,
@@ -45,12 +45,12 @@ from hydrotele.hydraulics.supply import (
     ADDED_LAG,
     circuit_supply,
     delivered_share,
+    demanded_share,
     open_ports,
     own_share,
     pump_response,
     supply_coupling,
     supply_pressure,
-    wanted_share,
     with_added,
 )
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
@@ -61,7 +61,7 @@ __all__ = [
     "ACTIVATIONS", "MAX_AXES", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
     "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_state", "chamber_flows",
     "circuit_scratch", "circuit_supply", "delivered_share", "force_after_friction", "open_ports",
-    "pressure_rates", "pumped_force", "step_circuit", "supply_pressure", "wanted_share",
+    "pressure_rates", "pumped_force", "step_circuit", "supply_pressure", "demanded_share",
 ]  # fmt: skip
 
 ACTIVATIONS = 4
@@ -154,7 +154,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     )
 
 
-@lean
+@allocation_free
 def _flows_of_terms(
     terms, i, user, time, x, v, spool, rate, p_head, p_rod, supply, command, drives
 ):
@@ -165,7 +165,7 @@ def _flows_of_terms(
     return added_flows(terms, i, s, drives)
 
 
-@lean
+@allocation_free
 def _delivery_of_terms(user, first, count, terms, act, length, velocity, command, time, supply, dt):
     """Share of the pump's largest flow that the terms add after a step, scalar [1].
 
@@ -189,7 +189,7 @@ def _delivery_of_terms(user, first, count, terms, act, length, velocity, command
     return wanted + (act[at] - wanted) * math.exp(-dt / ADDED_LAG)
 
 
-@lean
+@allocation_free
 def step_circuit(
     user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms=None, time=0.0,
     memory=None,
@@ -249,7 +249,7 @@ def step_circuit(
         p_start = circuit_supply(user, first, count, scratch)
     else:
         p_start = circuit_supply(user, first, count, scratch, delivered_share(user, first, act))
-        begun = wanted_share(user, first, count, scratch)
+        begun = demanded_share(user, first, count, scratch)
         more_delivered = _delivery_of_terms(
             user, first, count, terms, act, length, velocity, command, time, p_start, dt
         )
@@ -292,7 +292,7 @@ def step_circuit(
         p_end = circuit_supply(user, first, count, scratch, share)
         if user[first * SLOTS + _LAG] > 0.0:
             at = int(user[first * SLOTS + _DELIVERY])
-            wanted = 0.5 * (begun + wanted_share(user, first, count, scratch))
+            wanted = 0.5 * (begun + demanded_share(user, first, count, scratch))
             act_dot[at] = (pump_response(user, first, wanted, act[at], dt) - act[at]) / dt
         if user[first * SLOTS + _ADDED] > 0.0:
             at = int(user[first * SLOTS + _ADDED])
@@ -334,7 +334,7 @@ def step_circuit(
     return p_start, p_end
 
 
-@lean
+@allocation_free
 def _relieved(room, rate, quick, dt):
     """Mean rate over a step in which a port relief opens that no stage has seen open [Pa/s].
 
@@ -372,7 +372,7 @@ def _softening_ahead(user, u, pressure, rate, dt):
     return softening(pressure, release, onset)
 
 
-@lean
+@allocation_free
 def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
     """What a supply pressure of 1 Pa more adds to the stage rates of the fed chambers.
 
@@ -414,7 +414,7 @@ def _couple(count, rate, scratch):
             rate[a + 3] -= scratch[f + 2] * pull
 
 
-@lean
+@allocation_free
 def axis_state(user, i, supply, act, x, v, share=0.0):
     """Flows and force of one axis in a state, for logs and balances.
 
@@ -454,7 +454,7 @@ _STEPS = 60  # bisections alone reach rounding in that many
 _ROUNDING = 1.0e-13
 
 
-@lean
+@allocation_free
 def settled_friction(user, u, velocity, push, inertia, dt):
     """Friction at the end of a step of a body that nothing else holds.
 
@@ -497,7 +497,7 @@ def settled_friction(user, u, velocity, push, inertia, dt):
 _AH_DRIVE, _AR_DRIVE, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
 
 
-@lean
+@allocation_free
 def drive_state(user, i, count, act, supply, time, x, v, command, gain):
     """State of one drive, as laws of terms see it.
 
@@ -526,7 +526,7 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
     )
 
 
-@lean
+@allocation_free
 def add_to_commands(user, terms, count, act, command, length, velocity, dt, time, scratch, out):
     """Commands of the valves with their terms, at the middle of a step.
 

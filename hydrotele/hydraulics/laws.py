@@ -7,7 +7,7 @@ Equations: Merritt, *Hydraulic Control Systems* (1967); the set is fixed as the 
 
 import math
 
-from hydrotele.core.compiled import inlined, lean
+from hydrotele.core.compiled import allocation_free, inlined
 
 ATMOSPHERE = 101325.0  # Pa
 _VACUUM = 0.01  # Pa absolute: what is said to be at or below it counts as this
@@ -93,7 +93,7 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
     return 0.0, 0.0
 
 
-@lean
+@allocation_free
 def pressure_with_air(oil, release, onset=0.0):
     """Pressure in a chamber whose oil gives off its dissolved air below atmosphere.
 
@@ -126,7 +126,7 @@ def pressure_with_air(oil, release, onset=0.0):
     return 2.0 * lack * ATMOSPHERE / (b + math.sqrt(b * b + 4.0 * lack * ATMOSPHERE)) - onset
 
 
-@lean
+@allocation_free
 def pressure_without_air(pressure, release, onset=0.0):
     """What a pressure below atmosphere would be if the oil gave off no air.
 
@@ -175,7 +175,7 @@ def softening(pressure, release, onset=0.0):
     return 1.0 / (1.0 + release * ATMOSPHERE / (absolute * absolute))
 
 
-@lean
+@allocation_free
 def holding_share(pressure, pilot, setting, pilot_ratio, override):
     """Share of the outlet that a counterbalance valve leaves open, and its slope.
 
@@ -204,7 +204,7 @@ def holding_share(pressure, pilot, setting, pilot_ratio, override):
     return share, 1.0 / override
 
 
-@lean
+@allocation_free
 def stop_force(position, velocity, low, high, stiffness, damping):
     """Force of an end stop: a spring and a damper that push and never pull.
 
@@ -271,7 +271,7 @@ def friction(
     return dry + viscous * velocity * (1.0 + viscous_asymmetry * way)
 
 
-@lean
+@allocation_free
 def friction_slope(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
@@ -306,11 +306,11 @@ def friction_slope(
     turn = (1.0 - way * way) / coulomb_velocity
     slope = steep * way * (1.0 + coulomb_asymmetry * way)
     slope += dry * turn * (1.0 + 2.0 * coulomb_asymmetry * way)
-    lean = viscous_asymmetry * (way + velocity * turn)
-    return slope + viscous * (1.0 + lean)
+    allocation_free = viscous_asymmetry * (way + velocity * turn)
+    return slope + viscous * (1.0 + allocation_free)
 
 
-@lean
+@allocation_free
 def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.0):
     """One step of the spool `s'' = w^2 (u - s) - 2 z w s'`, `|s'| <= s_max`, with the command held.
 

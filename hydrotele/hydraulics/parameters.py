@@ -158,7 +158,7 @@ def actuator_order(machine: Machine) -> list[str]:
     return [*machine.hydraulic_axes, *(n for n, a in machine.axes.items() if not a.hydraulic)]
 
 
-def memory_names(machine: Machine) -> list[str]:
+def extra_state_names(machine: Machine) -> list[str]:
     """Names of the states that follow the activations of the hydraulic axes, in their order.
 
     `bristle.<axis>` of every hydraulic axis with presliding friction, `delivery.supply` of a pump
@@ -176,7 +176,7 @@ def memory_names(machine: Machine) -> list[str]:
     return names + [f"bristle.{n}" for n in rubbing if not machine.axes[n].hydraulic]
 
 
-def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
+def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
     """`actuator_user` of every axis, in actuator order.
 
     Args:
@@ -186,7 +186,7 @@ def actuator_numbers(machine: Machine) -> dict[str, np.ndarray]:
         Axis name -> (SLOTS,) numbers in SI, placed as `circuit.Slot` says.
     """
     count = len(machine.hydraulic_axes)
-    memory = {name: 4 * count + k for k, name in enumerate(memory_names(machine))}
+    memory = {name: 4 * count + k for k, name in enumerate(extra_state_names(machine))}
     shared = sum(name.partition(".")[2] in ("supply", *machine.hydraulic_axes) for name in memory)
     table = {}
     for name in actuator_order(machine):
@@ -239,7 +239,7 @@ def longest_step(machine: Machine, name: str) -> float:
     >>> longest_step(load_machine("eha", "load_30_bar"), "piston")
     0.002
     """
-    numbers = actuator_numbers(machine)[name]
+    numbers = actuator_parameters(machine)[name]
     block, stroke = numbers[PUMP:], numbers[Slot.STROKE]
     stiffness = np.zeros(2)  # at either end of the stroke
     for area, volume, soft, travel in (

@@ -14,7 +14,7 @@ pressures are above the atmosphere's.
 
 import math
 
-from hydrotele.core.compiled import lean
+from hydrotele.core.compiled import allocation_free
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.parameters import PumpSlot
 
@@ -38,7 +38,7 @@ _VOID_P = PumpSlot.LOAD_VOID_PRESSURE.value
 _RUB, _RETURN = PumpSlot.LOAD_FRICTION.value, PumpSlot.LOAD_RETURN.value
 
 
-@lean
+@allocation_free
 def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
     """Speed of the pump after a step, with the sign of the side that the valve picks.
 
@@ -82,7 +82,7 @@ def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
     return side * max((w + gain * torque) / (1.0 + gain * brake), STALLED)
 
 
-@lean
+@allocation_free
 def switched_speed(speed, after):
     """Speed of a pump at the start of a step, with the side that the valve has over the step.
 
@@ -106,7 +106,7 @@ def switched_speed(speed, after):
     return math.copysign(max(abs(speed), STALLED), after)
 
 
-@lean
+@allocation_free
 def accumulator_pressure(pressure, gas_volume, taken):
     """Pressure of the accumulator after oil has left it, with the gas at constant temperature.
 
@@ -128,7 +128,7 @@ def accumulator_pressure(pressure, gas_volume, taken):
     return (pressure + ATMOSPHERE) * gas_volume / (gas_volume + taken) - ATMOSPHERE
 
 
-@lean
+@allocation_free
 def pump_flows(user, p, speed, p_head, p_rod, taken):
     """Flows of pump and accumulator line into both chambers and their slopes.
 
@@ -160,7 +160,7 @@ def pump_flows(user, p, speed, p_head, p_rod, taken):
     return pumped + line * (gas - p_head), -pumped, -leak - line, -leak
 
 
-@lean
+@allocation_free
 def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
     """Compliance of a chamber: oil, walls, and air that follows Boyle's law.
 
@@ -185,7 +185,7 @@ def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
     return volume / bulk_modulus + compliance + air * ATMOSPHERE / (absolute * absolute)
 
 
-@lean
+@allocation_free
 def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, added):
     """Pressure rates of both chambers of a pump drive and their slopes with their own pressure.
 
@@ -221,7 +221,7 @@ def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, 
     )
 
 
-@lean
+@allocation_free
 def load_pressure_step(user, p, pressure, velocity, dt):
     """Pressure in the load cylinder after a step.
 
@@ -255,7 +255,7 @@ def load_pressure_step(user, p, pressure, velocity, dt):
     return min(risen, user[p + _TOP] + user[p + _OVERRIDE] * area * max(0.0, velocity))
 
 
-@lean
+@allocation_free
 def load_force(user, p, pressure):
     """Force of the load cylinder against extension, without its friction, scalar [N].
 
@@ -264,7 +264,7 @@ def load_force(user, p, pressure):
     return user[p + _AREA] * pressure
 
 
-@lean
+@allocation_free
 def pump_piston_friction(user, p, seal, velocity, push, load_pressure, dt):
     """Friction at the end of a step that holds a piston fast until it is overcome.
 

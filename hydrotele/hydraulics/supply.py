@@ -5,7 +5,7 @@ Flat arrays are laid out as in `circuit`; `ports` holds four numbers per axis, s
 
 import math
 
-from hydrotele.core.compiled import inlined, lean
+from hydrotele.core.compiled import allocation_free, inlined
 from hydrotele.hydraulics.parameters import SLOTS, Kind, Slot
 from hydrotele.hydraulics.valve import axis_opening, inlet_flow, inlet_gain
 
@@ -23,7 +23,7 @@ _ADDED = int(Slot.ADDED_DELIVERY)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
-@lean
+@allocation_free
 def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0):
     """Largest pressure up to the relief setting at which the valves draw no more than the pump.
 
@@ -120,7 +120,7 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
             ports[4 * i + 1] += ahead * rate[4 * i + side]
 
 
-@lean
+@allocation_free
 def delivered_share(user, first, act):
     """Share of its largest flow that the pump gives: 1 where it follows at once, and without terms.
 
@@ -133,7 +133,7 @@ def delivered_share(user, first, act):
     Returns:
         Share, scalar [1].
 
-    Source: `wanted_share`.
+    Source: `demanded_share`.
     """
     s, added = first * SLOTS, 0.0
     if user[s + _ADDED] > 0.0:
@@ -141,7 +141,7 @@ def delivered_share(user, first, act):
     return with_added(own_share(user, first, act), added)
 
 
-@lean
+@allocation_free
 def own_share(user, first, act):
     """As `delivered_share`, without what terms add.
 
@@ -153,7 +153,7 @@ def own_share(user, first, act):
     Returns:
         Share, scalar [1].
 
-    Source: `wanted_share`.
+    Source: `demanded_share`.
     """
     s = first * SLOTS
     if user[s + _LAG] == 0.0:
@@ -161,7 +161,7 @@ def own_share(user, first, act):
     return min(1.0, max(_LEAST_SHARE, act[int(user[s + _DELIVERY])]))
 
 
-@lean
+@allocation_free
 def with_added(share, added):
     """Share of a pump's largest flow with what terms add to it; never none.
 
@@ -177,28 +177,28 @@ def with_added(share, added):
     return max(_LEAST_SHARE, share + added)
 
 
-@lean
+@allocation_free
 def pump_response(user, first, wanted, share, dt):
     """Share of its largest flow that the pump is set to after a time, by the exact exponential.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
         first: index of the first hydraulic actuator.
-        wanted: as of `wanted_share`, held, scalar [1].
+        wanted: as of `demanded_share`, held, scalar [1].
         share: at the start, scalar [1].
         dt: scalar [s].
 
     Returns:
         Share, scalar [1]: 1 where the pump follows at once.
 
-    Source: `wanted_share`.
+    Source: `demanded_share`.
     """
     lag = user[first * SLOTS + _LAG]
     return wanted + (share - wanted) * math.exp(-dt / lag) if lag > 0.0 else 1.0
 
 
-@lean
-def wanted_share(user, first, count, ports):
+@allocation_free
+def demanded_share(user, first, count, ports):
     """Share of its largest flow that the valves draw from a pump that follows at once.
 
     `q = (sum_i q_i + c_p p_s) / Q_pump` at the pressure p_s of such a pump. One with a time
@@ -221,7 +221,7 @@ def wanted_share(user, first, count, ports):
     return min(1.0, drawn_flow(user, first, count, ports, supply) / user[first * SLOTS + _PUMP])
 
 
-@lean
+@allocation_free
 def drawn_flow(user, first, count, ports, supply):
     """Flow that the valves and the pump's own leak take at a supply pressure.
 
@@ -296,7 +296,7 @@ def circuit_supply(user, first, count, ports, share=1.0):
     return supply_pressure(ports, count, user[s + _D], most, flow, user[s + _DROOP])
 
 
-@lean
+@allocation_free
 def supply_coupling(user, first, count, ports, supply, out):
     """How the supply pressure follows the chambers that it feeds.
 

@@ -15,7 +15,7 @@ from hydrotele.identify.motion import (
     Processing,
     Resolution,
     joint_motion,
-    rate_spread,
+    rate_deviations,
 )
 from hydrotele.identify.projection import project
 from hydrotele.identify.record import Record
@@ -196,7 +196,7 @@ def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start:
     given = [chain.index(name) for name in setup.given]
     spread = None
     if rate_std is not None and np.isfinite(rate_std).all():
-        spread = rate_spread(found, given, rate_std)
+        spread = rate_deviations(found, given, rate_std)
     table = regressor(
         chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
         offsets=False if setup.offsets is None else setup.offsets,

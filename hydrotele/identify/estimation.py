@@ -16,7 +16,11 @@ from scipy.signal import lfilter
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.equations import Gathered
-from hydrotele.identify.identifiability import Identifiability, reference_sizes, told_in_noise
+from hydrotele.identify.identifiability import (
+    Identifiability,
+    identifiable_in_noise,
+    reference_sizes,
+)
 from hydrotele.identify.regressor import RUBBING, Regressor, Setup
 
 _ESTIMATE = "estimate"
@@ -382,7 +386,7 @@ def weighted(
     return found
 
 
-def told_by(
+def identifiable_from(
     data: Weighted, structure: Identifiability, setup: Setup, resting: Sequence[str],
     drives: Sequence[str],
 ) -> Identifiability:  # fmt: skip
@@ -412,7 +416,7 @@ def told_by(
     held = {f"{kind}.{drive}" for kind in RUBBING for drive in resting}
     asked = np.array([name not in held for name in table.names])
     rows = (data.matrix / noise[:, None]).reshape(-1, data.matrix.shape[2])
-    told = told_in_noise(rows, table.names, sizes, asked)
+    told = identifiable_in_noise(rows, table.names, sizes, asked)
     if not len(told.base):
         raise InputError(_WHERE, "these data tell no parameter: log a motion with larger forces")
     return told

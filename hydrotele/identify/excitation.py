@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.identify.identifiability import reference_sizes, told_in_noise
+from hydrotele.identify.identifiability import identifiable_in_noise, reference_sizes
 from hydrotele.identify.projection import Projection, project
 from hydrotele.identify.regressor import Setup, regressor
 from hydrotele.machine.machine import Machine
@@ -142,7 +142,9 @@ def informative_base(
     forces = np.sqrt(np.mean((table.matrix @ table.nominal) ** 2, axis=0))
     flat = (table.matrix / noise[:, None]).reshape(-1, len(table.names))
     asked = np.ones(len(table.names), bool)
-    return told_in_noise(flat, table.names, reference_sizes(table, setup, forces), asked).base
+    return identifiable_in_noise(
+        flat, table.names, reference_sizes(table, setup, forces), asked
+    ).base
 
 
 def design_excitation(

@@ -15,7 +15,7 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
-from hydrotele.estimate.evidence import Evidence, Fit, spreads
+from hydrotele.estimate.evidence import Evidence, Fit, standard_deviations
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.stretches import busiest
 from hydrotele.estimate.track import Levels, known_levels, track_run
@@ -120,7 +120,7 @@ def identify_hydraulics(
         fit, settled = _fitted(evidence, guess, say)
         evidence.set_base(fit.guess)
         say("intervals", 0.9)
-        std = spreads(evidence, fit.guess)
+        std = standard_deviations(evidence, fit.guess)
         levels = Levels(evidence.tracks[0].levels.noise)
     finally:
         evidence.close()

@@ -105,7 +105,7 @@ def identifiability(
     )  # fmt: skip
 
 
-def told_in_noise(
+def identifiable_in_noise(
     matrix: np.ndarray, names: Sequence[str], sizes: np.ndarray, asked: np.ndarray
 ) -> Identifiability:
     """What noisy data tell: parameters that they tell to better than half of their own sizes.

@@ -36,7 +36,7 @@ from hydrotele.identify.estimation import (
     Estimate,
     Estimator,
     Weighted,
-    told_by,
+    identifiable_from,
     weighted,
     weights,
 )
@@ -437,7 +437,7 @@ def fit_runs(
     still = ~np.any([part.moves for part in resolved], axis=0)
     resting = [d for d, stands in zip(data.table.drives, still, strict=True) if stands]
     equations = weighted(data, structure, estimator.method, processing.period)
-    told = told_by(equations, structure, setup, resting, data.drives)
+    told = identifiable_from(equations, structure, setup, resting, data.drives)
     found = equations.fitted(told, estimator.ridge, estimator.cut)
     return Fitted(data, processing, equations, structure, told, found, still)
 

@@ -272,7 +272,7 @@ def _filtered(
     )  # fmt: skip
 
 
-def rate_spread(found: Projection, given: list[int], rate_std: np.ndarray) -> np.ndarray:
+def rate_deviations(found: Projection, given: list[int], rate_std: np.ndarray) -> np.ndarray:
     """Standard deviations of all joints' rates.
 
     Args:

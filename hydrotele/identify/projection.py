@@ -17,60 +17,60 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import compiled, lean
+from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.identify.chain import Chain
 
 
-@lean
+@allocation_free
 def vector(rows, k):
     """Row k of (n, 3) rows as a tuple (x, y, z)."""
     return rows[k, 0], rows[k, 1], rows[k, 2]
 
 
-@lean
+@allocation_free
 def put(rows, k, a):
     """Write a tuple (x, y, z) into row k of (n, 3) rows."""
     rows[k, 0], rows[k, 1], rows[k, 2] = a
 
 
-@lean
+@allocation_free
 def add(a, b):
     """Sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@lean
+@allocation_free
 def less(a, b):
     """Difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@lean
+@allocation_free
 def times(s, a):
     """A vector times a number."""
     return s * a[0], s * a[1], s * a[2]
 
 
-@lean
+@allocation_free
 def dot(a, b):
     """Scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@lean
+@allocation_free
 def cross(a, b):
     """Vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@lean
+@allocation_free
 def swept(w, dw, arm):
     """Acceleration `dw x r + w x (w x r)` of a point at an arm r of a turning body."""
     return add(cross(dw, arm), cross(w, cross(w, arm)))
 
 
-@lean
+@allocation_free
 def rotation(rows, k):
     """Matrix k of (n, 3, 3) as three row vectors."""
     m = rows[k]
@@ -79,7 +79,7 @@ def rotation(rows, k):
     )  # fmt: skip
 
 
-@lean
+@allocation_free
 def put_rotation(rows, k, r):
     """Write three row vectors into matrix k of (n, 3, 3)."""
     m = rows[k]
@@ -88,25 +88,25 @@ def put_rotation(rows, k, r):
     m[2, 0], m[2, 1], m[2, 2] = r[2]
 
 
-@lean
+@allocation_free
 def turned(r, a):
     """A vector turned by a rotation."""
     return dot(r[0], a), dot(r[1], a), dot(r[2], a)
 
 
-@lean
+@allocation_free
 def turned_back(r, a):
     """A vector turned by the inverse of a rotation."""
     return add(add(times(a[0], r[0]), times(a[1], r[1])), times(a[2], r[2]))
 
 
-@lean
+@allocation_free
 def after(r, s):
     """The rotation that first does s, then r."""
     return turned_back(s, r[0]), turned_back(s, r[1]), turned_back(s, r[2])
 
 
-@lean
+@allocation_free
 def about(axis, angle):
     """Rotation about a unit axis by an angle [rad] (Rodrigues)."""
     c, s = math.cos(angle), math.sin(angle)
@@ -122,7 +122,7 @@ def about(axis, angle):
 _STIFF = 1e-7  # least ratio of a column's own part to the largest column; below, rank is lacking
 
 
-@lean
+@allocation_free
 def factor(matrix, columns, q, r):
     """QR of chosen columns by modified Gram-Schmidt, twice; False if they lack rank."""
     rows, count, size = len(matrix), len(columns), 0.0
@@ -154,7 +154,7 @@ def factor(matrix, columns, q, r):
     return True
 
 
-@lean
+@allocation_free
 def least(q, r, count, right, column, answer, k):
     """Least squares after `_factor`, of one column of the right side into one of the answer."""
     for j in range(count - 1, -1, -1):
@@ -201,7 +201,7 @@ def new_frames(tree):
     )  # fmt: skip
 
 
-@lean
+@allocation_free
 def move_tree(tree, q, rate, acceleration, ground, frames):
     """Place and move all bodies, from (v,) positions, rates, accelerations; ground: (3,)."""
     put(frames.place, 0, (0.0, 0.0, 0.0))
@@ -242,14 +242,14 @@ def move_tree(tree, q, rate, acceleration, ground, frames):
         put(frames.pull, b, a)
 
 
-@lean
+@allocation_free
 def point_column(tree, frames, j, point):
     """Velocity of a point per unit rate of a joint that moves it."""
     way = vector(frames.axis, j)
     return way if tree.slides[j] else cross(way, less(point, vector(frames.anchor, j)))
 
 
-@lean
+@allocation_free
 def gaps(tree, frames, gap, slope):
     """How far closures gape (3 c, 1), and its slopes (3 c, v)."""
     slope[:, :] = 0.0
@@ -268,8 +268,8 @@ def gaps(tree, frames, gap, slope):
                         slope[3 * c + k, j] += sign * column[k]
 
 
-@lean
-def parting(tree, frames, out):
+@allocation_free
+def closure_acceleration(tree, frames, out):
     """Acceleration (3 c, 1) with which closures part."""
     out[:, 0] = 0.0
     for c in range(len(tree.ends)):
@@ -282,7 +282,7 @@ def parting(tree, frames, out):
                 out[3 * c + k, 0] += sign * part[k]
 
 
-@lean
+@allocation_free
 def wrenches(frames, body, forces, torques):
     """Force and torque (3, 10) at a body's origin per unit of an inertial parameter, in the world.
 
@@ -470,7 +470,7 @@ def _project(
                 rate[j] += moves[j, i] * rates[row, i]
         if hidden:
             move_tree(tree, q, rate, still, none, frames)
-            parting(tree, frames, gap)
+            closure_acceleration(tree, frames, gap)
             least(q_factor, r_factor, hidden, gap, 0, part, 0)
             for o in range(hidden):
                 acceleration[others[o]] = -part[o, 0]
@@ -522,7 +522,7 @@ def _start_slope(tree, q):
     return slope
 
 
-@lean
+@allocation_free
 def _close(tree, q, others, still, none, frames, gap, slope, q_factor, r_factor, part):
     """Close the loops near a position; False if that fails or leads to another branch."""
     for _ in range(_ROUNDS):
@@ -545,7 +545,7 @@ def _close(tree, q, others, still, none, frames, gap, slope, q_factor, r_factor,
     return False
 
 
-@lean
+@allocation_free
 def _load(tree, frames, body, forces, torques, share, out):
     """Carry a body's wrench through the joints that move it to the drives."""
     first, point = 10 * (body - 1), vector(frames.place, body)
@@ -566,7 +566,7 @@ def _load(tree, frames, body, forces, torques, share, out):
                 out[i, first + m] += share[i, j] * effort
 
 
-@lean
+@allocation_free
 def _rub(tree, frames, closure, share, out):
     """Carry viscous friction in a closure to the drives; return the rate of its turning."""
     one, two = tree.ends[closure, 0], tree.ends[closure, 1]

@@ -31,7 +31,7 @@ _NODES, _WEIGHTS = hermegauss(21)  # a sign that is blurred tenfold is then aver
 
 
 @dataclass(frozen=True)
-class Rubbing:
+class FrictionTerm:
     """Friction at one place, linear in its parameters.
 
     `(coulomb + stribeck exp(-(v/v_s)^2)) way + viscous v`, plus a part of each in which `way` or
@@ -77,7 +77,7 @@ class Regressor:
 
 def regressor(
     chain: Chain, found: Projection, drives: Sequence[str] | None = None,
-    bodies: Sequence[str] | None = None, rubbing: Sequence[Rubbing] = (),
+    bodies: Sequence[str] | None = None, rubbing: Sequence[FrictionTerm] = (),
     offsets: Mapping[str, float] | bool = True, drive_inertia: Sequence[str] = (),
     rate_std: np.ndarray | None = None,
 ) -> Regressor:  # fmt: skip
@@ -126,7 +126,7 @@ def regressor(
         column = found.share[:, :, j] * found.acceleration[:, None, j]
         add(column, f"drive_inertia.{joint}", unit, chain.armature[j])
     for one in rubbing:
-        for kind, (column, unit) in _rubbing(chain, found, one, rate_std).items():
+        for kind, (column, unit) in _friction_terms(chain, found, one, rate_std).items():
             add(column, f"{kind}.{one.place}", unit, one.nominal[kind])
     given = offsets if isinstance(offsets, Mapping) else {}
     for i, drive in enumerate(drives if offsets is not False else ()):
@@ -139,7 +139,7 @@ def regressor(
 
 
 def sign_doubt(
-    chain: Chain, found: Projection, drives: Sequence[str], rubbing: Sequence[Rubbing],
+    chain: Chain, found: Projection, drives: Sequence[str], rubbing: Sequence[FrictionTerm],
     rate_std: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """How uncertain it is on which side of zero the rates of the drives are.
@@ -166,7 +166,9 @@ def sign_doubt(
     return out
 
 
-def _rubbing(chain: Chain, found: Projection, one: Rubbing, rate_std: np.ndarray | None):
+def _friction_terms(
+    chain: Chain, found: Projection, one: FrictionTerm, rate_std: np.ndarray | None
+):
     """Parameter -> (column (n, k), unit)."""
     strange = [kind for kind in one.nominal if kind not in RUBBING]
     if strange:
@@ -188,7 +190,7 @@ def _rubbing(chain: Chain, found: Projection, one: Rubbing, rate_std: np.ndarray
     }
 
 
-def _shape(one: Rubbing, kind: str, velocity: np.ndarray) -> np.ndarray:
+def _shape(one: FrictionTerm, kind: str, velocity: np.ndarray) -> np.ndarray:
     """Friction per unit of a parameter at velocities of any shape."""
     if kind == "viscous":
         return velocity
@@ -201,7 +203,7 @@ def _shape(one: Rubbing, kind: str, velocity: np.ndarray) -> np.ndarray:
     return side
 
 
-def _pin(closure: int, found: Projection, one: Rubbing):
+def _pin(closure: int, found: Projection, one: FrictionTerm):
     """Friction between the bodies of a closure, against the axis about which they turn."""
     twist, share = found.twist[:, closure], found.pins[:, :, closure]
     floor = one.smoothing or np.finfo(float).tiny
@@ -217,7 +219,7 @@ def _pin(closure: int, found: Projection, one: Rubbing):
     }
 
 
-def drive_friction(machine: Machine, chain: Chain) -> list[Rubbing]:
+def drive_friction(machine: Machine, chain: Chain) -> list[FrictionTerm]:
     """Friction of all drives, with the machine's numbers.
 
     Coulomb and viscous parts are always there; the Stribeck part and the asymmetries
@@ -234,7 +236,7 @@ def drive_friction(machine: Machine, chain: Chain) -> list[Rubbing]:
     Source: nominal model, "Piston force", without the speeds that make it nonlinear.
     """
     return [
-        Rubbing(joint, _numbers(f), f.smoothing_velocity, f.stribeck_velocity)
+        FrictionTerm(joint, _numbers(f), f.smoothing_velocity, f.stribeck_velocity)
         for joint, f in zip(
             chain.drives, (machine.axes[a].drive.friction for a in actuator_order(machine)),
             strict=True,
@@ -242,7 +244,7 @@ def drive_friction(machine: Machine, chain: Chain) -> list[Rubbing]:
     ]  # fmt: skip
 
 
-def pin_friction(chain: Chain) -> list[Rubbing]:
+def pin_friction(chain: Chain) -> list[FrictionTerm]:
     """Coulomb friction of all passive hinges and closures.
 
     Args:
@@ -255,7 +257,7 @@ def pin_friction(chain: Chain) -> list[Rubbing]:
     """
     slides = chain.tree.slides
     hinges = [j for k, j in enumerate(chain.joints) if not slides[k] and j not in chain.drives]
-    return [Rubbing(place, {"coulomb": 0.0}) for place in (*hinges, *chain.closures)]
+    return [FrictionTerm(place, {"coulomb": 0.0}) for place in (*hinges, *chain.closures)]
 
 
 def _numbers(f: Friction) -> dict[str, float]:
@@ -287,7 +289,7 @@ class Setup:
     chain: Chain
     given: tuple[str, ...]
     bodies: tuple[str, ...]
-    rubbing: tuple[Rubbing, ...]
+    rubbing: tuple[FrictionTerm, ...]
     offsets: Mapping[str, float] | None = field(default_factory=dict)
     drive_inertia: tuple[str, ...] = ()
 

@@ -19,7 +19,7 @@ REACHED, BEYOND, SINGULAR = range(3)
 _STRAIGHT = 1e-3  # sine of the elbow below which rates are not solved for
 
 
-def task_numbers(geometry: ArmGeometry | FellerGeometry) -> np.ndarray:
+def arm_parameters(geometry: ArmGeometry | FellerGeometry) -> np.ndarray:
     """Numbers (9,) of an arm for the functions below [m], [rad].
 
     Args:
@@ -51,7 +51,7 @@ def task_forward(g, q, pose):
     """Pose of the tip.
 
     Args:
-        g: (9,) of `task_numbers`.
+        g: (9,) of `arm_parameters`.
         q: (k,) swing, boom, stick and, if driven, tool and head angle [rad]; k is 3, 4 or 5.
         pose: (5,) written: r [m], theta [rad], z [m], attitude [rad], head [rad]; what the arm has
             not is 0, but the attitude, which is that of the last link.
@@ -82,7 +82,7 @@ def task_inverse(g, pose, near, q):
     """Joint angles for a pose, with the elbow above and the tip ahead.
 
     Args:
-        g: (9,) of `task_numbers`.
+        g: (9,) of `arm_parameters`.
         pose: (5,) as `task_forward` writes it.
         near: swing angle of now, scalar [rad]: the turn nearest to it is taken.
         q: (k,) written, unless the pose is out of reach [rad].
@@ -124,7 +124,7 @@ def task_rates(g, q, pose, rate, out):
     """Joint rates for a rate of the pose.
 
     Args:
-        g: (9,) of `task_numbers`.
+        g: (9,) of `arm_parameters`.
         q: (k,) joint angles [rad].
         pose: (5,) of these angles.
         rate: (5,) of the pose [m/s], [rad/s].
@@ -167,7 +167,7 @@ def task_jacobian(g, q, out):
     """Derivative of `task_forward` by the joint angles.
 
     Args:
-        g: (9,) of `task_numbers`.
+        g: (9,) of `arm_parameters`.
         q: (k,) joint angles [rad].
         out: (k, k) written: d (r, theta, z, attitude, head) / d q, the first k rows [m/rad], [1].
 

@@ -467,7 +467,7 @@ class _Data(NamedTuple):
         return channel_sensor(self.machine, self.sensors, channel)
 
 
-def mend(
+def remove_faults(
     machine: Machine, sensors: SensorSet | None, axes: Sequence[str], channels: Sequence[str],
     noise: np.ndarray, runs: Mapping[str, Rows],
 ) -> tuple[dict[str, Rows], tuple[str, ...]]:  # fmt: skip

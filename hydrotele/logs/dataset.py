@@ -19,7 +19,7 @@ import numpy as np
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.logs.cleaning import check_range, mend
+from hydrotele.logs.cleaning import check_range, remove_faults
 from hydrotele.logs.files import RunFiles, check_commands, read_runs
 from hydrotele.logs.log import Log
 from hydrotele.logs.rows import Masked, Rows, averaged, check_runs, cut, read_mask, run_rows
@@ -464,7 +464,7 @@ def make_dataset(
     known, notes = stated_sensors(files, machine, sensors)
     noise = np.array([channel_noise(machine, known, channel) for channel in channels])
     runs, origin, said = _runs(files, machine, axes, channels, masks)
-    mended, more = mend(machine, known, axes, channels, noise, runs)
+    mended, more = remove_faults(machine, known, axes, channels, noise, runs)
     notes += unknown_columns(files, machine) + said + list(more)
     notes += still_channels(mended, channels, noise)
     kept = np.array([any(np.isfinite(rows.reading[:, column]).any() for rows in mended.values())

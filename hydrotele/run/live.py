@@ -227,7 +227,7 @@ def drive(
     hand.span = station.span
     status, told = _status_of(session, further), _Told(session, say)
     while session.tick < session.scenario.ticks:
-        if session.tick % station.person.every == 0:
+        if session.tick % station.operator.every == 0:
             reading = device.read(session.time)
             if reading.said:
                 say(reading.said)

@@ -32,7 +32,7 @@ from hydrotele.simulate.drive_side import flexible_axes
 from hydrotele.simulate.feedback import Feedback, feedback, measure
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import Record, late_channels, true_channels
-from hydrotele.teleop.person import Hand
+from hydrotele.teleop.operator_model import Hand
 from hydrotele.teleop.station import Station, StationLog
 
 _VACUUM = -1.0e5  # Pa below the atmosphere, as far as pressure can fall

@@ -13,7 +13,7 @@ import numpy as np
 
 from hydrotele.control.feedforward import force_references
 from hydrotele.control.plan import Plan
-from hydrotele.control.servo import drive_references, servo_numbers, servo_step
+from hydrotele.control.servo import drive_references, servo_parameters, servo_step
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Scenario
@@ -25,7 +25,7 @@ from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
 from hydrotele.simulate.stepping import DelayLine, Stepper
 from hydrotele.simulate.surroundings import Surroundings
-from hydrotele.teleop.person import Hand
+from hydrotele.teleop.operator_model import Hand
 from hydrotele.teleop.station import Station
 
 
@@ -95,7 +95,7 @@ class Session:
         self.start, self.line = full_state(plant.model, data), DelayLine(plant, data.ctrl)
         self._plan, self._dt = plan, 1.0 / scenario.control_rate
         self.every = round(scenario.control_rate / scenario.log_rate)
-        self._numbers = servo_numbers(plant.machine, plant.axes, scenario.servo, self._dt)
+        self._numbers = servo_parameters(plant.machine, plant.axes, scenario.servo, self._dt)
         self._drives = drive_references(plant.machine, plan, scenario.servo)
         self._forces = force_references(nominal, plan, scenario.servo)
         k, ticks = len(plant.axes), scenario.ticks

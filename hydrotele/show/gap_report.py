@@ -15,9 +15,8 @@ import yaml
 
 import hydrotele
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.customary import amount, customary, said
+from hydrotele.gap.customary import amount, customary, in_customary_units
 from hydrotele.gap.description import (
-    chance_words,
     channel_words,
     effect_title,
     gap_closed,
@@ -27,6 +26,7 @@ from hydrotele.gap.description import (
     learned_title,
     most_moved,
     number_title,
+    probability_text,
     share_words,
     variable_words,
     verdict_words,
@@ -86,8 +86,11 @@ def law_table(
     """Balance residuals by law and place, in multiples of what noise alone would give."""
     places = list(dict.fromkeys(place for by_place in laws.values() for place in by_place))
     keys = ("before", "after") if changed else ("before",)
-    said = {"before": "as given", "after": "patched"}
-    head = ["law", *(Markup(tag("b", p) + tag("small", said[k])) for p in places for k in keys)]
+    heading = {"before": "as given", "after": "patched"}
+    head = [
+        "law",
+        *(Markup(tag("b", p) + tag("small", heading[k])) for p in places for k in keys),
+    ]
     rows = []
     for law, by_place in laws.items():
         cells: list[object] = [Markup(tag("b", law) + tag("small", law_words(law)))]
@@ -125,7 +128,7 @@ def calibration_table(gap: Gap) -> Markup:
     rows = []
     for key in most_moved(gap):
         estimate = gap.calibration[key]
-        s = said(estimate, key)
+        s = in_customary_units(estimate, key)
         rows.append((number_title(key), s.nominal, s.value, f"{s.low} to {s.high}", s.unit,
                      interval(estimate)))  # fmt: skip
     head = ("number", "model had", "found", "95 % interval", "unit", "model and found, to scale")
@@ -423,11 +426,11 @@ def _found(gap: Gap) -> Markup:
     rows = []
     for effect in gap.effects:
         for name, estimate in effect.parameters.items():
-            s = said(estimate, name)
+            s = in_customary_units(estimate, name)
             what = tag("b", effect_title(effect))
             rows.append((
                 what, name.replace("_", " "), s.nominal, s.value, f"{s.low} to {s.high}", s.unit,
-                interval(estimate), chance_words(effect.probability), share_words(effect.share),
+                interval(estimate), probability_text(effect.probability), share_words(effect.share),
             ))  # fmt: skip
     head = ("effect", "parameter", "model had", "found", "95 % interval", "unit",
             "model and found, to scale", "probability", "share of the gap")  # fmt: skip
@@ -546,7 +549,11 @@ def _next(gap: Gap) -> Markup:
     parts = []
     if rivals:
         rows = [
-            (effect_title(e), effect_title(a), *map(chance_words, (e.probability, a.probability)))
+            (
+                effect_title(e),
+                effect_title(a),
+                *map(probability_text, (e.probability, a.probability)),
+            )
             for e, a in rivals
         ]
         head = ("in the patched model", "could also be", "probability", "of the other")

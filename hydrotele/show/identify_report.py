@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import hydrotele
-from hydrotele.gap.customary import amount, said
+from hydrotele.gap.customary import amount, in_customary_units
 from hydrotele.gap.result import Estimate
 from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.hydraulic import Hydraulics
@@ -169,7 +169,7 @@ def _parameters(found: Identification) -> Markup:
         if row.value is None or row.ci95 is None:
             continue
         estimate = Estimate(row.value, row.unit, *row.ci95, row.nominal)
-        s = said(estimate)
+        s = in_customary_units(estimate)
         rows.append((
             Markup(tag("b", row.name) + tag("small", _short(row.combination))), s.nominal, s.value,
             f"{s.low} to {s.high}", s.unit, interval(estimate), row.status,
@@ -224,7 +224,7 @@ def _hydraulics(found: Hydraulics) -> Markup:
     rows = []
     for n in found.numbers:
         estimate = Estimate(n.value, n.unit, *n.ci95, n.nominal)
-        s = said(estimate, n.parameter)
+        s = in_customary_units(estimate, n.parameter)
         cells = (s.value, f"{s.low} to {s.high}") if n.told else ("not told", "")
         drawn = interval(estimate) if n.told else Markup("")
         rows.append(

@@ -12,7 +12,7 @@ from hydrotele.machine.machine import Machine
 from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.closure import follow_loops, following_joints
 from hydrotele.simulate.mechanism import assemble, mjcf_document
-from hydrotele.simulate.surroundings import thing_joints
+from hydrotele.simulate.surroundings import object_joints
 
 _THINGS = TypeAdapter(list[Thing])
 
@@ -85,7 +85,7 @@ def logged_surroundings(log: Log) -> tuple[Thing, ...]:
 
 def _place_things(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
     """Put plates, trees and logs where a log of truth has them; `rows` (n, nq) is written."""
-    for joint, place in thing_joints(model):
+    for joint, place in object_joints(model):
         name, kind = model.joint(joint).name, model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             for k, letter in enumerate("xyz"):

@@ -28,10 +28,10 @@ from hydrotele.teleop.analysis import stability_map
 from hydrotele.teleop.findings import (
     Findings,
     ScenarioFindings,
-    said_delay,
-    said_error,
-    said_factor,
-    said_size,
+    format_delay,
+    format_error,
+    format_factor,
+    format_number,
     why_unstable,
 )
 from hydrotele.teleop.switching import Spring, growth_map
@@ -333,7 +333,7 @@ def _verdicts(found: Findings) -> Markup:
     rows = []
     for one in found.analyses:
         name = Markup(tag("b", plain_name(one.structure)) + tag("small", _CHANNELS[one.structure]))
-        margin, delay = said_factor(one.gain_margin), said_delay(one.largest_delay)
+        margin, delay = format_factor(one.gain_margin), format_delay(one.largest_delay)
         rows.append((name, _yes(one.stable, why_unstable(one)), margin, delay,
                      f"{one.scattering.max():.3g}", _yes(one.passive, "no")))  # fmt: skip
     head = ("structure", "stable", "gain margin", "largest delay", "scattering norm", "passive")
@@ -353,7 +353,7 @@ def _verdicts(found: Findings) -> Markup:
 def _confirmed(found: Findings) -> Markup:
     rows = []
     for one in found.agreements:
-        errors = [said_error(s.error) for s in found.sweeps if s.structure == one.structure]
+        errors = [format_error(s.error) for s in found.sweeps if s.structure == one.structure]
         cells = f"{int((one.predicted == one.seen).sum())} of {one.seen.size}"
         rows.append((tag("b", plain_name(one.structure)), *[*errors, "-"][:2], cells))
     head = ("in simulation", "felt, no delay", "felt, with delay", "cells of the map that agree")
@@ -412,7 +412,7 @@ def _hybrid(found: Findings) -> Markup:
 def _stiffness(spring: Spring, held: Spring) -> Markup:
     rows = [
         (tag("b", name), f"{one.mass:.3g}", f"{one.damping:.4g}", f"{one.least:g} to {one.most:g}",
-         said_size(one.margin), f"{one.enough_damping:.4g}", f"{one.growth:.3g}")
+         format_number(one.margin), f"{one.enough_damping:.4g}", f"{one.growth:.3g}")
         for name, one in (("held", held), ("let go", spring))
     ]  # fmt: skip
     head = ("joystick", "M [kg]", "B [N s/m]", "K [N/m]", "B² - 4 M K_max", "B that it asks for",
@@ -517,7 +517,7 @@ def write_loop_report(
     """
     rows = [(tag("b", what), value, remark) for what, value, remark in said]
     springs = [
-        (tag("b", name), f"{one.damping:g}", f"{one.most:g}", said_size(one.margin),
+        (tag("b", name), f"{one.damping:g}", f"{one.most:g}", format_number(one.margin),
          f"{one.enough_damping:.4g}", f"{one.growth:.3g}")
         for name, one in (("held", found.held), ("let go", found.free))
     ]  # fmt: skip

@@ -27,7 +27,7 @@ from hydrotele.core.datafile import Vector
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import check_assets, read_xml
 from hydrotele.hydraulics.circuit import ACTIVATIONS
-from hydrotele.hydraulics.parameters import SLOTS, Slot, actuator_numbers, actuator_order
+from hydrotele.hydraulics.parameters import SLOTS, Slot, actuator_order, actuator_parameters
 from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
 from hydrotele.machine.drives import Axis, Cylinder, Pin
 from hydrotele.machine.machine import Link, Machine
@@ -371,7 +371,7 @@ def _connect(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
 
 
 def _write_actuators(root, machine: Machine) -> None:
-    for name, numbers in actuator_numbers(machine).items():
+    for name, numbers in actuator_parameters(machine).items():
         axis: Axis = machine.axes[name]
         actuator = root.actuator.add(
             "general", name=name, user=numbers, biastype="user",

@@ -23,7 +23,7 @@ from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.core.compiled import callback, compiled, lean
+from hydrotele.core.compiled import allocation_free, callback, compiled
 from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate, settled_bristle_friction
 from hydrotele.hydraulics.circuit import (
     MAX_AXES,
@@ -144,14 +144,14 @@ def _state(
     return s, Drives(count, act, lengths, velocities, commands)
 
 
-@lean
+@allocation_free
 def _advance_force_drive(user, u, act, rate, velocity, command, low, high, dt):
     """Rates of the two activations of a force drive with bristles; the second is the command."""
     rate[0] = bristle_rate(user, u, act[0], velocity, user[u + _FELT], dt)
     rate[1] = (min(high, max(low, command)) - act[1]) / dt
 
 
-@lean
+@allocation_free
 def _advance_with_memory(
     user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time
 ):
@@ -167,7 +167,7 @@ def _advance_with_memory(
             act_dot[at] = bristle_rate(user, u, act[at], velocity[i], user[u + _FELT], dt)
 
 
-@lean
+@allocation_free
 def _sound(user, first, count, nu, free):
     """Whether the numbers of a group of axes index nothing that is not there.
 
@@ -194,7 +194,7 @@ def _sound(user, first, count, nu, free):
     return True
 
 
-@lean
+@allocation_free
 def _given(command, k):
     """Command of actuator k; 0 where any is NaN, as MuJoCo has it, which also warns."""
     for value in command:

@@ -23,7 +23,7 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air
-from hydrotele.hydraulics.parameters import Slot, actuator_order, memory_names
+from hydrotele.hydraulics.parameters import Slot, actuator_order, extra_state_names
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
@@ -260,9 +260,9 @@ def build_plant(
 
 
 def _memory(machine: Machine, model: mujoco.MjModel) -> dict[str, int]:
-    """Activations of what `memory_names` lists; a force drive's bristles have one of their own."""
+    """Activations of what `extra_state_names` lists; bristles of force drives have their own."""
     places, first = {}, ACTIVATIONS * len(machine.hydraulic_axes)
-    for k, name in enumerate(memory_names(machine)):
+    for k, name in enumerate(extra_state_names(machine)):
         axis = machine.axes.get(name.partition(".")[2]) if name.startswith("bristle.") else None
         force = axis is not None and axis.force is not None
         places[name] = int(model.actuator(name[8:]).actadr[0]) if force else first + k

@@ -33,7 +33,7 @@ from hydrotele.machine.machine import Machine
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.mechanism import TIP_SITE
 from hydrotele.simulate.plant import Plant
-from hydrotele.simulate.surroundings import is_thing, thing_joints
+from hydrotele.simulate.surroundings import is_surrounding_object, object_joints
 from hydrotele.simulate.term_readout import added_by_terms
 
 Lag = tuple[float, float]  # delay and time constant of a sensor [s]
@@ -199,7 +199,7 @@ class Recorder:
 def surrounding_bodies(plant: Plant) -> np.ndarray:
     """Whether each body (nbody,) is the ground, fixed to it or one of the things around."""
     model = plant.model
-    named = [is_thing(model.body(b).name) for b in range(model.nbody)]
+    named = [is_surrounding_object(model.body(b).name) for b in range(model.nbody)]
     return (model.body_weldid == 0) | (np.array(named) & bool(plant.surroundings))
 
 
@@ -377,7 +377,7 @@ def _hidden(plant: Plant, record: Record):
 
 def _put_things(plant: Plant, record: Record, put) -> None:
     """Where plates, trees and logs are; turning as a rotation vector."""
-    for joint, place in thing_joints(plant.model):
+    for joint, place in object_joints(plant.model):
         name, kind = plant.model.joint(joint).name, plant.model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             for letter, column in zip("xyz", record.qpos[:, place : place + 3].T, strict=True):

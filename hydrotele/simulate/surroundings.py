@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from hydrotele.core.compiled import lean
+from hydrotele.core.compiled import allocation_free
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
@@ -30,7 +30,7 @@ ROW = 11  # numbers of a weld in `eq_data`
 LET_GO, UNCHANGED, TAKEN = -1, 0, 1
 
 
-def grip_numbers(
+def grip_parameters(
     closed: float, open: float, line: int, straight: float, centre: Sequence[float],
     half: Sequence[float], own: int, reach: tuple[float, float] = (-math.inf, math.inf),
 ) -> np.ndarray:  # fmt: skip
@@ -52,7 +52,7 @@ def grip_numbers(
     return np.array([closed, open, line, math.cos(straight), *centre, *half, own, *reach], float)
 
 
-@lean
+@allocation_free
 def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle, held, row):
     """Whether a grab takes or lets go of a thing, and how it is then welded to it.
 
@@ -61,7 +61,7 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
     the thing's length.
 
     Args:
-        grip: (GRIP,) of `grip_numbers`.
+        grip: (GRIP,) of `grip_parameters`.
         hand_position: (3,) of the grab's body, `xpos` [m].
         hand_quaternion: (4,) `xquat`.
         position: (3,) of the thing's body [m].
@@ -113,7 +113,7 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
     return TAKEN
 
 
-@lean
+@allocation_free
 def _turned(w, x, y, z, vx, vy, vz):
     """A vector turned by a unit quaternion."""
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
@@ -279,14 +279,16 @@ def _write_tree(root, name: str, tree: Tree, machine: Machine, where: str) -> No
     _write_weld(root, machine, tree.grab, name)
 
 
-def thing_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
+def object_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """(joint, its place in `qpos`) of plates, trees and logs."""
     return [
-        (j, int(model.jnt_qposadr[j])) for j in range(model.njnt) if is_thing(model.joint(j).name)
+        (j, int(model.jnt_qposadr[j]))
+        for j in range(model.njnt)
+        if is_surrounding_object(model.joint(j).name)
     ]
 
 
-def is_thing(name: str) -> bool:
+def is_surrounding_object(name: str) -> bool:
     """Whether a body or joint of this name is a plate, tree or log."""
     return name.startswith(_PREFIXES)
 
@@ -306,7 +308,7 @@ def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
     site, radius = model.site(f"{log.grab}_pocket"), log.diameter / 2.0
     low, high = site.pos - site.size + (radius, 0, radius), site.pos + site.size - (0, 0, radius)
     reach = log.length / 2.0 - _END
-    return grip_numbers(
+    return grip_parameters(
         log.closed, log.open, 1, _ASKEW, 0.5 * (low + high), 0.5 * (high - low), 0, (-reach, reach)
     )
 
@@ -388,7 +390,7 @@ class _Standing:
     def __init__(self, machine: Machine, model: mujoco.MjModel, name: str, tree: Tree) -> None:
         self._model, self._tree, self.name = model, tree, name
         saw = machine.link_of(machine.axes[tree.saw].joint)
-        grip = grip_numbers(tree.closed, tree.closed, 2, _LEANING, *_STEM_POCKET, 2)
+        grip = grip_parameters(tree.closed, tree.closed, 2, _LEANING, *_STEM_POCKET, 2)
         self._grip = _Grip(machine, model, name, tree.grab, grip)
         self._saw = model.body(saw).id
         self._spin = model.joint(machine.axes[tree.saw].joint).dofadr[0]

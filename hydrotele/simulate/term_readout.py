@@ -12,7 +12,7 @@ from hydrotele.hydraulics.circuit import (
     drive_state,
     open_ports,
 )
-from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order, memory_names
+from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters, extra_state_names
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added, terms_table
@@ -41,7 +41,7 @@ def added_by_terms(
         order = actuator_order(machine)
         drives = [machine.axes[name].force for name in order]
         _evaluate(
-            np.concatenate(list(actuator_numbers(machine).values())),
+            np.concatenate(list(actuator_parameters(machine).values())),
             terms_table(machine.terms, order), len(machine.hydraulic_axes),
             np.array([drive.gain if drive else 0.0 for drive in drives]),
             np.ascontiguousarray(time, float), np.ascontiguousarray(act, float),
@@ -91,7 +91,7 @@ def terms_at_rest(
     """
     if not machine.terms:
         return np.zeros(len(forces))
-    act = np.zeros((1, ACTIVATIONS * len(machine.hydraulic_axes) + len(memory_names(machine))))
+    act = np.zeros((1, ACTIVATIONS * len(machine.hydraulic_axes) + len(extra_state_names(machine))))
     for i, axis in enumerate(machine.hydraulic_axes.values()):
         act[0, ACTIVATIONS * i + 2] = forces[i] / axis.hydraulic_drive.areas[0]
     still = np.zeros((1, len(forces)))

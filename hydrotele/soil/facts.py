@@ -185,7 +185,7 @@ moment about the edge, positive raises the outboard end [N m]; mass carried [kg]
 centre lies from the edge, outwards and up [m]."""
 
 
-def soil_numbers(soil: Soil, bucket: Bucket, start: float, cell: float) -> np.ndarray:
+def soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) -> np.ndarray:
     """Pack what does not change.
 
     Args:

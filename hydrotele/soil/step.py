@@ -23,7 +23,7 @@ Soil and load on a bucket as the wrench about its centre of mass that MuJoCo's b
 
 import math
 
-from hydrotele.core.compiled import lean
+from hydrotele.core.compiled import allocation_free
 from hydrotele.soil.facts import (
     ADHESION,
     CARRIED,
@@ -74,7 +74,7 @@ from hydrotele.soil.facts import (
 from hydrotele.soil.terrain import cell_of, cut_cells_, lay_down_, slide_cells_, surface_height
 
 
-@lean
+@allocation_free
 def held_soil(n, attitude, level, out):
     """Volume of soil that rests in the bucket: below a surface at the angle of repose from its rim.
 
@@ -161,7 +161,7 @@ STEEPEST_SLOPE = 0.6  # of the friction angle
 _LEAST_SQUARE = 0.05  # keeps the wedge from jamming where blade and surface are nearly parallel
 
 
-@lean
+@allocation_free
 def failure_plane(rake, slope, friction, tool_friction):
     """Angle between surface and the plane on which the wedge shears off: that of least N_g.
 
@@ -192,7 +192,7 @@ def failure_plane(rake, slope, friction, tool_friction):
     return min(max(plane, math.radians(5.0)), math.radians(85.0))
 
 
-@lean
+@allocation_free
 def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
     """N_g: force on the blade by the weight of the wedge, per specific weight, width and depth^2.
 
@@ -218,7 +218,7 @@ def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
     return 0.5 * top * surcharge_factor(rake, slope, friction, tool_friction, plane)
 
 
-@lean
+@allocation_free
 def surcharge_factor(rake, slope, friction, tool_friction, plane):
     """N_q: force on the blade per weight that rests on the wedge.
 
@@ -237,7 +237,7 @@ def surcharge_factor(rake, slope, friction, tool_friction, plane):
     return math.sin(plane + friction + slope) / math.sin(rake + tool_friction + friction + plane)
 
 
-@lean
+@allocation_free
 def cohesion_factor(rake, friction, tool_friction, plane):
     """N_c: force on the blade by cohesion on the plane, per cohesion, width and depth.
 
@@ -256,7 +256,7 @@ def cohesion_factor(rake, friction, tool_friction, plane):
     return math.cos(friction) / (math.sin(plane) * math.sin(fan))
 
 
-@lean
+@allocation_free
 def adhesion_factor(rake, friction, tool_friction, plane):
     """N_ca: force on the blade by adhesion to it, per adhesion, width and depth.
 
@@ -275,7 +275,7 @@ def adhesion_factor(rake, friction, tool_friction, plane):
     return -math.cos(rake + friction + plane) / (math.sin(rake) * math.sin(fan))
 
 
-@lean
+@allocation_free
 def bearing_pressure(overburden, cohesion, friction, tilt):
     """Pressure at which soil yields under a smooth face that is pushed into it.
 
@@ -300,7 +300,7 @@ def bearing_pressure(overburden, cohesion, friction, tilt):
     return (overburden + cohesion / t) * factor - cohesion / t
 
 
-@lean
+@allocation_free
 def acting_rake(rake, slope, friction, tool_friction):
     """Rake against the surface that the wedge feels, kept where the equation holds.
 
@@ -322,7 +322,7 @@ def acting_rake(rake, slope, friction, tool_friction):
     return min(max(rake + slope, FLATTEST_RAKE), steepest)
 
 
-@lean
+@allocation_free
 def acting_slope(slope, friction):
     """Slope of the surface, kept where a plane can form.
 
@@ -348,7 +348,7 @@ SWEEPS = 2  # of sliding soil per step
 EARTH_AT_REST = 0.5  # horizontal over vertical pressure beside a blade
 
 
-@lean
+@allocation_free
 def cutting_force(n, depth, loose, rake, slope, load, out):
     """Force of soil on a blade that is drawn through it towards the machine.
 
@@ -388,7 +388,7 @@ def cutting_force(n, depth, loose, rake, slope, load, out):
     out[1] = -force * math.cos(upright + delta) + stuck * math.sin(upright) / math.sin(rake)
 
 
-@lean
+@allocation_free
 def yielding_force(n, state, place, along, rate, low, high):
     """Force of one surface along its direction: a spring and a damper that yield.
 
@@ -412,7 +412,7 @@ def yielding_force(n, state, place, along, rate, low, high):
     return min(max(spring + n[DAMPING] * rate, low), high)
 
 
-@lean
+@allocation_free
 def _spread(n, surface, loose, state, first, second, volume):
     lost = lay_down_(n, surface, loose, first, 0.5 * volume)
     lost += lay_down_(n, surface, loose, second, 0.5 * volume)
@@ -420,7 +420,7 @@ def _spread(n, surface, loose, state, first, second, volume):
     _touch(state, min(first, second), max(first, second), len(surface))
 
 
-@lean
+@allocation_free
 def _touch(state, low, high, count):
     """Widen the range of cells that may slide."""
     low, high = max(low - 1, 0), min(high + 1, count - 1)
@@ -430,7 +430,7 @@ def _touch(state, low, high, count):
         state[LOW], state[HIGH] = min(state[LOW], low), max(state[HIGH], high)
 
 
-@lean
+@allocation_free
 def _press(n, surface, loose, state, r, z, attitude, r_rate, z_rate, dt, out):
     """Forces of all surfaces on the bucket; returns depths inside and outside of the edge."""
     phi, delta = n[FRICTION], n[TOOL_FRICTION]
@@ -503,7 +503,7 @@ def _press(n, surface, loose, state, r, z, attitude, r_rate, z_rate, dt, out):
     return inside, outside
 
 
-@lean
+@allocation_free
 def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out):
     """Move the edge of the bucket to a place and say what the soil does to it.
 
@@ -583,7 +583,7 @@ def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out)
             state[LOW], state[HIGH] = 0.0, 0.0
 
 
-@lean
+@allocation_free
 def bucket_wrench(out, edge, theta, centre, wrench):
     """Force and torque of the soil and of the weight that is carried on the bucket's body.
 

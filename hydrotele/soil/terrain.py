@@ -7,13 +7,13 @@ bank swells. What leaves the profile at its ends is told, so that no mass is los
 
 import math
 
-from hydrotele.core.compiled import lean
+from hydrotele.core.compiled import allocation_free
 from hydrotele.soil.facts import CELL, CUT_SLOPE, REPOSE, START, SWELL, WIDTH
 
 SETTLED = 1e-4  # m, a step between cells beyond the stable one that is left alone
 
 
-@lean
+@allocation_free
 def surface_height(n, surface, r):
     """Height of the surface between the middles of cells, that of the end cells beyond them.
 
@@ -37,7 +37,7 @@ def surface_height(n, surface, r):
     return surface[i] + (place - i) * (surface[i + 1] - surface[i])
 
 
-@lean
+@allocation_free
 def cut_cells_(n, surface, loose, r0, z0, r1, z1):
     """Take away what lies above the path of the edge in the cells that it sweeps.
 
@@ -83,7 +83,7 @@ def cut_cells_(n, surface, loose, r0, z0, r1, z1):
     return taken * n[CELL] * n[WIDTH]
 
 
-@lean
+@allocation_free
 def lay_down_(n, surface, loose, cell, volume):
     """Lay loose soil on a cell.
 
@@ -107,7 +107,7 @@ def lay_down_(n, surface, loose, cell, volume):
     return 0.0
 
 
-@lean
+@allocation_free
 def cell_of(n, r):
     """Number of the cell at a radius, below 0 or beyond the last outside of the profile.
 
@@ -123,7 +123,7 @@ def cell_of(n, r):
     return int(math.floor((r - n[START]) / n[CELL]))
 
 
-@lean
+@allocation_free
 def slide_pair_(n, surface, loose, upper, lower):
     """Let soil slide from one cell to its lower neighbour, at most to the stable slope.
 
@@ -160,7 +160,7 @@ def slide_pair_(n, surface, loose, upper, lower):
     return moved > 0.0
 
 
-@lean
+@allocation_free
 def slide_cells_(n, surface, loose, low, high, wall):
     """Let the soil of a range of cells slide once, from the left and from the right.
 

@@ -75,7 +75,7 @@ def key_unit(key: str) -> str | None:
     return next(found, None) or _SCENARIO.get(key)
 
 
-def possible_numbers(axes: Iterable[str], teleoperated: bool) -> list[str]:
+def possible_results(axes: Iterable[str], teleoperated: bool) -> list[str]:
     """Names of all numbers that runs of machines with these axes can have."""
     tracked = [f"tracking.{name}.{size}" for name in (*axes, *_TIP) for size in ("rms", "max")]
     station = [f"teleoperation.{name}" for name in _STATION] if teleoperated else []

@@ -51,7 +51,7 @@ from hydrotele.sweep.journal import (
     Entry,
     Journal,
     check_figures,
-    possible_numbers,
+    possible_results,
 )
 from hydrotele.sweep.running import Keep, Outcome, Task, failed, perform, placed, unpack
 from hydrotele.sweep.table import Table, make_table, save_table
@@ -431,7 +431,7 @@ def run_sweep(
     checked = check_points(
         base, progress and (lambda done, total: progress("check", done, total, 0))
     )
-    possible = possible_numbers(checked.axes, checked.teleoperated)
+    possible = possible_results(checked.axes, checked.teleoperated)
     check_figures(file.sweep.figures, possible, file.place("figures"))
     if how.dask:
         base.inputs.refuse_bound("--dask")

@@ -127,7 +127,7 @@ def _known(table: Table, name: str) -> dict[int, float]:
             if v is not None}  # fmt: skip
 
 
-def spreads(table: Table, figures: list[str]) -> dict[str, dict[str, Any]]:
+def spread_statistics(table: Table, figures: list[str]) -> dict[str, dict[str, Any]]:
     """Smallest, median and largest value of numbers, with the runs that have them."""
     found = {}
     for name in figures:

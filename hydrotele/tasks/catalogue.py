@@ -12,12 +12,12 @@ from hydrotele.tasks.task import Task
 from hydrotele.tasks.track import track_fields
 
 
-def _about_home(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
+def _about_home(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Axes somewhere in the middle part of their ranges; the swing anywhere in front."""
     places = {}
     for name, axis in machine.axes.items():
         low, high = machine.joints[axis.joint].range or (-0.5, 0.5)
-        places[name] = float(low + (high - low) * chance.uniform(0.3, 0.7))
+        places[name] = float(low + (high - low) * rng.uniform(0.3, 0.7))
     return places
 
 

@@ -15,11 +15,11 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.fleet import Fleet
 from hydrotele.simulate.native import stop_profiling_clock
-from hydrotele.tasks.chance import streams
 from hydrotele.tasks.facts import Setup, make_facts, timing
 from hydrotele.tasks.loop import advance
 from hydrotele.tasks.memory import AXES, CHANNELS, MEASURES, MEMORY, NEXT_STEP, RESET, STEP
 from hydrotele.tasks.observation import machine_fields
+from hydrotele.tasks.rng import streams
 from hydrotele.tasks.task import Options, Task
 from hydrotele.tasks.variants import make_variants
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.control.servo import drive_tables, servo_numbers
+from hydrotele.control.servo import drive_tables, servo_parameters
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage
@@ -166,7 +166,7 @@ def _write_machine(facts: np.ndarray, setup: Setup, columns: list[int]) -> None:
     ranges = [machine.joints[machine.axes[name].joint].range for name in plant.axes]
     facts["ranges"][:k] = [limits or (-np.inf, np.inf) for limits in ranges]
     facts["arm"] = arm_facts(machine)[0]
-    facts["servo"][:k] = servo_numbers(machine, plant.axes, servo, setup.clock.period)
+    facts["servo"][:k] = servo_parameters(machine, plant.axes, servo, setup.clock.period)
     facts["feedforward"] = servo.feedforward
     facts["grid"][:k] = drive_tables(machine, plant.axes)[0]
     facts["table"] = setup.table.ctypes.data

@@ -17,8 +17,8 @@ from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 from hydrotele.scenario.surroundings import Plate, Thing
 from hydrotele.simulate.layout import field
-from hydrotele.tasks.chance import between
 from hydrotele.tasks.observation import Field
+from hydrotele.tasks.rng import between
 from hydrotele.tasks.starts import draw_start
 from hydrotele.tasks.task import Task
 
@@ -118,7 +118,7 @@ def tick_force(f, e, w):
 
 
 @compiled
-def force_wanted(g, time):
+def reference_force(g, time):
     """Force wanted at a time since the start [s], and the time since it was last changed.
 
     Args:
@@ -151,11 +151,11 @@ def observe_force(f, e, out, at):
     Source: `force_fields`.
     """
     out[at] = e.goal[FORCE_READ]
-    out[at + 1], out[at + 2] = force_wanted(e.goal, e.tick * f.period)
+    out[at + 1], out[at + 2] = reference_force(e.goal, e.tick * f.period)
 
 
 @compiled
-def judge_force(f, e, w):
+def reward_force(f, e, w):
     """Reward of the true force; the episode ends by an overload or away from the plate.
 
     Args:
@@ -170,7 +170,7 @@ def judge_force(f, e, w):
     Source: this module.
     """
     g, n = e.goal, f.numbers
-    wanted = force_wanted(g, e.tick * f.period)[0]
+    wanted = reference_force(g, e.tick * f.period)[0]
     overload = g[_PEAK] > OVERLOAD
     aside = math.fabs(e.tip[0] - n[MIDDLE_X]) > n[HALF_X]
     aside = aside or math.fabs(e.tip[1] - n[MIDDLE_Y]) > n[HALF_Y]
@@ -192,20 +192,20 @@ _DAMPING = 0.87  # of critical, as that of the plate of Zhu 1994's experiment in
 _ABOVE = (0.05, 0.15)  # m
 
 
-def _start(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
+def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """The bucket over the middle of the plate, its teeth down."""
-    return draw_start(machine, chance, (5.6, -0.05, 0.2, -1.92), (6.4, 0.05, 0.9, -1.57))
+    return draw_start(machine, rng, (5.6, -0.05, 0.2, -1.92), (6.4, 0.05, 0.9, -1.57))
 
 
 def _plate(
-    machine: Machine, chance: np.random.Generator, start: dict[str, float]
+    machine: Machine, rng: np.random.Generator, start: dict[str, float]
 ) -> tuple[Thing, ...]:
     """A plate below the tip."""
     numbers, axes, _ = arm_facts(machine)
     pose = np.zeros(5)
     task_forward(numbers, np.array([start[name] for name in axes]), pose)
-    stiffness = math.exp(chance.uniform(math.log(_SOFT), math.log(_STIFF)))
-    height = float(pose[2] - chance.uniform(*_ABOVE))
+    stiffness = math.exp(rng.uniform(math.log(_SOFT), math.log(_STIFF)))
+    height = float(pose[2] - rng.uniform(*_ABOVE))
     damping = 2.0 * _DAMPING * math.sqrt(stiffness * _MASS)
     return (Plate(position=(*_MIDDLE, height), size=_HALF, mass=_MASS, stiffness=stiffness,
                   damping=damping),)  # fmt: skip

@@ -31,13 +31,13 @@ from hydrotele.soil.facts import (
     WIDTH,
     Bucket,
     Soil,
-    soil_numbers,
+    soil_parameters,
 )
 from hydrotele.soil.step import bucket_wrench, soil_step
 from hydrotele.soil.terrain import surface_height
-from hydrotele.tasks.chance import between, draw
 from hydrotele.tasks.memory import ARM, NUMBERS
 from hydrotele.tasks.observation import Field, reach
+from hydrotele.tasks.rng import between, draw
 from hydrotele.tasks.starts import draw_start
 from hydrotele.tasks.task import Task
 
@@ -51,7 +51,7 @@ _SOIL = _RESULT + OUT
 TERRAIN = _SOIL + _SHARED
 
 
-def bed_numbers(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray:
+def bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray:
     """Numbers of a task with a bed of soil.
 
     Args:
@@ -64,7 +64,7 @@ def bed_numbers(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray:
     Raises:
         InputError: there are no soils or more than three, or the bucket has other corners.
     """
-    rows = [soil_numbers(soil, bucket, START, CELL) for soil in soils]
+    rows = [soil_parameters(soil, bucket, START, CELL) for soil in soils]
     if not 1 <= len(rows) <= SOILS_MOST or len(rows[0]) != _SHARED:
         raise InputError("bed of soil", f"takes 1 to {SOILS_MOST} soils and the CAT 215's bucket")
     return np.concatenate([rows[0], *(row[:WIDTH] for row in rows[1:])])
@@ -150,7 +150,7 @@ def lay_bed(f, w, soil):
     """Begin with level undisturbed soil at height 0 and an empty bucket.
 
     Args:
-        f: record of FACTS; its numbers are those of `bed_numbers`.
+        f: record of FACTS; its numbers are those of `bed_parameters`.
         w: World; `terrain` is written.
         soil: number of the soil, scalar [1].
 
@@ -388,7 +388,7 @@ def observe_grade(f, e, w, out, at):
 
 
 @compiled
-def judge_grade(f, e, w):
+def reward_grade(f, e, w):
     """Pay every centimetre that the ground comes nearer to the plane; time costs.
 
     Args:
@@ -428,14 +428,14 @@ _LEAST_POSE = (5.6, -0.5, 1.25, math.radians(-110.0))  # r [m], theta [rad], z [
 _LARGEST_POSE = (6.4, 0.5, 1.5, math.radians(-90.0))
 
 
-def _start(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
+def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """The bucket over the far end of the stretch, ready to dig, above the highest ground."""
-    return draw_start(machine, chance, _LEAST_POSE, _LARGEST_POSE)
+    return draw_start(machine, rng, _LEAST_POSE, _LARGEST_POSE)
 
 
 def _numbers(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
     """Soils, bucket and profile; the last one is the number of soils."""
-    bed = bed_numbers([SOILS[name] for name in GRADE_SOILS]).tolist()
+    bed = bed_parameters([SOILS[name] for name in GRADE_SOILS]).tolist()
     return (*bed, *[0.0] * (NUMBERS - 1 - len(bed)), float(len(GRADE_SOILS)))
 
 

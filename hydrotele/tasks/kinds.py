@@ -5,13 +5,13 @@ is its place in KINDS.
 """
 
 from hydrotele.core.compiled import compiled
-from hydrotele.tasks.force import begin_force, judge_force, observe_force, tick_force
-from hydrotele.tasks.grade import begin_grade, judge_grade, observe_grade, tick_bed
-from hydrotele.tasks.line import begin_line, judge_line, observe_line
+from hydrotele.tasks.force import begin_force, observe_force, reward_force, tick_force
+from hydrotele.tasks.grade import begin_grade, observe_grade, reward_grade, tick_bed
+from hydrotele.tasks.line import begin_line, observe_line, reward_line
 from hydrotele.tasks.observation import observe_machine
-from hydrotele.tasks.place import begin_place, judge_place, observe_place, tick_grapple
-from hydrotele.tasks.reach import begin_reach, judge_reach, observe_reach
-from hydrotele.tasks.track import begin_track, judge_track, observe_track
+from hydrotele.tasks.place import begin_place, observe_place, reward_place, tick_grapple
+from hydrotele.tasks.reach import begin_reach, observe_reach, reward_reach
+from hydrotele.tasks.track import begin_track, observe_track, reward_track
 
 KINDS = ("track", "line", "force", "reach", "grade", "place")
 _TRACK, _LINE, _FORCE, _REACH, _GRADE, _PLACE = range(6)
@@ -98,7 +98,7 @@ def observe_task(f, e, w, out):
 
 
 @compiled
-def judge_task(f, e, w):
+def reward_task(f, e, w):
     """Reward of the step that is over, and whether the task is.
 
     Args:
@@ -112,15 +112,15 @@ def judge_task(f, e, w):
     Source: the task's own file.
     """
     if f.kind == _TRACK:
-        return judge_track(f, e, w)
+        return reward_track(f, e, w)
     if f.kind == _LINE:
-        return judge_line(f, e, w)
+        return reward_line(f, e, w)
     if f.kind == _FORCE:
-        return judge_force(f, e, w)
+        return reward_force(f, e, w)
     if f.kind == _REACH:
-        return judge_reach(f, e, w)
+        return reward_reach(f, e, w)
     if f.kind == _GRADE:
-        return judge_grade(f, e, w)
+        return reward_grade(f, e, w)
     if f.kind == _PLACE:
-        return judge_place(f, e, w)
+        return reward_place(f, e, w)
     return 0.0, False

@@ -14,9 +14,9 @@ from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
-from hydrotele.tasks.chance import between, draw
 from hydrotele.tasks.memory import ARM
 from hydrotele.tasks.observation import Field, pose_fields, reach
+from hydrotele.tasks.rng import between, draw
 from hydrotele.tasks.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.tasks.task import Task
 
@@ -194,7 +194,7 @@ def line_reward(across, along, attitude):
 
 
 @compiled
-def judge_line(f, e, w):
+def reward_line(f, e, w):
     """Reward of the tip's true place.
 
     Args:
@@ -216,9 +216,9 @@ def judge_line(f, e, w):
     return line_reward(across, along, attitude), False
 
 
-def _start(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
+def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """The bucket in the air before the machine, about as in Zhu 1994, Figs 6.45-6.48."""
-    return draw_start(machine, chance, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
+    return draw_start(machine, rng, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
 
 
 STRAIGHT_LINE = Task(

@@ -30,8 +30,7 @@ from hydrotele.simulate.feedback import convert
 from hydrotele.simulate.fleet import STATE
 from hydrotele.simulate.layout import call_set_state, call_step, field, floats, pointer
 from hydrotele.simulate.record import state_supply
-from hydrotele.tasks.chance import draw
-from hydrotele.tasks.kinds import begin_task, judge_task, observe_task, tick_task
+from hydrotele.tasks.kinds import begin_task, observe_task, reward_task, tick_task
 from hydrotele.tasks.memory import (
     ARM,
     AXES,
@@ -47,6 +46,7 @@ from hydrotele.tasks.memory import (
     SAME_STEP,
     VALVE,
 )
+from hydrotele.tasks.rng import draw
 
 _AHEAD = 0.2  # rad or m by which a reference may lead its joint: a stalled arm winds nothing up
 
@@ -451,7 +451,7 @@ def _step(f, e, m, d, sim, w, action):
         e.fault = 1
         e.faults += 1
         return 0.0, True, False
-    reward, done = judge_task(f, e, w)
+    reward, done = reward_task(f, e, w)
     return reward, done, e.step >= f.horizon and not done
 
 

@@ -22,9 +22,9 @@ from hydrotele.scenario.scenario import Servo
 from hydrotele.scenario.surroundings import LogOnGround
 from hydrotele.simulate.feedback import convert
 from hydrotele.simulate.surroundings import CENTRE, GRIP, ROW, TAKEN, grip_step, log_grip
-from hydrotele.tasks.chance import between, draw
 from hydrotele.tasks.memory import ARM
 from hydrotele.tasks.observation import Field, reach
+from hydrotele.tasks.rng import between, draw
 from hydrotele.tasks.starts import draw_start
 from hydrotele.tasks.task import Task
 
@@ -35,7 +35,7 @@ READ = 0  # first of the readings in the goal: pitch, roll, their rates
 READINGS = 4
 
 
-def grapple_numbers(machine: Machine, model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
+def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
     """Numbers of a task with a grapple and one log.
 
     Args:
@@ -129,7 +129,7 @@ def tick_grapple(f, e, w):
     """Take the log or let it go, and read the free joints.
 
     Args:
-        f: record of FACTS; its numbers are those of `grapple_numbers`.
+        f: record of FACTS; its numbers are those of `grapple_parameters`.
         e: record of MEMORY; `goal` is written.
         w: World after a physics step; the weld is written.
 
@@ -173,7 +173,7 @@ def grip_distance(f, w):
 
 
 @compiled
-def lean(f, w):
+def tilt_angle(f, w):
     """Angle between the grapple and plumb, scalar [rad].
 
     Args:
@@ -326,7 +326,7 @@ def observe_place(f, e, w, out, at):
 
 
 @compiled
-def judge_place(f, e, w):
+def reward_place(f, e, w):
     """Reward of bringing the grapple to the log and the log to its goal.
 
     Args:
@@ -344,7 +344,7 @@ def judge_place(f, e, w):
     x, y, z, sine, cosine, slope = log_pose(f, w)
     height = z - f.numbers[RADIUS]
     distance = math.sqrt((x - g[_X]) ** 2 + (y - g[_Y]) ** 2 + height**2)
-    yaw, swing = yaw_between(sine, cosine, g[_YAW]), lean(f, w)
+    yaw, swing = yaw_between(sine, cosine, g[_YAW]), tilt_angle(f, w)
     lies = not held and height < _LYING and abs(slope) < _LYING
     there = lies and distance <= NEAR and yaw <= STRAIGHT
     left = distance + LEVER * yaw
@@ -377,16 +377,16 @@ LOG_TO_PLACE = LogOnGround(position=(5.5, 0.0), direction=math.pi / 2.0)
 _LOW, _HIGH = (4.5, -0.5, 2.2), (6.5, 0.5, 2.8)  # m, rad, m: the stick's pin at the start
 
 
-def _start(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
+def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """The open grapple hangs plumb, higher than a log on the ground."""
-    joints = draw_start(machine, chance, _LOW, _HIGH)
+    joints = draw_start(machine, rng, _LOW, _HIGH)
     plumb = -0.5 * math.pi - joints["boom"] - joints["stick"]
-    turned = float(chance.uniform(-0.5, 0.5) * math.pi)
+    turned = float(rng.uniform(-0.5, 0.5) * math.pi)
     return {**joints, "grapple_pitch": plumb, "grapple": turned, "claw": 0.0}
 
 
 def _numbers(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
-    return grapple_numbers(machine, model, LOG_TO_PLACE)
+    return grapple_parameters(machine, model, LOG_TO_PLACE)
 
 
 PLACE_LOG = Task(

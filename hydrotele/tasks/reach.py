@@ -13,9 +13,9 @@ from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
-from hydrotele.tasks.chance import between
 from hydrotele.tasks.memory import ARM
 from hydrotele.tasks.observation import Field, pose_fields, reach
+from hydrotele.tasks.rng import between
 from hydrotele.tasks.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.tasks.task import Task
 
@@ -131,7 +131,7 @@ def observe_reach(f, e, out, at):
 
 
 @compiled
-def judge_reach(f, e, w):
+def reward_reach(f, e, w):
     """Reward of coming nearer; the episode ends once the pose was kept long enough.
 
     Args:
@@ -157,10 +157,10 @@ def judge_reach(f, e, w):
     return reward + (SUCCESS if done else 0.0), done
 
 
-def _start(machine: Machine, chance: np.random.Generator) -> dict[str, float]:
+def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """The head in the air before the machine, about level."""
     return draw_start(
-        machine, chance, (5.0, -0.5, 0.8, -0.4, -0.3), (8.0, 0.5, 3.0, 0.4, 0.3)
+        machine, rng, (5.0, -0.5, 0.8, -0.4, -0.3), (8.0, 0.5, 3.0, 0.4, 0.3)
     )  # fmt: skip
 
 

@@ -17,13 +17,13 @@ _ROOM = 0.08  # rad to the ends of the joints' ranges
 
 
 def draw_start(
-    machine: Machine, chance: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...]
+    machine: Machine, rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...]
 ) -> dict[str, float]:
     """Positions of an arm's axes for a pose between two.
 
     Args:
         machine: the machine.
-        chance: random generator.
+        rng: random generator.
         low: (5,) or, without a head, (4,) least r [m], theta [rad], z [m], attitude, head [rad].
         high: the same, at most.
 
@@ -36,7 +36,7 @@ def draw_start(
     numbers, axes, ranges = arm_facts(machine)
     pose, joints = np.zeros(5), np.zeros(len(axes))
     for _ in range(_DRAWS):
-        pose[: len(low)] = chance.uniform(low, high)
+        pose[: len(low)] = rng.uniform(low, high)
         if (
             task_inverse(numbers, pose, pose[1], joints) == REACHED
             and ((ranges[:, 0] + _ROOM <= joints) & (joints <= ranges[:, 1] - _ROOM)).all()

@@ -11,9 +11,9 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
-from hydrotele.tasks.chance import between, draw
 from hydrotele.tasks.memory import ARM, AXES
 from hydrotele.tasks.observation import Field, position_field, rate_field
+from hydrotele.tasks.rng import between, draw
 
 PREVIEWS = (0.1, 0.2, 0.4)  # s ahead
 SCALE = 0.1  # m of error that costs a reward of 1
@@ -131,7 +131,7 @@ def observe_track(f, e, out, at):
 
 
 @compiled
-def judge_track(f, e, w):
+def reward_track(f, e, w):
     """Reward 1 on the trajectory, less 1 for every 0.1 m that the tip is off, at least -1.
 
     Args:

@@ -86,10 +86,10 @@ def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
 def _make(task: Task, options: Options, nominal: Machine) -> Variants:
     machines, plants, states, tips = [], [], [], []
     for number in range(options.variants):
-        chance = np.random.default_rng([options.variant_seed, number])
-        joints = task.start(nominal, chance)
-        things = task.surroundings(nominal, chance, joints)
-        machine = _changed(nominal, options, chance)
+        rng = np.random.default_rng([options.variant_seed, number])
+        joints = task.start(nominal, rng)
+        things = task.surroundings(nominal, rng, joints)
+        machine = _changed(nominal, options, rng)
         known = (p for m, p in zip(machines, plants, strict=True)
                  if m == machine and p.surroundings == things)  # fmt: skip
         plant = next(known, None)
@@ -115,14 +115,14 @@ def _by_joint(machine: Machine, places: Mapping[str, float]) -> dict[str, float]
     return {machine.axes[n].joint if n in machine.axes else n: v for n, v in places.items()}
 
 
-def _changed(nominal: Machine, options: Options, chance: np.random.Generator) -> Machine:
+def _changed(nominal: Machine, options: Options, rng: np.random.Generator) -> Machine:
     """The machine with what is planted and what is drawn."""
     machine = nominal
     for effect in options.effects:
         machine = apply_effect(machine, *_said(effect), dict(effect.get("parameters", {})))
     for effect in options.randomise:
         drawn = {
-            key: float(chance.uniform(*_range(effect, key, value)))
+            key: float(rng.uniform(*_range(effect, key, value)))
             for key, value in effect.get("parameters", {}).items()
         }
         machine = apply_effect(machine, *_said(effect), drawn)
@@ -223,7 +223,7 @@ _DELAY = (0.0, 0.05)  # s, of a fieldbus and its valve amplifiers
 _PAYLOAD = (0.0, 0.02)  # times the mass of all links, at the tip
 
 
-def usual_spread(machine: Machine) -> tuple[dict[str, Any], ...]:
+def typical_variation(machine: Machine) -> tuple[dict[str, Any], ...]:
     """Effects with ranges, for `Options.randomise`, of every valve, drive and the whole machine.
 
     Args:

@@ -106,7 +106,7 @@ def why_unstable(one: Analysis) -> str:
     return f"no, {many} pole{'s' * (many != 1)}{free}"
 
 
-def said_factor(margin: float) -> str:
+def format_factor(margin: float) -> str:
     """A gain margin.
 
     >>> said_factor(0.17), said_factor(math.inf)
@@ -115,7 +115,7 @@ def said_factor(margin: float) -> str:
     return "any" if math.isinf(margin) else f"x {margin:.3g}"
 
 
-def said_delay(delay: float) -> str:
+def format_delay(delay: float) -> str:
     """A delay.
 
     >>> said_delay(0.12345)
@@ -124,7 +124,7 @@ def said_delay(delay: float) -> str:
     return "any" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
 
 
-def said_size(value: float) -> str:
+def format_number(value: float) -> str:
     """A number with four digits, without an exponent.
 
     >>> said_size(-20026.0), said_size(0.0123456)
@@ -133,7 +133,7 @@ def said_size(value: float) -> str:
     return np.format_float_positional(value, precision=4, fractional=False, trim="-")
 
 
-def said_error(error: float | None) -> str:
+def format_error(error: float | None) -> str:
     """A relative error.
 
     >>> said_error(0.0016), said_error(1e-7)

@@ -59,7 +59,7 @@ class Levitation:
     frozen: float = FROZEN
 
 
-class Remembered(NamedTuple):
+class ControllerState(NamedTuple):
     """What the control keeps from period to period.
 
     Attributes:
@@ -115,15 +115,15 @@ def levitation(
     )
 
 
-def nothing_remembered() -> Remembered:
+def initial_controller_state() -> ControllerState:
     """What the control knows before its first reading."""
-    return Remembered(np.full(3, np.nan), np.full(4, np.nan), 0.0)
+    return ControllerState(np.full(3, np.nan), np.full(4, np.nan), 0.0)
 
 
 def levitation_step(
-    control: Levitation, before: Remembered, place: np.ndarray, quaternion: np.ndarray,
+    control: Levitation, before: ControllerState, place: np.ndarray, quaternion: np.ndarray,
     target: np.ndarray, turned: np.ndarray,
-) -> tuple[Remembered, Levitated]:  # fmt: skip
+) -> tuple[ControllerState, Levitated]:  # fmt: skip
     """One period: velocities by differences, wrench, currents.
 
     A reading that is no number, or has been the same for longer than noise allows, switches the
@@ -144,9 +144,9 @@ def levitation_step(
     Source: Zhu 1994, 5.1.3.
     """
     if not (np.isfinite(place).all() and np.isfinite(quaternion).all()):
-        return nothing_remembered(), Levitated(_NONE, True, True)
+        return initial_controller_state(), Levitated(_NONE, True, True)
     same = np.array_equal(place, before.place) and np.array_equal(quaternion, before.quaternion)
-    after = Remembered(place, quaternion, before.same + control.period if same else 0.0)
+    after = ControllerState(place, quaternion, before.same + control.period if same else 0.0)
     if after.same > control.frozen:
         return after, Levitated(_NONE, True, True)
     velocity, rate = np.zeros(3), np.zeros(3)
@@ -232,7 +232,7 @@ def pose_of_readings(readings: np.ndarray, distance: float) -> tuple[np.ndarray,
     raise InputError(_WHERE, f"no pose makes the readings {readings}")
 
 
-def sensed_spread(distance: float, step: float) -> np.ndarray:
+def pose_resolution(distance: float, step: float) -> np.ndarray:
     """What a step of the diodes leaves unknown of the pose at the centre.
 
     Args:
@@ -306,7 +306,7 @@ class Flight:
     warnings: int
 
 
-class Eye:
+class PoseSensor:
     """Reads the flotor's pose as its sensors do.
 
     The simple reading rounds handle place and rotation vector to the stated resolution, as
@@ -353,7 +353,7 @@ class Eye:
         return values
 
 
-def fly(
+def simulate_levitation(
     joystick: Joystick, target: np.ndarray, *, control: Levitation | None = None,
     start: np.ndarray | None = None, noise: float = 1.0, diodes: bool = False, seed: int = 0,
     cab: tuple[np.ndarray, np.ndarray] | None = None, push: np.ndarray | None = None,
@@ -379,9 +379,9 @@ def fly(
     control = control or levitation(joystick, frozen=FROZEN if noise > 0.0 else np.inf)
     flotor = SimulatedFlotor(joystick, hand=False, period=control.period, fine=_FINE)
     flotor.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    eye = Eye(joystick, noise=noise, diodes=diodes, seed=seed)
+    eye = PoseSensor(joystick, noise=noise, diodes=diodes, seed=seed)
     flotor.place(np.zeros(6) if start is None else start)
-    n, memory, mount = len(target), nothing_remembered(), np.array(joystick.mount)
+    n, memory, mount = len(target), initial_controller_state(), np.array(joystick.mount)
     push = np.zeros((n, 6)) if push is None else push
     pose, place, quaternion = np.empty((n, 6)), np.empty((n, 3)), np.empty((n, 4))
     currents, limited, blind = np.empty((n, 6)), np.empty(n, bool), np.empty(n, bool)
@@ -403,7 +403,9 @@ def fly(
     return Flight(time, pose, place, quaternion, currents, limited, blind, warnings)
 
 
-def wobble(joystick: Joystick, seconds: float, seed: int = 0, share: float = 0.5) -> np.ndarray:
+def excitation_path(
+    joystick: Joystick, seconds: float, seed: int = 0, share: float = 0.5
+) -> np.ndarray:
     """A path that tells the flotor's numbers: every axis in its own tones between 0.4 and 6 Hz.
 
     Args:
@@ -413,7 +415,7 @@ def wobble(joystick: Joystick, seconds: float, seed: int = 0, share: float = 0.5
         share: of the workspace that the targets may use [1].
 
     Returns:
-        (n, 6) targets for `fly` [m], [rad].
+        (n, 6) targets for `simulate_levitation` [m], [rad].
     """
     rng, time = np.random.default_rng(seed), np.arange(0.0, seconds, 1.0 / joystick.control_rate)
     tones = 0.4 * 15.0 ** ((np.arange(6 * _TONES) + 0.5) / (6 * _TONES))  # no tone twice

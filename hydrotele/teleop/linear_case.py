@@ -68,7 +68,7 @@ from hydrotele.teleop.axis_table import (
     REFLECTED_MOST,
 )
 from hydrotele.teleop.master import Master, master
-from hydrotele.teleop.person import DECISIONS, REFLEX
+from hydrotele.teleop.operator_model import DECISIONS, REFLEX
 from hydrotele.teleop.slave import AHEAD, SMOOTH
 from hydrotele.teleop.switching import Spring
 from hydrotele.teleop.two_port import Impedance, TwoPort

@@ -225,7 +225,7 @@ def measure_task(numbers, joint, fresh, elapsed, s):
 
 
 @compiled
-def ask(numbers, packet, arrived, force, period, s):
+def update_references(numbers, packet, arrived, force, period, s):
     """Joint references of this period from what the master says.
 
     Args:
@@ -400,9 +400,9 @@ def slave_step(numbers, packet, arrived, force, joint, period, s):
 
     Args:
         numbers: Slave.
-        packet: (3, 6) see `ask`.
-        arrived: see `ask`, scalar.
-        force: (k,) see `ask`.
+        packet: (3, 6) see `update_references`.
+        arrived: see `update_references`, scalar.
+        force: (k,) see `update_references`.
         joint: (k,) measured [rad].
         period: scalar [s].
         s: SlaveState, written.
@@ -412,5 +412,5 @@ def slave_step(numbers, packet, arrived, force, joint, period, s):
 
     Source: this module.
     """
-    ask(numbers, packet, arrived, force, period, s)
+    update_references(numbers, packet, arrived, force, period, s)
     watch(numbers, joint, s)

@@ -45,7 +45,7 @@ from hydrotele.teleop.master import (
     unpack_master,
     unpack_master_state,
 )
-from hydrotele.teleop.person import Hand, Person, pull, unpack_muscles
+from hydrotele.teleop.operator_model import Hand, OperatorModel, pull, unpack_muscles
 from hydrotele.teleop.slave import (
     BLOCKED,
     SILENT,
@@ -96,7 +96,7 @@ def to_the_hand(
     Returns:
         Nothing.
 
-    Source: `teleop.master`, `teleop.slave`, `teleop.person`.
+    Source: `teleop.master`, `teleop.slave`, `teleop.operator_model`.
     """
     k = len(columns)
     slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
@@ -324,13 +324,13 @@ class Station:
         self._force = np.zeros(len(axes))
         self._elapsed = 0.0
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
-        self.person = Person(
+        self.operator = OperatorModel(
             pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed,
             hand,
         )  # fmt: skip
         self._master_flat, self._m_flat = flat_view(self._master), flat_view(self._m)
         self._slave_flat, self._s_flat = flat_view(self._slave), flat_view(self._s)
-        self._hand_flat = flat_view(self.person.muscles)
+        self._hand_flat = flat_view(self.operator.muscles)
         self.notes: list[str] = []
         self._said: set[str] = set()
         self.tripped = False
@@ -361,18 +361,18 @@ class Station:
                 self._pilot.tip_over, self._master, self._line.packet, self._slave.start,
                 self._m.handle, self._m.speed, self._m.extra,
             )  # fmt: skip
-        if tick % self.person.every == 0:
-            self.person.decide(tick)
-        person, line = self.person, self._line
+        if tick % self.operator.every == 0:
+            self.operator.decide(tick)
+        operator, line = self.operator, self._line
         to_the_hand(
             tick, fresh, self._elapsed, self.tripped, seen.joint, self._force, self.columns,
             self._slave_flat, self._s_flat, line.back, line.packet, line.lost, line.state,
-            self._master_flat, self._m_flat, self._qpos, self._hand_flat, person.past,
-            person.tremor, line.forward,
+            self._master_flat, self._m_flat, self._qpos, self._hand_flat, operator.past,
+            operator.tremor, line.forward,
         )  # fmt: skip
         self._elapsed = seen.period
         self._move_flotor(data)
-        self.log.take(tick, self._force, person.muscles.force, data.ncon > 0)
+        self.log.take(tick, self._force, operator.muscles.force, data.ncon > 0)
         self._ask(tick, seen)
         self._check(tick, seen)
         return self.tripped
@@ -392,7 +392,7 @@ class Station:
 
     def _move_flotor(self, data: mujoco.MjData) -> None:
         """One period of the joystick, shaken by the cab if it stands there."""
-        currents, muscles = self._m.currents, self.person.muscles.force
+        currents, muscles = self._m.currents, self.operator.muscles.force
         if self._swing < 0:
             self._flotor.step(currents, muscles)
             return

@@ -18,7 +18,7 @@ from numba import carray, cfunc, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.core.compiled import compiled, lean
+from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.terms.facts import BALANCES, Term
 from hydrotele.terms.law import LAWS, VARIABLES, DriveState, Law, Numbers, Variable
@@ -176,7 +176,7 @@ def _call(typingctx, function, terms, at, state):
     return types.float64(function, terms, at, state), codegen
 
 
-@lean
+@allocation_free
 def _seen(terms, at, k, value, s, drives):
     """A variable as the law of a term sees it: of the drive that it names, inside its domain."""
     first = int(terms[at + _DOMAIN])
@@ -190,7 +190,7 @@ def _seen(terms, at, k, value, s, drives):
     return value
 
 
-@lean
+@allocation_free
 def _of_drive(i, k, s, drives):
     """Variable k of drive i; what all drives share is that of the state."""
     if i < 0 or i >= len(drives.velocity):
@@ -206,7 +206,7 @@ def _of_drive(i, k, s, drives):
     return s[k]
 
 
-@lean
+@allocation_free
 def added(terms, balance, axis, s, drives):
     """What the terms add to a balance of a drive.
 
@@ -252,7 +252,7 @@ def added(terms, balance, axis, s, drives):
     return total
 
 
-@lean
+@allocation_free
 def _moved(s, velocity, head, rod):
     """The state with another velocity and other pressures."""
     return DriveState(
@@ -261,7 +261,7 @@ def _moved(s, velocity, head, rod):
     )  # fmt: skip
 
 
-@lean
+@allocation_free
 def added_with_slope(terms, balance, axis, s, drives):
     """What the terms add to force or command, and its slope with respect to the velocity.
 
@@ -281,7 +281,7 @@ def added_with_slope(terms, balance, axis, s, drives):
     return value, (beyond - value) / step
 
 
-@lean
+@allocation_free
 def added_flows(terms, axis, s, drives):
     """What the terms add to the flows into both chambers of an axis, and slopes for a stiff step.
 

@@ -239,7 +239,7 @@ def test_full_disk_leaves_nothing(broken, tmp_path, monkeypatch):
 
 def test_killed_runs_leave_no_folder_of_the_final_name(tmp_path):
     """SIGKILL at five seeded times, some while writing; the next run removes what they left."""
-    chance = random.Random(4)
+    rng = random.Random(4)
     words = ["run", "zhu_up", "--set", "duration=0.5", "--out", tmp_path / "run"]
     seen_part = False
     for attempt in range(5):
@@ -247,9 +247,9 @@ def test_killed_runs_leave_no_folder_of_the_final_name(tmp_path):
         if attempt % 2:  # kill it in the middle of writing
             while process.poll() is None and not list(tmp_path.glob(".run.*.part")):
                 time.sleep(0.002)
-            time.sleep(chance.uniform(0.0, 0.05))
+            time.sleep(rng.uniform(0.0, 0.05))
         else:
-            time.sleep(chance.uniform(0.1, 1.0))
+            time.sleep(rng.uniform(0.1, 1.0))
         process.kill()
         process.communicate()
         left = names(tmp_path)

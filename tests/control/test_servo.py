@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.control.servo import servo_numbers, servo_step, wanted_opening
+from hydrotele.control.servo import feedforward_opening, servo_parameters, servo_step
 from hydrotele.hydraulics.circuit import Slot, chamber_flows
 from hydrotele.hydraulics.laws import valve_opening
-from hydrotele.hydraulics.parameters import actuator_numbers
+from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario, Servo
@@ -32,12 +32,12 @@ def test_opening_keeps_the_force(axis, velocity, head, rod, place):
 
     1e-9 of either term: orifices are smoothed over d = 50 kPa in the machine, over 1 Pa here.
     """
-    user = actuator_numbers(CAT)[axis]
+    user = actuator_parameters(CAT)[axis]
     user[Slot.ORIFICE_SMOOTHING] = 1.0
     area_head, area_rod = user[Slot.AREA_HEAD], user[Slot.AREA_ROD]
     volume_head = user[Slot.VOLUME_HEAD] + area_head * place * user[Slot.STROKE]
     volume_rod = user[Slot.VOLUME_ROD] + area_rod * (1 - place) * user[Slot.STROKE]
-    opening = wanted_opening(
+    opening = feedforward_opening(
         velocity, head, rod, SUPPLY, TANK, area_head, area_rod, volume_head, volume_rod,
         user[Slot.FLOW_GAIN],
     )  # fmt: skip
@@ -52,7 +52,7 @@ def test_opening_keeps_the_force(axis, velocity, head, rod, place):
 def test_opening_is_bounded_where_the_valve_has_nothing_to_drive():
     """Both chambers at the supply pressure: finite, and monotone in the wanted velocity."""
     opening = [
-        wanted_opening(v, SUPPLY, TANK, SUPPLY, TANK, 0.02, 0.013, 0.01, 0.01, 2e-6)
+        feedforward_opening(v, SUPPLY, TANK, SUPPLY, TANK, 0.02, 0.013, 0.01, 0.01, 2e-6)
         for v in np.linspace(-0.2, 0.2, 41)
     ]
     assert np.all(np.isfinite(opening)) and np.all(np.diff(opening) > 0)
@@ -60,7 +60,7 @@ def test_opening_is_bounded_where_the_valve_has_nothing_to_drive():
 
 def one_step(axis, servo=None, error=0.0, velocity=0.0, arm=1.0, rate=0.0, load=None):
     """Command of one axis in one control period of 5 ms, at rest but for what is given."""
-    numbers = servo_numbers(CAT, AXES, servo or Servo(), 0.005)
+    numbers = servo_parameters(CAT, AXES, servo or Servo(), 0.005)
     k = AXES.index(axis)
     full = lambda value: np.full(4, float(value))  # noqa: E731 - a name for a long expression
     head, rod = full(5e6), full(4e6)

@@ -11,10 +11,10 @@ import pytest
 from numba.core.errors import TypingError
 
 import hydrotele
-from hydrotele.core.compiled import lean
+from hydrotele.core.compiled import allocation_free
 
 
-@lean
+@allocation_free
 def _double(values):
     part = values[1:]
     for i in range(len(part)):
@@ -22,12 +22,12 @@ def _double(values):
     return values[0]
 
 
-@lean
+@allocation_free
 def _creates(size):
     return np.zeros(size).sum()
 
 
-@lean
+@allocation_free
 def _returns_part(values):
     return values[1:]
 

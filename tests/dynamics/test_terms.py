@@ -8,7 +8,7 @@ import pytest
 from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.effects import Term, changed, with_terms
 from hydrotele.hydraulics.circuit import circuit_scratch, step_circuit
-from hydrotele.hydraulics.parameters import actuator_numbers, actuator_order
+from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters
 from hydrotele.terms.table import terms_table
 
 PERIOD = 0.02
@@ -89,7 +89,7 @@ def test_a_stiff_damper_of_a_term_creeps(slide, reduced_of):
 def still_circuit(machine, terms, pressures, dt, end):
     """Chamber pressures after a time with closed valves and drives that stand still."""
     order = actuator_order(machine)
-    user, count = np.concatenate(list(actuator_numbers(machine).values())), len(order)
+    user, count = np.concatenate(list(actuator_parameters(machine).values())), len(order)
     act, rate = np.zeros(4 * count), np.zeros(4 * count)
     act[2::4], act[3::4] = pressures
     zeros, table = np.zeros(count), terms_table(terms, order)

@@ -37,13 +37,13 @@ def test_interface_of_dm_env(name, flat):
 @pytest.mark.parametrize("name", hydrotele.envs.TASK_NAMES)
 def test_same_bits_as_gymnasium_over_episodes(name):
     theirs, ours = dm.load(name, random=9, **SHORT), MachineEnv(name, **SHORT)
-    chance = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     for episode in range(3):
         step, (seen, _) = theirs.reset(), ours.reset(seed=9 if episode == 0 else None)
         over = False
         while not over:
             assert np.concatenate(list(step.observation.values())).tobytes() == seen.tobytes()
-            action = chance.uniform(-1.2, 1.2, ours.action_space.shape)
+            action = rng.uniform(-1.2, 1.2, ours.action_space.shape)
             step = theirs.step(action)
             seen, reward, terminated, truncated, info = ours.step(action)
             assert step.reward == reward

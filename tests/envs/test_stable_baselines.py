@@ -16,9 +16,9 @@ def test_steps_and_ends_are_those_of_the_vector_environment():
     theirs = MachineVectorEnv("TrackTrajectory", 3, None, 1, "SameStep", **_SHORT)
     ours.seed(5)
     assert np.array_equal(ours.reset(), theirs.reset(seed=[5, 6, 7])[0])
-    chance = np.random.default_rng(1)
+    rng = np.random.default_rng(1)
     for step in range(12):
-        action = chance.uniform(-1, 1, (3, 3)).astype(np.float32)
+        action = rng.uniform(-1, 1, (3, 3)).astype(np.float32)
         seen, reward, over, infos = ours.step(action)
         observation, paid, terminated, truncated, told = theirs.step(action)
         assert np.array_equal(seen, observation)

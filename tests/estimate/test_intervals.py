@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.estimate.evidence import Evidence, spreads
+from hydrotele.estimate.evidence import Evidence, standard_deviations
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import PERIOD, machine_data
@@ -28,10 +28,10 @@ def fitted(name, location, values, step=1e-3):
 def test_only_scatter_beyond_chance_widens():
     evidence, fit, noise = fitted("angle_offset", "boom", {"offset": 0.01})
     # steps hardly matter to an offset; 40 stretches tell a spread to 11 %
-    plain = spreads(evidence, fit.guess)
+    plain = standard_deviations(evidence, fit.guess)
     assert np.all((plain > 0.99 * noise) & (plain < 1.3 * noise))
-    assert spreads(evidence, fit.guess, 2.5) == pytest.approx(plain, rel=0.05)
-    assert spreads(evidence, fit.guess, 16.0) == pytest.approx(4.0 * plain, rel=0.05)
+    assert standard_deviations(evidence, fit.guess, 2.5) == pytest.approx(plain, rel=0.05)
+    assert standard_deviations(evidence, fit.guess, 16.0) == pytest.approx(4.0 * plain, rel=0.05)
     evidence.close()
 
 
@@ -49,7 +49,7 @@ def test_errors_that_hang_together_widen():
         evidence = Evidence(dataclasses.replace(data, fit=(moved,)), (moved,), 1)
         guess = Guess(((hypothesis, np.zeros(1)),))
         evidence.set_base(guess)
-        (found,) = spreads(evidence, evidence.fit(guess, 0.0).guess)
+        (found,) = standard_deviations(evidence, evidence.fit(guess, 0.0).guess)
         evidence.close()
         return found
 
@@ -60,7 +60,7 @@ def test_errors_that_hang_together_widen():
 def test_what_half_the_step_changes_is_added():
     """At 10 ms the steps show in a delay; a fit at half the step moves as far as is stated."""
     evidence, fit, noise = fitted("command_delay", "all", {"delay": 0.05}, step=10e-3)
-    wide = spreads(evidence, fit.guess)
+    wide = standard_deviations(evidence, fit.guess)
     finer = Evidence(evidence.data, evidence.data.fit, 1, 5e-3)
     finer.set_base(fit.guess)
     moved = finer.fit(fit.guess, 0.0).guess.deviation - fit.guess.deviation

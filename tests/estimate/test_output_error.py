@@ -15,9 +15,9 @@ from hydrotele.estimate.output_error import (
     flow_table,
     free_run_windows,
     linkage,
-    open_numbers,
     stretched,
     timing,
+    uncertain_parameters,
 )
 from hydrotele.kinematics.from_machine import axis_linkage, range_at_drive
 from hydrotele.logs.dataset import RunData, load_dataset
@@ -31,13 +31,13 @@ from hydrotele.scenario.scenario import Scenario
 @pytest.mark.parametrize("machine", ["cat215", "ec20", "emps"])
 def test_nominal_numbers_change_nothing(machine):
     nominal = load_machine(machine)
-    assert open_numbers(nominal).machine(nominal) == nominal
+    assert uncertain_parameters(nominal).machine(nominal) == nominal
 
 
 def test_numbers_have_the_priors_that_the_machine_states():
     stated = {"delay": 0.02, "linkage.stick": 0.3}
     machine = load_machine("ec20").model_copy(update={"uncertainty": stated})
-    found = {(h.name, h.location): h.parameters for h, _ in open_numbers(machine).parts}
+    found = {(h.name, h.location): h.parameters for h, _ in uncertain_parameters(machine).parts}
     assert found["timing", "boom"]["delay"].scale == 0.02
     assert found["linkage", "stick"]["base"].scale == 0.3
     assert found["linkage", "boom"]["base"].scale == 0.15

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.customary import amount, said
+from hydrotele.gap.customary import amount, in_customary_units
 from hydrotele.gap.description import effect_title, gap_closed, headline, verdict_words
 from hydrotele.gap.result import Alternative, Estimate, GapSize, NamedEffect
 from hydrotele.machine.machine_file import load_machine
@@ -122,10 +122,10 @@ def test_customary_numbers(value, unit, parameter, expected):
 
 
 def test_digits_follow_the_interval():
-    wide = said(Estimate(251.27, "kg", 210.0, 290.0, 0.0))
-    narrow = said(Estimate(251.27, "kg", 251.24, 251.3, 0.0))
+    wide = in_customary_units(Estimate(251.27, "kg", 210.0, 290.0, 0.0))
+    narrow = in_customary_units(Estimate(251.27, "kg", 251.24, 251.3, 0.0))
     assert (wide.value, narrow.value) == ("251", "251.270")
-    assert said(Estimate(1.0, "kg", math.nan, math.nan, 0.0)).low == "-"
+    assert in_customary_units(Estimate(1.0, "kg", math.nan, math.nan, 0.0)).low == "-"
 
 
 def test_every_effect_has_a_title_and_known_units():

@@ -20,7 +20,7 @@ from hydrotele.hydraulics.laws import (
     pressure_without_air,
     softening,
 )
-from hydrotele.hydraulics.parameters import actuator_numbers
+from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
 
 BOOM = 1
@@ -30,7 +30,7 @@ CLOSED = np.zeros(1)
 @pytest.fixture
 def boom():
     """Actuator numbers of the CAT 215's boom, as the only axis."""
-    numbers = actuator_numbers(load_machine("cat215", "none"))["boom"].copy()
+    numbers = actuator_parameters(load_machine("cat215", "none"))["boom"].copy()
     numbers[Slot.COUNT] = 1
     return numbers
 
@@ -165,7 +165,7 @@ def test_what_is_said_to_be_below_vacuum_is_nearly_empty_and_nothing_worse(boom)
 
 def test_axes_that_share_a_supply_stay_sound_while_one_of_them_is_empty():
     """A fed chamber that is drawn empty beside one that the supply couples it with."""
-    user = np.concatenate(list(actuator_numbers(load_machine("cat215", "none")).values()))
+    user = np.concatenate(list(actuator_parameters(load_machine("cat215", "none")).values()))
     act, rate, scratch = np.zeros(12), np.zeros(12), circuit_scratch()
     act[2::4] = act[3::4] = 2.0e6
     x, v = np.full(3, 0.4), np.array([0.0, 0.6, 0.1])

@@ -16,7 +16,7 @@ from hydrotele.hydraulics.circuit import (
     supply_pressure,
 )
 from hydrotele.hydraulics.laws import port_flow
-from hydrotele.hydraulics.parameters import actuator_numbers
+from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
 
 SWING, BOOM, STICK = range(3)
@@ -28,7 +28,7 @@ SMOOTHING = 5.0e4
 @pytest.fixture(scope="module")
 def user():
     """Actuator numbers of the CAT 215: swing, boom, stick."""
-    return np.concatenate(list(actuator_numbers(load_machine("cat215", "none")).values()))
+    return np.concatenate(list(actuator_parameters(load_machine("cat215", "none")).values()))
 
 
 def run(user, act, command, x, v, dt, steps, count=3):

@@ -17,11 +17,11 @@ from hydrotele.hydraulics.circuit import (
     SCRATCH,
     Slot,
     circuit_supply,
+    demanded_share,
     open_ports,
     step_circuit,
-    wanted_share,
 )
-from hydrotele.hydraulics.parameters import actuator_numbers, memory_names
+from hydrotele.hydraulics.parameters import actuator_parameters, extra_state_names
 from hydrotele.machine.drives import Axis, Friction
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
@@ -37,7 +37,7 @@ def friction(**more):
     machine = load_machine("rig")
     for name, value in facts.items():
         machine = changed(machine, f"axes.slide.cylinder.friction.{name}", value)
-    return actuator_numbers(machine)["slide"]
+    return actuator_parameters(machine)["slide"]
 
 
 def integrated(way, speed, end, points):
@@ -143,8 +143,8 @@ def test_a_light_drive_side_is_stepped_implicitly():
 def test_without_the_numbers_nothing_is_remembered():
     for name in ("rig", "emps", "cat215"):
         machine = load_machine(name)
-        assert memory_names(machine) == []
-        for numbers in actuator_numbers(machine).values():
+        assert extra_state_names(machine) == []
+        for numbers in actuator_parameters(machine).values():
             assert not numbers[Slot.BRISTLE_STIFFNESS : Slot.CURVES].any()
 
 
@@ -154,11 +154,11 @@ def test_what_is_remembered_stands_behind_the_activations():
     for name in order:
         usual = EFFECTS["presliding"].parameters(machine, name)["compliance"].scale
         machine = apply_effect(machine, "presliding", name, {"compliance": usual})
-    names, valves = memory_names(machine), list(machine.hydraulic_axes)
+    names, valves = extra_state_names(machine), list(machine.hydraulic_axes)
     drives = [n for n, a in machine.axes.items() if a.force]
     assert names == [*(f"bristle.{n}" for n in valves), "delivery.supply",
                      *(f"bristle.{n}" for n in drives)]  # fmt: skip
-    numbers = actuator_numbers(machine)
+    numbers = actuator_parameters(machine)
     assert numbers[valves[0]][Slot.BRISTLE] == 4 * len(valves)
     assert all(numbers[n][Slot.MEMORY] == len(valves) + 1 for n in valves)
     assert all(numbers[n][Slot.DELIVERY] == 5 * len(valves) for n in valves)
@@ -182,7 +182,7 @@ def slow_pump(time_constant):
     machine = load_machine("rig")
     for name, value in supply.items():
         machine = changed(machine, f"supply.{name}", value)
-    return actuator_numbers(machine)["slide"]
+    return actuator_parameters(machine)["slide"]
 
 
 def test_the_pump_follows_by_its_exponential_and_arrives_at_todays_pressure():
@@ -191,7 +191,7 @@ def test_the_pump_follows_by_its_exponential_and_arrives_at_todays_pressure():
     now, scratch, rates = slow_pump(0.0), np.zeros(SCRATCH), np.zeros(5)
     act = np.array([0.6, 0.0, 2e6, 2e6, 0.0])
     open_ports(user, act, act, scratch, 0, 1, 0.0, act)
-    wanted = wanted_share(user, 0, 1, scratch)
+    wanted = demanded_share(user, 0, 1, scratch)
     without = circuit_supply(now, 0, 1, scratch)
     assert 0.2 < wanted < 1.0
     low = circuit_supply(user, 0, 1, scratch, 0.5 * wanted)

@@ -13,7 +13,7 @@ from hydrotele.hydraulics.circuit import (
     step_circuit,
 )
 from hydrotele.hydraulics.laws import holding_share, spool_step, stop_force, valve_opening
-from hydrotele.hydraulics.parameters import Slot, actuator_numbers
+from hydrotele.hydraulics.parameters import Slot, actuator_parameters
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
@@ -36,7 +36,7 @@ def changed_machine(valve=None, supply=None, **axis):
 
 def record(**facts):
     """Actuator numbers of the boom alone."""
-    numbers = actuator_numbers(changed_machine(**facts))["boom"].copy()
+    numbers = actuator_parameters(changed_machine(**facts))["boom"].copy()
     numbers[Slot.COUNT] = 1
     return numbers
 
@@ -222,7 +222,7 @@ def test_a_slew_limited_spool_follows_the_saturated_equation(bandwidth, limit, d
 
 
 def supply_of(act, **supply):
-    user = np.concatenate(list(actuator_numbers(changed_machine(supply=supply)).values()))
+    user = np.concatenate(list(actuator_parameters(changed_machine(supply=supply)).values()))
     ports = circuit_scratch()
     act = np.array(act, float)
     open_ports(user, act, act, ports, 0, 3, 0.0, act)
@@ -313,7 +313,7 @@ def test_stops_push_and_never_pull():
 
 
 def test_stroke_and_joint_range_end_the_travel():
-    numbers = actuator_numbers(CAT)
+    numbers = actuator_parameters(CAT)
     assert numbers["swing"][Slot.STOP_STIFFNESS] == 0.0, "it turns without end"
     low, high = numbers["boom"][Slot.STOP_LOW], numbers["boom"][Slot.STOP_HIGH]
     assert 0.0 < low < 0.1 and 1.04 < high < 1.05, "-42 .. 58 deg lie inside the stroke"

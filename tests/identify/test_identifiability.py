@@ -8,7 +8,7 @@ import pytest
 from hydrotele.identify.chain import load_chain
 from hydrotele.identify.identifiability import COMBINATION, FULL, UNIDENTIFIABLE, identifiability
 from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import Rubbing, pin_friction, regressor
+from hydrotele.identify.regressor import FrictionTerm, pin_friction, regressor
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from tests.identify.test_projection import panda
@@ -29,7 +29,10 @@ def test_the_panda_has_43_base_parameters():
     motion = random_motion(np.zeros(7), 2.0, 60, 3)
     motion[0] = np.sort(motion[0], axis=0)
     found = project(chain, chain.joints, *motion, drives=chain.joints)
-    for rubbing, offsets, rank in (((), False, 43), ([Rubbing(j) for j in chain.joints], True, 64)):
+    for rubbing, offsets, rank in (
+        ((), False, 43),
+        ([FrictionTerm(j) for j in chain.joints], True, 64),
+    ):
         table = regressor(chain, found, drives=chain.joints, rubbing=rubbing, offsets=offsets)
         told = identifiability(table.matrix.reshape(-1, len(table.names)), table.names, table.units)
         assert len(told.base) == rank
@@ -53,7 +56,7 @@ def complete():
         -(width * rate**2 * np.sin(rate * t + phase)).sum(0),
     ]
     found = project(chain, ("swing", "boom", "stick"), *motion)
-    drives = [Rubbing(joint, {"coulomb": 0.0}) for joint in chain.drives]
+    drives = [FrictionTerm(joint, {"coulomb": 0.0}) for joint in chain.drives]
     return regressor(
         chain, found, bodies=[b for b in chain.bodies if b != "chassis"],
         rubbing=[*drives, *pin_friction(chain)],
@@ -98,7 +101,7 @@ def test_no_motion_tells_gravity_only():
     chain = dataclasses.replace(load_chain(plant.model), start=rest_state(plant).qpos.copy())
     still = np.tile([[0.0, 0.3, -1.6]], (50, 1))
     found = project(chain, ("swing", "boom", "stick"), still, 0 * still, 0 * still)
-    table = regressor(chain, found, rubbing=[Rubbing(j) for j in chain.drives])
+    table = regressor(chain, found, rubbing=[FrictionTerm(j) for j in chain.drives])
     told = identifiability(table.matrix.reshape(-1, len(table.names)), table.names, table.units)
     # one pose: a torque of the swing, a force of each cylinder
     assert len(told.base) == 3

@@ -14,7 +14,7 @@ from hydrotele.identify.estimation import estimate
 from hydrotele.identify.identifiability import identifiability, reference_sizes
 from hydrotele.identify.projection import project
 from hydrotele.identify.regressor import (
-    Rubbing,
+    FrictionTerm,
     drive_friction,
     machine_setup,
     pin_friction,
@@ -192,9 +192,9 @@ def test_refuses_what_it_cannot_tell():
     with pytest.raises(InputError, match="cat215 has no body bucket"):
         regressor(chain, found, bodies=("bucket",))
     with pytest.raises(InputError, match="friction has no sticky"):
-        regressor(chain, found, rubbing=[Rubbing("boom", {"sticky": 0.0})])
+        regressor(chain, found, rubbing=[FrictionTerm("boom", {"sticky": 0.0})])
     with pytest.raises(InputError, match="closure, which has no sides"):
-        regressor(chain, found, rubbing=[Rubbing("boom_pin", {"viscous_asymmetry": 0.0})])
+        regressor(chain, found, rubbing=[FrictionTerm("boom_pin", {"viscous_asymmetry": 0.0})])
     grapple, plant = closed_chain(load_machine("cat215", "grapple"))
     given = tuple(plant.machine.axes[a].joint for a in plant.axes)
     with pytest.raises(InputError, match="closure: grapple_pitch, grapple_roll"):

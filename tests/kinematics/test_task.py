@@ -8,10 +8,10 @@ from hydrotele.kinematics.task import (
     BEYOND,
     REACHED,
     SINGULAR,
+    arm_parameters,
     task_forward,
     task_inverse,
     task_jacobian,
-    task_numbers,
     task_rates,
 )
 
@@ -38,7 +38,7 @@ def angles(k, count=40):
 
 def forward(geometry, q):
     pose = np.zeros(5)
-    task_forward(task_numbers(geometry), q, pose)
+    task_forward(arm_parameters(geometry), q, pose)
     return pose
 
 
@@ -59,7 +59,7 @@ def test_it_is_the_closed_form_of_the_arm(name):
 @pytest.mark.parametrize("name", SIZES)
 def test_inverse_and_rates_go_back(name):
     geometry, k = SIZES[name]
-    g, back, out, table = task_numbers(geometry), np.zeros(k), np.zeros(k), np.zeros((k, k))
+    g, back, out, table = arm_parameters(geometry), np.zeros(k), np.zeros(k), np.zeros((k, k))
     for q in angles(k):
         pose = forward(geometry, q)
         assert task_inverse(g, pose, q[0], back) == REACHED
@@ -76,7 +76,7 @@ def test_inverse_and_rates_go_back(name):
 
 
 def test_beyond_reach_nothing_is_written_and_a_straight_elbow_is_told():
-    g, q = task_numbers(DIGGER), np.full(4, 7.0)
+    g, q = arm_parameters(DIGGER), np.full(4, 7.0)
     for r in (30.0, 0.05, np.nan):
         assert task_inverse(g, np.array([r, 0.0, 1.0, 0.0, 0.0]), 0.0, q) == BEYOND
         assert np.all(q == 7.0)
@@ -85,7 +85,7 @@ def test_beyond_reach_nothing_is_written_and_a_straight_elbow_is_told():
 
 
 def test_swing_takes_the_turn_nearest_to_now():
-    g, q = task_numbers(DIGGER), np.zeros(4)
+    g, q = arm_parameters(DIGGER), np.zeros(4)
     pose = forward(DIGGER, np.array([3.1, 0.3, -1.2, 0.1]))
     task_inverse(g, pose, 3.1 + 4 * np.pi, q)
     assert abs(q[0] - 3.1 - 4 * np.pi) < 1e-9

@@ -7,7 +7,7 @@ import signal
 import numpy as np
 import pytest
 
-from hydrotele.cli.driving import Wishes, drive_to_folder, first_interrupt
+from hydrotele.cli.driving import DriveOptions, drive_to_folder, first_interrupt
 from hydrotele.core.errors import InputError
 from hydrotele.devices.reading import Reading
 from hydrotele.logs.log import load_log
@@ -33,7 +33,7 @@ class Clock:
 
 
 def wishes(out, **changes):
-    usual = Wishes(None, {}, "keyboard", out, False, None, 0.0, False, True)
+    usual = DriveOptions(None, {}, "keyboard", out, False, None, 0.0, False, True)
     return usual._replace(**changes)
 
 

@@ -6,10 +6,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.simulate.surroundings import LET_GO, ROW, TAKEN, UNCHANGED, grip_numbers, grip_step
+from hydrotele.simulate.surroundings import (
+    LET_GO,
+    ROW,
+    TAKEN,
+    UNCHANGED,
+    grip_parameters,
+    grip_step,
+)
 
 CENTRE, HALF = (0.7, 0.0, 0.1), (0.1, 0.3, 0.2)
-GRIP = grip_numbers(1.2, 1.0, 1, math.radians(20.0), CENTRE, HALF, 0, (-1.5, 1.5))
+GRIP = grip_parameters(1.2, 1.0, 1, math.radians(20.0), CENTRE, HALF, 0, (-1.5, 1.5))
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 ACROSS = np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])  # own x axis along the grab's y
 

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
-from hydrotele.soil.facts import CAT215, SOILS, level_profile, outline_from_edge, soil_numbers
+from hydrotele.soil.facts import CAT215, SOILS, level_profile, outline_from_edge, soil_parameters
 from hydrotele.soil.step import held_soil
 
 DEGREE = math.pi / 180.0
 SOIL = SOILS["sandy_loam"]
-NUMBERS = soil_numbers(SOIL, CAT215, 3.0, 0.05)
+NUMBERS = soil_parameters(SOIL, CAT215, 3.0, 0.05)
 
 
 def held(attitude, level=0.0):
@@ -94,10 +94,10 @@ def test_shape_is_that_of_the_model():
 
 def test_unusable_profiles_and_buckets_are_refused():
     with pytest.raises(InputError, match="0.01 to 0.5"):
-        soil_numbers(SOIL, CAT215, 3.0, 0.0)
+        soil_parameters(SOIL, CAT215, 3.0, 0.0)
     with pytest.raises(InputError, match="at least 0"):
-        soil_numbers(SOIL, CAT215, -1.0, 0.05)
+        soil_parameters(SOIL, CAT215, -1.0, 0.05)
     with pytest.raises(InputError, match="3 to 16"):
-        soil_numbers(SOIL, CAT215._replace(outline=CAT215.outline[:2]), 3.0, 0.05)
+        soil_parameters(SOIL, CAT215._replace(outline=CAT215.outline[:2]), 3.0, 0.05)
     with pytest.raises(InputError, match="at least 8"):
         level_profile(3)

@@ -16,7 +16,7 @@ from hydrotele.soil import step, terrain
 from hydrotele.soil import step as bucket
 from hydrotele.soil import step as cutting
 from hydrotele.soil import step as wrench
-from hydrotele.soil.facts import CAT215, SOILS, Soil, soil_numbers
+from hydrotele.soil.facts import CAT215, SOILS, Soil, soil_parameters
 from hydrotele.soil.step import (
     acting_rake,
     acting_slope,
@@ -199,7 +199,7 @@ def test_wedge_is_in_equilibrium(rake, slope, phi, delta, plane, c, a):
 
 
 def numbers():
-    return soil_numbers(SOILS["sandy_loam"], CAT215, 3.0, 0.05)
+    return soil_parameters(SOILS["sandy_loam"], CAT215, 3.0, 0.05)
 
 
 def force(n, depth, rake=48 * DEGREE, slope=0.0, loose=0.0, load=0.0):
@@ -214,7 +214,7 @@ def force(n, depth, rake=48 * DEGREE, slope=0.0, loose=0.0, load=0.0):
 )  # fmt: skip
 def test_cutting_force_is_bounded(rake, slope, depth, loose, load, name):
     s = SOILS[name]
-    out = force(soil_numbers(s, CAT215, 3.0, 0.05), depth, rake, slope, loose, load)
+    out = force(soil_parameters(s, CAT215, 3.0, 0.05), depth, rake, slope, loose, load)
     assert np.isfinite(out).all()
     weight = s.density * 9.81 * depth * depth * CAT215.width
     # No factor exceeds 60: that of a rough upright blade in a steep surface is the largest.
@@ -248,7 +248,7 @@ def test_units_fit():
     wide = CAT215._replace(width=2.0 * CAT215.width)
     loam = SOILS["sandy_loam"]
     strong = loam.model_copy(update={"cohesion": 2 * loam.cohesion, "adhesion": 2 * loam.adhesion})
-    large = force(soil_numbers(strong, wide, 3.0, 0.05), 0.2, load=8.0e3)
+    large = force(soil_parameters(strong, wide, 3.0, 0.05), 0.2, load=8.0e3)
     assert large == pytest.approx(8.0 * small, rel=1e-12)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hydrotele.kinematics.from_machine import arm_geometry
-from hydrotele.kinematics.task import task_forward, task_inverse, task_jacobian, task_numbers
+from hydrotele.kinematics.task import arm_parameters, task_forward, task_inverse, task_jacobian
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.soil.facts import (
@@ -22,7 +22,7 @@ from hydrotele.soil.facts import (
     bucket_state,
     level_profile,
     soil_mass,
-    soil_numbers,
+    soil_parameters,
 )
 from hydrotele.soil.step import bucket_wrench, soil_step
 
@@ -38,14 +38,14 @@ def plant():
 def dig(plant, steps, seconds=2.5, draw=1.2):
     """Stick and bucket open-loop through firm soil with the force held over some physics steps."""
     model = plant.model
-    g = task_numbers(arm_geometry(plant.machine))
+    g = arm_parameters(arm_geometry(plant.machine))
     order = [plant.axes.index(name) for name in AXES]
     q, pose, jacobian = np.zeros(4), np.zeros(5), np.zeros((4, 4))
     task_inverse(g, np.array([6.3, 0.0, -0.12, -88.0 * DEGREE, 0.0]), 0.0, q)
     joints = [plant.machine.axes[name].joint for name in AXES]
     data = rest_state(plant, dict(zip(joints, q.tolist(), strict=True)))
     data.ctrl[:] = 0.0
-    n = soil_numbers(SOILS["firm"], CAT215, 3.0, 0.05)
+    n = soil_parameters(SOILS["firm"], CAT215, 3.0, 0.05)
     (surface, loose), state, out = level_profile(140), bucket_state(), np.zeros(OUT)
     body, wrench, rows = model.body("bucket").id, np.zeros(6), []
     mass = soil_mass(n, surface, loose, state)
@@ -85,7 +85,7 @@ def test_digging_machine_does_not_chatter(plant):
 def test_wrench_does_the_work_of_its_parts(plant):
     """Its power over any motion of the body is that of force, moment and weight in the plane."""
     model, data = plant.model, rest_state(plant)
-    g = task_numbers(arm_geometry(plant.machine))
+    g = arm_parameters(arm_geometry(plant.machine))
     order = [plant.axes.index(name) for name in AXES]
     pose, jacobian = np.zeros(5), np.zeros((4, 4))
     q = data.qpos[plant.qpos[order]]

@@ -38,7 +38,7 @@ from hydrotele.soil.facts import (
     bucket_state,
     level_profile,
     soil_mass,
-    soil_numbers,
+    soil_parameters,
 )
 from hydrotele.soil.step import soil_step
 
@@ -50,7 +50,7 @@ class Ground:
     """A profile of 140 cells of 5 cm from 3 m on, and a bucket over it."""
 
     def __init__(self, soil="sandy_loam", height=0.0):
-        self.numbers = soil_numbers(SOILS[soil], CAT215, 3.0, 0.05)
+        self.numbers = soil_parameters(SOILS[soil], CAT215, 3.0, 0.05)
         self.surface, self.loose = level_profile(140, height)
         self.state, self.out = bucket_state(), np.zeros(OUT)
         self.last = None

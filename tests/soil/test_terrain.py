@@ -15,7 +15,7 @@ from hydrotele.soil.facts import (
     bucket_state,
     level_profile,
     soil_mass,
-    soil_numbers,
+    soil_parameters,
 )
 from hydrotele.soil.terrain import (
     SETTLED,
@@ -27,7 +27,7 @@ from hydrotele.soil.terrain import (
 )
 
 SOIL = SOILS["sandy_loam"]
-NUMBERS = soil_numbers(SOIL, CAT215, 3.0, 0.05)
+NUMBERS = soil_parameters(SOIL, CAT215, 3.0, 0.05)
 
 
 def settle(surface, loose, wall=-2):

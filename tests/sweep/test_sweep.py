@@ -22,7 +22,7 @@ from hydrotele.simulate.record import SimulationFailed
 from hydrotele.sweep import running
 from hydrotele.sweep.checking import check_points, open_base, scenario_of
 from hydrotele.sweep.facts import load_sweep, overrides, points
-from hydrotele.sweep.journal import FAILED, OK, Entry, Journal, numbers_of, possible_numbers
+from hydrotele.sweep.journal import FAILED, OK, Entry, Journal, numbers_of, possible_results
 from hydrotele.sweep.running import Task, perform
 from hydrotele.sweep.sweep import How, outcomes, run_sweep, sweep_folder
 from tests.sweep.conftest import rows_of, write_sweep
@@ -240,7 +240,7 @@ def test_a_machine_with_further_files_is_refused_on_a_cluster(own, tmp_path):
 
 def test_all_numbers_that_runs_have_are_known_beforehand():
     teleoperated = run_scenario(load_scenario("joystick_up", {"duration": "0.5"}))
-    possible = possible_numbers(teleoperated.plant.axes, True)
+    possible = possible_results(teleoperated.plant.axes, True)
     names = set(numbers_of(teleoperated.summary))
     assert names <= set(possible) and "teleoperation.handle_energy_J" in names
 

@@ -12,7 +12,7 @@ from hydrotele.tasks.core import TaskCore
 from hydrotele.tasks.evaluation import compare, evaluate
 from hydrotele.tasks.memory import DISABLED, NEXT_STEP
 from hydrotele.tasks.task import Options
-from hydrotele.tasks.variants import usual_spread
+from hydrotele.tasks.variants import typical_variation
 
 
 def _core(count=3, autoreset=DISABLED, **choices) -> TaskCore:
@@ -24,8 +24,8 @@ def test_figures_are_those_of_the_episodes():
     core = _core()
     scores = evaluate(core, make_controller("random", core.setup), 6, seed=4)
     alone = _core(count=1)
-    chance = np.random.default_rng(0)
-    actions = chance.uniform(-1.0, 1.0, (25, 3, 3))  # as the controller draws them for the batch
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1.0, 1.0, (25, 3, 3))  # as the controller draws them for the batch
     for number in range(3):
         alone.reset(np.array([4 + number]))
         total, errors = 0.0, []
@@ -66,8 +66,8 @@ def test_a_core_that_begins_anew_by_itself_is_refused():
 
 def test_the_usual_spread_suits_every_task_and_changes_the_machine():
     for task in TASKS.values():
-        assert usual_spread(load_machine(task.machine, task.tool))
-    core = _core(randomise=usual_spread(load_machine("cat215", "none")))
+        assert typical_variation(load_machine(task.machine, task.tool))
+    core = _core(randomise=typical_variation(load_machine("cat215", "none")))
     first, second = core.setup.variants.machines
     assert first.axes["boom"].valve != second.axes["boom"].valve
     assert first.axes["swing"].command_delay == first.axes["boom"].command_delay

@@ -21,7 +21,7 @@ from hydrotele.soil.facts import (
     STATE,
     SWELL,
     soil_mass,
-    soil_numbers,
+    soil_parameters,
 )
 from hydrotele.soil.step import bucket_wrench
 from hydrotele.tasks.catalogue import TASKS
@@ -48,7 +48,7 @@ from hydrotele.tasks.grade import (
     TERRAIN,
     TILT,
     TIME_COST,
-    bed_numbers,
+    bed_parameters,
     grade_radii,
 )
 from hydrotele.tasks.memory import DISABLED
@@ -229,7 +229,7 @@ def test_episodes_have_the_soils_they_are_said_to_have():
     core = core_of(32, variants=1)
     for n in range(32):
         soil = SOILS[GRADE_SOILS[int(core.measures[n, 3])]]
-        assert np.array_equal(parts(core, n)[4], soil_numbers(soil, CAT215, START, CELL))
+        assert np.array_equal(parts(core, n)[4], soil_parameters(soil, CAT215, START, CELL))
     assert core.terrain.shape[1] == TERRAIN
     with pytest.raises(InputError, match="1 to 3 soils"):
-        bed_numbers([SOILS["firm"]] * 4)
+        bed_parameters([SOILS["firm"]] * 4)

@@ -7,7 +7,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.compliance import Flotor
 from hydrotele.teleop.flotor import identify_flotor
-from hydrotele.teleop.levitation import fly, levitation, wobble
+from hydrotele.teleop.levitation import excitation_path, levitation, simulate_levitation
 
 GUESS = Flotor(0.9, np.zeros(3), 2e-3 * np.eye(3))  # of the control while nothing is known
 
@@ -24,7 +24,9 @@ def test_planted_numbers_are_found(diodes):
     """12 s of wobbling under a control that takes the flotor for another one."""
     joystick = with_com((0.002, -0.001, 0.02))
     control = levitation(joystick, GUESS)
-    flight = fly(joystick, wobble(joystick, 12.0), control=control, diodes=diodes)
+    flight = simulate_levitation(
+        joystick, excitation_path(joystick, 12.0), control=control, diodes=diodes
+    )
     assert not flight.limited.any() and np.abs(flight.pose[:, :3]).max() < 5e-3
     found = identify_flotor(
         flight.place, flight.quaternion, flight.currents, control.period, control.coils
@@ -41,7 +43,7 @@ def test_motions_that_tell_too_little_are_refused():
     joystick = with_com((0.0, 0.0, 0.02))
     control = levitation(joystick)
     period, coils = control.period, control.coils
-    still = fly(joystick, np.zeros((500, 6)))
+    still = simulate_levitation(joystick, np.zeros((500, 6)))
     with pytest.raises(InputError, match="does not tell"):  # noise of hovering tells nothing
         identify_flotor(still.place, still.quaternion, still.currents, period, coils)
     with pytest.raises(InputError, match="does not tell"):

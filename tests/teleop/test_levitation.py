@@ -7,7 +7,7 @@ import pytest
 
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.compliance import Flotor
-from hydrotele.teleop.levitation import FROZEN, designed_step, fly, levitation
+from hydrotele.teleop.levitation import FROZEN, designed_step, levitation, simulate_levitation
 
 JOYSTICK = load_joystick()
 STEPS = np.array([2e-3] * 3 + [np.deg2rad(3.0)] * 3)
@@ -18,7 +18,7 @@ STEPS = np.array([2e-3] * 3 + [np.deg2rad(3.0)] * 3)
 def test_every_axis_steps_as_designed_and_leaves_the_others_alone(axis, diodes):
     target = np.zeros((121, 6))
     target[:, axis] = STEPS[axis]
-    flight = fly(JOYSTICK, target, diodes=diodes)
+    flight = simulate_levitation(JOYSTICK, target, diodes=diodes)
     alone = JOYSTICK.alone
     designed = designed_step(flight.time, alone.frequency[axis], alone.ratio[axis])
     share = flight.pose / STEPS
@@ -35,7 +35,7 @@ def test_it_hovers_within_ten_micrometres(diodes):
     """After it was lifted by 0.3 mm, with errors of a reading up to one step."""
     lift = np.zeros((1000, 6))
     lift[:, 2] = 3e-4
-    held = (fly(JOYSTICK, lift, diodes=diodes).pose - lift)[200:, :3]
+    held = (simulate_levitation(JOYSTICK, lift, diodes=diodes).pose - lift)[200:, :3]
     assert 1e-8 < np.abs(held).max() < 1e-5
 
 
@@ -54,7 +54,7 @@ def test_a_failed_sensor_gets_no_currents_and_the_flotor_comes_back(bad):
             return seen
         return (np.full(3, np.nan), seen[1]) if bad == "no number" else tuple(kept)
 
-    flight = fly(JOYSTICK, np.zeros((500, 6)), spoil=spoil)
+    flight = simulate_levitation(JOYSTICK, np.zeros((500, 6)), spoil=spoil)
     known = 100 + (0 if bad == "no number" else round(FROZEN * JOYSTICK.control_rate) - 1)
     assert flight.blind[known + 1 : 200].all() and not flight.currents[known + 1 : 200].any()
     assert not flight.blind[:known].any() and not flight.blind[200:].any()
@@ -69,7 +69,7 @@ def test_a_wrong_weight_is_a_wrong_place():
     body = levitation(JOYSTICK).body
     heavy = Flotor(1.05 * body.mass, body.centre_of_mass, body.inertia)
     control = dataclasses.replace(levitation(JOYSTICK), body=heavy)
-    found = fly(JOYSTICK, np.zeros((400, 6)), control=control).pose[-1, 2]
+    found = simulate_levitation(JOYSTICK, np.zeros((400, 6)), control=control).pose[-1, 2]
     # the spring is stiffer by the same 5 %
     assert found == pytest.approx(0.05 * 9.81 / 25.0**2 / 1.05, rel=0.01)
 
@@ -80,7 +80,7 @@ def test_a_demand_beyond_the_coils_keeps_its_direction_and_the_flotor_its_stops(
     axes = dataclasses.replace(control.axes, frequency=np.full(6, 250.0))
     target = np.zeros((40, 6))
     target[:, :3] = 4.5e-3
-    flight = fly(JOYSTICK, target, control=dataclasses.replace(control, axes=axes))
+    flight = simulate_levitation(JOYSTICK, target, control=dataclasses.replace(control, axes=axes))
     assert flight.limited[0] and np.abs(flight.currents[0]).max() == pytest.approx(4.0)
     force = control.coils.wrench(flight.currents[0])[:3]
     wanted = 250.0**2 * target[0, :3] + [0.0, 0.0, 9.81]

@@ -11,9 +11,9 @@ from hydrotele.teleop.compliance import rotation_between, turn_matrix
 from hydrotele.teleop.levitation import (
     diode_readings,
     pose_of_readings,
+    pose_resolution,
     quaternion_of,
     rotation_vector,
-    sensed_spread,
 )
 
 JOYSTICK = load_joystick()
@@ -65,7 +65,7 @@ def test_steps_of_the_diodes_give_the_stated_resolution():
     sensing = JOYSTICK.sensing
     stated = np.array([sensing.translation] * 3 + [sensing.rotation] * 3) / np.sqrt(12.0)
     assert (spread < stated).all(), spread / stated
-    np.testing.assert_allclose(spread, sensed_spread(FAR, STEP), rtol=0.25)
+    np.testing.assert_allclose(spread, pose_resolution(FAR, STEP), rtol=0.25)
 
 
 def test_beams_that_miss_and_readings_that_fit_no_pose():

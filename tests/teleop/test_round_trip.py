@@ -10,7 +10,7 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.teleop.axis_table import flat_view, flattened
 from hydrotele.teleop.master import master
-from hydrotele.teleop.person import Muscles
+from hydrotele.teleop.operator_model import Muscles
 from hydrotele.teleop.slave import AGE, slave
 from hydrotele.teleop.station import QUIET, SHARE, to_the_hand, to_the_machine
 

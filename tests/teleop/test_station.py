@@ -163,7 +163,7 @@ def worked(duration, **pilot):
         place = data.qpos[:3].copy()
         session.advance()
         speed = (data.qpos[:3] - place) / PERIOD
-        force = session.station.person.muscles.force[:3] - hand.stiffness * place
+        force = session.station.operator.muscles.force[:3] - hand.stiffness * place
         force -= hand.damping * speed + hand.mass * (speed - before) / PERIOD
         force[2] -= 9.81 * hand.mass
         true.append(true[-1] + PERIOD * float(force @ speed))

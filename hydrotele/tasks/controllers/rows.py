@@ -9,7 +9,7 @@ out what the nominal machine does not know: leakage, other dead bands and flow g
 
 import numpy as np
 
-from hydrotele.control.servo import drive_row, drive_tables, servo_numbers, servo_step
+from hydrotele.control.servo import drive_row, drive_tables, servo_parameters, servo_step
 from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward, task_inverse
 from hydrotele.scenario.scenario import Servo
@@ -114,7 +114,7 @@ class ValveLaw:
         """
         machine, self._dt = setup.machine, step_time(setup)
         self._axes, self._integral_gain = setup.axes, integral_gain
-        self._numbers = servo_numbers(machine, setup.axes, servo, self._dt)
+        self._numbers = servo_parameters(machine, setup.axes, servo, self._dt)
         self._grid, self._table = drive_tables(machine, setup.axes)
         valves = [i for i, name in enumerate(setup.axes) if machine.axes[name].hydraulic]
         names = [setup.axes[i] for i in valves]

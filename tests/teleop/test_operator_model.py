@@ -7,7 +7,7 @@ from hydrotele.machine.joystick import load_joystick
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.teleop.axis_table import NOMINAL, REACH
 from hydrotele.teleop.master import master
-from hydrotele.teleop.person import Person, pull
+from hydrotele.teleop.operator_model import OperatorModel, pull
 
 STICK, PERIOD, TICKS = load_joystick(), 0.005, 400
 CARRIED = 9.81 * STICK.hand.mass
@@ -32,7 +32,7 @@ class Views:
 def person(operator, seed=1, views=None, **changed):
     pilot = TeleopPilot.model_validate({"kind": "teleop", "operator": operator, **changed})
     numbers = master(STICK, pilot, ("r", "theta", "z", "attitude"))[0]
-    return Person(pilot, STICK, numbers, views or Views(), TICKS, PERIOD, seed), numbers
+    return OperatorModel(pilot, STICK, numbers, views or Views(), TICKS, PERIOD, seed), numbers
 
 
 @pytest.mark.parametrize("mode", ["rate", "position"])

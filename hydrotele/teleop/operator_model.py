@@ -2,7 +2,7 @@
 
 He never knows the contact force: he feels what the handle does, sees the tip and whether it
 touches, and in `track` a graph of the force that he is to make. He decides fifty times a second;
-`teleop.person` does the rest.
+`teleop.operator_model` does the rest.
 
 Muscles of the simulated operator: from a wanted displacement to forces on the handle.
 """
@@ -157,7 +157,7 @@ class Seen(Protocol):
         ...
 
 
-class Person:
+class OperatorModel:
     """An operator in one run.
 
     Attributes:
