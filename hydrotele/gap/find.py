@@ -23,6 +23,7 @@ from hydrotele.gap.residuals import (
     believed,
     believed_part,
     constancy,
+    has_sizes,
     left_over,
     perfect_tracks,
     residual_tests,
@@ -211,7 +212,7 @@ class _Judge:
         holds = np.isfinite(floor) and _FLOOR[0] < floor < _FLOOR[1]
         clean = holds and not self.ripple
         tests = residual_tests(tracks, self.data.channels, perfect if clean else ())
-        if clean and any(h.name != CALIBRATION for h, _ in judged.guess.parts):
+        if clean and has_sizes(judged.guess):
             made = Evidence(noisy, [track.run for track in perfect[1:]], 1, evidence.step)
             try:
                 evidence.set_base(judged)

@@ -132,6 +132,11 @@ LIMIT = 8.0
 _KNOWN = 1.0  # least information on a direction in units of the prior's: it tells as much
 
 
+def has_sizes(guess: Guess) -> bool:
+    """Whether effects beside the calibration have sizes; a learned law may have none of its own."""
+    return len(guess.deviation) > len(_calibrated(guess))
+
+
 def constancy(evidence: Evidence, guess: Guess, perfect: Evidence) -> dict[str, Any]:
     """Test of the sizes that the runs ask for, each by itself, against each other.
 
@@ -142,7 +147,7 @@ def constancy(evidence: Evidence, guess: Guess, perfect: Evidence) -> dict[str, 
 
     Args:
         evidence: with the guess as its base, fitted.
-        guess: at least one effect.
+        guess: at least one effect with a size (`has_sizes`).
         perfect: the same runs with readings that the guess made, with the guess as its base.
 
     Returns:

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from hydrotele.gap.residuals import believed, believed_part
+from hydrotele.effects.effect import Parameter
+from hydrotele.estimate.calibration import CALIBRATION
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.gap.residuals import believed, believed_part, has_sizes
 from hydrotele.gap.result import LearnedLaw, NamedEffect
 
 LEFT = {"": 0.05, "boom": 0.02, "stick": 0.6}
@@ -65,3 +68,12 @@ def test_effects_of_all_axes_are_judged_by_all_channels():
 )
 def test_the_part_of_what_was_lacking(part, low, high):
     assert low < believed_part(part) < high
+
+
+def test_only_sizes_of_effects_can_be_constant_over_runs():
+    size = {"value": Parameter("1", 0.0, -1.0, 1.0, 1.0, 0.1)}
+    opened = (Hypothesis("learned_law", "boom", {}), np.zeros(0))
+    calibrated = (Hypothesis(CALIBRATION, "", size), np.zeros(1))
+    effect = (Hypothesis("payload", "tool", size), np.zeros(1))
+    assert not has_sizes(Guess((calibrated, opened)))
+    assert has_sizes(Guess((calibrated, opened, effect)))
