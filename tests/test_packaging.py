@@ -75,8 +75,8 @@ def test_installed_wheel_finds_its_machines_from_any_folder(wheel, tmp_path):
     site = tmp_path / "site"
     pip("install", "--quiet", "--no-deps", "--no-index", "--target", site, wheel)
     script = (
-        "from hydrotele.core import resources\n"
-        "print(resources.__file__)\n"
+        "from hydrotele.core import files\n"
+        "print(files.__file__)\n"
         "print(*sorted(p.name for p in resources.models_folder().glob('*/machine.yaml')))\n"
         "print(resources.models_folder())\n"
     )

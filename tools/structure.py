@@ -2,7 +2,7 @@
 
     python tools/structure.py                                  # rooms, modules, lines, arrows
     python tools/structure.py --arrows                         # and every arrow between rooms
-    python tools/structure.py -- run dig --out /tmp/dig        # and the modules a command passes
+    python tools/structure.py -- run scenarios/dig.yaml --out runs/dig   # modules passed
 
 An arrow is a pair of rooms of which one imports the other, anywhere in its modules. A module is
 passed by a command when a Python function of it is called while the command runs, or when it is

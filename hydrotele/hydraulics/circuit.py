@@ -505,7 +505,7 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
         user: (nu * SLOTS,) actuator numbers.
         i: index of the actuator.
         count: number of hydraulic axes, which come first.
-        act: (>= 4 count,) activations.
+        act: (>= 4 count,) spool [1], spool rate [1/s] and pressures [Pa].
         supply: supply pressure, scalar [Pa].
         time: scalar [s].
         x: position of the drive, scalar [m] or [rad].
@@ -535,9 +535,9 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
-        terms: (n,) table of terms.
+        terms: (n,) table of terms [SI].
         count: number of hydraulic axes, which come first.
-        act: (>= 4 count,) activations at the start of the step.
+        act: (>= 4 count,) activations [SI] at the start of the step.
         command: (>= count,) commands that arrive [1].
         length: (>= count,) drive positions at the end of the step [m] or [rad].
         velocity: (>= count,) drive velocities [m/s] or [rad/s].
