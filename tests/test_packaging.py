@@ -77,15 +77,15 @@ def test_installed_wheel_finds_its_machines_from_any_folder(wheel, tmp_path):
     script = (
         "from hydrotele.core import files\n"
         "print(files.__file__)\n"
-        "print(*sorted(p.name for p in resources.models_folder().glob('*/machine.yaml')))\n"
-        "print(resources.models_folder())\n"
+        "print(*sorted(p.name for p in files.models_folder().glob('*/machine.yaml')))\n"
+        "print(files.models_folder())\n"
     )
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     environment = {**os.environ, "PYTHONPATH": str(site)}
     lines = run(sys.executable, "-c", script, cwd=elsewhere, env=environment).splitlines()
     assert lines == [
-        str(site / "hydrotele" / "core" / "resources.py"),
+        str(site / "hydrotele" / "core" / "files.py"),
         " ".join(["machine.yaml"] * len(list((ROOT / "models").glob("*/machine.yaml")))),
         str(site / "hydrotele" / "models"),
     ]

@@ -5,8 +5,8 @@
     python tools/structure.py -- run scenarios/dig.yaml --out runs/dig   # modules passed
 
 An arrow is a pair of rooms of which one imports the other, anywhere in its modules. A module is
-passed by a command when a Python function of it is called while the command runs, or when it is
-imported by one that is and holds compiled functions (numba calls these without Python).
+passed by a command when a Python function of it is called while the command runs, other than by an
+import; compiled functions call each other without Python, and are not seen.
 """
 
 import argparse
@@ -43,12 +43,18 @@ def imported_rooms(path: Path) -> set[str]:
 def passed_by(words: list[str]) -> tuple[Counter[str], int]:
     """Run a command of hydrotele; calls per module, and the command's exit status."""
     calls: Counter[str] = Counter()
-    prefix = f"{PACKAGE}/"
+    prefix, passed = f"{PACKAGE}/", set()
 
     def count(frame, event, _):
-        if event == "call" and frame.f_code.co_filename.startswith(prefix):
-            if frame.f_code.co_name != "<module>":
-                calls[frame.f_code.co_filename.removeprefix(prefix)] += 1
+        name = frame.f_code.co_filename
+        if event == "call" and name.startswith(prefix):
+            caller = frame
+            while caller and name not in passed:
+                if caller.f_code.co_name == "<module>" and caller.f_code.co_filename != __file__:
+                    return
+                caller = caller.f_back
+            passed.add(name)
+            calls[name.removeprefix(prefix)] += 1
 
     from hydrotele.cli.main import main
 

@@ -205,7 +205,6 @@ def force_after_friction(user, u, push, other, act, velocity, dt):
     return push - actuator_friction(user, u, velocity), slope
 
 
-_AV_PRESLIDING = int(Slot.VISCOUS_ASYMMETRY)
 _STIFF, _DAMP = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE_DAMPING)
 
 _RESOLVED = 0.5  # (w dt)^2 of a drive on its bristles; an explicit step is stable up to 4
@@ -333,7 +332,7 @@ def bristle_friction(user, u, share, velocity, inertia, dt):
     damping = user[u + _DAMP]
     if inertia > 0.0 and dt > 0.0:
         damping = min(damping, _RESOLVED * inertia / dt)
-    viscous, asymmetry = user[u + _B], user[u + _AV_PRESLIDING]
+    viscous, asymmetry = user[u + _B], user[u + _AV]
     force = share * (user[u + _FC] + user[u + _FS]) + damping * bent * velocity
     force += friction(velocity, 0.0, 0.0, 1.0, viscous, user[u + _V0], 0.0, asymmetry)
     slope = friction_slope(velocity, 0.0, 0.0, 1.0, viscous, user[u + _V0], 0.0, asymmetry)

@@ -494,7 +494,7 @@ def settled_friction(user, u, velocity, push, inertia, dt):
     return actuator_friction(user, u, v)
 
 
-_AH_DRIVE, _AR_DRIVE, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
+_OFFSET = int(Slot.OFFSET)
 
 
 @allocation_free
@@ -514,13 +514,15 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
         gain: force per command of a force drive, scalar [N/V] or [N m/V].
 
     Returns:
-        DriveState.
+        DriveState [SI].
+
+    Source: docs/effects.md, laws of one's own: the variables of a law.
     """
     u, a = i * SLOTS, 4 * i
     if i >= count:
         force = gain * command - user[u + _OFFSET]
         return DriveState(time, x, v, 0.0, 0.0, 0.0, 0.0, supply, command, force)
-    force = user[u + _AH_DRIVE] * act[a + 2] - user[u + _AR_DRIVE] * act[a + 3]
+    force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
     return DriveState(
         time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3], supply, command, force
     )
@@ -548,6 +550,8 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
 
     Returns:
         Nothing.
+
+    Source: docs/effects.md, laws of one's own: the balance `command`.
     """
     open_ports(user, act, act, scratch, 0, count, 0.0, act)
     supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
