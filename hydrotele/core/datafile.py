@@ -16,6 +16,7 @@ import yaml
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import beyond, limit, read_text
+from hydrotele.core.units import KEY_SUFFIXES, to_si
 
 LARGEST = 1.0e20  # of any SI number of a file, so that products of a few stay finite
 Number = Annotated[float, pydantic.Field(ge=-LARGEST, le=LARGEST)]
@@ -24,25 +25,10 @@ Positive = Annotated[float, pydantic.Field(gt=0, le=LARGEST)]
 NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST)]
 Name = Annotated[str, pydantic.Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
-PSI = 6894.757293168361  # Pa, exact pound-force and inch
-
-UNIT_SUFFIXES = {
-    "_deg": math.pi / 180.0,
-    "_mm": 1.0e-3,
-    "_in2": 0.0254**2,
-    "_cm2": 1.0e-4,
-    "_psi": PSI,
-    "_bar": 1.0e5,
-    "_hz": 1.0,
-    "_l_min": 1.0e-3 / 60.0,
-    "_ms": 1.0e-3,
-}
-"""Suffix of a key -> factor to SI; `_hz` of an angular frequency counts 2 pi."""
-
-ANGULAR_FREQUENCIES = ("bandwidth",)
+ANGULAR_FREQUENCIES = ("bandwidth",)  # in rad/s: their `_hz` counts 2 pi
 
 
-def to_si(value: Any, factor: float) -> Any:
+def scale_numbers(value: Any, factor: float) -> Any:
     """Multiply a number, or every number of nested lists, by a factor; leave the rest alone.
 
     Raises:
@@ -51,7 +37,7 @@ def to_si(value: Any, factor: float) -> Any:
     if isinstance(value, str):
         raise ValueError(f"{value!r} is a text, not a number")
     if isinstance(value, list):
-        return [to_si(item, factor) for item in value]
+        return [scale_numbers(item, factor) for item in value]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
     try:
@@ -66,11 +52,11 @@ def split_unit(key: str) -> tuple[str, float | None]:
     >>> split_unit("accuracy_mm")
     ('accuracy', 0.001)
     """
-    for suffix, factor in UNIT_SUFFIXES.items():
+    for suffix, unit in KEY_SUFFIXES.items():
         if key.endswith(suffix):
             stem = key.removesuffix(suffix)
             turns = suffix == "_hz" and stem in ANGULAR_FREQUENCIES
-            return stem, 2.0 * math.pi if turns else factor
+            return stem, 2.0 * math.pi if turns else to_si(unit)[1]
     return key, None
 
 
@@ -99,7 +85,7 @@ class Facts(pydantic.BaseModel):
             if key in fields:
                 name = key
             elif factor is not None and name in fields:
-                value = to_si(value, factor)
+                value = scale_numbers(value, factor)
             else:
                 raise ValueError(f"unknown key {key!r}; {suggest(key, fields)}")
             if name in result:

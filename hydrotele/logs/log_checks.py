@@ -7,14 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.machine.signals import (
-    allowed_units,
-    canonical_unit,
-    magnitude_limits,
-    parse_channel,
-    to_si,
-    usual_unit,
-)
+from hydrotele.core.units import canonical_unit, to_si
+from hydrotele.machine.signals import allowed_units, magnitude_limits, parse_channel, usual_unit
 
 _PLAY = 0.02  # of half a command's range, by which a converter may read beyond it
 _LONGEST_STEP = 1.0  # [s] slower than any log of a hydraulic machine

@@ -13,9 +13,10 @@ import mujoco
 import numpy as np
 import yaml
 
-from hydrotele.core.datafile import PSI, parse, read_yaml, split_unit, suggest, to_si
+from hydrotele.core.datafile import parse, read_yaml, scale_numbers, split_unit, suggest
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import copy_mjcf, models_folder, read_xml
+from hydrotele.core.units import PSI
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import LAWS
 
@@ -272,7 +273,7 @@ def _resolve_pin(pin: dict, data: dict, where: str) -> dict:
         if child not in list(links):
             raise InputError(where, f"from: {child!r} is no link; {suggest(child, links)}")
         link = links[child] if isinstance(links[child], dict) else {}
-        origin = link.get("position") or to_si(link.get("position_mm"), 1.0e-3) or origin
+        origin = link.get("position") or scale_numbers(link.get("position_mm"), 1.0e-3) or origin
         if not isinstance(origin, list) or len(origin) != 3:
             raise InputError(where, f"links.{child}.position must be three numbers")
     x, y, z = (_number(value, f"{where}: links.position") for value in origin)

@@ -90,47 +90,6 @@ TRUTH: Mapping[str, Kind] = {
     "tip": Kind(("m",), "position of the tool tip, base frame", "xyz"),
 }
 
-# Foreign unit -> (SI unit, factor). All are pure scalings.
-FOREIGN_UNITS: Mapping[str, tuple[str, float]] = {
-    "deg": ("rad", math.pi / 180),
-    "mrad": ("rad", 1e-3),
-    "rev": ("rad", 2 * math.pi),
-    "deg/s": ("rad/s", math.pi / 180),
-    "rpm": ("rad/s", math.pi / 30),
-    "deg/s^2": ("rad/s^2", math.pi / 180),
-    "mm": ("m", 1e-3),
-    "cm": ("m", 1e-2),
-    "in": ("m", 0.0254),
-    "ft": ("m", 0.3048),
-    "mm/s": ("m/s", 1e-3),
-    "cm/s": ("m/s", 1e-2),
-    "mm/s^2": ("m/s^2", 1e-3),
-    "psi": ("Pa", 6894.757293168361),
-    "bar": ("Pa", 1e5),
-    "mbar": ("Pa", 1e2),
-    "kPa": ("Pa", 1e3),
-    "MPa": ("Pa", 1e6),
-    "ms": ("s", 1e-3),
-    "us": ("s", 1e-6),
-    "ns": ("s", 1e-9),
-    "min": ("s", 60.0),
-    "%": ("1", 1e-2),
-    "%/s": ("1/s", 1e-2),
-    "L/min": ("m^3/s", 1e-3 / 60),
-    "L/s": ("m^3/s", 1e-3),
-    "kN": ("N", 1e3),
-    "lbf": ("N", 4.4482216152605),
-    "kN m": ("N m", 1e3),
-    "mV": ("V", 1e-3),
-}
-
-_SPELLINGS = {
-    "-": "1", "sec": "s", "seconds": "s", "volt": "V", "µs": "us", "s^-1": "1/s",
-    "Nm": "N m", "N*m": "N m", "N.m": "N m", "kNm": "kN m", "kN*m": "kN m", "m3/s": "m^3/s",
-    "rad/s2": "rad/s^2", "deg/s2": "deg/s^2", "m/s2": "m/s^2", "°": "deg", "°/s": "deg/s",
-    "l/min": "L/min", "lpm": "L/min", "degree": "deg", "degrees": "deg", "percent": "%",
-}  # fmt: skip
-
 
 class Limits(NamedTuple):
     """Bounds on a channel's largest magnitude over a run, and the unit that lies behind others."""
@@ -246,26 +205,6 @@ def usual_unit(name: str, present: Iterable[str] = ()) -> str:
     position = channel_name("position", parse_channel(name).axis)
     linear = units[0].startswith("rad") and not {position, _TRUTH + position}.isdisjoint(present)
     return units[-1] if linear else units[0]
-
-
-def canonical_unit(text: str) -> str:
-    """Return the spelling used here for a unit, or the stripped text itself where it is unknown.
-
-    >>> canonical_unit("Nm"), canonical_unit("l/min")
-    ('N m', 'L/min')
-    """
-    unit = text.strip().replace("²", "^2").replace("³", "^3").replace("·", "*").replace("μ", "µ")
-    return _SPELLINGS.get(unit, unit)
-
-
-def to_si(unit: str) -> tuple[str, float]:
-    """Return the SI unit and the factor to it [SI unit per `unit`]; factor 1 for an unknown unit.
-
-    >>> to_si("bar")
-    ('Pa', 100000.0)
-    """
-    unit = canonical_unit(unit)
-    return FOREIGN_UNITS.get(unit, (unit, 1.0))
 
 
 def close_matches(name: str, present: Iterable[str] = ()) -> list[str]:

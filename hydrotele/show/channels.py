@@ -6,23 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.units import axis_unit
 from hydrotele.logs.log import Log
-from hydrotele.machine.signals import Channel, parse_channel, to_si
+from hydrotele.machine.signals import Channel, parse_channel
 
 # SI unit -> the unit on a plot.
-_SHOWN_UNITS: Mapping[str, str] = {
-    "rad": "deg",
-    "rad/s": "deg/s",
-    "rad/s^2": "deg/s^2",
-    "m": "mm",
-    "m/s": "mm/s",
-    "m/s^2": "mm/s^2",
-    "Pa": "MPa",
-    "m^3/s": "L/min",
-    "N": "kN",
-    "N m": "kN m",
-}
-
 # Kind -> title of its plot, in the order in which signals travel.
 TITLES: Mapping[str, str] = {
     "reference": "reference",
@@ -101,18 +89,6 @@ class Trace(NamedTuple):
         return self.channel.axis or "supply"
 
 
-def shown_unit(unit: str) -> tuple[str, float]:
-    """Return the unit on a plot and the factor from the SI unit to it.
-
-    >>> shown_unit("Pa")
-    ('MPa', 1e-06)
-    >>> shown_unit("1")
-    ('1', 1.0)
-    """
-    shown = _SHOWN_UNITS.get(unit, unit)
-    return shown, 1.0 / to_si(shown)[1]
-
-
 def shown(log: Log, name: str) -> Trace:
     """Return a channel of a log, scaled for a plot.
 
@@ -122,7 +98,7 @@ def shown(log: Log, name: str) -> Trace:
     channel, values = parse_channel(name), log[name]
     if channel.kind in _PLAIN and log.units[name] != "rad":
         return Trace(channel, log.units[name], values)
-    unit, factor = shown_unit(log.units[name])
+    unit, factor = axis_unit(log.units[name])
     return Trace(channel, unit, values * factor)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from hydrotele.gap.customary import customary
+from hydrotele.core.units import customary
 from hydrotele.show.report_html import drawing, png
 
 MEASURED = "#262b33"

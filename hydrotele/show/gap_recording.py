@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from hydrotele.core.units import axis_unit
 from hydrotele.gap.description import channel_words, headline, learned_title, verdict_words
 from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Gap, Prediction
 from hydrotele.logs.dataset import RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.signals import parse_channel, usual_unit
-from hydrotele.show.channels import padded_range, shown_unit
+from hydrotele.show.channels import padded_range
 from hydrotele.show.recording import (
     Scene,
     _log_machines,
@@ -198,7 +199,7 @@ def _sizes(models) -> "rrb.TimeSeriesView":
 
 
 def _signal(before: Prediction, models, channel: str, legend: bool) -> "rrb.TimeSeriesView":
-    unit, factor = shown_unit(usual_unit(channel))
+    unit, factor = axis_unit(usual_unit(channel))
     column = before.channels.index(channel)
     values = [before.measured[:, column], *(p.predicted[:, column] for p, _ in models.values())]
     span = padded_range([factor * v[np.isfinite(v)] for v in values], unit)
@@ -299,7 +300,7 @@ def _log_channels(out, models) -> None:
     """Readings, predictions and whitened errors, without the rows that were not measured."""
     before, _ = models["nominal"]
     for k, channel in enumerate(before.channels):
-        unit, factor = shown_unit(usual_unit(channel))
+        unit, factor = axis_unit(usual_unit(channel))
         lines = {"measured": (before.measured[:, k], _MEASURED)}
         for name, (prediction, colour) in models.items():
             lines[name] = (prediction.predicted[:, k], colour)

@@ -14,8 +14,9 @@ import numpy as np
 import yaml
 
 import hydrotele
+from hydrotele.core.units import axis_unit, customary
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.customary import amount, customary, in_customary_units
+from hydrotele.gap.customary import amount, in_customary_units
 from hydrotele.gap.description import (
     channel_words,
     effect_title,
@@ -34,7 +35,7 @@ from hydrotele.gap.description import (
 from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Candidate, Gap, LearnedLaw, Prediction, finite
 from hydrotele.machine.signals import usual_unit
-from hydrotele.show.channels import padded_range, shown_unit
+from hydrotele.show.channels import padded_range
 from hydrotele.show.gap_recording import channel_rms, most_changed, windowed
 from hydrotele.show.report_html import (
     STYLE,
@@ -262,7 +263,7 @@ def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: b
         A PNG.
     """
     column = before.channels.index(channel)
-    unit, factor = shown_unit(usual_unit(channel))
+    unit, factor = axis_unit(usual_unit(channel))
     measured = factor * before.measured[:, column]
     lines = [("model as given", NOMINAL, factor * before.predicted[:, column])]
     if changed:

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hydrotele.core.datafile import UNIT_SUFFIXES, suggest
+from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import json_value
 from hydrotele.core.output import replacing
+from hydrotele.core.units import KEY_SUFFIXES
 
 Number = float | int | bool | None
 Numbers = dict[str, tuple[Number, str]]
@@ -26,8 +27,6 @@ Numbers = dict[str, tuple[Number, str]]
 TIMINGS = ("wall_seconds", "realtime_factor")  # differ between runs of equal content
 _LEFT_OUT = (*TIMINGS, "kind", "seed", "versions", "git_commit")
 _ENDINGS = {"mm": "mm", "N": "N", "J": "J", "m": "m", "rad": "rad", "A": "A", "seconds": "s"}
-_SPOKEN = {"_deg": "deg", "_mm": "mm", "_in2": "in2", "_cm2": "cm2", "_psi": "psi", "_bar": "bar",
-           "_hz": "Hz", "_l_min": "l/min", "_ms": "ms"}  # fmt: skip
 _SCENARIO = {
     "duration": "s", "timestep": "s", "control_rate": "Hz", "log_rate": "Hz",
     "servo.position_gain": "1/s", "servo.lead": "s", "servo.load_time": "s",
@@ -71,7 +70,7 @@ def _flat(part: dict[str, Any], above: str, unit: str | None):
 
 def key_unit(key: str) -> str | None:
     """Unit of a scenario's key as far as its name tells."""
-    found = (_SPOKEN[suffix] for suffix in UNIT_SUFFIXES if key.endswith(suffix))
+    found = (unit for suffix, unit in KEY_SUFFIXES.items() if key.endswith(suffix))
     return next(found, None) or _SCENARIO.get(key)
 
 

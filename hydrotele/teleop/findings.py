@@ -109,7 +109,7 @@ def why_unstable(one: Analysis) -> str:
 def format_factor(margin: float) -> str:
     """A gain margin.
 
-    >>> said_factor(0.17), said_factor(math.inf)
+    >>> format_factor(0.17), format_factor(math.inf)
     ('x 0.17', 'any')
     """
     return "any" if math.isinf(margin) else f"x {margin:.3g}"
@@ -118,7 +118,7 @@ def format_factor(margin: float) -> str:
 def format_delay(delay: float) -> str:
     """A delay.
 
-    >>> said_delay(0.12345)
+    >>> format_delay(0.12345)
     '123 ms'
     """
     return "any" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
@@ -127,7 +127,7 @@ def format_delay(delay: float) -> str:
 def format_number(value: float) -> str:
     """A number with four digits, without an exponent.
 
-    >>> said_size(-20026.0), said_size(0.0123456)
+    >>> format_number(-20026.0), format_number(0.0123456)
     ('-20030', '0.01235')
     """
     return np.format_float_positional(value, precision=4, fractional=False, trim="-")
@@ -136,7 +136,7 @@ def format_number(value: float) -> str:
 def format_error(error: float | None) -> str:
     """A relative error.
 
-    >>> said_error(0.0016), said_error(1e-7)
+    >>> format_error(0.0016), format_error(1e-7)
     ('0.16 %', '< 0.01 %')
     """
     if error is None:

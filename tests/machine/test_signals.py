@@ -2,7 +2,6 @@
 
 import ast
 import doctest
-import math
 from pathlib import Path
 
 import pytest
@@ -105,32 +104,6 @@ def test_usual_unit_follows_the_joint():
     assert signals.usual_unit("reference.slide", ["position.slide"]) == "m"
     assert signals.usual_unit("truth.velocity.slide", ["truth.position.slide"]) == "m/s"
     assert signals.usual_unit("command.slide", ["position.slide"]) == "1"
-
-
-@pytest.mark.parametrize(
-    ("unit", "si", "factor"),
-    [
-        ("deg", "rad", math.pi / 180),
-        ("°/s", "rad/s", math.pi / 180),
-        ("psi", "Pa", 0.45359237 * 9.80665 / 0.0254**2),  # pound, standard gravity, inch: all exact
-        ("bar", "Pa", 1e5),
-        ("l/min", "m^3/s", 1 / 60000),
-        ("kN·m", "N m", 1e3),
-        ("m³/s", "m^3/s", 1.0),
-        ("furlong", "furlong", 1.0),
-    ],
-)
-def test_conversion_to_si(unit, si, factor):
-    assert signals.to_si(unit)[0] == si
-    assert signals.to_si(unit)[1] == pytest.approx(factor, rel=1e-14)  # rounding of one division
-
-
-def test_every_foreign_unit_ends_in_a_unit_that_some_channel_has():
-    known = {
-        u for table in (signals.MEASURED, signals.TRUTH) for k in table.values() for u in k.units
-    }
-    assert {si for si, _ in signals.FOREIGN_UNITS.values()} <= known
-    assert not known & signals.FOREIGN_UNITS.keys()
 
 
 def test_limits_are_wider_where_the_unit_is_stated():

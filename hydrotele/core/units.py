@@ -1,0 +1,146 @@
+"""Units: what each is in SI, how it is spelled, how keys of files name it, how people read it.
+
+One table for logs, YAML keys, plots and reports.
+"""
+
+import math
+from collections.abc import Mapping
+
+PSI = 6894.757293168361  # Pa, exact pound-force and inch
+
+UNITS: Mapping[str, tuple[str, float]] = {
+    "deg": ("rad", math.pi / 180),
+    "mrad": ("rad", 1e-3),
+    "rev": ("rad", 2 * math.pi),
+    "deg/s": ("rad/s", math.pi / 180),
+    "rpm": ("rad/s", math.pi / 30),
+    "deg/s^2": ("rad/s^2", math.pi / 180),
+    "mm": ("m", 1e-3),
+    "cm": ("m", 1e-2),
+    "in": ("m", 0.0254),
+    "ft": ("m", 0.3048),
+    "mm/s": ("m/s", 1e-3),
+    "cm/s": ("m/s", 1e-2),
+    "mm/s^2": ("m/s^2", 1e-3),
+    "psi": ("Pa", PSI),
+    "bar": ("Pa", 1e5),
+    "mbar": ("Pa", 1e2),
+    "kPa": ("Pa", 1e3),
+    "MPa": ("Pa", 1e6),
+    "ms": ("s", 1e-3),
+    "us": ("s", 1e-6),
+    "ns": ("s", 1e-9),
+    "min": ("s", 60.0),
+    "%": ("1", 1e-2),
+    "%/s": ("1/s", 1e-2),
+    "L/min": ("m^3/s", 1e-3 / 60),
+    "L/s": ("m^3/s", 1e-3),
+    "kN": ("N", 1e3),
+    "lbf": ("N", 4.4482216152605),
+    "kN m": ("N m", 1e3),
+    "mV": ("V", 1e-3),
+    "MN/m": ("N/m", 1e6),
+    "kN/m": ("N/m", 1e3),
+    "MN m/rad": ("N m/rad", 1e6),
+    "kN m/rad": ("N m/rad", 1e3),
+    "kN s/m": ("N s/m", 1e3),
+    "kN m s/rad": ("N m s/rad", 1e3),
+    "in^2": ("m^2", 0.0254**2),
+    "cm^2": ("m^2", 1e-4),
+    "cm^3/bar": ("m^3/Pa", 1e-11),
+    "L/min per 100 bar": ("m^3/(s Pa)", 1e-10 / 60),
+}
+"""Unit -> (SI unit, factor to it). All are pure scalings."""
+
+_SPELLINGS = {
+    "-": "1", "sec": "s", "seconds": "s", "volt": "V", "µs": "us", "s^-1": "1/s",
+    "Nm": "N m", "N*m": "N m", "N.m": "N m", "kNm": "kN m", "kN*m": "kN m", "m3/s": "m^3/s",
+    "rad/s2": "rad/s^2", "deg/s2": "deg/s^2", "m/s2": "m/s^2", "°": "deg", "°/s": "deg/s",
+    "l/min": "L/min", "lpm": "L/min", "degree": "deg", "degrees": "deg", "percent": "%",
+}  # fmt: skip
+
+KEY_SUFFIXES: Mapping[str, str] = {
+    "_deg": "deg", "_mm": "mm", "_in2": "in^2", "_cm2": "cm^2", "_psi": "psi", "_bar": "bar",
+    "_hz": "Hz", "_l_min": "L/min", "_ms": "ms",
+}  # fmt: skip
+"""Suffix of a key in a YAML file -> unit; `Hz` is SI, but of an angular frequency."""
+
+_ON_AXES: Mapping[str, str] = {
+    "rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2", "m": "mm", "m/s": "mm/s",
+    "m/s^2": "mm/s^2", "Pa": "MPa", "m^3/s": "L/min", "N": "kN", "N m": "kN m",
+}  # fmt: skip
+
+# SI unit -> (smallest magnitude in SI, unit in reports), the largest first.
+_IN_REPORTS: Mapping[str, tuple[tuple[float, str], ...]] = {
+    "1": ((0.0, "%"),),
+    "m": ((1.0, "m"), (0.0, "mm")),
+    "m/s": ((0.0, "mm/s"),),
+    "rad": ((0.0, "deg"),),
+    "rad/s": ((0.0, "deg/s"),),
+    "s": ((1.0, "s"), (0.0, "ms")),
+    "Pa": ((1e6, "MPa"), (0.0, "bar")),
+    "m^3/s": ((0.0, "L/min"),),
+    "m^3/(s Pa)": ((0.0, "L/min per 100 bar"),),
+    "m^3/Pa": ((0.0, "cm³/bar"),),
+    "N": ((1e3, "kN"), (0.0, "N")),
+    "N m": ((1e3, "kN m"), (0.0, "N m")),
+    "N s/m": ((1e3, "kN s/m"), (0.0, "N s/m")),
+    "N m s/rad": ((1e3, "kN m s/rad"), (0.0, "N m s/rad")),
+    "N/m": ((1e6, "MN/m"), (0.0, "kN/m")),
+    "N m/rad": ((1e6, "MN m/rad"), (0.0, "kN m/rad")),
+    "kg m^2": ((0.0, "kg m²"),),
+}
+
+
+def canonical_unit(text: str) -> str:
+    """Return the spelling used here for a unit, or the stripped text itself where it is unknown.
+
+    >>> canonical_unit("Nm"), canonical_unit("l/min")
+    ('N m', 'L/min')
+    """
+    unit = text.strip().replace("²", "^2").replace("³", "^3").replace("·", "*").replace("μ", "µ")
+    return _SPELLINGS.get(unit, unit)
+
+
+def to_si(unit: str) -> tuple[str, float]:
+    """Return the SI unit and the factor to it [SI unit per `unit`]; factor 1 for an unknown unit.
+
+    >>> to_si("bar")
+    ('Pa', 100000.0)
+    """
+    unit = canonical_unit(unit)
+    return UNITS.get(unit, (unit, 1.0))
+
+
+def axis_unit(unit: str) -> tuple[str, float]:
+    """Unit on the axes of plots for a SI unit, and the factor to it.
+
+    >>> axis_unit("Pa")
+    ('MPa', 1e-06)
+    >>> axis_unit("1")
+    ('1', 1.0)
+    """
+    shown = _ON_AXES.get(unit, unit)
+    return shown, 1.0 / to_si(shown)[1]
+
+
+def customary(unit: str, size: float, parameter: str = "") -> tuple[str, float]:
+    """Customary unit for numbers of a size, and the factor to it.
+
+    Args:
+        unit: SI unit.
+        size: the largest magnitude to be shown [unit].
+        parameter: its name; a bandwidth is said in Hz.
+
+    Returns:
+        (customary unit, factor).
+
+    >>> customary("Pa", 24.5e6), customary("Pa", 6e4)
+    (('MPa', 1e-06), ('bar', 1e-05))
+    """
+    if unit == "rad/s" and parameter.endswith("bandwidth"):
+        return "Hz", 0.5 / math.pi
+    for least, shown in _IN_REPORTS.get(unit, ()):
+        if abs(size) >= least or not math.isfinite(size):
+            return shown, 1.0 / to_si(shown)[1]
+    return unit, 1.0
