@@ -161,30 +161,66 @@ def feedforward_opening(
     return velocity * swept / (flow_gain * max(flow, least))
 
 
+class DriveReference(NamedTuple):
+    """References of k drives for one control period, as `drive_row` writes them.
+
+    Attributes:
+        velocity: (k,) reference velocity ahead [m/s] or [rad/s].
+        arm: (k,) d(drive)/d(joint) at the reference.
+        volume_head: (k,) [m^3].
+        volume_rod: (k,) [m^3].
+    """
+
+    velocity: np.ndarray
+    arm: np.ndarray
+    volume_head: np.ndarray
+    volume_rod: np.ndarray
+
+
+class Measured(NamedTuple):
+    """Sensor readings of k axes.
+
+    Attributes:
+        joint: (k,) joint positions [rad] or [m].
+        rate: (k,) joint velocities [rad/s] or [m/s].
+        head: (k,) head-side pressures [Pa].
+        rod: (k,) rod-side pressures [Pa].
+        supply: supply pressure [Pa].
+    """
+
+    joint: np.ndarray
+    rate: np.ndarray
+    head: np.ndarray
+    rod: np.ndarray
+    supply: float
+
+
+class ComputedForce(NamedTuple):
+    """Drive forces that inverse dynamics asks for.
+
+    Attributes:
+        known: whether they were computed; the arrays count only then.
+        force: (k,) of now [N] or [N m].
+        rate: (k,) rate of change, ahead as the velocity [N/s] or [N m/s].
+    """
+
+    known: bool
+    force: np.ndarray
+    rate: np.ndarray
+
+
 @compiled
-def servo_step(
-    numbers, closed, velocity, arm, volume_head, volume_rod, reference, joint, rate, head, rod,
-    supply, load, computed, force_ahead, force_rate, out,
-):  # fmt: skip
+def servo_step(numbers, closed, drive, reference, measured, load, computed, out):
     """Commands of all axes for one control period.
 
     Args:
         numbers: (k, 14) of `servo_parameters`.
         closed: (k,) whether the axis is under feedback; the others keep `out`.
-        velocity: (k,) wanted drive velocity ahead [m/s] or [rad/s].
-        arm: (k,) d(drive)/d(joint) at the reference.
-        volume_head: (k,) [m^3].
-        volume_rod: (k,) [m^3].
-        reference: (k,) joint reference when `joint` was measured [rad] or [m].
-        joint: (k,) measured joint position [rad] or [m].
-        rate: (k,) measured joint velocity [rad/s] or [m/s].
-        head: (k,) measured head-side pressures [Pa].
-        rod: (k,) measured rod-side pressures [Pa].
-        supply: measured supply pressure, scalar [Pa].
+        drive: DriveReference.
+        reference: (k,) joint reference when the joint was measured [rad] or [m].
+        measured: Measured.
         load: (k,) slow mean of the drive force, updated [N] or [N m].
-        computed: whether forces were computed; scalar.
-        force_ahead: (k,) computed force of the drive, of now [N] or [N m].
-        force_rate: (k,) its rate of change, ahead as the velocity [N/s] or [N m/s].
+        computed: ComputedForce.
         out: (k,) commands, written where closed [1] or in the drive's unit.
 
     Returns:
@@ -192,28 +228,30 @@ def servo_step(
 
     Source: this module's docstring; dynamic pressure feedback after Merritt 1967, section 8.
     """
+    velocity, arm, volume_head, volume_rod = drive
+    joint, rate, head, rod, supply = measured
     for i in range(numbers.shape[0]):
         error = reference[i] - joint[i]
         gain, rate_gain = numbers[i, 8], numbers[i, 9]
         if numbers[i, 0] == _FORCE:
             if closed[i]:
                 force = rate_gain * (gain * error + velocity[i] - rate[i])
-                if computed:
-                    force += force_ahead[i]
+                if computed.known:
+                    force += computed.force[i]
                 limit = numbers[i, 6]
                 out[i] = min(limit, max(-limit, force / numbers[i, 7]))
             continue
         area_head, area_rod = numbers[i, 1], numbers[i, 2]
         force = area_head * head[i] - area_rod * rod[i]
-        model = force_ahead[i] if computed else 0.0
+        model = computed.force[i] if computed.known else 0.0
         load[i] += numbers[i, 11] * (force - model - load[i])
         if not closed[i]:
             continue
         stiffness = numbers[i, 12] * (area_head**2 / volume_head[i] + area_rod**2 / volume_rod[i])
         wanted = velocity[i] + gain * arm[i] * error
         wanted -= numbers[i, 13] * (force - model - load[i]) / stiffness
-        if computed:
-            wanted += force_rate[i] / stiffness
+        if computed.known:
+            wanted += computed.rate[i] / stiffness
         opening = feedforward_opening(
             wanted, head[i], rod[i], supply, numbers[i, 5], area_head, area_rod, volume_head[i],
             volume_rod[i], numbers[i, 3],

@@ -249,56 +249,129 @@ def _slopes(model, sp, z, nudge, slope, moved):
             slope[c, s] = model.scale[c] * (above - below) / (2.0 * nudge[s])
 
 
+class MeasuredRun(NamedTuple):
+    """A run of n rows.
+
+    Attributes:
+        command: (n, nu) commands.
+        known: (n,) whether the row's command is known.
+        reading: (n, c) readings, NaN where missing [channel's unit].
+        period: between rows [s].
+    """
+
+    command: np.ndarray
+    known: np.ndarray
+    reading: np.ndarray
+    period: float
+
+
+class Variances(NamedTuple):
+    """Noise of readings and of the process.
+
+    Attributes:
+        reading: (c,) of a reading.
+        drift: (nz,) that a row adds to the state.
+        unknown_command: (nz,) that a row with unknown command adds.
+    """
+
+    reading: np.ndarray
+    drift: np.ndarray
+    unknown_command: np.ndarray
+
+
+class Steps(NamedTuple):
+    """How finely a run is crossed.
+
+    Attributes:
+        mean: steps per row of the mean.
+        covariance: steps per row of the covariance.
+        difference: (nz,) differences for derivatives.
+    """
+
+    mean: int
+    covariance: int
+    difference: np.ndarray
+
+
+class Linearisation(NamedTuple):
+    """Gains and transitions, computed or used again.
+
+    Attributes:
+        fresh: whether to compute gains; False keeps those given.
+        given: whether `flow` holds transition Jacobians already; only where `fresh`.
+        own: (ng,) states that the gains know; of those that they lack, a transmission's follow
+            the load. All states where `fresh`.
+        gains: Gains, written if `fresh`, else used.
+        initial: (nz, nz) written if `fresh`: covariance before the first row's readings.
+        flow: (n, nz, nz) written if `fresh` and not `given`: d (state before the next row's
+            readings) / d (state after this row's), the latter along the first index; (0, nz, nz)
+            keeps none.
+    """
+
+    fresh: bool
+    given: bool
+    own: np.ndarray
+    gains: Gains
+    initial: np.ndarray
+    flow: np.ndarray
+
+
+class InputEffect(NamedTuple):
+    """What m unknown inputs do.
+
+    Attributes:
+        columns: (n, m, nz - q - m) what each one, of size 1, adds to the model's states over a
+            row.
+        decay: by which factor inputs fall over a row.
+    """
+
+    columns: np.ndarray
+    decay: float
+
+
+class Crossing(NamedTuple):
+    """What a filter writes of a run.
+
+    Attributes:
+        whitened: (n, c) errors; NaN where missing.
+        predicted: (n, c) readings predicted from the rows before.
+        corrected: (n, nz - q - m) the model's states after the row's readings.
+    """
+
+    whitened: np.ndarray
+    predicted: np.ndarray
+    corrected: np.ndarray
+
+
 @compiled
-def filter_run(
-    model, sp, late, z, spread, command, known, reading, noise, drift, startle, period, steps,
-    coarse, nudge, own, slope, gain, width, fresh, given, columns, decay, whitened, predicted,
-    corrected, initial, flow,
-):  # fmt: skip
+def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, out):
     """Cross a run.
 
     Args:
         model: Model.
         sp: Space.
-        late: Late; its q readings follow the model's states, and are set here at first; m unknown
-            inputs are the last of the nz states.
+        late: DelayedReadings; its q readings follow the model's states, and are set here at first;
+            m unknown inputs are the last of the nz states.
         z: (nz,) state before the first row's readings; overwritten.
-        spread: (nz, nz) its covariance; overwritten.
-        command: (n, nu) commands.
-        known: (n,) whether the row's command is known.
-        reading: (n, c) readings, NaN where missing [channel's unit].
-        noise: (c,) variance of a reading.
-        drift: (nz,) variance that a row adds to the state.
-        startle: (nz,) variance that a row with unknown command adds.
-        period: scalar [s].
-        steps: steps per row of the mean.
-        coarse: steps per row of the covariance.
-        nudge: (nz,) differences for derivatives.
-        own: (ng,) states that the gains know; of those that they lack, a transmission's follow
-            the load. All states where `fresh`.
-        slope: (n, c, ng), gain: (n, c, ng), width: (n, c): see `Gains`; written if `fresh`, else
-            used.
-        gain: see slope.
-        width: see slope.
-        fresh: whether to compute gains; False keeps those in `gain`.
-        given: whether `flow` holds transition Jacobians already; only where `fresh`.
-        columns: (n, m, nz - q - m) what each unknown input, of size 1, adds to the model's states
-            over a row.
-        decay: by which factor inputs fall over a row.
-        whitened: (n, c) written; NaN where missing.
-        predicted: (n, c) written: readings predicted from the rows before.
-        corrected: (n, nz - q - m) written: the model's states after the row's readings.
-        initial: (nz, nz) written if `fresh`: covariance before the first row's readings.
-        flow: (n, nz, nz) written if `fresh` and not `given`: d (state before the next row's
-            readings) / d (state after this row's), the latter along the first index; (0, nz, nz)
-            keeps none.
+        covariance: (nz, nz) its covariance; overwritten.
+        rows: MeasuredRun.
+        variances: Variances.
+        lines: (Steps, Linearisation).
+        inputs: InputEffect.
+        out: Crossing, written.
 
     Returns:
         -2 log likelihood without its constant; infinite if the states broke down.
 
     Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings.
     """
-    rows, channels, full = reading.shape[0], reading.shape[1], len(z)
+    command, known, reading, period = rows
+    noise, drift, unknown = variances
+    (steps, coarse, nudge), (fresh, given, own, gains, initial, flow) = lines
+    slope, gain, width = gains
+    columns, decay = inputs
+    whitened, predicted, corrected = out
+    count, channels, full = reading.shape[0], reading.shape[1], len(z)
     inputs, h, few = columns.shape[1], period / steps, len(own)
     begin = full - inputs  # of the inputs
     size = begin - len(late.channel)
@@ -315,10 +388,10 @@ def filter_run(
     begin_delayed(late, size, predicted[0], z)
     if fresh:
         _slopes(model, sp, z[:size], nudge, slope[0], moved)
-        delayed_covariance(late, size, slope[0], spread)
-        initial[:] = spread
+        delayed_covariance(late, size, slope[0], covariance)
+        initial[:] = covariance
     loss = 0.0
-    for row in range(rows):
+    for row in range(count):
         read_channels(model, sp, z, row, steps, h, trail[:0], predicted[row])
         if fresh:
             _slopes(model, sp, z[:size], nudge, slope[row], moved)
@@ -343,7 +416,7 @@ def filter_run(
                 for k in range(full):  # a reading depends on few states
                     if hc[k] != 0.0:
                         for s in range(full):
-                            pull[s] += spread[k, s] * hc[k]
+                            pull[s] += covariance[k, s] * hc[k]
                 for s in range(full):
                     total += hc[s] * pull[s]
                 width[row, c] = math.sqrt(total)
@@ -352,7 +425,7 @@ def filter_run(
                 for s in range(full):
                     part = gain[row, c, s]
                     for k in range(full):
-                        spread[s, k] -= part * pull[k]
+                        covariance[s, k] -= part * pull[k]
             for s in range(few):
                 delta[s] += gain[row, c, s] * error
             whitened[row, c] = error / width[row, c]
@@ -362,7 +435,7 @@ def filter_run(
             corrected[row, s] = z[s]
         if not math.isfinite(loss):
             return math.inf
-        if row == rows - 1:
+        if row == count - 1:
             break
         if fresh:
             if given:
@@ -390,10 +463,10 @@ def filter_run(
                     for s in range(full):
                         for r in range(full):
                             flow[row, s, r] = reached[s, r]
-            _carry(reached, spread, work, drift)
+            _carry(reached, covariance, work, drift)
             if not known[row]:
                 for s in range(full):
-                    spread[s, s] += startle[s]
+                    covariance[s, s] += unknown[s]
         advance(model, sp, z, command, row, period, steps, trail)
         shift_delayed(model, late, size, trail, h, z)
         for i in range(inputs):
@@ -470,7 +543,7 @@ def _among(numbers, number):
 
 
 @allocation_free
-def _carry(columns, spread, work, drift):
+def _carry(columns, covariance, work, drift):
     """`P = F P F' + Q`, kept symmetric; the rows of `columns` are F's columns."""
     size = len(drift)
     for a in range(size):  # work = F P, then P = work F'; the innermost index is contiguous
@@ -480,14 +553,14 @@ def _carry(columns, spread, work, drift):
             part = columns[k, a]
             if part != 0.0:
                 for b in range(size):
-                    work[a, b] += part * spread[k, b]
+                    work[a, b] += part * covariance[k, b]
     for a in range(size):
-        spread[a] = 0.0
+        covariance[a] = 0.0
         for k in range(size):
             part = work[a, k]
             for b in range(a + 1):
-                spread[a, b] += part * columns[k, b]
+                covariance[a, b] += part * columns[k, b]
     for a in range(size):
         for b in range(a):
-            spread[b, a] = spread[a, b]
-        spread[a, a] += drift[a]
+            covariance[b, a] = covariance[a, b]
+        covariance[a, a] += drift[a]

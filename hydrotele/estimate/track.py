@@ -12,7 +12,17 @@ from scipy.optimize import fminbound
 
 from hydrotele.dynamics.integrate import load_position, place
 from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
-from hydrotele.estimate.filter import Gains, filter_run, late_readings
+from hydrotele.estimate.filter import (
+    Crossing,
+    Gains,
+    InputEffect,
+    Linearisation,
+    MeasuredRun,
+    Steps,
+    Variances,
+    filter_run,
+    late_readings,
+)
 from hydrotele.estimate.inputs import Input, decay, input_drift
 from hydrotele.hydraulics.circuit import circuit_scratch, demanded_share, open_ports
 from hydrotele.hydraulics.parameters import DELIVERY, SLOTS, Slot, actuator_order, longest_step
@@ -416,14 +426,20 @@ def _cross(
     if given is not None and given.shape[1] != full:  # another number of readings on their way
         given = None
     flow = np.empty((rows if linearise else 0, full, full)) if given is None else given
-    loss = filter_run(
-        model, space, late, state, covariance, run.command, run.command_known, run.reading,
-        noise**2, state_drift(names, levels, run.period),
-        by_kind(names, STARTLE) ** 2, run.period,
+    variances = Variances(
+        noise**2, state_drift(names, levels, run.period), by_kind(names, STARTLE) ** 2
+    )
+    steps = Steps(
         max(1, round(run.period / step)), max(1, round(run.period / coarse)),
-        by_kind(names, _NUDGE), np.array([names.index(name) for name in known]), *gains,
-        kept is None, given is not None, columns, decay(run.period), whitened, predicted, states,
-        initial, flow,
+        by_kind(names, _NUDGE),
+    )  # fmt: skip
+    own = np.array([names.index(name) for name in known])
+    lines = Linearisation(kept is None, given is not None, own, gains, initial, flow)
+    loss = filter_run(
+        model, space, late, state, covariance,
+        MeasuredRun(run.command, run.command_known, run.reading, run.period), variances,
+        (steps, lines),
+        InputEffect(columns, decay(run.period)), Crossing(whitened, predicted, states),
     )  # fmt: skip
     return Track(
         run, levels, loss, whitened, predicted, states, gains, known, start, rest, columns,

@@ -13,7 +13,14 @@ import numpy as np
 
 from hydrotele.control.feedforward import force_references
 from hydrotele.control.plan import Plan
-from hydrotele.control.servo import drive_references, servo_parameters, servo_step
+from hydrotele.control.servo import (
+    ComputedForce,
+    DriveReference,
+    Measured,
+    drive_references,
+    servo_parameters,
+    servo_step,
+)
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Scenario
@@ -131,11 +138,14 @@ class Session:
             self._load[:] = held - forces.force[0]
         command[:] = plan.command[tick]
         tripped = self.station is not None and self.station.tick(tick, data, seen)
+        drive = DriveReference(
+            drives.velocity[tick], drives.arm[tick], drives.volume_head[tick],
+            drives.volume_rod[tick],
+        )  # fmt: skip
         servo_step(
-            numbers, plan.closed, drives.velocity[tick], drives.arm[tick],
-            drives.volume_head[tick], drives.volume_rod[tick],
-            plan.reference[tick - tick % seen.every], seen.joint, seen.rate, seen.head, seen.rod,
-            seen.supply, self._load, forces.known, forces.force[tick], forces.rate[tick], command,
+            numbers, plan.closed, drive, plan.reference[tick - tick % seen.every],
+            Measured(seen.joint, seen.rate, seen.head, seen.rod, seen.supply), self._load,
+            ComputedForce(forces.known, forces.force[tick], forces.rate[tick]), command,
         )  # fmt: skip
         if tripped:
             command[:] = 0.0

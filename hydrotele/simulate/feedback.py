@@ -12,6 +12,7 @@ import dataclasses
 import math
 import zlib
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -187,12 +188,43 @@ class Past:
         return qpos, act, float(supply[0])
 
 
+class SensorErrors(NamedTuple):
+    """What c sensors make of the truth: joints, then head and rod of every axis, then supply.
+
+    Attributes:
+        scales: (c,) [1].
+        offsets: (c,) [channel's unit].
+        errors: (c,) random errors of the sample [channel's unit].
+        steps: (c,) converter steps [channel's unit].
+        low: (c,) lowest readings [channel's unit].
+        high: (c,) highest readings [channel's unit].
+    """
+
+    scales: np.ndarray
+    offsets: np.ndarray
+    errors: np.ndarray
+    steps: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+class SensorReadings(NamedTuple):
+    """SensorReadings of k axes.
+
+    Attributes:
+        joint: (k,) joint positions [rad] or [m].
+        head: (k,) head-side pressures [Pa].
+        rod: (k,) rod-side pressures [Pa].
+    """
+
+    joint: np.ndarray
+    head: np.ndarray
+    rod: np.ndarray
+
+
 @compiled
-def read_sensors(
-    qpos, places, act, supply_act, slow_supply, user, count, scales, offsets, errors, steps, low,
-    high, joint, head, rod, work,
-):  # fmt: skip
-    """Readings of the fed-back sensors in a state.
+def read_sensors(qpos, places, act, supply_act, slow_supply, user, count, sensors, out, work):
+    """SensorReadings of the fed-back sensors in a state.
 
     Args:
         qpos: (nq,) positions [rad] or [m].
@@ -203,15 +235,8 @@ def read_sensors(
             one.
         user: (k * SLOTS,) actuator numbers.
         count: number of hydraulic axes.
-        scales: (c,) scales of the sensors [1], in the order of `errors`.
-        offsets: (c,) offsets of the sensors.
-        errors: (c,) random errors: joints, then head and rod of every axis, then supply.
-        steps: (c,) converter steps.
-        low: (c,) lowest readings.
-        high: (c,) highest readings.
-        joint: (k,) written [rad] or [m].
-        head: (k,) written [Pa].
-        rod: (k,) written [Pa].
+        sensors: SensorErrors.
+        out: SensorReadings, written.
         work: (SCRATCH,) work space.
 
     Returns:
@@ -219,6 +244,8 @@ def read_sensors(
 
     Source: nominal model, "Sensors".
     """
+    scales, offsets, errors, steps, low, high = sensors
+    joint, head, rod = out
     k = len(places)
     for i in range(k):
         value = scales[i] * qpos[places[i]] + offsets[i]
@@ -298,8 +325,10 @@ class Feedback:
             qpos, act, supply_act, slow_supply = self._seen_late(qpos, act, past)
         self.supply = read_sensors(
             qpos, plant.qpos, act, supply_act, slow_supply, self._user, plant.hydraulic,
-            self._scales, self._offsets, self._table[tick // self.every], steps, low, high,
-            self.joint, self.head, self.rod, self._work,
+            SensorErrors(
+                self._scales, self._offsets, self._table[tick // self.every], steps, low, high
+            ),
+            SensorReadings(self.joint, self.head, self.rod), self._work,
         )  # fmt: skip
         if tick:
             self.rate[:] = (self.joint - before) / self.period

@@ -83,7 +83,7 @@ def held_soil(n, attitude, level, out):
     ahead of the mouth props what lies behind it: the surface then begins where it meets the mouth.
 
     Args:
-        n: (k,) of `soil_numbers`.
+        n: (k,) of `soil_parameters`.
         attitude: of the bucket, scalar [rad].
         level: height of the soil ahead of the mouth over the edge, scalar [m].
         out: (4,) written: volume [m^3]; centre outwards and up from the edge [m]; how far out the
@@ -353,7 +353,7 @@ def cutting_force(n, depth, loose, rake, slope, load, out):
     """Force of soil on a blade that is drawn through it towards the machine.
 
     Args:
-        n: (k,) of `soil_numbers`.
+        n: (k,) of `soil_parameters`.
         depth: of the edge below the surface ahead, scalar [m].
         loose: how much of that is loose, which has weight and no cohesion, scalar [m].
         rake: of the blade against the horizontal, scalar [rad].
@@ -393,7 +393,7 @@ def yielding_force(n, state, place, along, rate, low, high):
     """Force of one surface along its direction: a spring and a damper that yield.
 
     Args:
-        n: (k,) of `soil_numbers`.
+        n: (k,) of `soil_parameters`.
         state: (STATE,) of the bucket; its deflection is changed [m].
         place: of the deflection in it, scalar [1].
         along: how far the surface moved against that direction, into the soil, scalar [m].
@@ -511,7 +511,7 @@ def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out)
     its own thread. A change of `cutting_force` with depth is smooth: nothing jumps between cells.
 
     Args:
-        n: (k,) of `soil_numbers`, not changed.
+        n: (k,) of `soil_parameters`, not changed.
         surface: (m,) height of the profile, changed [m].
         loose: (m,) how much of it is loose, changed [m].
         state: (STATE,) of the bucket, changed; see `numbers`.

@@ -18,7 +18,7 @@ def surface_height(n, surface, r):
     """Height of the surface between the middles of cells, that of the end cells beyond them.
 
     Args:
-        n: (k,) of `soil_numbers`.
+        n: (k,) of `soil_parameters`.
         surface: (m,) heights [m].
         r: radius, scalar [m].
 
@@ -45,7 +45,7 @@ def cut_cells_(n, surface, loose, r0, z0, r1, z1):
     further part takes its share of what remains.
 
     Args:
-        n: (k,) of `soil_numbers`.
+        n: (k,) of `soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
         r0: radius before, scalar [m].
@@ -88,7 +88,7 @@ def lay_down_(n, surface, loose, cell, volume):
     """Lay loose soil on a cell.
 
     Args:
-        n: (k,) of `soil_numbers`.
+        n: (k,) of `soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
         cell: number of the cell, scalar [1].
@@ -112,7 +112,7 @@ def cell_of(n, r):
     """Number of the cell at a radius, below 0 or beyond the last outside of the profile.
 
     Args:
-        n: (k,) of `soil_numbers`.
+        n: (k,) of `soil_parameters`.
         r: radius, scalar [m].
 
     Returns:
@@ -128,7 +128,7 @@ def slide_pair_(n, surface, loose, upper, lower):
     """Let soil slide from one cell to its lower neighbour, at most to the stable slope.
 
     Args:
-        n: (k,) of `soil_numbers`.
+        n: (k,) of `soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
         upper: number of the higher cell, scalar [1].
@@ -165,7 +165,7 @@ def slide_cells_(n, surface, loose, low, high, wall):
     """Let the soil of a range of cells slide once, from the left and from the right.
 
     Args:
-        n: (k,) of `soil_numbers`.
+        n: (k,) of `soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
         low: first cell, scalar [1].

@@ -21,7 +21,14 @@ import numpy as np
 from numba import carray, types
 
 from hydrotele.control.resolved_motion import follow_pose
-from hydrotele.control.servo import POINTS, drive_row, servo_step
+from hydrotele.control.servo import (
+    POINTS,
+    ComputedForce,
+    DriveReference,
+    Measured,
+    drive_row,
+    servo_step,
+)
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.hydraulics.circuit import SCRATCH
 from hydrotele.hydraulics.parameters import SLOTS
@@ -135,10 +142,11 @@ def act(f, e, action):
         e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
     )  # fmt: skip
     none = np.zeros(k)
+    drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
+    measured = Measured(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply)
     servo_step(
-        f.servo[:k], f.closed[:k], e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
-        e.sampled_reference[:k], e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply,
-        e.load[:k], False, none, none, e.command[:k],
+        f.servo[:k], f.closed[:k], drive, e.sampled_reference[:k], measured, e.load[:k],
+        ComputedForce(False, none, none), e.command[:k],
     )  # fmt: skip
 
 

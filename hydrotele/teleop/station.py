@@ -13,6 +13,7 @@ Delay lines are rings: what is written at a tick is read as many ticks later as 
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,7 +21,7 @@ import numpy as np
 from hydrotele.control.endpoint_force import EndpointForce
 from hydrotele.control.plan import Plan
 from hydrotele.control.resolved_motion import COORDINATES, arm_facts
-from hydrotele.control.servo import DriveReferences, drive_row, drive_tables
+from hydrotele.control.servo import DriveReference, DriveReferences, drive_row, drive_tables
 from hydrotele.control.task_impedance import TaskImpedance
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
@@ -63,11 +64,66 @@ from hydrotele.teleop.tip_over import push_back
 QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
 
 
+class SlaveSide(NamedTuple):
+    """The machine as teleoperation sees it; k joints of the arm among nu axes.
+
+    Attributes:
+        joint: (nu,) measured [rad] or [m].
+        force: (k,) at the tip, task coordinates [N], [N m].
+        columns: (k,) places of the arm's joints among the axes.
+        slave: (21 + 13 k,) Slave.
+        state: (52 + 3 k,) SlaveState, written.
+    """
+
+    joint: np.ndarray
+    force: np.ndarray
+    columns: np.ndarray
+    slave: np.ndarray
+    state: np.ndarray
+
+
+class Line(NamedTuple):
+    """The line between joystick and machine.
+
+    Attributes:
+        forward: (n, 3, 6) packets of the master on their way, written: displacement and rate of
+            the handle, what is left of the hand's force beyond the joystick's own spring and
+            damper.
+        back: (n, 7, k) packets of the machine on their way, written.
+        packet: (7, k) the last one that the master got, written.
+        lost: (ticks, 2) whether the packet that arrives then is lost: forward, back.
+        state: (5,) QUIET, SHARE, written, PERIOD, SILENCE, FADING [s].
+    """
+
+    forward: np.ndarray
+    back: np.ndarray
+    packet: np.ndarray
+    lost: np.ndarray
+    state: np.ndarray
+
+
+class MasterSide(NamedTuple):
+    """Joystick and operator.
+
+    Attributes:
+        master: (160,) Master.
+        state: (63,) MasterState, written.
+        qpos: (7,) of the flotor: position [m] and quaternion.
+        muscles: (61,) Muscles, written.
+        past: (reflex + 1, 6) see `pull`.
+        tremor: (n, 6) see `pull`.
+    """
+
+    master: np.ndarray
+    state: np.ndarray
+    qpos: np.ndarray
+    muscles: np.ndarray
+    past: np.ndarray
+    tremor: np.ndarray
+
+
 @compiled
-def to_the_hand(
-    tick, fresh, elapsed, tripped, joint, force, columns, slave_flat, state_flat, back, packet,
-    lost, line, master_flat, master_state, qpos, hand_flat, past, tremor, forward,
-):  # fmt: skip
+def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
     """Report the machine to the master, reflect, pull: ends in coil currents and muscle forces.
 
     Args:
@@ -75,50 +131,39 @@ def to_the_hand(
         fresh: whether the sensors have a new sample, scalar.
         elapsed: since the last one, scalar [s].
         tripped: whether the machine has been stopped for good, scalar.
-        joint: (nu,) measured [rad] or [m].
-        force: (k,) at the tip, task coordinates [N], [N m].
-        columns: (k,) places of the arm's joints among the axes.
-        slave_flat: (21 + 13 k,) Slave.
-        state_flat: (52 + 3 k,) SlaveState, written.
-        back: (n, 7, k) packets of the machine on their way, written.
-        packet: (7, k) the last one that the master got, written.
-        lost: (ticks, 2) whether the packet that arrives then is lost: forward, back.
-        line: (5,) QUIET, SHARE, written, PERIOD, SILENCE, FADING [s].
-        master_flat: (160,) Master.
-        master_state: (63,) MasterState, written.
-        qpos: (7,) of the flotor: position [m] and quaternion.
-        hand_flat: (61,) Muscles, written.
-        past: (reflex + 1, 6) see `pull`.
-        tremor: (n, 6) see `pull`.
-        forward: (n, 3, 6) packets of the master on their way, written: displacement and rate of the
-            handle, what is left of the hand's force beyond the joystick's own spring and damper.
+        machine: SlaveSide.
+        line: Line.
+        operator: MasterSide.
 
     Returns:
         Nothing.
 
     Source: `teleop.master`, `teleop.slave`, `teleop.operator_model`.
     """
+    joint, force, columns, slave_flat, state_flat = machine
+    forward, back, packet, lost, state = line
+    master_flat, master_state, qpos, hand_flat, past, tremor = operator
     k = len(columns)
     slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
     m, hand = unpack_master_state(master_state), unpack_muscles(hand_flat)
-    period, rows = line[2], len(back)
+    period, rows = state[2], len(back)
     arm = np.empty(k)
     for i in range(k):
         arm[i] = joint[columns[i]]
     measure_task(slave, arm, fresh, elapsed, s)
     report(slave, force, s, back[tick % rows])
     if lost[tick % len(lost), 1]:
-        line[0] += period
+        state[0] += period
     else:
-        line[0] = 0.0
+        state[0] = 0.0
         for row in range(7):
             for i in range(k):  # a number that is none does not count
                 if np.isfinite(back[(tick + 1) % rows, row, i]):
                     packet[row, i] = back[(tick + 1) % rows, row, i]
-    goal = 0.0 if tripped or line[0] > line[3] else 1.0
-    line[1] += (goal - line[1]) * min(1.0, period / line[4])
+    goal = 0.0 if tripped or state[0] > state[3] else 1.0
+    state[1] += (goal - state[1]) * min(1.0, period / state[4])
     numbers = unpack_master(master_flat)
-    master_step(numbers, qpos, packet, line[1], period, tick == 0, m)
+    master_step(numbers, qpos, packet, state[1], period, tick == 0, m)
     pull(hand, past, tremor, m.handle, tick, period)
     ahead = forward[tick % len(forward)]
     for i in range(6):
@@ -127,44 +172,35 @@ def to_the_hand(
 
 
 @compiled
-def to_the_machine(
-    tick, joint, force, columns, slave_flat, state_flat, forward, lost, line, grid, table, scale,
-    reference, rate, velocity, arm, volume_head, volume_rod,
-):  # fmt: skip
+def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, drive):
     """Take the packet that arrives, and write the references of joints and drives.
 
     Args:
         tick: scalar.
-        joint: (nu,) measured [rad] or [m].
-        force: (k,) at the tip, task coordinates [N], [N m].
-        columns: (k,) places of the arm's joints among the axes.
-        slave_flat: (21 + 13 k,) Slave.
-        state_flat: (52 + 3 k,) SlaveState, written.
-        forward: (n, 3, 6) packets of the master on their way.
-        lost: (ticks, 2) whether the packet that arrives then is lost: forward, back.
-        line: (5,) see `to_the_hand`.
+        machine: SlaveSide.
+        line: Line.
         grid: (nu, 2) of `drive_tables`.
         table: (nu, POINTS, 3) of `drive_tables`.
         scale: of drive velocities, scalar.
         reference: (nu,) joint references, those of the arm written [rad] or [m].
         rate: (nu,) the same, their rates [rad/s] or [m/s].
-        velocity: (nu,) written, see `drive_row` [m/s] or [rad/s].
-        arm: (nu,) written.
-        volume_head: (nu,) written [m^3].
-        volume_rod: (nu,) written [m^3].
+        drive: DriveReference, written.
 
     Returns:
         Nothing.
 
-    Source: `teleop.slave`, `control.drive_rows`.
+    Source: `teleop.slave`, `control.servo`.
     """
+    joint, force, columns, slave_flat, state_flat = machine
+    forward, _, _, lost, state = line
+    velocity, arm, volume_head, volume_rod = drive
     k, rows = len(columns), len(forward)
     slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
     measured = np.empty(k)
     for i in range(k):
         measured[i] = joint[columns[i]]
     coming = tick >= rows - 1 and lost[tick % len(lost), 0]
-    slave_step(slave, forward[(tick + 1) % rows], not coming, force, measured, line[2], s)
+    slave_step(slave, forward[(tick + 1) % rows], not coming, force, measured, state[2], s)
     for i in range(k):
         reference[columns[i]], rate[columns[i]] = s.joint[i], s.joint_rate[i]
     drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod)
@@ -311,7 +347,7 @@ class Station:
         self._master, self._m = master(joystick, pilot, self.coordinates)
         start = plan.reference[0, self.columns]
         self._slave, self._s = slave(machine, pilot, self._master, start, scenario.servo.lead)
-        self._line = _Line(pilot, scenario, len(axes))
+        self._line = _line(pilot, scenario, len(axes))
         self._flotor = SimulatedFlotor(joystick, period=self._period)
         self._qpos = self._flotor.data.qpos
         self._mount = np.array(joystick.mount)
@@ -363,12 +399,13 @@ class Station:
             )  # fmt: skip
         if tick % self.operator.every == 0:
             self.operator.decide(tick)
-        operator, line = self.operator, self._line
+        operator = self.operator
         to_the_hand(
-            tick, fresh, self._elapsed, self.tripped, seen.joint, self._force, self.columns,
-            self._slave_flat, self._s_flat, line.back, line.packet, line.lost, line.state,
-            self._master_flat, self._m_flat, self._qpos, self._hand_flat, operator.past,
-            operator.tremor, line.forward,
+            tick, fresh, self._elapsed, self.tripped, self._machine(seen), self._line,
+            MasterSide(
+                self._master_flat, self._m_flat, self._qpos, self._hand_flat, operator.past,
+                operator.tremor,
+            ),
         )  # fmt: skip
         self._elapsed = seen.period
         self._move_flotor(data)
@@ -376,6 +413,9 @@ class Station:
         self._ask(tick, seen)
         self._check(tick, seen)
         return self.tripped
+
+    def _machine(self, seen: Feedback) -> SlaveSide:
+        return SlaveSide(seen.joint, self._force, self.columns, self._slave_flat, self._s_flat)
 
     def _felt(self, data: mujoco.MjData, seen: Feedback, fresh: bool) -> None:
         """Force at the tip, and what the task is like if that is reflected."""
@@ -401,12 +441,14 @@ class Station:
 
     def _ask(self, tick: int, seen: Feedback) -> None:
         """Turn the packet that arrives into references."""
-        plan, drives, line = self._plan, self._drives, self._line
+        plan, drives = self._plan, self._drives
         to_the_machine(
-            tick, seen.joint, self._force, self.columns, self._slave_flat, self._s_flat,
-            line.forward, line.lost, line.state, self._grid, self._table, self._scale,
-            plan.reference[tick], plan.rate[tick], drives.velocity[tick], drives.arm[tick],
-            drives.volume_head[tick], drives.volume_rod[tick],
+            tick, self._machine(seen), self._line, self._grid, self._table, self._scale,
+            plan.reference[tick], plan.rate[tick],
+            DriveReference(
+                drives.velocity[tick], drives.arm[tick], drives.volume_head[tick],
+                drives.volume_rod[tick],
+            ),
         )  # fmt: skip
         if plan.pose is not None:
             plan.pose[tick] = self._s.pose[: plan.pose.shape[1]]
@@ -521,19 +563,20 @@ def _beside(scenario: Scenario, name: str) -> str:
     return str(path) if name != "joystick" and path.is_file() else name
 
 
-class _Line:
-    """Delay lines, and the packets that will be lost."""
-
-    def __init__(self, pilot: TeleopPilot, scenario: Scenario, k: int) -> None:
-        channel, period = pilot.channel, 1.0 / scenario.control_rate
-        for name in ("delay_forward", "delay_back"):
-            if (delay := getattr(channel, name)) >= scenario.duration:
-                message = f"{delay:g} s is as long as the run ({scenario.duration:g} s)"
-                raise InputError(f"pilot.channel.{name}", message)
-        rng = np.random.default_rng([scenario.seed, 404])
-        self.lost = rng.random((scenario.ticks, 2)) < channel.lost
-        self.lost[: round(channel.lost_from / period)] = False
-        self.forward = np.zeros((1 + round(channel.delay_forward / period), 3, 6))
-        self.back = np.zeros((1 + round(channel.delay_back / period), 7, k))
-        self.packet = np.zeros((7, k))
-        self.state = np.array([0.0, 1.0, period, pilot.safety.silence, _FADE])
+def _line(pilot: TeleopPilot, scenario: Scenario, k: int) -> Line:
+    """Empty delay lines, and the packets that will be lost."""
+    channel, period = pilot.channel, 1.0 / scenario.control_rate
+    for name in ("delay_forward", "delay_back"):
+        if (delay := getattr(channel, name)) >= scenario.duration:
+            message = f"{delay:g} s is as long as the run ({scenario.duration:g} s)"
+            raise InputError(f"pilot.channel.{name}", message)
+    rng = np.random.default_rng([scenario.seed, 404])
+    lost = rng.random((scenario.ticks, 2)) < channel.lost
+    lost[: round(channel.lost_from / period)] = False
+    return Line(
+        np.zeros((1 + round(channel.delay_forward / period), 3, 6)),
+        np.zeros((1 + round(channel.delay_back / period), 7, k)),
+        np.zeros((7, k)),
+        lost,
+        np.array([0.0, 1.0, period, pilot.safety.silence, _FADE]),
+    )

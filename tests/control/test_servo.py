@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.control.servo import feedforward_opening, servo_parameters, servo_step
+from hydrotele.control.servo import (
+    ComputedForce,
+    DriveReference,
+    Measured,
+    feedforward_opening,
+    servo_parameters,
+    servo_step,
+)
 from hydrotele.hydraulics.circuit import Slot, chamber_flows
 from hydrotele.hydraulics.laws import valve_opening
 from hydrotele.hydraulics.parameters import actuator_parameters
@@ -68,9 +75,10 @@ def one_step(axis, servo=None, error=0.0, velocity=0.0, arm=1.0, rate=0.0, load=
     out, reference = np.full(4, 0.123), full(0.0)
     reference[k] = error
     servo_step(
-        numbers, np.arange(4) == k, full(velocity), full(arm), full(0.02), full(0.02), reference,
-        full(0.0), full(rate), head, rod, SUPPLY,
-        forces if load is None else load * forces, False, full(0.0), full(0.0), out,
+        numbers, np.arange(4) == k,
+        DriveReference(full(velocity), full(arm), full(0.02), full(0.02)), reference,
+        Measured(full(0.0), full(rate), head, rod, SUPPLY),
+        forces if load is None else load * forces, ComputedForce(False, full(0.0), full(0.0)), out,
     )  # fmt: skip
     assert np.all(np.delete(out, k) == 0.123)  # what is not under feedback keeps its command
     return out[k]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.control.servo import drive_tables
+from hydrotele.control.servo import DriveReference, drive_tables
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.teleoperation import TeleopPilot
@@ -12,7 +12,15 @@ from hydrotele.teleop.axis_table import flat_view, flattened
 from hydrotele.teleop.master import master
 from hydrotele.teleop.operator_model import Muscles
 from hydrotele.teleop.slave import AGE, slave
-from hydrotele.teleop.station import QUIET, SHARE, to_the_hand, to_the_machine
+from hydrotele.teleop.station import (
+    QUIET,
+    SHARE,
+    Line,
+    MasterSide,
+    SlaveSide,
+    to_the_hand,
+    to_the_machine,
+)
 
 CAT, STICK, PERIOD, FADE = load_machine("cat215", "bucket"), load_joystick(), 0.005, 0.2
 AXES = tuple(CAT.axes)
@@ -20,7 +28,7 @@ COLUMNS = np.array([AXES.index(axis) for axis in arm_facts(CAT)[1]])
 HOME = np.array([CAT.home.get(CAT.axes[a].joint, 0.0) for a in AXES])
 
 
-class Line:
+class RoundTrip:
     """Both halves of the round trip, around a machine and a handle that stand still."""
 
     def __init__(self, forward=0, back=0, lost=(), ticks=400, **changed):
@@ -44,24 +52,23 @@ class Line:
 
     def step(self, tripped=False):
         flat, k = flat_view, len(AXES)
-        to_the_hand(
-            self.tick, True, PERIOD, tripped, self.joint, self.force, COLUMNS, flat(self.s),
-            flat(self.ss), self.back, self.packet, self.lost, self.state, flat(self.m),
-            flat(self.ms), self.qpos, flat(self.hand), np.zeros((2, 6)), np.zeros((8, 6)),
-            self.forward,
+        machine = SlaveSide(self.joint, self.force, COLUMNS, flat(self.s), flat(self.ss))
+        line = Line(self.forward, self.back, self.packet, self.lost, self.state)
+        operator = MasterSide(
+            flat(self.m), flat(self.ms), self.qpos, flat(self.hand), np.zeros((2, 6)),
+            np.zeros((8, 6)),
         )  # fmt: skip
-        out = [np.zeros(k) for _ in range(6)]
-        to_the_machine(
-            self.tick, self.joint, self.force, COLUMNS, flat(self.s), flat(self.ss), self.forward,
-            self.lost, self.state, self.grid, self.table, 1.0, *out,
-        )  # fmt: skip
+        to_the_hand(self.tick, True, PERIOD, tripped, machine, line, operator)
+        reference, rate = np.zeros(k), np.zeros(k)
+        drive = DriveReference(*(np.zeros(k) for _ in range(4)))
+        to_the_machine(self.tick, machine, line, self.grid, self.table, 1.0, reference, rate, drive)
         self.tick += 1
         return self
 
 
 @pytest.mark.parametrize("late", [0, 1, 7, 40])
 def test_a_force_comes_to_the_hand_exactly_so_late(late):
-    line = Line(back=late)
+    line = RoundTrip(back=late)
     seen = []
     for tick in range(60):
         line.force[2] = 1e4 if tick == 10 else 0.0
@@ -71,7 +78,7 @@ def test_a_force_comes_to_the_hand_exactly_so_late(late):
 
 @pytest.mark.parametrize("late", [0, 1, 7, 40])
 def test_a_displacement_comes_to_the_machine_exactly_so_late(late):
-    line = Line(forward=late)
+    line = RoundTrip(forward=late)
     seen = []
     for tick in range(60):
         line.qpos[2] = 3e-3 if tick == 10 else 0.0
@@ -86,7 +93,7 @@ def test_silence_fades_the_force_and_is_forgotten_when_packets_come(late):
     6 %: the fade is stepped, and begins a period sooner or later.
     """
     gone = range(100, 200)
-    line = Line(back=late, forward=late, lost=gone)
+    line = RoundTrip(back=late, forward=late, lost=gone)
     line.force[2] = 1e4
     silent = round(line.state[3] / PERIOD) - 1  # the sum of periods may round up
     for _ in range(100 + silent):
@@ -103,7 +110,7 @@ def test_silence_fades_the_force_and_is_forgotten_when_packets_come(late):
 
 
 def test_a_machine_that_tripped_lets_the_hand_go():
-    line = Line()
+    line = RoundTrip()
     line.force[2] = 1e4
     for _ in range(400):
         line.step(tripped=line.tick > 50)
@@ -112,7 +119,7 @@ def test_a_machine_that_tripped_lets_the_hand_go():
 
 def test_nonsense_from_the_sensors_stays_out_of_the_hand():
     """The last good number of a channel counts; the machine trips, the joystick works on."""
-    line = Line()
+    line = RoundTrip()
     line.force[2] = 1e4
     for _ in range(20):
         line.step()

@@ -9,7 +9,15 @@ out what the nominal machine does not know: leakage, other dead bands and flow g
 
 import numpy as np
 
-from hydrotele.control.servo import drive_row, drive_tables, servo_parameters, servo_step
+from hydrotele.control.servo import (
+    ComputedForce,
+    DriveReference,
+    Measured,
+    drive_row,
+    drive_tables,
+    servo_parameters,
+    servo_step,
+)
 from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward, task_inverse
 from hydrotele.scenario.scenario import Servo
@@ -49,10 +57,10 @@ def servo_rows(
         drive_row(
             grid, table, reference[i], rate_ahead[i], 1.0, velocity, arm, volume_head, volume_rod
         )
-        servo_step(
-            numbers, closed, velocity, arm, volume_head, volume_rod, reference[i], joint[i],
-            rate[i], head[i], rod[i], supply[i], load[i], False, none, none, out[i],
-        )  # fmt: skip
+        drive = DriveReference(velocity, arm, volume_head, volume_rod)
+        measured = Measured(joint[i], rate[i], head[i], rod[i], supply[i])
+        computed = ComputedForce(False, none, none)
+        servo_step(numbers, closed, drive, reference[i], measured, load[i], computed, out[i])
 
 
 @compiled
