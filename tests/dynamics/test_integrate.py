@@ -2,7 +2,6 @@
 
 import json
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,8 +25,8 @@ from hydrotele.effects.effect import changed
 from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
 from hydrotele.logs.log import load_log
 from hydrotele.machine.sensors import SensorError
+from tests.measured import TRUTH
 
-TRUTH = Path(__file__).parents[3] / "shared" / "measured" / "nominal_truth"
 PERIOD, RELIEF = 0.02, 28.0e6
 
 
@@ -41,8 +40,6 @@ def free_run(model, space, z, command, steps):
 @pytest.fixture(scope="module")
 def truth(machine_of, reduced_of):
     """(model, space, start, commands, readings) of a run of an independent simulator."""
-    if not TRUTH.is_dir():
-        pytest.skip(f"{TRUTH} is absent: it is not part of this repository")
     machine, log = machine_of("cat215/none"), load_log(TRUTH / "test_1.parquet")
     channels = predicted_channels(machine)
     model, space, z = reduced_of(machine, channels)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,13 +27,10 @@ from hydrotele.machine.signals import usual_unit
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.terms.facts import Term
 from tests.estimate.test_filter import machine_data
+from tests.measured import MEASURED
 
 SENSORS, PERIOD = "khoshzaban1992", 0.02
-MEASURED = Path(__file__).parents[3] / "shared" / "measured"
 RUNS = ("fit_1", "fit_2", "fit_3", "test_1")
-shared = pytest.mark.skipif(
-    not MEASURED.is_dir(), reason=f"{MEASURED} is absent: it is not part of this repository"
-)
 
 
 def recorded(machine, seconds=20.0, seed=0):
@@ -233,14 +229,12 @@ def shared_case(case):
     return [judged(machine, load_log(MEASURED / case / f"{run}.parquet")) for run in RUNS]
 
 
-@shared
 def test_clean_measured_runs_are_at_their_noise():
     for found in shared_case("open_04"):
         loud = {k: v for k, v in found.items() if v > (2.0 if k[0] == "timing" else 1.5)}
         assert loud == {}  # as above: 40 s hold 120 independent values, 6 % by chance
 
 
-@shared
 def test_exact_signals_leave_less_than_the_sensors_noise():
     machine = load_machine("cat215")
     for run in RUNS:
@@ -248,7 +242,6 @@ def test_exact_signals_leave_less_than_the_sensors_noise():
         assert max(judged(machine, log).values()) < 1.0
 
 
-@shared
 @pytest.mark.parametrize(
     ("case", "place", "least"),
     [
@@ -273,7 +266,6 @@ def test_changed_measured_machines_stand_out_in_the_right_law(case, place, least
     assert np.median(quiet) < 1.3
 
 
-@shared
 def test_the_delay_of_open_03_is_read_off_in_seconds():
     log = load_log(MEASURED / "open_03" / "fit_2.parquet")
     found = balances(load_machine("cat215"), log, SENSORS)["timing"]

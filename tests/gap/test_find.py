@@ -5,7 +5,6 @@ Half of every fitted run is enough to tell what is asserted here; all ten whole 
 """
 
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +16,7 @@ from hydrotele.gap.result import Estimate, NamedEffect
 from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.logs.log import Log, load_log, save_log
 from hydrotele.machine.machine_file import load_machine
-
-MEASURED = Path(__file__).resolve().parents[3] / "shared" / "measured"
-pytestmark = pytest.mark.skipif(not MEASURED.is_dir(), reason="../shared/measured is absent")
+from tests.measured import MEASURED
 
 
 def half(folder, seconds: float = 60.0) -> Dataset:

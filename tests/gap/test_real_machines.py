@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +15,10 @@ from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.gap.find import find_gap
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.machine.machine_file import load_machine
+from tests.measured import REAL, needs_real
 from tools.real_machines import FIRST_THREE_QUARTERS, PUSH, ec20_splits, force_error, pushed
 
-REAL = Path(__file__).resolve().parents[3] / "shared" / "real"
-pytestmark = pytest.mark.skipif(not REAL.is_dir(), reason="../shared/real is absent")
+pytestmark = needs_real
 
 
 def test_emps_names_friction_that_depends_on_the_direction():

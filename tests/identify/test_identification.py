@@ -1,7 +1,6 @@
 """Identification from logs: independent data, real data, and data that tell little."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,11 +17,7 @@ from hydrotele.identify.result import counts, parameter_rows
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log, save_log
 from hydrotele.machine.machine_file import load_machine
-
-SHARED = Path(__file__).resolve().parents[3] / "shared"
-MEASURED, REAL = SHARED / "measured", SHARED / "real"
-needs_measured = pytest.mark.skipif(not MEASURED.is_dir(), reason="no ../shared/measured here")
-needs_real = pytest.mark.skipif(not REAL.is_dir(), reason="no ../shared/real here")
+from tests.measured import MEASURED, REAL, needs_real
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +33,6 @@ def found(clean):
     return identify_dynamics(*clean)
 
 
-@needs_measured
 def test_intervals_hold_the_parameters_of_the_machine_that_was_recorded(found):
     truth = found.told.combination @ found.nominal
     away = np.abs(found.estimate.value - truth) / found.estimate.std
@@ -48,7 +42,6 @@ def test_intervals_hold_the_parameters_of_the_machine_that_was_recorded(found):
     assert len(away) > 25 and found.estimate.ellipsoid(truth) < 49.6
 
 
-@needs_measured
 def test_held_out_forces_differ_by_noise(found):
     for drive, judged in found.heldout.items():
         # what the exact parameters leave, which 3 identified ones in 100 equations may raise by 3 %
@@ -60,7 +53,6 @@ def test_held_out_forces_differ_by_noise(found):
     assert found.status == "ok"
 
 
-@needs_measured
 def test_a_wrong_machine_is_found_out_and_mended(clean, found):
     fit, heldout, setup = clean
     wrong = dataclasses.replace(setup.chain, inertia=setup.chain.inertia * 0.8)
@@ -76,7 +68,6 @@ def test_a_wrong_machine_is_found_out_and_mended(clean, found):
         assert judged.rms < 1.1 * found.heldout[drive].rms, drive  # weak ones stay wrong
 
 
-@needs_measured
 def test_the_complete_model_is_at_least_as_good_as_the_reduced_one(clean, found):
     """As Khoshzaban's cross-validation: 3720, 5860, 8700 against 4720, 5500, 11900."""
     fit, heldout, setup = clean
@@ -87,7 +78,6 @@ def test_the_complete_model_is_at_least_as_good_as_the_reduced_one(clean, found)
     assert max(better) < 1.08
 
 
-@needs_measured
 def test_with_perfect_sensors_tubes_and_rods_show():
     machine = load_machine("cat215")
     fit, heldout, _ = records(load_dataset([MEASURED / "nominal_truth"], machine, "ideal"))
@@ -102,7 +92,6 @@ def test_with_perfect_sensors_tubes_and_rods_show():
         assert complete[drive].relative < 0.006, drive
 
 
-@needs_measured
 def test_without_pressures_of_one_side_the_others_are_still_told(clean):
     fit, heldout, setup = clean
 
@@ -118,7 +107,6 @@ def test_without_pressures_of_one_side_the_others_are_still_told(clean):
     assert rows["coulomb.stick_rod"].value == pytest.approx(2000, abs=4 * 60)
 
 
-@needs_measured
 def test_a_drive_that_rests_has_no_friction_to_tell(clean):
     fit, heldout, setup = clean
 
@@ -134,7 +122,6 @@ def test_a_drive_that_rests_has_no_friction_to_tell(clean):
     assert all(rows[f"{kind}.boom_rod"].value is None for kind in ("coulomb", "viscous"))
 
 
-@needs_measured
 def test_missing_samples_are_bridged(clean, found):
     fit, heldout, setup = clean
     rng = np.random.default_rng(1)
@@ -150,7 +137,6 @@ def test_missing_samples_are_bridged(clean, found):
         assert judged.rms < 1.1 * found.heldout[drive].rms, drive
 
 
-@needs_measured
 def test_readings_of_a_saturated_sensor_are_left_out(clean, tmp_path):
     """A third of the time the pressure is above what its sensor can say."""
     for file in sorted((MEASURED / "open_04").glob("*.parquet")):
@@ -166,7 +152,6 @@ def test_readings_of_a_saturated_sensor_are_left_out(clean, tmp_path):
     assert 20 < len(found.told.base) <= 25 and found.distance(found.nominal)[0] < 44.3
 
 
-@needs_measured
 def test_unknown_forces_everywhere_are_refused(clean):
     fit, heldout, setup = clean
     blind = [dataclasses.replace(r, force=np.full_like(r.force, np.nan)) for r in fit]
@@ -195,7 +180,6 @@ def test_emps_has_the_published_numbers(asymmetry, error):
         assert rows["offset.slide"].value == pytest.approx(-3.165, rel=0.05)
 
 
-@needs_measured
 def test_rows_say_of_every_parameter_what_is_known(found):
     rows = parameter_rows(found)
     assert [row.name for row in rows] == list(found.names)
@@ -217,7 +201,6 @@ def test_processing_refuses_nonsense():
         Processing("periodic")
 
 
-@needs_measured
 def test_pressures_that_are_read_half_as_often_are_enough(clean, found):
     fit, heldout, setup = clean
 
@@ -233,7 +216,6 @@ def test_pressures_that_are_read_half_as_often_are_enough(clean, found):
     assert np.sum(away > 1.96) <= 4
 
 
-@needs_measured
 def test_a_short_run_is_left_out_with_a_note(clean):
     fit, heldout, setup = clean
     short = dataclasses.replace(
@@ -251,7 +233,6 @@ def test_options_without_sense_are_refused(options):
         Estimator(**options)
 
 
-@needs_measured
 def test_a_band_beyond_the_samples_is_refused(clean):
     with pytest.raises(InputError, match="too wide"):
         identify_dynamics(*clean, Processing(band=40.0))

@@ -19,11 +19,7 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.noise import IDEAL, noise_rms
 from hydrotele.machine.signals import usual_unit
 from hydrotele.simulate.feedback import measure
-
-SHARED = Path(__file__).resolve().parents[3] / "shared"
-MEASURED, REAL = SHARED / "measured", SHARED / "real"
-needs_measured = pytest.mark.skipif(not MEASURED.is_dir(), reason=f"{MEASURED} is absent")
-needs_real = pytest.mark.skipif(not REAL.is_dir(), reason=f"{REAL} is absent")
+from tests.measured import MEASURED, REAL, needs_real
 
 CAT = load_machine("cat215")
 SENSORS = CAT.sensors["khoshzaban1992"]
@@ -98,7 +94,6 @@ def column(data: Dataset, run: str, channel: str) -> np.ndarray:
 # Clean data
 
 
-@needs_measured
 @pytest.mark.parametrize("case", [f"open_{k:02d}" for k in range(1, 11)])
 def test_clean_measured_logs_pass_unchanged(case):
     data = load_dataset(MEASURED / case, CAT)
@@ -121,7 +116,6 @@ def test_clean_measured_logs_pass_unchanged(case):
         assert not (read[:, 5:][kept[:, 5:]] == 0.0).any()
 
 
-@needs_measured
 def test_hundred_draws_of_noise_have_no_stuck_sensor():
     truths = [load_log(MEASURED / "nominal_truth" / f"{run}.parquet").without_truth()
               for run in ("fit_1", "test_1")]  # fmt: skip
@@ -612,7 +606,6 @@ def test_run_folders_are_read_and_truth_is_not(tmp_path):
     assert [r.name for r in runs_of(load_dataset(tmp_path, CAT))] == ["one", "two"]
 
 
-@needs_measured
 def test_truth_is_stripped():
     data = load_dataset(MEASURED / "nominal_truth", CAT)
     for run in runs_of(data):

@@ -18,13 +18,9 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log, load_log, load_logs, save_log
+from tests.measured import MEASURED, REAL, needs_real
 
 ROOT = Path(__file__).resolve().parents[2]
-SHARED = ROOT.parent / "shared"
-needs_shared = pytest.mark.skipif(
-    not (SHARED / "measured").is_dir() or not (SHARED / "real").is_dir(),
-    reason="the shared measured and real logs are not beside this checkout",
-)
 EMPS = {
     "position": "position.slide",
     "reference": "reference.slide",
@@ -95,10 +91,9 @@ def refusal(path: Path, **kwargs) -> str:
 # Real files
 
 
-@needs_shared
 @pytest.mark.parametrize("folder", ["nominal_truth", "open_01", "open_10"])
 def test_measured_folders_load(folder):
-    logs = load_logs(SHARED / "measured" / folder, required=["pressure_supply"])
+    logs = load_logs(MEASURED / folder, required=["pressure_supply"])
     assert [log.name for log in logs] == ["fit_1", "fit_2", "fit_3", "test_1"]
     for log in logs:
         assert len(log) == 2000
@@ -112,9 +107,9 @@ def test_measured_folders_load(folder):
         assert logs[0].units["truth.force.swing"] == "N m"
 
 
-@needs_shared
+@needs_real
 def test_emps_loads_through_aliases():
-    path = SHARED / "real" / "emps" / "main.parquet"
+    path = REAL / "emps" / "main.parquet"
     log = load_log(path, aliases=EMPS)
     assert log.units == {
         "position.slide": "m",
@@ -127,25 +122,25 @@ def test_emps_loads_through_aliases():
     assert "such as position.boom" in refusal(path)
 
 
-@needs_shared
+@needs_real
 def test_volvo_loads_though_its_joystick_passes_one():
-    log = load_log(SHARED / "real" / "volvo_ec20" / "long.parquet")
+    log = load_log(REAL / "volvo_ec20" / "long.parquet")
     assert log.axes == ("boom", "stick")
     assert 1.0 < np.abs(log["command.boom"]).max() < 1.001
 
 
-@needs_shared
+@needs_real
 def test_panda_lacks_samples_and_says_so():
-    path = SHARED / "real" / "panda" / "exciting_1.parquet"
+    path = REAL / "panda" / "exciting_1.parquet"
     assert "dropped" in refusal(path)
     log = load_log(path, maximum_dropped=0.05)
     assert len(log.axes) == 7
     assert len(log.gaps) > 0
 
 
-@needs_shared
+@needs_real
 def test_a_csv_that_is_no_log_is_told_about_the_header():
-    path = SHARED / "real" / "mukca_panda_3" / "backcenter" / "hole_0.csv"
+    path = REAL / "mukca_panda_3" / "backcenter" / "hole_0.csv"
     assert "header" in refusal(path)
 
 
@@ -169,9 +164,8 @@ def test_round_trip_is_bit_exact(tmp_path):
     assert os.listdir(tmp_path) == ["run.parquet"]
 
 
-@needs_shared
-def test_round_trip_of_a_shared_file(tmp_path):
-    log = load_log(SHARED / "measured" / "nominal_truth" / "fit_1.parquet")
+def test_round_trip_of_a_measured_file(tmp_path):
+    log = load_log(MEASURED / "nominal_truth" / "fit_1.parquet")
     save_log(log, tmp_path / "fit_1.parquet")
     again = load_log(tmp_path / "fit_1.parquet")
     assert all(np.array_equal(again[name], log[name]) for name in log.columns)

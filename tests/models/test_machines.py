@@ -2,7 +2,6 @@
 
 import math
 import os
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -13,6 +12,7 @@ from hydrotele.machine.machine_file import load_machine, shipped_machines
 from hydrotele.machine.signals import parse_channel
 from hydrotele.simulate.closure import holding_forces, independent_dofs, motion_basis, pin_opening
 from hydrotele.simulate.plant import build_plant, rest_state
+from tests.measured import REAL, needs_real
 
 CASES = [(name, tool) for name in shipped_machines() for tool in load_machine(name).tools]
 PIN = 1.0e-4  # m, asked for: a tenth of a millimetre on a 20 t machine
@@ -257,10 +257,10 @@ def test_force_drive_rests_with_the_voltage_that_balances_the_offset():
     assert data.qacc[0] == pytest.approx(3.165 / 95.11)
 
 
-RECORD = Path(__file__).parents[3] / "shared" / "real" / "emps" / "main.parquet"
+RECORD = REAL / "emps" / "main.parquet"
 
 
-@pytest.mark.skipif(not RECORD.is_file(), reason="the published EMPS record is not here")
+@needs_real
 def test_emps_record_is_followed_with_its_published_controller():
     """Position gain 160.18 1/s, velocity gain 243.45 V s/m (the record's): 5 um, 10 % of voltage.
 

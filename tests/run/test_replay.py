@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +13,8 @@ from hydrotele.run.replay import replay_log
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.record import SimulationFailed
+from tests.measured import MEASURED
 
-MEASURED = Path(__file__).parents[3] / "shared" / "measured"
 HELD = {"control_rate": "50"}  # commands held over each row of the log
 CASES = {
     "excitation": {"duration": "6"},
@@ -211,7 +210,6 @@ def test_jitter_of_the_clock_does_not_add_up(excitation):
     assert replay.channels["angle.boom"].max < 1e-3
 
 
-@pytest.mark.skipif(not MEASURED.is_dir(), reason="the shared measured logs are not here")
 @pytest.mark.parametrize("run", ["fit_2"])
 def test_replay_converges_to_an_independent_simulator(run):
     """Half the step, less than 0.6 of the error; 10 s, as nothing forgets slower than 4 s."""

@@ -2,7 +2,6 @@
 
 import functools
 import json
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -10,14 +9,10 @@ import pytest
 
 from hydrotele.logs.log import load_log
 from hydrotele.simulate.plant import initial_state
+from tests.measured import TRUTH
 
-TRUTH = Path(__file__).parents[3] / "shared" / "measured" / "nominal_truth"
 RUNS = ("fit_1", "fit_2", "fit_3", "test_1")
 RELIEF = 28.0e6
-
-pytestmark = pytest.mark.skipif(
-    not TRUTH.is_dir(), reason=f"{TRUTH} is absent: it is not part of this repository"
-)
 
 
 @pytest.fixture(scope="module")

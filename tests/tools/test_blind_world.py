@@ -16,6 +16,7 @@ from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log, save_log
 from hydrotele.machine.machine_file import load_machine
+from tests.measured import TRUTH
 from tools.blind.forms import FORMS
 from tools.blind.open_loop import open_loop_error
 from tools.blind.spreads import SIZES, draw_library_effect, off_everywhere
@@ -51,10 +52,6 @@ def replay(facts, start, commands, period, steps):
     return shown
 
 
-TRUTH = Path(__file__).parents[3] / "shared" / "measured" / "nominal_truth"
-
-
-@pytest.mark.skipif(not TRUTH.is_dir(), reason="needs the measured logs")
 @pytest.mark.parametrize("run", ["fit_2", "test_1"])
 def test_the_nominal_machine_comes_out_of_other_equations(run):
     log = load_log(TRUTH / f"{run}.parquet")
