@@ -49,17 +49,6 @@ def test_a_pressure_offset_below_one_reading_is_named():
     assert gap.tests["constancy"]["passed"]
 
 
-def test_a_scored_zone_of_the_bore_is_named_with_its_place_and_size():
-    gap = found(MEASURED / "open_02")
-    assert gap.verdict == "named"
-    (effect,) = gap.effects
-    assert (effect.name, effect.location) == ("position_dependent_friction", "stick")
-    # the truth: 9 kN about 0.72 m, 0.05 m wide; known to 1 % from all of the logs, half are fitted
-    assert effect.parameters["coulomb"].value == pytest.approx(9000.0, rel=0.04)
-    assert effect.parameters["centre"].value == pytest.approx(0.72, abs=0.004)
-    assert effect.parameters["width"].value == pytest.approx(0.05, rel=0.08)
-
-
 def test_missing_channels_and_rows_still_find_the_dead_band(tmp_path):
     """No rod pressures, no lengths, no supply pressure, and 1 % of the rows dropped."""
     gone = ("pressure_rod", "length", "pressure_supply")
