@@ -17,7 +17,7 @@ PACKAGE = "hydrotele"
 FLOORS = (
     ("core",),
     ("terms", "machine", "effects"),
-    ("kinematics", "hydraulics", "dynamics", "soil"),
+    ("kinematics", "hydraulics", "multibody", "soil"),
     ("logs",),
     ("scenario", "devices"),
     ("estimate",),

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.excitation import (
     Excitation,
     design_excitation,
@@ -24,13 +23,14 @@ from hydrotele.identify.excitation import (
 )
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import force_noise, records
-from hydrotele.identify.regressor import machine_setup
 from hydrotele.identify.result import parameter_rows
+from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
+from hydrotele.simulate.closure import closed_chain
 from tools.study import options, publish
 
 SENSORS, OLD, HELD_OUT = "khoshzaban1992", "excitation", "excitation_fast"

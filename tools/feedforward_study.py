@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from hydrotele.cli.identifying import closed_chain
 from hydrotele.effects.effect import changed
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.identified_machine import identified_machine
 from hydrotele.identify.record import records
-from hydrotele.identify.regressor import machine_setup
+from hydrotele.identify.setup import machine_setup
 from hydrotele.kinematics.arm import forward_cartesian, inverse
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.logs.dataset import make_dataset
@@ -30,6 +29,7 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
+from hydrotele.simulate.closure import closed_chain
 from tools.study import options, publish
 
 SENSORS = "khoshzaban1992"

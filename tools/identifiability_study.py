@@ -13,11 +13,11 @@ in the null space.
 
 import numpy as np
 
-from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identifiability import identifiability
-from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import FrictionTerm, Regressor, pin_friction, regressor
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.regressor import FrictionTerm, Regressor, pin_friction, regressor
+from hydrotele.simulate.closure import closed_chain
 from tools.study import options, publish
 
 TABLE_13 = (31, 24, 27)

@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import records
-from hydrotele.identify.regressor import Setup, machine_setup
+from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
+from hydrotele.simulate.closure import closed_chain
 from tools.study import options, publish, side_by_side
 
 FIT, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"

@@ -13,16 +13,17 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hydrotele.cli.identifying import closed_chain
-from hydrotele.identify.chain import Chain, load_chain
 from hydrotele.identify.identification import identify_with_shapes
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import Record, records
-from hydrotele.identify.regressor import FrictionTerm, Setup, machine_setup
 from hydrotele.identify.result import Identification, parameter_rows
+from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.chain import Chain, load_chain
+from hydrotele.multibody.regressor import FrictionTerm
+from hydrotele.simulate.closure import closed_chain
 
 HELD_OUT = 0.25
 WIDE = 10.0  # Hz: the whole of what is in the Panda's torques besides noise

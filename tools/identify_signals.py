@@ -14,21 +14,22 @@ identified parameters, mean over the trials. No noise has a part in the judgemen
 
 import numpy as np
 
-from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.projection import project
 from hydrotele.identify.record import records
-from hydrotele.identify.regressor import Setup, machine_setup, regressor
+from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.kinematics.arm import inverse
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.regressor import regressor
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
+from hydrotele.simulate.closure import closed_chain
 from tools.identify_coverage import wrong_setup
 from tools.study import options, publish, side_by_side
 

@@ -17,13 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.cli.identifying import closed_chain
-from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import machine_setup, regressor
+from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.regressor import regressor
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
+from hydrotele.simulate.closure import closed_chain
 from tools.study import options, publish
 
 CHILD = """

@@ -15,20 +15,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.equations import build_equations, stacked
 from hydrotele.identify.estimation import estimate
 from hydrotele.identify.identifiability import identifiability, reference_sizes
 from hydrotele.identify.motion import Processing, resolution
-from hydrotele.identify.projection import project
 from hydrotele.identify.record import Record, records
-from hydrotele.identify.regressor import Setup, machine_setup, regressor
+from hydrotele.identify.setup import Setup, machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.regressor import regressor
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import load_scenario
+from hydrotele.simulate.closure import closed_chain
 from tools.study import options, publish, side_by_side
 
 RUNS, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"

@@ -16,7 +16,6 @@ from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.core.units import customary
-from hydrotele.dynamics.model import predicted_channels
 from hydrotele.estimate.baselines import BASELINES, fit_baseline
 from hydrotele.estimate.free_run import (
     TO_THE_END,
@@ -26,6 +25,7 @@ from hydrotele.estimate.free_run import (
     free_run_errors,
     machine_runner,
 )
+from hydrotele.estimate.reduced_model import predicted_channels
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData, load_dataset
 from hydrotele.machine.machine import Machine

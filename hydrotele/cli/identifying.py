@@ -18,7 +18,6 @@ from hydrotele.cli.console import notes, out, plain, print_json, stages, table
 from hydrotele.cli.opening import data_name, machine_of
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, replacing, whole_folder
-from hydrotele.identify.chain import Chain, load_chain
 from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.excitation import design_excitation, informative_base
@@ -27,8 +26,8 @@ from hydrotele.identify.identification import identify_with_shapes
 from hydrotele.identify.identified_machine import identified_machine, identify_document
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import force_noise, records
-from hydrotele.identify.regressor import Model, cylinder_bars, machine_setup
 from hydrotele.identify.result import MEANING, Identification, counts, parameter_rows
+from hydrotele.identify.setup import Model, cylinder_bars, machine_setup
 from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import (
@@ -38,8 +37,9 @@ from hydrotele.machine.machine_file import (
     shipped_machines,
 )
 from hydrotele.scenario.scenario import load_scenario
+from hydrotele.simulate.closure import closed_chain
 from hydrotele.simulate.native import stop_profiling_clock
-from hydrotele.simulate.plant import build_plant, rest_state
+from hydrotele.simulate.plant import build_plant
 
 
 @dataclass(frozen=True)
@@ -156,12 +156,6 @@ def identify_mechanism(dataset: Dataset, choices: Choices) -> Mechanism:
     )  # fmt: skip
     patched, best = identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
     return Mechanism(found, best, patched)
-
-
-def closed_chain(machine: Machine) -> Chain:
-    """Chain of a machine, with its loops closed at its home position."""
-    plant = build_plant(machine)
-    return dataclasses.replace(load_chain(plant.model), start=rest_state(plant).qpos.copy())
 
 
 def _write(

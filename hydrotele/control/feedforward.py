@@ -1,20 +1,20 @@
 """Computed forces: what inverse dynamics asks of the drives along a plan."""
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
 from hydrotele.control.plan import Plan
 from hydrotele.core.errors import InputError
-from hydrotele.identify.chain import load_chain
-from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import machine_setup, regressor
+from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.identify.setup import machine_setup
 from hydrotele.identify.smoothing import Smoothed, zero_phase
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.regressor import regressor
 from hydrotele.scenario.scenario import Servo
-from hydrotele.simulate.plant import build_plant, rest_state
+from hydrotele.simulate.closure import closed_chain
 
 NOMINAL = "nominal"
 
@@ -61,12 +61,11 @@ def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferen
     if not np.all(plan.closed):
         open_ones = ", ".join(a for a, c in zip(plan.axes, plan.closed, strict=True) if not c)
         raise InputError(where, f"needs a reference of every axis; {open_ones} has none")
-    plant = build_plant(machine, ground=False)
-    if tuple(plant.axes) != tuple(plan.axes):
-        raise InputError(where, f"{machine.name} has the axes {', '.join(plant.axes)}")
+    axes = actuator_order(machine)
+    if tuple(axes) != tuple(plan.axes):
+        raise InputError(where, f"{machine.name} has the axes {', '.join(axes)}")
     joints = [machine.axes[a].joint for a in plan.axes]
-    start = rest_state(plant, dict(zip(joints, plan.reference[0], strict=True)))
-    chain = dataclasses.replace(load_chain(plant.model), start=start.qpos.copy())
+    chain = closed_chain(machine, dict(zip(joints, plan.reference[0], strict=True)))
     setup = machine_setup(machine, chain)
     step = float(plan.time[1] - plan.time[0])
     motion = _smooth(plan.reference, step)

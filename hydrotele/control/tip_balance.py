@@ -11,14 +11,14 @@ import numpy as np
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import allocation_free
 from hydrotele.core.errors import InputError
-from hydrotele.dynamics.integrate import place_mechanism
-from hydrotele.dynamics.mechanism import DAMPING, HOME, Mechanism, coordinate_names
-from hydrotele.dynamics.model import model_space, reduced_model, state_size
-from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Motion, gather_forces
+from hydrotele.estimate.reduced_dynamics import place_mechanism
+from hydrotele.estimate.reduced_model import model_space, reduced_model, state_size
 from hydrotele.hydraulics.circuit import actuator_friction
 from hydrotele.hydraulics.parameters import SLOTS, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.machine import Machine
+from hydrotele.multibody.reduced_mechanism import DAMPING, HOME, Mechanism, coordinate_names
+from hydrotele.multibody.reduced_motion import BIAS, DRIFT, RATE, Motion, gather_forces
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _ODDS = 8.0
@@ -26,7 +26,7 @@ _SINGULAR = 1.0e-6  # pivot against the largest entry
 
 
 class Body(NamedTuple):
-    """What is needed of `dynamics.model.Model`, whose attributes these are.
+    """What is needed of `estimate.reduced_model.Model`, whose attributes these are.
 
     Every array that Python hands over costs a tenth of a microsecond.
     """
@@ -39,7 +39,7 @@ class Body(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What is needed of `dynamics.model.Space`, whose attributes these are."""
+    """What is needed of `estimate.reduced_model.Space`, whose attributes these are."""
 
     motion: Motion
     drive: np.ndarray
@@ -90,7 +90,7 @@ def dynamic_balance(arm, outside):
     Returns:
         Nothing.
 
-    Source: Zhu 1994, 6.2, with the projection of `dynamics.integrate`.
+    Source: Zhu 1994, 6.2, with the projection of `estimate.reduced_dynamics`.
     """
     model, m = arm.model, arm.space.motion
     n, nt = len(outside), m.joint.shape[1]

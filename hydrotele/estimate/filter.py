@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import allocation_free, compiled
-from hydrotele.dynamics.integrate import (
+from hydrotele.estimate.reduced_dynamics import (
     advance,
     follow_channel,
     load_position,
@@ -26,11 +26,11 @@ from hydrotele.dynamics.integrate import (
     read_channels,
     supply_of,
 )
-from hydrotele.dynamics.mechanism import JOINT
-from hydrotele.dynamics.model import Model
+from hydrotele.estimate.reduced_model import Model
 from hydrotele.hydraulics.laws import softening
 from hydrotele.hydraulics.parameters import SLOTS, Kind, Slot
 from hydrotele.hydraulics.pump import STALLED
+from hydrotele.multibody.reduced_mechanism import JOINT
 
 _CHANGE = 0.1  # s in which a channel may change as much as its value is unknown at a run's start
 

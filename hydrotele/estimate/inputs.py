@@ -13,10 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.dynamics.closures import solve
-from hydrotele.dynamics.integrate import accelerate, advance, place
-from hydrotele.dynamics.model import X, model_space, reduced_model
 from hydrotele.effects.effect import changed
+from hydrotele.estimate.reduced_dynamics import accelerate, advance, place
+from hydrotele.estimate.reduced_model import X, model_space, reduced_model
 from hydrotele.hydraulics.parameters import (
     ADDED_DELIVERY,
     actuator_order,
@@ -25,6 +24,7 @@ from hydrotele.hydraulics.parameters import (
 )
 from hydrotele.hydraulics.supply import ADDED_LAG
 from hydrotele.machine.machine import Machine
+from hydrotele.multibody.reduced_closures import solve
 from hydrotele.terms.facts import Term
 
 MEMORY = 0.3  # s, correlation time: longer than a valve's lag, shorter than a motion

@@ -23,8 +23,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from hydrotele.core.compiled import compiled
-from hydrotele.dynamics.model import state_names
 from hydrotele.estimate.inputs import Input, decay, input_columns, input_sizes, possible_inputs
+from hydrotele.estimate.reduced_model import state_names
 from hydrotele.estimate.stretches import busiest_rows
 from hydrotele.estimate.track import (
     DRIFT,

@@ -33,10 +33,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.dynamics.model import model_space, reduced_model
 from hydrotele.effects import Parameter, changed
 from hydrotele.estimate.free_run import _run_from, _shown, following_levels
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.reduced_model import model_space, reduced_model
 from hydrotele.estimate.track import Levels, fine_enough, track_run
 from hydrotele.kinematics.from_machine import range_at_drive
 from hydrotele.logs.dataset import Dataset, RunData

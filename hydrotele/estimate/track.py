@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import fminbound
 
-from hydrotele.dynamics.integrate import load_position, place
-from hydrotele.dynamics.model import BACKLASH, Model, model_space, reduced_model, state_names
 from hydrotele.estimate.filter import (
     Crossing,
     Gains,
@@ -24,6 +22,14 @@ from hydrotele.estimate.filter import (
     late_readings,
 )
 from hydrotele.estimate.inputs import Input, decay, input_drift
+from hydrotele.estimate.reduced_dynamics import load_position, place
+from hydrotele.estimate.reduced_model import (
+    BACKLASH,
+    Model,
+    model_space,
+    reduced_model,
+    state_names,
+)
 from hydrotele.hydraulics.circuit import circuit_scratch, demanded_share, open_ports
 from hydrotele.hydraulics.parameters import DELIVERY, SLOTS, Slot, actuator_order, longest_step
 from hydrotele.logs.dataset import Dataset, RunData

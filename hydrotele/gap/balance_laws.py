@@ -3,10 +3,8 @@
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.dynamics.integrate import load_position, place
-from hydrotele.dynamics.mechanism import BAR, DAMPING
-from hydrotele.dynamics.model import X
-from hydrotele.dynamics.motion import BIAS, DRIFT, LENGTH_BIAS, LENGTH_ROW, RATE, gather_forces
+from hydrotele.estimate.reduced_dynamics import load_position, place
+from hydrotele.estimate.reduced_model import X
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
@@ -22,6 +20,15 @@ from hydrotele.hydraulics.circuit import (
 )
 from hydrotele.hydraulics.laws import port_flow, softening
 from hydrotele.hydraulics.supply import drawn_flow, highest_supply
+from hydrotele.multibody.reduced_mechanism import BAR, DAMPING
+from hydrotele.multibody.reduced_motion import (
+    BIAS,
+    DRIFT,
+    LENGTH_BIAS,
+    LENGTH_ROW,
+    RATE,
+    gather_forces,
+)
 
 _AH, _AR, _LEAK = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.LEAKAGE)
 _PORT, _KR = int(Slot.PORT_RELIEF), int(Slot.RELIEF_GAIN)

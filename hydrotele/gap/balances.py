@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from hydrotele.dynamics.integrate import arriving
-from hydrotele.dynamics.mechanism import JOINT
-from hydrotele.dynamics.model import model_space, reduced_model
+from hydrotele.estimate.reduced_dynamics import arriving
+from hydrotele.estimate.reduced_model import model_space, reduced_model
 from hydrotele.gap.balance_laws import chamber_residuals, load_forces, pump_lacks, supply_pressures
 from hydrotele.hydraulics.laws import spool_step
 from hydrotele.hydraulics.parameters import PUMP, actuator_order, actuator_parameters
@@ -31,6 +30,7 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import parse_channel, usual_unit
+from hydrotele.multibody.reduced_mechanism import JOINT
 
 DRAWS = 16  # a standard deviation from 16 draws, averaged over a second, is known to some 5 %
 _LEAST_READINGS = 10  # readings that a channel needs

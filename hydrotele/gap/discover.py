@@ -24,14 +24,14 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.dynamics.integrate import place, supply_of
-from hydrotele.dynamics.model import X, model_space
 from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import Evidence, Judged, flat
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.inputs import SUPPLY, Input, input_sizes
 from hydrotele.estimate.levels import smoothed, smoothed_inputs
+from hydrotele.estimate.reduced_dynamics import place, supply_of
+from hydrotele.estimate.reduced_model import X, model_space
 from hydrotele.estimate.responses import error_responses
 from hydrotele.estimate.track import Track, following_model
 from hydrotele.gap.balances import pump_lack

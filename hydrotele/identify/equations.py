@@ -17,10 +17,11 @@ from hydrotele.identify.motion import (
     joint_motion,
     rate_deviations,
 )
-from hydrotele.identify.projection import project
 from hydrotele.identify.record import Record
-from hydrotele.identify.regressor import Regressor, Setup, regressor, sign_doubt
+from hydrotele.identify.setup import Setup
 from hydrotele.identify.smoothing import Smoothed, error_draws, smooth
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.regressor import Regressor, regressor, sign_doubt
 
 _TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
 _KAISER = 5.0  # its ripple is 50 dB down

@@ -21,7 +21,8 @@ from hydrotele.identify.identifiability import (
     identifiable_in_noise,
     reference_sizes,
 )
-from hydrotele.identify.regressor import RUBBING, Regressor, Setup
+from hydrotele.identify.setup import Setup
+from hydrotele.multibody.regressor import RUBBING, Regressor
 
 _ESTIMATE = "estimate"
 _NORMAL95 = 1.959964

@@ -11,9 +11,10 @@ from scipy.optimize import minimize
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.identify.identifiability import identifiable_in_noise, reference_sizes
-from hydrotele.identify.projection import Projection, project
-from hydrotele.identify.regressor import Setup, regressor
+from hydrotele.identify.setup import Setup
 from hydrotele.machine.machine import Machine
+from hydrotele.multibody.inverse_dynamics import Projection, project
+from hydrotele.multibody.regressor import regressor
 
 _ROWS = 12  # per period of the highest harmonic
 _MARGIN = 0.05  # of a range, stroke or limit that is left free

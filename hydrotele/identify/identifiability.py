@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.identify.regressor import BODY_PARAMETERS, Regressor, Setup
+from hydrotele.identify.setup import Setup
+from hydrotele.multibody.regressor import BODY_PARAMETERS, Regressor
 
 UNIDENTIFIABLE, COMBINATION, FULL = "unidentifiable", "combination", "full"
 WEAK = "weak"  # an effect below the noise

@@ -43,9 +43,10 @@ from hydrotele.identify.estimation import (
 from hydrotele.identify.identifiability import Identifiability, identifiability
 from hydrotele.identify.motion import Processing, Resolution, adjoint, joint_motion, resolution
 from hydrotele.identify.record import Record, beginning, check_repeats, whole_cycles
-from hydrotele.identify.regressor import Regressor, Setup
 from hydrotele.identify.result import Forces, HeldOut, Identification
+from hydrotele.identify.setup import Setup
 from hydrotele.identify.smoothing import Smoothed, smooth
+from hydrotele.multibody.regressor import Regressor
 
 _SLOPES = 8000  # rows of a run that are asked for the forces' slopes
 _BLOCK = 4  # parameters at a time, so that long logs need little memory

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.projection import Projection
 from hydrotele.identify.smoothing import (
     Smoothed,
     checked_period,
@@ -19,6 +18,7 @@ from hydrotele.identify.smoothing import (
     smooth,
     zero_phase,
 )
+from hydrotele.multibody.inverse_dynamics import Projection
 
 _PERIODIC = "periodic filter"
 

@@ -1,10 +1,12 @@
 """Closed loops: which joints follow, where they stand, how fast they move, what loads they carry.
 
-Loops are closed on the MuJoCo model itself, so that any tree with `connect` constraints works.
+Names and poses of a Machine for `multibody.closures`, which closes the loops of its MuJoCo model.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,10 +15,14 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.machine import machine as loops
 from hydrotele.machine.machine import Machine
+from hydrotele.multibody import closures
+from hydrotele.multibody.chain import Chain, load_chain
+from hydrotele.multibody.closures import close_from
 from hydrotele.simulate.drive_side import drive_and_load_dofs, lock_drives
-from hydrotele.simulate.mechanism import pin_site
+from hydrotele.simulate.mechanism import assemble, mjcf_document, pin_site
 
-_STEP = 0.2  # largest move of an independent joint between two Newton solutions [rad] or [m]
+_STEP = 0.2  # largest move of an independent joint between two solutions [rad] or [m]
+_TURN = 0.3  # largest move of a joint that follows, in a round of Newton's method [rad] or [m]
 _CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
 _CONNECT = int(mujoco.mjtEq.mjEQ_CONNECT)
 _FOLLOWED = 1.0e-9  # the same where only looks depend on it
@@ -38,33 +44,6 @@ def shaping_joints(machine: Machine) -> list[str]:
             joint = machine.links[link].joint
             joints += [joint.name] if joint else []
     return [name for name in dict.fromkeys(joints) if name not in following]
-
-
-def closure_error(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """Openings of all `connect` pins and their Jacobian, in the current configuration.
-
-    Pins come before any other equality.
-
-    Args:
-        model: the model; its connects are defined by sites.
-        data: the data; kinematics are updated here.
-
-    Returns:
-        (errors (3 pins,) [m], Jacobian (3 pins, nv)).
-    """
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    pins = pin_count(model)
-    errors = np.zeros(3 * pins)
-    jacobian = np.zeros((3 * pins, model.nv))
-    ja, jb = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-    for k in range(pins):
-        a, b = model.eq_obj1id[k], model.eq_obj2id[k]
-        errors[3 * k : 3 * k + 3] = data.site_xpos[a] - data.site_xpos[b]
-        mujoco.mj_jacSite(model, data, ja, None, a)
-        mujoco.mj_jacSite(model, data, jb, None, b)
-        jacobian[3 * k : 3 * k + 3] = ja - jb
-    return errors, jacobian
 
 
 def pin_count(model: mujoco.MjModel) -> int:
@@ -92,8 +71,39 @@ def _widest(places, kinds, one, two, connect):
     return widest
 
 
+class _Linkage(NamedTuple):
+    """A model, its chain, and the places (m,) in that of the joints that follow."""
+
+    model: mujoco.MjModel
+    chain: Chain
+    following: np.ndarray
+
+
+def _linkage(machine: Machine, model: mujoco.MjModel) -> _Linkage:
+    chain, following = load_chain(model), following_joints(machine)
+    return _Linkage(model, chain, np.array([chain.index(name) for name in following], np.int64))
+
+
+def closed_chain(machine: Machine, target: Mapping[str, float] | None = None) -> Chain:
+    """Chain of a machine, which starts in a position with closed loops.
+
+    Args:
+        machine: the machine.
+        target: joint name -> angle [rad] or position [m]; others stand at home.
+
+    Raises:
+        InputError: the linkages do not close there.
+    """
+    root = assemble(machine, 1.0e-3, ground=False, looks=False)
+    model = mjcf_document(root).compile()
+    data = mujoco.MjData(model)
+    close_loops(machine, model, data, target or {})
+    chain = load_chain(model)
+    return dataclasses.replace(chain, start=data.qpos[chain.places])
+
+
 def close_loops(
-    machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, target: dict[str, float]
+    machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, target: Mapping[str, float]
 ) -> None:
     """Put the independent joints at their target and close every loop.
 
@@ -109,6 +119,10 @@ def close_loops(
     Raises:
         InputError: a loop cannot be closed there (outside the reach of a linkage).
     """
+    _close_from_home(machine, model, data, target, _linkage(machine, model))
+
+
+def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
     following = following_joints(machine)
     names = [n for n in machine.joints if n not in following]
     places = [model.joint(n).qposadr[0] for n in names]
@@ -123,10 +137,26 @@ def close_loops(
         data.qpos[places] = home + (goal - home) * part / parts
         if part == 0:
             _aim_cylinders(machine, model, data)
-        if not _newton(model, data, following):
+        if not _close(linkage, data, _CLOSED):
             where = ", ".join(f"{n} {v:.3f}" for n, v in zip(names, data.qpos[places], strict=True))
             raise InputError(f"machine {machine.name}", f"its linkages do not close at {where}")
     lock_drives(machine, model, data)
+
+
+def _close(linkage: _Linkage, data: mujoco.MjData, closed: float) -> bool:
+    """Close all loops from where they are, by the joints that follow; whether that worked.
+
+    Places of bodies and sites in `data` are then up to date.
+    """
+    _, chain, following = linkage
+    if not len(following):
+        return True
+    q = data.qpos[chain.places]
+    left = close_from(chain.tree, q, following, closed, _TURN)
+    data.qpos[chain.places] = q
+    mujoco.mj_kinematics(linkage.model, data)
+    mujoco.mj_comPos(linkage.model, data)
+    return bool(left < 1e3 * closed)
 
 
 def follow_loops(
@@ -137,7 +167,7 @@ def follow_loops(
 ) -> np.ndarray:
     """Poses of the whole machine along a motion of its independent joints.
 
-    The first row is closed by `close_loops`, and so is each one after a jump; the others by
+    The first row is closed from the home position, and so is each one after a jump; the others by
     Newton's method from the row before. So every linkage stays on its branch.
 
     Args:
@@ -152,13 +182,13 @@ def follow_loops(
     Raises:
         InputError: a joint is not an independent one, or a loop cannot be closed in some row.
     """
-    following = following_joints(machine)
+    following, linkage = following_joints(machine), _linkage(machine, model)
     free = [name for name in machine.joints if name not in following]
     if strange := [name for name in joints if name not in free]:
         raise InputError(f"joint {strange[0]}", f"cannot be set; the free ones are {free}")
     values = np.stack([np.asarray(v, float) for v in joints.values()], 1) if joints else None
     if values is None or not len(values):
-        close_loops(machine, model, data, {})
+        _close_from_home(machine, model, data, {}, linkage)
         return np.tile(data.qpos, (0 if joints else 1, 1))
     places = [model.joint(n).qposadr[0] for n in joints]
     shaping = np.isin(list(joints), shaping_joints(machine))
@@ -167,9 +197,10 @@ def follow_loops(
         moved = np.abs(target - values[row - 1])[shaping]
         near = row > 0 and moved.max(initial=0.0) <= _STEP
         data.qpos[places] = target
-        if not (near and _newton(model, data, following, _FOLLOWED)):
+        if not (near and _close(linkage, data, _FOLLOWED)):
+            asked = dict(zip(joints, target.tolist(), strict=True))
             try:
-                close_loops(machine, model, data, dict(zip(joints, target, strict=True)))
+                _close_from_home(machine, model, data, asked, linkage)
             except InputError as error:
                 raise InputError(f"{error.where}, row {row}", error.message) from None
         lock_drives(machine, model, data)
@@ -178,6 +209,7 @@ def follow_loops(
 
 
 def _aim_cylinders(machine, model, data) -> None:
+    """Point tubes and rods at each other where the links stand, as a first guess."""
     for _ in range(2):
         for name, axis in machine.axes.items():
             if not axis.cylinder:
@@ -194,20 +226,6 @@ def _aim_cylinders(machine, model, data) -> None:
             data.qpos[hinge.qposadr[0]] = np.arctan2(local @ across, local @ along)
             reach = np.linalg.norm(way) - axis.cylinder.closed_length
             data.qpos[model.joint(f"{name}_rod").qposadr[0]] = reach
-
-
-def _newton(model, data, following, closed: float = _CLOSED) -> bool:
-    dofs = [model.joint(n).dofadr[0] for n in following]
-    places = [model.joint(n).qposadr[0] for n in following]
-    if not dofs:
-        return True
-    for _ in range(30):
-        error, jacobian = closure_error(model, data)
-        if np.abs(error).max() < closed:
-            return True
-        step = np.linalg.lstsq(jacobian[:, dofs], -error, rcond=1e-10)[0]
-        data.qpos[places] += step * min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
-    return bool(np.abs(error).max() < 1e3 * closed)
 
 
 def independent_dofs(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
@@ -231,16 +249,13 @@ def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -
     Returns:
         N, (nv, n), with `qvel = N @ qvel[independent_dofs]`; drive sides move with their loads.
     """
-    independent = independent_dofs(machine, model)
+    _, chain, following = _linkage(machine, model)
+    free = np.setdiff1d(np.arange(len(chain.joints)), following)
+    every = np.eye(model.nv)
+    moves = closures.motion_basis(chain, data.qpos[chain.places], free)
+    every[np.ix_(chain.dofs, chain.dofs[free])] = moves
+    basis = every[:, independent_dofs(machine, model)]
     drives, loads = drive_and_load_dofs(machine, model)
-    dependent = np.setdiff1d(np.arange(model.nv), [*independent, *drives])
-    basis = np.zeros((model.nv, len(independent)))
-    basis[independent, np.arange(len(independent))] = 1.0
-    if len(dependent):
-        _, jacobian = closure_error(model, data)
-        basis[dependent] = -np.linalg.lstsq(
-            jacobian[:, dependent], jacobian[:, independent], rcond=1e-10
-        )[0]
     basis[drives] = basis[loads]
     return basis
 

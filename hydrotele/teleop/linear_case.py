@@ -41,14 +41,14 @@ from hydrotele.control.resolved_motion import COORDINATES, arm_axes, pose_to_joi
 from hydrotele.control.state_filter import butterworth
 from hydrotele.control.tip_balance import Arm, arm_tables
 from hydrotele.core.errors import InputError
-from hydrotele.dynamics.integrate import place_mechanism
-from hydrotele.dynamics.model import X
-from hydrotele.dynamics.motion import gather_forces
+from hydrotele.estimate.reduced_dynamics import place_mechanism
+from hydrotele.estimate.reduced_model import X
 from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.joystick import AXES, Joystick
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import sensor_set
+from hydrotele.multibody.reduced_motion import gather_forces
 from hydrotele.scenario.scenario import Scenario, Servo
 from hydrotele.scenario.surroundings import Plate
 from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track

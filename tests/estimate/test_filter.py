@@ -5,9 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hydrotele.dynamics.integrate import simulate_rows
-from hydrotele.dynamics.model import model_space, predicted_channels, reduced_model, state_names
 from hydrotele.effects import apply_effect
+from hydrotele.estimate.reduced_dynamics import simulate_rows
+from hydrotele.estimate.reduced_model import (
+    model_space,
+    predicted_channels,
+    reduced_model,
+    state_names,
+)
 from hydrotele.estimate.track import track_run
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.dynamics.integrate import simulate_rows
-from hydrotele.dynamics.model import model_space, reduced_model, state_names
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.inputs import Input, input_columns
 from hydrotele.estimate.levels import rough_noise
+from hydrotele.estimate.reduced_dynamics import simulate_rows
+from hydrotele.estimate.reduced_model import model_space, reduced_model, state_names
 from hydrotele.estimate.track import STEP, fine_enough, track_run
 from hydrotele.hydraulics.parameters import longest_step
 from hydrotele.logs.dataset import Dataset, RunData

@@ -6,15 +6,15 @@ import functools
 import numpy as np
 import pytest
 
-from hydrotele.dynamics.integrate import advance, read_channels
-from hydrotele.dynamics.model import (
+from hydrotele.effects.effect import changed
+from hydrotele.estimate.reduced_dynamics import advance, read_channels
+from hydrotele.estimate.reduced_model import (
     model_space,
     predicted_channels,
     reduced_model,
     state_names,
     state_size,
 )
-from hydrotele.effects.effect import changed
 from hydrotele.gap.balances import balances, peak_lag, pump_lack, window_lags
 from hydrotele.gap.discover import lack_regression
 from hydrotele.gap.law_tables import Table

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from hydrotele.cli.identifying import closed_chain
 from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import METHODS, Estimator
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import beginning, records
-from hydrotele.identify.regressor import machine_setup
+from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
+from hydrotele.simulate.closure import closed_chain
 from tools.identify_coverage import one_trial
 
 PERIOD = 20.0  # s, of the scenario `excitation`

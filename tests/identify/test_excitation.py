@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import yaml
 
-from hydrotele.cli.identifying import closed_chain
 from hydrotele.identify.excitation import (
     Excitation,
     design_excitation,
@@ -12,10 +11,11 @@ from hydrotele.identify.excitation import (
     informative_base,
 )
 from hydrotele.identify.record import force_noise
-from hydrotele.identify.regressor import machine_setup
+from hydrotele.identify.setup import machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
+from hydrotele.simulate.closure import closed_chain
 
 
 @pytest.fixture(scope="module")

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hydrotele.identify.chain import load_chain
 from hydrotele.identify.identifiability import COMBINATION, FULL, UNIDENTIFIABLE, identifiability
-from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import FrictionTerm, pin_friction, regressor
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.chain import load_chain
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.regressor import FrictionTerm, pin_friction, regressor
 from hydrotele.simulate.plant import build_plant, rest_state
-from tests.identify.test_projection import panda
+from tests.multibody.test_inverse_dynamics import panda
 
 
 def random_motion(middle, width, rows, seed):

@@ -5,18 +5,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hydrotele.cli.identifying import closed_chain
 from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identifiability import FULL, WEAK
 from hydrotele.identify.identification import identify_dynamics, identify_with_shapes
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import records
-from hydrotele.identify.regressor import machine_setup
 from hydrotele.identify.result import counts, parameter_rows
+from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log, save_log
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.simulate.closure import closed_chain
 from tests.measured import MEASURED, REAL, needs_real
 
 

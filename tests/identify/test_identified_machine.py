@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from hydrotele.effects.effect import changed
-from hydrotele.identify.chain import load_chain
 from hydrotele.identify.consistent import Freedom, consistent
 from hydrotele.identify.estimation import Estimate
 from hydrotele.identify.identifiability import identifiability
 from hydrotele.identify.identified_machine import identified_machine
-from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import BODY_PARAMETERS, cylinder_bars, machine_setup, regressor
 from hydrotele.identify.result import Forces, Identification
+from hydrotele.identify.setup import cylinder_bars, machine_setup
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.chain import load_chain
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.regressor import BODY_PARAMETERS, regressor
 from hydrotele.simulate.plant import build_plant, rest_state
 
 

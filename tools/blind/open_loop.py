@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hydrotele.dynamics.integrate import advance, place, read_channels, write_trail
-from hydrotele.dynamics.model import model_space, reduced_model
+from hydrotele.estimate.reduced_dynamics import advance, place, read_channels, write_trail
+from hydrotele.estimate.reduced_model import model_space, reduced_model
 from hydrotele.estimate.track import STEP, fine_enough, track_run
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine

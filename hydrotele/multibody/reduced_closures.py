@@ -1,15 +1,14 @@
-"""Closed chains of links: positions, rates and accelerations of the coordinates they determine.
+"""Closed chains in reduced coordinates: positions, rates and accelerations that closures determine.
 
-Motion of the cylinders: a bar between two pins, tube and rod turning together.
-
-Cholesky for the few unknowns of a machine: quicker than a library call at this size.
+Cylinders are bars between two pins, tube and rod turning together. Few unknowns are solved by a
+Cholesky factorisation of its own, quicker than a library call at this size.
 """
 
 import math
 
 from hydrotele.core.compiled import allocation_free
-from hydrotele.dynamics.mechanism import AXIS, HOME, PARENT, REACH
-from hydrotele.dynamics.motion import (
+from hydrotele.multibody.reduced_mechanism import AXIS, HOME, PARENT, REACH
+from hydrotele.multibody.reduced_motion import (
     ACCELERATION,
     DRIFT,
     LENGTH,

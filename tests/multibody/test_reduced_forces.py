@@ -5,10 +5,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hydrotele.dynamics.integrate import place
-from hydrotele.dynamics.mechanism import INERTIA, MASS, coordinate_names
-from hydrotele.dynamics.motion import BIAS, DRIFT, RATE, Q, gather_forces
-from hydrotele.simulate.closure import independent_dofs, motion_basis
+from hydrotele.estimate.reduced_dynamics import place
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.reduced_mechanism import INERTIA, MASS, coordinate_names
+from hydrotele.multibody.reduced_motion import BIAS, DRIFT, RATE, Q, gather_forces
+from hydrotele.simulate.closure import closed_chain, independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 
 MACHINES = ("cat215/none", "cat215/bucket", "cat215/grapple", "cat325", "ec20", "rig", "emps")
@@ -64,6 +65,33 @@ def test_mass_matrix_and_bias_are_those_of_mujoco(
     # MuJoCo's side knows the rate of the basis by differences only
     largest = max(np.abs(expected_bias).max(), np.abs(mass).max())
     np.testing.assert_allclose(bias, expected_bias, rtol=0, atol=1e-8 * largest)
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_reduced_coordinates_and_the_chain_ask_for_the_same_forces(
+    name, machine_of, reduced_of, move_at_random
+):
+    """The two implementations of a closed chain, `reduced_motion` and `inverse_dynamics`."""
+    machine = machine_of(name)
+    model, space, z = reduced_of(machine)
+    names = coordinate_names(machine)
+    free = tuple(names[i] for i in model.mech.free)
+    n, rng = len(free), np.random.default_rng(5)
+    move_at_random(model, z, 5)
+    rates, accelerations = z[n : 2 * n], rng.uniform(-1.0, 1.0, n)
+    mass, bias = reduced_forces(model, space, z)
+    chain = closed_chain(machine, dict(zip(free, z[:n], strict=True)))
+    found = project(chain, free, z[None, :n], rates[None], accelerations[None], drives=free)
+    for k, joint in enumerate(names):
+        j, m = chain.index(joint), space.motion.joint
+        assert found.position[0, j] == pytest.approx(m[Q, k], abs=1e-9)
+        assert found.rate[0, j] == pytest.approx(m[RATE, k], abs=1e-9)
+        moved = m[DRIFT, k] + space.motion.basis[k] @ accelerations
+        assert found.acceleration[0, j] == pytest.approx(moved, abs=1e-8)
+    expected = found.bodies[0] @ chain.inertia.ravel()
+    largest = max(np.abs(expected).max(), np.abs(mass).max())
+    # loops are closed to 1e-11 m and 1e-12 m
+    np.testing.assert_allclose(mass @ accelerations + bias, expected, atol=1e-9 * largest)
 
 
 def spanning_tree(machine):

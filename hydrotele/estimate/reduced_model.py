@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.dynamics.mechanism import Mechanism, coordinate_names, mechanism
-from hydrotele.dynamics.motion import Motion, motion_space
 from hydrotele.hydraulics.circuit import SCRATCH
 from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters, extra_state_names
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import parse_channel
+from hydrotele.multibody.reduced_mechanism import Mechanism, coordinate_names, mechanism
+from hydrotele.multibody.reduced_motion import Motion, motion_space
 from hydrotele.terms.table import terms_table
 
 POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)

@@ -1,8 +1,6 @@
 """The reduced model in time: kick, drift, kick, with the circuit of the MuJoCo plant between.
 
-What drives share in the reduced model: supply, pressures that are felt, laws that terms add.
-
-Sensors with a first-order lag, along what an ideal sensor would show over a row of a log.
+Also what its sensors show along a row of a log: late, or behind a first-order lag.
 """
 
 import math
@@ -10,16 +8,7 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import allocation_free, compiled
-from hydrotele.dynamics.closures import (
-    close_chains,
-    drift_chains,
-    factorise,
-    move_bars,
-    place_bars,
-    solve,
-)
-from hydrotele.dynamics.mechanism import BAR, CLOSED, DAMPING, JOINT
-from hydrotele.dynamics.model import (
+from hydrotele.estimate.reduced_model import (
     BACKLASH,
     COMMAND,
     GEAR_DAMPING,
@@ -33,17 +22,6 @@ from hydrotele.dynamics.model import (
     V,
     X,
 )
-from hydrotele.dynamics.motion import (
-    BIAS,
-    DRIFT,
-    LENGTH_ROW,
-    RATE,
-    Q,
-    gather_forces,
-    move_links,
-    place_links,
-)
-from hydrotele.dynamics.motion import LENGTH as BAR_LENGTH
 from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate
 from hydrotele.hydraulics.circuit import (
     actuator_stop,
@@ -58,6 +36,26 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.hydraulics.laws import pressure_with_air, pressure_without_air
 from hydrotele.hydraulics.parameters import SLOTS, Slot
 from hydrotele.machine.noise import first_order
+from hydrotele.multibody.reduced_closures import (
+    close_chains,
+    drift_chains,
+    factorise,
+    move_bars,
+    place_bars,
+    solve,
+)
+from hydrotele.multibody.reduced_mechanism import BAR, CLOSED, DAMPING, JOINT
+from hydrotele.multibody.reduced_motion import (
+    BIAS,
+    DRIFT,
+    LENGTH_ROW,
+    RATE,
+    Q,
+    gather_forces,
+    move_links,
+    place_links,
+)
+from hydrotele.multibody.reduced_motion import LENGTH as BAR_LENGTH
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
@@ -196,7 +194,7 @@ def follow_channel(trail, c, ratio, shown):
     """Replace what an ideal sensor shows over a row by what one with a first-order lag shows.
 
     Args:
-        trail: (k + 1, c) as `integrate.advance` writes it, of k steps; column c is replaced
+        trail: (k + 1, c) as `advance` writes it, of k steps; column c is replaced
             [channel's unit].
         c: channel.
         ratio: length of a step over the time constant, scalar [1].
@@ -223,7 +221,7 @@ def follow_trail(model, trail, h, shown):
 
     Args:
         model: Model.
-        trail: (k + 1, c) as `integrate.advance` writes it, of k steps; changed in place.
+        trail: (k + 1, c) as `advance` writes it, of k steps; changed in place.
         h: step, scalar [s].
         shown: (c,) what the sensors show at the row's start, then at its end; changed in place.
 

@@ -9,18 +9,13 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import changed
 from hydrotele.hydraulics.laws import friction
-from hydrotele.identify.chain import load_chain
 from hydrotele.identify.estimation import estimate
 from hydrotele.identify.identifiability import identifiability, reference_sizes
-from hydrotele.identify.projection import project
-from hydrotele.identify.regressor import (
-    FrictionTerm,
-    drive_friction,
-    machine_setup,
-    pin_friction,
-    regressor,
-)
+from hydrotele.identify.setup import drive_friction, machine_setup
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.chain import load_chain
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.regressor import FrictionTerm, pin_friction, regressor
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 

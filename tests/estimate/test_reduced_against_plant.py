@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from hydrotele.dynamics.integrate import simulate_rows
-from hydrotele.dynamics.model import predicted_channels, state_names
 from hydrotele.effects import apply_effect
+from hydrotele.estimate.reduced_dynamics import simulate_rows
+from hydrotele.estimate.reduced_model import predicted_channels, state_names
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.parameters import SLOTS, Slot
 from hydrotele.machine.drives import EndStop

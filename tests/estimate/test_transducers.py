@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim, lti
 
-from hydrotele.dynamics.integrate import advance, follow_channel, simulate_rows
+from hydrotele.estimate.reduced_dynamics import advance, follow_channel, simulate_rows
 from hydrotele.machine.noise import first_order
 from hydrotele.machine.sensors import SensorError
 

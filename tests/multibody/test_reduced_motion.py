@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hydrotele.dynamics.integrate import place
-from hydrotele.dynamics.mechanism import JOINT, REACH
-from hydrotele.dynamics.motion import (
+from hydrotele.estimate.reduced_dynamics import place
+from hydrotele.multibody.reduced_mechanism import JOINT, REACH
+from hydrotele.multibody.reduced_motion import (
     ACCELERATION,
     DRIFT,
     LENGTH,

@@ -1,9 +1,6 @@
-"""Motion of every frame: places and Jacobians first, then rates and accelerations.
+"""Motion, mass matrix and bias forces in reduced coordinates, compiled.
 
-Links come from the tree; a bar (tube and rod) follows from its two pins. Everything is differential
-kinematics in tree coordinates, so that one pass serves simulation, estimation and regressors.
-
-Mass matrix and bias forces of a mechanism: the projection method.
+Places and Jacobians of every frame first, then rates and accelerations, then Kane's projection.
 """
 
 from typing import NamedTuple
@@ -11,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import allocation_free
-from hydrotele.dynamics.mechanism import (
+from hydrotele.multibody.reduced_mechanism import (
     AXIS,
     COM,
     COORDINATE,

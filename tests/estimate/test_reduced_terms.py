@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.dynamics.integrate import simulate_rows
 from hydrotele.effects import Term, changed, with_terms
+from hydrotele.estimate.reduced_dynamics import simulate_rows
 from hydrotele.hydraulics.circuit import circuit_scratch, step_circuit
 from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters
 from hydrotele.terms.table import terms_table

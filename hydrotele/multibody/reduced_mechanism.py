@@ -1,4 +1,9 @@
-"""The mechanical part of a Machine as tables: links, cylinder bars, pins of closures, drives."""
+"""A Machine's mechanism in reduced coordinates, as tables: links, bars, pins of closures, drives.
+
+A Kalman filter and a tip balance evaluate it at every step, which `inverse_dynamics` is too slow
+for: links alone are in the tree, cylinders are bars between two pins, and nothing allocates. It
+knows a Machine's closures only; the two are tested against each other.
+"""
 
 from typing import NamedTuple
 

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.dynamics.integrate import (
+from hydrotele.effects.effect import changed
+from hydrotele.estimate.reduced_dynamics import (
     accelerate,
     advance,
     arriving,
@@ -18,13 +19,12 @@ from hydrotele.dynamics.integrate import (
     supply_of,
     write_trail,
 )
-from hydrotele.dynamics.mechanism import COM, DAMPING, MASS
-from hydrotele.dynamics.model import predicted_channels, state_names
-from hydrotele.dynamics.motion import BIAS, ORIGIN, RATE, TURN, gather_forces
-from hydrotele.effects.effect import changed
+from hydrotele.estimate.reduced_model import predicted_channels, state_names
 from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
 from hydrotele.logs.log import load_log
 from hydrotele.machine.sensors import SensorError
+from hydrotele.multibody.reduced_mechanism import COM, DAMPING, MASS
+from hydrotele.multibody.reduced_motion import BIAS, ORIGIN, RATE, TURN, gather_forces
 from tests.measured import TRUTH
 
 PERIOD, RELIEF = 0.02, 28.0e6

@@ -5,9 +5,9 @@ import functools
 import numpy as np
 import pytest
 
-from hydrotele.dynamics.mechanism import HOME
-from hydrotele.dynamics.model import model_space, reduced_model, state_names, state_size
+from hydrotele.estimate.reduced_model import model_space, reduced_model, state_names, state_size
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.reduced_mechanism import HOME
 
 
 @pytest.fixture(scope="session")

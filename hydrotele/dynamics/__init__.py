@@ -1,1 +1,0 @@
-"""The reduced model of a Machine: closed chains in independent coordinates, compiled."""

@@ -1,0 +1,310 @@
+"""A mechanism read from an MJCF: a joint tree whose loops `connect` and `weld` constraints close.
+
+Every joint of the tree is a hinge or a slide. A ball joint becomes three hinges about x, y and z in
+turn (Cardan angles, singular where the second is 90 degrees), a free joint three slides and a ball.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from hydrotele.core.errors import InputError
+
+_FREE, _BALL, _SLIDE, _HINGE = (
+    int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
+)
+_CONNECT, _WELD = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
+_WHERE = "chain"
+
+
+class Tree(NamedTuple):
+    """Numbers of a joint tree, as compiled code takes them; b bodies with the world, v joints.
+
+    Attributes:
+        parent: (b,) parent body.
+        offset: (b, 3) place of a body's frame in its parent's [m].
+        turn: (b, 3, 3) its orientation.
+        first: (b + 1,) first joint of a body; its joints end where the next body's begin.
+        slides: (v,) whether a joint slides instead of turning.
+        axis: (v, 3) in the body's frame.
+        anchor: (v, 3) in the body's frame [m].
+        zero: (v,) position at which the frames stand as in the file [rad] or [m].
+        above: (b, v) whether a joint moves a body.
+        ends: (c, 2) bodies that a closure connects.
+        points: (c, 2, 3) the points that it holds together, in their bodies' frames [m].
+        turns: (c, 2, 3, 3) orientations, in their bodies' frames, that a weld holds together.
+        row: (c + 1,) first equation of a closure: a connect has 3, a weld 6.
+        gravity: (3,) [m/s^2].
+    """
+
+    parent: np.ndarray
+    offset: np.ndarray
+    turn: np.ndarray
+    first: np.ndarray
+    slides: np.ndarray
+    axis: np.ndarray
+    anchor: np.ndarray
+    zero: np.ndarray
+    above: np.ndarray
+    ends: np.ndarray
+    points: np.ndarray
+    turns: np.ndarray
+    row: np.ndarray
+    gravity: np.ndarray
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A mechanism with names.
+
+    Attributes:
+        name: of the model.
+        tree: its numbers.
+        bodies: names of the bodies, without the world.
+        joints: names of the v joints; those of a ball joint `elbow` are `elbow_rx`, `elbow_ry` and
+            `elbow_rz`, those of a free joint also `elbow_x`, `elbow_y` and `elbow_z`.
+        closures: names of the c closures.
+        start: (v,) positions from which the loops are closed: those of the file's first keyframe,
+            else of its reference pose.
+        inertia: (b - 1, 10) inertial parameters of the bodies, about their frames' origins.
+        armature: (v,) inertia of a joint's drive [kg] or [kg m^2].
+        damping: (v,) [N s/m] or [N m s/rad].
+        drives: joints that an actuator moves, in the actuators' order.
+        places: (v,) place of a joint in MuJoCo's `qpos`, -1 for those of ball and free joints.
+        dofs: (v,) place of a joint in MuJoCo's `qvel`, -1 likewise.
+    """
+
+    name: str
+    tree: Tree
+    bodies: tuple[str, ...]
+    joints: tuple[str, ...]
+    closures: tuple[str, ...]
+    start: np.ndarray
+    inertia: np.ndarray
+    armature: np.ndarray
+    damping: np.ndarray
+    drives: tuple[str, ...]
+    places: np.ndarray
+    dofs: np.ndarray
+
+    def index(self, joint: str) -> int:
+        """Place of a joint.
+
+        Raises:
+            InputError: there is no such joint.
+        """
+        if joint not in self.joints:
+            raise InputError(_WHERE, f"{self.name} has no joint {joint}: {', '.join(self.joints)}")
+        return self.joints.index(joint)
+
+
+class _Joint(NamedTuple):
+    """A hinge or a slide of the tree."""
+
+    name: str
+    body: int
+    slides: bool
+    axis: tuple[float, ...]
+    anchor: tuple[float, ...]
+    zero: float
+    start: float
+    armature: float
+    damping: float
+    place: int
+    dof: int
+
+
+def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
+    """Read a mechanism.
+
+    What no actuator and no closure holds, such as an object that lies on the ground beside a
+    machine, stands still and has no joints here, unless nothing in the model is held.
+
+    Args:
+        source: path of an MJCF, or a compiled model.
+
+    Returns:
+        The chain. Actuators that move a joint name the drives; without any, all joints are.
+
+    Raises:
+        InputError: no such file, an actuator on a ball or free joint, such a joint with damping or
+            armature, or an active constraint other than `connect` and `weld`.
+
+    Source: MuJoCo manual, `mj_kinematics` and `mjData`.
+    """
+    model = _read(source) if isinstance(source, str | Path) else source
+    closures = _closures(model)
+    moved = [
+        int(model.actuator_trnid[a, 0])
+        for a in range(model.nu)
+        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
+    ]
+    held = {int(model.body_rootid[model.jnt_bodyid[j]]) for j in moved}
+    held |= {int(model.body_rootid[body]) for one in closures for body in one.ends}
+    held = held - {0} or set(range(model.nbody))
+    pose = model.key_qpos[0] if model.nkey else model.qpos0
+    joints: list[_Joint] = []
+    first = np.zeros(model.nbody + 1, np.int64)
+    offset, turn = model.body_pos.copy(), np.array([_turn(q) for q in model.body_quat])
+    for b in range(model.nbody):
+        for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
+            if model.body_rootid[b] not in held:
+                continue
+            if model.jnt_type[j] == _FREE:  # its position is that of the body itself
+                offset[b], turn[b] = 0.0, np.eye(3)
+            joints += _scalar_joints(model, j, pose)
+        first[b + 1] = len(joints)
+    above = np.zeros((model.nbody, len(joints)), dtype=np.bool_)
+    for b in range(1, model.nbody):
+        above[b] = above[model.body_parentid[b]]
+        above[b, first[b] : first[b + 1]] = True
+    c, names = len(closures), tuple(joint.name for joint in joints)
+    whole = {joint.place: joint.name for joint in joints if joint.place >= 0}
+    for j in moved:
+        if int(model.jnt_qposadr[j]) not in whole:
+            raise InputError(
+                _WHERE, f"joint {model.joint(j).name or j} has a drive but is no hinge or slide"
+            )
+    tree = Tree(
+        parent=model.body_parentid.astype(np.int64), offset=offset, turn=turn, first=first,
+        slides=np.array([joint.slides for joint in joints], np.bool_),
+        axis=np.array([joint.axis for joint in joints]).reshape(-1, 3),
+        anchor=np.array([joint.anchor for joint in joints]).reshape(-1, 3),
+        zero=np.array([joint.zero for joint in joints]), above=above,
+        ends=np.array([one.ends for one in closures], np.int64).reshape(c, 2),
+        points=np.array([one.points for one in closures]).reshape(c, 2, 3),
+        turns=np.array([one.turns for one in closures]).reshape(c, 2, 3, 3),
+        row=np.cumsum([0, *(6 if one.weld else 3 for one in closures)]).astype(np.int64),
+        gravity=model.opt.gravity.copy(),
+    )  # fmt: skip
+    return Chain(
+        name=model.names[: model.names.index(b"\0")].decode() or "model",
+        tree=tree,
+        bodies=tuple(model.body(b).name or f"body{b}" for b in range(1, model.nbody)),
+        joints=names,
+        closures=tuple(one.name for one in closures),
+        start=np.array([joint.start for joint in joints]),
+        inertia=np.array([_inertia(model, b) for b in range(1, model.nbody)]).reshape(-1, 10),
+        armature=np.array([joint.armature for joint in joints]),
+        damping=np.array([joint.damping for joint in joints]),
+        drives=tuple(dict.fromkeys(whole[int(model.jnt_qposadr[j])] for j in moved)) or names,
+        places=np.array([joint.place for joint in joints], np.int64),
+        dofs=np.array([joint.dof for joint in joints], np.int64),
+    )
+
+
+def _read(path: str | Path) -> mujoco.MjModel:
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise InputError(str(path), str(error)) from error
+
+
+_AXES = tuple(enumerate("xyz"))
+
+
+def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joint]:
+    """The hinges and slides that a joint of MuJoCo becomes, standing as in a pose (nq,)."""
+    name, kind = model.joint(j).name or f"joint{j}", model.jnt_type[j]
+    body, anchor = int(model.jnt_bodyid[j]), tuple(model.jnt_pos[j])
+    place, dof = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+    if kind in (_HINGE, _SLIDE):
+        return [
+            _Joint(
+                name, body, kind == _SLIDE, tuple(model.jnt_axis[j]), anchor,
+                float(model.qpos0[place]), float(pose[place]), float(model.dof_armature[dof]),
+                float(model.dof_damping[dof]), place, dof,
+            )
+        ]  # fmt: skip
+    last = dof + (3 if kind == _BALL else 6)
+    if model.dof_damping[dof:last].any() or model.dof_armature[dof:last].any():
+        raise InputError(
+            _WHERE, f"joint {name}: only hinges and slides may have damping or armature"
+        )
+    out, unit = [], np.eye(3)
+    if kind == _FREE:
+        anchor, ground = (0.0, 0.0, 0.0), pose[place : place + 3]
+        for k, letter in _AXES:
+            out.append(
+                _Joint(f"{name}_{letter}", body, True, tuple(unit[k]), anchor, 0.0,
+                       float(ground[k]), 0.0, 0.0, -1, -1)
+            )  # fmt: skip
+        place += 3
+    angles = cardan_angles(_turn(pose[place : place + 4]))
+    for k, letter in _AXES:
+        out.append(
+            _Joint(f"{name}_r{letter}", body, False, tuple(unit[k]), anchor, 0.0,
+                   float(angles[k]), 0.0, 0.0, -1, -1)
+        )  # fmt: skip
+    return out
+
+
+def cardan_angles(turn: np.ndarray) -> np.ndarray:
+    """Angles (3,) [rad] of `R = R_x(a) R_y(b) R_z(c)`, with b from -90 to 90 degrees.
+
+    Args:
+        turn: (3, 3) rotation R.
+
+    Source: Diebel 2006, Representing attitude, 8.4 (sequence 1-2-3).
+
+    >>> cardan_angles(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])).round(4)
+    array([-0.    ,  0.    ,  1.5708])
+    """
+    middle = np.arcsin(np.clip(turn[0, 2], -1.0, 1.0))
+    return np.array(
+        [np.arctan2(-turn[1, 2], turn[2, 2]), middle, np.arctan2(-turn[0, 1], turn[0, 0])]
+    )
+
+
+class _Closure(NamedTuple):
+    name: str
+    weld: bool
+    ends: tuple[int, int]
+    points: tuple[np.ndarray, np.ndarray]
+    turns: tuple[np.ndarray, np.ndarray]
+
+
+def _closures(model: mujoco.MjModel) -> list[_Closure]:
+    """The active `connect` and `weld` constraints."""
+    out = []
+    for e in range(model.neq):
+        if not model.eq_active0[e]:
+            continue
+        name, kind = model.equality(e).name or f"closure{e}", model.eq_type[e]
+        if kind not in (_CONNECT, _WELD):
+            raise InputError(
+                _WHERE,
+                f"constraint {name} is neither `connect` nor `weld`: deactivate it, or build it of"
+                " those",
+            )
+        one, two, data = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e]
+        turns = (np.eye(3), np.eye(3))
+        if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
+            ends = (int(model.site_bodyid[one]), int(model.site_bodyid[two]))
+            points = (model.site_pos[one].copy(), model.site_pos[two].copy())
+            turns = (_turn(model.site_quat[one]), _turn(model.site_quat[two]))
+        elif kind == _CONNECT:
+            ends, points = (one, two), (data[:3].copy(), data[3:6].copy())
+        else:
+            ends, points = (one, two), (data[3:6].copy(), data[:3].copy())
+            turns = (_turn(data[6:10]), np.eye(3))  # of body 2 in body 1
+        out.append(_Closure(name, kind == _WELD, ends, points, turns))
+    return out
+
+
+def _turn(quaternion: np.ndarray) -> np.ndarray:
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
+
+
+def _inertia(model: mujoco.MjModel, body: int) -> list[float]:
+    """Mass, mass times centre of mass, and inertia about the frame's origin, of a body."""
+    mass, com, turn = model.body_mass[body], model.body_ipos[body], _turn(model.body_iquat[body])
+    about = turn @ np.diag(model.body_inertia[body]) @ turn.T
+    about += mass * (com @ com * np.eye(3) - np.outer(com, com))
+    upper = about[np.triu_indices(3)]
+    return [float(mass), *(mass * com), *upper]
