@@ -306,5 +306,5 @@ def _inertia(model: mujoco.MjModel, body: int) -> list[float]:
     mass, com, turn = model.body_mass[body], model.body_ipos[body], _turn(model.body_iquat[body])
     about = turn @ np.diag(model.body_inertia[body]) @ turn.T
     about += mass * (com @ com * np.eye(3) - np.outer(com, com))
-    upper = about[np.triu_indices(3)]
+    upper = about[0, 0], about[0, 1], about[0, 2], about[1, 1], about[1, 2], about[2, 2]
     return [float(mass), *(mass * com), *upper]
