@@ -1,10 +1,9 @@
 """Computed forces: what inverse dynamics asks of the drives along a plan."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from hydrotele.control.plan import Plan
+from hydrotele.control.servo import ForceReferences
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.identify.setup import machine_setup
@@ -20,20 +19,6 @@ NOMINAL = "nominal"
 
 
 _SMOOTH = 8.0  # Hz: a table's steps and corners above it are no forces to ask for
-
-
-class ForceReferences(NamedTuple):
-    """Forces of the drives along a plan, (n, k) each.
-
-    Attributes:
-        known: whether they were computed.
-        force: [N] or [N m]; 0 where not computed.
-        rate: its rate of change, ahead of time by the servo's lead [N/s] or [N m/s].
-    """
-
-    known: bool
-    force: np.ndarray
-    rate: np.ndarray
 
 
 def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferences:

@@ -209,6 +209,20 @@ class ComputedForce(NamedTuple):
     rate: np.ndarray
 
 
+class ForceReferences(NamedTuple):
+    """Forces of the drives along a plan, (n, k) each.
+
+    Attributes:
+        known: whether they were computed.
+        force: [N] or [N m]; 0 where not computed.
+        rate: its rate of change, ahead of time by the servo's lead [N/s] or [N m/s].
+    """
+
+    known: bool
+    force: np.ndarray
+    rate: np.ndarray
+
+
 @compiled
 def servo_step(numbers, closed, drive, reference, measured, load, computed, out):
     """Commands of all axes for one control period.

@@ -185,7 +185,7 @@ def _drive(plant: Plant, data, times, commands, steps, progress) -> Record:
     begin_leapfrog(plant.model, data)
     stepper = Stepper(plant, data, steps)
     for row, time in enumerate(times):
-        recorder.take(row, time, data, stepper.past)
+        recorder.take(row, time, data, stepper.shown() if stepper.late else None)
         if progress and row % 100 == 0:
             progress(time - times[0], times[-1] - times[0])
         stepper.advance(commands[row])

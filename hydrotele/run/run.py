@@ -32,6 +32,7 @@ from hydrotele.simulate.drive_side import flexible_axes
 from hydrotele.simulate.feedback import Feedback, feedback, measure
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import Record, late_channels, true_channels
+from hydrotele.simulate.stepping import delayed_commands
 from hydrotele.teleop.operator_model import Hand
 from hydrotele.teleop.station import Station, StationLog
 
@@ -263,7 +264,7 @@ def finished(session: Session, scenario: Scenario) -> Run:
     summary["notes"] += [f"{said} at {time:.2f} s" for time, said in looped.events]
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
     window = looped.commands[: round(AUDIT_SECONDS * scenario.control_rate)]
-    controls = np.concatenate([session.line.controls(command, steps) for command in window])
+    controls = delayed_commands(plant, session.before, window, steps)
     summary["balance"] = audit(plant, session.start, controls)
     return Run(scenario, plant, plan, measured, truth, summary, looped.station)
 

@@ -13,14 +13,8 @@ import numpy as np
 
 from hydrotele.control.feedforward import force_references
 from hydrotele.control.plan import Plan
-from hydrotele.control.servo import (
-    ComputedForce,
-    DriveReference,
-    Measured,
-    drive_references,
-    servo_parameters,
-    servo_step,
-)
+from hydrotele.control.servo import drive_references, servo_parameters
+from hydrotele.control.tick import Controller, Planned, planned_tick
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Scenario
@@ -30,7 +24,7 @@ from hydrotele.simulate.closure import pin_opening
 from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
-from hydrotele.simulate.stepping import DelayLine, Stepper
+from hydrotele.simulate.stepping import Stepper
 from hydrotele.simulate.surroundings import Surroundings
 from hydrotele.teleop.operator_model import Hand
 from hydrotele.teleop.station import Station
@@ -77,7 +71,7 @@ class Session:
         seen: what the machine's sensors say.
         station: the operator's, of a teleoperated run.
         start: full physics state before the first tick.
-        line: commands on their way at the start.
+        before: (nu,) commands in force before the first tick.
         tick: number of the next control tick.
         every: control ticks per row of the logs.
     """
@@ -99,19 +93,32 @@ class Session:
         plant, data, plan, seen = prepared
         begin_leapfrog(plant.model, data)
         self.plant, self.data, self.seen, self.scenario = plant, data, seen, scenario
-        self.start, self.line = full_state(plant.model, data), DelayLine(plant, data.ctrl)
+        self.start, self.before = full_state(plant.model, data), np.array(data.ctrl)
         self._plan, self._dt = plan, 1.0 / scenario.control_rate
         self.every = round(scenario.control_rate / scenario.log_rate)
-        self._numbers = servo_parameters(plant.machine, plant.axes, scenario.servo, self._dt)
-        self._drives = drive_references(plant.machine, plan, scenario.servo)
-        self._forces = force_references(nominal, plan, scenario.servo)
+        parameters = servo_parameters(plant.machine, plant.axes, scenario.servo, self._dt)
+        drives = drive_references(plant.machine, plan, scenario.servo)
+        forces = force_references(nominal, plan, scenario.servo)
         k, ticks = len(plant.axes), scenario.ticks
-        self._load, self._command, self._commands = np.zeros(k), np.zeros(k), np.zeros((ticks, k))
         self._recorder = Recorder(plant, scenario.rows)
         self._stepper = Stepper(plant, data, round(self._dt / scenario.timestep))
+        self.seen.update(0, self._stepper)
+        load = parameters[:, 1] * seen.head - parameters[:, 2] * seen.rod - forces.force[0]
+        self._commands = np.zeros((ticks, k))
+        self._planned = Planned(
+            sim=self._stepper.sim,
+            steps=self._stepper.steps,
+            controller=Controller(parameters, plan.closed, load, np.zeros(k)),
+            feedback=seen.table,
+            drives=drives,
+            forces=forces,
+            reference=plan.reference,
+            command=plan.command,
+            given=self._commands,
+        )
         self.station = None
         if isinstance(scenario.pilot, TeleopPilot):
-            self.station = Station(plant, scenario, plan, self._drives, seen, hand)
+            self.station = Station(plant, scenario, plan, drives, seen, hand)
         self._around = Surroundings(plant.machine, plant.model, scenario.surroundings)
         self._worst, self._begin = 0.0, 0.0
         self.tick = 0
@@ -127,31 +134,14 @@ class Session:
         Raises:
             SimulationFailed: states became infinite or not a number.
         """
-        tick, data, seen, command = self.tick, self.data, self.seen, self._command
-        plan, drives, forces, numbers = self._plan, self._drives, self._forces, self._numbers
-        past = self._stepper.past
+        tick, data, stepper = self.tick, self.data, self._stepper
         if tick % self.every == 0 and tick // self.every < len(self._recorder.time):
-            self._recorder.take(tick // self.every, tick * self._dt, data, past)
-        seen.update(tick, data, past)
-        if tick == 0:
-            held = numbers[:, 1] * seen.head - numbers[:, 2] * seen.rod
-            self._load[:] = held - forces.force[0]
-        command[:] = plan.command[tick]
-        tripped = self.station is not None and self.station.tick(tick, data, seen)
-        drive = DriveReference(
-            drives.velocity[tick], drives.arm[tick], drives.volume_head[tick],
-            drives.volume_rod[tick],
-        )  # fmt: skip
-        servo_step(
-            numbers, plan.closed, drive, plan.reference[tick - tick % seen.every],
-            Measured(seen.joint, seen.rate, seen.head, seen.rod, seen.supply), self._load,
-            ComputedForce(forces.known, forces.force[tick], forces.rate[tick]), command,
-        )  # fmt: skip
-        if tripped:
-            command[:] = 0.0
-        self._commands[tick] = command
+            shown = stepper.shown() if stepper.late else None
+            self._recorder.take(tick // self.every, tick * self._dt, data, shown)
+        tripped = self.station is not None and self.station.tick(tick, data, self.seen)
         self._begin = self._begin if tick else clock.perf_counter()
-        self._stepper.advance(command)
+        planned_tick(self._planned, tick, tripped)
+        stepper.tick = tick + 1
         if self.scenario.surroundings:
             self._around.update(tick * self._dt, data, self._dt)
         self._worst = max(self._worst, pin_opening(self.plant.model, data))

@@ -1,30 +1,25 @@
 """What the controller sees: joint positions and pressures, sampled, with error, converted, held.
 
-What late sensors show of a plant: its last states, delayed or behind a first-order lag.
-
-Sensors: scale and offset, a random error, then an analogue-to-digital converter.
-
-Every channel draws from its own stream, keyed by the scenario's seed and the channel's name, so
-that leaving a channel out changes no other.
+Sensors: scale and offset, a random error, then an analogue-to-digital converter; runs and
+environments read them by the functions of this module. Every channel of a run draws from its own
+stream, keyed by the scenario's seed and the channel's name, so that leaving a channel out changes
+no other.
 """
 
-import dataclasses
-import math
 import zlib
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.hydraulics.circuit import circuit_scratch
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.noise import channel_sensor, converter, first_order
+from hydrotele.machine.noise import channel_sensor, converter
 from hydrotele.machine.sensors import Sensor, SensorError, SensorSet
 from hydrotele.simulate.plant import Plant
-from hydrotele.simulate.record import Lag, aligned_positions, sensor_lags, split_delay, state_supply
+from hydrotele.simulate.record import sensed_channels
+from hydrotele.simulate.stepping import Stepper, look_back, true_values
 
 
 def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:
@@ -125,229 +120,159 @@ def measure(
     return readings
 
 
-class Past:
-    """States of the last physics steps, for sensors that read late.
-
-    Args:
-        plant: the plant, with the delays and time constants of its `sensor_errors`.
-        data: state at the start, as `begin_leapfrog` left it; it stands for all times before.
-    """
-
-    def __init__(self, plant: Plant, data: mujoco.MjData) -> None:
-        """Make room for the longest delay."""
-        self._plant, self.lags = plant, sensor_lags(plant.machine)
-        self._step = plant.model.opt.timestep
-        self._parts = {delay: split_delay(delay, self._step) for delay, _ in self.lags}
-        supply = plant.machine.sensor_errors.get("pressure_supply")
-        self._slow_supply = supply is not None and supply.time_constant > 0.0
-        self._scratch = circuit_scratch()
-        self._before = self._state(data)
-        size = 2 + max((steps for steps, _ in self._parts.values()), default=0)
-        self._rings = {
-            constant: tuple(np.tile(part, (size, 1)) for part in self._before)
-            for constant in dict.fromkeys(constant for _, constant in self.lags)
-        }
-        self._size, self._now = size, 0
-
-    def _state(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions (nq,), activations (na,) and supply pressure (1,), 0 where nobody asks."""
-        supply = np.zeros(1)
-        if self._slow_supply:
-            user = self._plant.model.actuator_user.ravel()
-            supply[0] = state_supply(user, self._plant.hydraulic, data.act, self._scratch)
-        return aligned_positions(self._plant.model, data), data.act.copy(), supply
-
-    def keep(self, data: mujoco.MjData) -> None:
-        """Remember the state after a step."""
-        state, last = self._state(data), self._now
-        self._now = (last + 1) % self._size
-        for constant, rings in self._rings.items():
-            for ring, before, now in zip(rings, self._before, state, strict=True):
-                ring[self._now] = (
-                    first_order(ring[last], before, now, self._step / constant)
-                    if constant else now
-                )  # fmt: skip
-        self._before = state
-
-    def at(self, lag: Lag) -> tuple[np.ndarray, np.ndarray, float]:
-        """What a sensor with this delay and time constant shows.
-
-        Args:
-            lag: one of `lags` [s].
-
-        Returns:
-            Positions (nq,), activations (na,) and supply pressure [Pa], linear between two steps;
-            the supply pressure only where its own sensor has a time constant.
-        """
-        delay, constant = lag
-        steps, part = self._parts[delay]
-        new, old = (self._now - steps) % self._size, (self._now - steps - 1) % self._size
-        qpos, act, supply = (
-            ring[new] + part * (ring[old] - ring[new]) for ring in self._rings[constant]
-        )
-        return qpos, act, float(supply[0])
-
-
-class SensorErrors(NamedTuple):
-    """What c sensors make of the truth: joints, then head and rod of every axis, then supply.
+class Sensors(NamedTuple):
+    """What c sensors make of what they show.
 
     Attributes:
-        scales: (c,) [1].
-        offsets: (c,) [channel's unit].
-        errors: (c,) random errors of the sample [channel's unit].
-        steps: (c,) converter steps [channel's unit].
+        scale: (c,) [1].
+        offset: (c,) [channel's unit].
+        step: (c,) converter steps [channel's unit]; 0 for none.
         low: (c,) lowest readings [channel's unit].
         high: (c,) highest readings [channel's unit].
     """
 
-    scales: np.ndarray
-    offsets: np.ndarray
-    errors: np.ndarray
-    steps: np.ndarray
+    scale: np.ndarray
+    offset: np.ndarray
+    step: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
 
-class SensorReadings(NamedTuple):
-    """SensorReadings of k axes.
+class Readings(NamedTuple):
+    """Sampled and held readings of k axes.
 
     Attributes:
-        joint: (k,) joint positions [rad] or [m].
-        head: (k,) head-side pressures [Pa].
-        rod: (k,) rod-side pressures [Pa].
-    """
-
-    joint: np.ndarray
-    head: np.ndarray
-    rod: np.ndarray
-
-
-@compiled
-def read_sensors(qpos, places, act, supply_act, slow_supply, user, count, sensors, out, work):
-    """SensorReadings of the fed-back sensors in a state.
-
-    Args:
-        qpos: (nq,) positions [rad] or [m].
-        places: (k,) place of each axis' joint in `qpos`.
-        act: (na,) activations; pressures [Pa].
-        supply_act: (na,) activations that the supply's sensor sees.
-        slow_supply: supply pressure behind its sensor's first-order lag, scalar [Pa]; NaN without
-            one.
-        user: (k * SLOTS,) actuator numbers.
-        count: number of hydraulic axes.
-        sensors: SensorErrors.
-        out: SensorReadings, written.
-        work: (SCRATCH,) work space.
-
-    Returns:
-        Measured supply pressure, scalar [Pa]; 0 without hydraulic axes.
-
-    Source: nominal model, "Sensors".
-    """
-    scales, offsets, errors, steps, low, high = sensors
-    joint, head, rod = out
-    k = len(places)
-    for i in range(k):
-        value = scales[i] * qpos[places[i]] + offsets[i]
-        joint[i] = convert(value + errors[i], steps[i], low[i], high[i])
-    for i in range(count):
-        c = k + 2 * i
-        value = scales[c] * act[4 * i + 2] + offsets[c]
-        head[i] = convert(value + errors[c], steps[c], low[c], high[c])
-        c += 1
-        value = scales[c] * act[4 * i + 3] + offsets[c]
-        rod[i] = convert(value + errors[c], steps[c], low[c], high[c])
-    if count == 0:
-        return 0.0
-    c = k + 2 * count
-    supply = slow_supply
-    if np.isnan(supply):
-        supply = state_supply(user, count, supply_act, work)
-    value = scales[c] * supply + offsets[c]
-    return convert(value + errors[c], steps[c], low[c], high[c])
-
-
-@dataclasses.dataclass
-class Feedback:
-    """Sampled and held readings of a plant; `update` refreshes them in place.
-
-    Attributes:
-        plant: the plant.
-        every: control ticks per sample.
-        period: time between samples [s].
-        errors: channel -> (samples,) errors, for the log to show the same ones.
-        converters: (3, c) step, low and high of every channel's converter.
         joint: (k,) positions [rad] or [m].
         rate: (k,) difference quotients of the last two positions [rad/s] or [m/s].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
-        supply: supply pressure [Pa].
+        supply: (1,) supply pressure [Pa].
     """
 
-    plant: Plant
-    every: int
-    period: float
-    errors: dict[str, np.ndarray]
-    converters: np.ndarray
     joint: np.ndarray
     rate: np.ndarray
     head: np.ndarray
     rod: np.ndarray
-    supply: float = 0.0
+    supply: np.ndarray
 
-    def __post_init__(self) -> None:
-        """Lay out what every update needs."""
-        self._table = np.column_stack(list(self.errors.values()))
-        defects = [self.plant.machine.sensor_errors.get(n, SensorError()) for n in self.errors]
-        self._scales = np.array([d.scale for d in defects])
-        self._offsets = np.array([d.offset for d in defects])
-        self._late = [
-            (place, (d.delay, d.time_constant)) for place, d in enumerate(defects) if d.late
-        ]
-        self._user = self.plant.model.actuator_user.ravel()
-        self._work = circuit_scratch()
 
-    def update(self, tick: int, data: mujoco.MjData, past: Past | None = None) -> None:
+@compiled
+def read_sensors(sensors, values, errors):
+    """Turn what sensors show into readings: scale, offset, random error, converter.
+
+    Args:
+        sensors: Sensors.
+        values: (c,) what they show, replaced by the readings [channel's unit].
+        errors: (c,) random errors of this sample [channel's unit].
+
+    Returns:
+        Nothing.
+
+    Source: nominal model, "Sensors".
+    """
+    for c in range(len(errors)):
+        value = sensors.scale[c] * values[c] + sensors.offset[c] + errors[c]
+        values[c] = convert(value, sensors.step[c], sensors.low[c], sensors.high[c])
+
+
+@compiled
+def hold_readings(values, hydraulic, span, readings):
+    """Take over a new sample.
+
+    Args:
+        values: (c,) readings of k positions, head and rod pressures, supply pressure.
+        hydraulic: number of hydraulic axes, scalar.
+        span: time since the last sample, scalar [s]; 0 for the first one, whose rates are 0.
+        readings: Readings, written but for the supply pressure.
+
+    Returns:
+        Supply pressure, scalar [Pa]; 0 without hydraulic axes.
+    """
+    k = len(readings.joint)
+    for i in range(k):
+        readings.rate[i] = (values[i] - readings.joint[i]) / span if span > 0.0 else 0.0
+        readings.joint[i] = values[i]
+    for i in range(hydraulic):
+        readings.head[i], readings.rod[i] = values[k + 2 * i], values[k + 2 * i + 1]
+    return values[k + 2 * hydraulic] if hydraulic > 0 else 0.0
+
+
+class FeedbackTable(NamedTuple):
+    """Sensors of a controller for a whole run.
+
+    Attributes:
+        every: control ticks per sample.
+        period: time between samples [s].
+        sensors: of c channels.
+        errors: (samples, c) random errors [channel's unit].
+        readings: sampled and held.
+    """
+
+    every: int
+    period: float
+    sensors: Sensors
+    errors: np.ndarray
+    readings: Readings
+
+
+@compiled
+def sample(table, sim, tick, steps):
+    """Take a new sample if one is due at this control tick; otherwise hold the last one.
+
+    Args:
+        table: FeedbackTable; its readings are written.
+        sim: Simulation.
+        tick: control tick, scalar.
+        steps: physics steps per tick, scalar.
+
+    Returns:
+        Nothing.
+
+    Source: nominal model, "Sensors".
+    """
+    if tick % table.every != 0:
+        return
+    values = np.empty(len(sim.past.before))
+    true_values(sim, values)
+    look_back(sim.past, tick * steps, values)
+    read_sensors(table.sensors, values, table.errors[tick // table.every])
+    span = table.period if tick > 0 else 0.0
+    table.readings.supply[0] = hold_readings(values, sim.hydraulic, span, table.readings)
+
+
+class Feedback:
+    """Sampled and held readings of a plant; `update` refreshes them in place.
+
+    Attributes:
+        table: facts and readings, as native code takes them.
+        errors: channel -> (samples,) errors, for the log to show the same ones.
+        every: control ticks per sample.
+        period: time between samples [s].
+        joint: (k,) positions [rad] or [m].
+        rate: (k,) difference quotients of the last two positions [rad/s] or [m/s].
+        head: (k,) head-side pressures [Pa].
+        rod: (k,) rod-side pressures [Pa].
+    """
+
+    def __init__(self, table: FeedbackTable, errors: Mapping[str, np.ndarray]) -> None:
+        """Before the first sample."""
+        self.table, self.errors = table, errors
+        self.every, self.period = table.every, table.period
+        self.joint, self.rate, self.head, self.rod, self._supply = table.readings
+
+    @property
+    def supply(self) -> float:
+        """Supply pressure [Pa]; 0 without hydraulic axes."""
+        return float(self._supply[0])
+
+    def update(self, tick: int, stepper: Stepper) -> None:
         """Take a new sample if one is due at this control tick; otherwise hold the last one.
 
         Args:
-            tick: the control tick.
-            data: the staggered state.
-            past: the states before; needed only where sensors read late.
+            tick: the control tick, which is that of the stepper.
+            stepper: what steps the plant.
         """
-        if tick % self.every:
-            return
-        before = self.joint.copy()
-        plant, (steps, low, high) = self.plant, self.converters
-        qpos, act, supply_act = aligned_positions(plant.model, data), data.act, data.act
-        slow_supply = math.nan
-        if past and self._late:
-            qpos, act, supply_act, slow_supply = self._seen_late(qpos, act, past)
-        self.supply = read_sensors(
-            qpos, plant.qpos, act, supply_act, slow_supply, self._user, plant.hydraulic,
-            SensorErrors(
-                self._scales, self._offsets, self._table[tick // self.every], steps, low, high
-            ),
-            SensorReadings(self.joint, self.head, self.rod), self._work,
-        )  # fmt: skip
-        if tick:
-            self.rate[:] = (self.joint - before) / self.period
-
-    def _seen_late(self, qpos, act, past: Past):
-        """States in which what every sensor reads stands as its delay and lag let it through."""
-        qpos, act, supply_act, slow_supply = qpos.copy(), act.copy(), act, math.nan
-        axes = len(self.plant.axes)
-        for place, lag in self._late:
-            old_qpos, old_act, old_supply = past.at(lag)
-            if place < axes:
-                qpos[self.plant.qpos[place]] = old_qpos[self.plant.qpos[place]]
-            elif place < axes + 2 * self.plant.hydraulic:
-                i, side = divmod(place - axes, 2)
-                act[4 * i + 2 + side] = old_act[4 * i + 2 + side]
-            else:
-                supply_act = old_act
-                slow_supply = old_supply if lag[1] else math.nan
-        return qpos, act, supply_act, slow_supply
+        sample(self.table, stepper.sim, tick, stepper.steps)
 
 
 def feedback(
@@ -368,26 +293,23 @@ def feedback(
     Raises:
         InputError: the sensors' rate does not divide the control rate.
     """
-    every = samples_every(control_rate, sensors)
-    names = [f"{plant.machine.position_kind(a)}.{a}" for a in plant.axes]
-    for axis in plant.axes[: plant.hydraulic]:
-        names += [f"pressure_head.{axis}", f"pressure_rod.{axis}"]
-    if plant.machine.valve_axes:
-        names.append("pressure_supply")
+    every, k = samples_every(control_rate, sensors), len(plant.axes)
+    names = sensed_channels(plant)[: k + 2 * plant.hydraulic + (1 if plant.hydraulic else 0)]
     kinds = {name: channel_sensor(plant.machine, sensors, name) for name in names}
-    count = -(-ticks // every)
-    k = len(plant.axes)
-    return Feedback(
-        plant=plant,
-        every=every,
-        period=every / control_rate,
-        errors={name: sensor_errors(kinds[name], seed, name, count) for name in names},
-        converters=np.array([converter(kinds[name], name) for name in names]).T.copy(),
-        joint=np.zeros(k),
-        rate=np.zeros(k),
-        head=np.zeros(k),
-        rod=np.zeros(k),
-    )
+    count = ticks // every + 1  # one after the last tick, which nobody asks for
+    errors = {name: sensor_errors(kinds[name], seed, name, count) for name in names}
+    defects = [plant.machine.sensor_errors.get(name, SensorError()) for name in names]
+    table = FeedbackTable(
+        every,
+        every / control_rate,
+        Sensors(
+            np.array([d.scale for d in defects]), np.array([d.offset for d in defects]),
+            *np.array([converter(kinds[name], name) for name in names]).T.copy(),
+        ),
+        np.column_stack(list(errors.values())),
+        Readings(np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(1)),
+    )  # fmt: skip
+    return Feedback(table, errors)
 
 
 def samples_every(rate: float, sensors: SensorSet | None) -> int:

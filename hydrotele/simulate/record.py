@@ -11,8 +11,6 @@ What a run shows: true channels from recorded states.
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -24,19 +22,15 @@ from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,
     axis_state,
-    circuit_scratch,
     circuit_supply,
     delivered_share,
     open_ports,
 )
-from hydrotele.machine.machine import Machine
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.mechanism import TIP_SITE
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.surroundings import is_surrounding_object, object_joints
 from hydrotele.simulate.term_readout import added_by_terms
-
-Lag = tuple[float, float]  # delay and time constant of a sensor [s]
 
 _WHOLE = 1.0e-9  # of a step, by which a delay may miss a whole number of steps through rounding
 
@@ -58,8 +52,8 @@ class Record:
         command: (n, nu) mean command over the row's interval.
         contact: (n, 3) sum of the forces on the machine of ground and things, world frame [N].
         tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
-        late: delay and time constant of a sensor [s] -> (qpos (n, nq), act (n, na), supply
-            pressure (n,)) as such a sensor shows them, see `past.Past.at`.
+        late: (n, c) what the sensors of `sensed_channels` show but for their errors; empty (n, 0)
+            where none is late.
     """
 
     time: np.ndarray
@@ -70,9 +64,7 @@ class Record:
     command: np.ndarray
     contact: np.ndarray
     tip: np.ndarray
-    late: Mapping[Lag, tuple[np.ndarray, np.ndarray, np.ndarray]] = dataclasses.field(
-        default_factory=dict
-    )
+    late: np.ndarray
 
 
 def begin_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -108,10 +100,15 @@ def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -
     return positions
 
 
-def sensor_lags(machine: Machine) -> tuple[Lag, ...]:
-    """Delays and time constants of the machine's late sensors, each pair once, sorted."""
-    errors = machine.sensor_errors.values()
-    return tuple(sorted({(e.delay, e.time_constant) for e in errors if e.late}))
+def sensed_channels(plant: Plant) -> tuple[str, ...]:
+    """Channels with a sensor: positions, head and rod pressures, supply pressure, lengths."""
+    machine = plant.machine
+    names = [f"{machine.position_kind(axis)}.{axis}" for axis in plant.axes]
+    for axis in plant.axes[: plant.hydraulic]:
+        names += [f"pressure_head.{axis}", f"pressure_rod.{axis}"]
+    if plant.hydraulic:
+        names.append("pressure_supply")
+    return (*names, *(f"length.{axis}" for axis in plant.axes if machine.axes[axis].cylinder))
 
 
 def split_delay(delay: float, timestep: float) -> tuple[int, float]:
@@ -119,14 +116,6 @@ def split_delay(delay: float, timestep: float) -> tuple[int, float]:
     steps = math.floor(delay / timestep + _WHOLE)
     rest = delay / timestep - steps
     return steps, rest if rest > _WHOLE else 0.0
-
-
-class Sight(Protocol):
-    """What tells what late sensors show, such as `past.Past`."""
-
-    def at(self, lag: Lag) -> tuple[np.ndarray, np.ndarray, float]:
-        """Positions (nq,), activations (na,) and supply pressure [Pa] that such a sensor shows."""
-        ...
 
 
 class Recorder:
@@ -148,19 +137,19 @@ class Recorder:
         self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
         self.command, self.contact = np.zeros((rows, model.nu)), np.zeros((rows, 3))
         self.tip = np.zeros((rows, 3 if self.tip_site >= 0 else 0))
-        self.late = {
-            lag: (np.zeros((rows, model.nq)), np.zeros((rows, model.na)), np.zeros(rows))
-            for lag in sensor_lags(plant.machine)
-        }
+        late = any(error.late for error in plant.machine.sensor_errors.values())
+        self.late = np.zeros((rows, len(sensed_channels(plant)) if late else 0))
 
-    def take(self, row: int, time: float, data: mujoco.MjData, past: Sight) -> None:
+    def take(
+        self, row: int, time: float, data: mujoco.MjData, shown: np.ndarray | None = None
+    ) -> None:
         """Keep the present state, before the next step is made.
 
         Args:
             row: which row.
             time: its time [s].
             data: staggered state, as `begin_leapfrog` or a step left it.
-            past: the states before, for sensors that read late.
+            shown: (c,) what the sensors of `sensed_channels` show, where one of them is late.
 
         Raises:
             SimulationFailed: the state is not finite, or MuJoCo warns.
@@ -171,8 +160,8 @@ class Recorder:
         self.qvel[row] = data.qvel - 0.5 * h * data.qacc
         self.qacc[row] = data.qacc
         self.act[row] = data.act
-        for lag, (qpos, act, supply) in self.late.items():
-            qpos[row], act[row], supply[row] = past.at(lag)
+        if shown is not None and self.late.shape[1]:
+            self.late[row] = shown
         if self.tip_site >= 0:
             self.tip[row] = data.site_xpos[self.tip_site]
         if data.ncon:
@@ -189,10 +178,10 @@ class Recorder:
 
     def record(self, rows: int | None = None) -> Record:
         """All rows as a Record, or the first ones."""
-        late = {lag: (q[:rows], a[:rows], p[:rows]) for lag, (q, a, p) in self.late.items()}
         return Record(
             self.time[:rows], self.qpos[:rows], self.qvel[:rows], self.qacc[:rows],
-            self.act[:rows], self.command[:rows], self.contact[:rows], self.tip[:rows], late,
+            self.act[:rows], self.command[:rows], self.contact[:rows], self.tip[:rows],
+            self.late[:rows],
         )  # fmt: skip
 
 
@@ -328,21 +317,12 @@ def late_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
     Returns:
         Channel -> (n,) values in SI; only channels with a delay or a time constant.
     """
-    values = {}
-    for channel, error in plant.machine.sensor_errors.items():
-        if not error.late:
-            continue
-        qpos, act, supply = record.late[error.delay, error.time_constant]
-        if channel == "pressure_supply" and error.time_constant:
-            values[channel] = supply
-        elif channel == "pressure_supply":
-            user, scratch = plant.model.actuator_user.ravel(), circuit_scratch()
-            values[channel] = np.array(
-                [state_supply(user, plant.hydraulic, row, scratch) for row in act]
-            )
-        else:
-            values[channel] = _sensed(plant, qpos, act)[channel]
-    return values
+    names = sensed_channels(plant)
+    return {
+        channel: record.late[:, names.index(channel)]
+        for channel, error in plant.machine.sensor_errors.items()
+        if error.late and channel in names
+    }
 
 
 def _hidden(plant: Plant, record: Record):

@@ -15,6 +15,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.fleet import Fleet
 from hydrotele.simulate.native import stop_profiling_clock
+from hydrotele.simulate.stepping import line_length, past_length
 from hydrotele.tasks.facts import Setup, make_facts, timing
 from hydrotele.tasks.loop import advance
 from hydrotele.tasks.memory import AXES, CHANNELS, MEASURES, MEMORY, NEXT_STEP, RESET, STEP
@@ -106,13 +107,9 @@ class TaskCore:
         self.measures, self.final_measures = (np.zeros((n, MEASURES)) for _ in range(2))
         self.terminated, self.truncated = (np.zeros(n, np.uint8) for _ in range(2))
         self.terrain = np.zeros((n, self.setup.task.terrain))
-        longest = 0
-        if v.delays.any():
-            longest = int(np.ceil((v.delays[:, :, 0].max() + 1) / self.setup.clock.substeps)) + 2
-        self._commands = np.zeros((n, longest, AXES))
-        late = v.lags / self.setup.clock.period
-        self._sensed = np.zeros((n, int(np.ceil(late.max())) + 2 if late.any() else 0, CHANNELS))
-        self._lags = late
+        self._commands = np.zeros((n, line_length(v.delays, self.setup.clock.substeps), AXES))
+        self._sensed = np.zeros((n, past_length(v.lags, v.ratios), CHANNELS))
+        self._before = np.zeros((n, CHANNELS))
         self._expanded = {name: self.simulations.expand(name) for name in v.fields}
         for name, live in self._expanded.items():
             if live.shape[1] != v.fields[name].shape[1]:  # native code copies the one to the other
@@ -136,9 +133,9 @@ class TaskCore:
             ("truncated", self.truncated), ("measures", self.measures),
             ("final_measures", self.final_measures), ("starts", v.states),
             ("start_tips", v.tips), ("users", self._users), ("scales", v.scales),
-            ("offsets", v.offsets),
-            ("lags", self._lags), ("delays", v.delays), ("commands", self._commands),
-            ("sensed", self._sensed), ("places", self._places), ("terrain", self.terrain),
+            ("offsets", v.offsets), ("lags", v.lags), ("ratios", v.ratios),
+            ("delays", v.delays), ("commands", self._commands), ("sensed", self._sensed),
+            ("sensed_before", self._before), ("places", self._places), ("terrain", self.terrain),
         ):  # fmt: skip
             f[name] = array.ctypes.data
         if "eq_data" in self._expanded:
@@ -159,7 +156,7 @@ class TaskCore:
         arrays = (
             self.memory, self.action, self.observation, self.final, self.reward, self.terminated,
             self.truncated, self.measures, self.final_measures, self.terrain, self._commands,
-            self._sensed, self.simulations.state, *self._expanded.values(),
+            self._sensed, self._before, self.simulations.state, *self._expanded.values(),
         )  # fmt: skip
         return sum(array.nbytes for array in arrays) // self.count
 

@@ -1,15 +1,8 @@
-"""An environment step in native code: actions, control, physics, sensors, reward, a new episode.
+"""An environment step in native code: actions, control tick, sensors, reward, a new episode.
 
 MuJoCo calls `advance` for every simulation from its own threads; nothing of Python runs in it.
-
-Actions of an agent into commands of valves and drives, once per control period.
-
-Rates are bounded in their change, since a machine of 20 t follows no jump: joint rates move joint
+Actions are bounded in their change, since a machine of 20 t follows no jump: joint rates move joint
 references, pose rates those of the arm by resolved motion, and the joint servo follows them.
-
-Sensors of an episode: true values at one time, late, with defects and errors, converted.
-
-The simulation of an episode as its task sees it: MuJoCo's arrays by name.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
 # numba's intrinsics are called without their typing context, and carray is its documented API.
@@ -21,22 +14,22 @@ import numpy as np
 from numba import carray, types
 
 from hydrotele.control.resolved_motion import follow_pose
-from hydrotele.control.servo import (
-    POINTS,
-    ComputedForce,
-    DriveReference,
-    Measured,
-    drive_row,
-    servo_step,
-)
+from hydrotele.control.servo import POINTS, ComputedForce, DriveReference, Measured, drive_row
+from hydrotele.control.tick import Controller, TickReference, control_tick
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.hydraulics.circuit import SCRATCH
 from hydrotele.hydraulics.parameters import SLOTS
 from hydrotele.kinematics.task import task_forward
-from hydrotele.simulate.feedback import convert
+from hydrotele.simulate.feedback import Readings, Sensors, hold_readings, read_sensors
 from hydrotele.simulate.fleet import STATE
-from hydrotele.simulate.layout import call_set_state, call_step, field, floats, pointer
-from hydrotele.simulate.record import state_supply
+from hydrotele.simulate.layout import call_set_state, field, floats, pointer
+from hydrotele.simulate.stepping import (
+    CommandLine,
+    SensorPast,
+    Simulation,
+    begin_past,
+    look_back,
+    true_values,
+)
 from hydrotele.tasks.kinds import begin_task, observe_task, reward_task, tick_task
 from hydrotele.tasks.memory import (
     ARM,
@@ -141,109 +134,43 @@ def act(f, e, action):
         f.grid[:k], table, e.reference[:k], e.reference_rate[:k], f.feedforward, e.drive[0, :k],
         e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
     )  # fmt: skip
-    none = np.zeros(k)
-    drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
-    measured = Measured(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply)
-    servo_step(
-        f.servo[:k], f.closed[:k], drive, e.sampled_reference[:k], measured, e.load[:k],
-        ComputedForce(False, none, none), e.command[:k],
-    )  # fmt: skip
 
 
 @compiled
-def true_positions(f, e, w):
-    """Bring an episode's true axis positions up to date.
-
-    Args:
-        f: record of FACTS.
-        e: record of MEMORY; `position` is written.
-        w: World, staggered as `simulate.record` says.
-
-    Returns:
-        Nothing.
-
-    Source: `simulate.record.aligned_positions`.
-    """
-    for i in range(f.axes):
-        e.position[i] = w.qpos[f.qpos[i]] - f.timestep * w.qvel[f.dof[i]]
-
-
-@compiled
-def _sensed(f, e, w, out):
-    """What stands before the sensors: positions [rad], [m], head and rod pressures, supply [Pa]."""
-    k = f.axes
-    for i in range(k):
-        out[i] = e.position[i]
-    for i in range(f.hydraulic):
-        out[k + 2 * i], out[k + 2 * i + 1] = w.act[4 * i + 2], w.act[4 * i + 3]
-    if f.hydraulic > 0:
-        scratch = np.empty(SCRATCH)
-        user = floats(f.users + 8 * e.variant * k * SLOTS, k * SLOTS)
-        out[k + 2 * f.hydraulic] = state_supply(user, f.hydraulic, w.act, scratch)
-
-
-@compiled
-def _late(f, e, sim, values):
-    """Put values into the ring of the past; take out those that the sensors see now."""
-    length = f.delayed_sensor
-    ring = floats(f.sensed + 8 * sim * length * CHANNELS, length * CHANNELS)
-    lags = floats(f.lags + 8 * e.variant * CHANNELS, CHANNELS)
-    now = e.tick % length
-    for c in range(CHANNELS):
-        ring[now * CHANNELS + c] = values[c]
-    for c in range(CHANNELS):
-        lag = min(lags[c], 1.0 * e.tick)
-        if lag > 0.0:
-            whole = int(lag)
-            part = lag - whole
-            new = ring[((now - whole) % length) * CHANNELS + c]
-            old = ring[((now - whole - 1) % length) * CHANNELS + c] if part > 0.0 else new
-            values[c] = new + part * (old - new)
-
-
-@compiled
-def sense(f, e, w, sim):
+def sense(f, e, sim):
     """Read the sensors, if a reading is due; otherwise they are held.
 
     Args:
         f: record of FACTS.
-        e: record of MEMORY; readings are written.
-        w: World.
-        sim: number of the simulation, scalar.
+        e: record of MEMORY; true positions are written, readings where they are due.
+        sim: Simulation of this episode.
 
     Returns:
         Nothing.
 
-    Source: as `simulate.feedback` for scenario runs; late readings are linear between control
-        periods, and before the start everything stood as at the start.
+    Source: `simulate.feedback`, as in scenario runs.
     """
-    true_positions(f, e, w)
-    due = e.tick % f.every == 0
-    if not due and f.delayed_sensor == 0:
+    k, c = f.axes, f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
+    if e.tick % f.every != 0:
+        for i in range(k):
+            e.position[i] = sim.qpos[f.qpos[i]] - f.timestep * sim.qvel[f.dof[i]]
         return
-    values = np.zeros(CHANNELS)
-    _sensed(f, e, w, values)
-    if f.delayed_sensor > 0:
-        _late(f, e, sim, values)
-    if not due:
-        return
-    k, many = f.axes, f.axes + 2 * f.hydraulic
-    scales = floats(f.scales + 8 * e.variant * CHANNELS, CHANNELS)
-    offsets = floats(f.offsets + 8 * e.variant * CHANNELS, CHANNELS)
-    for c in range(many + (1 if f.hydraulic > 0 else 0)):
-        value = scales[c] * values[c] + offsets[c]
-        if f.noisy:
-            value += f.accuracy[c] * (2.0 * draw(e) - 1.0)
-            value = convert(value, f.converters[0, c], f.converters[1, c], f.converters[2, c])
-        values[c] = value
-    span = f.every * f.period
+    values, scales = np.empty(c), f.scales + 8 * e.variant * CHANNELS
+    true_values(sim, values)
     for i in range(k):
-        e.rate[i] = (values[i] - e.joint[i]) / span if e.tick > 0 else 0.0
-        e.joint[i] = values[i]
+        e.position[i] = values[i]
         e.sampled_reference[i] = e.reference[i]
-    for i in range(f.hydraulic):
-        e.head[i], e.rod[i] = values[k + 2 * i], values[k + 2 * i + 1]
-    e.supply = values[many] if f.hydraulic > 0 else 0.0
+    look_back(sim.past, e.tick * f.substeps, values)
+    for i in range(c):
+        e.error[i] = f.accuracy[i] * (2.0 * draw(e) - 1.0) if f.noisy else 0.0
+    sensors = Sensors(
+        floats(scales, c), floats(f.offsets + 8 * e.variant * CHANNELS, c), f.converters[0],
+        f.converters[1], f.converters[2],
+    )  # fmt: skip
+    read_sensors(sensors, values, e.error[:c])
+    span = f.every * f.period if e.tick > 0 else 0.0
+    readings = Readings(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], np.empty(1))
+    e.supply = hold_readings(values, f.hydraulic, span, readings)
 
 
 assert CHANNELS >= 3 * AXES + 1
@@ -337,45 +264,40 @@ _SIGNATURE = types.void(types.int64, types.int64, types.intc, types.int64)
 
 
 @compiled
-def _delayed(f, e, sim, s, ctrl):
-    """Commands that reach valves and drives in physics step `s` of this control period."""
-    length = f.delayed_command
-    ring = floats(f.commands + 8 * sim * length * AXES, length * AXES)
-    delays = floats(f.delays + 8 * e.variant * AXES * 2, AXES * 2)
-    now = e.tick * f.substeps + s
-    for i in range(f.axes):
-        at = now - int(delays[2 * i])
-        part = delays[2 * i + 1]
-        value = ring[_slot(at, f.substeps, e.tick, length) * AXES + i]
-        if part > 0.0:
-            before = ring[_slot(at - 1, f.substeps, e.tick, length) * AXES + i]
-            value += part * (before - value)
-        ctrl[i] = value
+def _simulation(f, e, w, number):
+    """An episode's plant for `simulate.stepping`."""
+    ring = floats(
+        f.commands + 8 * number * f.delayed_command * AXES, f.delayed_command * AXES
+    ).reshape((f.delayed_command, AXES))
+    delays = floats(f.delays + 8 * e.variant * AXES * 2, AXES * 2).reshape((AXES, 2))
+    c = f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
+    sensed = floats(
+        f.sensed + 8 * number * f.delayed_sensor * CHANNELS, f.delayed_sensor * CHANNELS
+    ).reshape((f.delayed_sensor, CHANNELS))
+    lags = floats(f.lags + 8 * e.variant * CHANNELS * 2, CHANNELS * 2).reshape((CHANNELS, 2))
+    past = SensorPast(
+        sensed, floats(f.sensed_before + 8 * number * CHANNELS, c), lags,
+        floats(f.ratios + 8 * e.variant * CHANNELS, CHANNELS),
+    )  # fmt: skip
+    none = f.qpos[:0]
+    user = floats(f.users + 8 * e.variant * f.axes * SLOTS, f.axes * SLOTS)
+    return Simulation(
+        f.mj_step, w.model, w.data, w.qpos, w.qvel, w.act, w.ctrl, f.timestep, f.axes, f.hydraulic,
+        f.qpos[: f.axes], f.dof[: f.axes], none, none, user, CommandLine(ring, delays), past,
+    )  # fmt: skip
 
 
 @compiled
-def _slot(step, substeps, tick, length):
-    """Place in the ring of the command that was given for a physics step; -1 is before all."""
-    given = step // substeps
-    return (min(max(given, -1), tick) + 1) % length
-
-
-@compiled
-def _physics(f, e, m, d, sim, w):
-    """Step through one control period."""
-    if f.delayed_command == 0:
-        for i in range(f.axes):
-            w.ctrl[i] = e.command[i]
-        for _ in range(f.substeps):
-            call_step(f.mj_step, m, d)
-        return
-    length = f.delayed_command
-    ring = floats(f.commands + 8 * sim * length * AXES, length * AXES)
-    for i in range(f.axes):
-        ring[((e.tick + 1) % length) * AXES + i] = e.command[i]
-    for s in range(f.substeps):
-        _delayed(f, e, sim, s, w.ctrl)
-        call_step(f.mj_step, m, d)
+def _tick(f, e, sim):
+    """Commands of this control period, and the physics under them."""
+    k, none = f.axes, np.zeros(f.axes)
+    controller = Controller(f.servo[:k], f.closed[:k], e.load[:k], e.command[:k])
+    drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
+    reference = TickReference(
+        e.sampled_reference[:k], drive, ComputedForce(False, none, none), False
+    )  # fmt: skip
+    measured = Measured(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply)
+    control_tick(sim, e.tick, f.substeps, controller, reference, measured)
 
 
 @compiled
@@ -392,17 +314,17 @@ def _unstable(f, e, d):
 
 
 @compiled
-def _begin_episode(f, e, m, d, sim, w):
+def _begin_episode(f, e, w, number):
     """Put the simulation at the start of a variant, and draw a new goal."""
     e.last_variant, e.last_fault = e.variant, e.fault
     e.variant = int(draw(e) * f.variants)
     start = f.starts + 8 * e.variant * f.states
-    call_set_state(f.mj_set_state, m, d, start, STATE)
+    call_set_state(f.mj_set_state, w.model, w.data, start, STATE)
     places = carray(pointer(f.places), (3 * f.fields,), np.int64)
     for n in range(f.fields):
         size = places[3 * n + 2]
         given = floats(places[3 * n] + 8 * e.variant * size, size)
-        taken = floats(places[3 * n + 1] + 8 * sim * size, size)
+        taken = floats(places[3 * n + 1] + 8 * number * size, size)
         for c in range(size):
             taken[c] = given[c]
     e.episode += 1
@@ -410,16 +332,12 @@ def _begin_episode(f, e, m, d, sim, w):
     e.command[:] = 0.0
     for i in range(f.axes):
         e.command[i] = w.ctrl[i]
-    if f.delayed_command > 0:
-        length = f.delayed_command
-        ring = floats(f.commands + 8 * sim * length * AXES, length * AXES)
-        for n in range(length):
-            for i in range(f.axes):
-                ring[n * AXES + i] = w.ctrl[i]
+    sim = _simulation(f, e, w, number)
+    begin_past(sim, w.ctrl)
     tips = floats(f.start_tips + 24 * e.variant, 3)
     e.tip[:] = tips
     e.reference_rate[:], e.pose_rate[:] = 0.0, 0.0
-    sense(f, e, w, sim)
+    sense(f, e, sim)
     e.reference[:] = e.joint
     e.sampled_reference[:] = e.joint
     if f.arm_axes > 0:
@@ -445,17 +363,18 @@ def _observe(f, e, w, address, sim):
 
 
 @compiled
-def _step(f, e, m, d, sim, w, action):
+def _step(f, e, w, number, action):
     """One environment step; reward, whether the task is over, whether the time is."""
+    sim = _simulation(f, e, w, number)
     for _ in range(f.ticks):
         act(f, e, action)
-        _physics(f, e, m, d, sim, w)
+        _tick(f, e, sim)
         e.tick += 1
-        sense(f, e, w, sim)
+        sense(f, e, sim)
         tick_task(f, e, w)  # after the physics: before, MuJoCo's places are another simulation's
     e.tip[:] = w.tip
     e.step += 1
-    if _unstable(f, e, d):
+    if _unstable(f, e, w.data):
         e.fault = 1
         e.faults += 1
         return 0.0, True, False
@@ -474,19 +393,19 @@ def _advance(m, d, sim, argument):
     reward[sim], terminated[sim], truncated[sim] = 0.0, 0, 0
     fresh = f.call == RESET or (f.autoreset == NEXT_STEP and e.over != 0)
     if fresh:
-        _begin_episode(f, e, m, d, sim, w)
+        _begin_episode(f, e, w, sim)
         _observe(f, e, w, f.observation, sim)
         return
     if f.autoreset == DISABLED and e.over != 0:
         return
     action = carray(pointer(f.action + 4 * sim * f.actions), (f.actions,), np.float32)
-    value, done, late = _step(f, e, m, d, sim, w, action)
+    value, done, late = _step(f, e, w, sim, action)
     reward[sim], terminated[sim], truncated[sim] = value, done, late
     e.over = 1 if done or late else 0
     if f.autoreset == SAME_STEP and e.over != 0:
         floats(f.final_measures + 8 * sim * MEASURES, MEASURES)[:] = w.measures
         _observe(f, e, w, f.final, sim)
-        _begin_episode(f, e, m, d, sim, w)
+        _begin_episode(f, e, w, sim)
     _observe(f, e, w, f.observation, sim)
 
 

@@ -97,14 +97,14 @@ FACTS = np.dtype(
         ("limit", _F, AXES),  # commands at full action [1], or in the drive's unit
         ("arm", _F, 9),  # of kinematics.task.task_numbers
         ("ranges", _F, (AXES, 2)),  # of the axes [rad], [m]
-        ("servo", _F, (AXES, 14)),  # of operate.servo.servo_numbers
+        ("servo", _F, (AXES, 14)),  # of control.servo.servo_parameters
         ("feedforward", _F),
-        ("grid", _F, (AXES, 2)),  # of operate.drive_rows.drive_tables
+        ("grid", _F, (AXES, 2)),  # of control.servo.drive_tables
         ("accuracy", _F, CHANNELS),
         ("converters", _F, (3, CHANNELS)),
         ("numbers", _F, NUMBERS),  # of the task
-        ("delayed_command", _I),  # length of the ring of commands, 0 without delays
-        ("delayed_sensor", _I),  # length of the ring of sensed values, 0 without delays
+        ("delayed_command", _I),  # control ticks in the ring of commands, 0 without delays
+        ("delayed_sensor", _I),  # physics steps in the ring of sensed values, 0 where none is late
         ("variants", _I),
         ("states", _I),  # length of a state
         ("fields", _I),  # number of fields of the model that differ between variants
@@ -121,16 +121,18 @@ FACTS = np.dtype(
         ("truncated", _I),
         ("measures", _I),  # (n, MEASURES)
         ("final_measures", _I),  # (n, MEASURES) before an autoreset in the same step
-        ("table", _I),  # (k, POINTS, 3) of operate.drive_rows.drive_tables
+        ("table", _I),  # (k, POINTS, 3) of control.servo.drive_tables
         ("starts", _I),  # (v, states)
         ("start_tips", _I),  # (v, 3)
         ("users", _I),  # (v, k SLOTS) numbers of the actuators
         ("scales", _I),  # (v, CHANNELS) of the sensors
         ("offsets", _I),
-        ("lags", _I),  # (v, CHANNELS) delays of the sensors [control periods]
+        ("lags", _I),  # (v, CHANNELS, 2) delays of the sensors: whole physics steps, rest of a step
+        ("ratios", _I),  # (v, CHANNELS) a physics step over the time constant of a sensor's lag
         ("delays", _I),  # (v, AXES, 2) of the commands: whole physics steps, rest of a step
         ("commands", _I),  # (n, delayed_command, AXES) ring
         ("sensed", _I),  # (n, delayed_sensor, CHANNELS) ring
+        ("sensed_before", _I),  # (n, CHANNELS) true values after the last physics step
         ("places", _I),  # (fields, 3): address for all variants, address for all n, floats in each
         ("terrain", _I),  # (n, width)
         ("eq_rows", _I),  # (n, neq eq_width) of every simulation, 0 where no task writes them

@@ -22,7 +22,8 @@ from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.fleet import STATE
 from hydrotele.simulate.mechanism import TIP_SITE
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
-from hydrotele.simulate.record import begin_leapfrog, split_delay
+from hydrotele.simulate.record import begin_leapfrog, sensed_channels
+from hydrotele.simulate.stepping import command_delays, sensor_delays
 from hydrotele.tasks.memory import AXES, CHANNELS
 from hydrotele.tasks.task import Options, Task
 
@@ -43,7 +44,8 @@ class Variants:
         fields: field of the model -> (v, size), where they differ or the task writes them.
         scales: (v, CHANNELS) of the sensors.
         offsets: (v, CHANNELS).
-        lags: (v, CHANNELS) delays of the sensors [s].
+        lags: (v, CHANNELS, 2) delays of the sensors: whole physics steps, rest of a step [1].
+        ratios: (v, CHANNELS) a physics step over the time constant of a sensor [1]; 0 without.
         delays: (v, AXES, 2) of the commands: whole physics steps, rest of a step [1].
     """
 
@@ -56,6 +58,7 @@ class Variants:
     scales: np.ndarray
     offsets: np.ndarray
     lags: np.ndarray
+    ratios: np.ndarray
     delays: np.ndarray
 
 
@@ -181,36 +184,28 @@ def _of(model: mujoco.MjModel, name: str):
     return getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)
 
 
-def channels(plant: Plant) -> list[str]:
+def channels(plant: Plant) -> tuple[str, ...]:
     """Channels in the order of the native sensors: positions, head and rod pressures, supply."""
-    names = [f"{plant.machine.position_kind(axis)}.{axis}" for axis in plant.axes]
-    for axis in plant.axes[: plant.hydraulic]:
-        names += [f"pressure_head.{axis}", f"pressure_rod.{axis}"]
-    return [*names, "pressure_supply"] if plant.hydraulic else names
+    return tuple(c for c in sensed_channels(plant) if not c.startswith("length."))
 
 
 def _sensor_tables(plant: Plant, machines: list[Machine]):
-    """Scales, offsets and delays of all sensors of all variants."""
-    shape = (len(machines), CHANNELS)
-    scales, offsets, lags = np.ones(shape), np.zeros(shape), np.zeros(shape)
+    """Scales, offsets, delays and lags of all sensors of all variants."""
+    shape, names = (len(machines), CHANNELS), channels(plant)
+    scales, offsets, ratios = np.ones(shape), np.zeros(shape), np.zeros(shape)
+    lags, c = np.zeros((*shape, 2)), len(names)
     for v, machine in enumerate(machines):
-        for c, name in enumerate(channels(plant)):
-            defect = machine.sensor_errors.get(name, SensorError())
-            if defect.time_constant:
-                raise InputError(
-                    f"sensor_errors.{name}",
-                    "environments know no time_constant of a sensor: give it as a delay",
-                )
-            scales[v, c], offsets[v, c], lags[v, c] = defect.scale, defect.offset, defect.delay
-    return scales, offsets, lags
+        defects = [machine.sensor_errors.get(name, SensorError()) for name in names]
+        scales[v, :c] = [defect.scale for defect in defects]
+        offsets[v, :c] = [defect.offset for defect in defects]
+        lags[v, :c], ratios[v, :c] = sensor_delays(machine, names, plant.model.opt.timestep)
+    return scales, offsets, lags, ratios
 
 
 def _delays(plant: Plant, machines: list[Machine]) -> np.ndarray:
     delays = np.zeros((len(machines), AXES, 2))
     for v, machine in enumerate(machines):
-        for i, name in enumerate(plant.axes):
-            late = machine.axes[name].command_delay
-            delays[v, i] = split_delay(late, plant.model.opt.timestep)
+        delays[v, : len(plant.axes)] = command_delays(machine, plant.axes, plant.model.opt.timestep)
     return delays
 
 

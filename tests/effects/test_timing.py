@@ -217,7 +217,7 @@ def supply_and_reading(machine, error):
     rows = 600 // steps
     stepper, recorder = Stepper(plant, data, steps), Recorder(plant, rows)
     for row in range(rows):
-        recorder.take(row, 0.02 * row, data, stepper.past)
+        recorder.take(row, 0.02 * row, data, stepper.shown())
         stepper.advance(np.array([0.9, 0.9, 0.9]))
     record = recorder.record()
     supply = true_channels(plant, record)[0]["pressure_supply"]
@@ -232,7 +232,7 @@ def test_the_controller_sees_what_the_log_shows():
     begin_leapfrog(plant.model, data)
     stepper = Stepper(plant, data, 20)
     for tick in range(50):
-        seen.update(tick, data, stepper.past)
+        seen.update(tick, stepper)
         for i, axis in enumerate(plant.axes):
             assert seen.joint[i] == measured[f"angle.{axis}"][tick]
             assert seen.head[i] == measured[f"pressure_head.{axis}"][tick]

@@ -13,6 +13,7 @@ from hydrotele.machine.sensors import Sensor
 from hydrotele.run.run import prepare, run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.feedback import _convert_all, measure, sensor_errors
+from hydrotele.simulate.stepping import Stepper
 
 
 @pytest.fixture(scope="module")
@@ -135,10 +136,10 @@ def test_slow_sensors_are_held_for_the_controller():
     """50 Hz sensors under a 200 Hz controller: four ticks see one reading, then a new one."""
     plant, data, _, seen = prepare(load_scenario("zhu_up"))
     assert seen.every == 4 and seen.period == pytest.approx(0.02)
-    readings = []
+    readings, stepper = [], Stepper(plant, data, 5)
     for tick in range(9):
         data.qpos[plant.qpos] += 0.01
-        seen.update(tick, data)
+        seen.update(tick, stepper)
         readings.append(seen.joint.copy())
     assert np.ptp(readings[:4], axis=0).max() == 0.0 and np.ptp(readings[4:8], axis=0).max() == 0.0
     assert np.all(np.abs(readings[4] - readings[0] - 0.04) < 2 * np.radians(0.1) + 4e-4)
@@ -149,7 +150,7 @@ def test_the_log_shows_what_the_controller_saw():
     """Feedback and log share sampling, errors and converter, clipped pressures included."""
     scenario = load_scenario("steps", {"duration": "3.0"})
     plant, data, _, seen = prepare(scenario)
-    seen.update(0, data)
+    seen.update(0, Stepper(plant, data, 5))
     log = run_scenario(scenario).measured
     for i, axis in enumerate(plant.axes):
         assert log[f"pressure_head.{axis}"][0] == seen.head[i]

@@ -22,8 +22,10 @@ LATE = (
 )
 DEFECTS = (
     {"name": "angle_offset", "location": "boom", "parameters": {"offset": 0.01}},
-    {"name": "angle_delay", "location": "stick", "parameters": {"delay": 0.015}},
+    {"name": "angle_delay", "location": "stick", "parameters": {"delay": 0.0137}},
+    {"name": "angle_lag", "location": "swing", "parameters": {"time_constant": 0.03}},
     {"name": "pressure_delay", "location": "boom", "parameters": {"delay": 0.020}},
+    {"name": "pressure_lag", "location": "stick", "parameters": {"time_constant": 0.017}},
     {"name": "pressure_offset", "location": "stick.head", "parameters": {"offset": 2.0e5}},
 )
 
@@ -66,16 +68,15 @@ def test_readings_are_those_of_a_scenario_run():
     data = mujoco.MjData(plant.model)
     mujoco.mj_setState(plant.model, data, state_of(core), STATE)
     seen, stepper = feedback(plant, None, 0, 300, 200.0), Stepper(plant, data, 5)
-    seen.update(0, data, stepper.past)
+    seen.update(0, stepper)
     for tick, command in enumerate(commands(200)):
         e = core.memory[0]
         for own, theirs in (("joint", seen.joint), ("head", seen.head), ("rod", seen.rod)):
-            # delays here are whole control periods, so that nothing is interpolated
-            assert np.allclose(e[own][:3], theirs, rtol=1e-12, atol=0.0)
-        assert e["supply"] == pytest.approx(seen.supply, rel=1e-12)
+            assert np.array_equal(e[own][:3], theirs)
+        assert e["supply"] == seen.supply
         core.step(command)
         stepper.advance(command.astype(float))
-        seen.update(tick + 1, data, stepper.past)
+        seen.update(tick + 1, stepper)
 
 
 def test_real_sensors_err_within_their_accuracy_and_are_held():

@@ -15,10 +15,9 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorError
 from hydrotele.simulate.drive_side import flexible_axes
-from hydrotele.simulate.feedback import Past
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.record import Recorder, begin_leapfrog, true_channels
-from hydrotele.simulate.stepping import DelayLine
+from hydrotele.simulate.stepping import delayed_commands
 from tools.blind.plant import Recorded, shown
 
 RESTART = 0.5  # s
@@ -84,17 +83,13 @@ def _restarted(plant: Plant, truth: Log, commands: np.ndarray) -> dict[str, np.n
     every, steps = round(RESTART / period), round(period / TIMESTEP)
     recorder = Recorder(plant, len(truth))
     data = mujoco.MjData(plant.model)
-    line, past = DelayLine(plant, data.ctrl), Past(plant, data)
-    for row, command in enumerate(commands):
+    controls = delayed_commands(plant, data.ctrl, commands, steps).reshape(len(truth), steps, -1)
+    for row in range(len(commands)):
         if row % every == 0:
             data = initial_state(plant, _state(plant, truth, row))
             begin_leapfrog(plant.model, data)
-        recorder.take(row, truth.time[row], data, past)
-        if line.idle:
-            data.ctrl[:] = command
-            mujoco.mj_step(plant.model, data, nstep=steps)
-            continue
-        for control in line.controls(command, steps):
+        recorder.take(row, truth.time[row], data)
+        for control in controls[row]:
             data.ctrl[:] = control
             mujoco.mj_step(plant.model, data)
     return true_channels(plant, recorder.record())[0]
