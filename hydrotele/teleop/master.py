@@ -2,8 +2,7 @@
 
 Every axis of the joystick is a spring and damper to its centre, made by the coils about the handle
 (remote centre of compliance), whose stiffness or force follows what comes back from the machine.
-One kernel makes all structures, 200 times a second; `teleop.handle` holds the same laws of one axis
-for people.
+One kernel makes all structures, 200 times a second.
 """
 
 from typing import NamedTuple
