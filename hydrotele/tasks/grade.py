@@ -33,7 +33,7 @@ from hydrotele.soil.facts import (
     Soil,
     soil_parameters,
 )
-from hydrotele.soil.step import bucket_wrench, soil_step
+from hydrotele.soil.step import EdgeMotion, bucket_wrench, soil_step
 from hydrotele.soil.terrain import surface_height
 from hydrotele.tasks.memory import ARM, NUMBERS
 from hydrotele.tasks.observation import Field, reach
@@ -220,10 +220,8 @@ def tick_bed(f, e, w):
     rates = np.empty(2)
     edge_rates(f, e, w, rates)
     out = result_of(w)
-    soil_step(
-        soil_of(w), surface_of(w), loose_of(w), bucket_of(w), math.hypot(w.tip[0], w.tip[1]),
-        w.tip[2], rates[0], rates[1], attitude, f.period, out,
-    )  # fmt: skip
+    edge = EdgeMotion(math.hypot(w.tip[0], w.tip[1]), w.tip[2], rates[0], rates[1], attitude)
+    soil_step(soil_of(w), surface_of(w), loose_of(w), bucket_of(w), edge, f.period, out)
     bucket_wrench(
         out, w.tip, theta, w.xipos[3 * body : 3 * body + 3], w.xfrc[6 * body : 6 * body + 6]
     )

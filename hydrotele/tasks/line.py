@@ -2,8 +2,6 @@
 
 Straight in r and z, and in some episodes turned by the swing in proportion to the way. A line is
 drawn until all of it lies in the workspace and asks less of the drives than they have.
-
-What `StraightLine` is.
 """
 
 import math
@@ -31,7 +29,13 @@ _INNER, _LOW, _HIGH = 3.0, 0.1, 6.0  # m: beyond the tracks, above the ground
 _EFFORT = 0.9  # of the drives
 _DRAWS, _TRUE_SIZE = 240, 200  # draws of a line, the first ones of them at its true size
 _SMALLER = 0.7  # factor of size from one draw to the next after those
-_START, _WAY, _LENGTH, _SPEED, _ACCELERATION = 0, 4, 7, 8, 9
+# numbers of the goal: pose at the start (r, theta, z, attitude), change of the pose per metre
+_START, _PER_METRE, _LENGTH, _SPEED, _ACCELERATION = 0, 4, 7, 8, 9
+_R, _THETA, _Z, _ATTITUDE, _HEAD = range(ARM)
+# numbers of the observation, after those of the machine: pose, its rate, places ahead, errors
+_POSE, _RATE, _AHEAD = 0, 4, 7
+_ALONG = _AHEAD + 3 * len(PREVIEWS)
+_ACROSS = _ALONG + 1
 _QUICK = 1.0  # m/s, rad/s: bound of the rates wanted
 
 
@@ -76,11 +80,13 @@ def begin_line(f, e):
         if n >= _TRUE_SIZE:
             size *= _SMALLER  # the start lies inside, so that a small and slow line fits surely
         way, length = between(e, -math.pi, math.pi), size * between(e, _SHORT, _LONG)
-        g[_WAY], g[_WAY + 1], g[_WAY + 2] = math.cos(way), turn, math.sin(way)
+        g[_PER_METRE + _R], g[_PER_METRE + _THETA] = math.cos(way), turn
+        g[_PER_METRE + _Z] = math.sin(way)
         g[_LENGTH], g[_SPEED] = length, size * speed
         for c in range(3):
-            change[c] = length * g[_WAY + c]
-        if start[0] + change[0] < _INNER or not _LOW <= start[2] + change[2] <= _HIGH:
+            change[c] = length * g[_PER_METRE + c]
+        end = start + change
+        if end[_R] < _INNER or not _LOW <= end[_Z] <= _HIGH:
             continue
         if path_effort(f, start, change) * g[_SPEED] / length <= _EFFORT:
             break
@@ -129,10 +135,10 @@ def line_pose(g, time, pose, rate):
     """
     way, speed = line_way(g, time)
     for c in range(3):
-        pose[c] = g[_START + c] + way * g[_WAY + c]
-        rate[c] = speed * g[_WAY + c]
-    pose[3], pose[4] = g[_START + 3], 0.0
-    rate[3], rate[4] = 0.0, 0.0
+        pose[c] = g[_START + c] + way * g[_PER_METRE + c]
+        rate[c] = speed * g[_PER_METRE + c]
+    pose[_ATTITUDE], pose[_HEAD] = g[_START + _ATTITUDE], 0.0
+    rate[_ATTITUDE], rate[_HEAD] = 0.0, 0.0
 
 
 @compiled
@@ -151,8 +157,10 @@ def line_errors(g, wanted, r, theta, z):
 
     Source: this module.
     """
-    x, y, up = r - wanted[0], wanted[0] * turned(theta - wanted[1]), z - wanted[2]
-    ahead, aside, rise = g[_WAY], wanted[0] * g[_WAY + 1], g[_WAY + 2]
+    x, up = r - wanted[_R], z - wanted[_Z]
+    y = wanted[_R] * turned(theta - wanted[_THETA])
+    ahead, rise = g[_PER_METRE + _R], g[_PER_METRE + _Z]
+    aside = wanted[_R] * g[_PER_METRE + _THETA]
     along = (x * ahead + y * aside + up * rise) / math.sqrt(ahead**2 + aside**2 + rise**2)
     return along, math.sqrt(max(0.0, x * x + y * y + up * up - along * along))
 
@@ -176,14 +184,15 @@ def observe_line(f, e, out, at):
     line_pose(e.goal, now, pose, rate)
     pose_read(f, e, tip)
     for c in range(4):
-        out[at + c] = pose[c]
+        out[at + _POSE + c] = pose[c]
     for c in range(3):
-        out[at + 4 + c] = rate[c]
-    out[at + 16], out[at + 17] = line_errors(e.goal, pose, tip[0], tip[1], tip[2])
+        out[at + _RATE + c] = rate[c]
+    along, across = line_errors(e.goal, pose, tip[_R], tip[_THETA], tip[_Z])
+    out[at + _ALONG], out[at + _ACROSS] = along, across
     for p in range(len(PREVIEWS)):
         line_pose(e.goal, now + PREVIEWS[p], pose, rate)
         for c in range(3):
-            out[at + 7 + 3 * p + c] = pose[c]
+            out[at + _AHEAD + 3 * p + c] = pose[c]
 
 
 @compiled
@@ -211,7 +220,7 @@ def reward_line(f, e, w):
     line_pose(e.goal, e.tick * f.period, pose, rate)
     r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
     along, across = line_errors(e.goal, pose, r, theta, e.tip[2])
-    attitude = e.position[1] + e.position[2] + e.position[3] - pose[3]
+    attitude = e.position[1] + e.position[2] + e.position[3] - pose[_ATTITUDE]
     w.measures[0], w.measures[1], w.measures[2] = across, along, attitude
     return line_reward(across, along, attitude), False
 

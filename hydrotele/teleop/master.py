@@ -13,6 +13,7 @@ from hydrotele.core.compiled import compiled
 from hydrotele.machine.joystick import Joystick
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.teleop.axis_table import (
+    COLUMNS,
     COORDINATE,
     COUPLING,
     COUPLING_DAMPING,
@@ -32,6 +33,7 @@ from hydrotele.teleop.axis_table import (
     axis_table,
     flat_state,
     flattened,
+    split,
 )
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.compliance import GRAVITY, holding_wrench, turn_matrix
@@ -159,9 +161,18 @@ def unpack_master(flat):
 
     Source: order and shapes of Master.
     """
+    axis, rest = split(flat, 6 * COLUMNS)
+    mass, rest = split(rest, 1)
+    turning, rest = split(rest, 3)
+    below, rest = split(rest, 3)
+    handle, rest = split(rest, 3)
+    gravity, rest = split(rest, 3)
+    to_currents, rest = split(rest, 36)
+    most, rest = split(rest, 1)
+    step, kind = split(rest, 6)
     return Master(
-        flat[0:102].reshape(6, 17), flat[102:103], flat[103:106], flat[106:109], flat[109:112],
-        flat[112:115], flat[115:151].reshape(6, 6), flat[151:152], flat[152:158], flat[158:160],
+        axis.reshape(6, COLUMNS), mass, turning, below, handle, gravity, to_currents.reshape(6, 6),
+        most, step, kind,
     )  # fmt: skip
 
 
@@ -177,9 +188,20 @@ def unpack_master_state(flat):
 
     Source: order and shapes of MasterState.
     """
+    handle, rest = split(flat, 6)
+    speed, rest = split(rest, 6)
+    push, rest = split(rest, 6)
+    stiffness, rest = split(rest, 6)
+    hand, rest = split(rest, 6)
+    momentum, rest = split(rest, 6)
+    integral, rest = split(rest, 6)
+    before, rest = split(rest, 6)
+    currents, rest = split(rest, 6)
+    extra, rest = split(rest, 6)
+    limited, energy = split(rest, 1)
     return MasterState(
-        flat[0:6], flat[6:12], flat[12:18], flat[18:24], flat[24:30], flat[30:36], flat[36:42],
-        flat[42:48], flat[48:54], flat[54:60], flat[60:61], flat[61:63],
+        handle, speed, push, stiffness, hand, momentum, integral, before, currents, extra, limited,
+        energy,
     )  # fmt: skip
 
 
@@ -269,7 +291,7 @@ def reflect(numbers, packet, fresh, period, s):
                 slower = share * (packet[WANTED_SPEED, c] - packet[SPEED, c])
                 push -= fresh * (row[COUPLING] * behind + row[COUPLING_DAMPING] * slower)
             elif kind == FOUR_CHANNEL:
-                push += _four_channels(row, mode, x, v, kept, sign, packet, c, fresh, period, s, i)
+                push += _four_channels(row, mode, kept, packet, fresh, period, s, i)
             elif kind == IMPEDANCE:
                 felt = fresh * row[RATIO] * gain
                 stiff = min(row[MOST], max(row[LEAST], stiff + felt * packet[TASK_STIFFNESS, c]))
@@ -288,12 +310,13 @@ def reflect(numbers, packet, fresh, period, s):
 
 
 @compiled
-def _four_channels(row, mode, x, v, force, sign, packet, c, fresh, period, s, i):
+def _four_channels(row, mode, force, packet, fresh, period, s, i):
     """Force back and velocity back of the four-channel structures, and the master's own part.
 
     Under rate control `C2 = s / k_v` differentiates the force, below 20 rad/s.
     """
     gain, spring, damper = row[GAIN], row[COUPLING], row[COUPLING_DAMPING]
+    x, v, c, sign = s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
     place, speed = sign * packet[PLACE, c], sign * packet[SPEED, c]
     reflected = row[RATIO] * force
     if mode == POSITION:

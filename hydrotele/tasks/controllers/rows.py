@@ -26,22 +26,16 @@ from hydrotele.tasks.facts import Setup
 
 
 @compiled
-def servo_rows(
-    numbers, grid, table, reference, rate_ahead, joint, rate, head, rod, supply, load, out
-):  # fmt: skip
+def servo_rows(numbers, grid, table, reference, rate_ahead, measured, load, out):
     """Commands of n episodes by the joint servo.
 
     Args:
-        numbers: (k, 14) of `control.servo.servo_numbers`.
-        grid: (k, 2) of `control.drive_rows.drive_tables`.
+        numbers: (k, 14) of `control.servo.servo_parameters`.
+        grid: (k, 2) of `control.servo.drive_tables`.
         table: (k, POINTS, 3) of the same.
         reference: (n, k) [rad] or [m].
         rate_ahead: (n, k) wanted rates, ahead by the spool's lag [rad/s] or [m/s].
-        joint: (n, k) measured [rad] or [m].
-        rate: (n, k) measured [rad/s] or [m/s].
-        head: (n, k) measured head-side pressures [Pa].
-        rod: (n, k) measured rod-side pressures [Pa].
-        supply: (n,) measured [Pa].
+        measured: Measured with (n, k) arrays, (n,) supply pressures.
         load: (n, k) slow means of the drive forces, updated [N] or [N m].
         out: (n, k) commands, written [1] or in the drive's unit.
 
@@ -58,9 +52,12 @@ def servo_rows(
             grid, table, reference[i], rate_ahead[i], 1.0, velocity, arm, volume_head, volume_rod
         )
         drive = DriveReference(velocity, arm, volume_head, volume_rod)
-        measured = Measured(joint[i], rate[i], head[i], rod[i], supply[i])
         computed = ComputedForce(False, none, none)
-        servo_step(numbers, closed, drive, reference[i], measured, load[i], computed, out[i])
+        now = Measured(
+            measured.joint[i], measured.rate[i], measured.head[i], measured.rod[i],
+            measured.supply[i],
+        )  # fmt: skip
+        servo_step(numbers, closed, drive, reference[i], now, load[i], computed, out[i])
 
 
 @compiled
@@ -169,7 +166,7 @@ class ValveLaw:
         np.clip(self._integral, -_MOST, _MOST, out=self._integral)
         servo_rows(
             self._numbers, self._grid, self._table, np.ascontiguousarray(reference, float),
-            np.ascontiguousarray(rate_ahead + self._integral), joint, seen[:, self._rate], head,
-            rod, supply, self._load, self._out,
+            np.ascontiguousarray(rate_ahead + self._integral),
+            Measured(joint, seen[:, self._rate], head, rod, supply), self._load, self._out,
         )  # fmt: skip
         return self._out / limit
