@@ -5,8 +5,8 @@ python tools/environments_page.py --out docs/environments.md
 
 from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import set_up
+from hydrotele.envs.episode import ACTIONS
 from hydrotele.envs.facts import Setup
-from hydrotele.envs.memory import ACTIONS
 from hydrotele.envs.task import Options, Task
 from tools.study import options, publish
 

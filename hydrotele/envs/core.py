@@ -12,11 +12,10 @@ import numpy as np
 from hydrotele.control.resolved_motion import arm_axes
 from hydrotele.control.servo import drive_tables
 from hydrotele.core.errors import InputError
+from hydrotele.envs.episode import AXES, CHANNELS, MEASURES, MEMORY, NEXT_STEP, RESET, STEP, streams
 from hydrotele.envs.facts import Setup, make_facts, timing
 from hydrotele.envs.loop import advance
-from hydrotele.envs.memory import AXES, CHANNELS, MEASURES, MEMORY, NEXT_STEP, RESET, STEP
 from hydrotele.envs.observation import machine_fields
-from hydrotele.envs.rng import streams
 from hydrotele.envs.task import Options, Task
 from hydrotele.envs.variants import make_variants
 from hydrotele.machine.machine_file import load_machine

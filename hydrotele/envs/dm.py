@@ -10,8 +10,8 @@ import numpy as np
 from dm_control.mujoco import engine, wrapper
 from dm_env import specs
 
+from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.making import info_of, make_core
-from hydrotele.envs.memory import DISABLED
 from hydrotele.envs.observation import Field
 from hydrotele.envs.stage import FREE, Camera, Stage
 

@@ -9,7 +9,7 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.core import TaskCore
-from hydrotele.envs.memory import DISABLED
+from hydrotele.envs.episode import DISABLED
 
 SUCCESS = "success"  # a figure of this name says whether an episode succeeded
 

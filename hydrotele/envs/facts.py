@@ -8,8 +8,8 @@ from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.control.servo import drive_tables, servo_parameters
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
+from hydrotele.envs.episode import ACTIONS, FACTS, VALVE
 from hydrotele.envs.kinds import KINDS
-from hydrotele.envs.memory import ACTIONS, FACTS, VALVE
 from hydrotele.envs.observation import Field
 from hydrotele.envs.task import REAL, Options, Task
 from hydrotele.envs.variants import Variants, channels

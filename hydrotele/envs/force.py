@@ -12,8 +12,8 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import compiled
+from hydrotele.envs.episode import between
 from hydrotele.envs.observation import Field
-from hydrotele.envs.rng import between
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Task
 from hydrotele.kinematics.task import task_forward

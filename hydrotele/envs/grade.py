@@ -17,9 +17,8 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.envs.memory import ARM, NUMBERS
+from hydrotele.envs.episode import ARM, NUMBERS, between, draw
 from hydrotele.envs.observation import Field, reach
-from hydrotele.envs.rng import between, draw
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Task
 from hydrotele.kinematics.task import task_forward, task_jacobian

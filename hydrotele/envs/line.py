@@ -9,9 +9,8 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.memory import ARM
+from hydrotele.envs.episode import ARM, between, draw
 from hydrotele.envs.observation import Field, pose_fields, reach
-from hydrotele.envs.rng import between, draw
 from hydrotele.envs.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.envs.task import Task
 from hydrotele.kinematics.task import task_forward

@@ -17,8 +17,7 @@ from hydrotele.control.resolved_motion import follow_pose
 from hydrotele.control.servo import POINTS, ComputedForce, DriveReference, Measured, drive_row
 from hydrotele.control.tick import Controller, TickReference, control_tick
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.envs.kinds import begin_task, observe_task, reward_task, tick_task
-from hydrotele.envs.memory import (
+from hydrotele.envs.episode import (
     ARM,
     AXES,
     CHANNELS,
@@ -32,8 +31,9 @@ from hydrotele.envs.memory import (
     RESOLVED_MOTION,
     SAME_STEP,
     VALVE,
+    draw,
 )
-from hydrotele.envs.rng import draw
+from hydrotele.envs.kinds import begin_task, observe_task, reward_task, tick_task
 from hydrotele.hydraulics.parameters import SLOTS
 from hydrotele.kinematics.task import task_forward
 from hydrotele.simulate.feedback import Readings, Sensors, hold_readings, read_sensors

@@ -11,7 +11,7 @@ from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
-from hydrotele.envs.memory import DISABLED, NEXT_STEP, SAME_STEP
+from hydrotele.envs.episode import DISABLED, NEXT_STEP, SAME_STEP
 from hydrotele.envs.task import Options
 
 _STRICT = ConfigDict(strict=True, allow_inf_nan=False)

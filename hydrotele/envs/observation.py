@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.memory import ARM
+from hydrotele.envs.episode import ARM
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 

@@ -16,9 +16,8 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.memory import ARM
+from hydrotele.envs.episode import ARM, between, draw
 from hydrotele.envs.observation import Field, reach
-from hydrotele.envs.rng import between, draw
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Task
 from hydrotele.kinematics.task import task_forward

@@ -10,9 +10,8 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.memory import ARM
+from hydrotele.envs.episode import ARM, between
 from hydrotele.envs.observation import Field, pose_fields, reach
-from hydrotele.envs.rng import between
 from hydrotele.envs.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.envs.task import Task
 from hydrotele.kinematics.task import task_forward

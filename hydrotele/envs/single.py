@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.making import (
     action_space,
     check_mode,
@@ -19,7 +20,6 @@ from hydrotele.envs.making import (
     observation_space,
     with_rate,
 )
-from hydrotele.envs.memory import DISABLED
 from hydrotele.envs.stage import Camera, Stage
 from hydrotele.show.markers import write_markers
 from hydrotele.show.window import check_screen

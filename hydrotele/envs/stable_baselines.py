@@ -7,8 +7,8 @@ from gymnasium.spaces import Box
 
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.agent import AgentView
+from hydrotele.envs.episode import SAME_STEP
 from hydrotele.envs.making import action_space, make_core, observation_space
-from hydrotele.envs.memory import SAME_STEP
 
 try:
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore - an extra

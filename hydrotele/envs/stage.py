@@ -18,10 +18,10 @@ from mujoco.batch import MODEL_FIELDS
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.errors import InputError
 from hydrotele.envs.core import TaskCore
+from hydrotele.envs.episode import ARM
 from hydrotele.envs.force import FORCE_READ, reference_force
 from hydrotele.envs.grade import CELL, CELLS, FAR, NEAR, START, plane_height
 from hydrotele.envs.line import SETTLE, line_pose
-from hydrotele.envs.memory import ARM
 from hydrotele.envs.place import GOAL_PLACE, HALF_LENGTH, RADIUS
 from hydrotele.envs.track import track_reference
 from hydrotele.kinematics.task import ALONG, BASE_RADIUS, BOOM, SIDE, STICK, task_forward

@@ -8,7 +8,7 @@ import numpy as np
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.envs.memory import ARM
+from hydrotele.envs.episode import ARM
 from hydrotele.kinematics.task import REACHED, task_forward, task_inverse, task_rates
 from hydrotele.machine.machine import Machine
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from hydrotele.envs.memory import ACTIONS
+from hydrotele.envs.episode import ACTIONS
 from hydrotele.envs.observation import Field
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo

@@ -9,9 +9,8 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.memory import ARM, AXES
+from hydrotele.envs.episode import ARM, AXES, between, draw
 from hydrotele.envs.observation import Field, position_field, rate_field
-from hydrotele.envs.rng import between, draw
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 

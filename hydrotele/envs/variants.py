@@ -16,7 +16,7 @@ from mujoco.batch import MODEL_FIELDS
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.envs.memory import AXES, CHANNELS
+from hydrotele.envs.episode import AXES, CHANNELS
 from hydrotele.envs.task import Options, Task
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError

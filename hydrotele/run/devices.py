@@ -3,8 +3,8 @@
 A device says what it asks for now: six axes of the handle (x out, y left, z up, rx the head, ry the
 tool, positive curls in, rz), commands of further axes, and when to end. The viewer's window reports
 only that a key goes down, not that it comes up: so every press moves an axis on by a part of its
-range, where it stays until the space bar centres everything. Gamepad and SpaceMouse are read through
-SDL, which sees both as joysticks (pygame, the extra `drive`).
+range, where it stays until the space bar centres everything. Gamepad and SpaceMouse are read
+through SDL, which sees both as joysticks (pygame, the extra `drive`).
 
 A file is CSV, with a first line of names (`time`, any of x, y, z, rx, ry, rz, and further axes of
 the machine), then a row from each time [s] on; or YAML with `time`, `axes`, `commands`, and

@@ -43,6 +43,7 @@ from hydrotele.teleop.master import (
     MasterState,
     master,
     master_step,
+    push_back,
     unpack_master,
     unpack_master_state,
 )
@@ -62,7 +63,6 @@ from hydrotele.teleop.slave import (
     unpack_slave,
     unpack_slave_state,
 )
-from hydrotele.teleop.tip_over import push_back
 
 QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
 

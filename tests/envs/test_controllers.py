@@ -9,7 +9,7 @@ from hydrotele.envs.controllers.catalogue import CONTROLLERS, REFERENCES, make_c
 from hydrotele.envs.controllers.controller import columns
 from hydrotele.envs.controllers.track import Preview, track_controller
 from hydrotele.envs.core import TaskCore
-from hydrotele.envs.memory import DISABLED, SAME_STEP
+from hydrotele.envs.episode import DISABLED, SAME_STEP
 from hydrotele.envs.task import Options
 from hydrotele.envs.track import PREVIEWS, track_reference
 

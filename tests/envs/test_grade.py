@@ -11,6 +11,7 @@ from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.controllers.controller import columns
 from hydrotele.envs.controllers.grade import DUMP, Grade
 from hydrotele.envs.core import TaskCore
+from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.grade import (
     CELL,
     CELLS,
@@ -34,7 +35,6 @@ from hydrotele.envs.grade import (
     bed_parameters,
     grade_radii,
 )
-from hydrotele.envs.memory import DISABLED
 from hydrotele.envs.task import Options
 from hydrotele.kinematics.task import REACHED, task_inverse
 from hydrotele.soil.facts import (

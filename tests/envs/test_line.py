@@ -5,9 +5,9 @@ import pytest
 
 from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
+from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import full_rate
 from hydrotele.envs.line import SETTLE, line_pose, line_way
-from hydrotele.envs.memory import ARM
 from hydrotele.envs.task import Options
 from hydrotele.kinematics.task import REACHED, task_inverse
 

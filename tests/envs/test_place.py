@@ -11,7 +11,7 @@ from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.controllers.catalogue import make_controller
 from hydrotele.envs.controllers.place import PERIOD, course
 from hydrotele.envs.core import TaskCore
-from hydrotele.envs.memory import DISABLED, SAME_STEP
+from hydrotele.envs.episode import DISABLED, SAME_STEP
 from hydrotele.envs.place import (
     GOAL_PLACE,
     LEANING,

@@ -6,7 +6,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
-from hydrotele.envs.memory import ARM, DISABLED
+from hydrotele.envs.episode import ARM, DISABLED
 from hydrotele.envs.reach import SUCCESS, TIME
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Options

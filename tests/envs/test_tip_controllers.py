@@ -7,7 +7,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.controllers.catalogue import make_controller
 from hydrotele.envs.core import TaskCore
-from hydrotele.envs.memory import ACTIONS, DISABLED
+from hydrotele.envs.episode import ACTIONS, DISABLED
 from hydrotele.envs.task import Options
 
 COUNT = 4

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hydrotele.envs.controllers.tune import tune
+from hydrotele.envs.controllers.catalogue import tune
 
 
 def test_a_ridge_is_climbed_to_its_top_within_bounds():

@@ -1,6 +1,6 @@
-"""Controllers by name, the reference of each task by the task's name."""
+"""Reference controllers by name, and the search for their gains."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
@@ -46,3 +46,36 @@ def make_controller(name: str, setup: Setup) -> Controller:
     if setup.task.name not in REFERENCES:
         raise InputError(f"task {setup.task.name}", "has no reference controller yet")
     return REFERENCES[setup.task.name](setup)
+
+
+def tune(
+    value: Callable[[dict[str, float]], float], start: Mapping[str, float], factor: float = 1.5,
+    rounds: int = 2, gain: float = 0.0, most: Mapping[str, float] | None = None,
+) -> tuple[dict[str, float], float]:  # fmt: skip
+    """Better gains by a search along one of them at a time.
+
+    Args:
+        value: of a set of gains, the more the better; always on the same episodes.
+        start: gains to begin with, all positive.
+        factor: by which a gain is changed, again as long as that helps.
+        rounds: through all gains.
+        gain: in value that a change must bring.
+        most: largest sensible values.
+
+    Returns:
+        (gains, their value).
+    """
+    best, score = dict(start), value(dict(start))
+    for _ in range(rounds):
+        for name in start:
+            for step in (factor, 1.0 / factor):
+                moved = False
+                while True:
+                    trial = min(best[name] * step, (most or {}).get(name, float("inf")))
+                    found = value({**best, name: trial}) if trial != best[name] else score
+                    if found <= score + gain:
+                        break
+                    best[name], score, moved = trial, found, True
+                if moved:
+                    break
+    return best, score

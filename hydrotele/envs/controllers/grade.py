@@ -9,9 +9,9 @@ from hydrotele.control.resolved_motion import COORDINATES, arm_facts
 from hydrotele.envs.controllers.controller import Controller, columns, position_columns, step_time
 from hydrotele.envs.controllers.rows import ValveLaw, inverse_rows
 from hydrotele.envs.controllers.track import Asked
+from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import ACCELERATION, POSE_ACCELERATIONS, Setup, full_rate
 from hydrotele.envs.grade import FAR, MIDDLE, NEAR, POINTS, grade_radii
-from hydrotele.envs.memory import ARM
 
 _INTEGRAL = 2.0  # 1/s^2
 _JOINTS = (6.0, 1.0)  # 1/s: of the model's place to the goal, of the model to what is measured

@@ -12,8 +12,8 @@ from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.envs.controllers.controller import Controller, columns, position_columns, step_time
 from hydrotele.envs.controllers.rows import ValveLaw, inverse_rows
 from hydrotele.envs.controllers.track import Asked
+from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import ACCELERATION, POSE_ACCELERATIONS, Setup, full_rate
-from hydrotele.envs.memory import ARM
 
 ABOVE, TAKE, CARRY, LAY = 2.5, 1.34, 2.6, 1.36  # m: heights of the stick's pin over the ground
 SWAY = 0.03  # m by which the closing jaw pushes the grapple to its own side

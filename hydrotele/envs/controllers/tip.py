@@ -12,9 +12,9 @@ from hydrotele.control.resolved_motion import COORDINATES, arm_facts
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller, columns, position_columns
 from hydrotele.envs.controllers.rows import ValveLaw, inverse_rows
+from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import Setup, full_rate
 from hydrotele.envs.line import PREVIEWS
-from hydrotele.envs.memory import ARM
 
 _LINE_GAIN = 0.5  # 1/s
 _REACH_GAINS = (1.0, 0.45, 1.0, 1.0, 1.0)  # 1/s of r, theta, z, attitude, head

@@ -11,13 +11,13 @@ from hydrotele.envs.controllers.controller import (
     step_time,
 )
 from hydrotele.envs.controllers.rows import ValveLaw, forward_rows
+from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import (
     ACCELERATION,
     POSE_ACCELERATIONS,
     Setup,
     full_rate,
 )
-from hydrotele.envs.memory import ARM
 from hydrotele.envs.track import PREVIEWS
 from hydrotele.scenario.scenario import Servo
 
