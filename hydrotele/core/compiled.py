@@ -5,9 +5,13 @@ contains functions and constants of other files, so each module has a cache fold
 of its own source and of all sources of the package that it imports, directly or not. A module that
 changes leaves the caches of the others alone, and checkouts with the same sources share them.
 A cache is code: it lies in the user's cache folder, and no one else may write there.
+
+Compiling is slow, so one process compiles a function and others that need it meanwhile wait for
+it, and callbacks for C are compiled when their address is first asked for, not when imported.
 """
 
 import contextlib
+import fcntl
 import functools
 import hashlib
 import logging
@@ -24,7 +28,7 @@ from typing import Any
 from numba import cfunc, njit
 from numba.core import config as _numba_config
 from numba.core import event
-from numba.core.caching import UserProvidedCacheLocator
+from numba.core.caching import FunctionCache, UserProvidedCacheLocator
 
 _CONFIG: Any = _numba_config  # its settings are made at run time
 _UNUSED = 30 * 24 * 3600.0  # s, after which the cache of other sources is removed
@@ -59,17 +63,39 @@ def inlined(function):
 
 def _compile(function, **options):
     with _caching(function.__module__) as cache:
-        return njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
+        made = njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
+        if cache:
+            made._cache = _SharedCache(function)
+        return made
 
 
 def callback(signature):
-    """Decorator that compiles a function for C to call, cached on disk where that is possible."""
+    """Decorator that makes a `Callback` of a function, for C to call."""
+    return lambda function: Callback(function, signature)
 
-    def decorate(function):
-        with _caching(function.__module__) as cache:
-            return cfunc(signature, cache=cache, error_model="numpy")(function)
 
-    return decorate
+class Callback:
+    """A function for C to call: compiled when first asked for, cached on disk where possible."""
+
+    def __init__(self, function, signature) -> None:
+        self._function, self._signature = function, signature
+
+    @functools.cached_property
+    def _compiled(self) -> Any:
+        with _caching(self._function.__module__) as cache, contextlib.ExitStack() as stack:
+            if cache:
+                stack.callback(_release, _lock(_CONFIG.CACHE_DIR, self._function))
+            return cfunc(self._signature, cache=cache, error_model="numpy")(self._function)
+
+    @property
+    def address(self) -> int:
+        """Where its machine code begins."""
+        return self._compiled.address
+
+    @property
+    def ctypes(self) -> Any:
+        """The same as a ctypes function."""
+        return self._compiled.ctypes
 
 
 def cache_folder() -> Path | None:
@@ -153,6 +179,58 @@ class Locator(UserProvidedCacheLocator):
     def get_source_stamp(self):
         """The folder is of one state of the sources, so there is nothing to compare."""
         return ""
+
+
+class _SharedCache(FunctionCache):
+    """A function's cache, in which one process at a time compiles what is missing."""
+
+    _held: int | None = None
+
+    def load_overload(self, sig, target_context):
+        """Compiled code of a signature; None where this process has to compile it."""
+        found = super().load_overload(sig, target_context)
+        if found is None and self._held is None:
+            self._held = _lock(self.cache_path, self._py_func)
+            found = super().load_overload(sig, target_context)
+            if found is not None:
+                self._let_go()
+        return found
+
+    def save_overload(self, sig, data):
+        """Keep compiled code, for other processes, too."""
+        try:
+            super().save_overload(sig, data)
+        finally:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        _release(self._held)
+        self._held = None
+
+
+def _lock(folder: str, function) -> int | None:
+    """Lock a function against other processes; None where that cannot be had within a minute."""
+    path = Path(folder, f"{function.__name__}-{function.__code__.co_firstlineno}.lock")
+    try:
+        handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    except OSError:
+        return None
+    end = time.monotonic() + _PATIENT
+    while time.monotonic() < end:
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return handle
+        time.sleep(0.05)
+    os.close(handle)
+    return None
+
+
+def _release(handle: int | None) -> None:
+    if handle is not None:
+        os.close(handle)
+
+
+_PATIENT = 60.0  # s; who compiles for longer, or has failed and lives on, is not waited for
 
 
 @contextlib.contextmanager

@@ -86,6 +86,31 @@ def test_a_changed_module_drops_the_caches_of_those_that_use_it_and_no_others(tm
     assert _run(elsewhere, cache, code)[0] == ["1.0", "12.0", "1", "1"]
 
 
+def test_two_processes_compile_a_function_once(tmp_path):
+    package = tmp_path / "hydrotele"
+    shutil.copytree(PACKAGE / "core", package / "core")
+    (package / "__init__.py").write_text("")
+    (package / "made.py").write_text(
+        "import numpy as np\nfrom hydrotele.core.compiled import callback, compiled\n\n"
+        "@compiled\ndef law(x):\n    return np.linalg.solve(np.eye(3), x)\n\n"
+        "@callback('float64(float64)')\ndef twice(x):\n    return 2.0 * x\n"
+    )
+    code = (
+        "import numpy as np; from hydrotele.made import law, twice\n"
+        "assert twice.ctypes(2.0) == 4.0\n"
+        "law(np.ones(3)); print(len(law.stats.cache_hits), twice._compiled._cache_hits)"
+    )
+    both = [
+        subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stdout=subprocess.PIPE,
+                         env={**os.environ, "PYTHONPATH": str(tmp_path),
+                              "XDG_CACHE_HOME": str(tmp_path / "cache")})
+        for _ in range(2)
+    ]  # fmt: skip
+    hits = [one.communicate()[0].split() for one in both]
+    assert sorted(laws for laws, _ in hits) == [b"0", b"1"]
+    assert sorted(callbacks for _, callbacks in hits) == [b"0", b"1"]
+
+
 def test_the_first_compilation_is_announced(tmp_path):
     code = (
         "from hydrotele.core import compiled as c; c._PATIENCE = 0.0\n"
