@@ -416,7 +416,7 @@ def _trust_region(search: _Search, begin: _Searched, most: int) -> _Searched:
     found = scipy.optimize.least_squares(
         lambda u: search.rows(search.full(base, u)), np.zeros(len(search.free)),
         jac=lambda u: search.matrix(problem.matrix(search.full(base, u))),  # type: ignore
-        ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=most,
+        method="lm", ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=10 * most,
     )  # fmt: skip
     good = found.status > 0
     said = "converged" if good else f"not converged after {most} steps: increase max_iterations"
