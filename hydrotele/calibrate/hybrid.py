@@ -17,7 +17,6 @@ import scipy.stats
 
 from hydrotele.calibrate.estimation import ParameterFit, Prior, identifiable, least_squares
 from hydrotele.calibrate.hybrid_data import Measurement
-from hydrotele.calibrate.poses import leave_one_out
 from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import COMBINATION, FULL, Identifiability
 from hydrotele.kinematics.hybrid import (
@@ -37,6 +36,7 @@ from hydrotele.kinematics.hybrid_errors import (
 )
 
 _STEP = 1e-2  # of a parameter's size, for central differences: errors are of its square
+_LEFT_OUT = 200  # poses that are left out one by one at most
 _MOST_OUT = 0.2  # share of poses that may be left out as wrong
 _WRONG = 1e-6  # probability under which a pose's residual is no noise
 _BETTER = 0.95  # share of the other model's error at which a model is preferred
@@ -397,34 +397,29 @@ def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
 
 
 def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
-    """Prediction errors of every pose by a calibration without it.
+    """Prediction errors of every pose by a calibration without it; of 200 poses where there are more.
 
-    The calibration without a pose is one Gauss-Newton step from the one with all: parameters change
-    by less than their standard deviations, over which the equations are straight.
+    Parameters change by less than their standard deviations, over which the equations are straight:
+    with the Jacobian Q R, the six rows Q_k and residuals r_k of the pose, the change is
+    R^-1 Q_k' (1 - Q_k Q_k')^-1 r_k. NaN where the calibration needs the pose.
     """
     free = np.flatnonzero(~fit.held)
     n = len(eq.measurement)
-    rows = np.arange(LEGS * n).reshape(n, LEGS)
-    matrix = fit.jacobian[:, free] * fit.scales[free]
-
-    def without(places: Sequence[int]) -> Hybrid:
-        kept = rows[np.array(places)].ravel()
-        step = np.linalg.lstsq(matrix[kept], -fit.residual[kept], rcond=1e-12)[0]
+    q, r = np.linalg.qr(fit.jacobian[:, free] * fit.scales[free])
+    q, residual = q.reshape(n, LEGS, -1), fit.residual.reshape(n, LEGS)
+    result = np.full((2, n), np.nan)
+    for k in np.unique(np.linspace(0, n - 1, min(n, _LEFT_OUT)).astype(int)):
+        inside = np.eye(LEGS) - q[k] @ q[k].T
+        if np.linalg.eigvalsh(inside)[0] < 1e-9:
+            continue
+        step = np.linalg.solve(r, q[k].T @ np.linalg.solve(inside, residual[k]))
         values = fit.values.copy()
         values[free] += step * fit.scales[free]
-        return corrected(eq.model, eq.full(values))
-
-    found: dict[int, Errors] = {}
-
-    def judge(robot: Hybrid, place: int) -> float:
-        found[place] = pose_errors(robot, eq.measurement.subset(np.array([place])))
-        return float(found[place].position[0])
-
-    if LEGS * (n - 1) < len(free):
-        return Errors(np.full(n, np.nan), np.full(n, np.nan))
-    leave_one_out(range(n), without, judge)
-    return Errors(np.concatenate([found[k].position for k in range(n)]),
-                  np.concatenate([found[k].orientation for k in range(n)]))  # fmt: skip
+        robot = corrected(eq.model, eq.full(values))
+        found = pose_errors(robot, eq.measurement.subset(np.array([k])))
+        result[:, k] = found.position[0], found.orientation[0]
+    known = ~np.isnan(result[0])
+    return Errors(*(result[:, known] if known.any() else result))
 
 
 def subset(calibration: Calibration) -> Equations:
