@@ -47,6 +47,7 @@ POSES, HELDOUT, FACTS = "poses", "heldout", "measurement.yaml"
 _KINDS = (".csv", ".parquet")
 _MARGIN = 0.2  # of a joint's range, that a reading may lie beyond it
 _FAR = 0.1  # m: legs that differ by more from the nominal robot are of another one
+_WIRE = 1e-4  # m: of a wire where nothing is stated; only its ratio to the other errors counts
 _SAME = 1e-5  # m or rad: poses that differ by less are one pose, measured again
 
 
@@ -120,6 +121,33 @@ class Measurement:
         return len(np.unique(np.round(whole / _SAME), axis=0))
 
 
+def measurement_of_wires(
+    robot: Hybrid, joints: np.ndarray, legs: np.ndarray, lengths: np.ndarray, wires: Wires,
+    noise: Mapping[str, float], source: str,
+) -> Measurement:  # fmt: skip
+    """A measurement from readings of carriage, legs and wires.
+
+    Args:
+        robot: nominal; its forward kinematics select among the solutions of the wires.
+        joints: (N, n) [m] or [rad].
+        legs: (N, 6) [m].
+        lengths: (N, 6) of the wires [m].
+        wires: where they are.
+        noise: standard deviations by the names of `Noise`, in SI.
+        source: what to call it.
+
+    Raises:
+        NoIntersection: the wires do not meet.
+        Unreachable: legs are not of this robot.
+    """
+    pose = pose_of_wires(wires, lengths, forward(robot, joints, legs))
+    stated = Noise(**noise)
+    of_pose = pose_covariance(wires, pose, stated.wire or _WIRE)
+    whole = _covariance(robot, joints, pose, of_pose, stated)
+    known = stated.wire is not None and stated.leg is not None
+    return Measurement(source, np.arange(len(legs)), joints, legs, pose, whole, known)
+
+
 def robot_file(folder: Path) -> Path | None:
     """The nominal robot that lies in a folder of measurements, None without one."""
     path = folder / "robot.yaml"
@@ -174,7 +202,7 @@ def _measurement(file: Path, facts: MeasurementFacts, robot: Hybrid) -> Measurem
     if "wire.1" in columns:
         pose = _pose_from_wires(table, columns, facts, robot, joints, legs)
         assert facts.wires is not None
-        of_pose = pose_covariance(facts.wires, pose, noise.wire or 1e-4)
+        of_pose = pose_covariance(facts.wires, pose, noise.wire or _WIRE)
         known = noise.wire is not None
     else:
         place = np.column_stack([columns[f"pose.{c}"] for c in COORDINATES])

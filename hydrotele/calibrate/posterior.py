@@ -44,14 +44,15 @@ class Evolution:
 
 
 def evolve(
-    cost: Cost, low: np.ndarray, high: np.ndarray, *, seed: int = 0, population: int = 4,
-    generations: int = 20000, agreement: float = 1e-4,
+    cost: Cost, low: np.ndarray, high: np.ndarray, *, seed: int = 0, population: int = 6,
+    generations: int = 20000, agreement: float = 1e-5,
 ) -> Evolution:  # fmt: skip
     """Minimise by differential evolution; no gradient, no start.
 
-    `currenttobest1bin` with crossover 1, so that nothing depends on how axes are turned: errors of
-    a calibration are strongly correlated. The search ends when the costs of the population differ
-    by less than `agreement`.
+    `randtobest1bin` with crossover 0.95 and a mutation that varies: errors of a calibration are
+    strongly correlated, so that most coordinates must change together, and a population that only
+    follows its best member agrees too early. The search ends when the costs of the population
+    differ by less than `agreement`.
 
     Args:
         cost: of (S, p) parameter sets, such as half the sum of squared weighted residuals.
@@ -61,7 +62,7 @@ def evolve(
         population: members per parameter.
         generations: at most.
         agreement: spread of costs in the population that ends the search; with a cost in units of
-            log likelihood 1e-4 leaves parameters within 1 % of their standard deviations.
+            log likelihood the best is then within some 1e-2 of the minimum.
 
     Returns:
         What was found, without a gradient search at the end.
@@ -82,8 +83,8 @@ def evolve(
         return bool(np.ptp(intermediate_result.population_energies) < agreement)
 
     found = differential_evolution(
-        batch, list(zip(low, high, strict=True)), strategy="currenttobest1bin",
-        mutation=(0.4, 0.9), recombination=1.0, popsize=population, maxiter=generations, tol=0.0,
+        batch, list(zip(low, high, strict=True)), strategy="randtobest1bin",
+        mutation=(0.4, 0.9), recombination=0.95, popsize=population, maxiter=generations, tol=0.0,
         polish=False, init="latinhypercube", rng=np.random.default_rng(seed), vectorized=True,
         updating="deferred", callback=watch,
     )  # fmt: skip
@@ -161,7 +162,7 @@ def sample_posterior(
         names: the p parameters.
         steps: of every walker after the burn-in.
         burn: steps that are thrown away; by default half of `steps`.
-        walkers: number of chains; by default the least even number from 3 p.
+        walkers: number of chains; by default 2 p + 2, the least that emcee takes and two more.
         seed: of the random numbers.
         thin: of the steps that are kept.
 
@@ -176,7 +177,7 @@ def sample_posterior(
     p = len(names)
     burn = steps // 2 if burn is None else burn
     rng = np.random.default_rng(seed)
-    count = walkers or max(2 * ((3 * p + 1) // 2), 2 * p + 2)
+    count = walkers or 2 * p + 2
     if np.ndim(start) == 2:
         begin = np.asarray(start, float)
     elif np.ndim(spread) == 2:
