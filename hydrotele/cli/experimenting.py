@@ -8,9 +8,10 @@ from hydrotele.cli.console import notes, out, print_json, stages
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.experiments.finding import Finding
+from hydrotele.experiments.wang2012 import wang2012
 from hydrotele.experiments.zhu1994 import zhu1994
 
-SERIES = ("zhu1994",)
+SERIES = {"wang2012": wang2012, "zhu1994": zhu1994}
 
 
 def experiments_to_folder(
@@ -37,7 +38,7 @@ def experiments_to_folder(
     if target:
         check_target(target, "experiments")
     with stages(f"experiments {name}", as_json) as progress:
-        findings = zhu1994(seeds, jobs, progress)
+        findings = SERIES[name](seeds, jobs, progress)
     if target:
         with whole_folder(target, "experiments") as folder:
             _write(folder, name, seeds, findings)
