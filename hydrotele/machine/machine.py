@@ -142,18 +142,24 @@ class Arm(Facts):
 
 
 class Machine(Facts):
-    """Everything the simulator, the controller and the learning code know of a machine."""
+    """Everything the simulator, the controller and the learning code know of a machine.
+
+    `sensed_joints` are undriven joints with an angle sensor, such as those of a calibrator;
+    `attached` names MJCF files whose bodies hang on a body of `mjcf`, by that body's name.
+    """
 
     name: Name
     description: str = ""
     source: str = ""
     mjcf: str | None = None
+    attached: dict[Name, str] = {}
     folder: str = ""
     tool: Name = "none"
     tools: tuple[str, ...] = ("none",)
     gravity: Vector = (0.0, 0.0, -9.81)
     links: dict[Name, Link]
     axes: dict[Name, Axis]
+    sensed_joints: tuple[Name, ...] = ()
     closures: dict[Name, Closure] = {}
     supply: Supply | None = None
     loads: dict[Name, LoadCylinder] = {}
@@ -230,6 +236,7 @@ class Machine(Facts):
     def sensed_channels(self) -> tuple[str, ...]:
         """Channels that sensors of this machine can show."""
         names = [f"{self.position_kind(axis)}.{axis}" for axis in self.axes]
+        names += [f"angle.{joint}" for joint in self.sensed_joints]
         names += [f"length.{name}" for name, axis in self.axes.items() if axis.cylinder]
         for side in ("head", "rod"):
             names += [f"pressure_{side}.{axis}" for axis in self.hydraulic_axes]
@@ -254,6 +261,10 @@ class Machine(Facts):
         for name, closure in self.closures.items():
             for end in (closure.a, closure.b):
                 _expect(end.link, known, f"closures.{name}")
+        for joint in self.sensed_joints:
+            _expect(joint, joints, "sensed_joints")
+            if joints[joint].type != "hinge" or joint in self.axes:
+                raise ValueError(f"sensed_joints: {joint} must be a hinge, and no axis' name")
         for joint in self.home:
             _expect(joint, joints, "home")
             low, high = joints[joint].range or (-np.inf, np.inf)
