@@ -309,7 +309,7 @@ def _sensed(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.nda
     values = {}
     for i, name in enumerate(plant.axes):
         values[f"{plant.machine.position_kind(name)}.{name}"] = qpos[:, plant.qpos[i]]
-    for name in plant.machine.sensed_joints:
+    for name in plant.machine.undriven_sensed_joints:
         values[f"angle.{name}"] = qpos[:, plant.model.joint(name).qposadr[0]]
     for i, name in enumerate(plant.axes):
         if plant.machine.axes[name].cylinder:
