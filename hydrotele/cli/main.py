@@ -20,6 +20,7 @@ from typing import Annotated
 
 import typer
 
+from hydrotele.cli.calibrating import app as calibrate_app
 from hydrotele.core.errors import InputError
 
 
@@ -237,6 +238,7 @@ app = typer.Typer(
 
 analyse_app = typer.Typer(help="Analyse by formula what others simulate.", no_args_is_help=True)
 app.add_typer(analyse_app, name="analyse")
+app.add_typer(calibrate_app, name="calibrate")
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 MachineName = Annotated[

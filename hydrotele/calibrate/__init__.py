@@ -1,0 +1,1 @@
+"""Kinematic calibration: parameters of mechanisms from poses, joint angles and closed chains."""

@@ -1,0 +1,507 @@
+"""Nonlinear least squares for calibration: scaled parameters, priors, identifiable set, intervals.
+
+The search is `scipy.optimize.least_squares` on parameters that are divided by their expected sizes.
+Parameters that the equations do not tell are found first and keep their start values; those that
+are told in combination only are represented by one of them. Levenberg-Marquardt with truncated
+singular values, which SciPy has not, is here, too.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import scipy.optimize
+import scipy.sparse
+import scipy.stats
+
+from hydrotele.core.errors import InputError
+from hydrotele.identify.identifiability import (
+    COMBINATION,
+    FULL,
+    Identifiability,
+    identifiability,
+    identifiable_in_noise,
+)
+
+Residual = Callable[[np.ndarray], np.ndarray]
+Jacobian = Callable[[np.ndarray], np.ndarray | scipy.sparse.spmatrix]
+Selection = Literal["structure", "noise", "none"]
+
+TRUNCATION = (0.05, 0.01, 0.002, 4e-4, 8e-5, 1.6e-5, 3.2e-6)
+"""Shares of the largest singular value: 5 % to begin with, lowered on convergence."""
+
+_WHERE = "calibration"
+_COMPLEX_STEP = 1e-30  # times a parameter's size; no difference is formed, so nothing is lost
+_CENTRAL = np.finfo(float).eps ** (1.0 / 3.0)  # balances rounding and the third derivative
+_CONVERGED = 1e-10  # of a step in units of the sizes
+_HALVINGS = 12
+_NOISE_ROUNDS, _NOISE_KNOWN = 30, 1e-4  # repeats until the noise changes by less than this share
+_EXACT = 1e-100  # a residual that is zero
+_NORMAL95 = 1.959964
+_UNSETTLED = "noise and prior do not agree: give sigma"
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of p parameters before the measurement.
+
+    Attributes:
+        mean: (p,) in the parameters' units.
+        std: (p,) standard deviations; infinite for parameters of which nothing is known.
+    """
+
+    mean: np.ndarray
+    std: np.ndarray
+
+
+@dataclass(frozen=True)
+class ParameterFit:
+    """Fitted parameters; p of them from m equations.
+
+    Attributes:
+        names: the p parameters.
+        values: (p,) fitted; those that the equations do not tell as they were at the start.
+        scales: (p,) their expected sizes.
+        covariance: (p, p) of the values; rows and columns of held parameters are zero.
+        held: (p,) whether a parameter kept its start value.
+        residual: (m,) at the solution, not weighted.
+        noise: standard deviation of one equation's error, estimated from the residual.
+        chi: estimated over given standard deviation; near 1 where `sigma` is right, 1 without it.
+        freedom: degrees of freedom, equations less (effective) parameters.
+        rank: number of directions that were fitted.
+        iterations: evaluations of the Jacobian.
+        evaluations: evaluations of the residual, without those for differences.
+        converged: whether the search ended by its tolerances.
+        status: how it ended and, if badly, what to do about it.
+        told: which parameters the data (without the prior) tell.
+        jacobian: (m, p) at the solution, not weighted.
+        critical: quantile by which standard deviations make 95 % intervals.
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    scales: np.ndarray
+    covariance: np.ndarray
+    held: np.ndarray
+    residual: np.ndarray
+    noise: float
+    chi: float
+    freedom: float
+    rank: int
+    iterations: int
+    evaluations: int
+    converged: bool
+    status: str
+    told: Identifiability
+    jacobian: np.ndarray
+    critical: float
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """(p,) standard deviations; infinite for held parameters, of which nothing was learnt."""
+        return np.where(self.held, np.inf, np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
+
+    @property
+    def intervals(self) -> np.ndarray:
+        """(p, 2) 95 % intervals; of a combination's representative, with the others held."""
+        reach = self.critical * self.deviations
+        return np.column_stack([self.values - reach, self.values + reach])
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residual."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    def value(self, name: str) -> float:
+        """One parameter by its name."""
+        return float(self.values[self.names.index(name)])
+
+
+def least_squares(
+    residual: Residual, start: Sequence[float] | np.ndarray, names: Sequence[str],
+    scales: Sequence[float] | np.ndarray, *, sigma: float | np.ndarray | None = None,
+    prior: Prior | None = None, jac: Jacobian | Literal["cs"] | None = None,
+    sparsity: np.ndarray | scipy.sparse.spmatrix | None = None,
+    truncation: Sequence[float] | None = None, select: Selection = "structure",
+    first: Sequence[str] = (), max_iterations: int = 100,
+) -> ParameterFit:  # fmt: skip
+    """Fit parameters to equations `residual(x) = noise`.
+
+    Without `sigma` the noise is one standard deviation for all equations, estimated from the
+    residuals; with a prior this is repeated until it agrees with the weight that the prior had.
+
+    Args:
+        residual: (p,) parameters to (m,) residuals; for `jac="cs"` it accepts complex ones.
+        start: (p,) where the search begins.
+        names: the p parameters.
+        scales: (p,) their expected sizes, positive: a millimetre, a milliradian.
+        sigma: standard deviation of the equations' errors, one or (m,); None to estimate it.
+        prior: what was known before.
+        jac: function of (p,) to (m, p), dense or sparse; `cs` for complex steps; None for central
+            differences.
+        sparsity: (m, p), nonzero where a residual depends on a parameter, for differences.
+        truncation: shares of the largest singular value below which directions of a step are left
+            out, one after the other, each until convergence: `TRUNCATION`. None for SciPy's trust
+            region.
+        select: which parameters are held: those that the equations do not tell at all
+            (`structure`), also those whose effect is below the noise (`noise`), or `none`.
+        first: parameters that shall stand for a combination if they can.
+        max_iterations: of the search.
+
+    Returns:
+        The fit.
+
+    Raises:
+        InputError: shapes do not fit, sizes are not positive, a residual is not finite, there are
+            too few equations, or they tell nothing.
+
+    >>> x = np.linspace(0.0, 1.0, 50)
+    >>> y = 2.0 + 3.0 * x
+    >>> fit = least_squares(lambda p: p[0] + p[1] * x + p[2] - y, [0.0, 0.0, 0.0],
+    ...                     ["a", "b", "c"], [1.0, 1.0, 1.0], jac="cs")
+    >>> fit.values.round(9).tolist(), fit.told.text(0)
+    ([2.0, 3.0, 0.0], 'a + c')
+
+    Source: Khoshzaban 1992, 3.37-3.43 (truncation, 5 % lowered on convergence); Khalil and Gautier
+    1991 (parameters that equations tell); Nocedal and Wright 2006, chapter 10.
+    """
+    problem = _Problem(residual, start, names, scales, jac, sparsity)
+    begin = problem.start
+    rows, matrix = problem.at(begin)
+    known = sigma is not None
+    weight = _weights(sigma, len(rows))
+    told = _structure(matrix * weight[:, None], problem, first)
+    free = np.ones(len(begin), bool) if select == "none" else _places(told)
+    if prior is not None:
+        free |= np.isfinite(prior.std)
+    _check_count(len(rows), int(free.sum()), prior is not None, known)
+    noise, searched = 1.0, _Searched(begin)
+    while True:
+        search = _Search(problem, weight / noise, prior, free)
+        searched = search.run(searched, truncation, max_iterations)
+        left, end = problem.at(searched.x)
+        freedom = len(left) - search.effective(end)
+        chi = float(np.sqrt(np.sum((left * weight) ** 2) / max(freedom, 1e-12)))
+        before, noise = noise, noise if known else max(chi, _EXACT)
+        weak = np.zeros(len(begin), bool)
+        if select == "noise" and chi > _EXACT:
+            told = _in_noise(end * (weight / noise)[:, None], problem, told)
+            weak = free & ~_places(told)
+        if weak.any():
+            free = free & ~weak
+            searched = replace(searched, x=np.where(weak, begin, searched.x))
+        elif known or prior is None or abs(noise - before) < _NOISE_KNOWN * noise:
+            break
+        if searched.rounds >= _NOISE_ROUNDS:
+            searched = replace(searched, status=_UNSETTLED, converged=False)
+            break
+    covariance, rank = _Search(problem, weight / noise, prior, free).covariance(end, truncation)
+    return ParameterFit(
+        names=tuple(names), values=searched.x, scales=problem.scales, covariance=covariance,
+        held=~free, residual=left, noise=chi * float(np.mean(1.0 / weight)),
+        chi=chi if known else 1.0, freedom=float(freedom), rank=rank,
+        iterations=searched.iterations, evaluations=searched.evaluations,
+        converged=searched.converged, status=searched.status, told=told, jacobian=end,
+        critical=_NORMAL95 if known else float(scipy.stats.t.ppf(0.975, max(freedom, 1.0))),
+    )  # fmt: skip
+
+
+def identifiable(
+    jacobian: np.ndarray, names: Sequence[str], scales: Sequence[float] | np.ndarray, *,
+    sigma: float | np.ndarray | None = None, first: Sequence[str] = (),
+) -> Identifiability:  # fmt: skip
+    """Which parameters equations tell: each by itself, in combination with others, or not at all.
+
+    Without noise a direction counts as not told if its singular value is below 1e-8 of the largest
+    of columns of length 1, the square root of rounding. With noise a parameter is told if it comes
+    out with a standard deviation below half of its expected size: otherwise the measurement adds
+    nothing to what was known before.
+
+    Args:
+        jacobian: (m, p) derivatives of the equations.
+        names: the p parameters.
+        scales: (p,) their expected sizes.
+        sigma: standard deviation of the equations' errors, one or (m,); None for no noise.
+        first: parameters that shall stand for a combination if they can.
+
+    Returns:
+        The classification; `told_in_words` writes it out.
+    """
+    matrix = np.asarray(jacobian, float)
+    sizes = np.asarray(scales, float)
+    exact = identifiability(matrix * sizes, names, ["1"] * len(sizes), first)
+    exact = _unscaled(exact, sizes)
+    if sigma is None:
+        return exact
+    weighted = matrix / np.broadcast_to(np.asarray(sigma, float), matrix.shape[:1])[:, None]
+    return identifiable_in_noise(weighted, names, sizes, _places(exact))
+
+
+def told_in_words(told: Identifiability) -> dict[str, list[str]]:
+    """A classification written out.
+
+    Args:
+        told: of the parameters.
+
+    Returns:
+        `identifiable`: parameters told by themselves. `combinations`: what is told only together,
+        each written out. `unknown`: parameters that are not told at all.
+
+    >>> matrix = np.array([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 2.0, 1.0, 0.0]])
+    >>> told_in_words(identifiable(matrix, ["a", "b", "c", "d"], [1.0] * 4))
+    {'identifiable': ['c'], 'combinations': ['a + 2 b'], 'unknown': ['d']}
+    """
+    status = dict(zip(told.names, told.status, strict=True))
+    return {
+        "identifiable": [n for n in told.names if status[n] == FULL],
+        "combinations": [
+            told.text(row) for row, base in enumerate(told.base)
+            if status[told.names[base]] == COMBINATION
+        ],
+        "unknown": [n for n in told.names if status[n] not in (FULL, COMBINATION)],
+    }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """Where a search ended."""
+
+    x: np.ndarray
+    iterations: int = 0
+    evaluations: int = 0
+    converged: bool = True
+    status: str = ""
+    rounds: int = 0
+
+
+class _Problem:
+    """Residual and Jacobian of all parameters, checked."""
+
+    def __init__(self, residual, start, names, scales, jac, sparsity) -> None:
+        self.start, self.scales = np.array(start, float), np.array(scales, float)
+        self.names, self.residual, self.jac = tuple(names), residual, jac
+        self.hits = None if sparsity is None else _dense(sparsity) != 0.0
+        p = len(self.names)
+        if self.start.shape != (p,) or self.scales.shape != (p,):
+            raise InputError(
+                _WHERE,
+                f"{p} names, start {self.start.shape} and scales {self.scales.shape} must fit",
+            )
+        bad = [n for n, s in zip(names, self.scales, strict=True) if not 0.0 < s < np.inf]
+        if bad:
+            raise InputError(_WHERE, f"the sizes of {', '.join(bad)} must be positive and finite")
+        self.groups = np.arange(p) if self.hits is None else _groups(self.hits)
+
+    def rows(self, x: np.ndarray) -> np.ndarray:
+        """(m,) residual."""
+        rows = np.asarray(self.residual(x))
+        if np.iscomplexobj(x):
+            return rows
+        rows = np.asarray(rows, float)
+        if rows.ndim != 1:
+            raise InputError(_WHERE, f"the residual must be (m,), is {rows.shape}")
+        if not np.isfinite(rows).all():
+            where = int(np.flatnonzero(~np.isfinite(rows))[0])
+            raise InputError(_WHERE, f"equation {where + 1} of {len(rows)} is not finite")
+        return rows
+
+    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(m,) residual and (m, p) Jacobian."""
+        return self.rows(x), self.matrix(x)
+
+    def matrix(self, x: np.ndarray) -> np.ndarray:
+        """(m, p) Jacobian, dense."""
+        if callable(self.jac):
+            return _dense(self.jac(x))
+        if self.jac == "cs":
+            columns = []
+            for k, size in enumerate(self.scales):
+                step = x.astype(complex)
+                step[k] += 1j * _COMPLEX_STEP * size
+                columns.append(np.imag(self.rows(step)) / (_COMPLEX_STEP * size))
+            return np.column_stack(columns)
+        return self._differences(x)
+
+    def _differences(self, x: np.ndarray) -> np.ndarray:
+        """Central differences; parameters that share no equation are moved together."""
+        steps = _CENTRAL * np.maximum(np.abs(x), self.scales)
+        columns: list[np.ndarray] = [np.empty(0)] * len(x)
+        for group in range(self.groups.max() + 1):
+            moved = np.where(self.groups == group, steps, 0.0)
+            change = self.rows(x + moved) - self.rows(x - moved)
+            for k in np.flatnonzero(self.groups == group):
+                own = change if self.hits is None else np.where(self.hits[:, k], change, 0.0)
+                columns[k] = own / (2.0 * steps[k])
+        return np.column_stack(columns)
+
+
+def _dense(matrix) -> np.ndarray:
+    return np.asarray(matrix.toarray() if scipy.sparse.issparse(matrix) else matrix, float)
+
+
+def _groups(hits: np.ndarray) -> np.ndarray:
+    """(p,) number of the group of columns of (m, p) that share no row, found greedily."""
+    groups: list[int] = []
+    taken: list[np.ndarray] = []
+    for column in hits.T:
+        group = next((g for g, used in enumerate(taken) if not (used & column).any()), len(taken))
+        if group == len(taken):
+            taken.append(np.zeros(len(column), bool))
+        taken[group] |= column
+        groups.append(group)
+    return np.array(groups)
+
+
+class _Search:
+    """A weighted problem in its free parameters, in units of their sizes, with the prior's rows."""
+
+    def __init__(self, problem: _Problem, weight, prior: Prior | None, free) -> None:
+        self.problem, self.weight, self.free = problem, weight, np.flatnonzero(free)
+        self.scales = problem.scales[self.free]
+        self.pull, self.mean = np.zeros(len(self.free)), np.zeros(len(self.free))
+        if prior is not None:
+            std, mean = np.asarray(prior.std, float), np.asarray(prior.mean, float)
+            if not (std > 0.0).all():
+                raise InputError(_WHERE, "standard deviations of the prior must be positive")
+            self.pull, self.mean = self.scales / std[self.free], mean[self.free]
+        self.drawn = self.pull > 0.0
+
+    def full(self, base: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """(p,) parameters from a base and the free ones' distances from it."""
+        x = base.copy()
+        x[self.free] += u * self.scales
+        return x
+
+    def rows(self, x: np.ndarray) -> np.ndarray:
+        """Weighted residual and what the prior adds."""
+        away = self.pull * (x[self.free] - self.mean) / self.scales
+        return np.concatenate([self.problem.rows(x) * self.weight, away[self.drawn]])
+
+    def matrix(self, matrix: np.ndarray) -> np.ndarray:
+        """Jacobian of `rows` by the scaled free parameters, from the problem's."""
+        weighted = matrix[:, self.free] * self.weight[:, None] * self.scales
+        return np.vstack([weighted, np.diag(self.pull)[self.drawn]])
+
+    def effective(self, matrix: np.ndarray) -> float:
+        """Parameters that the equations, not the prior, decide."""
+        whole = self.matrix(matrix)
+        q = np.linalg.qr(whole)[0][: len(matrix)]
+        return float(np.sum(q**2))
+
+    def run(self, begin: _Searched, truncation: Sequence[float] | None, most: int) -> _Searched:
+        """Search from where another one ended."""
+        found = (
+            _truncated(self, begin, truncation, most)
+            if truncation
+            else _trust_region(self, begin, most)
+        )
+        return replace(found, rounds=begin.rounds + 1)
+
+    def covariance(self, matrix: np.ndarray, truncation) -> tuple[np.ndarray, int]:
+        """(p, p) of all parameters, held ones zero; and the rank."""
+        whole = self.matrix(matrix)
+        _, s, v = np.linalg.svd(whole, full_matrices=False)
+        cut = truncation[-1] if truncation else len(self.free) * np.finfo(float).eps
+        kept = s > cut * s[0]
+        inverse = (v[kept].T / s[kept] ** 2) @ v[kept] * np.outer(self.scales, self.scales)
+        covariance = np.zeros((len(self.problem.start),) * 2)
+        covariance[np.ix_(self.free, self.free)] = inverse
+        return covariance, int(kept.sum())
+
+
+def _trust_region(search: _Search, begin: _Searched, most: int) -> _Searched:
+    """SciPy's trust-region search; it ends at rounding, or after `most` Jacobians."""
+    base, problem = begin.x, search.problem
+    found = scipy.optimize.least_squares(
+        lambda u: search.rows(search.full(base, u)), np.zeros(len(search.free)),
+        jac=lambda u: search.matrix(problem.matrix(search.full(base, u))),  # type: ignore
+        ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=most,
+    )  # fmt: skip
+    good = found.status > 0
+    said = "converged" if good else f"not converged after {most} steps: increase max_iterations"
+    return _Searched(
+        search.full(base, found.x), begin.iterations + int(found.njev),
+        begin.evaluations + int(found.nfev), good, said,
+    )  # fmt: skip
+
+
+def _truncated(search: _Search, begin: _Searched, shares: Sequence[float], most: int) -> _Searched:
+    """Gauss-Newton steps without the smallest singular values, whose share is lowered.
+
+    A step that does not reduce the residual is halved; where that does not help, or a step is
+    small, the next share follows.
+    """
+    x, problem = begin.x, search.problem
+    rows = search.rows(x)
+    iterations, evaluations, good = begin.iterations, begin.evaluations + 1, True
+    for share in shares:
+        for _ in range(most):
+            matrix = search.matrix(problem.matrix(x))
+            iterations += 1
+            u, s, v = np.linalg.svd(matrix, full_matrices=False)
+            kept = s > share * s[0]
+            step = -v[kept].T @ ((u.T @ rows)[kept] / s[kept])
+            for _ in range(_HALVINGS):
+                new = search.full(x, step)
+                tried = search.rows(new)
+                evaluations += 1
+                if tried @ tried < rows @ rows:
+                    break
+                step = 0.5 * step
+            else:
+                break
+            x, rows = new, tried
+            if np.max(np.abs(step)) < _CONVERGED:
+                break
+        else:
+            good = False
+    said = "converged" if good else f"not converged after {most} steps: increase max_iterations"
+    return _Searched(x, iterations, evaluations, good, said)
+
+
+def _weights(sigma: float | np.ndarray | None, m: int) -> np.ndarray:
+    sizes = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, float), (m,))
+    if not (np.isfinite(sizes).all() and (sizes > 0.0).all()):
+        raise InputError(_WHERE, "sigma must be positive")
+    return 1.0 / sizes
+
+
+def _places(told: Identifiability) -> np.ndarray:
+    """(p,) whether a parameter stands for a combination."""
+    return np.isin(np.arange(len(told.names)), told.base)
+
+
+def _structure(matrix: np.ndarray, problem: _Problem, first: Sequence[str]) -> Identifiability:
+    told = identifiable(matrix, problem.names, problem.scales, first=first)
+    if not len(told.base):
+        raise InputError(
+            _WHERE, f"the data tell none of {', '.join(problem.names)}: vary the poses"
+        )
+    return told
+
+
+def _in_noise(matrix: np.ndarray, problem: _Problem, told: Identifiability) -> Identifiability:
+    found = identifiable_in_noise(matrix, problem.names, problem.scales, _places(told))
+    if not len(found.base):
+        raise InputError(
+            _WHERE, f"the noise hides all of {', '.join(problem.names)}: record more and"
+            " more different poses"
+        )  # fmt: skip
+    return found
+
+
+def _unscaled(told: Identifiability, sizes: np.ndarray) -> Identifiability:
+    """A classification of parameters in units of their sizes, in the parameters themselves."""
+    combination = told.combination * sizes[told.base][:, None] / sizes
+    return Identifiability(
+        told.names, told.status, told.base, combination, told.condition, told.gap
+    )
+
+
+def _check_count(equations: int, unknowns: int, prior: bool, known: bool) -> None:
+    needed = 1 if prior else unknowns + (0 if known else 1)
+    if equations < needed:
+        raise InputError(
+            _WHERE, f"{equations} equations do not tell {unknowns} parameters: record more poses"
+        )
