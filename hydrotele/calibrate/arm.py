@@ -15,7 +15,7 @@ import scipy.sparse
 
 from hydrotele.calibrate.arm_poses import Poses
 from hydrotele.calibrate.estimation import TRUNCATION, identifiable, least_squares
-from hydrotele.calibrate.loop import KINDS, Loop, ball_from, unit_of
+from hydrotele.calibrate.loop import KINDS, Loop, ball_from, ball_place, unit_of
 from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import Identifiability
 
@@ -167,15 +167,14 @@ class _Equations:
         self.place = loop.links.index(poses.link)
         self.outer = loop.links[self.place :]
 
-    def at(self, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residual (M, 2) [m], derivative (M, 2, links, 5), the same by the S readings."""
+    def _seen(self, numbers: Mapping[str, float]) -> tuple[Loop, np.ndarray]:
+        """The chain with numbers, and the angles (M, links - 1) of the joints beyond the moving.
+
+        The moving link's own d keeps its nominal value: only p_z less it can be told.
+        """
         loop, poses = self.loop, self.poses
-        table = {f"{kind}.{link}": (k, c) for k, link in enumerate(loop.links)
-                 for c, kind in enumerate(KINDS)}  # fmt: skip
-        values = loop.values.copy()
-        for name, spot in table.items():
-            values[spot] = numbers[name]
-        moved = dataclasses.replace(loop, values=values)
+        values = np.array([[numbers[f"{kind}.{link}"] for kind in KINDS] for link in loop.links])
+        values[self.place, KINDS.index("d")] = loop.values[self.place, KINDS.index("d")]
         theta = np.empty((len(poses), len(loop) - self.place - 1))
         for column, link in enumerate(self.outer[1:]):
             k = self.place + 1 + column
@@ -183,16 +182,31 @@ class _Equations:
                 theta[:, column] = numbers[f"held.{link}"]
             else:
                 theta[:, column] = poses.theta[:, k - loop.moved] + numbers[f"offset.{link}"]
-        s, by = ball_from(moved, self.place, theta)
-        reach = np.hypot(s[:, 0], s[:, 1])
-        way = s[:, :2] / reach[:, None]
-        rows = np.stack([np.einsum("mi,mikp->mkp", way, by[:, :2]), by[:, 2]], axis=1)
-        error = np.stack([reach - numbers[f"p_xy.{poses.link}"],
-                          s[:, 2] - numbers[f"p_z.{poses.link}"]], axis=1)  # fmt: skip
-        return error, rows, rows[:, :, loop.moved - self.place :, 0]
+        return dataclasses.replace(loop, values=values), theta
 
-    def columns(self, by: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """(M, 2, p) derivative by named parameters; zero by those that do not appear."""
+    def _error(self, s: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
+        reach, link = np.hypot(s[:, 0], s[:, 1]), self.poses.link
+        return np.stack([reach - numbers[f"p_xy.{link}"], s[:, 2] - numbers[f"p_z.{link}"]], axis=1)
+
+    def residual(self, numbers: Mapping[str, float]) -> np.ndarray:
+        """Residual (M, 2) [m]."""
+        loop, theta = self._seen(numbers)
+        return self._error(ball_place(loop, self.place, theta), numbers)
+
+    def at(self, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residual (M, 2) [m], derivative (M, 2, links, 5), the same by the S readings."""
+        loop, theta = self._seen(numbers)
+        s, by = ball_from(loop, self.place, theta)
+        way = s[:, :2] / np.hypot(s[:, :1], s[:, 1:2])
+        plane = way[:, 0, None, None] * by[:, 0] + way[:, 1, None, None] * by[:, 1]
+        rows = np.stack([plane, by[:, 2]], axis=1)
+        return self._error(s, numbers), rows, rows[:, :, loop.moved - self.place :, 0]
+
+    def columns(self, by: np.ndarray, names: Sequence[str], own_d: bool = False) -> np.ndarray:
+        """(M, 2, p) derivative by named parameters; zero by those that do not appear.
+
+        The moving link's d appears only where `own_d` says so.
+        """
         out = np.zeros((*by.shape[:2], len(names)))
         for column, name in enumerate(names):
             kind, _, link = name.partition(".")
@@ -202,6 +216,8 @@ class _Equations:
             elif link in self.outer:
                 k = self.outer.index(link)
                 held = 0 < k and self.place + k < self.loop.moved
+                if k == 0 and kind == "d" and not own_d:
+                    continue
                 if kind == "held" and held:
                     out[:, :, column] = by[:, :, k, 0]
                 elif kind != "held" and not (kind == "offset" and self.place + k < self.loop.moved):
@@ -237,8 +253,8 @@ def start_numbers(loop: Loop, stages: Sequence[Poses]) -> Numbers:
             numbers[f"held.{link}"] = float(np.median(outermost.manipulator[link]) + loop.values[k, 0])
     for poses in stages:
         blank = numbers | {f"p_xy.{poses.link}": 0.0, f"p_z.{poses.link}": 0.0}
-        error, _, _ = _Equations(loop, poses).at(blank)
-        numbers[f"p_xy.{poses.link}"], numbers[f"p_z.{poses.link}"] = error.mean(axis=0)
+        mean = _Equations(loop, poses).residual(blank).mean(axis=0)
+        numbers[f"p_xy.{poses.link}"], numbers[f"p_z.{poses.link}"] = map(float, mean)
     return numbers
 
 
@@ -287,7 +303,7 @@ def identify_arm(
 def _told(loop: Loop, equations: _Equations, numbers: Numbers, names: Sequence[str]):
     """What the poses of a stage tell of its candidates, about the given numbers."""
     _, by, sensed = equations.at(numbers)
-    matrix = equations.whitening(sensed) @ equations.columns(by, names)
+    matrix = equations.whitening(sensed) @ equations.columns(by, names, own_d=True)
     sizes = [size_of(loop, name) for name in names]
     return identifiable(matrix.reshape(-1, len(names)), names, sizes, sigma=1.0)
 
@@ -315,8 +331,8 @@ def _stage(
             whitening = np.broadcast_to(np.eye(2) / level, whitening.shape)
 
         def residual(x, whitening=whitening):
-            error, _, _ = equations.at(numbers | dict(zip(own, x.tolist(), strict=True)))
-            return np.einsum("mij,mj->mi", whitening, error).ravel()
+            error = equations.residual(numbers | dict(zip(own, x.tolist(), strict=True)))
+            return (whitening @ error[..., None]).ravel()
 
         def jacobian(x, whitening=whitening):
             _, by, _ = equations.at(numbers | dict(zip(own, x.tolist(), strict=True)))
@@ -406,7 +422,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
         def residual(u, whitenings=whitenings):
             at = base | dict(zip(names, (u * sizes).tolist(), strict=True))
             return np.concatenate([
-                np.einsum("mij,mj->mi", w, e.at(at)[0]).ravel()
+                (w @ e.residual(at)[..., None]).ravel()
                 for e, w in zip(equations, whitenings, strict=True)
             ])  # fmt: skip
 
@@ -438,7 +454,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
     scaled = inverse * np.concatenate([np.full(len(p), c) for p, c in zip(parts, chi, strict=True)])
     updated = []
     for stage, poses, e in zip(fit.stages, order, equations, strict=True):
-        error = e.at(numbers)[0]
+        error = e.residual(numbers)
         updated.append(dataclasses.replace(
             stage, rms=float(np.sqrt(np.mean(error**2))),
             chi=float(np.sqrt(np.mean(parts[order.index(poses)] ** 2))), iterations=int(found.njev),

@@ -7,12 +7,14 @@ point along the dominant positive direction of the machine's frame, so that a bo
 angle is the negative of the machine's.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hydrotele.core.errors import InputError
+from hydrotele.kinematics.serial_chain import Element, SerialChain, forward, forward_and_rates
 from hydrotele.machine.machine import Machine
 
 KINDS = ("offset", "alpha", "a", "d", "beta")
@@ -87,26 +89,51 @@ def unit_of(name: str) -> str:
     return "m" if name.partition(".")[0] in ("a", "d", "p_xy", "p_z") else "rad"
 
 
-def link_matrices(values: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """`A_k` of K Eq. 3.10 for many poses.
+def link_chain(values: np.ndarray) -> SerialChain:
+    """The serial chain of consecutive links; its joint coordinates hold the offsets.
 
     Args:
-        values: (5,) offset, alpha, a, d, beta; the offset is not used.
-        theta: joint angle, any shape [rad].
+        values: (k, 5) rows of `Loop.values`; the offsets are not used.
 
     Returns:
-        Shape of theta + (3, 4): rotation and origin.
+        k joints, 5 parameters a link in the order of `KINDS`, but for d, which comes second.
     """
-    _, alpha, a, d, beta = values
-    ct, st = np.cos(theta), np.sin(theta)
-    ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
-    out = np.empty((*np.shape(theta), 3, 4))
-    out[..., 0, 0], out[..., 0, 1] = cb * ct - sa * sb * st, -ca * st
-    out[..., 0, 2], out[..., 0, 3] = sb * ct + sa * cb * st, a * ct
-    out[..., 1, 0], out[..., 1, 1] = cb * st + sa * sb * ct, ca * ct
-    out[..., 1, 2], out[..., 1, 3] = sb * st - sa * cb * ct, a * st
-    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2], out[..., 2, 3] = -ca * sb, sa, ca * cb, d
-    return out
+    return _chain_of(len(values), values.tobytes())
+
+
+@functools.lru_cache(maxsize=64)
+def _chain_of(count: int, numbers: bytes) -> SerialChain:
+    elements = []
+    for k, (_, alpha, a, d, beta) in enumerate(np.frombuffer(numbers).reshape(count, 5)):
+        elements += [
+            Element("rz", f"offset.{k}", 0.0, k), Element("tz", f"d.{k}", float(d)),
+            Element("tx", f"a.{k}", float(a)), Element("rx", f"alpha.{k}", float(alpha)),
+            Element("ry", f"beta.{k}", float(beta)),
+        ]  # fmt: skip
+    return SerialChain(tuple(map(str, range(count))), tuple(elements))
+
+
+_ORDER = [0, 3, 2, 1, 4]  # of offset, d, a, alpha, beta in a chain, as KINDS
+
+
+def frame_of(loop: Loop, count: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The frame behind the first links.
+
+    Args:
+        loop: the chain.
+        count: of links.
+        theta: (M, N) angles with offsets [rad].
+
+    Returns:
+        (origins (M, 3) [m], rotations (M, 3, 3)) in frame 0.
+    """
+    return forward(link_chain(loop.values[:count]), theta[:, :count])
+
+
+def ball_place(loop: Loop, first: int, theta: np.ndarray) -> np.ndarray:
+    """The ball's place of `ball_from` alone, (M, 3) [m]; the arguments are the same."""
+    angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
+    return forward(link_chain(loop.values[first:]), angles).position
 
 
 def ball_from(loop: Loop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -124,45 +151,10 @@ def ball_from(loop: Loop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np
         (s (M, 3) [m], ds (M, 3, N - first, 5) by offset, alpha, a, d, beta of links i .. N; that by
         the offset of link i itself is that by a turn of the joint i.)
     """
-    count, size = len(theta), len(loop) - first
-    angles = np.concatenate([np.zeros((count, 1)), theta], axis=1)
-    frames = [link_matrices(loop.values[first + k], angles[:, k]) for k in range(size)]
-    tails = [np.zeros((count, 3))]  # the ball seen from frame k, last first
-    for frame in reversed(frames):
-        tails.append(np.einsum("mij,mj->mi", frame[:, :, :3], tails[-1]) + frame[:, :, 3])
-    tails = tails[::-1]
-    derivatives = np.zeros((count, 3, size, 5))
-    turn = np.broadcast_to(np.eye(3), (count, 3, 3))
-    for k in range(size):
-        alpha, beta = loop.values[first + k, 1], loop.values[first + k, 4]
-        derivatives[:, :, k] = np.einsum(
-            "mij,mjp->mip", turn, _by_parameters(angles[:, k], alpha, beta, tails[k], tails[k + 1])
-        )
-        turn = np.einsum("mij,mjk->mik", turn, frames[k][:, :, :3])
-    return tails[0], derivatives
-
-
-def _by_parameters(
-    theta: np.ndarray, alpha: float, beta: float, seen: np.ndarray, beyond: np.ndarray
-) -> np.ndarray:
-    """(M, 3, 5) derivative of `A v` by the five parameters; seen = A v, beyond = v."""
-    ct, st = np.cos(theta), np.sin(theta)
-    zero = np.zeros_like(ct)
-    out = np.empty((len(theta), 3, 5))
-    out[:, :, 0] = np.stack([-seen[:, 1], seen[:, 0], zero], 1)  # z x (A v)
-    cb, sb, ca, sa = np.cos(beta), np.sin(beta), np.cos(alpha), np.sin(alpha)
-    x, y, z = beyond.T
-    u = np.stack([cb * x + sb * z, y, -sb * x + cb * z], 1)  # Ry v
-    w = np.stack([zero, -sa * u[:, 1] - ca * u[:, 2], ca * u[:, 1] - sa * u[:, 2]], 1)
-    q = np.stack([u[:, 2], zero, -u[:, 0]], 1)  # y x (Ry v)
-    q = np.stack([q[:, 0], -sa * q[:, 2], ca * q[:, 2]], 1)  # Rx of it
-    for column, vector in ((1, w), (4, q)):
-        out[:, 0, column] = ct * vector[:, 0] - st * vector[:, 1]
-        out[:, 1, column] = st * vector[:, 0] + ct * vector[:, 1]
-        out[:, 2, column] = vector[:, 2]
-    out[:, :, 2] = np.stack([ct, st, zero], 1)
-    out[:, :, 3] = (0.0, 0.0, 1.0)
-    return out
+    angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
+    found = forward_and_rates(link_chain(loop.values[first:]), angles)
+    by = found.position_by_parameter.reshape(len(theta), 3, len(loop) - first, 5)
+    return found.position, by[..., _ORDER]
 
 
 def closure(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -329,8 +321,8 @@ def _denavit_hartenberg(
             beta = float(np.arcsin(np.clip(u[0], -1.0, 1.0))) if parallel[k] else 0.0
             alpha = float(np.arctan2(-u[1], u[2]))
         values[k] = theta, alpha, a, d, beta
-        rotation = link_matrices(np.array([0.0, alpha, 0.0, 0.0, beta]), np.zeros(()))[:, :3]
-        frame, foot = middle @ rotation, centre
+        rotation = forward(link_chain(np.array([[0.0, alpha, 0.0, 0.0, beta]])), np.zeros((1, 1)))
+        frame, foot = middle @ rotation.rotation[0], centre
     return values, base
 
 
@@ -366,11 +358,7 @@ def calibrator_angles(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.nda
     """
     theta = theta.copy()
     first = len(loop) - 3
-    turn, place = np.broadcast_to(np.eye(3), (len(theta), 3, 3)), np.zeros((len(theta), 3))
-    for k in range(first):
-        frame = link_matrices(loop.values[k], theta[:, k])
-        place = place + np.einsum("mij,mj->mi", turn, frame[:, :, 3])
-        turn = turn @ frame[:, :, :3]
+    place, turn = frame_of(loop, first, theta)
     x, y, z = np.einsum("mji,mj->im", turn, loop.ball - place)
     upper, lower, aside = loop.values[-2, 3], loop.values[-1, 2], loop.values[-1, 3]
     sine = (x**2 + y**2 + z**2 - upper**2 - lower**2 - aside**2) / (2.0 * upper * lower)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import Loop, calibrator_angles
+from hydrotele.calibrate.loop import Loop, calibrator_angles, frame_of
 
 RESOLVER = np.radians(0.1)
 """Bound of a resolver's error, uniform [rad]; Khoshzaban 1992 section 2.5."""
@@ -94,13 +94,7 @@ def sweep_poses(loop: Loop, link: str, sweep: Sweep, seed: int = 0) -> Clean:
 
 def _pointing(loop: Loop, theta: np.ndarray) -> np.ndarray:
     """Grapple's angle at which its yoke's axis is square to the line towards the ball."""
-    from hydrotele.calibrate.loop import link_matrices
-
-    turn, place = np.broadcast_to(np.eye(3), (len(theta), 3, 3)), np.zeros((len(theta), 3))
-    for k in range(loop.moved):
-        frame = link_matrices(loop.values[k], theta[:, k])
-        place = place + np.einsum("mij,mj->mi", turn, frame[:, :, 3])
-        turn = turn @ frame[:, :, :3]
+    place, turn = frame_of(loop, loop.moved, theta)
     x, y, _ = np.einsum("mji,mj->im", turn, loop.ball - place)
     return np.arctan2(y, x)
 
@@ -151,11 +145,7 @@ def stressed(loop: Loop, clean: Clean, rng: np.random.Generator, degrees: float 
     Returns:
         (M, N) errors [rad].
     """
-    from hydrotele.calibrate.loop import link_matrices
-
-    turn = np.broadcast_to(np.eye(3), (len(clean.theta), 3, 3))
-    for k in range(len(loop) - 2):
-        turn = turn @ link_matrices(loop.values[k], clean.theta[:, k])[:, :, :3]
+    _, turn = frame_of(loop, len(loop) - 2, clean.theta)
     level = np.abs(turn[:, 2, 2])  # of the arm's direction along the vertical
     stress = level <= np.quantile(level, share)
     extra = np.zeros_like(clean.theta)
