@@ -14,7 +14,7 @@ import scipy.optimize
 import scipy.sparse
 
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.estimation import TRUNCATION, identifiable, least_squares
+from hydrotele.calibrate.estimation import identifiable, least_squares
 from hydrotele.calibrate.loop import KINDS, Loop, ball_from, ball_place, unit_of
 from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import Identifiability
@@ -24,6 +24,9 @@ SIZES = {"m": 0.1, "rad": np.radians(5.0)}
 
 LABORATORY = {"m": 1.0e-3, "rad": np.radians(0.05)}
 """The same of the calibrator's own links, which were measured in a laboratory (K 3.6.4)."""
+
+TRUNCATION = (0.05, 0.01, 1.0e-3, 1.0e-5)
+"""Shares of the largest singular value below which directions are left out: K's 5 %, lowered."""
 
 _CRITICAL = 1.959964
 _ROUNDS = 3  # of weights that depend on the parameters; the second already changes nothing by 1e-3
@@ -122,7 +125,7 @@ def stage_order(loop: Loop, stages: Sequence[Poses]) -> list[Poses]:
     return sorted(stages, key=lambda poses: -links.index(poses.link))
 
 
-def candidates(loop: Loop, link: str) -> tuple[list[str], dict[str, str]]:
+def candidates(loop: Loop, link: str) -> list[str]:
     """Parameters that the poses of a moving link may tell, the most wanted first.
 
     Args:
@@ -130,7 +133,7 @@ def candidates(loop: Loop, link: str) -> tuple[list[str], dict[str, str]]:
         link: the moving link.
 
     Returns:
-        (candidates, others that belong to the same links -> why they are none).
+        Names; of parameters that show only together the first one is identified.
     """
     place = loop.links.index(link)
     first = [f"p_xy.{link}", f"p_z.{link}"]
@@ -147,7 +150,7 @@ def candidates(loop: Loop, link: str) -> tuple[list[str], dict[str, str]]:
         outer = loop.links[place + 1]
         own = [f"held.{outer}", f"alpha.{link}", f"a.{link}", f"d.{outer}"]
     own += [f"beta.{link}", f"d.{link}"]
-    return first + own, {}
+    return first + own
 
 
 def size_of(loop: Loop, name: str) -> float:
@@ -159,7 +162,7 @@ def size_of(loop: Loop, name: str) -> float:
     return SIZES[unit_of(name)]
 
 
-class _Equations:
+class Equations:
     """The two equations per pose of one stage."""
 
     def __init__(self, loop: Loop, poses: Poses) -> None:
@@ -167,7 +170,7 @@ class _Equations:
         self.place = loop.links.index(poses.link)
         self.outer = loop.links[self.place :]
 
-    def _seen(self, numbers: Mapping[str, float]) -> tuple[Loop, np.ndarray]:
+    def seen(self, numbers: Mapping[str, float]) -> tuple[Loop, np.ndarray]:
         """The chain with numbers, and the angles (M, links - 1) of the joints beyond the moving.
 
         The moving link's own d keeps its nominal value: only p_z less it can be told.
@@ -180,22 +183,25 @@ class _Equations:
             k = self.place + 1 + column
             if k < loop.moved:
                 theta[:, column] = numbers[f"held.{link}"]
+                if poses.drift and link in poses.drift.held:
+                    theta[:, column] += poses.drift.held[link]
             else:
                 theta[:, column] = poses.theta[:, k - loop.moved] + numbers[f"offset.{link}"]
         return dataclasses.replace(loop, values=values), theta
 
     def _error(self, s: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
         reach, link = np.hypot(s[:, 0], s[:, 1]), self.poses.link
-        return np.stack([reach - numbers[f"p_xy.{link}"], s[:, 2] - numbers[f"p_z.{link}"]], axis=1)
+        error = np.stack([reach - numbers[f"p_xy.{link}"], s[:, 2] - numbers[f"p_z.{link}"]], axis=1)
+        return error - self.poses.drift.ball[:, :2] if self.poses.drift else error
 
     def residual(self, numbers: Mapping[str, float]) -> np.ndarray:
         """Residual (M, 2) [m]."""
-        loop, theta = self._seen(numbers)
+        loop, theta = self.seen(numbers)
         return self._error(ball_place(loop, self.place, theta), numbers)
 
     def at(self, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residual (M, 2) [m], derivative (M, 2, links, 5), the same by the S readings."""
-        loop, theta = self._seen(numbers)
+        loop, theta = self.seen(numbers)
         s, by = ball_from(loop, self.place, theta)
         way = s[:, :2] / np.hypot(s[:, :1], s[:, 1:2])
         plane = way[:, 0, None, None] * by[:, 0] + way[:, 1, None, None] * by[:, 1]
@@ -253,7 +259,7 @@ def start_numbers(loop: Loop, stages: Sequence[Poses]) -> Numbers:
             numbers[f"held.{link}"] = float(np.median(outermost.manipulator[link]) + loop.values[k, 0])
     for poses in stages:
         blank = numbers | {f"p_xy.{poses.link}": 0.0, f"p_z.{poses.link}": 0.0}
-        mean = _Equations(loop, poses).residual(blank).mean(axis=0)
+        mean = Equations(loop, poses).residual(blank).mean(axis=0)
         numbers[f"p_xy.{poses.link}"], numbers[f"p_z.{poses.link}"] = map(float, mean)
     return numbers
 
@@ -281,38 +287,60 @@ def identify_arm(
     """
     order = stage_order(loop, stages)
     for poses in order:
-        _check_poses(loop, poses)
+        check_poses(loop, poses)
     numbers = start_numbers(loop, order)
     start = dict(numbers)
     names: tuple[str, ...] = ()
     covariance = np.zeros((0, 0))
     found = []
     for poses in order:
-        equations = _Equations(loop, poses)
-        wanted, _ = candidates(loop, poses.link)
-        told = _told(loop, equations, start | {n: numbers[n] for n in names}, wanted)
+        equations = Equations(loop, poses)
+        wanted = candidates(loop, poses.link)
+        told = what_is_told(equations, start | {n: numbers[n] for n in names}, wanted)
         own = list((chosen or {}).get(poses.link, [told.names[k] for k in sorted(told.base)]))
-        stage, numbers, covariance = _stage(
+        stage, numbers, covariance = identify_stage(
             equations, numbers, own, names, covariance, told, wanted, weighted
         )
         names = (*names, *own)
         found.append(stage)
-    return _fit(loop, numbers, start, names, covariance, found, "hierarchical")
+    return arm_fit(loop, numbers, start, names, covariance, found, "hierarchical")
 
 
-def _told(loop: Loop, equations: _Equations, numbers: Numbers, names: Sequence[str]):
+def what_is_told(
+    equations: Equations, numbers: Numbers, names: Sequence[str]
+) -> Identifiability:
     """What the poses of a stage tell of its candidates, about the given numbers."""
+    loop = equations.loop
     _, by, sensed = equations.at(numbers)
     matrix = equations.whitening(sensed) @ equations.columns(by, names, own_d=True)
     sizes = [size_of(loop, name) for name in names]
     return identifiable(matrix.reshape(-1, len(names)), names, sizes, sigma=1.0)
 
 
-def _stage(
-    equations: _Equations, numbers: Numbers, own: list[str], earlier: tuple[str, ...],
-    covariance: np.ndarray, told: Identifiability, wanted: Sequence[str], weighted: bool,
+def identify_stage(
+    equations: Equations, numbers: Numbers, own: list[str], earlier: tuple[str, ...],
+    covariance: np.ndarray, told: Identifiability, wanted: Sequence[str], weighted: bool = True,
+    near: bool = False,
 ) -> tuple[Stage, Numbers, np.ndarray]:  # fmt: skip
-    """Identify one stage; its part, the numbers, and the covariance of all parameters so far."""
+    """Identify what one stage tells.
+
+    Args:
+        equations: of the stage.
+        numbers: every parameter, where the search starts.
+        own: p parameters to identify.
+        earlier: q parameters that earlier stages identified.
+        covariance: (q, q) of these.
+        told: what the poses tell of the candidates.
+        wanted: the candidates.
+        weighted: as `identify_arm`.
+        near: whether the start is near, so that no singular value has to be left out.
+
+    Returns:
+        (the stage, all numbers, covariance (q + p, q + p) of earlier and own parameters).
+
+    Raises:
+        InputError: too few poses.
+    """
     poses, loop = equations.poses, equations.loop
     if 2 * len(poses) < _FEWEST * len(own):
         raise InputError(
@@ -340,7 +368,7 @@ def _stage(
 
         fit = least_squares(
             residual, start if fit is None else fit.values, own, sizes, sigma=1.0, jac=jacobian,
-            truncation=TRUNCATION if iterations == 0 else None, select="none",
+            truncation=TRUNCATION if iterations == 0 and not near else None, select="none",
         )  # fmt: skip
         iterations = iterations or fit.iterations
     assert fit is not None
@@ -377,7 +405,7 @@ def _reason(told: Identifiability, name: str, loop: Loop) -> str:
     return f"shows only together with {', '.join(partners)}"
 
 
-def _fit(loop, numbers, start, names, covariance, stages, method) -> ArmFit:
+def arm_fit(loop, numbers, start, names, covariance, stages, method) -> ArmFit:
     values = {name: numbers[name] for name in loop.names}
     calibrated = loop.with_values(values)
     first = loop.links[0]
@@ -411,7 +439,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
     """
     loop, names = fit.nominal, fit.names
     order = stage_order(loop, stages)
-    equations = [_Equations(loop, poses) for poses in order]
+    equations = [Equations(loop, poses) for poses in order]
     sizes = np.array([size_of(loop, name) for name in names])
     base = dict(fit.numbers)
     x = fit.values.copy()
@@ -459,10 +487,10 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
             stage, rms=float(np.sqrt(np.mean(error**2))),
             chi=float(np.sqrt(np.mean(parts[order.index(poses)] ** 2))), iterations=int(found.njev),
         ))  # fmt: skip
-    return _fit(loop, numbers, fit.start, names, scaled @ scaled.T, updated, "joint")
+    return arm_fit(loop, numbers, fit.start, names, scaled @ scaled.T, updated, "joint")
 
 
-def _check_poses(loop: Loop, poses: Poses) -> None:
+def check_poses(loop: Loop, poses: Poses) -> None:
     """Refuse readings that are not finite, or poses that are one and the same."""
     bad = np.argwhere(~np.isfinite(poses.theta))
     if len(bad):
@@ -489,6 +517,6 @@ def stage_residuals(loop: Loop, poses: Poses, numbers: Mapping[str, float]) -> n
     Returns:
         (M, 2) of unit variance where only the sensors err.
     """
-    equations = _Equations(loop, poses)
+    equations = Equations(loop, poses)
     error, _, sensed = equations.at(numbers)
     return np.einsum("mij,mj->mi", equations.whitening(sensed), error)
