@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.calibrate.arm_poses import Poses
+from hydrotele.calibrate.linkage import Strokes
 from hydrotele.calibrate.loop import Loop
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log, load_logs
@@ -17,6 +18,7 @@ POSES = 300
 """Poses that are taken of a log, evenly spread; Khoshzaban's figures show 300 to 400."""
 
 _SETTLED = np.radians(1.0)  # a link that is held drifts by less while another is moved
+_LINEAR = 2.0e-3 / math.sqrt(3.0)  # m, of a linear transducer, K 2.5
 _RESOLVER = np.radians(0.1) / math.sqrt(3.0)  # of sensors of which nothing is said, K 2.5
 
 
@@ -152,3 +154,40 @@ def held_out(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], list
     judged = [np.arange(len(p)) % every == every // 2 for p in stages]
     return ([p.only(~j) for p, j in zip(stages, judged, strict=True)],
             [p.only(j) for p, j in zip(stages, judged, strict=True)])  # fmt: skip
+
+
+def strokes_of(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) -> list[Strokes]:
+    """Angles and cylinder displacements of the axes that move in a log.
+
+    Args:
+        log: with `angle.AXIS` and `length.AXIS`.
+        machine: the machine.
+        axes: to look for.
+        poses: samples to take at most; 0 for all.
+
+    Returns:
+        One per axis that moves by 5 deg or more.
+    """
+    found = []
+    rows = np.flatnonzero(log["valid"] > 0.5) if "valid" in log else np.arange(len(log))
+    if poses and len(rows) > poses:
+        rows = rows[np.linspace(0, len(rows) - 1, poses).round().astype(int)]
+    for axis in axes:
+        channels = f"angle.{axis}", f"length.{axis}"
+        if not all(c in log for c in channels) or np.ptp(log[channels[0]][rows]) < np.radians(5.0):
+            continue
+        angle, length = (log[c][rows] for c in channels)
+        sigma = _deviation(log, machine, channels[0], None)
+        found.append(Strokes(
+            axis, angle, length, sigma, _length_deviation(log, machine, channels[1]), "measured",
+            log.source,
+        ))  # fmt: skip
+    return found
+
+
+def _length_deviation(log: Log, machine: Machine, channel: str) -> float:
+    """Standard deviation of a displacement's reading [m]."""
+    name = log.metadata.get("sensors", "")
+    if name in machine.sensors and name != IDEAL:
+        return noise_rms(machine, sensor_set(machine, name), channel) or _LINEAR
+    return _LINEAR

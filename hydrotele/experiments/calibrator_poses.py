@@ -1,102 +1,19 @@
-"""Simulated measurements with a calibrator: links that move one at a time, sensors as they are.
+"""Simulated readings of a calibrator: sensors as they are, joints that bend, machines as built.
 
 The kinematics of the closed chain, for studies of many seeds; `models/calibrator` is the same chain
 with masses and hydraulics in MuJoCo.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import Loop, calibrator_angles, frame_of
+from hydrotele.calibrate.loop import Loop, frame_of
+from hydrotele.calibrate.sweeps import Clean
 
 RESOLVER = np.radians(0.1)
 """Bound of a resolver's error, uniform [rad]; Khoshzaban 1992 section 2.5."""
-
-
-class Sweep(NamedTuple):
-    """How one link is moved while the others are held [deg, K's signs].
-
-    Attributes:
-        moving: range of the moving link.
-        held: link -> where it stands.
-        drift: link -> by how much it has drifted when the last pose is taken.
-        wander: by how much the grapple is turned about the place where it points at the ball.
-        poses: number of poses.
-    """
-
-    moving: tuple[float, float]
-    held: Mapping[str, float]
-    drift: Mapping[str, float]
-    wander: float = 20.0
-    poses: int = 300
-
-
-SWEEPS: Mapping[str, Sweep] = {
-    "pitch": Sweep((20.0, 80.0), {"swing": 0.0, "boom": -27.5, "stick": 80.0},
-                   {"boom": -0.2, "stick": 0.3}, 40.0),
-    "stick": Sweep((50.0, 140.0), {"swing": 0.0, "boom": -27.5, "pitch": 42.9}, {"boom": -0.4}),
-    "boom": Sweep((-48.0, -5.0), {"swing": 0.0, "stick": 80.2, "pitch": 42.9}, {"stick": 0.6}),
-    "swing": Sweep((-95.0, 95.0), {"boom": -26.8, "stick": 81.0, "pitch": 42.9},
-                   {"boom": -0.4, "stick": 0.8}, 10.0, 400),
-}  # fmt: skip
-"""Trajectories in kind of Khoshzaban 1992 Figs 16 to 18 (stick, boom, swing), and of link 4."""
-
-STILL = {name: sweep._replace(drift={}, held={**{"boom": -27.8, "stick": 80.6, "pitch": 42.9,
-         "swing": 0.0}, **{}}) for name, sweep in SWEEPS.items()}  # fmt: skip
-"""The same with held links that stay where they are from the first stage to the last."""
-
-
-@dataclass(frozen=True)
-class Clean:
-    """Poses of a stage without any error.
-
-    Attributes:
-        link: moving link.
-        theta: (M, N) true angles with offsets [rad].
-    """
-
-    link: str
-    theta: np.ndarray
-
-
-def sweep_poses(loop: Loop, link: str, sweep: Sweep, seed: int = 0) -> Clean:
-    """True poses while a link sweeps its range and held links drift.
-
-    Args:
-        loop: the true chain.
-        link: moving link.
-        sweep: its trajectory.
-        seed: of the grapple's wandering.
-
-    Returns:
-        The poses that the calibrator reaches.
-    """
-    rng, count = np.random.default_rng([seed, len(link)]), 2 * sweep.poses
-    u = np.linspace(0.0, 1.0, count)
-    low, high = np.radians(sweep.moving)
-    theta = np.tile(loop.values[:, 0], (count, 1))
-    for name, angle in sweep.held.items():
-        theta[:, loop.links.index(name)] = np.radians(angle + sweep.drift.get(name, 0.0) * u)
-    moving = loop.links.index(link)
-    theta[:, moving] = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(4.0 * np.pi * u - 1.2)
-    pointing = _pointing(loop, theta)
-    phases = rng.uniform(0.0, 2.0 * np.pi, 3)
-    wave = sum(np.sin(2.0 * np.pi * f * u + p) for f, p in zip((3.7, 7.3, 11.9), phases, strict=True))
-    theta[:, loop.moved] = pointing + np.radians(sweep.wander) * wave / 3.0 * 1.6
-    theta, reached = calibrator_angles(loop, theta)
-    good = theta[reached]
-    return Clean(link, good[np.linspace(0, len(good) - 1, min(sweep.poses, len(good))).astype(int)])
-
-
-def _pointing(loop: Loop, theta: np.ndarray) -> np.ndarray:
-    """Grapple's angle at which its yoke's axis is square to the line towards the ball."""
-    place, turn = frame_of(loop, loop.moved, theta)
-    x, y, _ = np.einsum("mji,mj->im", turn, loop.ball - place)
-    return np.arctan2(y, x)
 
 
 def readings(
