@@ -9,7 +9,7 @@ from hydrotele.calibrate.loop import Loop, calibrator_angles, frame_of
 
 
 class Sweep(NamedTuple):
-    """How one link is moved while the others are held [deg, K's signs].
+    """How one link is moved, there and back once, while the others are held [deg, K's signs].
 
     Attributes:
         moving: range of the moving link.
@@ -29,12 +29,12 @@ class Sweep(NamedTuple):
 SWEEPS: Mapping[str, Sweep] = {
     "pitch": Sweep((20.0, 80.0), {"swing": 0.0, "boom": -27.5, "stick": 80.0},
                    {"boom": -0.2, "stick": 0.3}, 40.0),
-    "stick": Sweep((50.0, 140.0), {"swing": 0.0, "boom": -27.5, "pitch": 42.9}, {"boom": -0.4}),
-    "boom": Sweep((-48.0, -5.0), {"swing": 0.0, "stick": 80.2, "pitch": 42.9}, {"stick": 0.6}),
-    "swing": Sweep((-95.0, 95.0), {"boom": -26.8, "stick": 81.0, "pitch": 42.9},
+    "stick": Sweep((45.0, 145.0), {"swing": 0.0, "boom": -27.5, "pitch": 42.9}, {"boom": -0.4}),
+    "boom": Sweep((-48.0, -4.0), {"swing": 0.0, "stick": 80.2, "pitch": 42.9}, {"stick": 0.6}),
+    "swing": Sweep((-95.0, 60.0), {"boom": -26.8, "stick": 81.0, "pitch": 42.9},
                    {"boom": -0.4, "stick": 0.8}, 10.0, 400),
 }  # fmt: skip
-"""Trajectories in kind of Khoshzaban 1992 Figs 16 to 18 (stick, boom, swing), and of link 4."""
+"""Ranges, drifts and numbers of poses of Khoshzaban 1992 Figs 16 to 18, and of link 4 alike (A)."""
 
 _HELD = {"swing": 0.0, "boom": -27.8, "stick": 80.6, "pitch": 42.9}  # K Table 2
 
@@ -75,7 +75,7 @@ def sweep_poses(loop: Loop, link: str, sweep: Sweep, seed: int = 0) -> Clean:
     for name, angle in sweep.held.items():
         theta[:, loop.links.index(name)] = np.radians(angle + sweep.drift.get(name, 0.0) * u)
     moving = loop.links.index(link)
-    theta[:, moving] = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(4.0 * np.pi * u - 1.2)
+    theta[:, moving] = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(2.0 * np.pi * u)
     pointing = _pointing(loop, theta)
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     wave = sum(np.sin(2.0 * np.pi * f * u + p) for f, p in zip((3.7, 7.3, 11.9), phases, strict=True))
