@@ -4,12 +4,13 @@ The kinematics of the closed chain, for studies of many seeds; `models/calibrato
 with masses and hydraulics in MuJoCo.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import Loop, frame_of
+from hydrotele.calibrate.loop import Loop, ball_place, frame_of
 from hydrotele.calibrate.sweeps import Clean
 
 RESOLVER = np.radians(0.1)
@@ -71,12 +72,15 @@ def stressed(loop: Loop, clean: Clean, rng: np.random.Generator, degrees: float 
     return extra
 
 
-def perturbed(loop: Loop, rng: np.random.Generator, length: float = 0.03, angle: float = 1.0) -> Loop:
+def perturbed(
+    loop: Loop, rng: np.random.Generator, length: float = 0.03, angle: float = 1.0,
+    sensors: float = 0.0,
+) -> Loop:  # fmt: skip
     """A true chain that differs from the nominal one as a machine built and worn does.
 
     Lengths of the manipulator and the ball's place differ by N(0, length) [m], its twists and the
     offsets of grapple, yoke and twist by N(0, angle) [deg]. The calibrator's own links, known from
-    the laboratory, do not.
+    the laboratory, do not. The manipulator's own sensors read with offsets of N(0, sensors) [deg].
     """
     values, m = loop.values.copy(), loop.moved
     for k in range(m + 1):
@@ -87,5 +91,37 @@ def perturbed(loop: Loop, rng: np.random.Generator, length: float = 0.03, angle:
     values[1, 3] += length * rng.standard_normal()
     values[m, 3] += length * rng.standard_normal()
     values[m : m + 3, 0] += np.radians(angle) * rng.standard_normal(3)
+    if sensors:
+        values[1:m, 0] += np.radians(sensors) * rng.standard_normal(m - 1)
     ball = loop.ball + np.array([1.0, 0.0, 1.0]) * length * rng.standard_normal(3)
     return replace(loop, values=values, ball=ball)
+
+
+def true_numbers(
+    loop: Loop, nominal: Loop, names: Sequence[str], clean: Sequence[Clean]
+) -> np.ndarray:
+    """True values of identified parameters.
+
+    Args:
+        loop: the true chain.
+        nominal: the nominal one, whose d a stage's p_z counts from.
+        names: (p) of the parameters.
+        clean: true poses; a held angle is its mean in the stage that identifies it.
+
+    Returns:
+        (p,) [rad] or [m].
+    """
+    stages = {one.link: one for one in clean}
+    found = []
+    for name in names:
+        kind, _, link = name.partition(".")
+        place = loop.links.index(link)
+        if kind == "held":
+            found.append(float(stages[loop.links[place - 1]].theta[:, place].mean()))
+        elif kind in ("p_xy", "p_z"):
+            seen = ball_place(loop, place, stages[link].theta[:1, place + 1 :])[0]
+            height = seen[2] - loop.values[place, 3] + nominal.values[place, 3]
+            found.append(float(np.hypot(*seen[:2]) if kind == "p_xy" else height))
+        else:
+            found.append(loop.value(name))
+    return np.array(found)
