@@ -18,19 +18,66 @@ HeldOut = Annotated[
 Out = Annotated[
     Path | None, typer.Option("--out", "-o", help="Folder to write; default nothing is written.")
 ]
+MachineName = Annotated[
+    str, typer.Option("--machine", "-m", help="Machine with a calibrator, shipped or a folder.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
-@app.command()
-def arm(data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False) -> None:
-    """Links of an arm from logs of the external calibrator (Khoshzaban 1992)."""
-    raise InputError("calibrate arm", "is not there yet")
+@app.command(epilog="Example:  hydrotele calibrate arm --data logs --json --out calibrated")
+def arm(
+    data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False,
+    machine: MachineName = "calibrator",
+    method: Annotated[str, typer.Option(help="joint or hierarchical.")] = "joint",
+    poses: Annotated[int, typer.Option(min=10, help="Poses to take of each log.")] = 300,
+    accuracy_deg: Annotated[
+        float | None, typer.Option(help="Standard deviation of an angle sensor [deg].")
+    ] = None,
+    bad_data: Annotated[bool, typer.Option(help="Look for corrupted readings, leave out.")] = True,
+    drift: Annotated[
+        bool, typer.Option(help="Use the arm's own sensors for how held links drift.")
+    ] = True,
+) -> None:  # fmt: skip
+    """Links of an arm from logs of the external calibrator (Khoshzaban 1992).
+
+    One log per link that moved while the others were held. --heldout N: every N-th pose is judged
+    on and not fitted; default 5.
+    """
+    from hydrotele.cli.calibrating_arm import ArmChoices, calibrate_arm
+
+    calibrate_arm(
+        data, machine, ArmChoices(method, poses, accuracy_deg, bad_data, drift, heldout), out, json
+    )
 
 
-@app.command()
-def linkage(data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False) -> None:
-    """Cylinder linkages of an arm from joint angles and cylinder lengths."""
-    raise InputError("calibrate linkage", "is not there yet")
+@app.command(epilog="Example:  hydrotele calibrate linkage --data logs --json")
+def linkage(
+    data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False,
+    machine: MachineName = "calibrator",
+    angles: Annotated[
+        str, typer.Option(help="measured: the joints' sensors; identified: from the calibrator.")
+    ] = "measured",
+) -> None:  # fmt: skip
+    """Cylinder linkages of an arm from joint angles and cylinder lengths.
+
+    Every fifth sample is judged on and not fitted.
+    """
+    from hydrotele.cli.calibrating_arm import calibrate_linkage
+
+    if heldout is not None:
+        raise InputError("--heldout", "is not used here: every fifth sample is judged on")
+    calibrate_linkage(data, machine, angles, out, json)
+
+
+@app.command(epilog="Example:  hydrotele calibrate design --out design")
+def design(
+    out: Out = None, json: Json = False, machine: MachineName = "calibrator",
+    accuracy_deg: Annotated[float, typer.Option(help="Bound of an angle sensor [deg].")] = 0.1,
+) -> None:  # fmt: skip
+    """Lengths of a calibrator's arms and the ball joint's place that tell an arm best."""
+    from hydrotele.cli.calibrating_arm import design_calibrator
+
+    design_calibrator(machine, accuracy_deg, out, json)
 
 
 @app.command(

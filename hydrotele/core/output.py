@@ -23,6 +23,7 @@ OURS = {
         "patched/machine.*", "patched/machine_assets/*", "patched/effects.yaml",
     ),
     "compare": ("compare.json", "*.png"),
+    "calibration": ("calibration.json", "report.html", "machine.yaml", "*.png"),
     "identify": ("identify.json", "report.html", "identified/machine.*",
                  "identified/machine_assets/*"),
     "experiments": ("experiments.json", "table.md", "report.html"),

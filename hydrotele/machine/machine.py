@@ -142,18 +142,24 @@ class Arm(Facts):
 
 
 class Machine(Facts):
-    """Everything the simulator, the controller and the learning code know of a machine."""
+    """Everything the simulator, the controller and the learning code know of a machine.
+
+    `sensed_joints` are the joints with a calibrator's angle sensors, from the machine outwards;
+    `attached` names MJCF files whose bodies hang on a body of `mjcf`, by that body's name.
+    """
 
     name: Name
     description: str = ""
     source: str = ""
     mjcf: str | None = None
+    attached: dict[Name, str] = {}
     folder: str = ""
     tool: Name = "none"
     tools: tuple[str, ...] = ("none",)
     gravity: Vector = (0.0, 0.0, -9.81)
     links: dict[Name, Link]
     axes: dict[Name, Axis]
+    sensed_joints: tuple[Name, ...] = ()
     closures: dict[Name, Closure] = {}
     supply: Supply | None = None
     loads: dict[Name, LoadCylinder] = {}
@@ -227,9 +233,16 @@ class Machine(Facts):
         return EndStop(stiffness=stiffness, damping=_STOP_RETARDATION * stiffness)
 
     @property
+    def undriven_sensed_joints(self) -> tuple[str, ...]:
+        """Those of the sensed joints that no drive moves; a driven one has its axis' channel."""
+        driven = {axis.joint for axis in self.axes.values()}
+        return tuple(joint for joint in self.sensed_joints if joint not in driven)
+
+    @property
     def sensed_channels(self) -> tuple[str, ...]:
         """Channels that sensors of this machine can show."""
         names = [f"{self.position_kind(axis)}.{axis}" for axis in self.axes]
+        names += [f"angle.{joint}" for joint in self.undriven_sensed_joints]
         names += [f"length.{name}" for name, axis in self.axes.items() if axis.cylinder]
         for side in ("head", "rod"):
             names += [f"pressure_{side}.{axis}" for axis in self.hydraulic_axes]
@@ -254,6 +267,12 @@ class Machine(Facts):
         for name, closure in self.closures.items():
             for end in (closure.a, closure.b):
                 _expect(end.link, known, f"closures.{name}")
+        for joint in self.sensed_joints:
+            _expect(joint, joints, "sensed_joints")
+            if joints[joint].type != "hinge":
+                raise ValueError(f"sensed_joints: {joint} must be a hinge")
+        if strange := [j for j in self.undriven_sensed_joints if j in self.axes]:
+            raise ValueError(f"sensed_joints: {strange[0]} is the name of another joint's axis")
         for joint in self.home:
             _expect(joint, joints, "home")
             low, high = joints[joint].range or (-np.inf, np.inf)

@@ -6,6 +6,7 @@ the same name; saying the same number twice is refused.
 """
 
 import math
+import os
 import shutil
 from pathlib import Path
 
@@ -67,6 +68,9 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
     """
     path = machine_path(name_or_path)
     data, lines = read_yaml(path)
+    others: list[dict] = []
+    if "extends" in data:
+        data, others = _extended(data, path, lines)
     tools = data.pop("tools", None) or {"none": {}}
     _check_tools(tools, path, lines)
     tool = tool or data.get("tool") or "none"
@@ -74,7 +78,7 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
         raise InputError(_place(path, lines, "tools"), f"no tool {tool!r}; {suggest(tool, tools)}")
     lines = _merge_tool(data, tool, tools[tool] or {}, path, lines)
     data |= {"tool": tool, "tools": sorted(tools), "folder": str(path.parent.resolve())}
-    others = [fragment for name, fragment in tools.items() if name != tool and fragment]
+    others += [fragment for name, fragment in tools.items() if name != tool and fragment]
     kept = _bodies_of([data])
     if data.get("resolved") and not (path.parent / str(data.get("mjcf"))).exists():
         data["folder"] = str(models_folder().resolve())
@@ -102,9 +106,15 @@ def save_machine(machine: Machine, path: str | Path) -> None:
     for key in ("folder", "tools"):
         data.pop(key, None)
     data |= {"tool": tool, "tools": {tool: {}}, "resolved": True}
+    shipped = models_folder().resolve()
+    attached = {b: Path(machine.folder, f).resolve() for b, f in machine.attached.items()}
+    if attached:
+        data["attached"] = {
+            body: str(file.relative_to(shipped) if file.is_relative_to(shipped) else file)
+            for body, file in attached.items()
+        }
     if machine.mjcf:
         mjcf = Path(machine.folder, machine.mjcf).resolve()
-        shipped = models_folder().resolve()
         copy = Path(path).with_suffix(".tree.xml")
         if mjcf.is_relative_to(shipped):
             data["mjcf"] = str(mjcf.relative_to(shipped))
@@ -127,6 +137,43 @@ def _with_law_files(machine: Machine, folder: Path) -> Machine:
                 shutil.copyfile(file, folder / source)
         terms.append(term.model_copy(update={"source": source}))
     return machine.model_copy(update={"terms": tuple(terms)})
+
+
+def _extended(data: dict, path: Path, lines) -> tuple[dict, list[dict]]:
+    """A file that says what it adds to another machine, or changes of it, as a whole machine.
+
+    Returns:
+        The data, and what the other machine's unused tools would add.
+    """
+    base = data.pop("extends")
+    where = _place(path, lines, "extends")
+    if not isinstance(base, dict) or not base.keys() <= {"machine", "tool"} or "machine" not in base:
+        raise InputError(where, "must say {machine: NAME or FOLDER, tool: NAME}")
+    name = str(base["machine"])
+    beside = path.parent / name
+    file = machine_path(beside if (beside / MACHINE_FILE).is_file() else name)
+    whole, base_lines = read_yaml(file)
+    if "extends" in whole:
+        raise InputError(where, f"{name} extends a machine itself; name that one")
+    tools = whole.pop("tools", None) or {"none": {}}
+    _check_tools(tools, file, base_lines)
+    tool = base.get("tool", "none")
+    if tool not in tools:
+        raise InputError(where, f"{name} has no tool {tool!r}; {suggest(str(tool), tools)}")
+    _merge_tool(whole, tool, tools[tool] or {}, file, base_lines)
+    if whole.get("mjcf"):
+        whole["mjcf"] = os.path.relpath(file.parent / str(whole["mjcf"]), path.parent)
+    unused = [fragment for other, fragment in tools.items() if other != tool and fragment]
+    whole = _overlaid(whole, data)
+    home = _entries(whole, "home")
+    return whole | {"home": {k: v for k, v in home.items() if v is not None}}, unused
+
+
+def _overlaid(base, new):
+    """Sections of `new` over those of `base`, mappings entry by entry."""
+    if not (isinstance(base, dict) and isinstance(new, dict)):
+        return new
+    return base | {key: _overlaid(base.get(key), value) for key, value in new.items()}
 
 
 def _place(path: Path, lines, *keys: str) -> str:

@@ -257,6 +257,8 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
     path = Path(machine.folder, machine.mjcf)
     try:
         tree = read_xml(path)
+        for body, file in machine.attached.items():
+            _attach(tree, body, Path(machine.folder, file))
         name_geoms(tree)
         if not looks:
             without_looks(tree)
@@ -269,11 +271,24 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
         raise InputError(path, f"is not an MJCF that dm_control reads: {error}") from None
 
 
+def _attach(tree: Element, body: str, file: Path) -> None:
+    """Hang the bodies of another MJCF file on a body of a tree, in place; they bring no assets."""
+    place = next((element for element in tree.iter("body") if element.get("name") == body), None)
+    world = read_xml(file).find("worldbody")
+    if place is None or world is None:
+        raise InputError(file, f"cannot hang on {body!r}: no such body, or no worldbody in the file")
+    place.extend(world.findall("body"))
+
+
 def _refuse_foreign_parts(root, machine: Machine) -> None:
     """Refuse what the machine file has to say, or what no log would show."""
     known = set(machine.joints)
     for name, axis in machine.axes.items():
         known |= {f"{name}_tube", f"{name}_rod"} if axis.cylinder else set()
+    for name, link in machine.links.items():
+        body = root.find("body", name)
+        if body is not None and link.joint is None:
+            known |= {joint.name for joint in body.joint}  # locked by the machine file
     joints = [j.name or "a joint without name" for j in root.find_all("joint")]
     strange = {
         "actuators": [a.name for a in root.find_all("actuator")],
@@ -318,6 +333,8 @@ def _write_link(root, name: str, link: Link) -> None:
     body.pos = link.position
     _set_inertial(body, link.mass, link.com, link.inertia)
     if link.joint is None:
+        for joint in list(body.joint):
+            joint.remove()
         return
     joint = root.find("joint", link.joint.name)
     if joint is None:

@@ -298,6 +298,8 @@ def _sensed(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.nda
     values = {}
     for i, name in enumerate(plant.axes):
         values[f"{plant.machine.position_kind(name)}.{name}"] = qpos[:, plant.qpos[i]]
+    for name in plant.machine.undriven_sensed_joints:
+        values[f"angle.{name}"] = qpos[:, plant.model.joint(name).qposadr[0]]
     for i, name in enumerate(plant.axes):
         if plant.machine.axes[name].cylinder:
             values[f"length.{name}"] = qpos[:, plant.rod_qpos[i]]

@@ -379,7 +379,7 @@ def test_round_trip(tmp_path, name, tool):
     path = tmp_path / "saved.yaml"
     save_machine(machine, path)
     again = load_machine(path)
-    moved = {"folder": "", "mjcf": None, "tools": ()}
+    moved = {"folder": "", "mjcf": None, "attached": {}, "tools": ()}
     assert again.model_copy(update=moved) == machine.model_copy(update=moved)
     assert mjcf_document(assemble(again)) == mjcf_document(assemble(machine))
     save_machine(again, tmp_path / "twice.yaml")

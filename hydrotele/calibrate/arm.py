@@ -1,0 +1,522 @@
+"""Identification of a manipulator from a calibrator's readings, without the manipulator's angles.
+
+While link i moves, the ball joint keeps its distance p_xy from the axis of joint i and its height
+p_z along it; that are two equations per pose without the angle of joint i (Khoshzaban 1992,
+Eq. 3.25). Links are identified one after the other, the outermost first, and then all together.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+import scipy.sparse
+
+from hydrotele.calibrate.arm_poses import Poses
+from hydrotele.calibrate.estimation import identifiable, least_squares
+from hydrotele.calibrate.loop import KINDS, Loop, ball_from, ball_place, unit_of
+from hydrotele.core.errors import InputError
+from hydrotele.identify.identifiability import Identifiability
+
+SIZES = {"m": 0.1, "rad": np.radians(5.0)}
+"""How far a parameter may be from its nominal value, by unit: what a tape and a protractor leave."""
+
+LABORATORY = {"m": 1.0e-3, "rad": np.radians(0.05)}
+"""The same of the calibrator's own links, which were measured in a laboratory (K 3.6.4)."""
+
+TRUNCATION = (0.05, 0.01, 1.0e-3, 1.0e-5)
+"""Shares of the largest singular value below which directions are left out: K's 5 %, lowered."""
+
+_CRITICAL = 1.959964
+_ROUNDS = 3  # of weights that depend on the parameters; the second already changes nothing by 1e-3
+_FLOOR = 1.0e-4  # m: no pose counts as known better than this, where readings do not show at all
+_FEWEST = 2  # equations per parameter
+_STILL = np.radians(2.0)  # of a sensor: it has to move by more while a link moves
+
+Numbers = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one moving link told.
+
+    Attributes:
+        link: the moving link.
+        names: parameters that were identified, p of them.
+        told: which of the stage's candidates its poses tell.
+        fixed: name of every other candidate -> why it kept its value.
+        iterations: of Levenberg-Marquardt.
+        poses: number of poses.
+        rms: root mean square of both equations' residuals [m].
+        chi: the same over what the sensors' accuracy explains; 1 where nothing else disturbs.
+        condition: ratio of the singular values of the columns of the identified parameters.
+    """
+
+    link: str
+    names: tuple[str, ...]
+    told: Identifiability
+    fixed: Mapping[str, str]
+    iterations: int
+    poses: int
+    rms: float
+    chi: float
+    condition: float
+
+
+@dataclass(frozen=True)
+class ArmFit:
+    """A calibrated manipulator.
+
+    Attributes:
+        nominal: the chain before.
+        loop: the chain with the identified parameters.
+        names: identified parameters, p of them, in the order of their stages.
+        values: (p,) of them [rad] or [m].
+        covariance: (p, p) of the values, sensor noise of this and of earlier stages.
+        numbers: every parameter of the chain, held angles and ball places, identified or not.
+        start: the same before the identification.
+        stages: of the moving links, the outermost first.
+        method: `hierarchical` or `joint`.
+    """
+
+    nominal: Loop
+    loop: Loop
+    names: tuple[str, ...]
+    values: np.ndarray
+    covariance: np.ndarray
+    numbers: Mapping[str, float]
+    start: Mapping[str, float]
+    stages: tuple[Stage, ...]
+    method: str
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """(p,) standard deviations [rad] or [m]."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def intervals(self) -> np.ndarray:
+        """(p, 2) 95 % intervals [rad] or [m]."""
+        reach = _CRITICAL * self.deviations
+        return np.column_stack([self.values - reach, self.values + reach])
+
+    def value(self, name: str) -> float:
+        """A parameter by its name, identified or kept."""
+        return float(self.numbers[name])
+
+
+def stage_order(loop: Loop, stages: Sequence[Poses]) -> list[Poses]:
+    """Stages from the outermost link inwards.
+
+    Raises:
+        InputError: a link is none that moves, is there twice, or its readings tell nothing.
+    """
+    links = loop.links[: loop.moved]
+    for poses in stages:
+        if poses.link not in links:
+            message = f"moves {poses.link!r}; links that can be calibrated: {', '.join(links)}"
+            raise InputError(poses.source, message)
+    names = [poses.link for poses in stages]
+    for name in names:
+        if names.count(name) > 1:
+            twice = [poses.source for poses in stages if poses.link == name]
+            raise InputError(twice[1], f"moves {name} like {twice[0]}: keep one of them")
+    return sorted(stages, key=lambda poses: -links.index(poses.link))
+
+
+def candidates(loop: Loop, link: str) -> list[str]:
+    """Parameters that the poses of a moving link may tell, the most wanted first.
+
+    Args:
+        loop: the chain.
+        link: the moving link.
+
+    Returns:
+        Names; of parameters that show only together the first one is identified.
+    """
+    place = loop.links.index(link)
+    first = [f"p_xy.{link}", f"p_z.{link}"]
+    if place == loop.moved - 1:
+        mount = loop.links[loop.moved]
+        own = [f"{k}.{link}" for k in ("alpha", "a")]
+        own += [f"{k}.{mount}" for k in ("offset", "alpha", "a", "d")]
+        rest = loop.links[loop.moved + 1 :]
+        own += [f"offset.{name}" for name in rest[:-1]]
+        own += [f"offset.{rest[-1]}"]
+        own += [f"{k}.{name}" for name in rest for k in ("d", "a", "alpha", "beta")]
+        own += [f"beta.{mount}"]
+    else:
+        outer = loop.links[place + 1]
+        own = [f"held.{outer}", f"alpha.{link}", f"a.{link}", f"d.{outer}"]
+    own += [f"beta.{link}", f"d.{link}"]
+    return first + own
+
+
+def size_of(loop: Loop, name: str) -> float:
+    """How far a parameter may be from where it starts [rad] or [m]."""
+    kind, _, link = name.partition(".")
+    known = loop.links[loop.moved + 1 :]
+    if link in known and not (kind == "offset" and link != known[-1]):
+        return LABORATORY[unit_of(name)]
+    return SIZES[unit_of(name)]
+
+
+class Equations:
+    """The two equations per pose of one stage."""
+
+    def __init__(self, loop: Loop, poses: Poses) -> None:
+        self.loop, self.poses = loop, poses
+        self.place = loop.links.index(poses.link)
+        self.outer = loop.links[self.place :]
+
+    def seen(self, numbers: Mapping[str, float]) -> tuple[Loop, np.ndarray]:
+        """The chain with numbers, and the angles (M, links - 1) of the joints beyond the moving.
+
+        The moving link's own d keeps its nominal value: only p_z less it can be told.
+        """
+        loop, poses = self.loop, self.poses
+        values = np.array([[numbers[f"{kind}.{link}"] for kind in KINDS] for link in loop.links])
+        values[self.place, KINDS.index("d")] = loop.values[self.place, KINDS.index("d")]
+        theta = np.empty((len(poses), len(loop) - self.place - 1))
+        for column, link in enumerate(self.outer[1:]):
+            k = self.place + 1 + column
+            if k < loop.moved:
+                theta[:, column] = numbers[f"held.{link}"]
+                if poses.drift and link in poses.drift.held:
+                    theta[:, column] += poses.drift.held[link]
+            else:
+                theta[:, column] = poses.theta[:, k - loop.moved] + numbers[f"offset.{link}"]
+        return dataclasses.replace(loop, values=values), theta
+
+    def _error(self, s: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
+        reach, link = np.hypot(s[:, 0], s[:, 1]), self.poses.link
+        error = np.stack([reach - numbers[f"p_xy.{link}"], s[:, 2] - numbers[f"p_z.{link}"]], axis=1)
+        return error - self.poses.drift.ball[:, :2] if self.poses.drift else error
+
+    def residual(self, numbers: Mapping[str, float]) -> np.ndarray:
+        """Residual (M, 2) [m]."""
+        loop, theta = self.seen(numbers)
+        return self._error(ball_place(loop, self.place, theta), numbers)
+
+    def at(self, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residual (M, 2) [m], derivative (M, 2, links, 5), the same by the S readings."""
+        loop, theta = self.seen(numbers)
+        s, by = ball_from(loop, self.place, theta)
+        way = s[:, :2] / np.hypot(s[:, :1], s[:, 1:2])
+        plane = way[:, 0, None, None] * by[:, 0] + way[:, 1, None, None] * by[:, 1]
+        rows = np.stack([plane, by[:, 2]], axis=1)
+        return self._error(s, numbers), rows, rows[:, :, loop.moved - self.place :, 0]
+
+    def columns(self, by: np.ndarray, names: Sequence[str], own_d: bool = False) -> np.ndarray:
+        """(M, 2, p) derivative by named parameters; zero by those that do not appear.
+
+        The moving link's d appears only where `own_d` says so.
+        """
+        out = np.zeros((*by.shape[:2], len(names)))
+        for column, name in enumerate(names):
+            kind, _, link = name.partition(".")
+            if kind in ("p_xy", "p_z"):
+                if link == self.poses.link:
+                    out[:, 0 if kind == "p_xy" else 1, column] = -1.0
+            elif link in self.outer:
+                k = self.outer.index(link)
+                held = 0 < k and self.place + k < self.loop.moved
+                if k == 0 and kind == "d" and not own_d:
+                    continue
+                if kind == "held" and held:
+                    out[:, :, column] = by[:, :, k, 0]
+                elif kind != "held" and not (kind == "offset" and self.place + k < self.loop.moved):
+                    out[:, :, column] = by[:, :, k, KINDS.index(kind)]
+        return out
+
+    def whitening(self, sensed: np.ndarray) -> np.ndarray:
+        """(M, 2, 2) upper factors that give both equations of a pose unit covariance."""
+        spread = sensed * self.poses.sigma
+        covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(2)
+        return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
+
+
+def start_numbers(loop: Loop, stages: Sequence[Poses]) -> Numbers:
+    """Every parameter where the identification starts.
+
+    Held angles are the manipulator's own readings where it has sensors, else those at home; the
+    ball's places follow from the readings of each stage with the nominal chain.
+
+    Args:
+        loop: the nominal chain.
+        stages: the poses.
+
+    Returns:
+        Name -> [rad] or [m].
+    """
+    numbers = {name: loop.value(name) for name in loop.names}
+    for k, link in enumerate(loop.links[: loop.moved]):
+        numbers[f"held.{link}"] = float(loop.home[k])
+        inward = [p for p in stages if loop.links.index(p.link) < k and link in p.manipulator]
+        if inward:
+            outermost = max(inward, key=lambda p: loop.links.index(p.link))
+            numbers[f"held.{link}"] = float(np.median(outermost.manipulator[link]) + loop.values[k, 0])
+    for poses in stages:
+        blank = numbers | {f"p_xy.{poses.link}": 0.0, f"p_z.{poses.link}": 0.0}
+        mean = Equations(loop, poses).residual(blank).mean(axis=0)
+        numbers[f"p_xy.{poses.link}"], numbers[f"p_z.{poses.link}"] = map(float, mean)
+    return numbers
+
+
+def identify_arm(
+    loop: Loop, stages: Sequence[Poses], *, weighted: bool = True,
+    chosen: Mapping[str, Sequence[str]] | None = None,
+) -> ArmFit:  # fmt: skip
+    """Identify link by link, from the outermost of the stages inwards.
+
+    Args:
+        loop: the nominal chain.
+        stages: poses of one or more links; links that are missing keep their nominal parameters.
+        weighted: give each equation the weight of its sensors' errors; False for Khoshzaban's plain
+            least squares, whose intervals are too optimistic.
+        chosen: link -> parameters to identify instead of those that are found to be told.
+
+    Returns:
+        The fit, with the covariance that sensor noise leaves in this and all earlier stages.
+
+    Raises:
+        InputError: poses that do not suffice; names file, link, and what to do.
+
+    Source: Khoshzaban 1992, sections 3.6.3 and 3.6.4.
+    """
+    order = stage_order(loop, stages)
+    for poses in order:
+        check_poses(loop, poses)
+    numbers = start_numbers(loop, order)
+    start = dict(numbers)
+    names: tuple[str, ...] = ()
+    covariance = np.zeros((0, 0))
+    found = []
+    for poses in order:
+        equations = Equations(loop, poses)
+        wanted = candidates(loop, poses.link)
+        told = what_is_told(equations, start | {n: numbers[n] for n in names}, wanted)
+        own = list((chosen or {}).get(poses.link, [told.names[k] for k in sorted(told.base)]))
+        stage, numbers, covariance = identify_stage(
+            equations, numbers, own, names, covariance, told, wanted, weighted
+        )
+        names = (*names, *own)
+        found.append(stage)
+    return arm_fit(loop, numbers, start, names, covariance, found, "hierarchical")
+
+
+def what_is_told(
+    equations: Equations, numbers: Numbers, names: Sequence[str]
+) -> Identifiability:
+    """What the poses of a stage tell of its candidates, about the given numbers."""
+    loop = equations.loop
+    _, by, sensed = equations.at(numbers)
+    matrix = equations.whitening(sensed) @ equations.columns(by, names, own_d=True)
+    sizes = [size_of(loop, name) for name in names]
+    return identifiable(matrix.reshape(-1, len(names)), names, sizes, sigma=1.0)
+
+
+def identify_stage(
+    equations: Equations, numbers: Numbers, own: list[str], earlier: tuple[str, ...],
+    covariance: np.ndarray, told: Identifiability, wanted: Sequence[str], weighted: bool = True,
+    near: bool = False,
+) -> tuple[Stage, Numbers, np.ndarray]:  # fmt: skip
+    """Identify what one stage tells.
+
+    Args:
+        equations: of the stage.
+        numbers: every parameter, where the search starts.
+        own: p parameters to identify.
+        earlier: q parameters that earlier stages identified.
+        covariance: (q, q) of these.
+        told: what the poses tell of the candidates.
+        wanted: the candidates.
+        weighted: as `identify_arm`.
+        near: whether the start is near, so that no singular value has to be left out.
+
+    Returns:
+        (the stage, all numbers, covariance (q + p, q + p) of earlier and own parameters).
+
+    Raises:
+        InputError: too few poses.
+    """
+    poses, loop = equations.poses, equations.loop
+    if 2 * len(poses) < _FEWEST * len(own):
+        raise InputError(
+            poses.source,
+            f"{len(poses)} poses of {poses.link} are too few for {len(own)} parameters:"
+            f" record {len(own) * _FEWEST} or more, better 200",
+        )
+    sizes = [size_of(loop, name) for name in own]
+    start = np.array([numbers[name] for name in own])
+    iterations, fit = 0, None
+    for _ in range(_ROUNDS if weighted else 1):
+        now = numbers if fit is None else numbers | dict(zip(own, fit.values.tolist(), strict=True))
+        whitening = equations.whitening(equations.at(now)[2])
+        if not weighted:
+            level = np.sqrt(np.mean(np.linalg.inv(whitening) ** 2) * 2.0)
+            whitening = np.broadcast_to(np.eye(2) / level, whitening.shape)
+
+        def residual(x, whitening=whitening):
+            error = equations.residual(numbers | dict(zip(own, x.tolist(), strict=True)))
+            return (whitening @ error[..., None]).ravel()
+
+        def jacobian(x, whitening=whitening):
+            _, by, _ = equations.at(numbers | dict(zip(own, x.tolist(), strict=True)))
+            return (whitening @ equations.columns(by, own)).reshape(-1, len(own))
+
+        fit = least_squares(
+            residual, start if fit is None else fit.values, own, sizes, sigma=1.0, jac=jacobian,
+            truncation=TRUNCATION if iterations == 0 and not near else None, select="none",
+        )  # fmt: skip
+        iterations = iterations or fit.iterations
+    assert fit is not None
+    numbers = numbers | dict(zip(own, fit.values.tolist(), strict=True))
+    error, by, _ = equations.at(numbers)
+    inverse = np.linalg.pinv((whitening @ equations.columns(by, own)).reshape(-1, len(own)))
+    chi = float(np.sqrt(np.mean(np.einsum("mij,mj->mi", whitening, error) ** 2)
+                        * 2 * len(poses) / (2 * len(poses) - len(own))))  # fmt: skip
+    before = (whitening @ equations.columns(by, earlier)).reshape(2 * len(poses), len(earlier))
+    through = -inverse @ before
+    noise = max(chi, 1.0) ** 2 * inverse @ inverse.T
+    corner = through @ covariance
+    covariance = np.block([[covariance, corner.T], [corner, noise + corner @ through.T]])
+    columns = equations.columns(by, own).reshape(-1, len(own)) * sizes
+    columns = columns / np.linalg.norm(columns, axis=0)
+    fixed = {name: _reason(told, name, loop) for name in wanted if name not in own}
+    stage = Stage(
+        poses.link, tuple(own), told, fixed, iterations, len(poses),
+        float(np.sqrt(np.mean(error**2))), chi, float(np.linalg.cond(columns)),
+    )  # fmt: skip
+    return stage, numbers, covariance
+
+
+def _reason(told: Identifiability, name: str, loop: Loop) -> str:
+    """Why a candidate keeps its value, in a few words."""
+    kind, _, link = name.partition(".")
+    if link in loop.links[loop.moved + 1 :] and size_of(loop, name) == LABORATORY[unit_of(name)]:
+        if told.status[told.names.index(name)] != "unidentifiable":
+            return "known better from the laboratory"
+    column = told.combination[:, told.names.index(name)]
+    partners = [told.names[told.base[k]] for k in np.flatnonzero(column)]
+    if told.status[told.names.index(name)] == "unidentifiable" or not partners:
+        return "shows in no pose"
+    return f"shows only together with {', '.join(partners)}"
+
+
+def arm_fit(loop, numbers, start, names, covariance, stages, method) -> ArmFit:
+    values = {name: numbers[name] for name in loop.names}
+    calibrated = loop.with_values(values)
+    first = loop.links[0]
+    if f"p_xy.{first}" in names:
+        flat = np.hypot(*loop.ball[:2])
+        way = loop.ball[:2] / flat if flat > 0.0 else np.array([1.0, 0.0])
+        ball = np.array([*(way * numbers[f"p_xy.{first}"]),
+                         numbers[f"p_z.{first}"] ])  # fmt: skip
+        calibrated = dataclasses.replace(calibrated, ball=ball)
+    return ArmFit(
+        loop, calibrated, names, np.array([numbers[n] for n in names]), covariance, numbers, start,
+        tuple(stages), method,
+    )  # fmt: skip
+
+
+def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
+    """Identify all stages together, from where the hierarchical identification ended.
+
+    Every parameter takes part in all stages in which it appears; the ball's places are each
+    stage's own. The Jacobian is sparse: a stage's rows know no parameter of the links inside.
+
+    Args:
+        fit: the hierarchical one.
+        stages: the same poses.
+
+    Returns:
+        The joint fit of the same parameters.
+
+    Raises:
+        InputError: the search does not converge.
+    """
+    loop, names = fit.nominal, fit.names
+    order = stage_order(loop, stages)
+    equations = [Equations(loop, poses) for poses in order]
+    sizes = np.array([size_of(loop, name) for name in names])
+    base = dict(fit.numbers)
+    x = fit.values.copy()
+    for _ in range(_ROUNDS):
+        now = base | dict(zip(names, x.tolist(), strict=True))
+        whitenings = [e.whitening(e.at(now)[2]) for e in equations]
+
+        def residual(u, whitenings=whitenings):
+            at = base | dict(zip(names, (u * sizes).tolist(), strict=True))
+            return np.concatenate([
+                (w @ e.residual(at)[..., None]).ravel()
+                for e, w in zip(equations, whitenings, strict=True)
+            ])  # fmt: skip
+
+        def jacobian(u, whitenings=whitenings):
+            at = base | dict(zip(names, (u * sizes).tolist(), strict=True))
+            return scipy.sparse.vstack([
+                scipy.sparse.csr_matrix(
+                    (w @ e.columns(e.at(at)[1], names)).reshape(-1, len(names)) * sizes
+                ) for e, w in zip(equations, whitenings, strict=True)
+            ]).tocsr()  # fmt: skip
+
+        found = scipy.optimize.least_squares(
+            residual, x / sizes, jacobian, x_scale="jac", ftol=1e-13, xtol=1e-11, gtol=1e-12,
+            tr_solver="lsmr", tr_options={"atol": 1e-13, "btol": 1e-13, "maxiter": 2000},
+            max_nfev=100,
+        )  # fmt: skip
+        if found.status <= 0:
+            raise InputError("joint identification", "does not converge; check the poses' residuals")
+        x = found.x * sizes
+    matrix = jacobian(x / sizes).toarray() / sizes
+    numbers = base | dict(zip(names, x.tolist(), strict=True))
+    rows, parts, kept = residual(x / sizes), [], 0
+    for poses in order:
+        parts.append(rows[kept : kept + 2 * len(poses)])
+        kept += 2 * len(poses)
+    # misfit beyond the sensors' (held links that drift) widens the intervals stage by stage
+    chi = [max(1.0, float(np.sqrt(np.mean(p**2)))) for p in parts]
+    inverse = np.linalg.pinv(matrix)
+    scaled = inverse * np.concatenate([np.full(len(p), c) for p, c in zip(parts, chi, strict=True)])
+    updated = []
+    for stage, poses, e in zip(fit.stages, order, equations, strict=True):
+        error = e.residual(numbers)
+        updated.append(dataclasses.replace(
+            stage, rms=float(np.sqrt(np.mean(error**2))),
+            chi=float(np.sqrt(np.mean(parts[order.index(poses)] ** 2))), iterations=int(found.njev),
+        ))  # fmt: skip
+    return arm_fit(loop, numbers, fit.start, names, scaled @ scaled.T, updated, "joint")
+
+
+def check_poses(loop: Loop, poses: Poses) -> None:
+    """Refuse readings that are not finite, or poses that are one and the same."""
+    bad = np.argwhere(~np.isfinite(poses.theta))
+    if len(bad):
+        row, column = bad[0]
+        name = f"angle.{loop.links[loop.moved + column]}"
+        raise InputError(f"{poses.source}, column {name}, row {row + 1}", "is not a number")
+    spread = np.ptp(poses.theta, axis=0)
+    if np.all(spread < _STILL):
+        raise InputError(
+            poses.source,
+            f"shows one pose of {poses.link} again and again: no calibrator joint moves by more"
+            f" than {np.degrees(spread.max()):.2g} deg; move the link through its range",
+        )
+
+
+def stage_residuals(loop: Loop, poses: Poses, numbers: Mapping[str, float]) -> np.ndarray:
+    """Residuals of a stage's equations in units of their sensors' errors.
+
+    Args:
+        loop: the nominal chain.
+        poses: of the stage.
+        numbers: of a fit.
+
+    Returns:
+        (M, 2) of unit variance where only the sensors err.
+    """
+    equations = Equations(loop, poses)
+    error, _, sensed = equations.at(numbers)
+    return np.einsum("mij,mj->mi", equations.whitening(sensed), error)

@@ -1,0 +1,193 @@
+"""Logs of a calibrator as poses: which link moved, which rows count, how accurate the sensors are."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hydrotele.calibrate.arm_poses import Poses
+from hydrotele.calibrate.linkage import Strokes
+from hydrotele.calibrate.loop import Loop
+from hydrotele.core.errors import InputError
+from hydrotele.logs.log import Log, load_logs
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import IDEAL, noise_rms, sensor_set
+
+POSES = 300
+"""Poses that are taken of a log, evenly spread; Khoshzaban's figures show 300 to 400."""
+
+_SETTLED = np.radians(1.0)  # a link that is held drifts by less while another is moved
+_LINEAR = 2.0e-3 / math.sqrt(3.0)  # m, of a linear transducer, K 2.5
+_RESOLVER = np.radians(0.1) / math.sqrt(3.0)  # of sensors of which nothing is said, K 2.5
+
+
+def read_stages(
+    path: Path, machine: Machine, loop: Loop, poses: int = POSES, accuracy: float | None = None
+) -> list[Poses]:
+    """Read the logs of a folder, one per moving link.
+
+    Args:
+        path: folder of logs, or one log.
+        machine: the machine with its calibrator.
+        loop: its chain.
+        poses: to take of each log at most.
+        accuracy: standard deviation of an angle reading [rad]; by default that of the sensors that
+            the logs name, or of Khoshzaban's resolvers.
+
+    Returns:
+        The stages, as the files are ordered.
+
+    Raises:
+        InputError: a log lacks a channel, is of another machine, or does not say which link moved.
+    """
+    logs = load_logs(path, required=loop.channels[loop.moved :])
+    return [stage_of(log, machine, loop, poses, accuracy) for log in logs]
+
+
+def stage_of(
+    log: Log, machine: Machine, loop: Loop, poses: int = POSES, accuracy: float | None = None
+) -> Poses:
+    """One log as a stage.
+
+    Args:
+        log: of one moving link.
+        machine: the machine with its calibrator.
+        loop: its chain.
+        poses: to take at most.
+        accuracy: standard deviation of an angle reading [rad], or None.
+
+    Returns:
+        The poses, evenly spread over the rows that count.
+
+    Raises:
+        InputError: as `read_stages`.
+    """
+    of = log.metadata.get("machine", machine.name)
+    if of != machine.name:
+        message = f"is a log of machine {of}, not of {machine.name}: name the machine with --machine"
+        raise InputError(log.source, message)
+    rows = np.arange(len(log))
+    if "valid" in log:
+        rows = rows[log["valid"] > 0.5]
+    if len(rows) < 2:
+        raise InputError(f"{log.source}, column valid", "leaves no rows: mark rows that count by 1")
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(poses, len(rows))).round().astype(int))]
+    link = moving_link(log, loop)
+    sensed = loop.channels[loop.moved :]
+    theta = np.stack([log[name][rows] for name in sensed], axis=1) * loop.signs[loop.moved :]
+    own = {
+        name: log[channel][rows] * sign
+        for name, channel, sign in zip(loop.links, loop.channels, loop.signs, strict=True)
+        if name in loop.links[: loop.moved] and channel in log
+    }
+    sigma = np.array([_deviation(log, machine, name, accuracy) for name in sensed])
+    others = [_deviation(log, machine, f"angle.{name}", accuracy) for name in own]
+    return Poses(link, theta, sigma, own, max(others, default=0.0), log.source, rows)
+
+
+def _deviation(log: Log, machine: Machine, channel: str, accuracy: float | None) -> float:
+    """Standard deviation of a channel's readings [rad]."""
+    if accuracy is not None:
+        return accuracy
+    name = log.metadata.get("sensors", "")
+    if name in machine.sensors and name != IDEAL:
+        known = noise_rms(machine, sensor_set(machine, name), channel)
+        return known or _RESOLVER
+    return _RESOLVER
+
+
+def moving_link(log: Log, loop: Loop) -> str:
+    """The powered link that moves in a log while the others are held.
+
+    Its joint angle shows it, else its cylinder's length or its command, else the file's name.
+
+    Args:
+        log: the log.
+        loop: the chain.
+
+    Returns:
+        Its name.
+
+    Raises:
+        InputError: no link moves, several do, or nothing in the log shows one.
+
+    >>> from hydrotele.machine.machine_file import load_machine
+    >>> from hydrotele.calibrate.loop import loop_of
+    >>> log = Log(np.arange(3.0), {"angle.boom": np.array([0.1, 0.3, 0.6])}, {"angle.boom": "rad"})
+    >>> moving_link(log, loop_of(load_machine("calibrator")))
+    'boom'
+    """
+    links = loop.links[: loop.moved]
+    for kind, still in (("angle", _SETTLED), ("length", 0.02), ("command", 0.1)):
+        span = {n: float(np.ptp(log[f"{kind}.{n}"])) for n in links if f"{kind}.{n}" in log}
+        moving = [name for name, size in span.items() if size > still]
+        if len(moving) > 1 and kind == "angle":
+            sizes = ", ".join(f"{n} by {np.degrees(span[n]):.1f} deg" for n in moving)
+            message = f"moves more than one link ({sizes}): move one and hold the others"
+            raise InputError(log.source, message)
+        if moving:
+            return max(moving, key=lambda name: span[name])
+        if len(span) == len(links):
+            message = f"moves none of {', '.join(links)}: move one link through its range"
+            raise InputError(log.source, message)
+    named = [name for name in links if name in Path(log.source).stem.split("_")]
+    if len(named) == 1:
+        return named[0]
+    example = f"calibrate_{links[-1]}.parquet"
+    message = f"does not say which link moves: log angles or commands, or name the file {example}"
+    raise InputError(log.source, message)
+
+
+def held_out(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], list[Poses]]:
+    """Poses to fit, and every n-th pose of each stage to judge on.
+
+    Args:
+        stages: all poses.
+        every: n; 0 for none to judge on.
+
+    Returns:
+        (stages to fit, stages to judge on).
+    """
+    if every <= 1:
+        return list(stages), []
+    judged = [np.arange(len(p)) % every == every // 2 for p in stages]
+    return ([p.only(~j) for p, j in zip(stages, judged, strict=True)],
+            [p.only(j) for p, j in zip(stages, judged, strict=True)])  # fmt: skip
+
+
+def strokes_of(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) -> list[Strokes]:
+    """Angles and cylinder displacements of the axes that move in a log.
+
+    Args:
+        log: with `angle.AXIS` and `length.AXIS`.
+        machine: the machine.
+        axes: to look for.
+        poses: samples to take at most; 0 for all.
+
+    Returns:
+        One per axis that moves by 5 deg or more.
+    """
+    found = []
+    rows = np.flatnonzero(log["valid"] > 0.5) if "valid" in log else np.arange(len(log))
+    if poses and len(rows) > poses:
+        rows = rows[np.linspace(0, len(rows) - 1, poses).round().astype(int)]
+    for axis in axes:
+        channels = f"angle.{axis}", f"length.{axis}"
+        if not all(c in log for c in channels) or np.ptp(log[channels[0]][rows]) < np.radians(5.0):
+            continue
+        angle, length = (log[c][rows] for c in channels)
+        sigma = _deviation(log, machine, channels[0], None)
+        found.append(Strokes(
+            axis, angle, length, sigma, _length_deviation(log, machine, channels[1]), "measured",
+            log.source,
+        ))  # fmt: skip
+    return found
+
+
+def _length_deviation(log: Log, machine: Machine, channel: str) -> float:
+    """Standard deviation of a displacement's reading [m]."""
+    name = log.metadata.get("sensors", "")
+    if name in machine.sensors and name != IDEAL:
+        return noise_rms(machine, sensor_set(machine, name), channel) or _LINEAR
+    return _LINEAR

@@ -1,0 +1,320 @@
+"""Corrupted readings of a calibrator: where they are, which joint's they are, without them anew.
+
+The manipulator's side predicts what the calibrator's sensors have to read. With the moving joint's
+own sensor a pose gives three equations: the ball's distance from the moving axis, its height, and
+its angle about the axis. A stretch of poses in which they do not hold is a region; the joint whose
+error alone explains it is responsible.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+import scipy.stats
+
+from hydrotele.calibrate.arm import (
+    ArmFit,
+    Equations,
+    Numbers,
+    arm_fit,
+    candidates,
+    check_poses,
+    identify_stage,
+    stage_order,
+    start_numbers,
+    what_is_told,
+)
+from hydrotele.calibrate.arm_poses import Poses
+from hydrotele.calibrate.loop import Loop, ball_from
+
+FALSE_ALARM = 0.005
+"""Probability that a whole measurement without corruption shows a region."""
+
+_ROUNDS = 8
+_CORE = 0.6  # of the poses that the first, robust fit of a stage trusts
+_EXCESS = 2.0  # times the usual size: what counts towards a region
+_FLOOR = 1.0e-4  # m, as in `arm`
+_RULED_OUT = 20.0  # difference of chi-squares: one in 20 000 that the truth lies behind by so much
+_MOST = 0.7  # of a stage's poses that may be left out
+
+
+class Region(NamedTuple):
+    """A stretch of poses of a stage with corrupted readings.
+
+    Attributes:
+        link: the moving link.
+        first: first pose.
+        last: last pose, included.
+        joint: the joint whose sensor is wrong; empty where it is the moving link's own sensor.
+        size: root mean square of its error [rad].
+        explained: part of the region's squared residual that this joint explains [1].
+        possible: every joint that the poses do not rule out, the most likely first; joints whose
+            axes are parallel in all poses of a region cannot be told apart.
+    """
+
+    link: str
+    first: int
+    last: int
+    joint: str
+    size: float
+    explained: float
+    possible: tuple[str, ...]
+
+
+class Cleaned(NamedTuple):
+    """An identification without corrupted poses.
+
+    Attributes:
+        fit: hierarchical, of the poses that are left.
+        stages: those poses.
+        regions: what was left out.
+    """
+
+    fit: ArmFit
+    stages: list[Poses]
+    regions: list[Region]
+
+
+class Misfit(NamedTuple):
+    """Equations of every pose of a stage, of unit variance where only the sensors err.
+
+    Attributes:
+        rows: (M, E) residuals; E is 3 with the moving joint's sensor, else 2.
+        sensed: (M, E, S) derivative by the calibrator's readings [1/rad].
+        own: (M, E) derivative by the moving joint's reading [1/rad], zero for E = 2.
+    """
+
+    rows: np.ndarray
+    sensed: np.ndarray
+    own: np.ndarray
+
+
+def misfit(loop: Loop, poses: Poses, numbers: Numbers) -> Misfit:
+    """Residuals of a stage with the manipulator's side.
+
+    Args:
+        loop: the nominal chain.
+        poses: of the stage.
+        numbers: of a fit.
+
+    Returns:
+        Residuals and derivatives, whitened.
+    """
+    equations = Equations(loop, poses)
+    error, _, sensed = equations.at(numbers)
+    own = np.zeros((len(poses), 2))
+    spread = sensed * poses.sigma
+    covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(2)
+    if poses.link in poses.manipulator:
+        seen, theta = equations.seen(numbers)
+        s, by = ball_from(seen, equations.place, theta)
+        reach = np.hypot(s[:, 0], s[:, 1])
+        around = np.stack([-s[:, 1], s[:, 0]], 1) / reach[:, None]
+        by_sensed = by[:, :, loop.moved - equations.place :, 0]
+        angle = np.unwrap(np.arctan2(s[:, 1], s[:, 0]) + poses.manipulator[poses.link])
+        third = reach * angle - (poses.drift.ball[:, 2] if poses.drift else 0.0)
+        third = reach.mean() * (third / reach)
+        third = third - np.median(third)
+        turn = around[:, 0, None] * by_sensed[:, 0] + around[:, 1, None] * by_sensed[:, 1]
+        error = np.column_stack([error, third])
+        sensed = np.concatenate([sensed, turn[:, None]], axis=1)
+        own = np.stack([0.0 * reach, 0.0 * reach, reach], axis=1)
+        spread = sensed * poses.sigma
+        covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(3)
+        covariance[:, 2, 2] += (reach * poses.manipulator_sigma) ** 2
+    whitening = np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
+    return Misfit(
+        (whitening @ error[..., None])[..., 0], whitening @ sensed,
+        (whitening @ own[..., None])[..., 0],
+    )  # fmt: skip
+
+
+def find_regions(
+    loop: Loop, poses: Poses, numbers: Numbers, total: int, false_alarm: float = FALSE_ALARM
+) -> list[Region]:
+    """Stretches of poses whose residuals are too large to be chance.
+
+    The sum of squares less twice its usual size is followed along the poses; its largest rises are
+    regions if they exceed what noise reaches once in 1/`false_alarm` measurements (the extreme
+    value of a random walk with negative drift).
+
+    Args:
+        loop: the nominal chain.
+        poses: of a stage, all of them.
+        numbers: of a fit.
+        total: number of poses of the whole measurement.
+        false_alarm: probability of a region in a measurement without corruption.
+
+    Returns:
+        The regions, in order.
+
+    Source: Karlin and Altschul 1990 (high-scoring segments).
+    """
+    found = misfit(loop, poses, numbers)
+    square, freedom = np.sum(found.rows**2, axis=1), found.rows.shape[1]
+    usual = max(1.0, float(np.median(square)) / scipy.stats.chi2.median(freedom))
+    score = square / usual - _EXCESS * freedom
+    rate = scipy.optimize.brentq(
+        lambda r: -0.5 * freedom * np.log1p(-2.0 * r) - _EXCESS * freedom * r, 0.05, 0.4999
+    )
+    threshold = np.log(total / false_alarm) / rate
+    regions = []
+    for first, last in _rises(score, threshold):
+        regions.append(_blamed(loop, poses, found, first, last))
+    return regions
+
+
+def _rises(score: np.ndarray, threshold: float) -> list[tuple[int, int]]:
+    """Disjoint stretches with the largest sums, each above a threshold."""
+    found: list[tuple[int, int]] = []
+    waiting = [(0, len(score))]
+    while waiting:
+        low, high = waiting.pop()
+        best, first, last = _largest(score[low:high])
+        if best > threshold:
+            found.append((low + first, low + last))
+            waiting += [(low, low + first), (low + last + 1, high)]
+    return sorted(found)
+
+
+def _largest(score: np.ndarray) -> tuple[float, int, int]:
+    """Sum, first and last place of the stretch with the largest sum."""
+    best, first, last = -np.inf, 0, -1
+    run, begin = 0.0, 0
+    for k, value in enumerate(score):
+        if run <= 0.0:
+            run, begin = 0.0, k
+        run += value
+        if run > best:
+            best, first, last = run, begin, k
+    return best, first, last
+
+
+def _blamed(loop: Loop, poses: Poses, found: Misfit, first: int, last: int) -> Region:
+    """The joint whose error explains most of a region."""
+    inside = slice(first, last + 1)
+    rows = found.rows[inside]
+    whole = float(np.sum(rows**2))
+    explained, errors = {}, {}
+    names = list(loop.links[loop.moved :])
+    slopes = {name: found.sensed[inside, :, k] for k, name in enumerate(names)}
+    if rows.shape[1] == 3:
+        slopes[""] = found.own[inside]
+    for name, slope in slopes.items():
+        length = np.maximum(np.sum(slope**2, axis=1), 1.0e-12)
+        error = np.sum(slope * rows, axis=1) / length
+        explained[name] = float(np.sum(error**2 * length) / whole)
+        errors[name] = error
+    left = {name: whole * (1.0 - part) for name, part in explained.items()}
+    best = min((n for n in left if n), key=lambda name: left[name])
+    if left.get("", np.inf) < left[best] - _RULED_OUT:
+        best = ""  # only a clear case: it is the calibrator that is examined
+    usual = max(1.0, left[best] / max(1, rows.size - len(rows)))
+    order = sorted(left, key=lambda name: left[name])
+    possible = tuple(n for n in order if n and left[n] - left[best] < _RULED_OUT * usual)
+    size = float(np.sqrt(np.mean(errors[best] ** 2)))
+    return Region(poses.link, first, last, best, size, explained[best], possible if best else ("",))
+
+
+def identify_without_bad_data(
+    loop: Loop, stages: Sequence[Poses], false_alarm: float = FALSE_ALARM
+) -> Cleaned:
+    """Identify link by link, and leave out corrupted regions of each link before the next.
+
+    A stage begins with the poses that agree best with each other, so that corrupted ones do not
+    hide behind a fit to them. Regions in which only the manipulator's own sensor is wrong stay: the
+    identification does not use it.
+
+    Args:
+        loop: the nominal chain.
+        stages: all poses.
+        false_alarm: probability of a region in a measurement without corruption.
+
+    Returns:
+        The fit, the poses that are left, and the regions.
+
+    Raises:
+        InputError: as `identify_arm`.
+    """
+    order = stage_order(loop, stages)
+    for poses in order:
+        check_poses(loop, poses)
+    numbers = start_numbers(loop, order)
+    start = dict(numbers)
+    total = sum(map(len, order))
+    names: tuple[str, ...] = ()
+    covariance = np.zeros((0, 0))
+    parts, kept_stages, regions = [], [], []
+    for poses in order:
+        wanted = candidates(loop, poses.link)
+        at = start | {n: numbers[n] for n in names}
+        told = what_is_told(Equations(loop, poses), at, wanted)
+        own = [told.names[k] for k in sorted(told.base)]
+
+        def solve(kept, near, numbers=numbers, poses=poses, own=own, told=told, wanted=wanted):
+            return identify_stage(
+                Equations(loop, poses.only(kept)), numbers, own, names, covariance, told, wanted,
+                near=near,
+            )  # fmt: skip
+
+        kept = np.ones(len(poses), bool)
+        found = solve(kept, False)
+        inside: list[Region] = find_regions(loop, poses, found[1], total, false_alarm)
+        if inside:
+            found, inside = _settled(loop, poses, solve, found, total, false_alarm, len(own))
+        kept = _outside(inside, len(poses))
+        found = solve(kept, True) if inside else found
+        stage, numbers, covariance = found
+        names = (*names, *own)
+        parts.append(stage)
+        kept_stages.append(poses.only(kept))
+        regions += inside
+    fit = arm_fit(loop, numbers, start, names, covariance, parts, "hierarchical")
+    return Cleaned(fit, kept_stages, regions)
+
+
+def _settled(loop, poses, solve, found, total, false_alarm, unknowns):
+    """Repeat fit and search from the best-agreeing poses until the regions stay the same."""
+    for _ in range(3):
+        square = np.sum(misfit(loop, poses, found[1]).rows ** 2, axis=1)
+        width = max(5, len(poses) // 40)
+        smooth = np.convolve(np.pad(square, width, mode="edge"), np.ones(2 * width + 1), "valid")
+        core = smooth <= np.quantile(smooth, max(_CORE, min(1.0, 3.0 * unknowns / len(poses))))
+        found = solve(core, True)
+    inside: list[Region] = []
+    for _ in range(_ROUNDS):
+        fresh = find_regions(loop, poses, found[1], total, false_alarm)
+        kept = _outside(fresh, len(poses))
+        if [r[:3] for r in fresh] == [r[:3] for r in inside] or kept.mean() < 1.0 - _MOST:
+            break
+        inside = fresh
+        found = solve(kept, True)
+    return found, inside
+
+
+def _outside(regions: Sequence[Region], count: int) -> np.ndarray:
+    """(count,) whether a pose is in none of the regions of a calibrator's joint."""
+    kept = np.ones(count, bool)
+    for region in regions:
+        if region.joint:
+            kept[region.first : region.last + 1] = False
+    return kept
+
+
+def predicted_readings(loop: Loop, poses: Poses, numbers: Numbers) -> np.ndarray:
+    """What each sensor of the calibrator had to read, from the manipulator's side and the others.
+
+    Args:
+        loop: the nominal chain.
+        poses: of a stage.
+        numbers: of a fit.
+
+    Returns:
+        (M, S) readings [rad]: for each sensor alone the value that satisfies the pose's equations
+        best while the others read what they do.
+    """
+    found = misfit(loop, poses, numbers)
+    length = np.maximum(np.sum(found.sensed**2, axis=1), 1.0e-12)
+    return poses.theta - np.einsum("mes,me->ms", found.sensed, found.rows) / length
+

@@ -1,0 +1,179 @@
+"""Designs of a calibrator: which lengths and which place of the ball joint tell an arm best.
+
+Khoshzaban 1992, section 5.3, asks for it. The information of a whole measurement is that of its
+equations' Jacobian over the sensors' errors; what counts is how well the tip of the calibrated arm
+is known over its workspace, and that the calibrator reaches the poses at all.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+
+from hydrotele.calibrate.arm import Equations, candidates, size_of, start_numbers, what_is_told
+from hydrotele.calibrate.arm_poses import Poses
+from hydrotele.calibrate.loop import Loop, link_chain
+from hydrotele.calibrate.sweeps import STILL, sweep_poses
+from hydrotele.kinematics.serial_chain import forward_and_rates
+
+ARMS = np.linspace(2.0, 4.4, 7)
+"""Lengths of the calibrator's arm that are looked at [m]."""
+
+FOREARMS = np.linspace(2.4, 4.8, 7)
+"""Lengths of its forearm that are looked at [m]."""
+
+_POSES = 60  # per link
+_REACH = 0.98  # of the poses that a design has to reach
+_TIP = ((-0.8, 0.9), (-0.5, 1.4), (-0.1, 1.9), (-0.1, 0.7), (-0.8, 2.2))  # boom, stick [rad, K]
+_OUT = 1.0e3  # m: what stands for the tip's error of a design that does not reach
+
+
+class Design(NamedTuple):
+    """A calibrator and what it tells.
+
+    Attributes:
+        arm: length from yoke to elbow, d of the twist joint [m].
+        forearm: length from elbow to ball, a of the elbow [m].
+        ball_x: place of the ball joint in front of the swing axis [m].
+        ball_z: its height above the boom's pin [m].
+        tip_error: RMS standard deviation of the calibrated arm's tip over its workspace [m].
+        information: log of the determinant of the information about the arm's parameters, each
+            over its expected size.
+        reached: part of the measurement's poses that the calibrator reaches [1].
+    """
+
+    arm: float
+    forearm: float
+    ball_x: float
+    ball_z: float
+    tip_error: float
+    information: float
+    reached: float
+
+
+class Survey(NamedTuple):
+    """Designs over the lengths of both arms, and the present one."""
+
+    designs: tuple[Design, ...]
+    present: Design
+
+
+def design_of(
+    loop: Loop, arm: float, forearm: float, ball_x: float, ball_z: float, accuracy: float
+) -> Design:
+    """What a calibrator of these dimensions would tell.
+
+    Args:
+        loop: the nominal chain.
+        arm: length from yoke to elbow [m].
+        forearm: length from elbow to ball [m].
+        ball_x: of the ball joint in front of the swing axis [m].
+        ball_z: above the boom's pin [m].
+        accuracy: bound of a sensor's uniform error [rad].
+
+    Returns:
+        The design with its figures.
+    """
+    values = loop.values.copy()
+    values[-2, 3], values[-1, 2] = arm, forearm
+    loop = replace(loop, values=values, ball=np.array([ball_x, loop.ball[1], ball_z]))
+    sigma = np.full(len(loop) - loop.moved, accuracy / np.sqrt(3.0))
+    stages, reached = [], []
+    for link, sweep in STILL.items():
+        clean = sweep_poses(loop, link, sweep._replace(poses=_POSES))
+        reached.append(clean.reached)
+        if len(clean.theta) < _POSES // 2:
+            return Design(arm, forearm, ball_x, ball_z, _OUT, -np.inf, float(np.mean(reached)))
+        shown = clean.theta - loop.values[:, 0]
+        own = {n: shown[:, k] for k, n in enumerate(loop.links[: loop.moved])}
+        stages.append(Poses(link, shown[:, loop.moved :], sigma, own))
+    names, matrix = _whole_jacobian(loop, stages)
+    sizes = np.array([size_of(loop, name) for name in names])
+    scaled = matrix * sizes
+    covariance = np.linalg.pinv(scaled.T @ scaled, rcond=1e-14) * np.outer(sizes, sizes)
+    own = [k for k, n in enumerate(names) if not n.startswith("p_")
+           and n.partition(".")[2] in loop.links[: loop.moved]]  # fmt: skip
+    part = covariance[np.ix_(own, own)] / np.outer(sizes[own], sizes[own])
+    information = -float(np.linalg.slogdet(part)[1])
+    tip = _tip_error(loop, names, covariance)
+    return Design(arm, forearm, ball_x, ball_z, tip, information, float(np.mean(reached)))
+
+
+def _whole_jacobian(loop: Loop, stages: list[Poses]) -> tuple[list[str], np.ndarray]:
+    """Identifiable parameters of all stages, and the weighted Jacobian of all equations."""
+    numbers = start_numbers(loop, stages)
+    names: list[str] = []
+    parts = []
+    for poses in stages:
+        equations = Equations(loop, poses)
+        told = what_is_told(equations, numbers, candidates(loop, poses.link))
+        names += [told.names[k] for k in sorted(told.base)]
+    for poses in stages:
+        equations = Equations(loop, poses)
+        _, by, sensed = equations.at(numbers)
+        rows = equations.whitening(sensed) @ equations.columns(by, names)
+        parts.append(rows.reshape(-1, len(names)))
+    return names, np.vstack(parts)
+
+
+def _tip_error(loop: Loop, names: list[str], covariance: np.ndarray) -> float:
+    """RMS standard deviation of the last moved link's inner pin over some arm poses [m]."""
+    count = loop.moved - 1
+    chain = link_chain(loop.values[:count])
+    total = 0.0
+    for boom, stick in _TIP:
+        rates = forward_and_rates(chain, np.array([[0.0, boom, stick][:count]]))
+        by = rates.position_by_parameter[0].reshape(3, count, 5)
+        slope = np.zeros((3, len(names)))
+        for column, name in enumerate(names):
+            kind, _, link = name.partition(".")
+            if link in loop.links[:count] and kind in ("held", "d", "a", "alpha", "beta"):
+                at = ("held", "d", "a", "alpha", "beta").index(kind)
+                slope[:, column] = by[:, loop.links.index(link), at]
+        total += float(np.trace(slope @ covariance @ slope.T))
+    return float(np.sqrt(total / len(_TIP)))
+
+
+def look_over_designs(loop: Loop, accuracy: float) -> Survey:
+    """Designs over a grid of both arms' lengths, with the ball joint where it is.
+
+    Args:
+        loop: the nominal chain.
+        accuracy: bound of a sensor's uniform error [rad].
+
+    Returns:
+        The designs, forearm by forearm, and the present one.
+    """
+    x, z = float(loop.ball[0]), float(loop.ball[2])
+    grid = [design_of(loop, float(a), float(f), x, z, accuracy) for f in FOREARMS for a in ARMS]
+    present = design_of(loop, *map(float, (loop.values[-2, 3], loop.values[-1, 2])), x, z, accuracy)
+    return Survey(tuple(grid), present)
+
+
+def best_design(loop: Loop, survey: Survey, accuracy: float) -> Design:
+    """The design with the best-known tip that reaches its poses, lengths and ball joint free.
+
+    Args:
+        loop: the nominal chain.
+        survey: where the search starts.
+        accuracy: bound of a sensor's uniform error [rad].
+
+    Returns:
+        The design; the ball joint stays on the chassis, 1.0 to 2.6 m in front of the swing axis
+        and 1.3 to 0.6 m below the boom's pin.
+    """
+    reaching = [d for d in (*survey.designs, survey.present) if d.reached >= _REACH]
+    start = min(reaching or [survey.present], key=lambda d: d.tip_error)
+
+    def cost(x):
+        found = design_of(loop, *map(float, x), accuracy)
+        return np.log(found.tip_error) + 50.0 * max(0.0, _REACH - found.reached)
+
+    bounds = [(1.5, 4.8), (1.5, 5.2), (1.0, 2.6), (-1.3, -0.6)]
+    first = np.clip(start[:4], *np.array(bounds).T)
+    found = scipy.optimize.minimize(
+        cost, first, method="Nelder-Mead", bounds=bounds,
+        options={"maxfev": 120, "xatol": 0.02, "fatol": 1e-3},
+    )  # fmt: skip
+    return design_of(loop, *map(float, found.x), accuracy)

@@ -1,0 +1,227 @@
+"""Cylinder linkages from joint angles and piston displacements (Khoshzaban 1992, 3.4.4, 3.8.3).
+
+`l_p = sqrt(l_l^2 + l_u^2 - 2 l_l l_u cos(theta + theta_off)) - l_c` (K Eqs 3.26 and 3.27) with the
+angle measured by the joint's own sensor, or identified from the calibrator.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hydrotele.calibrate.arm import ArmFit, Equations
+from hydrotele.calibrate.arm_poses import Poses
+from hydrotele.calibrate.estimation import ParameterFit, least_squares
+from hydrotele.calibrate.loop import ball_place, frame_of
+from hydrotele.core.errors import InputError
+from hydrotele.effects.effect import changed
+from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.kinematics.linkages import TwoBar
+from hydrotele.machine.machine import Machine
+
+Angles = Literal["measured", "identified"]
+
+NAMES = ("theta_off", "l_l", "l_c", "l_u")
+"""Offset of the included angle [rad], lower pin distance, closed length, upper pin distance [m]."""
+
+_SIZES = np.array([np.radians(10.0), 0.2, 0.2, 0.2])
+_SPAN = np.radians(5.0)  # by which the joint must move
+_EVERY = 5  # every fifth sample is judged on, not fitted
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Strokes:
+    """Angles and displacements of one axis.
+
+    Attributes:
+        axis: name of the axis.
+        angle: (n,) joint angle, machine's sign [rad].
+        length: (n,) piston displacement [m].
+        angle_sigma: standard deviation of an angle [rad].
+        length_sigma: standard deviation of a displacement [m].
+        angles: where the angles come from.
+        source: the file.
+    """
+
+    axis: str
+    angle: np.ndarray
+    length: np.ndarray
+    angle_sigma: float
+    length_sigma: float
+    angles: Angles = "measured"
+    source: str = "memory"
+
+
+@dataclass(frozen=True)
+class LinkageFit:
+    """A calibrated linkage.
+
+    Attributes:
+        axis: name of the axis.
+        angles: where the angles came from.
+        nominal: (4,) parameters before, in the order of `NAMES`.
+        fit: of the parameters.
+        fixed: names of those that were held.
+        direction: +1 if the cylinder extends as the angle grows, else -1.
+        rms: root mean square error of the displacement on samples that were not fitted [m].
+        vaf: variance of these that the linkage accounts for [%].
+        rms_before: with the nominal parameters [m].
+        samples: number of samples, fitted and judged.
+        residual: (n,) error of every sample [m].
+        angle: (n,) the angles [rad].
+    """
+
+    axis: str
+    angles: Angles
+    nominal: np.ndarray
+    fit: ParameterFit
+    fixed: tuple[str, ...]
+    direction: int
+    rms: float
+    vaf: float
+    rms_before: float
+    samples: int
+    residual: np.ndarray
+    angle: np.ndarray
+
+
+def displacement(values: np.ndarray, direction: int, angle: np.ndarray) -> np.ndarray:
+    """Piston displacement [m], (n,), of parameters in the order of `NAMES` at angles (n,) [rad]."""
+    offset, lower, closed, upper = values
+    return TwoBar(lower, upper, offset, direction).length(angle) - closed
+
+
+def identify_linkage(
+    machine: Machine, strokes: Strokes, fixed: Sequence[str] | None = None
+) -> LinkageFit:
+    """Identify a cylinder's triangle.
+
+    Args:
+        machine: the nominal machine.
+        strokes: angles and displacements.
+        fixed: parameters that keep their nominal values; by default none with measured angles, and
+            the longer of the two pin distances with identified ones, as Khoshzaban 1992 Table 11.
+
+    Returns:
+        The fit, judged on every fifth sample, which it does not use.
+
+    Raises:
+        InputError: the axis has no triangle, or does not move enough.
+    """
+    linkage = axis_linkage(machine, strokes.axis)
+    cylinder = machine.axes[strokes.axis].cylinder
+    if not isinstance(linkage, TwoBar) or cylinder is None:
+        raise InputError(f"axis {strokes.axis}", "has no cylinder across its joint (two-bar)")
+    if np.ptp(strokes.angle) < _SPAN:
+        moved = np.degrees(np.ptp(strokes.angle))
+        raise InputError(
+            strokes.source,
+            f"{strokes.axis} moves by {moved:.2g} deg only: move it through its range, by 5 deg or"
+            " more; theta_off, l_l, l_c and l_u stay unknown",
+        )
+    nominal = np.array([linkage.angle_offset, linkage.lower, cylinder.closed_length, linkage.upper])
+    if fixed is None:
+        longer = "l_u" if linkage.upper > linkage.lower else "l_l"
+        fixed = (longer,) if strokes.angles == "identified" else ()
+    free = [k for k, name in enumerate(NAMES) if name not in fixed]
+    judged = np.arange(len(strokes.angle)) % _EVERY == _EVERY // 2
+    angle, length = strokes.angle[~judged], strokes.length[~judged]
+    values, fit = nominal.copy(), None
+    for _ in range(_ROUNDS):
+        offset, lower, _, upper = values
+        arm = TwoBar(lower, upper, offset, linkage.direction).rate(angle)
+        sigma = np.hypot(strokes.length_sigma, np.asarray(arm) * strokes.angle_sigma)
+
+        def residual(x):
+            full = nominal.copy()
+            full[free] = x
+            full[[1, 3]] = np.maximum(full[[1, 3]], 1.0e-3)
+            return displacement(full, linkage.direction, angle) - length
+
+        fit = least_squares(
+            residual, values[free], [NAMES[k] for k in free], _SIZES[free], sigma=sigma
+        )
+        values[free] = fit.values
+    assert fit is not None
+    error = displacement(values, linkage.direction, strokes.angle) - strokes.length
+    before = displacement(nominal, linkage.direction, strokes.angle) - strokes.length
+    kept = strokes.length[judged]
+    return LinkageFit(
+        strokes.axis, strokes.angles, nominal, fit, tuple(fixed), linkage.direction,
+        float(np.sqrt(np.mean(error[judged] ** 2))),
+        100.0 * float(1.0 - np.sum(error[judged] ** 2) / np.sum((kept - kept.mean()) ** 2)),
+        float(np.sqrt(np.mean(before[judged] ** 2))), len(strokes.angle), error, strokes.angle,
+    )  # fmt: skip
+
+
+def values_of(found: LinkageFit) -> np.ndarray:
+    """(4,) parameters in the order of `NAMES`, held ones nominal."""
+    values = found.nominal.copy()
+    for name, value in zip(found.fit.names, found.fit.values, strict=True):
+        values[NAMES.index(name)] = value
+    return values
+
+
+def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
+    """The machine with an identified triangle: pins at its distances and angle, closed length.
+
+    The base pin keeps its direction from the joint, the rod pin turns by the change of the offset.
+
+    Args:
+        machine: the machine.
+        found: of one axis.
+
+    Returns:
+        The machine.
+    """
+    axis = machine.axes[found.axis]
+    assert axis.cylinder
+    outboard = machine.link_of(axis.joint)
+    link = machine.links[outboard]
+    assert link.joint
+    offset, lower, closed, upper = values_of(found)
+    turn = found.direction * (offset - found.nominal[0])
+    way, ends = np.array(link.joint.axis), {}
+    for part in ("base_pin", "rod_pin"):
+        pin = getattr(axis.cylinder, part)
+        origin = np.zeros(3) if pin.link == outboard else np.array(link.position)
+        arm = np.array(pin.position) - origin
+        along = way * (way @ arm)
+        across = arm - along
+        if pin.link == outboard:
+            size = upper
+            across = across * np.cos(turn) + np.cross(way, across) * np.sin(turn)
+        else:
+            size = lower
+        across = across * size / np.linalg.norm(across)
+        position = tuple(map(float, origin + along + across))
+        ends[part] = pin.model_copy(update={"position": position})
+    cylinder = axis.cylinder.model_copy(update={**ends, "closed_length": float(closed)})
+    return changed(machine, f"axes.{found.axis}.cylinder", cylinder)
+
+
+def identified_angles(fit: ArmFit, poses: Poses) -> np.ndarray:
+    """Angle of the moving joint from the calibrator's readings alone.
+
+    The ball's direction about the joint's axis turns against the joint; where it stands at angle
+    zero is known up to the links inside, which the triangle's own offset takes up.
+
+    Args:
+        fit: of the arm.
+        poses: of the link's stage.
+
+    Returns:
+        (M,) angles, machine's sign [rad]; their mean is that of the nominal chain at home.
+    """
+    loop = fit.nominal
+    equations = Equations(loop, poses)
+    seen, theta = equations.seen(fit.numbers)
+    s = ball_place(seen, equations.place, theta)
+    angle = -np.unwrap(np.arctan2(s[:, 1], s[:, 0]))
+    origin, turn = frame_of(fit.loop, equations.place, loop.home[None])
+    ball = turn[0].T @ (fit.loop.ball - origin[0])
+    angle = angle + np.arctan2(ball[1], ball[0])
+    angle = angle - 2.0 * np.pi * np.round((angle.mean() - loop.home[equations.place]) / (2 * np.pi))
+    return (angle - loop.values[equations.place, 0]) * loop.signs[equations.place]

@@ -1,0 +1,378 @@
+"""The closed chain of a manipulator and a calibrator, in the Denavit-Hartenberg form of Khoshzaban.
+
+The chain runs from the chassis over the manipulator's powered joints, over the sensed joints of the
+calibrator, to a ball joint on the chassis. Link k is `A_k = Tz(d) Rz(theta) Tx(a) Rx(alpha)
+Ry(beta)` (K Eq. 3.8); the origin of the last frame is the ball. K's signs hold in this room: z axes
+point along the dominant positive direction of the machine's frame, so that a boom's or stick's
+angle is the negative of the machine's.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hydrotele.core.errors import InputError
+from hydrotele.kinematics.serial_chain import Element, SerialChain, forward, forward_and_rates
+from hydrotele.machine.machine import Machine
+
+KINDS = ("offset", "alpha", "a", "d", "beta")
+"""Kinds of a link's parameters; `offset` is theta at a sensor's zero, or at rest of a held joint."""
+
+_PARALLEL = 0.05  # rad within which neighbouring axes count as nominally parallel
+_DOF = {kind: k for k, kind in enumerate(KINDS)}
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A closed chain of N links with its ball joint.
+
+    Attributes:
+        joints: names of the joints, (N) texts, from the chassis outwards.
+        channels: channel of each joint's sensor, (N) texts.
+        links: what the tables call each link: the axis' name of a driven joint, else the joint's.
+        signs: (N,) machine's joint angle -> K's.
+        moved: number n of powered joints of the manipulator; the others are the calibrator's.
+        values: (N, 5) offset [rad], alpha [rad], a [m], d [m], beta [rad] of every link.
+        ball: (3,) place of the ball in frame 0, x towards it where the swing is 0 [m].
+        base: (3,) origin of frame 0 in the machine's frame [m].
+        parallel: (N,) whether a link's axis is nominally parallel to the next one.
+        home: (N,) angles with offsets at the machine's home position [rad].
+        machine: name of the machine.
+    """
+
+    joints: tuple[str, ...]
+    channels: tuple[str, ...]
+    links: tuple[str, ...]
+    signs: np.ndarray
+    moved: int
+    values: np.ndarray
+    ball: np.ndarray
+    base: np.ndarray
+    parallel: np.ndarray
+    home: np.ndarray
+    machine: str = ""
+
+    def __len__(self) -> int:
+        """Return the number of links N."""
+        return len(self.joints)
+
+    def place(self, name: str) -> tuple[int, int]:
+        """Row and column in `values` of a parameter such as `a.boom`.
+
+        Raises:
+            KeyError: there is no such parameter.
+        """
+        kind, _, link = name.partition(".")
+        return self.links.index(link), _DOF[kind]
+
+    def value(self, name: str) -> float:
+        """A parameter by its name, [rad] or [m]."""
+        return float(self.values[self.place(name)])
+
+    def with_values(self, numbers: dict[str, float]) -> "Loop":
+        """The loop with some parameters replaced."""
+        values = self.values.copy()
+        for name, number in numbers.items():
+            values[self.place(name)] = number
+        return replace(self, values=values)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every parameter's name, link by link."""
+        return tuple(f"{kind}.{link}" for link in self.links for kind in KINDS)
+
+
+def unit_of(name: str) -> str:
+    """Unit of a parameter: `m` of a, d, p_xy and p_z, else `rad`."""
+    return "m" if name.partition(".")[0] in ("a", "d", "p_xy", "p_z") else "rad"
+
+
+def link_chain(values: np.ndarray) -> SerialChain:
+    """The serial chain of consecutive links; its joint coordinates hold the offsets.
+
+    Args:
+        values: (k, 5) rows of `Loop.values`; the offsets are not used.
+
+    Returns:
+        k joints, 5 parameters a link in the order of `KINDS`, but for d, which comes second.
+    """
+    return _chain_of(len(values), values.tobytes())
+
+
+@functools.lru_cache(maxsize=64)
+def _chain_of(count: int, numbers: bytes) -> SerialChain:
+    elements = []
+    for k, (_, alpha, a, d, beta) in enumerate(np.frombuffer(numbers).reshape(count, 5)):
+        elements += [
+            Element("rz", f"offset.{k}", 0.0, k), Element("tz", f"d.{k}", float(d)),
+            Element("tx", f"a.{k}", float(a)), Element("rx", f"alpha.{k}", float(alpha)),
+            Element("ry", f"beta.{k}", float(beta)),
+        ]  # fmt: skip
+    return SerialChain(tuple(map(str, range(count))), tuple(elements))
+
+
+_ORDER = [0, 3, 2, 1, 4]  # of offset, d, a, alpha, beta in a chain, as KINDS
+
+
+def frame_of(loop: Loop, count: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The frame behind the first links.
+
+    Args:
+        loop: the chain.
+        count: of links.
+        theta: (M, N) angles with offsets [rad].
+
+    Returns:
+        (origins (M, 3) [m], rotations (M, 3, 3)) in frame 0.
+    """
+    return forward(link_chain(loop.values[:count]), theta[:, :count])
+
+
+def ball_place(loop: Loop, first: int, theta: np.ndarray) -> np.ndarray:
+    """The ball's place of `ball_from` alone, (M, 3) [m]; the arguments are the same."""
+    angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
+    return forward(link_chain(loop.values[first:]), angles).position
+
+
+def ball_from(loop: Loop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place of the ball seen from a joint's axis, without that joint's own angle, and derivatives.
+
+    `s = Tx(a_i) Rx(alpha_i) Ry(beta_i) A_(i+1) ... A_N [0 0 0 1]'` of K Eqs 3.23 and 3.24, with
+    `d_i` added to its z.
+
+    Args:
+        loop: the chain.
+        first: place of link i in the chain, from 0.
+        theta: (M, N - first - 1) angles of the joints beyond it, with their offsets [rad].
+
+    Returns:
+        (s (M, 3) [m], ds (M, 3, N - first, 5) by offset, alpha, a, d, beta of links i .. N; that by
+        the offset of link i itself is that by a turn of the joint i.)
+    """
+    angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
+    found = forward_and_rates(link_chain(loop.values[first:]), angles)
+    by = found.position_by_parameter.reshape(len(theta), 3, len(loop) - first, 5)
+    return found.position, by[..., _ORDER]
+
+
+def closure(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the chain ends less where the ball is, and the derivative by every joint.
+
+    Args:
+        loop: the chain.
+        theta: (M, N) joint angles with their offsets [rad], K's signs.
+
+    Returns:
+        (gaps (M, 3) in frame 0 [m], d(gap)/d(theta) (M, 3, N) [m/rad]).
+    """
+    place, by = ball_from(loop, 0, theta[:, 1:])
+    ct, st = np.cos(theta[:, 0]), np.sin(theta[:, 0])
+    turn = np.zeros((len(theta), 3, 3))
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = ct, -st, st, ct, 1.0
+    by = turn @ by[..., 0]
+    return np.einsum("mij,mj->mi", turn, place) - loop.ball, by
+
+
+def close(
+    loop: Loop, theta: np.ndarray, free: Sequence[int], start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Angles of three joints that close the chain, by Newton's method along the poses.
+
+    Args:
+        loop: the chain.
+        theta: (M, N) angles [rad]; those of `free` are not used.
+        free: places of the three joints.
+        start: (3,) or (M, 3) angles near the solution: of the first pose, or of every one [rad].
+
+    Returns:
+        (theta (M, N) closed to 1e-12 m, reached (M,) whether each one closes).
+    """
+    theta, free = theta.copy(), list(free)
+    if np.ndim(start) == 2:
+        theta[:, free] = start
+        reached = _newton(loop, theta, free)
+        return theta, reached
+    reached = np.zeros(len(theta), dtype=bool)
+    last = np.asarray(start, float)
+    for row in range(len(theta)):
+        one = theta[row : row + 1]
+        one[:, free] = last
+        reached[row] = _newton(loop, one, free)[0]
+        if reached[row]:
+            last = one[0, free]
+    return theta, reached
+
+
+def _newton(loop: Loop, theta: np.ndarray, free: list[int]) -> np.ndarray:
+    """Close every row in place; whether each one closes."""
+    for _ in range(40):
+        gap, by = closure(loop, theta)
+        if np.abs(gap).max() < 1.0e-12:
+            break
+        slope = by[:, :, free]
+        damped = slope.transpose(0, 2, 1) @ slope + 1.0e-14 * np.eye(3)
+        step = -np.linalg.solve(damped, slope.transpose(0, 2, 1) @ gap[..., None])[..., 0]
+        largest = np.abs(step).max(axis=1, keepdims=True)
+        theta[:, free] += step * np.minimum(1.0, 0.3 / np.maximum(largest, 1.0e-300))
+    gap, _ = closure(loop, theta)
+    return np.abs(gap).max(axis=1) < 1.0e-9
+
+
+def loop_of(machine: Machine) -> Loop:
+    """The closed chain of a machine with a calibrator, from its links and joints.
+
+    Args:
+        machine: with `sensed_joints` and a closure between the calibrator's end and the chassis.
+
+    Returns:
+        The chain with the machine's nominal numbers.
+
+    Raises:
+        InputError: the machine has no such chain.
+    """
+    where = f"machine {machine.name}"
+    if not machine.sensed_joints:
+        message = "has no sensed_joints: give a machine with a calibrator, such as calibrator"
+        raise InputError(where, message)
+    last = machine.link_of(machine.sensed_joints[-1])
+    ends = [
+        (one, other) for c in machine.closures.values() for one, other in ((c.a, c.b), (c.b, c.a))
+        if one.link == last
+    ]  # fmt: skip
+    if len(ends) != 1 or machine.links.get(ends[0][1].link) is not None:
+        raise InputError(where, f"needs one closure between {last} and the world, the ball joint")
+    end, ball = ends[0]
+    chain, origin = [], {}
+    for name in _ancestors(machine, last):
+        link = machine.links[name]
+        origin[name] = origin.get(link.parent, np.zeros(3)) + np.array(link.position)
+        if link.joint:
+            chain.append(name)
+    joints = tuple(machine.links[name].joint.name for name in chain)  # pyright: ignore
+    axes = {axis.joint: name for name, axis in machine.axes.items()}
+    links = tuple(axes.get(joint, joint) for joint in joints)
+    moved = joints.index(machine.sensed_joints[0])
+    if joints[moved:] != machine.sensed_joints:
+        raise InputError(where, "sensed_joints must be the chain's last ones, in its order")
+    if stray := [j for j in joints[:moved] if j not in axes]:
+        raise InputError(where, f"{stray[0]} in the chain is neither driven nor sensed: lock it")
+    ways = np.array([machine.joints[joint].axis for joint in joints])
+    signs = np.sign(ways[np.arange(len(ways)), np.abs(ways).argmax(axis=1)])
+    ways = ways * signs[:, None]
+    points = np.array([origin[name] for name in chain])
+    tip = origin[last] + np.array(end.position)
+    angle = ways @ np.roll(ways, -1, axis=0).T
+    parallel = np.array([np.arccos(min(1.0, abs(angle[k, k]))) < _PARALLEL
+                         for k in range(len(ways) - 1)] + [False])  # fmt: skip
+    values, base = _denavit_hartenberg(ways, points, tip, parallel)
+    home = np.array([machine.home.get(joint, 0.0) for joint in joints]) * signs + values[:, 0]
+    return Loop(
+        joints, tuple(f"angle.{link}" for link in links), links, signs, moved, values,
+        np.array(ball.position) - base, base, parallel, home, machine.name,
+    )  # fmt: skip
+
+
+def _ancestors(machine: Machine, link: str) -> list[str]:
+    chain = []
+    while link != "world":
+        chain.append(link)
+        link = machine.links[link].parent
+    return chain[::-1]
+
+
+def _denavit_hartenberg(
+    ways: np.ndarray, points: np.ndarray, tip: np.ndarray, parallel: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters (N, 5) of lines through points along ways, and the origin of frame 0 (3,)."""
+    count = len(ways)
+    values = np.zeros((count, 5))
+    foot, _ = _feet(points[0], ways[0], points[1], ways[1])
+    base = foot
+    frame = np.column_stack([*_across(ways[0]), ways[0]])
+    for k in range(count):
+        z = ways[k]
+        if k == count - 1:
+            centre, along = tip, None
+        elif parallel[k]:
+            height = z @ (points[k + 1] - foot)  # K: d keeps its nominal value
+            nearby, along = points[k + 1], ways[k + 1]
+            centre = nearby + along * ((foot + z * height - nearby) @ z) / (along @ z)
+        else:
+            on_this, centre = _feet(points[k], z, points[k + 1], ways[k + 1])
+            along = ways[k + 1]
+        d = z @ (centre - foot)
+        if along is not None and not parallel[k]:
+            d = z @ (on_this - foot)
+            x = np.cross(z, along)
+            x /= np.linalg.norm(x)
+            x *= np.sign(x[np.abs(x).argmax()])
+            a = float(x @ (centre - on_this))
+        else:
+            x = centre - foot - z * d
+            a = float(np.linalg.norm(x))
+            x = x / a if a > 1.0e-12 else frame[:, 0]
+        theta = np.arctan2(frame[:, 1] @ x, frame[:, 0] @ x)
+        alpha = beta = 0.0
+        middle = np.column_stack([x, np.cross(z, x), z])
+        if along is not None:
+            u = middle.T @ along  # = (sin b, -sin al cos b, cos al cos b)
+            beta = float(np.arcsin(np.clip(u[0], -1.0, 1.0))) if parallel[k] else 0.0
+            alpha = float(np.arctan2(-u[1], u[2]))
+        values[k] = theta, alpha, a, d, beta
+        rotation = forward(link_chain(np.array([[0.0, alpha, 0.0, 0.0, beta]])), np.zeros((1, 1)))
+        frame, foot = middle @ rotation.rotation[0], centre
+    return values, base
+
+
+def _across(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x of the machine made perpendicular to a way (z where they are parallel), and the third."""
+    x = np.array([1.0, 0.0, 0.0]) if abs(way[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
+    x = x - way * (way @ x)
+    x /= np.linalg.norm(x)
+    return x, np.cross(way, x)
+
+
+def _feet(p, u, q, v) -> tuple[np.ndarray, np.ndarray]:
+    """Feet of the common normal of the lines p + s u and q + t v."""
+    between, cosine = q - p, u @ v
+    square = 1.0 - cosine**2
+    s = (between @ u - cosine * (between @ v)) / square
+    t = (cosine * (between @ u) - between @ v) / square
+    return p + s * u, q + t * v
+
+
+def calibrator_angles(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles of the last three joints that close the chain, on the branch of an elbow that hangs.
+
+    A closed form for a yoke, a twist and an elbow whose axes cross at right angles is the start of
+    Newton's method for the chain as it is.
+
+    Args:
+        loop: the chain; its last three links are yoke, twist and elbow.
+        theta: (M, N) angles with offsets; those of the last three joints are not used [rad].
+
+    Returns:
+        (theta (M, N) closed to 1e-9 m, reached (M,); rows that are not reached hold no solution).
+    """
+    theta = theta.copy()
+    first = len(loop) - 3
+    place, turn = frame_of(loop, first, theta)
+    x, y, z = np.einsum("mji,mj->im", turn, loop.ball - place)
+    upper, lower, aside = loop.values[-2, 3], loop.values[-1, 2], loop.values[-1, 3]
+    sine = (x**2 + y**2 + z**2 - upper**2 - lower**2 - aside**2) / (2.0 * upper * lower)
+    elbow = np.arcsin(np.clip(sine, -1.0, 1.0))
+    across = lower * np.cos(elbow)
+    phase, reach = np.arctan2(-aside, across), np.hypot(across, aside)
+    possible = (np.abs(sine) <= 1.0) & (np.abs(z) <= reach)
+    twist = np.arcsin(np.clip(-z / np.maximum(reach, 1.0e-12), -1.0, 1.0)) - phase
+    along = across * np.cos(twist) + aside * np.sin(twist)
+    yoke = np.arctan2(y, x) - np.arctan2(upper + lower * np.sin(elbow), along)
+    theta[:, first:] = np.stack([(yoke + np.pi) % (2 * np.pi) - np.pi, twist, elbow], axis=1)
+    closed = theta[possible]
+    reached = possible.copy()
+    if len(closed):
+        reached[possible] = _newton(loop, closed, [first, first + 1, first + 2])
+        theta[possible] = closed
+    return theta, reached
