@@ -1,8 +1,8 @@
 """The plant: a Machine compiled to MuJoCo with its hydraulics, and its complete states.
 
 Bristles of presliding friction: an explicit step follows a drive on its bristles only as long as
-these are not too stiff for the inertia that it moves; `hydraulics.actuator.bristle_rate` limits them by the
-inertia at home that is written here.
+these are not too stiff for the inertia that it moves; `hydraulics.actuator.bristle_rate` limits
+them by the inertia at home that is written here.
 
 End stops: a limit of MuJoCo is a soft constraint whose force solves `(A + R) f = a_ref - a_0` with
 the inverse inertia A felt there. With `R = 1 / (h b)`, `a_ref = -v / h - k r / (h b)` and
