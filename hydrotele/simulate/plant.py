@@ -35,7 +35,7 @@ from hydrotele.hydraulics.parameters import (
     extra_state_names,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.surroundings import Thing
+from hydrotele.scenario.surroundings import SurroundingObject
 from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
 from hydrotele.simulate.mechanism import (
     TIP_SITE,
@@ -46,7 +46,7 @@ from hydrotele.simulate.mechanism import (
     flexible_axes,
     load_joint,
     mjcf_document,
-    wind_up,
+    preload_transmissions,
 )
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.terms.law import Drives
@@ -157,7 +157,7 @@ class Plant:
     machine: Machine
     model: mujoco.MjModel
     ground: bool
-    surroundings: tuple[Thing, ...]
+    surroundings: tuple[SurroundingObject, ...]
     axes: tuple[str, ...]
     qpos: np.ndarray
     dof: np.ndarray
@@ -234,7 +234,7 @@ class Plant:
 
 def build_plant(
     machine: Machine, timestep: float = 1.0e-3, ground: bool = True,
-    surroundings: tuple[Thing, ...] = (),
+    surroundings: tuple[SurroundingObject, ...] = (),
 ) -> Plant:  # fmt: skip
     """Compile a machine.
 
@@ -315,7 +315,9 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
     data = mujoco.MjData(plant.model)
     close_loops(plant.machine, plant.model, data, dict(joints or {}))
     forces = holding_forces(plant.machine, plant.model, data)
-    wind_up(plant.machine, plant.model, data, dict(zip(plant.axes, forces, strict=True)))
+    preload_transmissions(
+        plant.machine, plant.model, data, dict(zip(plant.axes, forces, strict=True))
+    )
     forces = forces - terms_at_rest(plant.machine, data, plant.drive_qpos, forces)
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
         axis = plant.machine.axes[name]
