@@ -43,7 +43,7 @@ from hydrotele.simulate.plant import build_plant
 
 
 @dataclass(frozen=True)
-class Mechanism:
+class MechanismResult:
     """What was found of bodies, friction and offsets.
 
     Attributes:
@@ -128,7 +128,7 @@ def identify_to_folder(
     return target
 
 
-def identify_mechanism(dataset: Dataset, choices: Choices) -> Mechanism:
+def identify_mechanism(dataset: Dataset, choices: Choices) -> MechanismResult:
     """Identify bodies, friction and offsets.
 
     Args:
@@ -146,7 +146,7 @@ def identify_mechanism(dataset: Dataset, choices: Choices) -> Mechanism:
     except InputError as error:
         if not choices.hydraulics:
             raise
-        return Mechanism(None, None, dataset.machine, str(error))
+        return MechanismResult(None, None, dataset.machine, str(error))
     setup = machine_setup(
         dataset.machine, closed_chain(dataset.machine), choices.model, pins=choices.pins,
         asymmetry=choices.asymmetry,
@@ -155,11 +155,11 @@ def identify_mechanism(dataset: Dataset, choices: Choices) -> Mechanism:
         fit, heldout, setup, choices.processing, choices.estimator, notes=(*dataset.notes, *said)
     )  # fmt: skip
     patched, best = identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
-    return Mechanism(found, best, patched)
+    return MechanismResult(found, best, patched)
 
 
 def _write(
-    folder: Path, dataset: Dataset, mechanism: Mechanism, hydraulics: Hydraulics | None,
+    folder: Path, dataset: Dataset, mechanism: MechanismResult, hydraulics: Hydraulics | None,
     data: Sequence[Path], choices: Choices,
 ) -> None:  # fmt: skip
     found, patched = mechanism.found, hydraulics.machine if hydraulics else mechanism.machine
@@ -187,7 +187,7 @@ def _write(
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
-def _print(mechanism: Mechanism, hydraulics: Hydraulics | None, dataset: Dataset) -> None:
+def _print(mechanism: MechanismResult, hydraulics: Hydraulics | None, dataset: Dataset) -> None:
     if mechanism.found:
         _print_mechanism(mechanism.found, dataset)
     else:

@@ -9,8 +9,8 @@ from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters,
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import parse_channel
-from hydrotele.multibody.reduced_mechanism import Mechanism, coordinate_names, mechanism
-from hydrotele.multibody.reduced_motion import Motion, motion_space
+from hydrotele.multibody.reduced_mechanism import ReducedMechanism, coordinate_names, mechanism
+from hydrotele.multibody.reduced_motion import ReducedMotion, motion_space
 from hydrotele.terms.table import terms_table
 
 POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)
@@ -49,7 +49,7 @@ class Model(NamedTuple):
             the compiled functions are then those of a model that knows no memory.
     """
 
-    mech: Mechanism
+    mech: ReducedMechanism
     user: np.ndarray
     hydraulic: int
     gain: np.ndarray
@@ -83,7 +83,7 @@ class Space(NamedTuple):
         time: (2,) now, and of the run's first row; only terms see it [s].
     """
 
-    motion: Motion
+    motion: ReducedMotion
     drive: np.ndarray
     row: np.ndarray
     mass: np.ndarray

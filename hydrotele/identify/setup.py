@@ -50,7 +50,7 @@ Model = Literal["complete", "reduced"]
 
 
 @dataclass(frozen=True)
-class Setup:
+class RegressorSetup:
     """What a regressor is built of.
 
     Attributes:
@@ -73,7 +73,7 @@ class Setup:
 def machine_setup(
     machine: Machine, chain: Chain, model: Model = "complete", *, pins: bool = False,
     asymmetry: bool = False,
-) -> Setup:  # fmt: skip
+) -> RegressorSetup:  # fmt: skip
     """Setup for a machine.
 
     Args:
@@ -100,7 +100,7 @@ def machine_setup(
         for drive, facts in zip(chain.drives, (machine.axes[a] for a in order), strict=True)
         if facts.force
     }
-    return Setup(
+    return RegressorSetup(
         chain=chain, given=tuple(machine.axes[a].joint for a in order), bodies=bodies,
         rubbing=(*rubbing, *(pin_friction(chain) if pins else ())), offsets=offsets,
     )  # fmt: skip
