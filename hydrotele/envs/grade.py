@@ -208,7 +208,7 @@ def tick_bed(f, e, w):
     Returns:
         Nothing.
 
-    Source: `soil.step`, `soil.wrench`; places are MuJoCo's own, so that every variant's geometry
+    Source: `soil.step.soil_step`, `bucket_wrench`; places are MuJoCo's own, so that every variant's geometry
         is exact.
     """
     body = f.tip_body
