@@ -44,8 +44,8 @@ def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround
 
     Returns:
         (GRIP + 11,): those of `simulate.surroundings.grip_step`, then numbers of the grapple's
-        body, the log's body and weld, places in `qpos` of jaw and log, the log's radius and half its length [m],
-        places of the free joints.
+        body, the log's body and weld, places in `qpos` of jaw and log, the log's radius and half
+        its length [m], places of the free joints.
     """
     hand = machine.links[machine.link_of(machine.axes[log.grab].joint)].parent
     places = [

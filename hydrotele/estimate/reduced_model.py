@@ -27,8 +27,8 @@ class Model(NamedTuple):
 
     A state is `(n positions, t drive positions, n rates, t drive rates, 4 h activations)` and what
     bristles and a slow pump remember, see `parameters.extra_state_names`. Its pressures are those
-    that the oil would have if it held its air (`laws.pressure_without_air`): any number is one, which a
-    filter needs, and they are the felt ones wherever these are not below the atmosphere's.
+    that the oil would have if it held its air (`laws.pressure_without_air`): any number is one,
+    which a filter needs, and they are the felt ones wherever these are not below the atmosphere's.
 
     Attributes:
         mech: the mechanism.
