@@ -49,7 +49,7 @@ class TaskSetup(NamedTuple):
         arm_axes: how many of them, the first ones, are the arm's.
         variants: machines and starts that episodes have.
         fields: of the observation.
-        table: (k, POINTS, 3) of `control.drive_rows.drive_tables`.
+        table: (k, POINTS, 3) of `control.servo.drive_tables`.
     """
 
     task: Task

@@ -208,8 +208,8 @@ def tick_bed(f, e, w):
     Returns:
         Nothing.
 
-    Source: `soil.step`, `soil.wrench`; places are MuJoCo's own, so that every variant's geometry
-        is exact.
+    Source: `soil.step.soil_step`, `bucket_wrench`; places are MuJoCo's own, so that every
+        variant's geometry is exact.
     """
     body = f.tip_body
     theta = math.atan2(w.tip[1], w.tip[0])

@@ -43,9 +43,9 @@ def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround
         log: the log.
 
     Returns:
-        (GRIP + 11,): those of `holding.grip_step`, then numbers of the grapple's body, the log's
-        body and weld, places in `qpos` of jaw and log, the log's radius and half its length [m],
-        places of the free joints.
+        (GRIP + 11,): those of `simulate.surroundings.grip_step`, then numbers of the grapple's
+        body, the log's body and weld, places in `qpos` of jaw and log, the log's radius and half
+        its length [m], places of the free joints.
     """
     hand = machine.links[machine.link_of(machine.axes[log.grab].joint)].parent
     places = [
@@ -108,7 +108,7 @@ def read_free_joints(f, e, w):
     Returns:
         Nothing.
 
-    Source: as `sense.sense`, with the error and resolution of the first axis' sensor.
+    Source: as `envs.loop.sense`, with the error and resolution of the first axis' sensor.
     """
     if e.tick % f.every != 0:
         return
@@ -135,7 +135,7 @@ def tick_grapple(f, e, w):
     Returns:
         Nothing.
 
-    Source: `simulate.holding.grip_step`.
+    Source: `simulate.surroundings.grip_step`.
     """
     _take_or_let_go(f, w)
     read_free_joints(f, e, w)

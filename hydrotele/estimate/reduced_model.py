@@ -26,9 +26,9 @@ class Model(NamedTuple):
     """Numbers of the reduced model; n independent coordinates, t transmissions, h valves.
 
     A state is `(n positions, t drive positions, n rates, t drive rates, 4 h activations)` and what
-    bristles and a slow pump remember, see `parameters.memory_names`. Its pressures are those that
-    the oil would have if it held its air (`laws.pressure_without_air`): any number is one, which a
-    filter needs, and they are the felt ones wherever these are not below the atmosphere's.
+    bristles and a slow pump remember, see `parameters.extra_state_names`. Its pressures are those
+    that the oil would have if it held its air (`laws.pressure_without_air`): any number is one,
+    which a filter needs, and they are the felt ones wherever these are not below the atmosphere's.
 
     Attributes:
         mech: the mechanism.

@@ -99,7 +99,7 @@ def measure(
         sensors: the set, None for ideal.
         seed: the scenario's seed.
         truth: channel -> (n,) true values; where a sensor reads late, those that it reads
-            (`readout.late_channels`).
+            (`record.late_channels`).
         errors: channel -> (n,) errors already drawn; others are drawn here.
 
     Returns:

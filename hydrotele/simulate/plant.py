@@ -151,7 +151,7 @@ class Plant:
         drive_dof: (nu,) the same in `qvel`.
         rod_qpos: (nu,) place of the piston displacement in `qpos`, -1 without cylinder.
         hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i+3.
-        memory: name of every other state, as `parameters.memory_names` has them -> its activation.
+        memory: name of every other state, of `parameters.extra_state_names` -> its activation.
     """
 
     machine: Machine

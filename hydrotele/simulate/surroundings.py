@@ -294,7 +294,7 @@ def is_surrounding_object(name: str) -> bool:
 
 
 def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
-    """Numbers of `holding.grip_step` for a log.
+    """Numbers of `grip_step` for a log.
 
     Args:
         model: the machine's. The box site `<grab>_pocket` is the room between the jaws: logs lie

@@ -208,7 +208,7 @@ def drive_follows(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) ->
     Returns:
         (...) [1].
 
-    Source: this module's docstring; `teleop.slave.ask` for the look ahead.
+    Source: this module's docstring; `teleop.slave.update_references` for the look ahead.
     """
     valve, place_lag, _ = _lags(tip, servo, clocks, s)
     held = np.exp(-0.5 * clocks.control * s)
@@ -234,7 +234,7 @@ STRUCTURES = ("rate_force", "position_force", "rate_position", "position_positio
 
 @dataclass(frozen=True)
 class LinearCase:
-    """A teleoperated axis with hand, machine and task; as `teleop.case.Case` to an analysis.
+    """A teleoperated axis with hand, machine and task; as `teleop.analysis.Case` to an analysis.
 
     Attributes:
         pilot: the scenario's.
