@@ -20,6 +20,7 @@ import scipy.stats
 from hydrotele.calibrate.estimation import ParameterFit, Prior, identifiable, least_squares
 from hydrotele.calibrate.regularisation import Sizes, estimate_sizes, prediction_error
 from hydrotele.calibrate.sockets import Socket, places_of
+from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.robot_file import load_robot, shipped_robots
 from hydrotele.kinematics.serial_chain import forward, forward_and_rates
@@ -35,7 +36,7 @@ MODELS = {
     "rigid": (False, False),
     "gravity": (True, False),
     "eccentricity": (False, True),
-    "gravity and eccentricity": (True, True),
+    "both": (True, True),
 }
 """Model of the joints -> whether they yield under gravity, and whether encoders err once a turn."""
 
@@ -89,6 +90,7 @@ class Judged:
         sockets: socket -> its own root mean square [m].
         distances: place -> distance of its sockets' means, the first two [m].
         outliers: rows apart from the rest of their socket.
+        rows: socket -> distance of every row's ball from the socket's mean [m].
     """
 
     rms: float
@@ -96,6 +98,7 @@ class Judged:
     sockets: dict[str, float]
     distances: dict[str, float]
     outliers: tuple[Outlier, ...]
+    rows: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -135,12 +138,14 @@ class LeftOut:
 
     Attributes:
         name: of the place or socket.
-        nominal: of the nominal robot with its ball as given.
+        given: of the nominal robot with the ball where its file says.
+        nominal: of the nominal robot with the ball fitted to all others.
         calibrated: of the robot calibrated on all others.
         model: of the joints, chosen without it.
     """
 
     name: str
+    given: Judged
     nominal: Judged
     calibrated: Judged
     model: str
@@ -364,15 +369,40 @@ def leave_out(
     Raises:
         InputError: nothing is left to calibrate on.
     """
-    made = []
-    for name in names:
-        own = tuple(s for s in sockets if name in (s.place, s.name))
-        rest = tuple(s for s in sockets if s not in own)
-        if not rest:
-            raise InputError(f"--heldout {name}", "is all there is; record another place")
-        found = calibrate_sockets(robot, rest, options)
-        made.append(LeftOut(name, judge(robot, own), judge(found.robot, own), found.model))
-    return tuple(made)
+    return tuple(hold_out(robot, sockets, name, options)[0] for name in names)
+
+
+def hold_out(
+    robot: Robot, sockets: Sequence[Socket], name: str, options: Options | None = None
+) -> tuple[LeftOut, SocketCalibration]:
+    """Predict one place, or socket, by a calibration that has not seen it.
+
+    Args:
+        robot: nominal.
+        sockets: all of them.
+        name: of the place, or of a socket.
+        options: of the calibration.
+
+    Returns:
+        How well it is predicted, and the calibration on all others.
+
+    Raises:
+        InputError: there is no such place, or nothing is left to calibrate on.
+    """
+    own = tuple(s for s in sockets if name in (s.place, s.name))
+    rest = tuple(s for s in sockets if name not in (s.place, s.name))
+    if not own:
+        known = (*places_of(sockets), *(s.name for s in sockets))
+        raise InputError(f"--heldout {name}", f"is no place of the data; {suggest(name, known)}")
+    if not rest:
+        raise InputError(f"--heldout {name}", "is all there is; record another place")
+    found = calibrate_sockets(robot, rest, options)
+    problem = _Problem(robot, rest, (), Options(distance=None))
+    values = dict(zip(problem.names, _with_ball(problem).tolist(), strict=True))
+    nominal = corrected_robot(robot, values, {})
+    return LeftOut(
+        name, judge(robot, own), judge(nominal, own), judge(found.robot, own), found.model
+    ), found
 
 
 def parts_to_leave_out(sockets: Sequence[Socket]) -> tuple[str, ...]:
@@ -624,6 +654,7 @@ def _judged(problem: _Problem, balls: np.ndarray) -> Judged:
         {s.name: float(np.sqrt(np.mean(apart[problem.index == k] ** 2)))
          for k, s in enumerate(problem.sockets)},
         dict(reversed(distances.items())), tuple(outliers),
+        {s.name: apart[problem.index == k] for k, s in enumerate(problem.sockets)},
     )  # fmt: skip
 
 
