@@ -63,6 +63,7 @@ def draw_sockets(found: SocketCalibration, left: Sequence[LeftOut]) -> bytes:
         upper.grid(axis="x", visible=False)
         upper.set_xlim(-0.5, place - 0.5)
         upper.set_yscale("log")
+        upper.yaxis.set_major_formatter("{x:g}")
         upper.set_ylabel("ball from its socket's\nmean [mm]; lines: RMS")
         upper.set_title(f"{found.nominal.name}: consistency of the predicted ball")
         upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False,
