@@ -43,6 +43,7 @@ MODELS = {
 _SIZE = 1e-3  # m and rad to begin with, a usual tolerance
 _SAG_SIZE = 1e-4  # rad s^2/m^2 to begin with: a milliradian by a kilogram at a metre
 _BALL = 0.3  # m by which the ball may be elsewhere in the last link
+_FINEST = 1e-8  # m of noise: below it rounding decides what the data tell
 _PASSES, _SAME_NOISE = 6, 1e-3
 _MEDIAN_CHI3 = 1.5382  # median length of three standard normal errors
 _FALSE_ALARM = 1e-3  # chance that normal noise alone makes an outlier of any row of a data set
@@ -314,13 +315,11 @@ def calibrate_sockets(
         full = _Problem(robot, robust, extra, options)
         found = _settled(full, state if not extra else _extended(full, state))
         fresh = _outlying(robot, sockets, extra, found.x, found.sizes.noise)
-        names = {(one.socket, one.line) for one in fresh}
+        outliers, names = fresh, {(one.socket, one.line) for one in fresh}
         if names == gone:
             break
         gone = names
         robust = _without(sockets, gone)
-        outliers = fresh
-    outliers = [one for one in outliers if (one.socket, one.line) in gone]
     fit = _fit(full, found)
     p = len(full.chain.nominal)
     values = dict(zip(full.names, fit.values.tolist(), strict=True))
@@ -443,7 +442,7 @@ def _settled(problem: _Problem, begin: _State | None) -> _State:
         weight = 1.0 / sigma[many:, None]
         new = estimate_sizes(
             matrix[:many], rest[:many], kinds, first, problem.freedom, sizes.noise,
-            matrix[many:] * weight, rest[many:] * weight[:, 0],
+            matrix[many:] * weight, rest[many:] * weight[:, 0], _FINEST,
         )  # fmt: skip
         close = abs(new.noise - sizes.noise) < _SAME_NOISE * sizes.noise
         sizes = new
@@ -563,7 +562,7 @@ def _chosen(problem: _Problem, state: _State) -> tuple[str, dict[str, float]]:
         weight = 1.0 / full.sigma(state.sizes.noise)[many:]
         sizes = estimate_sizes(
             matrix[:many], rest[:many], _kinds(full), begun.sizes.std, full.freedom,
-            state.sizes.noise, matrix[many:] * weight[:, None], rest[many:] * weight,
+            state.sizes.noise, matrix[many:] * weight[:, None], rest[many:] * weight, _FINEST,
         )  # fmt: skip
         errors[model] = prediction_error(matrix[:many], rest[:many], folds, sizes)
     return wanted or min(errors, key=lambda model: errors[model]), errors

@@ -13,6 +13,7 @@ import numpy as np
 
 _SMALLEST = 1e-7  # of a size, over its start: a kind that is not there
 _LARGEST = 1e3
+_ROUNDING = 1e-14
 _ROUNDS, _SETTLED = 200, 1e-4
 
 
@@ -36,7 +37,7 @@ class Sizes:
 def estimate_sizes(
     matrix: np.ndarray, rest: np.ndarray, kinds: Sequence[str], start: np.ndarray,
     freedom: float, noise: float, known: np.ndarray | None = None,
-    known_rest: np.ndarray | None = None,
+    known_rest: np.ndarray | None = None, finest: float = 0.0,
 ) -> Sizes:  # fmt: skip
     """Sizes of kinds of parameters by maximum evidence.
 
@@ -53,6 +54,7 @@ def estimate_sizes(
         noise: standard deviation to begin with.
         known: (r, p) equations whose error has the standard deviation 1, if there are any.
         known_rest: (r,) what these have to explain.
+        finest: the least that the noise may be.
 
     Returns:
         The sizes.
@@ -73,9 +75,10 @@ def estimate_sizes(
         inverse = np.linalg.inv(scaled)
         value = std * (inverse @ (std * (right / noise**2 + extra_right)))
         decided = 1.0 - np.diag(inverse)
-        error = max(square - 2.0 * value @ right + value @ normal @ value, 0.0)
+        error = square - 2.0 * value @ right + value @ normal @ value
+        error = max(error, _ROUNDING * square)  # a difference of squares
         before = np.append(std, noise)
-        noise = float(np.sqrt(max(error, 1e-300) / max(freedom - decided.sum(), 1.0)))
+        noise = max(float(np.sqrt(error / max(freedom - decided.sum(), 1.0))), finest)
         for places in groups.values():
             share = decided[places].sum()
             size = np.sqrt(np.sum(value[places] ** 2) / share) if share > 0.0 else 0.0

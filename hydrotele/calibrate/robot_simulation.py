@@ -18,6 +18,7 @@ from hydrotele.kinematics.serial_robot import (
 
 _TRIES = 200
 _REACHED = 1e-9  # m
+_IDLE = 0.3  # rad
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ def robot_with_errors(
 def simulated_sockets(
     robot: Robot, places: Mapping[str, Sequence[float]], rows: int, errors: Errors,
     rng: np.random.Generator, distance: float = 0.050, limit: float = 2.8,
+    idle: int | None = None,
 ) -> tuple[Socket, ...]:  # fmt: skip
     """Postures of a robot with its ball in two sockets at every place.
 
@@ -82,6 +84,7 @@ def simulated_sockets(
         rng: random numbers.
         distance: of the two sockets [m].
         limit: of the joints' angles to either side [rad].
+        idle: column of a joint that stays at 0.3 rad; None for none.
 
     Returns:
         The sockets.
@@ -93,8 +96,10 @@ def simulated_sockets(
     for place, first in places.items():
         for hole in (0, 1):
             middle = np.asarray(first, float) + [0.0, hole * distance, 0.0]
-            joints = _postures(robot, middle, rows, errors, rng, limit, place)
+            joints = _postures(robot, middle, rows, errors, rng, limit, place, idle)
             joints = joints + errors.encoder * rng.standard_normal(joints.shape)
+            if idle is not None:
+                joints[:, idle] = _IDLE
             path = Path(place) / f"hole_{hole}.csv"
             made.append(Socket(place, hole, path, joints, np.arange(1, rows + 1)))
     return tuple(made)
@@ -110,16 +115,18 @@ def save_sockets(sockets: Sequence[Socket], folder: Path) -> None:
 
 def _postures(
     robot: Robot, middle: np.ndarray, rows: int, errors: Errors, rng: np.random.Generator,
-    limit: float, place: str,
+    limit: float, place: str, idle: int | None,
 ) -> np.ndarray:  # fmt: skip
     """(rows, k) encoder readings that bring the ball into a socket."""
     found: list[np.ndarray] = []
     for _ in range(_TRIES):
         start = rng.uniform(-limit, limit, (4 * rows, len(robot.joints)))
+        if idle is not None:
+            start[:, idle] = _IDLE
         near = np.linalg.norm(robot_poses(robot, start).position - middle, axis=1)
         start = start[np.argsort(near)[: 2 * rows]]
         targets = middle + errors.play * rng.standard_normal((len(start), 3))
-        reached = joints_for_places(robot, targets, start)
+        reached = joints_for_places(robot, targets, start, idle=idle)
         good = (reached.missed < _REACHED) & (np.abs(reached.joints).max(axis=1) < limit)
         found += list(reached.joints[good])
         if len(found) >= rows:

@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import hydrotele
-from hydrotele.calibrate.estimation import told_in_words
+from hydrotele.calibrate.estimation import told_combinations, told_in_words
 from hydrotele.calibrate.mukca import (
     Judged,
     LeftOut,
@@ -28,11 +28,12 @@ from hydrotele.cli.console import out, plain, print_json, table
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 from hydrotele.core.output import check_target, whole_folder
+from hydrotele.identify.identifiability import FULL
 from hydrotele.kinematics.robot_file import corrected_urdf, load_robot, robot_yaml
 from hydrotele.kinematics.serial_robot import Robot
 
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "*.urdf", "*.xml")
-_SHOWN = 40  # parameters of the printed table
+_SHOWN, _WIDE = 25, 60  # combinations of the printed table, and their letters
 
 
 @dataclass(frozen=True)
@@ -108,10 +109,12 @@ def socket_document(
     """The result as JSON: lengths of results in mm, parameters in SI units."""
     fit, angular = found.fit, ("r", "s", "c")
     status = dict(zip(fit.told.names, fit.told.status, strict=True))
+    alone = {name for name, told in status.items() if told == FULL}
     parameters = [
         {
-            "name": name, "value": value, "std": std, "low": low, "high": high,
-            "unit": _unit(name, angular), "told": status[name],
+            "name": name, "value": value, "unit": _unit(name, angular), "told": status[name],
+            "std": std if name in alone else None, "low": low if name in alone else None,
+            "high": high if name in alone else None,
         }
         for name, value, std, (low, high) in zip(
             fit.names, fit.values, fit.deviations, fit.intervals, strict=True
@@ -140,6 +143,7 @@ def socket_document(
             "parameters": parameters,
             "effective_parameters": len(found.fit.residual) - found.fit.freedom,
             **told_in_words(fit.told),
+            "told": [asdict(one) for one in told_combinations(fit)],
             "outliers": _outliers(found.outliers),
             "status": fit.status,
             "notes": list(notes),
@@ -262,19 +266,18 @@ def _print(document: dict[str, Any], found: SocketCalibration, left: Sequence[Le
 
 
 def _print_parameters(document: dict[str, Any]) -> None:
-    told = [p for p in document["parameters"] if p["told"] in ("full", "combination")]
-    rows = table("Parameters that the data tell", "parameter", "value", "95 % +-", "unit", "told")
+    units = {one["name"]: one["unit"] for one in document["parameters"]}
+    rows = table("What the data tell", "parameter or combination", "value", "95 % +-", "unit")
+    told = sorted(document["told"], key=lambda one: len(one["text"]))
     for one in told[:_SHOWN]:
-        unit, factor = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(one["unit"], (one["unit"], 1.0))
+        unit = units[one["text"].split()[0]]
+        shown, factor = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(unit, (unit, 1.0))
+        text = one["text"] if len(one["text"]) < _WIDE else f"{one['text'][:_WIDE]} ..."
         reach = f"{0.5 * factor * (one['high'] - one['low']):.2g}"
-        said = "by itself" if one["told"] == "full" else "with others"
-        rows.add_row(one["name"], f"{factor * one['value']:.4g}", reach, unit, said)
+        rows.add_row(text, f"{factor * one['value']:.4g}", reach, shown)
     out.print(rows)
     if len(told) > _SHOWN:
-        out.print(f"... and {len(told) - _SHOWN} more: --out or --json lists all")
-    out.print(f"{len(document['combinations'])} combinations, such as:")
-    for text in sorted(document["combinations"], key=len)[:4]:
-        out.print(f"  {text}")
+        out.print(f"... and {len(told) - _SHOWN} longer combinations: --out or --json lists all")
     out.print("not told: " + (", ".join(document["unknown"]) or "nothing"))
 
 

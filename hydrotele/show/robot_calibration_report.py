@@ -115,7 +115,7 @@ def robot_report(document: dict[str, Any], png_: bytes) -> str:
         ]  # fmt: skip
         parts.append(section(
             "Places that were not fitted", "Root mean square distance of the ball from its"
-            " socket's mean; the last places are predicted by a calibration on all others.",
+            " socket's mean, predicted by a calibration on all others.",
             table(("place", "nominal mm", "calibrated mm", "without outliers mm", "joints"), rows,
                   numbers="-nnn"),
         ))  # fmt: skip
@@ -155,12 +155,10 @@ def _head(document: dict[str, Any]) -> Markup:
 def _parameters(document: dict[str, Any]) -> Markup:
     rows = []
     for one in document["parameters"]:
-        unit, factor = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(one["unit"], (one["unit"], 1.0))
-        reach = 0.5 * (one["high"] - one["low"])
+        unit, factor = _customary(one["unit"])
+        reach = "" if one["std"] is None else f"{0.5 * factor * (one['high'] - one['low']):.2g}"
         told = {"full": "by itself", "combination": "with others"}.get(one["told"], "no")
-        rows.append(
-            (one["name"], f"{factor * one['value']:.4g}", f"{factor * reach:.2g}", unit, told)
-        )
+        rows.append((one["name"], f"{factor * one['value']:.4g}", reach, unit, told))
     return section(
         "Parameters", "t and r: displacement along and rotation about the axes of a joint's frame,"
         " z being the joint's axis; rz is the offset of its angle. sag: yielding of a joint under"
@@ -170,11 +168,20 @@ def _parameters(document: dict[str, Any]) -> Markup:
 
 
 def _told(document: dict[str, Any]) -> Markup:
+    units = {one["name"]: one["unit"] for one in document["parameters"]}
+    rows = []
+    for one in document["told"]:
+        unit, factor = _customary(units[one["text"].split()[0]])
+        reach = f"{0.5 * factor * (one['high'] - one['low']):.2g}"
+        rows.append((one["text"], f"{factor * one['value']:.4g}", reach, unit))
     return section(
-        "What the data tell", "A parameter is told if its uncertainty is below half of its expected"
-        " size in the noise that there is. The rest moves only what others move, too, or nothing.",
-        tag("p", tag("b", "by themselves: "), ", ".join(document["identifiable"]) or "none"),
-        tag("p", tag("b", "together: ")),
-        tag("ul", *(tag("li", text) for text in document["combinations"])),
-        tag("p", tag("b", "not at all: "), ", ".join(document["unknown"]) or "none"),
+        "What the data tell", "A parameter or combination is told if its uncertainty is below half"
+        " of its expected size in the noise that there is. How a combination is split between its"
+        " parameters follows from their expected sizes, not from the data.",
+        table(("parameter or combination", "value", "95 % +-", "unit"), rows, numbers="-nn"),
+        tag("p", tag("b", "not told at all: "), ", ".join(document["unknown"]) or "none"),
     )  # fmt: skip
+
+
+def _customary(unit: str) -> tuple[str, float]:
+    return {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(unit, (unit, 1.0))
