@@ -264,6 +264,47 @@ def told_in_words(told: Identifiability) -> dict[str, list[str]]:
 
 
 @dataclass(frozen=True)
+class Combination:
+    """What the data tell of parameters: one by itself, or some together.
+
+    Attributes:
+        text: the combination written out, such as `a + 2 b`.
+        value: estimated.
+        std: its standard deviation.
+        low: end of the 95 % interval.
+        high: its other end.
+    """
+
+    text: str
+    value: float
+    std: float
+    low: float
+    high: float
+
+
+def told_combinations(fit: ParameterFit) -> tuple[Combination, ...]:
+    """Everything that the data tell, with intervals.
+
+    A parameter that is told with others only has no interval of its own: how a combination is split
+    follows from the prior, or from which parameters were held.
+
+    Args:
+        fit: the fit.
+
+    Returns:
+        One combination per direction that is told.
+    """
+    order = [fit.names.index(name) for name in fit.told.names]
+    values, covariance = fit.values[order], fit.covariance[np.ix_(order, order)]
+    made = []
+    for row, weights in enumerate(fit.told.combination):
+        value, std = float(weights @ values), float(np.sqrt(weights @ covariance @ weights))
+        reach = fit.critical * std
+        made.append(Combination(fit.told.text(row), value, std, value - reach, value + reach))
+    return tuple(made)
+
+
+@dataclass(frozen=True)
 class _Searched:
     """Where a search ended."""
 

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 
@@ -21,7 +20,6 @@ _FILE = re.compile(r"hole_?(\d+)\.(csv|txt)", re.IGNORECASE)
 _SEPARATOR = re.compile(r"[,;\t ]\s*|\s+")
 _SAME = 1e-6  # rad or m: a posture that is recorded twice
 _FEWEST = 3  # postures that have a mean and a spread
-_TURN = 2.0 * math.pi + 0.2  # rad that joints of robots reach at most
 
 
 @dataclass(frozen=True)
@@ -94,36 +92,10 @@ def places_of(sockets: Sequence[Socket]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(socket.place for socket in sockets))
 
 
-def at_place(sockets: Sequence[Socket], place: str) -> tuple[Socket, ...]:
-    """The sockets of one place.
-
-    Raises:
-        InputError: there is no such place; lists those that are.
-    """
-    names = places_of(sockets)
-    if place not in names:
-        raise InputError(f"--heldout {place}", f"is no place of the data; {suggest(place, names)}")
-    return tuple(socket for socket in sockets if socket.place == place)
-
-
-def without_place(sockets: Sequence[Socket], place: str) -> tuple[Socket, ...]:
-    """The sockets of all other places."""
-    return tuple(socket for socket in sockets if socket.place != place)
-
-
 def idle_joints(sockets: Sequence[Socket]) -> list[int]:
     """Columns that have one value in all files: joints that never move."""
     joints = np.vstack([socket.joints for socket in sockets])
     return [int(k) for k in np.flatnonzero(np.ptp(joints, axis=0) < _SAME)]
-
-
-def beyond_a_turn(sockets: Sequence[Socket], revolute: Sequence[bool]) -> tuple[Socket, int] | None:
-    """The first file and column with a revolute joint's angle that no robot reaches [rad]."""
-    for socket in sockets:
-        for k in np.flatnonzero(np.abs(socket.joints).max(axis=0) > _TURN):
-            if revolute[int(k)]:
-                return socket, int(k)
-    return None
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -130,7 +130,43 @@ def scara(data: Data, heldout: HeldOut = None, out: Out = None, json: Json = Fal
     raise InputError("calibrate scara", "is not there yet")
 
 
-@app.command()
-def mukca(data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False) -> None:
+@app.command(
+    epilog="Examples:  hydrotele calibrate mukca --data my_panda --out calibrated   |   "
+    "hydrotele calibrate mukca --data sets --robot arm.urdf --heldout left --json"
+)
+def mukca(
+    data: Annotated[
+        Path, typer.Option("--data", "-d", help="Folder of PLACE/hole_0.csv, PLACE/hole_1.csv.")
+    ],
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            help="Shipped robot, or a YAML, URDF or MJCF file; default the one in the folder of"
+            " the data, else the shipped one that fits best."
+        ),
+    ] = None,
+    heldout: Annotated[
+        str | None,
+        typer.Option(help="Place to judge on, not fitted; default every place in turn."),
+    ] = None,
+    distance: Annotated[
+        float, typer.Option(min=0.0, help="Of neighbouring sockets in mm; 0 if not known.")
+    ] = 50.0,
+    accuracy: Annotated[
+        float, typer.Option(min=1e-6, help="Standard deviation of that distance in mm.")
+    ] = 0.05,
+    unit: Annotated[str, typer.Option(help="Of the angles: rad or deg.")] = "rad",
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="Of the joints: rigid, gravity, eccentricity, or both; default what predicts best."
+        ),
+    ] = None,
+    out: Out = None,
+    json: Json = False,
+) -> None:
     """Serial robot from joint angles alone, its ball held in sockets."""
-    raise InputError("calibrate mukca", "is not there yet")
+    from hydrotele.cli.calibrating_robots import SocketChoices, calibrate_mukca
+
+    choices = SocketChoices(robot, heldout, 1e-3 * distance, 1e-3 * accuracy, unit, model)
+    calibrate_mukca(data, choices, out, json)

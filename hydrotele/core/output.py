@@ -24,6 +24,8 @@ OURS = {
     ),
     "compare": ("compare.json", "*.png"),
     "calibration": ("calibration.json", "report.html", "machine.yaml", "*.png"),
+    "robot calibration": ("calibration.json", "report.html", "*.png", "calibrated.yaml",
+                          "calibrated.urdf"),
     "identify": ("identify.json", "report.html", "identified/machine.*",
                  "identified/machine_assets/*"),
     "experiments": ("experiments.json", "table.md", "report.html"),

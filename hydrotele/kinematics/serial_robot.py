@@ -222,8 +222,9 @@ class Reached(NamedTuple):
 
 
 def joints_for_places(
-    robot: Robot, places: np.ndarray, start: np.ndarray, iterations: int = 50
-) -> Reached:
+    robot: Robot, places: np.ndarray, start: np.ndarray, iterations: int = 50,
+    idle: int | None = None,
+) -> Reached:  # fmt: skip
     """Encoder readings that bring the ball to places: resolved motion to the end.
 
     Every step is the one of least norm that closes the gap, by the robot's Jacobian with a damping
@@ -234,6 +235,7 @@ def joints_for_places(
         places: (n, 3) in the base frame [m].
         start: (n, k) where the joints are.
         iterations: most steps.
+        idle: column of a joint that does not move; None for none.
 
     Returns:
         (n, k) readings and (n,) distances that are left.
@@ -249,7 +251,9 @@ def joints_for_places(
         size = np.sum(gap**2, axis=1)
         if size.max(initial=0.0) < 1e-24:
             break
-        rates = found.position_by_joint
+        rates = found.position_by_joint.copy()
+        if idle is not None:
+            rates[:, :, idle] = 0.0
         square = rates @ np.swapaxes(rates, 1, 2) + (1e-3 * size)[:, None, None] * np.eye(3)
         step = np.swapaxes(rates, 1, 2) @ np.linalg.solve(square, gap[:, :, None])
         joints += step[:, :, 0]
