@@ -39,6 +39,8 @@ _STEP = 1e-2  # of a parameter's size, for central differences: errors are of it
 _LEFT_OUT = 200  # poses that are left out one by one at most
 _MOST_OUT = 0.2  # share of poses that may be left out as wrong
 _WRONG = 1e-6  # probability under which a pose's residual is no noise
+_LARGE = 20.0  # sizes of an error of manufacture, beyond which it is none
+_UNLIKELY = 1e-4  # probability of residuals so large under the stated noise
 _BETTER = 0.95  # share of the other model's error at which a model is preferred
 _STILL = 1e-3  # m or rad: a joint that moves by less stands still
 _LOADING = 1e-4  # share in a null direction that counts as taking part
@@ -169,8 +171,8 @@ def redundancy(eq: Equations, values: np.ndarray | None = None) -> Redundancy:
     shares = np.abs(directions).max(axis=0, initial=0.0)
     partners = tuple(n for n, share in zip(eq.names, shares, strict=True) if share > _LOADING)
     noisy = identifiable(matrix, eq.names, ones, sigma=1.0, first=first)
-    told = tuple(n for n, status in zip(noisy.names, noisy.status, strict=True)
-                 if status in (FULL, COMBINATION) and eq.names.index(n) in set(noisy.base))  # fmt: skip
+    told = tuple(eq.names[k] for k in sorted(noisy.base)
+                 if noisy.status[k] in (FULL, COMBINATION))  # fmt: skip
     return Redundancy(rank, held, directions, partners, _in_words(eq, exact, held, partners),
                       s / s[0], told)  # fmt: skip
 
@@ -257,6 +259,7 @@ class Calibration:
         after: of the calibrated one.
         left_out: of robots calibrated without the pose that they predict.
         wrong: rows of poses that were left out because they fit nothing.
+        warnings: what is suspicious about the result, and what to do.
     """
 
     model: ErrorModel
@@ -268,6 +271,7 @@ class Calibration:
     after: Errors
     left_out: Errors
     wrong: tuple[int, ...]
+    warnings: tuple[str, ...]
 
     @property
     def errors(self) -> np.ndarray:
@@ -313,7 +317,7 @@ def calibrate(
     return Calibration(
         model, eq, fit, redundancy(eq, fit.values), calibrated,
         pose_errors(model.nominal, eq.measurement), pose_errors(calibrated, eq.measurement),
-        _left_out(eq, fit), tuple(sorted(wrong)),
+        _left_out(eq, fit), tuple(sorted(wrong)), _warnings(eq, fit),
     )  # fmt: skip
 
 
@@ -339,6 +343,31 @@ def best(robot: Hybrid, measurement: Measurement, names: Sequence[str] | None = 
     poe = calibrate(robot, measurement, "poe")
     size = [np.sqrt(np.mean(c.left_out.position**2)) for c in (dh, poe)]
     return poe if size[1] < _BETTER * size[0] else dh
+
+
+def _warnings(eq: Equations, fit: ParameterFit) -> tuple[str, ...]:
+    said = []
+    units = [eq.model.units[k] for k in eq.model.index(eq.names)]
+    large = np.flatnonzero(np.abs(fit.values) > _LARGE * eq.scales)
+    if len(large):
+        which = ", ".join(
+            f"{fit.names[k]} {1e3 * fit.values[k]:.3g} {'mm' if units[k] == 'm' else 'mrad'}"
+            for k in large[:6]
+        )
+        said.append(
+            f"{which}: these are no errors of manufacture; the data are of another robot, a sensor"
+            " has another zero, or a frame differs from the nominal robot's"
+        )
+    if eq.measurement.stated:
+        freedom = max(fit.freedom, 1.0)
+        if scipy.stats.chi2.sf(freedom * fit.chi**2, freedom) < _UNLIKELY:
+            said.append(
+                f"residuals are {fit.chi:.2f} times what the stated noise makes: it is larger than"
+                " stated, or this error model (or choice of parameters) does not describe the robot"
+            )
+    if not fit.converged:
+        said.append(fit.status)
+    return tuple(said)
 
 
 def _fit(eq: Equations, prior: Prior | None) -> ParameterFit:
@@ -397,7 +426,7 @@ def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
 
 
 def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
-    """Prediction errors of every pose by a calibration without it; of 200 poses where there are more.
+    """Prediction errors of every pose by a calibration without it; of 200 if there are more.
 
     Parameters change by less than their standard deviations, over which the equations are straight:
     with the Jacobian Q R, the six rows Q_k and residuals r_k of the pose, the change is

@@ -189,44 +189,49 @@ def sample_posterior(
     full = emcee.moves.DEMove(gamma0=1.0)
     usual = emcee.moves.DEMove(gamma0=2.38 / np.sqrt(2.0 * p))
     moves = [(usual, 0.8 - _JUMP), (full, _JUMP), (emcee.moves.DESnookerMove(), 0.2)]
-    sampler = emcee.EnsembleSampler(
-        len(begin), p, log_probability, moves=moves, vectorize=True
-    )
+    sampler = emcee.EnsembleSampler(len(begin), p, log_probability, moves=moves, vectorize=True)
     sampler.random_state = np.random.RandomState(seed).get_state()
-    state = sampler.run_mcmc(begin, burn, skip_initial_state_check=True)
+    state = begin
+    if burn:
+        state = sampler.run_mcmc(begin, burn, store=False, skip_initial_state_check=True)
     sampler.reset()
-    sampler.run_mcmc(state, steps, skip_initial_state_check=True)
+    sampler.run_mcmc(state, -(-steps // thin), thin_by=thin, skip_initial_state_check=True)
     chain = sampler.get_chain()
     assert chain is not None
     return judged(names, chain, sampler.get_log_prob(), float(np.mean(sampler.acceptance_fraction)),
                   (burn + steps) * len(begin), thin)  # fmt: skip
 
 
-def judged(names, chain, log_probability, acceptance, evaluations, thin=10) -> Posterior:
+def judged(
+    names: Sequence[str], chain: np.ndarray, log_probability: np.ndarray, acceptance: float,
+    evaluations: int, thin: int = 1,
+) -> Posterior:  # fmt: skip
     """A chain with its diagnostics.
 
     Args:
         names: the p parameters.
-        chain: (steps, walkers, p) after the burn-in.
-        log_probability: (steps, walkers).
+        chain: (draws, walkers, p) after the burn-in, every `thin`-th step.
+        log_probability: (draws, walkers).
         acceptance: share of accepted moves.
         evaluations: of the log probability.
-        thin: of the steps that are kept.
+        thin: steps between draws.
 
     Returns:
         The sample.
     """
     tau, rhat = autocorrelation_time(chain), split_rhat(chain)
     effective = chain.shape[0] * chain.shape[1] / tau
-    long = chain.shape[0] / tau.max()
+    long = len(chain) / tau.max()
     good = bool(rhat.max() < _RHAT and long > _LENGTHS)
-    said = (f"{'converged' if good else 'not converged'}: split R-hat at most {rhat.max():.3f},"
-            f" {long:.0f} autocorrelation times, effective size at least {effective.min():.0f}")
+    said = (
+        f"{'converged' if good else 'not converged'}: split R-hat at most {rhat.max():.3f},"
+        f" {long:.0f} autocorrelation times, effective size at least {effective.min():.0f}"
+    )
     if not good:
         said += "; draw more steps"
     return Posterior(
-        tuple(names), chain[::thin].copy(), np.asarray(log_probability)[::thin].copy(), acceptance,
-        tau, rhat, effective, len(chain), evaluations, good, said,
+        tuple(names), chain, np.asarray(log_probability), acceptance, thin * tau, rhat, effective,
+        thin * len(chain), evaluations, good, said,
     )  # fmt: skip
 
 

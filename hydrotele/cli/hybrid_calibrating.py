@@ -126,7 +126,7 @@ def _result(data, done: Calibration, heldout, evolved, posterior) -> dict[str, A
         "poses_left_out_as_wrong": list(done.wrong),
         "noise": "stated" if done.equations.measurement.stated else "estimated",
         "chi": fit.chi, "degrees_of_freedom": fit.freedom, "iterations": fit.iterations,
-        "converged": fit.converged, "status": fit.status,
+        "converged": fit.converged, "status": fit.status, "warnings": list(done.warnings),
         "redundancy": {
             "parameters": len(fit.names), "rank": done.redundancy.rank,
             "redundant": list(done.redundancy.held), "take_part": list(done.redundancy.takes_part),
@@ -225,8 +225,8 @@ def _print(result: dict[str, Any]) -> None:
     rows = [("nominal", errors["before"]), ("calibrated", errors["after"]),
             ("each pose predicted without itself", errors["left_out"])]  # fmt: skip
     for name, e in rows:
-        shown.add_row(name, *(f"{e[k]:.3f}" for k in
-                              ("position_rms_mm", "position_max_mm", "orientation_rms_mrad")))  # fmt: skip
+        shown.add_row(name, f"{e['position_rms_mm']:.3f}", f"{e['position_max_mm']:.3f}",
+                      f"{e['orientation_rms_mrad']:.3f}")  # fmt: skip
     if "heldout" in result:
         h = result["heldout"]
         shown.add_row(f"{h['poses']} poses not used, nominal", f"{h['before_rms_mm']:.3f}",
@@ -247,12 +247,14 @@ def _print(result: dict[str, Any]) -> None:
     if result["poses_left_out_as_wrong"]:
         rows_ = ", ".join(map(str, result["poses_left_out_as_wrong"]))
         out.print(f"left out, as their readings fit no calibration: rows {rows_}")
+    for words in result["warnings"]:
+        out.print(f"[yellow]warning[/] {words}")
     for key, name in (("evolution", "differential evolution"), ("posterior", "MCMC")):
         if key in result:
             one = result[key]
             said = one.get("status", "converged" if one["converged"] else "not converged")
-            out.print(f"{name}: {said}; least squares differs by at most"
-                      f" {one['largest_difference_in_deviations']:.2f} standard deviations")  # fmt: skip
+            away = one["largest_difference_in_deviations"]
+            out.print(f"{name}: {said}; least squares differs by at most {away:.2f} deviations")
 
 
 def simulate_hybrid(

@@ -64,7 +64,7 @@ _CAPTIONS = {
     15: ("d4", "a3y", "a4y", "a5y"), 16: ("theta4", "a1z", "a2z", "a3z"),
     17: ("alpha4", "a1z", "a2z", "a3z"),
 }  # fmt: skip
-"""Figure -> the parameters that its caption names; that of Fig. 14 has one (dd) of no known meaning."""
+"""Figure -> the parameters that its caption names; Fig. 14 has one (dd) of no known meaning."""
 
 
 class Trial(NamedTuple):
@@ -165,7 +165,8 @@ def _counts(robot: Hybrid) -> Finding:
     count = len(error_model(robot, "dh").names)
     carriage = error_model(robot, "dh").carriage_count
     return Finding(
-        "number of parameter errors", "section 3.1.2 (page 34)",
+        "number of parameter errors",
+        "section 3.1.2 (page 34)",
         "12 of the carriage (4 per revolute, 2 per prismatic joint) and 7 per leg, 42, of the"
         " Hexa-WH",
         f"{carriage} and {count - carriage}, {count} together",
@@ -197,7 +198,8 @@ def _free_counts(robot: Hybrid) -> Finding:
     eq = equations(model, _exact(robot, joints, legs), model.names[model.carriage_count :])
     hexapod = redundancy(eq).rank
     return Finding(
-        "independent parameters: counting formulas", "Eqs 4 and 5 (pages 23 and 24)",
+        "independent parameters: counting formulas",
+        "Eqs 4 and 5 (pages 23 and 24)",
         "C = 4R + 2P + T: 18 for the carriage with its pose measured; C = SS + 6L + 6(F - 1) of Eq."
         " 5: 42 for six legs between points (6 pairs, 5 loops, 2 frames)",
         f"rank {serial} of the carriage with errors in all directions of all links; rank {hexapod}"
@@ -224,7 +226,8 @@ def _linear(robot: Hybrid, joints: np.ndarray) -> Finding:
         worst = max(worst, float(np.linalg.norm(straight - true, axis=1).max()))
         moved = max(moved, float(np.linalg.norm(nominal - true, axis=1).max()))
     return Finding(
-        "first-order error model", "Eqs 12 to 26 (pages 31 to 33)",
+        "first-order error model",
+        "Eqs 12 to 26 (pages 31 to 33)",
         "the first-order model is sufficiently accurate for most applications",
         f"of up to {1e3 * moved:.2f} mm at the carriage's end it leaves out {1e3 * worst:.4f} mm"
         " (20 robots with errors of 1 mm and 1 mrad, 200 poses; criterion: below the accuracy that"
@@ -324,7 +327,8 @@ def refined_exact() -> Finding:
     kept = one.model.index(done.fit.names)
     worst = float(np.abs(done.fit.values - one.errors[kept]).max())
     return Finding(
-        "36 parameters without noise", "Table 4 (title)",
+        "36 parameters without noise",
+        "Table 4 (title)",
         "the refined 36-parameter model without measurement noise: assumed and identified errors",
         f"rank {done.redundancy.rank}; least squares brings back every assumed error to"
         f" {worst:.1e} m or rad (criterion: rank 36 and 1e-9)",
@@ -412,7 +416,10 @@ def evolution_runs(results, kind: str) -> Finding:
     source, what = (
         ("Fig. 11 (caption), section 4.1", "15 measurement poses in five different data sets")
         if kind == "dh"
-        else ("Fig. 19 (caption), section 4.3", "four runs with four different data sets, POE model")
+        else (
+            "Fig. 19 (caption), section 4.3",
+            "four runs with four different data sets, POE model",
+        )
     )
     return Finding(
         f"DE on {len(results)} data sets ({'D-H' if kind == 'dh' else 'POE'} model)", source,
@@ -465,7 +472,8 @@ def wire_method() -> Finding:
     deviations = np.sqrt(np.einsum("nii->ni", covariance))
     position, turn = (np.median(np.linalg.norm(deviations[:, k : k + 3], axis=1)) for k in (0, 3))
     return Finding(
-        "3-2-1 wires: pose by three spheres", "Figs 22 to 24, section 5.1, Tables 10 and 12 (titles)",
+        "3-2-1 wires: pose by three spheres",
+        "Figs 22 to 24, section 5.1, Tables 10 and 12 (titles)",
         "end-effector poses are calculated from six wire lengths by trilateration",
         f"exact lengths give the pose to {exact:.1e} m or rad. Errors of {1e3 * sigma:g} mm of the"
         f" wires become {1e3 * position:.3f} mm and {1e3 * turn:.3f} mrad of the pose in the"
@@ -534,7 +542,7 @@ def _compensated(one: Trial, nominal: Hybrid, done: Calibration) -> Finding:
         errors.append(np.linalg.norm(pose_difference(reached, desired)[:, :3], axis=1))
     return Finding(
         "correction in the controller", "section 1.1 (page 21), final step",
-        "identified errors are substituted into the model; the robot then reaches the desired poses",
+        "identified errors are substituted into the kinematic model; desired poses are reached",
         f"25 desired poses by the inverse kinematics: RMS {_mm(errors[0]):.2f} mm with the nominal,"
         f" {_mm(errors[1]):.3f} mm with the calibrated robot (criterion: below 0.1 mm)",
         _mm(errors[1]) < 0.1,
@@ -557,7 +565,8 @@ def coverage(results: list[tuple[int, int]]) -> Finding:
     inside, total = np.sum(results, axis=0)
     share = inside / total
     return Finding(
-        "intervals of the 36 parameters", "Table 5 (title): standard deviations",
+        "intervals of the 36 parameters",
+        "Table 5 (title): standard deviations",
         "standard deviations say how well parameters are known",
         f"{100 * share:.1f} % of {total} assumed errors in {len(results)} trials lie within their"
         " 95 % intervals (criterion: 93 to 97 %)",
