@@ -17,6 +17,7 @@ import scipy.stats
 
 from hydrotele.calibrate.estimation import ParameterFit, Prior, identifiable, least_squares
 from hydrotele.calibrate.hybrid_data import Measurement
+from hydrotele.calibrate.poses import Criterion, select_poses
 from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import COMBINATION, FULL, Identifiability
 from hydrotele.kinematics.hybrid import (
@@ -455,3 +456,27 @@ def subset(calibration: Calibration) -> Equations:
     """The equations of a calibration with its fitted parameters alone."""
     eq, held = calibration.equations, calibration.fit.held
     return replace(eq, names=tuple(n for n, h in zip(eq.names, held, strict=True) if not h))
+
+
+def informative_poses(
+    model: ErrorModel, candidates: Measurement, count: int, criterion: Criterion = "D"
+) -> np.ndarray:
+    """Poses whose measurement tells the parameters best, among candidates.
+
+    Args:
+        model: error model.
+        candidates: poses as the nominal robot would be measured there, with their covariances.
+        count: how many to choose.
+        criterion: `D` or an observability index `O1` to `O5`.
+
+    Returns:
+        (count,) places of the poses.
+
+    Raises:
+        InputError: there are too few candidates or poses.
+    """
+    eq = equations(model, candidates)
+    matrix = eq.jacobian(np.zeros(len(eq.names))) * eq.scales
+    base = identifiable(matrix, eq.names, np.ones(len(eq.names))).base
+    rows = matrix[:, base].reshape(len(candidates), LEGS, -1)
+    return np.sort(select_poses(rows, count, criterion).chosen)

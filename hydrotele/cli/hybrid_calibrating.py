@@ -12,12 +12,14 @@ from hydrotele.calibrate.hybrid import (
     Errors,
     best,
     calibrate,
+    informative_poses,
     pose_errors,
     subset,
 )
 from hydrotele.calibrate.hybrid_data import (
     HELDOUT,
     POSES,
+    measurement_of_wires,
     measurement_text,
     read_measurement,
     robot_file,
@@ -27,11 +29,14 @@ from hydrotele.calibrate.posterior import Evolution, Posterior, evolve, sample_p
 from hydrotele.cli.console import notes, out, plain, print_json, table
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
-from hydrotele.kinematics.hybrid import Hybrid, load_hybrid, save_hybrid
+from hydrotele.kinematics.hybrid import Hybrid, forward, load_hybrid, save_hybrid
 from hydrotele.kinematics.hybrid_errors import document_parameters, error_model
+from hydrotele.kinematics.wires import wire_lengths
 
 KIND = "hybrid calibration"
 MEASUREMENT = "hybrid measurement"
+CRITERIA = ("D", "O1", "O2", "O3", "O4", "O5")
+CANDIDATES = 200  # poses among which the best are chosen
 NOISE = {"leg": 1e-5, "slide": 1e-5, "turn": 2e-5, "wire": 2e-5}  # m, rad: models/iwr/README.md
 BOX = 8.0  # sizes of the errors of manufacture, that differential evolution searches
 
@@ -259,7 +264,7 @@ def _print(result: dict[str, Any]) -> None:
 
 def simulate_hybrid(
     target: Path, robot: str | None, poses: int, heldout: int, seed: int, noise: float,
-    errors: float, parameters: str, kind: str,
+    errors: float, parameters: str, kind: str, choose: str = "random",
 ) -> None:  # fmt: skip
     """Write a simulated measurement of a robot with errors of manufacture, and its truth apart.
 
@@ -273,6 +278,7 @@ def simulate_hybrid(
         errors: factor on the errors of manufacture of 1 mm and 1 mrad.
         parameters: `all`, `document` or names: which have errors.
         kind: error model of the planted errors, `dh` or `poe`.
+        choose: `random` poses, or a criterion of `informative_poses`.
 
     Raises:
         InputError: the folder cannot be written, or a choice is not usable.
@@ -285,6 +291,8 @@ def simulate_hybrid(
         shipped_wires,
     )
 
+    if choose not in ("random", *CRITERIA):
+        raise InputError(f"--choose {choose}", f"valid: random, {', '.join(CRITERIA)}")
     check_target(target, MEASUREMENT)
     nominal = load_hybrid(robot or "iwr")
     kind = "dh" if kind == "auto" and nominal.facts.carriage else "poe" if kind == "auto" else kind
@@ -299,6 +307,8 @@ def simulate_hybrid(
         for stem, count in ((POSES, poses), (HELDOUT, heldout)):
             if count:
                 joints, legs = random_poses(nominal, count, rng, wires)
+                if stem == POSES and choose != "random":
+                    joints, legs = _chosen(model, wires, count, rng, choose)
                 read = measured_poses(true, joints, legs, wires, sizes, rng)
                 save_measurement(folder, stem, nominal, read.joints, read.legs, wires=read.wires)
         (folder / "measurement.yaml").write_text(measurement_text(nominal.name, wires, stated))
@@ -310,3 +320,15 @@ def simulate_hybrid(
         summary = {"kind": MEASUREMENT, "name": nominal.name, "hydrotele": hydrotele.__version__}
         (folder / "summary.json").write_text(json.dumps(summary) + "\n", encoding="utf-8")
     out.print(f"written to [bold]{target}[/]: {poses} poses and {heldout} to judge on")
+
+
+def _chosen(model, wires, count: int, rng: np.random.Generator, criterion: Any):
+    """Commands of the most informative poses among random ones: joints and leg readings."""
+    from hydrotele.simulate.hybrid import random_poses
+
+    robot = model.nominal
+    joints, legs = random_poses(robot, max(CANDIDATES, count), rng, wires)
+    lengths = wire_lengths(wires, forward(robot, joints, legs))
+    candidates = measurement_of_wires(robot, joints, legs, lengths, wires, NOISE, "candidates")
+    places = informative_poses(model, candidates, count, criterion)
+    return joints[places], legs[places]
