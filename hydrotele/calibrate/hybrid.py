@@ -10,6 +10,7 @@ Source: Wang 2012, sections 3.1.2 and 3.1.3 (Eq. 29 and its sum of squares); Kha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -258,7 +259,6 @@ class Calibration:
         robot: with the errors built in.
         before: errors of the nominal robot at the poses.
         after: of the calibrated one.
-        left_out: of robots calibrated without the pose that they predict.
         wrong: rows of poses that were left out because they fit nothing.
         warnings: what is suspicious about the result, and what to do.
     """
@@ -270,9 +270,13 @@ class Calibration:
     robot: Hybrid
     before: Errors
     after: Errors
-    left_out: Errors
     wrong: tuple[int, ...]
     warnings: tuple[str, ...]
+
+    @cached_property
+    def left_out(self) -> Errors:
+        """Errors of robots that are calibrated without the pose that they predict."""
+        return _left_out(self.equations, self.fit)
 
     @property
     def errors(self) -> np.ndarray:
@@ -318,7 +322,7 @@ def calibrate(
     return Calibration(
         model, eq, fit, redundancy(eq, fit.values), calibrated,
         pose_errors(model.nominal, eq.measurement), pose_errors(calibrated, eq.measurement),
-        _left_out(eq, fit), tuple(sorted(wrong)), _warnings(eq, fit),
+        tuple(sorted(wrong)), _warnings(eq, fit),
     )  # fmt: skip
 
 
@@ -381,18 +385,18 @@ def _fit(eq: Equations, prior: Prior | None) -> ParameterFit:
 
 
 def _check_poses(eq: Equations) -> None:
-    """Refuse fewer different poses than the free parameters need."""
+    """Refuse as many equations as they have independent parameters, or fewer."""
     m, q = eq.measurement, len(eq.names)
-    needed = q // LEGS + 1
-    if eq.model.kind == "dh" and q == len(eq.model.names):
-        needed = (q - 4) // LEGS + 1  # four are redundant
-    if m.distinct < needed:
+    matrix = eq.jacobian(np.zeros(q)) * eq.scales
+    rank = len(identifiable(matrix, eq.names, np.ones(q)).base)
+    if LEGS * m.distinct <= rank:
         same = "" if m.distinct == len(m) else f" ({len(m)} rows, of which many are the same pose)"
         raise InputError(
-            m.source, f"{m.distinct} different poses{same} give {LEGS * m.distinct} equations for"
-            f" {q} parameters: measure at least {needed} different poses, better twice as many, or"
-            " identify fewer parameters (--parameters document)",
-        )  # fmt: skip
+            m.source,
+            f"{m.distinct} different poses{same} give {LEGS * m.distinct} equations for"
+            f" {q} parameters: measure at least {q // LEGS + 1} different poses, better twice as"
+            " many, or identify fewer parameters (--parameters document)",
+        )
 
 
 def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
@@ -431,7 +435,7 @@ def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
 
     Parameters change by less than their standard deviations, over which the equations are straight:
     with the Jacobian Q R, the six rows Q_k and residuals r_k of the pose, the change is
-    R^-1 Q_k' (1 - Q_k Q_k')^-1 r_k. NaN where the calibration needs the pose.
+    R^-1 Q_k' (1 - Q_k Q_k')^-1 r_k. Poses that the calibration cannot do without are left away.
     """
     free = np.flatnonzero(~fit.held)
     n = len(eq.measurement)
@@ -446,7 +450,10 @@ def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
         values = fit.values.copy()
         values[free] += step * fit.scales[free]
         robot = corrected(eq.model, eq.full(values))
-        found = pose_errors(robot, eq.measurement.subset(np.array([k])))
+        try:
+            found = pose_errors(robot, eq.measurement.subset(np.array([k])))
+        except InputError:  # without this pose the calibration is worth nothing there
+            continue
         result[:, k] = found.position[0], found.orientation[0]
     known = ~np.isnan(result[0])
     return Errors(*(result[:, known] if known.any() else result))
