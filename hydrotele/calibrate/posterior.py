@@ -197,8 +197,9 @@ def sample_posterior(
     sampler.reset()
     sampler.run_mcmc(state, -(-steps // thin), thin_by=thin, skip_initial_state_check=True)
     chain = sampler.get_chain()
-    assert chain is not None
-    return judged(names, chain, sampler.get_log_prob(), float(np.mean(sampler.acceptance_fraction)),
+    probability = sampler.get_log_prob()
+    assert chain is not None and probability is not None
+    return judged(names, chain, probability, float(np.mean(sampler.acceptance_fraction)),
                   (burn + steps) * len(begin), thin)  # fmt: skip
 
 
