@@ -162,7 +162,8 @@ def sample_posterior(
         names: the p parameters.
         steps: of every walker after the burn-in.
         burn: steps that are thrown away; by default half of `steps`.
-        walkers: number of chains; by default 2 p + 2, the least that emcee takes and two more.
+        walkers: number of chains; by default 4 p: each half moves along differences of
+            the other, which must span all directions.
         seed: of the random numbers.
         thin: of the steps that are kept.
 
@@ -177,7 +178,7 @@ def sample_posterior(
     p = len(names)
     burn = steps // 2 if burn is None else burn
     rng = np.random.default_rng(seed)
-    count = walkers or 2 * p + 2
+    count = walkers or 4 * p
     if np.ndim(start) == 2:
         begin = np.asarray(start, float)
     elif np.ndim(spread) == 2:
