@@ -9,9 +9,14 @@ import matplotlib.image
 import mujoco
 import numpy as np
 
-from hydrotele.kinematics.hybrid import Pose, load_hybrid, rotation_of_euler
+from hydrotele.kinematics.hybrid import (
+    Pose,
+    home_pose,
+    leg_readings,
+    load_hybrid,
+    rotation_of_euler,
+)
 from hydrotele.simulate.hybrid import hybrid_mechanism, mechanism_pose
-from hydrotele.kinematics.hybrid import home_pose, leg_readings
 
 FOLDER = Path(__file__).resolve().parent.parent / "models" / "iwr"
 JOINTS = np.array([0.9, 0.05, -0.35, 0.12])  # m and rad, of the picture
@@ -31,8 +36,12 @@ def main() -> None:
     scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[8, 8, 0.1],
                              rgba=[0.80, 0.81, 0.80, 1], contype=0, conaffinity=0)  # fmt: skip
     for place, strength in (((2, -3, 5), 0.45), ((-1, 3, 4), 0.25)):
-        scene.worldbody.add_light(pos=place, dir=[-p for p in place], diffuse=[strength] * 3,
-                                  type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+        scene.worldbody.add_light(
+            pos=place,
+            dir=[-p for p in place],
+            diffuse=[strength] * 3,
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        )
     model = scene.compile()
     data = mujoco.MjData(model)
     home = home_pose(robot, JOINTS)

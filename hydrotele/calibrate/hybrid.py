@@ -10,6 +10,7 @@ Source: Wang 2012, sections 3.1.2 and 3.1.3 (Eq. 29 and its sum of squares); Kha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ import scipy.stats
 
 from hydrotele.calibrate.estimation import ParameterFit, Prior, identifiable, least_squares
 from hydrotele.calibrate.hybrid_data import Measurement
+from hydrotele.calibrate.poses import Criterion, select_poses
 from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import COMBINATION, FULL, Identifiability
 from hydrotele.kinematics.hybrid import (
@@ -39,6 +41,8 @@ _STEP = 1e-2  # of a parameter's size, for central differences: errors are of it
 _LEFT_OUT = 200  # poses that are left out one by one at most
 _MOST_OUT = 0.2  # share of poses that may be left out as wrong
 _WRONG = 1e-6  # probability under which a pose's residual is no noise
+_LARGE = 20.0  # sizes of an error of manufacture, beyond which it is none
+_UNLIKELY = 1e-4  # probability of residuals so large under the stated noise
 _BETTER = 0.95  # share of the other model's error at which a model is preferred
 _STILL = 1e-3  # m or rad: a joint that moves by less stands still
 _LOADING = 1e-4  # share in a null direction that counts as taking part
@@ -169,8 +173,8 @@ def redundancy(eq: Equations, values: np.ndarray | None = None) -> Redundancy:
     shares = np.abs(directions).max(axis=0, initial=0.0)
     partners = tuple(n for n, share in zip(eq.names, shares, strict=True) if share > _LOADING)
     noisy = identifiable(matrix, eq.names, ones, sigma=1.0, first=first)
-    told = tuple(n for n, status in zip(noisy.names, noisy.status, strict=True)
-                 if status in (FULL, COMBINATION) and eq.names.index(n) in set(noisy.base))  # fmt: skip
+    told = tuple(eq.names[k] for k in sorted(noisy.base)
+                 if noisy.status[k] in (FULL, COMBINATION))  # fmt: skip
     return Redundancy(rank, held, directions, partners, _in_words(eq, exact, held, partners),
                       s / s[0], told)  # fmt: skip
 
@@ -255,8 +259,8 @@ class Calibration:
         robot: with the errors built in.
         before: errors of the nominal robot at the poses.
         after: of the calibrated one.
-        left_out: of robots calibrated without the pose that they predict.
         wrong: rows of poses that were left out because they fit nothing.
+        warnings: what is suspicious about the result, and what to do.
     """
 
     model: ErrorModel
@@ -266,8 +270,13 @@ class Calibration:
     robot: Hybrid
     before: Errors
     after: Errors
-    left_out: Errors
     wrong: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+    @cached_property
+    def left_out(self) -> Errors:
+        """Errors of robots that are calibrated without the pose that they predict."""
+        return _left_out(self.equations, self.fit)
 
     @property
     def errors(self) -> np.ndarray:
@@ -313,7 +322,7 @@ def calibrate(
     return Calibration(
         model, eq, fit, redundancy(eq, fit.values), calibrated,
         pose_errors(model.nominal, eq.measurement), pose_errors(calibrated, eq.measurement),
-        _left_out(eq, fit), tuple(sorted(wrong)),
+        tuple(sorted(wrong)), _warnings(eq, fit),
     )  # fmt: skip
 
 
@@ -341,6 +350,31 @@ def best(robot: Hybrid, measurement: Measurement, names: Sequence[str] | None = 
     return poe if size[1] < _BETTER * size[0] else dh
 
 
+def _warnings(eq: Equations, fit: ParameterFit) -> tuple[str, ...]:
+    said = []
+    units = [eq.model.units[k] for k in eq.model.index(eq.names)]
+    large = np.flatnonzero(np.abs(fit.values) > _LARGE * eq.scales)
+    if len(large):
+        which = ", ".join(
+            f"{fit.names[k]} {1e3 * fit.values[k]:.3g} {'mm' if units[k] == 'm' else 'mrad'}"
+            for k in large[:6]
+        )
+        said.append(
+            f"{which}: these are no errors of manufacture; the data are of another robot, a sensor"
+            " has another zero, or a frame differs from the nominal robot's"
+        )
+    if eq.measurement.stated:
+        freedom = max(fit.freedom, 1.0)
+        if scipy.stats.chi2.sf(freedom * fit.chi**2, freedom) < _UNLIKELY:
+            said.append(
+                f"residuals are {fit.chi:.2f} times what the stated noise makes: it is larger than"
+                " stated, or this error model (or choice of parameters) does not describe the robot"
+            )
+    if not fit.converged:
+        said.append(fit.status)
+    return tuple(said)
+
+
 def _fit(eq: Equations, prior: Prior | None) -> ParameterFit:
     first = [n for n in document_parameters(eq.model) if n in eq.names]
     known = 1.0 if eq.measurement.stated else None
@@ -351,18 +385,18 @@ def _fit(eq: Equations, prior: Prior | None) -> ParameterFit:
 
 
 def _check_poses(eq: Equations) -> None:
-    """Refuse fewer different poses than the free parameters need."""
+    """Refuse as many equations as they have independent parameters, or fewer."""
     m, q = eq.measurement, len(eq.names)
-    needed = q // LEGS + 1
-    if eq.model.kind == "dh" and q == len(eq.model.names):
-        needed = (q - 4) // LEGS + 1  # four are redundant
-    if m.distinct < needed:
+    matrix = eq.jacobian(np.zeros(q)) * eq.scales
+    rank = len(identifiable(matrix, eq.names, np.ones(q)).base)
+    if LEGS * m.distinct <= rank:
         same = "" if m.distinct == len(m) else f" ({len(m)} rows, of which many are the same pose)"
         raise InputError(
-            m.source, f"{m.distinct} different poses{same} give {LEGS * m.distinct} equations for"
-            f" {q} parameters: measure at least {needed} different poses, better twice as many, or"
-            " identify fewer parameters (--parameters document)",
-        )  # fmt: skip
+            m.source,
+            f"{m.distinct} different poses{same} give {LEGS * m.distinct} equations for"
+            f" {q} parameters: measure at least {q // LEGS + 1} different poses, better twice as"
+            " many, or identify fewer parameters (--parameters document)",
+        )
 
 
 def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
@@ -397,11 +431,11 @@ def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
 
 
 def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
-    """Prediction errors of every pose by a calibration without it; of 200 poses where there are more.
+    """Prediction errors of every pose by a calibration without it; of 200 if there are more.
 
     Parameters change by less than their standard deviations, over which the equations are straight:
     with the Jacobian Q R, the six rows Q_k and residuals r_k of the pose, the change is
-    R^-1 Q_k' (1 - Q_k Q_k')^-1 r_k. NaN where the calibration needs the pose.
+    R^-1 Q_k' (1 - Q_k Q_k')^-1 r_k. Poses that the calibration cannot do without are left away.
     """
     free = np.flatnonzero(~fit.held)
     n = len(eq.measurement)
@@ -416,7 +450,10 @@ def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
         values = fit.values.copy()
         values[free] += step * fit.scales[free]
         robot = corrected(eq.model, eq.full(values))
-        found = pose_errors(robot, eq.measurement.subset(np.array([k])))
+        try:
+            found = pose_errors(robot, eq.measurement.subset(np.array([k])))
+        except InputError:  # without this pose the calibration is worth nothing there
+            continue
         result[:, k] = found.position[0], found.orientation[0]
     known = ~np.isnan(result[0])
     return Errors(*(result[:, known] if known.any() else result))
@@ -426,3 +463,27 @@ def subset(calibration: Calibration) -> Equations:
     """The equations of a calibration with its fitted parameters alone."""
     eq, held = calibration.equations, calibration.fit.held
     return replace(eq, names=tuple(n for n, h in zip(eq.names, held, strict=True) if not h))
+
+
+def informative_poses(
+    model: ErrorModel, candidates: Measurement, count: int, criterion: Criterion = "D"
+) -> np.ndarray:
+    """Poses whose measurement tells the parameters best, among candidates.
+
+    Args:
+        model: error model.
+        candidates: poses as the nominal robot would be measured there, with their covariances.
+        count: how many to choose.
+        criterion: `D` or an observability index `O1` to `O5`.
+
+    Returns:
+        (count,) places of the poses.
+
+    Raises:
+        InputError: there are too few candidates or poses.
+    """
+    eq = equations(model, candidates)
+    matrix = eq.jacobian(np.zeros(len(eq.names))) * eq.scales
+    base = identifiable(matrix, eq.names, np.ones(len(eq.names))).base
+    rows = matrix[:, base].reshape(len(candidates), LEGS, -1)
+    return np.sort(select_poses(rows, count, criterion).chosen)

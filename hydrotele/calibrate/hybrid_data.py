@@ -46,7 +46,7 @@ COVARIANCE = tuple(f"covariance.{a}.{b}" for a, b in combinations_with_replaceme
 POSES, HELDOUT, FACTS = "poses", "heldout", "measurement.yaml"
 _KINDS = (".csv", ".parquet")
 _MARGIN = 0.2  # of a joint's range, that a reading may lie beyond it
-_FAR = 0.1  # m: legs that differ by more from the nominal robot are of another one
+_FAR = 0.05  # m: legs that differ by more from the nominal robot are of another one
 _WIRE = 1e-4  # m: of a wire where nothing is stated; only its ratio to the other errors counts
 _SAME = 1e-5  # m or rad: poses that differ by less are one pose, measured again
 
@@ -183,7 +183,9 @@ def read_measurement(folder: Path, robot: Hybrid) -> tuple[Measurement, Measurem
             f" {robot.name!r}: give that robot with --robot",
         )  # fmt: skip
     heldout = _table(folder, HELDOUT)
-    return _measurement(file, facts, robot), _measurement(heldout, facts, robot) if heldout else None
+    return _measurement(file, facts, robot), _measurement(
+        heldout, facts, robot
+    ) if heldout else None
 
 
 def _table(folder: Path, stem: str) -> Path | None:

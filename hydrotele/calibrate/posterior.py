@@ -162,7 +162,8 @@ def sample_posterior(
         names: the p parameters.
         steps: of every walker after the burn-in.
         burn: steps that are thrown away; by default half of `steps`.
-        walkers: number of chains; by default 2 p + 2, the least that emcee takes and two more.
+        walkers: number of chains; by default 4 p: each half moves along differences of
+            the other, which must span all directions.
         seed: of the random numbers.
         thin: of the steps that are kept.
 
@@ -177,7 +178,7 @@ def sample_posterior(
     p = len(names)
     burn = steps // 2 if burn is None else burn
     rng = np.random.default_rng(seed)
-    count = walkers or 2 * p + 2
+    count = walkers or 4 * p
     if np.ndim(start) == 2:
         begin = np.asarray(start, float)
     elif np.ndim(spread) == 2:
@@ -189,44 +190,50 @@ def sample_posterior(
     full = emcee.moves.DEMove(gamma0=1.0)
     usual = emcee.moves.DEMove(gamma0=2.38 / np.sqrt(2.0 * p))
     moves = [(usual, 0.8 - _JUMP), (full, _JUMP), (emcee.moves.DESnookerMove(), 0.2)]
-    sampler = emcee.EnsembleSampler(
-        len(begin), p, log_probability, moves=moves, vectorize=True
-    )
+    sampler = emcee.EnsembleSampler(len(begin), p, log_probability, moves=moves, vectorize=True)
     sampler.random_state = np.random.RandomState(seed).get_state()
-    state = sampler.run_mcmc(begin, burn, skip_initial_state_check=True)
+    state = begin
+    if burn:
+        state = sampler.run_mcmc(begin, burn, store=False, skip_initial_state_check=True)
     sampler.reset()
-    sampler.run_mcmc(state, steps, skip_initial_state_check=True)
+    sampler.run_mcmc(state, -(-steps // thin), thin_by=thin, skip_initial_state_check=True)
     chain = sampler.get_chain()
-    assert chain is not None
-    return judged(names, chain, sampler.get_log_prob(), float(np.mean(sampler.acceptance_fraction)),
+    probability = sampler.get_log_prob()
+    assert chain is not None and probability is not None
+    return judged(names, chain, probability, float(np.mean(sampler.acceptance_fraction)),
                   (burn + steps) * len(begin), thin)  # fmt: skip
 
 
-def judged(names, chain, log_probability, acceptance, evaluations, thin=10) -> Posterior:
+def judged(
+    names: Sequence[str], chain: np.ndarray, log_probability: np.ndarray, acceptance: float,
+    evaluations: int, thin: int = 1,
+) -> Posterior:  # fmt: skip
     """A chain with its diagnostics.
 
     Args:
         names: the p parameters.
-        chain: (steps, walkers, p) after the burn-in.
-        log_probability: (steps, walkers).
+        chain: (draws, walkers, p) after the burn-in, every `thin`-th step.
+        log_probability: (draws, walkers).
         acceptance: share of accepted moves.
         evaluations: of the log probability.
-        thin: of the steps that are kept.
+        thin: steps between draws.
 
     Returns:
         The sample.
     """
     tau, rhat = autocorrelation_time(chain), split_rhat(chain)
     effective = chain.shape[0] * chain.shape[1] / tau
-    long = chain.shape[0] / tau.max()
+    long = len(chain) / tau.max()
     good = bool(rhat.max() < _RHAT and long > _LENGTHS)
-    said = (f"{'converged' if good else 'not converged'}: split R-hat at most {rhat.max():.3f},"
-            f" {long:.0f} autocorrelation times, effective size at least {effective.min():.0f}")
+    said = (
+        f"{'converged' if good else 'not converged'}: split R-hat at most {rhat.max():.3f},"
+        f" {long:.0f} autocorrelation times, effective size at least {effective.min():.0f}"
+    )
     if not good:
         said += "; draw more steps"
     return Posterior(
-        tuple(names), chain[::thin].copy(), np.asarray(log_probability)[::thin].copy(), acceptance,
-        tau, rhat, effective, len(chain), evaluations, good, said,
+        tuple(names), chain, np.asarray(log_probability), acceptance, thin * tau, rhat, effective,
+        thin * len(chain), evaluations, good, said,
     )  # fmt: skip
 
 

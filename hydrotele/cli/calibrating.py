@@ -108,6 +108,9 @@ def hybrid(
     ] = None,
     poses: Annotated[int, typer.Option(min=1, help="Of the simulated measurement.")] = 25,
     heldout: Annotated[int, typer.Option(min=0, help="Further ones, to judge on.")] = 25,
+    choose: Annotated[
+        str, typer.Option(help="How: random, or the best of 200 by D, O1 to O5.")
+    ] = "random",
     noise: Annotated[float, typer.Option(min=0.0, help="Factor on the sensors' noise.")] = 1.0,
     errors: Annotated[float, typer.Option(min=0.0, help="Factor on 1 mm and 1 mrad.")] = 1.0,
     out: Out = None,
@@ -119,7 +122,9 @@ def hybrid(
     if (data is None) == (simulate is None):
         raise InputError("calibrate hybrid", "give either --data FOLDER or --simulate FOLDER")
     if simulate is not None:
-        simulate_hybrid(simulate, robot, poses, heldout, seed, noise, errors, parameters, model)
+        simulate_hybrid(
+            simulate, robot, poses, heldout, seed, noise, errors, parameters, model, choose
+        )
     elif data is not None:
         calibrate_hybrid(data, robot, model, parameters, evolution, posterior, seed, out, json)
 

@@ -12,12 +12,14 @@ from hydrotele.calibrate.hybrid import (
     Errors,
     best,
     calibrate,
+    informative_poses,
     pose_errors,
     subset,
 )
 from hydrotele.calibrate.hybrid_data import (
     HELDOUT,
     POSES,
+    measurement_of_wires,
     measurement_text,
     read_measurement,
     robot_file,
@@ -27,11 +29,14 @@ from hydrotele.calibrate.posterior import Evolution, Posterior, evolve, sample_p
 from hydrotele.cli.console import notes, out, plain, print_json, table
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
-from hydrotele.kinematics.hybrid import Hybrid, load_hybrid, save_hybrid
+from hydrotele.kinematics.hybrid import Hybrid, forward, load_hybrid, save_hybrid
 from hydrotele.kinematics.hybrid_errors import document_parameters, error_model
+from hydrotele.kinematics.wires import wire_lengths
 
 KIND = "hybrid calibration"
 MEASUREMENT = "hybrid measurement"
+CRITERIA = ("D", "O1", "O2", "O3", "O4", "O5")
+CANDIDATES = 200  # poses among which the best are chosen
 NOISE = {"leg": 1e-5, "slide": 1e-5, "turn": 2e-5, "wire": 2e-5}  # m, rad: models/iwr/README.md
 BOX = 8.0  # sizes of the errors of manufacture, that differential evolution searches
 
@@ -126,7 +131,7 @@ def _result(data, done: Calibration, heldout, evolved, posterior) -> dict[str, A
         "poses_left_out_as_wrong": list(done.wrong),
         "noise": "stated" if done.equations.measurement.stated else "estimated",
         "chi": fit.chi, "degrees_of_freedom": fit.freedom, "iterations": fit.iterations,
-        "converged": fit.converged, "status": fit.status,
+        "converged": fit.converged, "status": fit.status, "warnings": list(done.warnings),
         "redundancy": {
             "parameters": len(fit.names), "rank": done.redundancy.rank,
             "redundant": list(done.redundancy.held), "take_part": list(done.redundancy.takes_part),
@@ -225,8 +230,8 @@ def _print(result: dict[str, Any]) -> None:
     rows = [("nominal", errors["before"]), ("calibrated", errors["after"]),
             ("each pose predicted without itself", errors["left_out"])]  # fmt: skip
     for name, e in rows:
-        shown.add_row(name, *(f"{e[k]:.3f}" for k in
-                              ("position_rms_mm", "position_max_mm", "orientation_rms_mrad")))  # fmt: skip
+        shown.add_row(name, f"{e['position_rms_mm']:.3f}", f"{e['position_max_mm']:.3f}",
+                      f"{e['orientation_rms_mrad']:.3f}")  # fmt: skip
     if "heldout" in result:
         h = result["heldout"]
         shown.add_row(f"{h['poses']} poses not used, nominal", f"{h['before_rms_mm']:.3f}",
@@ -247,17 +252,19 @@ def _print(result: dict[str, Any]) -> None:
     if result["poses_left_out_as_wrong"]:
         rows_ = ", ".join(map(str, result["poses_left_out_as_wrong"]))
         out.print(f"left out, as their readings fit no calibration: rows {rows_}")
+    for words in result["warnings"]:
+        out.print(f"[yellow]warning[/] {words}")
     for key, name in (("evolution", "differential evolution"), ("posterior", "MCMC")):
         if key in result:
             one = result[key]
             said = one.get("status", "converged" if one["converged"] else "not converged")
-            out.print(f"{name}: {said}; least squares differs by at most"
-                      f" {one['largest_difference_in_deviations']:.2f} standard deviations")  # fmt: skip
+            away = one["largest_difference_in_deviations"]
+            out.print(f"{name}: {said}; least squares differs by at most {away:.2f} deviations")
 
 
 def simulate_hybrid(
     target: Path, robot: str | None, poses: int, heldout: int, seed: int, noise: float,
-    errors: float, parameters: str, kind: str,
+    errors: float, parameters: str, kind: str, choose: str = "random",
 ) -> None:  # fmt: skip
     """Write a simulated measurement of a robot with errors of manufacture, and its truth apart.
 
@@ -271,6 +278,7 @@ def simulate_hybrid(
         errors: factor on the errors of manufacture of 1 mm and 1 mrad.
         parameters: `all`, `document` or names: which have errors.
         kind: error model of the planted errors, `dh` or `poe`.
+        choose: `random` poses, or a criterion of `informative_poses`.
 
     Raises:
         InputError: the folder cannot be written, or a choice is not usable.
@@ -283,6 +291,8 @@ def simulate_hybrid(
         shipped_wires,
     )
 
+    if choose not in ("random", *CRITERIA):
+        raise InputError(f"--choose {choose}", f"valid: random, {', '.join(CRITERIA)}")
     check_target(target, MEASUREMENT)
     nominal = load_hybrid(robot or "iwr")
     kind = "dh" if kind == "auto" and nominal.facts.carriage else "poe" if kind == "auto" else kind
@@ -297,6 +307,8 @@ def simulate_hybrid(
         for stem, count in ((POSES, poses), (HELDOUT, heldout)):
             if count:
                 joints, legs = random_poses(nominal, count, rng, wires)
+                if stem == POSES and choose != "random":
+                    joints, legs = _chosen(model, wires, count, rng, choose)
                 read = measured_poses(true, joints, legs, wires, sizes, rng)
                 save_measurement(folder, stem, nominal, read.joints, read.legs, wires=read.wires)
         (folder / "measurement.yaml").write_text(measurement_text(nominal.name, wires, stated))
@@ -308,3 +320,15 @@ def simulate_hybrid(
         summary = {"kind": MEASUREMENT, "name": nominal.name, "hydrotele": hydrotele.__version__}
         (folder / "summary.json").write_text(json.dumps(summary) + "\n", encoding="utf-8")
     out.print(f"written to [bold]{target}[/]: {poses} poses and {heldout} to judge on")
+
+
+def _chosen(model, wires, count: int, rng: np.random.Generator, criterion: Any):
+    """Commands of the most informative poses among random ones: joints and leg readings."""
+    from hydrotele.simulate.hybrid import random_poses
+
+    robot = model.nominal
+    joints, legs = random_poses(robot, max(CANDIDATES, count), rng, wires)
+    lengths = wire_lengths(wires, forward(robot, joints, legs))
+    candidates = measurement_of_wires(robot, joints, legs, lengths, wires, NOISE, "candidates")
+    places = informative_poses(model, candidates, count, criterion)
+    return joints[places], legs[places]

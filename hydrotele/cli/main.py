@@ -565,7 +565,9 @@ def experiments(
         Path | None,
         typer.Option("--out", "-o", help="Folder to write; default runs/NAME, with --json none."),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Repetitions: operators, or tens of trials.")] = 20,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Repetitions: operators, or tens of trials.")
+    ] = 20,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
     json: Json = False,
 ) -> None:

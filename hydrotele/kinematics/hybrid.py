@@ -347,7 +347,7 @@ def carriage_pose(robot: Hybrid, joints: np.ndarray) -> np.ndarray:
 
 
 def leg_vectors(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
-    """Vectors from A_i to B_i in the connecting platform's frame: the vector loops of Wang Eqs 8 and 10.
+    """Vectors from A_i to B_i in the connecting platform's frame (Wang Eqs 8 and 10).
 
     Args:
         robot: the robot.
@@ -513,7 +513,7 @@ def forward_evolution(
 
     found = differential_evolution(
         misfit, [(-reach, reach)] * 3 + [(-turn, turn)] * 3, rng=np.random.default_rng(seed),
-        popsize=10, maxiter=2000, tol=0.0, atol=1e-16, polish=polish, vectorized=True,
+        popsize=10, maxiter=2000, tol=1e-16, polish=polish, vectorized=True,
         updating="deferred",
     )  # fmt: skip
     pose = pose_of(found.x[:, None])

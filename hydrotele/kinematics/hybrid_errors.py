@@ -308,5 +308,3 @@ def _poe_frames(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
 def _poe_constants(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
     at_zero = zero_frames(robot)[1]
     return constants_of_axes(_poe_frames(robot, errors), at_zero)
-
-

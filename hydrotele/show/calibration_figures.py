@@ -1,4 +1,4 @@
-"""Pictures of a calibration: errors per pose before and after, posteriors in one and two dimensions."""
+"""Pictures of a calibration: errors per pose before and after, posteriors in 1-D and 2-D."""
 
 from collections.abc import Mapping, Sequence
 

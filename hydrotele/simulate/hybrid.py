@@ -246,8 +246,8 @@ def _legs(spec, platform, lower, upper, home: Pose, robot: Hybrid) -> None:
         if leg == 1:
             moving = rod.add_body(name="platform")
             moving.add_joint(name="ball", type=mujoco.mjtJoint.mjJNT_BALL, pos=b, damping=2.0)
-            moving.add_site(name="frame5", pos=home.position, size=[0.03, 0, 0],
-                            quat=Rotation.from_matrix(home.rotation).as_quat(scalar_first=True))  # fmt: skip
+            turn = Rotation.from_matrix(home.rotation).as_quat(scalar_first=True)
+            moving.add_site(name="frame5", pos=home.position, size=[0.03, 0, 0], quat=turn)
             _plate(moving, home.position, home.rotation, upper, 0.03, _MASS["platform"], "platform")
         assert moving is not None
         moving.add_site(name=f"b{leg}", pos=b, size=[0.025, 0, 0], rgba=_COLOURS["rod"])
@@ -302,7 +302,9 @@ def _carriage_shapes(links, frames, last, robot: Hybrid) -> None:
                 0.22], mass=mass, rgba=_COLOURS["carriage"], **_NO_CONTACT,
             )  # fmt: skip
     points = robot.universal @ last[:3, :3].T + last[:3, 3]
-    _plate(links[-1], last[:3, 3] - 0.03 * last[:3, 2], last[:3, :3], points, 0.05, 80.0, "carriage")
+    _plate(
+        links[-1], last[:3, 3] - 0.03 * last[:3, 2], last[:3, :3], points, 0.05, 80.0, "carriage"
+    )
 
 
 def mechanism_pose(
