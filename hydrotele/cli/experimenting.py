@@ -8,9 +8,10 @@ from hydrotele.cli.console import notes, out, print_json, stages
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.experiments.finding import Finding
+from hydrotele.experiments.khoshzaban1992 import khoshzaban1992
 from hydrotele.experiments.zhu1994 import zhu1994
 
-SERIES = ("zhu1994",)
+SERIES = ("zhu1994", "khoshzaban1992")
 
 
 def experiments_to_folder(
@@ -21,7 +22,7 @@ def experiments_to_folder(
     Args:
         name: of the series.
         target: folder, default `runs/<name>`; with `as_json` none.
-        seeds: operators of the experiments that are repeated.
+        seeds: operators, or seeds of noise, of the experiments that are repeated.
         jobs: processes; as many as there are cores by default.
         as_json: print the findings as JSON instead of words.
 
@@ -37,7 +38,10 @@ def experiments_to_folder(
     if target:
         check_target(target, "experiments")
     with stages(f"experiments {name}", as_json) as progress:
-        findings = zhu1994(seeds, jobs, progress)
+        if name == "khoshzaban1992":
+            findings = khoshzaban1992(seeds, progress)
+        else:
+            findings = zhu1994(seeds, jobs, progress)
     if target:
         with whole_folder(target, "experiments") as folder:
             _write(folder, name, seeds, findings)

@@ -16,11 +16,13 @@ class Panel(NamedTuple):
         title: with its unit.
         time: (n,) [s].
         curves: label -> (n,) in the title's unit.
+        along: what `time` is where it is something else, with its unit.
     """
 
     title: str
     time: np.ndarray
     curves: Mapping[str, np.ndarray]
+    along: str = "time [s]"
 
 
 class Finding(NamedTuple):
