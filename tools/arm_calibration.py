@@ -97,7 +97,7 @@ def corrupted(theta: np.ndarray, rng: np.random.Generator, joint: int) -> tuple[
     return theta, slice(first, first + length)
 
 
-def bad_data(trials: int, clean_trials: int, poses: int = 200) -> str:
+def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
     """Hidden corruption: found regions and joints, false alarms, errors with and without."""
     nominal = loop_of(load_machine("calibrator"))
     lines, alarms = [], {}

@@ -35,6 +35,8 @@ _ROUNDS = 8
 _CORE = 0.6  # of the poses that the first, robust fit of a stage trusts
 _EXCESS = 2.0  # times the usual size: what counts towards a region
 _FLOOR = 1.0e-4  # m, as in `arm`
+_FREE = 1.0e3  # times its noise: the third equation's zero is not known
+_FAR = 16.0  # squared residual of a pose, over the usual one, from which on it does not count
 _RULED_OUT = 20.0  # difference of chi-squares: one in 20 000 that the truth lies behind by so much
 _MOST = 0.7  # of a stage's poses that may be left out
 
@@ -90,19 +92,31 @@ class Misfit(NamedTuple):
     own: np.ndarray
 
 
-def misfit(loop: Loop, poses: Poses, numbers: Numbers) -> Misfit:
+class Known(NamedTuple):
+    """How well parameters are known: p names and their covariance (p, p)."""
+
+    names: tuple[str, ...]
+    covariance: np.ndarray
+
+
+def misfit(loop: Loop, poses: Poses, numbers: Numbers, known: Known | None = None) -> Misfit:
     """Residuals of a stage with the manipulator's side.
+
+    The third equation takes no part in the identification. What the parameters' remaining
+    uncertainty makes of it is taken off: the parameters move within their covariance to where most
+    poses agree.
 
     Args:
         loop: the nominal chain.
         poses: of the stage.
         numbers: of a fit.
+        known: its parameters' uncertainty, None to take them as exact.
 
     Returns:
         Residuals and derivatives, whitened.
     """
     equations = Equations(loop, poses)
-    error, _, sensed = equations.at(numbers)
+    error, slopes, sensed = equations.at(numbers)
     own = np.zeros((len(poses), 2))
     spread = sensed * poses.sigma
     covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(2)
@@ -117,6 +131,8 @@ def misfit(loop: Loop, poses: Poses, numbers: Numbers) -> Misfit:
         third = reach.mean() * (third / reach)
         third = third - np.median(third)
         turn = around[:, 0, None] * by_sensed[:, 0] + around[:, 1, None] * by_sensed[:, 1]
+        tangent = around[:, 0, None, None] * by[:, 0] + around[:, 1, None, None] * by[:, 1]
+        slopes = np.concatenate([slopes, tangent[:, None]], axis=1)
         error = np.column_stack([error, third])
         sensed = np.concatenate([sensed, turn[:, None]], axis=1)
         own = np.stack([0.0 * reach, 0.0 * reach, reach], axis=1)
@@ -124,15 +140,37 @@ def misfit(loop: Loop, poses: Poses, numbers: Numbers) -> Misfit:
         covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(3)
         covariance[:, 2, 2] += (reach * poses.manipulator_sigma) ** 2
     whitening = np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
-    return Misfit(
-        (whitening @ error[..., None])[..., 0], whitening @ sensed,
-        (whitening @ own[..., None])[..., 0],
-    )  # fmt: skip
+    rows = (whitening @ error[..., None])[..., 0]
+    if known and len(known.names):
+        rows = _absorbed(rows, whitening @ equations.columns(slopes, known.names), known.covariance)
+    return Misfit(rows, whitening @ sensed, (whitening @ own[..., None])[..., 0])
+
+
+def _absorbed(rows: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Residuals (M, E) after parameters moved within their covariance, without poses far off."""
+    root = np.linalg.cholesky(covariance + 1.0e-18 * np.eye(len(covariance)))
+    scaled = slopes @ root
+    if rows.shape[1] == 3:  # the third equation's zero
+        third = np.zeros((*rows.shape, 1))
+        third[:, 2, 0] = _FREE
+        scaled = np.concatenate([scaled, third], axis=2)
+    count = scaled.shape[2]
+    left, usual = rows, scipy.stats.chi2.median(rows.shape[1])
+    for _ in range(4):
+        square = np.sum(left**2, axis=1)
+        near = square < _FAR * max(1.0, float(np.median(square)) / usual)
+        matrix = scaled[near].reshape(-1, count)
+        move = np.linalg.solve(
+            np.eye(count) + matrix.T @ matrix, -matrix.T @ rows[near].ravel()
+        )
+        left = rows + scaled @ move
+    return left
 
 
 def find_regions(
-    loop: Loop, poses: Poses, numbers: Numbers, total: int, false_alarm: float = FALSE_ALARM
-) -> list[Region]:
+    loop: Loop, poses: Poses, numbers: Numbers, total: int, false_alarm: float = FALSE_ALARM,
+    known: Known | None = None,
+) -> list[Region]:  # fmt: skip
     """Stretches of poses whose residuals are too large to be chance.
 
     The sum of squares less twice its usual size is followed along the poses; its largest rises are
@@ -145,13 +183,14 @@ def find_regions(
         numbers: of a fit.
         total: number of poses of the whole measurement.
         false_alarm: probability of a region in a measurement without corruption.
+        known: uncertainty of the fit's parameters.
 
     Returns:
         The regions, in order.
 
     Source: Karlin and Altschul 1990 (high-scoring segments).
     """
-    found = misfit(loop, poses, numbers)
+    found = misfit(loop, poses, numbers, known)
     square, freedom = np.sum(found.rows**2, axis=1), found.rows.shape[1]
     usual = max(1.0, float(np.median(square)) / scipy.stats.chi2.median(freedom))
     score = square / usual - _EXCESS * freedom
@@ -260,9 +299,10 @@ def identify_without_bad_data(
 
         kept = np.ones(len(poses), bool)
         found = solve(kept, False)
-        inside: list[Region] = find_regions(loop, poses, found[1], total, false_alarm)
+        every = (*names, *own)
+        inside = find_regions(loop, poses, found[1], total, false_alarm, Known(every, found[2]))
         if inside:
-            found, inside = _settled(loop, poses, solve, found, total, false_alarm, len(own))
+            found, inside = _settled(loop, poses, solve, found, total, false_alarm, every, own)
         kept = _outside(inside, len(poses))
         found = solve(kept, True) if inside else found
         stage, numbers, covariance = found
@@ -274,17 +314,20 @@ def identify_without_bad_data(
     return Cleaned(fit, kept_stages, regions)
 
 
-def _settled(loop, poses, solve, found, total, false_alarm, unknowns):
+def _settled(loop, poses, solve, found, total, false_alarm, names, own):
     """Repeat fit and search from the best-agreeing poses until the regions stay the same."""
     for _ in range(3):
-        square = np.sum(misfit(loop, poses, found[1]).rows ** 2, axis=1)
+        known = Known(names, found[2])
+        square = np.sum(misfit(loop, poses, found[1], known).rows ** 2, axis=1)
         width = max(5, len(poses) // 40)
         smooth = np.convolve(np.pad(square, width, mode="edge"), np.ones(2 * width + 1), "valid")
-        core = smooth <= np.quantile(smooth, max(_CORE, min(1.0, 3.0 * unknowns / len(poses))))
+        core = smooth <= np.quantile(smooth, max(_CORE, min(1.0, 3.0 * len(own) / len(poses))))
         found = solve(core, True)
     inside: list[Region] = []
     for _ in range(_ROUNDS):
-        fresh = find_regions(loop, poses, found[1], total, false_alarm)
+        fresh = find_regions(
+            loop, poses, found[1], total, false_alarm, Known(names, found[2])
+        )
         kept = _outside(fresh, len(poses))
         if [r[:3] for r in fresh] == [r[:3] for r in inside] or kept.mean() < 1.0 - _MOST:
             break

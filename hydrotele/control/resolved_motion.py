@@ -13,7 +13,12 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import Unreachable, inverse
-from hydrotele.kinematics.from_machine import arm_geometry, feller_geometry
+from hydrotele.kinematics.from_machine import (
+    arm_geometry,
+    arm_is_plane,
+    feller_geometry,
+    joints_for_tip,
+)
 from hydrotele.kinematics.task import (
     REACHED,
     arm_parameters,
@@ -183,6 +188,9 @@ def pose_to_joints(
 ) -> dict[str, float]:
     """Axis positions that bring the tip to a pose.
 
+    The joint axes of a calibrated arm may be twisted out of its plane: an arm of three joints then
+    goes on from the plane's solution by Newton's method.
+
     Args:
         machine: the machine.
         pose: the pose; without `attitude` the tool keeps that of `here`.
@@ -204,6 +212,9 @@ def pose_to_joints(
     joints, wanted = np.zeros(len(axes)), np.array([pose.r, pose.theta, pose.z, attitude, head])
     if task_inverse(numbers, wanted, pose.theta, joints) != REACHED:
         raise InputError(where, _why_not(machine, wanted[: len(axes)]))
+    if len(axes) == 3 and not arm_is_plane(machine):
+        place = (pose.r * math.cos(pose.theta), pose.r * math.sin(pose.theta), pose.z)
+        joints = joints_for_tip(machine, np.array(place), joints)
     for name, q, (low, high) in zip(axes, joints.tolist(), ranges, strict=True):
         if not low <= q <= high:
             raise InputError(

@@ -265,6 +265,66 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
     )
 
 
+def arm_is_plane(machine: Machine) -> bool:
+    """Whether swing, boom and stick turn about z and -y exactly, as the closed forms take it."""
+    assert machine.arm
+    wanted = ((0, 0, 1), (0, -1, 0), (0, -1, 0))
+    joints = (machine.arm.swing, machine.arm.boom, machine.arm.stick)
+    return all(
+        np.abs(np.subtract(machine.joints[name].axis, axis)).max() < _EXACT
+        for name, axis in zip(joints, wanted, strict=True)
+    )
+
+
+def tip_place(machine: Machine, joints: np.ndarray) -> np.ndarray:
+    """Where the arm's tip is.
+
+    Args:
+        machine: a machine with an `arm`.
+        joints: (3,) swing, boom and stick [rad]; other joints stand at zero.
+
+    Returns:
+        (3,) place in the world [m].
+    """
+    assert machine.arm
+    names = (machine.arm.swing, machine.arm.boom, machine.arm.stick)
+    angles = dict(zip(names, joints, strict=True))
+    place, link = np.array(machine.arm.tip.position), machine.arm.tip.link
+    while link != "world":
+        facts = machine.links[link]
+        if facts.joint and facts.joint.name in angles:
+            way, angle = np.array(facts.joint.axis), angles[facts.joint.name]
+            along = way * (way @ place)
+            across = np.cross(way, place)
+            place = along + (place - along) * math.cos(angle) + across * math.sin(angle)
+        place, link = place + np.array(facts.position), facts.parent
+    return place
+
+
+def joints_for_tip(machine: Machine, place: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Joint angles that bring the tip to a place, for any joint axes.
+
+    Args:
+        machine: a machine with an `arm` of three joints.
+        place: (3,) of the tip [m].
+        start: (3,) swing, boom and stick near the solution [rad].
+
+    Returns:
+        (3,) angles, by Newton's method [rad].
+    """
+    joints, step = np.array(start, float), 1.0e-6
+    for _ in range(8):
+        gap = tip_place(machine, joints) - place
+        if np.abs(gap).max() < _EXACT:
+            break
+        slope = np.column_stack([
+            (tip_place(machine, joints + step * e) - tip_place(machine, joints - step * e))
+            / (2.0 * step) for e in np.eye(3)
+        ])  # fmt: skip
+        joints -= np.linalg.lstsq(slope, gap, rcond=None)[0]
+    return joints
+
+
 def feller_geometry(machine: Machine) -> FellerGeometry:
     """Dimensions of a feller-buncher's arm, heights counted from the ground.
 

@@ -18,16 +18,22 @@ from hydrotele.terms.facts import Term
 
 
 class Joint(Facts):
-    """One degree of freedom: `range` [rad] or [m], `damping` [N m s/rad] or [N s/m]."""
+    """One degree of freedom: `range` [rad] or [m], `damping` [N m s/rad] or [N s/m].
+
+    Behind a hinge the link may bend about both axes across the hinge's, `bending` [rad/(N m)].
+    """
 
     name: Name
     type: Literal["hinge", "slide"] = "hinge"
     axis: Vector = (0.0, 0.0, 1.0)
     range: tuple[float, float] | None = None
     damping: NonNegative = 0.0
+    bending: NonNegative = 0.0
 
     @model_validator(mode="after")
     def _check(self):
+        if self.bending and self.type != "hinge":
+            raise ValueError("bending is across a hinge; a slide has none")
         if abs(np.linalg.norm(self.axis) - 1.0) > 1e-6:
             raise ValueError(f"axis {self.axis} must have unit length")
         if self.range and self.range[0] >= self.range[1]:
@@ -286,8 +292,11 @@ class Machine(Facts):
                 if joint is not None:
                     _expect(joint, joints, f"arm.{part}")
             _expect(self.arm.tip.link, known, "arm.tip.link")
-        for channel in self.sensor_errors:
+        for channel, error in self.sensor_errors.items():
             _expect(channel, self.sensed_channels, "sensor_errors")
+            if error.coupled:
+                places = [f"angle.{joint}" for joint in self.undriven_sensed_joints]
+                _expect(channel, places, "sensor_errors (tilt, backlash)")
         _check_terms(self.terms, self.axes, self.supply)
         for name, sensors in self.sensors.items():
             for channel in sensors.channels:

@@ -64,13 +64,22 @@ class SensorError(Facts):
     """A defect of one channel: it reads `scale * y(t - delay) + offset`, delay in [s].
 
     y follows the true value with a first-order lag, `time_constant dy/dt = value - y` [s]; without
-    a time constant it is the true value.
+    a time constant it is the true value. The coupling of an undriven joint's sensor may be tilted
+    against its axis by `tilt` [rad], as a universal joint is, `tan(shown) = tan(y) cos(tilt)`, and
+    have a play of `backlash` [rad].
     """
 
     offset: float = 0.0
     scale: Positive = 1.0
     delay: NonNegative = 0.0
     time_constant: NonNegative = 0.0
+    tilt: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
+    backlash: NonNegative = 0.0
+
+    @property
+    def coupled(self) -> bool:
+        """Whether the sensor's coupling has a tilt or a play."""
+        return self.tilt > 0.0 or self.backlash > 0.0
 
     @property
     def late(self) -> bool:

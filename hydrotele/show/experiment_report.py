@@ -19,6 +19,10 @@ from hydrotele.show.report_html import (
     tag,
 )
 
+_ABOUT = {
+    "zhu1994": "A simulated operator repeats what a person did on the machines; every row says what"
+    " the source reports and what is seen here.",
+}
 _COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0")
 _MOST = 4000  # points of a curve: more are not seen
 
@@ -36,7 +40,7 @@ def write_experiment_report(name: str, findings: Sequence[Finding], path: Path) 
         "header",
         tag("p", f"hydrotele {hydrotele.__version__} - experiments {name}", class_="over"),
         tag("h1", f"{same} of {len(findings)} experiments as published"),
-        tag("p", "Every row says what the source reports and what is seen here in simulation."),
+        tag("p", _ABOUT.get(name, "Every row says what the source reports and what is seen here.")),
     )  # fmt: skip
     rows = [
         (

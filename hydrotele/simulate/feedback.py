@@ -76,6 +76,8 @@ def _convert_all(values, step, low, high):
 def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """What sensors without noise read: `scale * value + offset` of the machine's sensor errors.
 
+    Before that, what a tilted or loose coupling makes of the value, see `SensorError`.
+
     Args:
         machine: the machine.
         truth: channel -> (n,) values at the times at which they are read.
@@ -84,8 +86,25 @@ def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray]) -> di
         Channel -> (n,) values.
     """
     errors = machine.sensor_errors
-    return {c: errors[c].scale * v + errors[c].offset if c in errors else v
-            for c, v in truth.items()}  # fmt: skip
+    return {
+        c: errors[c].scale * _through_coupling(errors[c], v) + errors[c].offset if c in errors else v
+        for c, v in truth.items()
+    }  # fmt: skip
+
+
+def _through_coupling(error: SensorError, values: np.ndarray) -> np.ndarray:
+    """Angles (n,) behind a coupling with tilt and play; the play starts in its middle [rad]."""
+    if error.tilt:
+        turned = np.arctan2(np.sin(values) * np.cos(error.tilt), np.cos(values))
+        values = values + np.remainder(turned - values + np.pi, 2.0 * np.pi) - np.pi
+    if error.backlash and len(values):
+        half, shown = 0.5 * error.backlash, np.empty(len(values))
+        last = float(values[0])
+        for row, value in enumerate(values):
+            last = min(max(last, value - half), value + half)
+            shown[row] = last
+        values = shown
+    return values
 
 
 def measure(

@@ -170,6 +170,7 @@ with warnings.catch_warnings():  # glfw warns when there is no screen, which nob
 # Default softness opens the pins of a 10 t machine by decimetres. A time constant of two steps is
 # the stiffest that MuJoCo takes, and makes the softness vanish with the step.
 _IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2)
+_BEND_DAMPING = 0.01  # s: a tube of some hertz rings a few times
 _CONTACT_SOLREF = (0.02, 1.0)  # s, 1: firm soil; an impact force grows as one over the time
 _SOIL_FRICTION = (0.3, 0.02, 0.001)  # steel sliding on loam: friction angle of some 17 deg
 
@@ -341,6 +342,21 @@ def _write_link(root, name: str, link: Link) -> None:
     if link.joint.range:
         turn = link.joint.type == "hinge" and root.compiler.angle == "degree"
         joint.range = np.degrees(link.joint.range) if turn else link.joint.range
+    if link.joint.bending:
+        stiffness = 1.0 / link.joint.bending
+        for letter, across in zip("ab", _across(link.joint.axis), strict=True):
+            body.add(
+                "joint", name=f"{OWN}{link.joint.name}_bend_{letter}", type="hinge", axis=across,
+                stiffness=stiffness, damping=_BEND_DAMPING * stiffness, limited="false",
+            )  # fmt: skip
+
+
+def _across(axis: Vector) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors across an axis and each other."""
+    way = np.array(axis)
+    first = np.cross(way, np.eye(3)[int(np.argmin(np.abs(way)))])
+    first /= np.linalg.norm(first)
+    return first, np.cross(way, first)
 
 
 def _set_inertial(body, mass, com, inertia) -> None:
