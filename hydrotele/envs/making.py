@@ -11,6 +11,7 @@ from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.tasks.catalogue import TASKS
 from hydrotele.tasks.core import TaskCore
+from hydrotele.tasks.loop import advance
 from hydrotele.tasks.memory import DISABLED, NEXT_STEP, SAME_STEP
 from hydrotele.tasks.task import Options
 
@@ -43,7 +44,9 @@ def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode
     if strange := set(choices) - known:
         name = sorted(strange)[0]
         raise InputError(f"environment option {name!r}", suggest(name, known))
-    return TaskCore(TASKS[task], _options(choices), count, threads, mode)
+    options = _options(choices)
+    advance.compile_elsewhere()  # while the plant's own code is compiled here
+    return TaskCore(TASKS[task], options, count, threads, mode)
 
 
 def _options(choices: dict[str, Any]) -> Options:

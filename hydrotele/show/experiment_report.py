@@ -5,18 +5,8 @@ from pathlib import Path
 
 import hydrotele
 from hydrotele.experiments.finding import Finding, Panel
-from hydrotele.show.report_html import (
-    STYLE,
-    Cell,
-    Markup,
-    drawing,
-    page,
-    picture,
-    png,
-    section,
-    table,
-    tag,
-)
+from hydrotele.show import report_html
+from hydrotele.show.report_html import drawing, png
 
 _COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0")
 _MOST = 4000  # points of a curve: more are not seen
@@ -30,33 +20,11 @@ def write_experiment_report(name: str, findings: Sequence[Finding], path: Path) 
         findings: of its experiments.
         path: HTML file to write.
     """
-    same = sum(one.ok for one in findings)
-    head = tag(
-        "header",
-        tag("p", f"hydrotele {hydrotele.__version__} - experiments {name}", class_="over"),
-        tag("h1", f"{same} of {len(findings)} experiments as published"),
-        tag("p", "A simulated operator repeats what a person did on the machines; every row says"
-            " what the source reports and what is seen here."),
+    report_html.write_report(
+        "experiments", path, title=f"experiments {name}", version=hydrotele.__version__, name=name,
+        same=sum(one.ok for one in findings), findings=findings,
+        curves=[(one, draw_panels(one.panels)) for one in findings if one.panels],
     )  # fmt: skip
-    rows = [
-        (
-            Cell(Markup(f"{tag('b', one.name)}{tag('small', one.source)}")),
-            one.published,
-            one.simulated,
-            Cell("same" if one.ok else "differs", "yes" if one.ok else "no"),
-        )
-        for one in findings
-    ]
-    parts = [head, section("Published and simulated", "", table(
-        ("experiment", "published", "simulated", ""), rows))]  # fmt: skip
-    parts += [_curves(one) for one in findings if one.panels]
-    path.write_text(page(f"experiments {name}", STYLE, parts), encoding="utf-8")
-
-
-def _curves(finding: Finding) -> Markup:
-    image = picture(draw_panels(finding.panels), finding.name)
-    return section(finding.name, f"{finding.source}: {finding.published}.",
-                   tag("figure", image, tag("figcaption", finding.simulated)))  # fmt: skip
 
 
 def draw_panels(panels: Sequence[Panel]) -> bytes:
