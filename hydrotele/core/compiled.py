@@ -258,7 +258,7 @@ def _lock(folder: str, function) -> int | None:
         time.sleep(0.02)
         if time.monotonic() - said > _HEARTBEAT:
             said = time.monotonic()
-            _LOG.warning("waiting for a process that compiles %s", function.__qualname__)
+            _LOG.warning("a process beside this one compiles, for %.0f s so far", said - began)
     os.close(handle)
     return None
 
