@@ -33,9 +33,10 @@ hypothesis.settings.load_profile("hydrotele")
 # Files that take ten seconds or more, the longest first: two processes then end together. A file
 # that is missing here costs at most its own length at the end.
 LONG = (
-    "scenario/test_scenario.py", "envs/test_gymnasium.py", "gap/test_find.py", "envs/test_render.py",
-    "cli/test_cli.py", "effects/test_library.py", "gap/test_discover.py", "teleop/test_station.py",
-    "sweep/test_processes.py", "experiments/test_zhu1994.py", "models/test_machines.py",
+    "scenario/test_scenario.py", "envs/test_gymnasium.py", "gap/test_find.py",
+    "envs/test_render.py", "cli/test_cli.py", "effects/test_library.py", "gap/test_discover.py",
+    "teleop/test_station.py", "sweep/test_processes.py", "experiments/test_zhu1994.py",
+    "models/test_machines.py",
 )  # fmt: skip
 
 

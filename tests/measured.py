@@ -2,7 +2,7 @@
 
 `MEASURED` lies in this repository: an independent simulator's logs of the CAT 215, nominal and with
 one thing changed in each of ten folders. `REAL` does not, as its sets belong to others: logs of
-real machines beside the checkout, without which their tests are skipped.
+real machines beside the checkout, without which their tests are not collected.
 """
 
 from pathlib import Path
