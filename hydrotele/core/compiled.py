@@ -66,7 +66,7 @@ def inlined(function):
 
 def _compile(function, **options):
     with _caching(function.__module__) as cache:
-        made = njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
+        made: Any = njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
         if cache:
             made._cache = _SharedCache(function)
         return made
@@ -100,7 +100,7 @@ class Callback:
             return
         path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, sys.path)])
         self._elsewhere = subprocess.Popen(
-            [sys.executable, "-c", f"from {module} import {name}; {name}.address"],
+            [sys.executable, "-P", "-c", f"from {module} import {name}; {name}.address"],
             env={**os.environ, "PYTHONPATH": path}, stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip

@@ -117,8 +117,7 @@ def interval(value: float, low: float, high: float, model: float) -> Interval | 
         round(12 + (width - 24) * (v - least) / span, 1) if math.isfinite(v) else None
         for v in (value, low, high, model)
     )
-    known = start is not None and end is not None
-    length = round(max(end - start, 2.0), 1) if known else None
+    length = None if start is None or end is None else round(max(end - start, 2.0), 1)
     return Interval(width, at, start, length, other)
 
 
