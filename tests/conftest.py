@@ -1,11 +1,18 @@
 """What every test shares: a renderer that needs no display, and hypothesis settings."""
 
 import ctypes
+import importlib.util
 import os
 import sys
 import time
+from pathlib import Path
 
 import hypothesis
+
+# Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out.
+collect_ignore = []
+if importlib.util.find_spec("stable_baselines3") is None:
+    collect_ignore = ["envs/test_stable_baselines.py", "tools/test_learn.py"]
 
 # Has to be settled before the first import of mujoco or dm_control.
 if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:
@@ -23,10 +30,40 @@ hypothesis.settings.register_profile("hydrotele", deadline=None, derandomize=Tru
 hypothesis.settings.load_profile("hydrotele")
 
 
+# Files that take ten seconds or more, the longest first: two processes then end together. A file
+# that is missing here costs at most its own length at the end.
+LONG = (
+    "scenario/test_scenario.py", "envs/test_gymnasium.py", "gap/test_find.py",
+    "envs/test_render.py", "cli/test_cli.py", "effects/test_library.py", "gap/test_discover.py",
+    "teleop/test_station.py", "sweep/test_processes.py", "experiments/test_zhu1994.py",
+    "models/test_machines.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out what needs absent records; put the files that take long first."""
+    root = Path(__file__).parent
+    if not (root.parent.parent / "shared" / "real").is_dir():
+        absent = [item for item in items if item.get_closest_marker("real")]
+        config.hook.pytest_deselected(items=absent)
+        items[:] = [item for item in items if item not in absent]
+    place = {name: k for k, name in enumerate(LONG)}
+    items.sort(key=lambda item: place.get(_inside(item.path, root), len(LONG)))
+
+
+def _inside(path, root):
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else ""
+
+
 def pytest_terminal_summary(terminalreporter):
-    """Say what tools/test did besides pytest here, so that pytest has the last word."""
-    started = os.environ.get("HYDROTELE_TEST_STARTED")
-    if started:
+    """Say what tools/test did beside pytest here, so that pytest has the last word."""
+    folder = os.environ.get("HYDROTELE_CHECKS")
+    if folder and Path(folder, "output").exists():
+        done = Path(folder, "done")
+        while not done.exists():
+            time.sleep(0.1)
+        terminalreporter.write_line(Path(folder, "output").read_text().rstrip())
+        if failed := done.read_text().strip():
+            terminalreporter.write_line(f"FAILED beside pytest: {failed}", red=True)
+    if started := os.environ.get("HYDROTELE_TEST_STARTED"):
         terminalreporter.write_line(f"tools/test took {time.time() - float(started):.0f} s in all")
-    if failed := os.environ.get("HYDROTELE_TEST_FAILED"):
-        terminalreporter.write_line(f"FAILED before pytest: {failed}", red=True)

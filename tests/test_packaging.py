@@ -1,7 +1,6 @@
 """What is built is complete: code, machines and scenarios in the wheel, everything in the sdist."""
 
 import os
-import re
 import subprocess
 import sys
 import tarfile
@@ -14,7 +13,6 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
-UNLOCKED = {"learn"}  # extras that no test needs: torch is larger than all the rest
 
 pytest.importorskip("hatchling", reason="the test extra is not installed")
 
@@ -102,7 +100,7 @@ def test_sdist_is_complete_and_builds_the_same_wheel(wheel, tmp_path):
     for folder in ("hydrotele", "models", "scenarios", "tests", "tools", ".ci"):
         missing = {name for name in shipped(folder) if not (unpacked / name).is_file()}
         assert missing == set()
-    for name in ("LICENSE", "README.md", "CHANGELOG.md", "pyproject.toml", "constraints.txt"):
+    for name in ("LICENSE", "README.md", "CHANGELOG.md", "pyproject.toml", "uv.lock"):
         assert (unpacked / name).is_file()
     run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", cwd=unpacked)
     (again,) = (unpacked / "dist").glob("*.whl")
@@ -110,37 +108,42 @@ def test_sdist_is_complete_and_builds_the_same_wheel(wheel, tmp_path):
         assert set(first.namelist()) == set(second.namelist())
 
 
-def locked() -> tuple[dict[str, str], dict[str, str]]:
-    """Versions in constraints.txt by name, for running and for testing."""
-    parts = (ROOT / "constraints.txt").read_text(encoding="utf-8").split("\n# test\n")
-    core, test = (
-        {canonicalize_name(name): v for name, v in re.findall(r"^([\w.-]+)==(\S+)", part, re.M)}
-        for part in parts
-    )
-    return core, test
+@pytest.fixture(scope="module")
+def lock() -> dict[str, list[dict]]:
+    """Packages of uv.lock by name; several where different Pythons get different versions."""
+    found: dict[str, list[dict]] = {}
+    for package in tomllib.loads((ROOT / "uv.lock").read_text(encoding="utf-8"))["package"]:
+        found.setdefault(package["name"], []).append(package)
+    return found
 
 
-def test_lock_holds_every_declared_dependency():
-    # tools/setup installs the lock without resolving, so a gap in it would be a gap in .venv.
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    core, test = locked()
-    declared = [(text, core) for text in project["dependencies"]]
-    extras = project["optional-dependencies"]
-    declared += [
-        (text, core | test)
-        for name, texts in extras.items()
-        if name not in UNLOCKED
-        for text in texts
+def test_lock_holds_every_declared_dependency(lock):
+    # tools/setup refuses a lock that is behind pyproject.toml, and then nothing can be set up.
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    texts = list(project["project"]["dependencies"])
+    texts += [
+        text for extra in project["project"]["optional-dependencies"].values() for text in extra
     ]
+    declared = {canonicalize_name(Requirement(text).name) for text in texts}
+    texts += [text for group in project["dependency-groups"].values() for text in group]
     stale = []
-    for text, versions in declared:
-        requirement = Requirement(text)
-        version = versions.get(canonicalize_name(requirement.name))
-        if version is None or not requirement.specifier.contains(version):
-            stale.append(f"{text}: {version} in constraints.txt; run tools/setup --lock")
+    for text in texts:
+        wanted = Requirement(text)
+        versions = [p["version"] for p in lock.get(canonicalize_name(wanted.name), [])]
+        if not versions or not all(map(wanted.specifier.contains, versions)):
+            stale.append(f"{text}: {versions} in uv.lock; run tools/setup --lock")
     assert stale == []
+    (own,) = lock["hydrotele"]
+    assert {one["name"] for one in own["metadata"]["requires-dist"]} == declared
 
 
-def test_lock_names_no_index():
-    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
-    assert not re.search(r"://|^-|@", text, re.M)
+def test_lock_names_the_public_index_only(lock):
+    (own,) = lock["hydrotele"]
+    assert own["source"] == {"editable": "."}
+    for name in lock.keys() - {"hydrotele"}:
+        for package in lock[name]:
+            assert package["source"] == {"registry": "https://pypi.org/simple"}
+            files = [package["sdist"]] if "sdist" in package else []
+            for file in files + package.get("wheels", []):
+                assert file["url"].startswith("https://files.pythonhosted.org/")
+                assert file["hash"].startswith("sha256:")

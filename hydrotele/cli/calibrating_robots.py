@@ -207,7 +207,7 @@ def _warnings(robot: Robot, sockets: Sequence[Socket], options: Options) -> list
 def _write(
     folder: Path, document: dict[str, Any], found: SocketCalibration, left: Sequence[LeftOut]
 ) -> None:
-    from hydrotele.show.robot_calibration_report import draw_sockets, robot_report
+    from hydrotele.show.robot_calibration_report import draw_sockets, write_robot_report
 
     text = json.dumps(document, indent=2, allow_nan=False)
     (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
@@ -219,7 +219,7 @@ def _write(
         (folder / "calibrated.urdf").write_text(made, encoding="utf-8")
     picture = draw_sockets(found, left)
     (folder / "sockets.png").write_bytes(picture)
-    (folder / "report.html").write_text(robot_report(document, picture), encoding="utf-8")
+    write_robot_report(folder / "report.html", document, picture)
     summary = {
         "kind": "robot calibration",
         "robot": document["robot"],

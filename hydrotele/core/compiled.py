@@ -10,6 +10,7 @@ Compiling is slow, so one process compiles a function and others that need it me
 it, and callbacks for C are compiled when their address is first asked for, not when imported.
 """
 
+import atexit
 import contextlib
 import fcntl
 import functools
@@ -19,6 +20,8 @@ import os
 import re
 import shutil
 import stat
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -63,7 +66,7 @@ def inlined(function):
 
 def _compile(function, **options):
     with _caching(function.__module__) as cache:
-        made = njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
+        made: Any = njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
         if cache:
             made._cache = _SharedCache(function)
         return made
@@ -79,6 +82,34 @@ class Callback:
 
     def __init__(self, function, signature) -> None:
         self._function, self._signature = function, signature
+        self._elsewhere: subprocess.Popen | None = None
+
+    def compile_elsewhere(self) -> None:
+        """Begin to compile in a process beside this one, where that is still to be done.
+
+        The function has to be a module's, so that the other process finds it.
+        """
+        module, name = self._function.__module__, self._function.__name__
+        with _caching(module) as cache:
+            folder = Path(_CONFIG.CACHE_DIR)
+        if (
+            not cache
+            or self._elsewhere
+            or any(folder.glob(f"*{name}-{_line(self._function)}.*.nbi"))
+        ):
+            return
+        path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, sys.path)])
+        self._elsewhere = subprocess.Popen(
+            [sys.executable, "-P", "-c", f"from {module} import {name}; {name}.address"],
+            env={**os.environ, "PYTHONPATH": path}, stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        atexit.register(self._end)
+
+    def _end(self) -> None:
+        if self._elsewhere:
+            self._elsewhere.kill()
+            self._elsewhere.wait()
 
     @functools.cached_property
     def _compiled(self) -> Any:
@@ -208,19 +239,26 @@ class _SharedCache(FunctionCache):
         self._held = None
 
 
+def _line(function) -> int:
+    return function.__code__.co_firstlineno
+
+
 def _lock(folder: str, function) -> int | None:
-    """Lock a function against other processes; None where that cannot be had within a minute."""
-    path = Path(folder, f"{function.__name__}-{function.__code__.co_firstlineno}.lock")
+    """Lock a function against other processes; None where that cannot be had for long."""
     try:
+        path = Path(folder, f"{function.__name__}-{_line(function)}.lock")
         handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
     except OSError:
         return None
-    end = time.monotonic() + _PATIENT
-    while time.monotonic() < end:
+    began = said = time.monotonic()
+    while time.monotonic() - began < _PATIENT:
         with contextlib.suppress(BlockingIOError):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             return handle
-        time.sleep(0.05)
+        time.sleep(0.02)
+        if time.monotonic() - said > _HEARTBEAT:
+            said = time.monotonic()
+            _LOG.warning("a process beside this one compiles, for %.0f s so far", said - began)
     os.close(handle)
     return None
 
@@ -230,7 +268,7 @@ def _release(handle: int | None) -> None:
         os.close(handle)
 
 
-_PATIENT = 60.0  # s; who compiles for longer, or has failed and lives on, is not waited for
+_PATIENT = 300.0  # s; who compiles for longer, or has failed and lives on, is not waited for
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, NEXT_STEP, SAME_STEP
+from hydrotele.envs.loop import advance
 from hydrotele.envs.task import Options
 
 _STRICT = ConfigDict(strict=True, allow_inf_nan=False)
@@ -43,7 +44,9 @@ def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode
     if strange := set(choices) - known:
         name = sorted(strange)[0]
         raise InputError(f"environment option {name!r}", suggest(name, known))
-    return TaskCore(TASKS[task], _options(choices), count, threads, mode)
+    options = _options(choices)
+    advance.compile_elsewhere()  # while the plant's own code is compiled here
+    return TaskCore(TASKS[task], options, count, threads, mode)
 
 
 def _options(choices: dict[str, Any]) -> Options:

@@ -7,6 +7,8 @@ The folder of a sweep: begun whole, gone on with by the same sweep, by one proce
 Processes of this computer that do runs: a killed one costs its run, not the sweep.
 
 `concurrent.futures` gives up all runs when one process dies and cannot say which was its own.
+dask's `LocalCluster` gives a lost worker's run to the next one, so a run that kills its process
+would kill several; it also needs the extra `cluster`.
 """
 
 import contextlib

@@ -12,7 +12,7 @@ from hydrotele.calibrate.bad_data import Region
 from hydrotele.calibrate.design import ARMS, FOREARMS, Design, Survey
 from hydrotele.calibrate.linkage import NAMES, LinkageFit, values_of
 from hydrotele.calibrate.loop import unit_of
-from hydrotele.show.report_html import STYLE, drawing, page, picture, png, section, table, tag
+from hydrotele.show.report_html import Section, drawing, png, write_sections
 
 _MOST_TIP = 0.06  # m: the colour scale of the designs ends there
 
@@ -28,32 +28,33 @@ def write_arm_report(
         regions: corrupted readings that were found.
         path: HTML file to write.
     """
-    head = tag(
-        "header",
-        tag("p", f"hydrotele {hydrotele.__version__} - calibrate arm", class_="over"),
-        tag("h1", f"{fit.nominal.machine}: {len(fit.names)} parameters, {fit.method}"),
-        tag("p", "Angle-free closed-chain identification with an external calibrator"
-            " (Khoshzaban 1992, chapter 3); intervals cover 95 %."),
-    )  # fmt: skip
     rows = []
     for name, value, deviation in zip(fit.names, fit.values, fit.deviations, strict=True):
         scale = np.degrees(1.0) if unit_of(name) == "rad" else 1e3
         unit = "deg" if unit_of(name) == "rad" else "mm"
         rows.append((name, f"{scale * fit.start[name]:.2f} {unit}", f"{scale * value:.2f} {unit}",
                      f"{1.96 * scale * deviation:.2f} {unit}"))  # fmt: skip
-    parts = [head, section("Parameters", "", table(
-        ("parameter", "nominal", "identified", "+-"), rows))]  # fmt: skip
-    fixed = [(s.link, name, why) for s in fit.stages for name, why in s.fixed.items()]
-    parts.append(section("Kept parameters", "What the poses do not tell keeps its value.", table(
-        ("moving link", "parameter", "why"), fixed)))  # fmt: skip
+    kept = [(s.link, name, why) for s in fit.stages for name, why in s.fixed.items()]
+    sections = [
+        Section("Parameters", head=("parameter", "nominal", "identified", "+-"), rows=rows),
+        Section("Kept parameters", "What the poses do not tell keeps its value.",
+                ("moving link", "parameter", "why"), kept),
+    ]  # fmt: skip
     if regions:
         found = [(r.link, f"{r.first} to {r.last}", r.joint or "the arm's own sensor",
                   f"{np.degrees(r.size):.2f} deg") for r in regions]  # fmt: skip
-        parts.append(section("Corrupted readings", "Left out where a calibrator's joint is to blame.",
-                             table(("moving link", "poses", "joint", "RMS error"), found)))  # fmt: skip
-    parts.append(section("Residuals", "In units of the sensors' errors.", tag(
-        "figure", picture(draw_residuals(fit, stages), "residuals"))))  # fmt: skip
-    path.write_text(page("calibrate arm", STYLE, parts), encoding="utf-8")
+        sections.append(Section(
+            "Corrupted readings", "Left out where a calibrator's joint is to blame.",
+            ("moving link", "poses", "joint", "RMS error"), found,
+        ))  # fmt: skip
+    sections.append(Section("Residuals", "In units of the sensors' errors.",
+                            picture=draw_residuals(fit, stages)))  # fmt: skip
+    write_sections(
+        path, f"hydrotele {hydrotele.__version__} - calibrate arm",
+        f"{fit.nominal.machine}: {len(fit.names)} parameters, {fit.method}",
+        "Angle-free closed-chain identification with an external calibrator (Khoshzaban 1992,"
+        " chapter 3); intervals cover 95 %.", sections,
+    )  # fmt: skip
 
 
 def draw_residuals(fit: ArmFit, stages: Sequence[Poses]) -> bytes:
@@ -77,14 +78,7 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
         fits: one per axis.
         path: HTML file to write.
     """
-    head = tag(
-        "header",
-        tag("p", f"hydrotele {hydrotele.__version__} - calibrate linkage", class_="over"),
-        tag("h1", "Cylinder linkages"),
-        tag("p", "The triangle of pins under each cylinder (Khoshzaban 1992, Eq. 3.26), judged on"
-            " samples that were not fitted."),
-    )  # fmt: skip
-    parts = [head]
+    sections = []
     for found in fits:
         deviations = dict(zip(found.fit.names, found.fit.deviations, strict=True))
         rows = []
@@ -94,10 +88,13 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
             rows.append((name, f"{scale * nominal:.2f} {unit}", f"{scale * value:.2f} {unit}", wide))
         said = (f"RMS {1e3 * found.rms:.2f} mm, VAF {found.vaf:.3f} % on samples that were not"
                 f" fitted; {found.angles} angles.")  # fmt: skip
-        parts.append(section(found.axis, said, table(
-            ("parameter", "nominal", "identified", "+-"), rows), tag(
-            "figure", picture(draw_linkage(found), found.axis))))  # fmt: skip
-    path.write_text(page("calibrate linkage", STYLE, parts), encoding="utf-8")
+        sections.append(Section(found.axis, said, ("parameter", "nominal", "identified", "+-"),
+                                rows, picture=draw_linkage(found)))  # fmt: skip
+    write_sections(
+        path, f"hydrotele {hydrotele.__version__} - calibrate linkage", "Cylinder linkages",
+        "The triangle of pins under each cylinder (Khoshzaban 1992, Eq. 3.26), judged on samples"
+        " that were not fitted.", sections,
+    )  # fmt: skip
 
 
 def draw_linkage(found: LinkageFit) -> bytes:

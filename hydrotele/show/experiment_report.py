@@ -5,19 +5,9 @@ from pathlib import Path
 
 import hydrotele
 from hydrotele.experiments.finding import Finding, Panel
+from hydrotele.show import report_html
 from hydrotele.show.calibration_figures import corner
-from hydrotele.show.report_html import (
-    STYLE,
-    Cell,
-    Markup,
-    drawing,
-    page,
-    picture,
-    png,
-    section,
-    table,
-    tag,
-)
+from hydrotele.show.report_html import drawing, png
 
 _ABOUT = {
     "zhu1994": "A simulated operator repeats what a person did on the machines; every row says what"
@@ -35,42 +25,19 @@ def write_experiment_report(name: str, findings: Sequence[Finding], path: Path) 
         findings: of its experiments.
         path: HTML file to write.
     """
-    same = sum(one.ok for one in findings)
-    head = tag(
-        "header",
-        tag("p", f"hydrotele {hydrotele.__version__} - experiments {name}", class_="over"),
-        tag("h1", f"{same} of {len(findings)} experiments as published"),
-        tag("p", _ABOUT.get(name, "Every row says what the source reports and what is seen here.")),
+    report_html.write_report(
+        "experiments", path, title=f"experiments {name}", version=hydrotele.__version__, name=name,
+        about=_ABOUT.get(name, "Every row says what the source reports and what is seen here."),
+        same=sum(one.ok for one in findings), findings=findings,
+        curves=[(one, draw_panels(one.panels)) for one in findings if one.panels],
+        posteriors=[(one, _corner(one)) for one in findings if one.marginals],
     )  # fmt: skip
-    rows = [
-        (
-            Cell(Markup(f"{tag('b', one.name)}{tag('small', one.source)}")),
-            one.published,
-            one.simulated,
-            Cell("same" if one.ok else "differs", "yes" if one.ok else "no"),
-        )
-        for one in findings
-    ]
-    parts = [head, section("Published and simulated", "", table(
-        ("experiment", "published", "simulated", ""), rows))]  # fmt: skip
-    parts += [_curves(one) for one in findings if one.panels]
-    parts += [_posterior(one) for one in findings if one.marginals]
-    path.write_text(page(f"experiments {name}", STYLE, parts), encoding="utf-8")
 
 
-def _curves(finding: Finding) -> Markup:
-    image = picture(draw_panels(finding.panels), finding.name)
-    return section(finding.name, f"{finding.source}: {finding.published}.",
-                   tag("figure", image, tag("figcaption", finding.simulated)))  # fmt: skip
-
-
-def _posterior(finding: Finding) -> Markup:
+def _corner(finding: Finding) -> bytes:
     shown = finding.marginals
     assert shown is not None
-    drawn = corner(shown.sample, shown.names, shown.truth, "truth", shown.unit)
-    image = picture(drawn, f"posterior: {finding.name}")
-    return section(f"Posterior: {finding.name}", f"{finding.source}: {finding.published}.",
-                   tag("figure", image, tag("figcaption", finding.simulated)))  # fmt: skip
+    return corner(shown.sample, shown.names, shown.truth, "truth", shown.unit)
 
 
 def draw_panels(panels: Sequence[Panel]) -> bytes:

@@ -1,8 +1,8 @@
 """`report.html` of a Gap: one page that needs nothing else, for the screen and for paper.
 
-The tables of a gap report: channels, laws, ranking and residual tests.
-
-The pictures of a gap report: heat map of prediction errors, and predictions over readings.
+Its tables (channels, laws, ranking, residual tests) as texts and numbers, which
+`templates/gap.html.j2` shows, and its pictures: heat map of prediction errors, and predictions
+over readings.
 """
 
 import math
@@ -33,86 +33,169 @@ from hydrotele.gap.description import (
     verdict_words,
 )
 from hydrotele.gap.patched import has_patch
-from hydrotele.gap.result import Candidate, Gap, LearnedLaw, Prediction, finite
+from hydrotele.gap.result import Candidate, Estimate, Gap, LearnedLaw, Prediction, finite
 from hydrotele.machine.signals import usual_unit
+from hydrotele.show import report_html
 from hydrotele.show.channels import padded_range
 from hydrotele.show.gap_recording import channel_rms, most_changed, windowed
-from hydrotele.show.report_html import (
-    STYLE,
-    Cell,
-    Markup,
-    bar,
-    drawing,
-    dumbbell,
-    interval,
-    page,
-    picture,
-    png,
-    section,
-    table,
-    tag,
-    text,
-)
+from hydrotele.show.report_html import drawing, dumbbell, interval, png
 
 _CANDIDATES = 12
 _DARKEST = 10.0  # times noise, where the colour of a cell is darkest
+_CHANNELS = 4
+_CHIPS = {
+    "named": "Effect named",
+    "no_gap": "No gap",
+    "ambiguous": "Ambiguous",
+    "unknown": "Unknown effect",
+    "partly": "Partly named",
+}
 
-_GIVEN = '<i class="b"></i>model as given'
-_PATCHED = '<i class="a"></i>patched model'
+
+def write_report(gap: Gap, path: str | Path) -> None:
+    """Write a Gap as one self-contained HTML file.
+
+    Args:
+        gap: what the search yields.
+        path: file to write.
+    """
+    patched, runs = has_patch(gap), ", ".join(p.run for p in gap.before[1:])
+    over = f"GAP REPORT  ·  machine {gap.machine.name}, tool {gap.machine.tool}"
+    if gap.before:
+        over += f"  ·  judged on {gap.before[0].run}" + (f", fitted on {runs}" if runs else "")
+    report_html.write_report(
+        "gap", path, title=f"{gap.machine.name}: {headline(gap)}", over=over, heading=headline(gap),
+        chip=(gap.verdict, _CHIPS[gap.verdict]), figures=_figures(gap), verdict=verdict_words(gap),
+        found=_found(gap), calibrated=_calibrated(gap), learned=[*map(_learned, gap.learned)],
+        unknown=_unknown(gap), lacks=_lacks(gap), patched=patched,
+        run=gap.before[0].run if gap.before else "", proof=_proof(gap) if gap.before else None,
+        laws=_laws(gap, patched) if gap.laws else None,
+        heat_map=draw_heat_map(gap.before[0], gap.after[0], patched) if gap.before else None,
+        ranking=_ranking(gap), unlisted=len(gap.ranking) - _CANDIDATES, tests=_tests(gap),
+        noise=_noise(gap), rivals=_rivals(gap), experiment=_experiment(gap), notes=gap.notes,
+        version=hydrotele.__version__, seconds=f"{gap.seconds:.0f}",
+    )  # fmt: skip
 
 
-def channel_table(before: Prediction, after: Prediction | None) -> Markup:
+def _figures(gap: Gap) -> list[tuple[str, str, str]]:
+    size, closed, patched = gap.size, gap_closed(gap.size), has_patch(gap)
+    cards = [("before", f"{size.before:.2f} × noise", "prediction error, model as given")]
+    if patched:
+        cards.append(("after", f"{size.after:.2f} × noise", "prediction error, patched"))
+    if patched and math.isfinite(closed):
+        cards.append(("", f"{100 * closed:.0f} %", "of the gap closed, on data not fitted"))
+    if size.noise_floor is not None:
+        cards.append(("", f"{size.noise_floor:.2f} × noise", "prediction error of a perfect model"))
+    return cards
+
+
+def _to_scale(estimate: Estimate) -> report_html.Interval | None:
+    return interval(estimate.value, estimate.low, estimate.high, estimate.nominal)
+
+
+def _found(gap: Gap) -> list[dict[str, Any]]:
+    rows = []
+    for effect in gap.effects:
+        for name, estimate in effect.parameters.items():
+            s = in_customary_units(estimate, name)
+            rows.append({
+                "effect": effect_title(effect),
+                "texts": (name.replace("_", " "), s.nominal, s.value, f"{s.low} to {s.high}",
+                           s.unit),
+                "drawn": _to_scale(estimate),
+                "trust": (probability_text(effect.probability), share_words(effect.share)),
+            })  # fmt: skip
+    return rows
+
+
+def _calibrated(gap: Gap) -> list[dict[str, Any]]:
+    """Calibrated numbers with their intervals, those that moved most first."""
+    rows = []
+    for key in most_moved(gap) if gap.calibration else ():
+        s = in_customary_units(gap.calibration[key], key)
+        values = (number_title(key), s.nominal, s.value, f"{s.low} to {s.high}", s.unit)
+        rows.append({"texts": values, "drawn": _to_scale(gap.calibration[key])})
+    return rows
+
+
+def _learned(law: LearnedLaw) -> dict[str, Any]:
+    share = f" It closes {share_words(law.share)} of the gap on the held-out run."
+    return {
+        "title": learned_title(law), "unit": law.unit, "formula": law.formula,
+        "description": law.description + (share if math.isfinite(law.share) else ""),
+        "picture": draw_law(law),
+    }  # fmt: skip
+
+
+def _unknown(gap: Gap) -> dict[str, Any] | None:
+    unknown = gap.unknown
+    if unknown is None:
+        return None
+    windows = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in unknown.windows)
+    facts = [
+        ("law that fails", f"{unknown.law}: {law_words(unknown.law)}"),
+        ("seen most in", channel_words(unknown.channel)),
+        ("changes with", ", ".join(map(channel_words, unknown.depends_on)) or "-"),
+        ("shows most at", windows or "-"),
+    ]
+    return {"description": unknown.description, "facts": facts}
+
+
+def _lacks(gap: Gap) -> list[tuple[str, str, float]]:
+    """Unknown forces, flows and commands that remain, the largest first."""
+    return [
+        (lack_words(lack), f"{100 * lack.part:.2g} %", lack.part / gap.lacks[0].part)
+        for lack in gap.lacks if lack.part > 0
+    ]  # fmt: skip
+
+
+def _proof(gap: Gap) -> dict[str, Any]:
+    before, after, patched = gap.before[0], gap.after[0], has_patch(gap)
+    return {
+        "channels": _channels(before, after if patched else None),
+        "pictures": [
+            (channel_words(name), draw_overlay(before, after, name, patched))
+            for name in most_changed(before, after, _CHANNELS)
+        ],
+    }
+
+
+def _channels(before: Prediction, after: Prediction | None) -> list[dict[str, Any]]:
     """Size of the prediction errors per channel, before and after."""
     old = channel_rms(before)
     new = channel_rms(after) if after else np.full(len(old), np.nan)
-    known = [v for v in (*old, *new) if math.isfinite(v)]
-    low, high = 0.95 * min([1.0, *known]), 1.05 * max([1.2, *known])
+    finite_ones = [v for v in (*old, *new) if math.isfinite(v)]
+    low, high = 0.95 * min([1.0, *finite_ones]), 1.05 * max([1.2, *finite_ones])
     rows = []
     for channel, b, a in zip(before.channels, old, new, strict=True):
         known = math.isfinite(b)
-        drawn = dumbbell(float(b), float(a) if after else None, low, high) if known else ""
         sizes = [f"{b:.2f}" if known else "not measured"]
         sizes += [f"{a:.2f}" if known else ""] if after else []
-        rows.append((channel_words(channel), *sizes, drawn))
-    columns = ("as given", "patched") if after else ("as given",)
-    key = f"{_GIVEN}{_PATCHED if after else ''}&nbsp;&nbsp;&nbsp;dashed: a perfect model"
-    head = ("channel", *columns, "error / sensor noise")
-    whole = table(head, rows, numbers=" " + "n" * len(columns))
-    return Markup(whole + tag("p", Markup(key), class_="key"))
+        drawn = dumbbell(float(b), float(a) if after else None, low, high) if known else None
+        rows.append({"texts": (channel_words(channel), *sizes), "drawn": drawn})
+    return rows
 
 
-def law_table(
-    laws: Mapping[str, Mapping[str, Mapping[str, float]]], units: Mapping[str, str], changed: bool
-) -> Markup:
+def _laws(gap: Gap, changed: bool) -> dict[str, Any]:
     """Balance residuals by law and place, in multiples of what noise alone would give."""
-    places = list(dict.fromkeys(place for by_place in laws.values() for place in by_place))
-    keys = ("before", "after") if changed else ("before",)
-    heading = {"before": "as given", "after": "patched"}
-    head = [
-        "law",
-        *(Markup(tag("b", p) + tag("small", heading[k])) for p in places for k in keys),
-    ]
+    places = list(dict.fromkeys(place for by_place in gap.laws.values() for place in by_place))
+    keys = {"before": "as given", "after": "patched"} if changed else {"before": "as given"}
     rows = []
-    for law, by_place in laws.items():
-        cells: list[object] = [Markup(tag("b", law) + tag("small", law_words(law)))]
-        for place in places:
-            for key in keys:
-                cells.append(_law_cell(by_place.get(place), key, units.get(law, "1")))
-        rows.append(cells)
-    note = "RMS of what does not add up, over what sensor noise alone would give."
-    numbers = " " + "n" * (len(head) - 1)
-    return Markup(table(head, rows, "laws", numbers) + tag("p", note, class_="key"))
+    for law, by_place in gap.laws.items():
+        unit = gap.law_units.get(law, "1")
+        cells = [_law_cell(by_place.get(place), key, unit) for place in places for key in keys]
+        rows.append({"law": law, "words": law_words(law), "cells": cells})
+    return {"head": [(place, words) for place in places for words in keys.values()], "rows": rows}
 
 
-def _law_cell(residual: Mapping[str, float] | None, key: str, unit: str) -> Cell:
+def _law_cell(residual: Mapping[str, float] | None, key: str, unit: str) -> dict[str, str]:
     if residual is None or not math.isfinite(residual.get(key, math.nan)):
-        return Cell("", "r")
+        return {"ratio": "", "size": "", "colour": ""}
     value, noise = residual[key], residual.get("noise", math.nan)
-    small = tag("small", amount(value, unit))
+    size = amount(value, unit)
     if not (math.isfinite(noise) and noise > 0):
-        return Cell(Markup("-" + small), "r")
-    ratio = value / noise
-    return Cell(Markup(f"{ratio:.1f} ×" + small), "r", f"background:{_heat(ratio)}")
+        return {"ratio": "-", "size": size, "colour": ""}
+    return {"ratio": f"{value / noise:.1f} ×", "size": size, "colour": _heat(value / noise)}
 
 
 def _heat(ratio: float) -> str:
@@ -124,57 +207,21 @@ def _heat(ratio: float) -> str:
     return "#" + "".join(f"{round(a + mix * (b - a)):02x}" for a, b in zip(low, high, strict=True))
 
 
-def calibration_table(gap: Gap) -> Markup:
-    """Calibrated numbers with their intervals, those that moved most first."""
-    rows = []
-    for key in most_moved(gap):
-        estimate = gap.calibration[key]
-        s = in_customary_units(estimate, key)
-        rows.append((number_title(key), s.nominal, s.value, f"{s.low} to {s.high}", s.unit,
-                     interval(estimate)))  # fmt: skip
-    head = ("number", "model had", "found", "95 % interval", "unit", "model and found, to scale")
-    return table(head, rows, numbers=" nnn")
-
-
-def lack_table(gap: Gap) -> Markup:
-    """Unknown forces, flows and commands that remain, the largest first."""
-    rows = [
-        (lack_words(lack), f"{100 * lack.part:.2g} %", bar(lack.part / gap.lacks[0].part))
-        for lack in gap.lacks if lack.part > 0
-    ]  # fmt: skip
-    head = ("", "of full force, rated flow or full command", "")
-    return table(head, rows, numbers=" n ")
-
-
-def noise_table(gap: Gap) -> Markup:
-    """Standard deviation of a reading per channel: found, and stated by the machine."""
-    rows = []
-    for channel, (found, stated) in gap.noise.items():
-        unit = usual_unit(channel)
-        known = math.isfinite(stated)
-        ratio = f"{found / stated:.2f}" if known and stated > 0 else "-"
-        rows.append((channel_words(channel), amount(found, unit),
-                     amount(stated, unit) if known else "not stated", ratio))  # fmt: skip
-    return table(("channel", "found", "stated", "found / stated"), rows, numbers=" nnn")
-
-
-def ranking_table(gap: Gap) -> Markup:
+def _ranking(gap: Gap) -> list[dict[str, Any]]:
     """Single effects by what naming them would gain."""
     shown = gap.ranking[:_CANDIDATES]
     best = max((c.gain - c.charge for c in shown), default=1.0)
     named = {(effect.name, effect.location) for effect in gap.effects}
     rows = []
     for place, candidate in enumerate(shown, 1):
-        title: object = effect_title(candidate)
-        if (candidate.name, candidate.location) in named:
-            title = tag("b", title)
         net = candidate.gain - candidate.charge
-        values = ", ".join(_value(gap, candidate, name) for name in candidate.parameters)
-        rows.append((place, title, values, f"{net:,.0f}", bar(net / best if best > 0 else 0.0)))
-    head = ("", "effect", "best value", "net gain", "")
-    more = len(gap.ranking) - len(shown)
-    note = tag("p", f"{more} more gain less.", class_="key") if more > 0 else Markup("")
-    return Markup(table(head, rows, numbers="n  n ") + note)
+        rows.append({
+            "place": place, "title": effect_title(candidate), "gain": f"{net:,.0f}",
+            "named": (candidate.name, candidate.location) in named,
+            "best": ", ".join(_value(gap, candidate, name) for name in candidate.parameters),
+            "part": net / best if best > 0 else 0.0,
+        })  # fmt: skip
+    return rows
 
 
 def _value(gap: Gap, candidate: Candidate, name: str) -> str:
@@ -186,18 +233,44 @@ def _value(gap: Gap, candidate: Candidate, name: str) -> str:
     return f"{label} {amount(value, facts[name].unit, name)}"
 
 
-def test_table(tests: Mapping[str, Mapping[str, Any]]) -> Markup:
+def _tests(gap: Gap) -> list[tuple[str, str, str, bool]]:
     """Residual tests of the final model."""
-    rows = []
-    for name, test in tests.items():
-        passed = bool(test.get("passed"))
-        mark = tag("span", "passed" if passed else "failed", class_="yes" if passed else "no")
-        rows.append((name, _plain(test.get("value")), _plain(test.get("limit")), mark))
-    return table(("test", "value", "limit", ""), rows, numbers=" nn ")
+    return [
+        (name, _plain(test.get("value")), _plain(test.get("limit")), bool(test.get("passed")))
+        for name, test in gap.tests.items()
+    ]
 
 
 def _plain(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, int | float) and math.isfinite(value) else "-"
+
+
+def _noise(gap: Gap) -> list[tuple[str, str, str, str]]:
+    """Standard deviation of a reading per channel: found, and stated by the machine."""
+    rows = []
+    for channel, (found, stated) in gap.noise.items():
+        unit, known = usual_unit(channel), math.isfinite(stated)
+        ratio = f"{found / stated:.2f}" if known and stated > 0 else "-"
+        rows.append((channel_words(channel), amount(found, unit),
+                     amount(stated, unit) if known else "not stated", ratio))  # fmt: skip
+    return rows
+
+
+def _rivals(gap: Gap) -> list[tuple[str, ...]]:
+    return [
+        (effect_title(e), effect_title(a), probability_text(e.probability),
+         probability_text(a.probability))
+        for e in gap.effects for a in e.alternatives
+    ]  # fmt: skip
+
+
+def _experiment(gap: Gap) -> dict[str, str] | None:
+    if not gap.next_experiment:
+        return None
+    scenario, written = gap.next_experiment.get("scenario"), ""
+    if scenario:
+        written = yaml.safe_dump(finite(scenario), sort_keys=False, default_flow_style=None)
+    return {"reason": gap.next_experiment.get("reason", ""), "scenario": written}
 
 
 if TYPE_CHECKING:
@@ -359,233 +432,3 @@ def _colours(top: float):
     steps = [(1.5 + (top - 1.5) * (k + 1) / len(rest), rest[k]) for k in range(len(rest))]
     scaled = [(level / top, colour) for level, colour in (*stops, *steps)]
     return LinearSegmentedColormap.from_list("gap", scaled)
-
-
-_CHANNELS = 4
-_CHIPS = {
-    "named": "Effect named",
-    "no_gap": "No gap",
-    "ambiguous": "Ambiguous",
-    "unknown": "Unknown effect",
-    "partly": "Partly named",
-}
-
-
-def write_report(gap: Gap, path: str | Path) -> None:
-    """Write a Gap as one self-contained HTML file.
-
-    Args:
-        gap: what the search yields.
-        path: file to write.
-    """
-    title = f"{gap.machine.name}: {headline(gap)}"
-    sections = [
-        _header(gap),
-        _found(gap),
-        _calibrated(gap),
-        _learned(gap),
-        _unknown(gap),
-        _proof(gap),
-        _where(gap),
-        _ranking(gap),
-        _rest(gap),
-        _next(gap),
-        _notes(gap),
-        _use(gap),
-    ]
-    Path(path).write_text(page(title, STYLE, sections), encoding="utf-8")
-
-
-def _header(gap: Gap) -> Markup:
-    size, closed = gap.size, gap_closed(gap.size)
-    patched = has_patch(gap)
-    runs = ", ".join(p.run for p in gap.before[1:])
-    over = f"GAP REPORT  ·  machine {gap.machine.name}, tool {gap.machine.tool}"
-    if gap.before:
-        over += f"  ·  judged on {gap.before[0].run}" + (f", fitted on {runs}" if runs else "")
-    cards = [("before", f"{size.before:.2f} × noise", "prediction error, model as given")]
-    if patched:
-        cards.append(("after", f"{size.after:.2f} × noise", "prediction error, patched"))
-    if patched and math.isfinite(closed):
-        cards.append(("", f"{100 * closed:.0f} %", "of the gap closed, on data not fitted"))
-    if size.noise_floor is not None:
-        cards.append(("", f"{size.noise_floor:.2f} × noise", "prediction error of a perfect model"))
-    figures = [tag("div", tag("b", b), tag("span", s), class_=c) for c, b, s in cards]
-    return tag(
-        "header",
-        tag("p", over, class_="over"),
-        tag("div", _CHIPS[gap.verdict], class_=f"chip {gap.verdict}"),
-        tag("h1", headline(gap)),
-        tag("div", *(tag("p", words) for words in verdict_words(gap)), class_="verdict"),
-        tag("div", *figures, class_="figures"),
-    )
-
-
-def _found(gap: Gap) -> Markup:
-    if not gap.effects:
-        return Markup("")
-    rows = []
-    for effect in gap.effects:
-        for name, estimate in effect.parameters.items():
-            s = in_customary_units(estimate, name)
-            what = tag("b", effect_title(effect))
-            rows.append((
-                what, name.replace("_", " "), s.nominal, s.value, f"{s.low} to {s.high}", s.unit,
-                interval(estimate), probability_text(effect.probability), share_words(effect.share),
-            ))  # fmt: skip
-    head = ("effect", "parameter", "model had", "found", "95 % interval", "unit",
-            "model and found, to scale", "probability", "share of the gap")  # fmt: skip
-    why = (
-        "Values that the fit runs ask for. The interval holds the true value in 95 of 100 cases;"
-        " the share is what comes back on the held-out run without the effect."
-    )
-    return section("What was found", why, table(head, rows, numbers="  nnn  nn"))
-
-
-def _calibrated(gap: Gap) -> Markup:
-    if not gap.calibration:
-        return Markup("")
-    why = (
-        "Numbers that the machine file states with an uncertainty, fitted together with it as their"
-        " prior. They are in the patched model; those that moved most, by their intervals, first."
-    )
-    return section("Numbers that were calibrated", why, calibration_table(gap))
-
-
-def _learned(gap: Gap) -> Markup:
-    if not gap.learned:
-        return Markup("")
-    why = (
-        "No known effect explains these; their form was taken from the data. They are terms of the"
-        " patched model, which every simulator calculates. The band is two standard deviations."
-    )
-    parts = []
-    for law in gap.learned:
-        share = f" It closes {share_words(law.share)} of the gap on the held-out run."
-        parts += [
-            tag("h3", learned_title(law)),
-            tag("p", law.description + (share if math.isfinite(law.share) else "")),
-            tag("figure", picture(draw_law(law), learned_title(law))),
-            tag("p", f"In SI units [{law.unit}]:", class_="key"),
-            tag("pre", law.formula),
-        ]
-    return section("Laws learned from the data", why, *parts)
-
-
-def _unknown(gap: Gap) -> Markup:
-    unknown = gap.unknown
-    if unknown is None:
-        return Markup("")
-    windows = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in unknown.windows)
-    facts = [
-        ("law that fails", f"{unknown.law}: {law_words(unknown.law)}"),
-        ("seen most in", channel_words(unknown.channel)),
-        ("changes with", ", ".join(map(channel_words, unknown.depends_on)) or "-"),
-        ("shows most at", windows or "-"),
-    ]
-    why = "None of the known effects removes this; here is what can be said of it."
-    rows = [(tag("b", name), value) for name, value in facts]
-    parts = [tag("p", unknown.description), table(("", ""), rows)]
-    if gap.lacks:
-        parts += [tag("h3", "What the patched model still lacks"), lack_table(gap)]
-    return section("What is not explained", why, *parts)
-
-
-def _proof(gap: Gap) -> Markup:
-    if not gap.before:
-        return Markup("")
-    before, after, patched = gap.before[0], gap.after[0], has_patch(gap)
-    why = (
-        f"One-step prediction errors on {before.run}: from its readings so far, the model says what"
-        " the sensors will read next. A perfect model is off by the sensors' noise alone, 1.0."
-    )
-    pictures = [
-        tag("figure", picture(draw_overlay(before, after, name, patched), channel_words(name)))
-        for name in most_changed(before, after, _CHANNELS)
-    ]
-    which = "that changed most" if patched else "that are off most"
-    return section(
-        "Proof on data that were not fitted" if patched else "Predictions on data not fitted", why,
-        channel_table(before, after if patched else None),
-        tag("h3", f"Readings and predictions of the channels {which}"), *pictures,
-    )  # fmt: skip
-
-
-def _where(gap: Gap) -> Markup:
-    if not gap.before:
-        return Markup("")
-    changed = has_patch(gap)
-    heat = tag(
-        "figure",
-        picture(draw_heat_map(gap.before[0], gap.after[0], changed), "errors by channel and time"),
-        tag("figcaption", "Size of the prediction errors in windows of half a second."
-            " White is noise alone; grey was not measured."),
-    )  # fmt: skip
-    why = f"Which law of the model fails, and in which channel and when, on {gap.before[0].run}."
-    laws = law_table(gap.laws, gap.law_units, changed) if gap.laws else Markup("")
-    return section("Where the model is off", why, laws, heat)
-
-
-def _ranking(gap: Gap) -> Markup:
-    if not gap.ranking:
-        return Markup("")
-    why = (
-        "Every effect was tried at every place, each alone. The gain is the fall of -2 log"
-        " likelihood over the fit runs, less the charge for its parameters; below 0 an effect is"
-        " not worth naming."
-    )
-    return section("Ranking of single effects", why, ranking_table(gap))
-
-
-def _rest(gap: Gap) -> Markup:
-    if not gap.tests:
-        return Markup("")
-    why = "What is left after the last model must look like sensor noise in every respect."
-    noise = [tag("h3", "Noise of the readings"), noise_table(gap)] if gap.noise else []
-    return section("Is anything left?", why, test_table(gap.tests), *noise)
-
-
-def _next(gap: Gap) -> Markup:
-    rivals = [(effect, a) for effect in gap.effects for a in effect.alternatives]
-    parts = []
-    if rivals:
-        rows = [
-            (
-                effect_title(e),
-                effect_title(a),
-                *map(probability_text, (e.probability, a.probability)),
-            )
-            for e, a in rivals
-        ]
-        head = ("in the patched model", "could also be", "probability", "of the other")
-        parts.append(table(head, rows, numbers="  nn"))
-    if gap.next_experiment:
-        reason = gap.next_experiment.get("reason", "")
-        parts.append(tag("p", tag("b", "Next experiment: "), reason))
-        if scenario := gap.next_experiment.get("scenario"):
-            written = yaml.safe_dump(finite(scenario), sort_keys=False, default_flow_style=None)
-            parts.append(tag("pre", written))
-    if not parts:
-        return Markup("")
-    why = "What these data leave open, and what would settle it."
-    return section("Alternatives and the next experiment", why, *parts)
-
-
-def _notes(gap: Gap) -> Markup:
-    if not gap.notes:
-        return Markup("")
-    items = tag("ul", *(tag("li", note) for note in gap.notes))
-    return section("Notes on the data", "What was left out or mended before the search.", items)
-
-
-def _use(gap: Gap) -> Markup:
-    commands = ["hydrotele review recording.rrd"]
-    if has_patch(gap):
-        commands = [
-            "hydrotele replay LOG --machine patched/",
-            "hydrotele run SCENARIO --machine patched/",
-        ]
-    lines = tag("pre", "\n".join(commands)) if has_patch(gap) else Markup("")
-    use = tag("p", "The patched model stands beside this page:") if lines else Markup("")
-    took = text(f"hydrotele {hydrotele.__version__}, searched for {gap.seconds:.0f} s.")
-    return tag("footer", use, lines, tag("p", took))

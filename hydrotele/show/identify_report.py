@@ -5,6 +5,7 @@ The pictures of an identification report: forces on the held-out run, and the pa
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,19 +23,8 @@ from hydrotele.identify.result import (
     parameter_rows,
 )
 from hydrotele.logs.dataset import Dataset
-from hydrotele.show.report_html import (
-    STYLE,
-    Markup,
-    drawing,
-    interval,
-    page,
-    picture,
-    png,
-    section,
-    table,
-    tag,
-    text,
-)
+from hydrotele.show import report_html
+from hydrotele.show.report_html import drawing, png
 
 MEASURED, NOMINAL, IDENTIFIED = "#262b33", "#e07b00", "#1769aa"
 
@@ -96,120 +86,93 @@ def write_identify_report(
         best: the nearest machine that can exist, None without a mechanism.
         path: file to write.
     """
-    sections = [_header(dataset, found, hydraulics)]
-    if found:
-        sections += [_proof(found), _parameters(found), _tests(found, best), _others(found)]
-    if hydraulics:
-        sections.append(_hydraulics(hydraulics))
-    notes = found.notes if found else dataset.notes
-    if notes:
-        items = tag("ul", *(tag("li", note) for note in notes))
-        sections.append(section("Notes", "On the data and on what was left out.", items))
-    sections.append(_use(found, hydraulics))
-    title = f"{dataset.machine.name}: identification"
-    Path(path).write_text(page(title, STYLE, sections), encoding="utf-8")
-
-
-def _header(
-    dataset: Dataset, found: Identification | None, hydraulics: Hydraulics | None
-) -> Markup:
     machine, runs = dataset.machine, ", ".join(run.name for run in dataset.fit)
-    over = (
-        f"IDENTIFICATION REPORT  ·  machine {machine.name}, tool {machine.tool}  ·  judged on"
-        f" {dataset.heldout.name}, fitted on {runs}"
-    )
-    cards = []
-    for drive, h in list(found.heldout.items())[:3] if found else ():
-        against = f"{h.rms / h.noise_rms:.2f} × noise, " if h.noise_rms > 0.0 else ""
-        name = drive.replace("_", " ")
-        cards.append(
-            ("after", f"{100 * h.relative:.2f} %", f"{against}error of the {name}'s force")
-        )
-    if hydraulics:
-        said_of = f"one-step prediction errors ({hydraulics.before:.2f} before)"
-        cards.append(("after", f"{hydraulics.after:.2f} × noise", said_of))
     status = found.status if found else hydraulics.status if hydraulics else ""
     good = status == "ok" and (hydraulics is None or hydraulics.status == "ok")
-    chip = tag(
-        "div",
-        "Identified" if good else "See below",
-        class_=f"chip {'no_gap' if good else 'ambiguous'}",
-    )
-    heading = "The machine's numbers, from its logs" if good else status
-    figures = [tag("div", tag("b", b), tag("span", s), class_=c) for c, b, s in cards]
-    return tag(
-        "header", tag("p", over, class_="over"), chip, tag("h1", heading),
-        tag("div", *figures, class_="figures"),
+    report_html.write_report(
+        "identify", path, title=f"{machine.name}: identification",
+        over=f"IDENTIFICATION REPORT  ·  machine {machine.name}, tool {machine.tool}  ·  judged on"
+        f" {dataset.heldout.name}, fitted on {runs}",
+        heading="The machine's numbers, from its logs" if good else status,
+        chip=("no_gap", "Identified") if good else ("ambiguous", "See below"),
+        figures=_figures(found, hydraulics), found=_mechanism(found, best) if found else None,
+        hydraulics=_hydraulics(hydraulics) if hydraulics else None,
+        notes=found.notes if found else dataset.notes, version=hydrotele.__version__,
+        seconds=f"{sum(part.seconds for part in (found, hydraulics) if part):.1f}",
     )  # fmt: skip
 
 
-def _proof(found: Identification) -> Markup:
-    rows = []
-    for drive, h in found.heldout.items():
-        noise = amount(h.noise_rms, h.unit) if math.isfinite(h.noise_rms) else "not stated"
-        rows.append((tag("b", drive.replace("_", " ")), amount(h.nominal_rms, h.unit),
-                     amount(h.rms, h.unit), noise, f"{100 * h.relative:.2f} %"))  # fmt: skip
-    head = ("drive", "as given", "identified", "noise alone", "relative error")
-    pictures = [
-        tag("figure", picture(draw_forces(found.forces, drive, h), f"force of {drive}"))
+def _figures(
+    found: Identification | None, hydraulics: Hydraulics | None
+) -> list[tuple[str, str, str]]:
+    cards = []
+    for drive, h in list(found.heldout.items())[:3] if found else ():
+        against = f"{h.rms / h.noise_rms:.2f} × noise, " if h.noise_rms > 0.0 else ""
+        what = f"{against}error of the {_name(drive)}'s force"
+        cards.append(("after", f"{100 * h.relative:.2f} %", what))
+    if hydraulics:
+        what = f"one-step prediction errors ({hydraulics.before:.2f} before)"
+        cards.append(("after", f"{hydraulics.after:.2f} × noise", what))
+    return cards
+
+
+def _name(drive: str) -> str:
+    return drive.replace("_", " ")
+
+
+def _mechanism(found: Identification, best: Consistent | None) -> dict[str, Any]:
+    forces = [
+        (_name(drive), amount(h.nominal_rms, h.unit), amount(h.rms, h.unit),
+         amount(h.noise_rms, h.unit) if math.isfinite(h.noise_rms) else "not stated",
+         f"{100 * h.relative:.2f} %")
         for drive, h in found.heldout.items()
-    ]
-    why = (
-        f"RMS of measured less predicted force on {found.forces.run}, below {found.band:.3g} Hz,"
-        " where the positions tell accelerations. Noise alone is what a perfect model would show"
-        " with these sensors; the grey band is twice that."
-    )
-    return section("Forces on data that were not fitted", why,
-                    table(head, rows, numbers=" nnnn"), *pictures)  # fmt: skip
+    ]  # fmt: skip
+    return {
+        "run": found.forces.run, "band": f"{found.band:.3g}", "forces": forces,
+        "pictures": [(drive, draw_forces(found.forces, drive, h))
+                     for drive, h in found.heldout.items()],
+        "condition": f"{found.estimate.condition:.3g}", "parameters": _parameters(found),
+        "tests": _tests(found, best), "statuses": _statuses(found),
+        "correlation": ", ".join(f"{_name(drive)} {r:.2f}" for drive, r in found.whiteness.items()),
+    }  # fmt: skip
 
 
-def _parameters(found: Identification) -> Markup:
+def _to_scale(estimate: Estimate) -> report_html.Interval | None:
+    return report_html.interval(estimate.value, estimate.low, estimate.high, estimate.nominal)
+
+
+def _parameters(found: Identification) -> list[dict[str, Any]]:
     rows = []
     for row in parameter_rows(found):
         if row.value is None or row.ci95 is None:
             continue
         estimate = Estimate(row.value, row.unit, *row.ci95, row.nominal)
         s = in_customary_units(estimate)
-        rows.append((
-            Markup(tag("b", row.name) + tag("small", _short(row.combination))), s.nominal, s.value,
-            f"{s.low} to {s.high}", s.unit, interval(estimate), row.status,
-        ))  # fmt: skip
-    head = ("parameter", "given", "identified", "95 % interval", "unit", "given and identified",
-            "status")  # fmt: skip
-    why = (
-        "A combination stands under the name of its first member; all numbers in its row are those"
-        f" of the whole. Condition of the equations {found.estimate.condition:.3g}."
-    )
-    return section("What the data tell", why, table(head, rows, numbers=" nnn"))
+        rows.append({
+            "name": row.name, "combination": _short(row.combination), "status": row.status,
+            "texts": (s.nominal, s.value, f"{s.low} to {s.high}", s.unit),
+            "drawn": _to_scale(estimate),
+        })  # fmt: skip
+    return rows
 
 
-def _tests(found: Identification, best: Consistent | None) -> Markup:
+def _tests(found: Identification, best: Consistent | None) -> list[tuple[str, ...]]:
     distance, limit = found.distance(found.nominal)
     verdict = "could be the true ones" if distance <= limit else "are refuted"
     rows = [("the given parameters, all together", f"{distance:.3g}", f"{limit:.3g}", verdict)]
     if best:
         verdict = "agrees with the estimate" if best.loss <= limit else "cannot have all of it"
         rows.append(("a machine that can exist", f"{best.loss:.3g}", f"{limit:.3g}", verdict))
-    head = ("95 % ellipsoid", "squared distance", "limit", "verdict")
-    memory = ", ".join(f"{drive.replace('_', ' ')} {r:.2f}" for drive, r in found.whiteness.items())
-    why = (
-        "How far other parameters are from the estimate in standard deviations, and what 95 of 100"
-        " true ones stay below. Bodies that can exist have positive mass and the inertia of a mass"
-        f" distribution. Residuals correlate with those before them by: {memory}; the intervals"
-        " know of it."
-    )
-    return section("Tests", why, table(head, rows, numbers=" nn"))
+    return rows
 
 
-def _others(found: Identification) -> Markup:
+def _statuses(found: Identification) -> list[tuple[str, ...]]:
     rows = parameter_rows(found)
     parts = []
     for status, number in counts(rows).items():
         names = [row.name for row in rows if row.status == status and row.value is None]
-        parts.append((tag("b", status), str(number), MEANING[status], ", ".join(names) or "-"))
-    head = ("status", "number", "meaning", "those without a number of their own")
-    why = "Why some parameters have no number: the data do not hold one."
-    return section("Identifiability", why, table(head, parts, numbers=" n"))
+        parts.append((status, str(number), MEANING[status], ", ".join(names) or "-"))
+    return parts
 
 
 def _short(combination: str) -> str:
@@ -220,30 +183,14 @@ def _short(combination: str) -> str:
     return " + ".join(parts[:_MEMBERS]).replace("+ -", "- ") + f" + {len(parts) - _MEMBERS} more"
 
 
-def _hydraulics(found: Hydraulics) -> Markup:
+def _hydraulics(found: Hydraulics) -> dict[str, Any]:
     rows = []
     for n in found.numbers:
         estimate = Estimate(n.value, n.unit, *n.ci95, n.nominal)
         s = in_customary_units(estimate, n.parameter)
-        cells = (s.value, f"{s.low} to {s.high}") if n.told else ("not told", "")
-        drawn = interval(estimate) if n.told else Markup("")
-        rows.append(
-            (tag("b", n.name), n.parameter.replace("_", " "), s.nominal, *cells, s.unit, drawn)
-        )
-    head = ("number", "parameter", "given", "identified", "95 % interval", "unit",
-            "given and identified")  # fmt: skip
-    why = (
-        "All fitted together to one-step prediction errors of commands, pressures and motion,"
-        f" which fall from {found.before:.2f} to {found.after:.2f} times noise on the held-out run."
-    )
-    return section("Valves, oil and supply", why, table(head, rows, numbers="  nnn"))
-
-
-def _use(found: Identification | None, hydraulics: Hydraulics | None) -> Markup:
-    commands = (
-        "hydrotele replay LOG --machine identified/\nhydrotele run SCENARIO --machine identified/"
-    )
-    seconds = sum(part.seconds for part in (found, hydraulics) if part)
-    took = text(f"hydrotele {hydrotele.__version__}, identified in {seconds:.1f} s.")
-    return tag("footer", tag("p", "The identified machine stands beside this page:"),
-               tag("pre", commands), tag("p", took))  # fmt: skip
+        values = (s.value, f"{s.low} to {s.high}") if n.told else ("not told", "")
+        rows.append({
+            "name": n.name, "texts": (_name(n.parameter), s.nominal, *values, s.unit),
+            "drawn": _to_scale(estimate) if n.told else None,
+        })  # fmt: skip
+    return {"before": f"{found.before:.2f}", "after": f"{found.after:.2f}", "numbers": rows}

@@ -1,23 +1,14 @@
 """`report.html` and the picture of a calibrated serial robot."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import hydrotele
 from hydrotele.calibrate.mukca import LeftOut, SocketCalibration
-from hydrotele.show.report_html import (
-    STYLE,
-    Markup,
-    drawing,
-    page,
-    picture,
-    png,
-    section,
-    table,
-    tag,
-)
+from hydrotele.show.report_html import Section, drawing, png, write_sections
 
 NOMINAL, CALIBRATED = "#e07b00", "#1769aa"
 
@@ -93,93 +84,75 @@ def _draw_distances(plot: Any, apart: dict[str, float], given: float | None) -> 
     plot.set_title("Distance of the sockets; grey: the tool's, +- 0.1 mm")
 
 
-def robot_report(document: dict[str, Any], png_: bytes) -> str:
-    """One page that needs nothing else.
+def write_robot_report(path: Path, document: dict[str, Any], picture: bytes) -> None:
+    """Write one page that needs nothing else.
 
     Args:
+        path: HTML file to write.
         document: `calibration.json`.
-        png_: the picture.
-
-    Returns:
-        HTML.
+        picture: of `draw_sockets`.
     """
-    parts = [
-        _head(document),
-        tag("figure", picture(png_, "distances of the ball from its sockets")),
-    ]
-    if document["heldout"]:
-        rows = [
-            (name, f"{one['nominal_rms_mm']:.3f}", f"{one['rms_mm']:.3f}",
-             f"{one['rms_without_outliers_mm']:.3f}", one["model"])
-            for name, one in document["heldout"]["parts"].items()
-        ]  # fmt: skip
-        parts.append(section(
-            "Places that were not fitted", "Root mean square distance of the ball from its"
-            " socket's mean, predicted by a calibration on all others.",
-            table(("place", "nominal mm", "calibrated mm", "without outliers mm", "joints"), rows,
-                  numbers="-nnn"),
-        ))  # fmt: skip
-    parts.append(_parameters(document))
-    parts.append(_told(document))
-    said = [*(f"{o['socket']}, row {o['row']}: {o['distance_mm']:.2f} mm from its socket, not"
-              " fitted" for o in document["outliers"]), *document["notes"]]  # fmt: skip
-    if said:
-        parts.append(section("Notes", "What was left out, and what to know.",
-                             tag("ul", *(tag("li", note) for note in said))))  # fmt: skip
-    parts.append(tag("footer", f"hydrotele {hydrotele.__version__}, data {document['data']}"))
-    return page(f"{document['robot']} calibrated", STYLE, parts)
-
-
-def _head(document: dict[str, Any]) -> Markup:
     judged, fitted = document["heldout"], document["fitted"]
     figures = [
         ("before", fitted["nominal_rms_mm"], "nominal robot, RMS mm"),
         ("after", fitted["rms_mm"], "calibrated, on the fitted rows, RMS mm"),
     ]
+    sections = [Section("Distances of the ball from its sockets", picture=picture)]
     if judged:
         figures.append(("after", judged["rms_mm"], "calibrated, not fitted, RMS mm"))
-    boxes = [
-        tag("div", tag("b", f"{value:.3f}"), tag("span", what), class_=kind)
-        for kind, value, what in figures
-    ]
-    return tag(
-        "header", tag("p", "Closed-chain calibration from joint angles", class_="over"),
-        tag("h1", f"{document['robot']}: {len(document['places'])} places,"
-            f" {sum(document['rows'].values())} postures"),
-        tag("p", f"Joints: {document['model']}. Noise of a coordinate {document['noise_mm']:.3f}"
-            f" mm. Search: {document['status']}."),
-        tag("div", *boxes, class_="figures"),
+        rows = [
+            (name, f"{one['nominal_rms_mm']:.3f}", f"{one['rms_mm']:.3f}",
+             f"{one['rms_without_outliers_mm']:.3f}", one["model"])
+            for name, one in judged["parts"].items()
+        ]  # fmt: skip
+        sections.append(Section(
+            "Places that were not fitted", "Root mean square distance of the ball from its"
+            " socket's mean, predicted by a calibration on all others.",
+            ("place", "nominal mm", "calibrated mm", "without outliers mm", "joints"), rows, "-nnn",
+        ))  # fmt: skip
+    notes = [*(f"{o['socket']}, row {o['row']}: {o['distance_mm']:.2f} mm from its socket, not"
+               " fitted" for o in document["outliers"]), *document["notes"],
+             f"data: {document['data']}"]  # fmt: skip
+    sections += [_parameters(document), _told(document),
+                 Section("Notes", "What was left out, and what to know.", notes=notes)]  # fmt: skip
+    write_sections(
+        path, f"hydrotele {hydrotele.__version__} - closed-chain calibration from joint angles",
+        f"{document['robot']}: {len(document['places'])} places,"
+        f" {sum(document['rows'].values())} postures",
+        f"Joints: {document['model']}. Noise of a coordinate {document['noise_mm']:.3f} mm."
+        f" Search: {document['status']}.",
+        sections, [(kind, f"{value:.3f}", what) for kind, value, what in figures],
     )  # fmt: skip
 
 
-def _parameters(document: dict[str, Any]) -> Markup:
+def _parameters(document: dict[str, Any]) -> Section:
     rows = []
     for one in document["parameters"]:
         unit, factor = _customary(one["unit"])
         reach = "" if one["std"] is None else f"{0.5 * factor * (one['high'] - one['low']):.2g}"
         told = {"full": "by itself", "combination": "with others"}.get(one["told"], "no")
         rows.append((one["name"], f"{factor * one['value']:.4g}", reach, unit, told))
-    return section(
+    return Section(
         "Parameters", "t and r: displacement along and rotation about the axes of a joint's frame,"
         " z being the joint's axis; rz is the offset of its angle. sag: yielding of a joint under"
         " a weight at a place beyond. sine and cosine: error of an encoder once per turn.",
-        table(("parameter", "value", "95 % +-", "unit", "told"), rows, numbers="-nn"),
+        ("parameter", "value", "95 % +-", "unit", "told"), rows, "-nn",
     )  # fmt: skip
 
 
-def _told(document: dict[str, Any]) -> Markup:
+def _told(document: dict[str, Any]) -> Section:
     units = {one["name"]: one["unit"] for one in document["parameters"]}
     rows = []
     for one in document["told"]:
         unit, factor = _customary(units[one["text"].split()[0]])
         reach = f"{0.5 * factor * (one['high'] - one['low']):.2g}"
         rows.append((one["text"], f"{factor * one['value']:.4g}", reach, unit))
-    return section(
+    return Section(
         "What the data tell", "A parameter or combination is told if its uncertainty is below half"
         " of its expected size in the noise that there is. How a combination is split between its"
         " parameters follows from their expected sizes, not from the data.",
-        table(("parameter or combination", "value", "95 % +-", "unit"), rows, numbers="-nn"),
-        tag("p", tag("b", "not told at all: "), ", ".join(document["unknown"]) or "none"),
+        ("parameter or combination", "value", "95 % +-", "unit"), rows, "-nn",
+        notes=(f"not told at all: {', '.join(document['unknown']) or 'none'}",),
     )  # fmt: skip
 
 

@@ -13,18 +13,8 @@ import numpy as np
 
 import hydrotele
 from hydrotele.core.output import replacing
-from hydrotele.show.report_html import (
-    STYLE,
-    Cell,
-    Markup,
-    drawing,
-    page,
-    picture,
-    png,
-    section,
-    table,
-    tag,
-)
+from hydrotele.show import report_html
+from hydrotele.show.report_html import drawing, png
 
 DOT, MEAN, FAILED = "#9db4c8", "#1769aa", "#b5281c"
 _ACROSS, _MAPS = 4, 3
@@ -287,67 +277,45 @@ def write_sweep_report(study: Study, folder: Path) -> None:
         else:
             (folder / name).unlink(missing_ok=True)
     with replacing(folder / "report.html", ".html") as part:
-        part.write_text(_page(study, images), encoding="utf-8")
+        _write_page(study, images, part)
 
 
-def _page(study: Study, images: dict[str, bytes]) -> str:
-    runs = len(study.columns["run"])
-    parts = [_head(study, runs), section("What was varied", "", _varied(study))]
-    if images:
-        why = "Means over the runs that succeeded are in the pictures, single runs here."
-        parts.append(section("How far the numbers spread", why, _spreads(study)))
-        why = ("Dots are runs, the line is their mean at each value of the key while all other keys"
-               " vary (of random values over bins of neighbours); red crosses are runs that"
-               " failed.")  # fmt: skip
-        image = picture(images["main_effects.png"], "main effects")
-        parts.append(section("What each key does", why, tag("figure", image)))
-    if "heat_map.png" in images:
-        image = picture(images["heat_map.png"], "maps of two keys")
-        why = "Mean of all runs of a cell; grey where all of them failed."
-        parts.append(section("Both keys together", why, tag("figure", image)))
-    if study.failed:
-        parts.append(_failures(study))
-    parts.append(tag("footer", "All runs with all numbers and their units: table.parquet."))
-    return page(f"sweep {study.name}", STYLE, parts)
+def _write_page(study: Study, images: dict[str, bytes], path: Path) -> None:
+    runs, failed = len(study.columns["run"]), len(study.failed)
+    report_html.write_report(
+        "sweep", path, title=f"sweep {study.name}", heading=study.name.replace("_", " "),
+        over=f"hydrotele {hydrotele.__version__} - sweep of {study.scenario}",
+        description=study.description, varied=_varied(study), spreads=_spreads(study),
+        figures=[
+            ("", runs, "runs"),
+            ("after", runs - failed, "succeeded"),
+            ("before" if failed else "", failed, "failed"),
+            ("", len(study.varied), "keys varied"),
+        ],
+        main_effects=images.get("main_effects.png"), heat_map=images.get("heat_map.png"),
+        failures=_failures(study), unlisted=max(failed - _LISTED, 0),
+    )  # fmt: skip
 
 
-def _head(study: Study, runs: int) -> Markup:
-    failed = len(study.failed)
-    numbers = [
-        (str(runs), "runs", ""),
-        (str(runs - failed), "succeeded", "after"),
-        (str(failed), "failed", "before" if failed else ""),
-        (str(len(study.varied)), "keys varied", ""),
-    ]
-    boxes = [tag("div", tag("b", n), tag("span", what), class_=c) for n, what, c in numbers]
-    return tag(
-        "header",
-        tag("p", f"hydrotele {hydrotele.__version__} - sweep of {study.scenario}", class_="over"),
-        tag("h1", study.name.replace("_", " ")),
-        tag("p", study.description),
-        tag("div", *boxes, class_="figures"),
-    )
-
-
-def _varied(study: Study) -> Markup:
+def _varied(study: Study) -> list[tuple[str, str]]:
     rows = []
     for key in (*study.grid, *study.sampled):
         steps = levels(study.columns[key])
         if key in study.sampled and numeric(steps):
-            said = f"{len(steps)} random values from {steps[0]:.4g} to {steps[-1]:.4g}"
+            values = f"{len(steps)} random values from {steps[0]:.4g} to {steps[-1]:.4g}"
         else:
-            said = ", ".join(map(_text, steps[:12])) + (" ..." if len(steps) > 12 else "")
-        rows.append((key_label(study, key), said))
+            values = ", ".join(map(_text, steps[:12])) + (" ..." if len(steps) > 12 else "")
+        rows.append((key_label(study, key), values))
     seeds = levels(study.columns["seed"])
     rows.append(("seed", ", ".join(map(str, seeds[:12])) + (" ..." if len(seeds) > 12 else "")))
-    return table(("key", "values"), rows)
+    return rows
 
 
 def _text(value) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _spreads(study: Study) -> Markup:
+def _spreads(study: Study) -> list[dict[str, Any]]:
     rows = []
     for name in study.figures:
         one = shown(study, name)
@@ -356,22 +324,23 @@ def _spreads(study: Study) -> Markup:
             continue
         values = one.values[known]
         ends = [int(known[np.argmin(values)]), int(known[np.argmax(values)])]
-        cells = [_run(study, one.values[row], row) for row in ends]
-        rows.append((one.label, cells[0], f"{np.median(values):.4g}", cells[1]))
-    return table(("number", "smallest", "median", "largest"), rows, numbers="-nnn")
+        smallest, largest = (_run(study, one.values[row], row) for row in ends)
+        median = f"{np.median(values):.4g}"
+        rows.append(
+            {"label": one.label, "smallest": smallest, "median": median, "largest": largest}
+        )
+    return rows
 
 
-def _run(study: Study, value: float, row: int) -> Cell:
+def _run(study: Study, value: float, row: int) -> tuple[str, str]:
+    """A number of a run, and which run it is."""
     keys = ", ".join(f"{key} {_text(study.columns[key][row])}" for key in study.varied[:3])
-    said = f"run {study.columns['run'][row]}: {keys}"
-    return Cell(Markup(f"{tag('b', f'{value:.4g}')}{tag('small', said)}"))
+    return f"{value:.4g}", f"run {study.columns['run'][row]}: {keys}"
 
 
-def _failures(study: Study) -> Markup:
+def _failures(study: Study) -> list[tuple[int, str, str]]:
     rows = []
     for run, reason in study.failed[:_LISTED]:
         keys = ", ".join(f"{key} {_text(study.columns[key][run - 1])}" for key in study.varied)
-        rows.append((run, keys, Cell(reason, "no")))
-    left = len(study.failed) - len(rows)
-    why = f"{left} more stand in the table." if left else ""
-    return section("Runs that failed", why, table(("run", "keys", "reason"), rows, numbers="n"))
+        rows.append((run, keys, reason))
+    return rows

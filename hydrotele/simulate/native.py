@@ -239,6 +239,7 @@ def _callbacks(remembers):
     def advance(m, d, i):
         if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
+        i = np.int64(i)
         nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
         at_user = carray(pointer(m + m_user), (1,), np.int64)[0]
         user = carray(pointer(at_user), (nu * SLOTS,), np.float64)
@@ -322,6 +323,7 @@ def _callbacks(remembers):
     def force(m, d, i):
         if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
+        i = np.int64(i)
         nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
         at_user = carray(pointer(m + m_user), (1,), np.int64)[0]
         user = carray(pointer(at_user), (nu * SLOTS,), np.float64)

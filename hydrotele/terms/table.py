@@ -23,7 +23,8 @@ from hydrotele.core.errors import InputError
 from hydrotele.terms.facts import BALANCES, Term
 from hydrotele.terms.law import LAWS, VARIABLES, DriveState, Law, Numbers, Variable
 
-FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = range(len(BALANCES))
+# numpy's integers, since numba compiles a function anew for each of Python's that it is called with
+FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = np.arange(len(BALANCES), dtype=np.int64)
 MARKER = 215325.75  # of a table of terms among other custom numbers of a model
 NO_TERMS = np.zeros(0)
 COUNT = 1  # place of the number of terms, after the marker
@@ -237,16 +238,16 @@ def added(terms, balance, axis, s, drives):
         seen = s
         if terms[at + _RANGES] > 0.0 or terms[at + _OTHERS] > 0.0:
             seen = DriveState(
-                _seen(terms, at, 0, s.time, s, drives),
-                _seen(terms, at, 1, s.position, s, drives),
-                _seen(terms, at, 2, s.velocity, s, drives),
-                _seen(terms, at, 3, s.spool, s, drives),
-                _seen(terms, at, 4, s.spool_rate, s, drives),
-                _seen(terms, at, 5, s.pressure_head, s, drives),
-                _seen(terms, at, 6, s.pressure_rod, s, drives),
-                _seen(terms, at, 7, s.pressure_supply, s, drives),
-                _seen(terms, at, 8, s.command, s, drives),
-                _seen(terms, at, 9, s.force, s, drives),
+                _seen(terms, at, np.int64(0), s.time, s, drives),
+                _seen(terms, at, np.int64(1), s.position, s, drives),
+                _seen(terms, at, np.int64(2), s.velocity, s, drives),
+                _seen(terms, at, np.int64(3), s.spool, s, drives),
+                _seen(terms, at, np.int64(4), s.spool_rate, s, drives),
+                _seen(terms, at, np.int64(5), s.pressure_head, s, drives),
+                _seen(terms, at, np.int64(6), s.pressure_rod, s, drives),
+                _seen(terms, at, np.int64(7), s.pressure_supply, s, drives),
+                _seen(terms, at, np.int64(8), s.command, s, drives),
+                _seen(terms, at, np.int64(9), s.force, s, drives),
             )
         total += _call(address, terms, int(terms[at + _PARAMETERS]), seen)
     return total

@@ -34,7 +34,6 @@ def hostile(tmp_path):
     return folder
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [

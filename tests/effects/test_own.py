@@ -151,7 +151,7 @@ def test_installed_packages_offer_effects_as_entry_points(monkeypatch, alone, tm
         own.add_plugins({})
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_page_is_true_as_written(tmp_path):
     """Every command of docs/effects.md, in order, with the file as printed there."""
     (tmp_path / "gas_spring.py").write_text(FILE, encoding="utf-8")

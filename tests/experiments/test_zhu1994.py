@@ -48,7 +48,7 @@ def test_reflection_helps_to_track_a_force():
     assert not forces.tracking(same, same).ok  # no better with it: not as published
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_tree_is_felled():
     found = felling.tree()
     assert found.ok, found.simulated
@@ -59,7 +59,7 @@ def test_a_machine_does_not_tip():
     assert found.ok, found.simulated
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_feller_buncher_steps_and_feels_little_in_the_air():
     for found in motion.feller_steps():
         assert found.ok, found.simulated

@@ -36,6 +36,7 @@ def test_the_unchanged_machine_has_no_gap():
     assert all(test["passed"] for test in gap.tests.values())
 
 
+@pytest.mark.nightly
 def test_a_pressure_offset_below_one_reading_is_named():
     gap = found(MEASURED / "open_06")
     assert gap.verdict == "named"
@@ -71,7 +72,7 @@ def test_missing_channels_and_rows_still_find_the_dead_band(tmp_path):
     assert gap.effects[0].parameters["deadband"].value == pytest.approx(0.085, abs=0.002)
 
 
-def test_stuck_sensor_and_files_with_unlike_clocks_still_find_the_dead_band(tmp_path):
+def split_and_stuck(folder):
     """Pressures in files of their own, 2.5 s off; the boom's angle stands still in one run."""
     for path in sorted((MEASURED / "open_05").glob("*.parquet")):
         log = load_log(path)
@@ -86,19 +87,28 @@ def test_stuck_sensor_and_files_with_unlike_clocks_still_find_the_dead_band(tmp_
             units = {c: log.units[c] for c in kept}
             save_log(
                 Log(log.time + later, {c: columns[c] for c in kept}, units, log.metadata),
-                tmp_path / named,
+                folder / named,
             )
-    data = half(tmp_path)
+    return half(folder)
+
+
+def test_stuck_sensor_and_files_with_unlike_clocks_are_seen(tmp_path):
+    data = split_and_stuck(tmp_path)
     assert len([note for note in data.notes if "-2.5 s" in note]) == 4
     assert any(note.startswith("fit_1: angle.boom is stuck") for note in data.notes)
     (stuck,) = [run for run in data.fit if run.name == "fit_1"]
     angle = stuck.reading[:, data.channels.index("angle.boom")]
     assert np.isnan(angle).any() and not np.isnan(angle).all()  # within the half that is fitted
-    gap = find_gap(data)
+
+
+@pytest.mark.nightly
+def test_stuck_sensor_and_files_with_unlike_clocks_still_find_the_dead_band(tmp_path):
+    gap = find_gap(split_and_stuck(tmp_path))
     assert {(e.name, e.location) for e in gap.effects} == {("valve_deadband", "stick")}
     assert gap.effects[0].parameters["deadband"].value == pytest.approx(0.085, abs=0.002)
 
 
+@pytest.mark.nightly
 def test_a_length_offset_as_small_as_a_pin_may_be_off_is_ambiguous(tmp_path):
     """1.5 mm of the stick's length sensor look like its cylinder's pin 1.5 mm off."""
     for path in sorted((MEASURED / "open_04").glob("*.parquet")):

@@ -28,7 +28,7 @@ def logs(folder, machine, sensors, planted, commands):
     return load_dataset(folder, load_machine(machine))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_bristles_of_the_emps_are_named(tmp_path):
     """50 um of way before it slides, under voltages that now hold and now break away."""
 
@@ -46,7 +46,7 @@ def test_bristles_of_the_emps_are_named(tmp_path):
     assert gap.size.after < 0.5 * gap.size.before
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_slow_pump_of_the_rig_is_named(tmp_path):
     """100 ms, under steps of the valve that ask for most of what the pump gives."""
 

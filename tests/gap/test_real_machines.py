@@ -18,7 +18,7 @@ from hydrotele.machine.machine_file import load_machine
 from tests.measured import REAL, needs_real
 from tools.real_machines import FIRST_THREE_QUARTERS, PUSH, ec20_splits, force_error, pushed
 
-pytestmark = needs_real
+pytestmark = [needs_real, pytest.mark.nightly]
 
 
 def test_emps_names_friction_that_depends_on_the_direction():

@@ -47,7 +47,6 @@ def lines(journal: Path) -> int:
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
-@pytest.mark.slow
 def test_interrupted_and_killed_sweeps_end_as_uninterrupted_ones(done, tmp_path):
     journal = tmp_path / "out" / "journal.jsonl"
     words = (write_sweep(tmp_path), "--out", tmp_path / "out", "--jobs", "1")
@@ -70,7 +69,7 @@ def test_interrupted_and_killed_sweeps_end_as_uninterrupted_ones(done, tmp_path)
     assert lines(journal) == 8  # nothing was done twice
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cluster_gives_the_same_table(done, tmp_path):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     (tmp_path / "there").mkdir()

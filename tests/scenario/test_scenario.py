@@ -27,8 +27,27 @@ LINES = {"zhu_up": "z", "zhu_down": "z", "zhu_in": "r", "zhu_out": "r"}  # what 
 @functools.cache
 def shipped(name, **overrides):
     """One shipped scenario, run once for all tests."""
+    if not overrides:
+        return watched(name)[0]
     changes = {"duration": SHORTER[name]} if name in SHORTER else {}
     return run_scenario(load_scenario(name, changes | overrides))
+
+
+@functools.cache
+def watched(name):
+    """A shipped scenario's run and its largest pin opening [m], seen after every physics step."""
+    worst, real = [0.0], mujoco.mj_step
+
+    def one_by_one(model, data, nstep=1):
+        for _ in range(nstep):
+            real(model, data)
+            worst[0] = max(worst[0], pin_opening(model, data))
+
+    changes = {"duration": SHORTER[name]} if name in SHORTER else {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hydrotele.run.run.mujoco.mj_step", one_by_one)
+        run = run_scenario(load_scenario(name, changes))
+    return run, worst[0]
 
 
 def scenario(**facts):
@@ -38,24 +57,14 @@ def scenario(**facts):
 
 
 @pytest.mark.parametrize("name", shipped_scenarios())
-def test_shipped_scenario_keeps_its_pins(name, monkeypatch):
+def test_shipped_scenario_keeps_its_pins(name):
     """Seen after every physics step, not only where the run itself looks."""
-    plant = prepare(load_scenario(name)).plant
-    worst, real = [0.0], mujoco.mj_step
-
-    def one_by_one(model, data, nstep=1):
-        for _ in range(nstep):
-            real(model, data)
-            worst[0] = max(worst[0], pin_opening(model, data))
-
-    monkeypatch.setattr("hydrotele.run.run.mujoco.mj_step", one_by_one)
-    changes = {"duration": SHORTER[name]} if name in SHORTER else {}
-    summary = run_scenario(load_scenario(name, changes)).summary
-    assert worst[0] < PIN
-    reported = summary["largest_pin_opening_mm"] * 1e-3
+    run, worst = watched(name)
+    assert worst < PIN
+    reported = run.summary["largest_pin_opening_mm"] * 1e-3
     # It is read once per control period, and a pin rings through many of them.
-    rounded = worst[0] * (1.0 + 1e-12)  # to millimetres and back
-    assert 0.5 * worst[0] <= reported <= rounded or plant.model.neq == 0
+    rounded = worst * (1.0 + 1e-12)  # to millimetres and back
+    assert 0.5 * worst <= reported <= rounded or run.plant.model.neq == 0
 
 
 @pytest.mark.parametrize("name", shipped_scenarios())

@@ -254,7 +254,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cluster_runs_the_trials(tmp_path):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     series = SmallSeries(tmp_path)
@@ -273,7 +273,7 @@ def test_a_cluster_runs_the_trials(tmp_path):
     assert "single: 0.0 % of 1" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_workflow_itself_answers_a_planted_trial(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     asked = ["--out", str(tmp_path / "o"), "--single", "1", "--clean", "0", "--seed", "8"]

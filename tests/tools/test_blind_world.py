@@ -35,6 +35,9 @@ from tools.blind.world_trials import (
     true_parameters,
 )
 
+# The independent simulator serves tools/nightly only, and so do its tests.
+pytestmark = pytest.mark.nightly
+
 CAT, RIG = load_machine("cat215"), load_machine("rig")
 SHORT = 4.0  # s
 _STATES = {"angle": Q, "velocity": W, "spool": S, "spool_rate": R, "pressure_head": PA,

@@ -7,7 +7,7 @@ import pytest
 from tools import fuzz
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_damaged_files_end_in_one_sentence():
     verdicts = [fuzz.judge(seed) for seed in range(1000, 1050)]
     assert [(v.seed, v.kind, v.defect, v.words[-300:]) for v in verdicts if v.defect] == []

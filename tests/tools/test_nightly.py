@@ -18,7 +18,8 @@ def test_every_check_is_a_command_of_this_repository():
     listed = nightly("--list").stdout.splitlines()
     assert len(listed) > 5
     for line in listed:
-        assert (ROOT / line.split()[1]).is_file()
+        script = line.split()[1]
+        assert script == "-m" or (ROOT / script).is_file()
 
 
 def test_a_check_needs_its_data_and_its_failure_is_told(tmp_path):
