@@ -129,10 +129,39 @@ def hybrid(
         calibrate_hybrid(data, robot, model, parameters, evolution, posterior, seed, out, json)
 
 
-@app.command()
-def scara(data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False) -> None:
+@app.command(
+    epilog="Examples:  hydrotele calibrate scara --simulate measured --poses 20   |   "
+    "hydrotele calibrate scara --data measured --out calibrated"
+)
+def scara(
+    data: Annotated[
+        Path | None, typer.Option("--data", "-d", help="Folder of nominal.yaml and measured.csv.")
+    ] = None,
+    heldout: Annotated[
+        str | None,
+        typer.Option(help="Poses to judge on, by number from 1, as 3,7; default each in turn."),
+    ] = None,
+    simulate: Annotated[
+        Path | None, typer.Option(help="Write simulated measurements into this folder.")
+    ] = None,
+    poses: Annotated[int, typer.Option(min=4, help="To simulate.")] = 20,
+    noise: Annotated[float, typer.Option(min=0.0, help="Of simulated positions in mm.")] = 0.05,
+    seed: Annotated[int, typer.Option(help="Of the simulation.")] = 1,
+    choose: Annotated[
+        int | None, typer.Option(min=2, help="Also name so many poses that tell most.")
+    ] = None,
+    out: Out = None,
+    json: Json = False,
+) -> None:
     """Link lengths of a SCARA from measured positions (Wang 2012, section 1.1)."""
-    raise InputError("calibrate scara", "is not there yet")
+    from hydrotele.cli.calibrating_scara import calibrate_scara_folder, simulate_scara_folder
+
+    if simulate is not None:
+        simulate_scara_folder(simulate, poses, 1e-3 * noise, seed)
+    if data is not None:
+        calibrate_scara_folder(data, heldout, choose, out, json)
+    elif simulate is None:
+        raise InputError("calibrate scara", "give --data FOLDER, or --simulate FOLDER to make one")
 
 
 @app.command(
