@@ -19,7 +19,7 @@ from hydrotele.show.report_html import (
     tag,
 )
 
-_COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0")
+_COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0", "#a33b3b", "#5b6670")
 _MOST = 4000  # points of a curve: more are not seen
 
 
