@@ -603,7 +603,7 @@ def wang2012(
         The findings, in the order of the thesis.
     """
     tasks: list[tuple[Callable, tuple]] = [
-        (kinematics, ()), (parameters_54, (3 * steps // 2,)), (refined_exact, ()),
+        (kinematics, ()), (parameters_54, (steps,)), (refined_exact, ()),
         (refined_noisy, (steps,)), (poe_poses, ()), (wire_method, ()), (wire_calibration, ()),
     ]  # fmt: skip
     single = len(tasks)

@@ -54,7 +54,7 @@ def corner(
     p = len(names)
     thin = sample[:: max(1, len(sample) // _MOST)]
     with drawing(1.5 * p) as figure:
-        axes = figure.subplots(p, p, squeeze=False)
+        axes = figure.subplots(p, p, squeeze=False, sharex="col")
         for row in range(p):
             for column in range(p):
                 place = axes[row, column]
@@ -76,8 +76,6 @@ def corner(
                         place.axhline(mark[row], color=_MARK, lw=1.0)
                 if row == p - 1:
                     place.set_xlabel(f"{names[column]}")
-                else:
-                    place.set_xticklabels([])
                 if column == 0 and row > 0:
                     place.set_ylabel(f"{names[row]}")
                 elif column > 0:

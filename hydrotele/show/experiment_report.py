@@ -13,7 +13,7 @@ _ABOUT = {
     "zhu1994": "A simulated operator repeats what a person did on the machines; every row says what"
     " the source reports and what is seen here.",
 }
-_COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0")
+_COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0", "#a33b3b", "#5b6670")
 _MOST = 4000  # points of a curve: more are not seen
 
 

@@ -168,3 +168,22 @@ def test_wrong_arguments_are_told(folder, arguments, message):
     )
     assert isinstance(done.exception, InputError)
     assert message in str(done.exception)
+
+
+def test_the_command_draws_a_posterior(folder, tmp_path):
+    arguments = ["--model", "dh", "--parameters", "a3,b1x,l4", "--posterior", "600"]
+    run = CliRunner().invoke(
+        app,
+        ["calibrate", "hybrid", "--data", str(folder), *arguments, "--out", str(tmp_path / "out"),
+         "--json"],
+    )  # fmt: skip
+    assert run.exit_code == 0, run.output
+    found = json.loads(run.stdout)
+    drawn, fitted = found["posterior"]["parameters"], found["parameters"]
+    for one, other in zip(drawn, fitted, strict=True):
+        assert one["name"] == other["name"]
+        # 600 steps of 12 walkers with correlations of some 30: means within 0.3 deviations
+        assert abs(one["mean"] - other["value"]) < 0.5 * other["standard_deviation"]
+    # three parameters do not describe a robot with errors in 54
+    assert "this error model (or choice of parameters) does not describe" in found["warnings"][-1]
+    assert (tmp_path / "out" / "posterior.png").stat().st_size > 10000
