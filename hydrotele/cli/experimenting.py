@@ -11,7 +11,7 @@ from hydrotele.experiments.finding import Finding
 from hydrotele.experiments.khoshzaban1992 import khoshzaban1992
 from hydrotele.experiments.zhu1994 import zhu1994
 
-SERIES = ("zhu1994", "khoshzaban1992")
+SERIES = {"khoshzaban1992": khoshzaban1992, "zhu1994": zhu1994}
 
 
 def experiments_to_folder(
@@ -38,10 +38,7 @@ def experiments_to_folder(
     if target:
         check_target(target, "experiments")
     with stages(f"experiments {name}", as_json) as progress:
-        if name == "khoshzaban1992":
-            findings = khoshzaban1992(seeds, progress)
-        else:
-            findings = zhu1994(seeds, jobs, progress)
+        findings = SERIES[name](seeds, jobs, progress)
     if target:
         with whole_folder(target, "experiments") as folder:
             _write(folder, name, seeds, findings)

@@ -565,7 +565,9 @@ def experiments(
         Path | None,
         typer.Option("--out", "-o", help="Folder to write; default runs/NAME, with --json none."),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Operators or noise seeds of repeated ones.")] = 20,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Operators or noise seeds of repeated ones.")
+    ] = 20,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
     json: Json = False,
 ) -> None:

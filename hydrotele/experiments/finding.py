@@ -10,19 +10,19 @@ from hydrotele.scenario.scenario import Scenario, load_scenario
 
 
 class Panel(NamedTuple):
-    """Curves over time that belong together.
+    """Curves over time, or over something else, that belong together.
 
     Attributes:
         title: with its unit.
-        time: (n,) [s].
+        time: (n,) [s], or what `over` says.
         curves: label -> (n,) in the title's unit.
-        along: what `time` is where it is something else, with its unit.
+        over: label of the horizontal axis.
     """
 
     title: str
     time: np.ndarray
     curves: Mapping[str, np.ndarray]
-    along: str = "time [s]"
+    over: str = "time [s]"
 
 
 class Finding(NamedTuple):

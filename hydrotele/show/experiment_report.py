@@ -18,10 +18,6 @@ from hydrotele.show.report_html import (
     tag,
 )
 
-_ABOUT = {
-    "zhu1994": "A simulated operator repeats what a person did on the machines; every row says what"
-    " the source reports and what is seen here.",
-}
 _COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0")
 _MOST = 4000  # points of a curve: more are not seen
 
@@ -39,7 +35,7 @@ def write_experiment_report(name: str, findings: Sequence[Finding], path: Path) 
         "header",
         tag("p", f"hydrotele {hydrotele.__version__} - experiments {name}", class_="over"),
         tag("h1", f"{same} of {len(findings)} experiments as published"),
-        tag("p", _ABOUT.get(name, "Every row says what the source reports and what is seen here.")),
+        tag("p", "Every row says what the source reports and what is seen here in simulation."),
     )  # fmt: skip
     rows = [
         (
@@ -80,5 +76,5 @@ def draw_panels(panels: Sequence[Panel]) -> bytes:
             place.set_title(panel.title)
             if len(panel.curves) > 1:
                 place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-        axes[-1].set_xlabel(panels[-1].along)
+        axes[-1].set_xlabel(panels[-1].over)
         return png(figure)
