@@ -137,7 +137,9 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
         maybe = found and all(name in r.possible for r in cleaned.regions)
         places, joints, possible = places + found, joints + right, possible + maybe
         if not right:
-            said = "; ".join(f"{r.joint or 'arm sensor'} {r.first}-{r.last}" for r in cleaned.regions)
+            said = "; ".join(
+                f"{r.joint or 'arm sensor'} {r.first}-{r.last}" for r in cleaned.regions
+            )
             misses.append(f"trial {trial}: {link}, {name} {region.start}-{region.stop - 1}, found"
                           f" {said or 'nothing'}, overlap {overlap:.2f}")  # fmt: skip
         truth = true_numbers(true, nominal, plain.names, clean)

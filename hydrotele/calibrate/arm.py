@@ -191,7 +191,9 @@ class Equations:
 
     def _error(self, s: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
         reach, link = np.hypot(s[:, 0], s[:, 1]), self.poses.link
-        error = np.stack([reach - numbers[f"p_xy.{link}"], s[:, 2] - numbers[f"p_z.{link}"]], axis=1)
+        error = np.stack(
+            [reach - numbers[f"p_xy.{link}"], s[:, 2] - numbers[f"p_z.{link}"]], axis=1
+        )
         return error - self.poses.drift.ball[:, :2] if self.poses.drift else error
 
     def residual(self, numbers: Mapping[str, float]) -> np.ndarray:
@@ -256,7 +258,9 @@ def start_numbers(loop: Loop, stages: Sequence[Poses]) -> Numbers:
         inward = [p for p in stages if loop.links.index(p.link) < k and link in p.manipulator]
         if inward:
             outermost = max(inward, key=lambda p: loop.links.index(p.link))
-            numbers[f"held.{link}"] = float(np.median(outermost.manipulator[link]) + loop.values[k, 0])
+            numbers[f"held.{link}"] = float(
+                np.median(outermost.manipulator[link]) + loop.values[k, 0]
+            )
     for poses in stages:
         blank = numbers | {f"p_xy.{poses.link}": 0.0, f"p_z.{poses.link}": 0.0}
         mean = Equations(loop, poses).residual(blank).mean(axis=0)
@@ -306,9 +310,7 @@ def identify_arm(
     return arm_fit(loop, numbers, start, names, covariance, found, "hierarchical")
 
 
-def what_is_told(
-    equations: Equations, numbers: Numbers, names: Sequence[str]
-) -> Identifiability:
+def what_is_told(equations: Equations, numbers: Numbers, names: Sequence[str]) -> Identifiability:
     """What the poses of a stage tell of its candidates, about the given numbers."""
     loop = equations.loop
     _, by, sensed = equations.at(numbers)
@@ -468,7 +470,9 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
             max_nfev=100,
         )  # fmt: skip
         if found.status <= 0:
-            raise InputError("joint identification", "does not converge; check the poses' residuals")
+            raise InputError(
+                "joint identification", "does not converge; check the poses' residuals"
+            )
         x = found.x * sizes
     matrix = jacobian(x / sizes).toarray() / sizes
     numbers = base | dict(zip(names, x.tolist(), strict=True))

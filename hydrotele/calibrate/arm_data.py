@@ -65,7 +65,9 @@ def stage_of(
     """
     of = log.metadata.get("machine", machine.name)
     if of != machine.name:
-        message = f"is a log of machine {of}, not of {machine.name}: name the machine with --machine"
+        message = (
+            f"is a log of machine {of}, not of {machine.name}: name the machine with --machine"
+        )
         raise InputError(log.source, message)
     rows = np.arange(len(log))
     if "valid" in log:

@@ -160,9 +160,7 @@ def _absorbed(rows: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> n
         square = np.sum(left**2, axis=1)
         near = square < _FAR * max(1.0, float(np.median(square)) / usual)
         matrix = scaled[near].reshape(-1, count)
-        move = np.linalg.solve(
-            np.eye(count) + matrix.T @ matrix, -matrix.T @ rows[near].ravel()
-        )
+        move = np.linalg.solve(np.eye(count) + matrix.T @ matrix, -matrix.T @ rows[near].ravel())
         left = rows + scaled @ move
     return left
 
@@ -325,9 +323,7 @@ def _settled(loop, poses, solve, found, total, false_alarm, names, own):
         found = solve(core, True)
     inside: list[Region] = []
     for _ in range(_ROUNDS):
-        fresh = find_regions(
-            loop, poses, found[1], total, false_alarm, Known(names, found[2])
-        )
+        fresh = find_regions(loop, poses, found[1], total, false_alarm, Known(names, found[2]))
         kept = _outside(fresh, len(poses))
         if [r[:3] for r in fresh] == [r[:3] for r in inside] or kept.mean() < 1.0 - _MOST:
             break
@@ -360,4 +356,3 @@ def predicted_readings(loop: Loop, poses: Poses, numbers: Numbers) -> np.ndarray
     found = misfit(loop, poses, numbers)
     length = np.maximum(np.sum(found.sensed**2, axis=1), 1.0e-12)
     return poses.theta - np.einsum("mes,me->ms", found.sensed, found.rows) / length
-

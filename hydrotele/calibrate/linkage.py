@@ -223,5 +223,7 @@ def identified_angles(fit: ArmFit, poses: Poses) -> np.ndarray:
     origin, turn = frame_of(fit.loop, equations.place, loop.home[None])
     ball = turn[0].T @ (fit.loop.ball - origin[0])
     angle = angle + np.arctan2(ball[1], ball[0])
-    angle = angle - 2.0 * np.pi * np.round((angle.mean() - loop.home[equations.place]) / (2 * np.pi))
+    angle = angle - 2.0 * np.pi * np.round(
+        (angle.mean() - loop.home[equations.place]) / (2 * np.pi)
+    )
     return (angle - loop.values[equations.place, 0]) * loop.signs[equations.place]

@@ -327,7 +327,7 @@ def _denavit_hartenberg(
 
 
 def _across(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x of the machine made perpendicular to a way (z where they are parallel), and the third."""
+    """X of the machine made perpendicular to a way (z where they are parallel), and the third."""
     x = np.array([1.0, 0.0, 0.0]) if abs(way[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = x - way * (way @ x)
     x /= np.linalg.norm(x)

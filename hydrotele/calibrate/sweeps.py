@@ -78,7 +78,9 @@ def sweep_poses(loop: Loop, link: str, sweep: Sweep, seed: int = 0) -> Clean:
     theta[:, moving] = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(2.0 * np.pi * u)
     pointing = _pointing(loop, theta)
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
-    wave = sum(np.sin(2.0 * np.pi * f * u + p) for f, p in zip((3.7, 7.3, 11.9), phases, strict=True))
+    wave = sum(
+        np.sin(2.0 * np.pi * f * u + p) for f, p in zip((3.7, 7.3, 11.9), phases, strict=True)
+    )
     theta[:, loop.moved] = pointing + np.radians(sweep.wander) * wave / 3.0 * 1.6
     theta, reached = calibrator_angles(loop, theta)
     good = theta[reached]

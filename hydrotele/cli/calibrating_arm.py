@@ -231,7 +231,9 @@ def _print_arm(said: Mapping[str, Any]) -> None:
 
 def _print_target(target: Path | None) -> None:
     if target:
-        out.print(f"written to [bold]{target}[/]; the calibrated machine is {target}/{MACHINE_FILE}")
+        out.print(
+            f"written to [bold]{target}[/]; the calibrated machine is {target}/{MACHINE_FILE}"
+        )
 
 
 def _write(target: Path, said: Mapping[str, Any], machine: Machine, report) -> None:
@@ -332,7 +334,9 @@ def _linkage_as_data(found: LinkageFit) -> dict[str, Any]:
 
 def _print_linkages(said: Mapping[str, Any]) -> None:
     for axis, found in said["axes"].items():
-        shown = table(f"{axis}: {said['angles']} angles", "parameter", "nominal", "identified", "+-")
+        shown = table(
+            f"{axis}: {said['angles']} angles", "parameter", "nominal", "identified", "+-"
+        )
         for row in found["parameters"]:
             scale = np.degrees(1.0) if row["unit"] == "rad" else 1.0
             wide = "held" if row["held"] else f"{1.96 * scale * row['standard_deviation']:.4f}"

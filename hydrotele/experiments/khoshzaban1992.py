@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.calibrate.arm import ArmFit, Equations, identify_arm
+from hydrotele.calibrate.arm import ArmFit, identify_arm
 from hydrotele.calibrate.arm_poses import Poses, with_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data, predicted_readings
 from hydrotele.calibrate.linkage import Strokes, identified_angles, identify_linkage
@@ -76,7 +76,9 @@ class Case(NamedTuple):
     def largest(self, unit: str) -> tuple[str, float]:
         """Name and RMS over the seeds of the largest error among lengths or angles."""
         rms = np.sqrt(np.mean(self.errors**2, axis=0))
-        best = max((k for k, n in enumerate(self.names) if unit_of(n) == unit), key=lambda k: rms[k])
+        best = max(
+            (k for k, n in enumerate(self.names) if unit_of(n) == unit), key=lambda k: rms[k]
+        )
         return self.names[best], float(rms[best])
 
     def rms(self, name: str) -> float:
@@ -221,7 +223,8 @@ def chain(loop: Loop) -> Finding:
     ours += [(math.degrees(v[1]), v[2], v[3], math.degrees(v[4])) for v in loop.values]
     worst = float(np.abs(np.array(ours) - np.array(TABLE_2)).max())
     return Finding(
-        "Denavit-Hartenberg parameters of machine and calibrator", "Table 2, Fig. 15",
+        "Denavit-Hartenberg parameters of machine and calibrator",
+        "Table 2, Fig. 15",
         "36 numbers of nine frames, among them a2 = 5.180, d5 = 1.134, d7 = 2.994, a8 = 3.505 m",
         f"links and joint axes of the MuJoCo model give the same within {worst:.1e} (m, deg)"
         " (agrees to the last printed digit)",
@@ -237,7 +240,8 @@ def identifiable_lists(loop: Loop) -> Finding:
     ours = {s.link: {n for n in s.names if not n.startswith("p_")} for s in fit.stages}
     same = [link for link in LISTS if ours[link] == LISTS[link]]
     return Finding(
-        "identifiable parameters of each stage", "section 3.6.4",
+        "identifiable parameters of each stage",
+        "section 3.6.4",
         "link 4: offsets of joints 5 to 7, alpha, a, d of link 5, alpha, a of link 4; links 3 and 2:"
         " the held angle outside, alpha, a, beta; link 1: theta_fix 2, d2, alpha 1, a1; besides the"
         " ball's p_xy and p_z",
@@ -361,7 +365,8 @@ def accuracy_halved(loop: Loop, cases: Mapping[str, Case], seeds: int) -> Findin
     most = 100.0 * float(np.abs(half.errors[:, column]).max()) / 0.340
     both = 100.0 * cases["sensor"].rms("a.swing") / 0.340
     return Finding(
-        "relative error of a1", "section 3.7.2",
+        "relative error of a1",
+        "section 3.7.2",
         "at most 2.5 % with sensors within 0.05 deg; about 10 % with drift and 0.1 deg",
         f"largest of {seeds} seeds {most:.1f} % with 0.05 deg and no drift; RMS {both:.0f} % with"
         " both (agrees if the first is at most 2.5 % and the second 5 to 20 %)",
@@ -394,7 +399,8 @@ def usual_errors(cases: Mapping[str, Case]) -> Finding:
     share = {n: 100.0 * cases["sensor"].rms(n) / size for n, size in nominal.items()}
     small = sum(value < 5.0 for value in share.values())
     return Finding(
-        "errors with resolvers of 0.1 deg", "section 5.1",
+        "errors with resolvers of 0.1 deg",
+        "section 5.1",
         "errors in the identified parameters are usually less than 5 %",
         ", ".join(f"{n} {v:.1f} %" for n, v in share.items())
         + f": {small} of {len(share)} (agrees if most are below 5 %)",
@@ -418,7 +424,8 @@ def start_does_not_matter(loop: Loop) -> Finding:
         fit = identify_arm(loop.with_values(changed), stages, weighted=False, chosen=chosen)
         worst = max(worst, float(np.abs(fit.values - first.values).max()))
     return Finding(
-        "first estimates", "sections 3.8.1 and 5.1",
+        "first estimates",
+        "sections 3.8.1 and 5.1",
         "a number of different initial conditions always ended up with the same results",
         f"ten starts within 0.2 m and 10 deg of nominal end within {worst:.1e} (m, rad) of each other"
         " (agrees below 1e-6)",
@@ -522,7 +529,8 @@ def _models(
                     "stick": (both[0] - true[0])[:, k], "grapple": (both[1] - true[1])[:, k]}, "pose"))  # fmt: skip
     one, two = rms["identified"], rms["re-identified"]
     ends = Finding(
-        "end points without the bad data", "Tables 7 and 9, Figs 22 to 25, section 3.8.2",
+        "end points without the bad data",
+        "Tables 7 and 9, Figs 22 to 25, section 3.8.2",
         "RMS against the nominal model falls from 0.212 to 0.153 m at the stick's end and from 0.256"
         " to 0.205 m at the grapple's",
         f"from {1e3 * one[0]:.0f} to {1e3 * two[0]:.0f} mm and from {1e3 * one[1]:.0f} to"
@@ -533,7 +541,8 @@ def _models(
     )
     (a, b), (c, d) = distance["identified"], distance["re-identified"]
     table = Finding(
-        "distances to the task frame", "Tables 8 and 10, Fig. 19",
+        "distances to the task frame",
+        "Tables 8 and 10, Fig. 19",
         "manipulator side: identified 0.162 and 0.217 m (VAF 98.32, 98.69 %), re-identified 0.101"
         " and 0.125 m (98.87, 99.07 %) for stick and grapple",
         f"identified {a[0]:.3f} and {b[0]:.3f} m ({a[1]:.2f}, {b[1]:.2f} %), re-identified"
@@ -575,7 +584,8 @@ def minor_links(machine: Machine, loop: Loop, cases: Mapping[str, Case]) -> tupl
         for axis, found in rows.items()
     }
     measured = Finding(
-        "cylinder linkages from measured angles", "Tables 11 and 12, section 3.8.3",
+        "cylinder linkages from measured angles",
+        "Tables 11 and 12, section 3.8.3",
         "RMS 0.4 mm and VAF 99.99 % for the boom, 2 mm and 99.98 % for the stick",
         f"boom {words['boom']['measured']}, stick {words['stick']['measured']} against readings with"
         " errors within 2 mm (agrees if RMS is below 2 mm and VAF above 99.9 %)",
@@ -583,7 +593,8 @@ def minor_links(machine: Machine, loop: Loop, cases: Mapping[str, Case]) -> tupl
         tuple(panels),
     )
     computed = Finding(
-        "cylinder linkages from identified angles", "Tables 11 and 12, section 3.8.3",
+        "cylinder linkages from identified angles",
+        "Tables 11 and 12, section 3.8.3",
         "worse than from measured angles: 3 mm, 99.91 % (boom) and 27 mm, 97.12 % (stick), with the"
         " longer pin distance held",
         f"boom {words['boom']['identified']}, stick {words['stick']['identified']}, l_u of the boom"
@@ -601,7 +612,8 @@ def pressure_errors(machine: Machine) -> Finding:
         errors[name] = 25.0 * PSI * (areas[0] + areas[1])
     wanted = {"swing": 1400.0, "boom": 5700.0, "stick": 4200.0}
     return Finding(
-        "error of torque and force from pressures within 25 psi", "section 4.4.3, Eq. 4.61",
+        "error of torque and force from pressures within 25 psi",
+        "section 4.4.3, Eq. 4.61",
         "about 1400 N m (swing), 5700 N (boom), 4200 N (stick)",
         f"{errors['swing']:.0f} N m, {errors['boom']:.0f} N, {errors['stick']:.0f} N from the"
         " machine's areas and Cq times the gear ratio (agrees within 3 %)",

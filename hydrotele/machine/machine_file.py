@@ -147,7 +147,11 @@ def _extended(data: dict, path: Path, lines) -> tuple[dict, list[dict]]:
     """
     base = data.pop("extends")
     where = _place(path, lines, "extends")
-    if not isinstance(base, dict) or not base.keys() <= {"machine", "tool"} or "machine" not in base:
+    if (
+        not isinstance(base, dict)
+        or not base.keys() <= {"machine", "tool"}
+        or "machine" not in base
+    ):
         raise InputError(where, "must say {machine: NAME or FOLDER, tool: NAME}")
     name = str(base["machine"])
     beside = path.parent / name

@@ -84,8 +84,10 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
         rows = []
         for name, nominal, value in zip(NAMES, found.nominal, values_of(found), strict=True):
             scale, unit = (np.degrees(1.0), "deg") if name == "theta_off" else (1e3, "mm")
-            wide = (f"{1.96 * scale * deviations[name]:.2f} {unit}" if name in deviations else "held")
-            rows.append((name, f"{scale * nominal:.2f} {unit}", f"{scale * value:.2f} {unit}", wide))
+            wide = f"{1.96 * scale * deviations[name]:.2f} {unit}" if name in deviations else "held"
+            rows.append(
+                (name, f"{scale * nominal:.2f} {unit}", f"{scale * value:.2f} {unit}", wide)
+            )
         said = (f"RMS {1e3 * found.rms:.2f} mm, VAF {found.vaf:.3f} % on samples that were not"
                 f" fitted; {found.angles} angles.")  # fmt: skip
         sections.append(Section(found.axis, said, ("parameter", "nominal", "identified", "+-"),

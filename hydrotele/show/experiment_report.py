@@ -9,10 +9,6 @@ from hydrotele.show import report_html
 from hydrotele.show.calibration_figures import corner
 from hydrotele.show.report_html import drawing, png
 
-_ABOUT = {
-    "zhu1994": "A simulated operator repeats what a person did on the machines; every row says what"
-    " the source reports and what is seen here.",
-}
 _COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0", "#a33b3b", "#5b6670")
 _MOST = 4000  # points of a curve: more are not seen
 
@@ -27,7 +23,6 @@ def write_experiment_report(name: str, findings: Sequence[Finding], path: Path) 
     """
     report_html.write_report(
         "experiments", path, title=f"experiments {name}", version=hydrotele.__version__, name=name,
-        about=_ABOUT.get(name, "Every row says what the source reports and what is seen here."),
         same=sum(one.ok for one in findings), findings=findings,
         curves=[(one, draw_panels(one.panels)) for one in findings if one.panels],
         posteriors=[(one, _corner(one)) for one in findings if one.marginals],

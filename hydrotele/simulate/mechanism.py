@@ -275,7 +275,9 @@ def _attach(tree: Element, body: str, file: Path) -> None:
     place = next((element for element in tree.iter("body") if element.get("name") == body), None)
     world = read_xml(file).find("worldbody")
     if place is None or world is None:
-        raise InputError(file, f"cannot hang on {body!r}: no such body, or no worldbody in the file")
+        raise InputError(
+            file, f"cannot hang on {body!r}: no such body, or no worldbody in the file"
+        )
     place.extend(world.findall("body"))
 
 
