@@ -166,6 +166,9 @@ def make_trial(place: Place, series: WorldSeries) -> None:
     number, kinds = series.names().index(place.trial), series.kinds()
     kind = kinds[number]
     turn, redrawn = kinds[:number].count(kind), []
+    if kind == "near":  # few trials of a series, but over many series all forms
+        order = np.random.default_rng([series.seed, 2]).permutation(len(FORMS))
+        turn = int(order[turn % len(order)]) + len(order) * (turn // len(order))
     while True:
         rng = np.random.default_rng([series.seed, 1, number, len(redrawn)])
         try:
