@@ -35,7 +35,7 @@ hypothesis.settings.load_profile("hydrotele")
 LONG = (
     "scenario/test_scenario.py", "envs/test_gymnasium.py", "gap/test_find.py",
     "envs/test_render.py", "cli/test_cli.py", "effects/test_library.py", "gap/test_discover.py",
-    "teleop/test_station.py", "sweep/test_processes.py", "experiments/test_zhu1994.py",
+    "teleop/test_station.py", "run/test_sweep_processes.py", "experiments/test_zhu1994.py",
     "models/test_machines.py",
 )  # fmt: skip
 
