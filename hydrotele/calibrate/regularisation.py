@@ -13,7 +13,6 @@ import numpy as np
 
 _SMALLEST = 1e-7  # of a size, over its start: a kind that is not there
 _LARGEST = 1e3
-_ROUNDING = 1e-14
 _ROUNDS, _SETTLED = 200, 1e-4
 
 
@@ -61,24 +60,24 @@ def estimate_sizes(
 
     Source: MacKay 1992, Bayesian interpolation; Tipping 2001 (sizes that vanish).
     """
-    normal, right = matrix.T @ matrix, matrix.T @ rest
-    square = float(rest @ rest)
-    extra, extra_right = np.zeros_like(normal), np.zeros_like(right)
-    if known is not None and known_rest is not None:
-        extra, extra_right = known.T @ known, known.T @ known_rest
+    basis, triangle = np.linalg.qr(matrix)
+    inside = basis.T @ rest
+    outside = float(np.sum((rest - basis @ inside) ** 2))
+    if known is None or known_rest is None:
+        known, known_rest = np.empty((0, matrix.shape[1])), np.empty(0)
     std = np.array(start, float)
     groups = {kind: np.flatnonzero([k == kind for k in kinds]) for kind in set(kinds) - {""}}
     decided = np.zeros(len(std))
     for rounds in range(1, _ROUNDS + 1):  # noqa: B007 - reported
-        # In units of the sizes, so that a vanishing one does no harm.
-        scaled = (normal / noise**2 + extra) * np.outer(std, std) + np.eye(len(std))
-        inverse = np.linalg.inv(scaled)
-        value = std * (inverse @ (std * (right / noise**2 + extra_right)))
-        decided = 1.0 - np.diag(inverse)
-        error = square - 2.0 * value @ right + value @ normal @ value
-        error = max(error, _ROUNDING * square)  # a difference of squares
+        # In units of sizes and noise; singular values, so that a small noise loses no digits.
+        scaled = np.vstack([triangle / noise, known]) * std
+        wanted = np.concatenate([inside / noise, known_rest])
+        u, s, v = np.linalg.svd(scaled, full_matrices=False)
+        value = std * (v.T @ (s / (1.0 + s**2) * (u.T @ wanted)))
+        decided = (s**2 / (1.0 + s**2)) @ v**2
+        error = float(np.sum((inside - triangle @ value) ** 2)) + outside
         before = np.append(std, noise)
-        noise = max(float(np.sqrt(error / max(freedom - decided.sum(), 1.0))), finest)
+        noise = max(float(np.sqrt(max(error, 1e-300) / max(freedom - decided.sum(), 1.0))), finest)
         for places in groups.values():
             share = decided[places].sum()
             size = np.sqrt(np.sum(value[places] ** 2) / share) if share > 0.0 else 0.0

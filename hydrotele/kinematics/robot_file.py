@@ -20,7 +20,7 @@ from hydrotele.kinematics.serial_robot import GRAVITY, Robot, RobotJoint, frame,
 ROBOTS = "robots"
 """Folder of the shipped robots, inside the one of the models."""
 
-_BALLS = ("ball", "tcp", "tool", "tip", "ee", "end_effector", "flange", "hand")
+_BALLS = ("calibrated_ball", "ball", "tcp", "tool", "tip", "ee", "end_effector", "flange", "hand")
 _MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
 
