@@ -23,6 +23,8 @@ OURS = {
         "patched/machine.*", "patched/machine_assets/*", "patched/effects.yaml",
     ),
     "compare": ("compare.json", "*.png"),
+    "robot calibration": ("calibration.json", "report.html", "*.png", "calibrated.yaml",
+                          "calibrated.urdf"),
     "identify": ("identify.json", "report.html", "identified/machine.*",
                  "identified/machine_assets/*"),
     "experiments": ("experiments.json", "table.md", "report.html"),
