@@ -15,6 +15,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from hydrotele.calibrate.estimation import Prior
 from hydrotele.calibrate.hybrid import (
     Calibration,
     Equations,
@@ -249,9 +250,11 @@ def parameters_54(steps: int) -> list[Finding]:
     eq = equations(one.model, one.measurement)
     told = redundancy(eq)
     scales = eq.scales
+    prior = Prior(np.zeros(54), scales)
+    fit = calibrate(load_hybrid("iwr"), one.measurement, "dh", prior=prior).fit
     sample = sample_posterior(
-        lambda x: -eq.misfit(x) - 0.5 * np.sum((x / scales) ** 2, axis=1), np.zeros(54),
-        _gaussian(eq, np.zeros(54)), eq.names, steps=steps, burn=steps // 4, seed=_SEED,
+        lambda x: -eq.misfit(x) - 0.5 * np.sum((x / scales) ** 2, axis=1), fit.values,
+        fit.covariance, eq.names, steps=steps, burn=1000, walkers=110, seed=_SEED,
     )  # fmt: skip
     scaled = sample.flat / scales
     size, vectors = np.linalg.eigh(np.cov(scaled, rowvar=False))
@@ -312,13 +315,6 @@ def _angle(inner: np.ndarray, outer: np.ndarray) -> float:
         return 90.0
     overlap = np.linalg.svd(inner @ outer, compute_uv=False)
     return float(np.degrees(np.arccos(np.clip(overlap.min(), 0.0, 1.0))))
-
-
-def _gaussian(eq: Equations, at: np.ndarray) -> np.ndarray:
-    """Covariance of a normal posterior with prior standard deviations of the parameters' sizes."""
-    matrix = eq.jacobian(at) * eq.scales
-    inner = np.linalg.inv(matrix.T @ matrix + np.eye(len(at)))
-    return inner * np.outer(eq.scales, eq.scales)
 
 
 def _without_tilt() -> tuple[int, int]:
@@ -607,7 +603,7 @@ def wang2012(
         The findings, in the order of the thesis.
     """
     tasks: list[tuple[Callable, tuple]] = [
-        (kinematics, ()), (parameters_54, (steps,)), (refined_exact, ()),
+        (kinematics, ()), (parameters_54, (5 * steps // 4,)), (refined_exact, ()),
         (refined_noisy, (steps,)), (poe_poses, ()), (wire_method, ()), (wire_calibration, ()),
     ]  # fmt: skip
     single = len(tasks)
