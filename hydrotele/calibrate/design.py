@@ -17,7 +17,7 @@ from hydrotele.calibrate.loop import Loop, link_chain
 from hydrotele.calibrate.sweeps import STILL, sweep_poses
 from hydrotele.kinematics.serial_chain import forward_and_rates
 
-ARMS = np.linspace(2.0, 4.4, 7)
+ARMS = np.linspace(2.0, 4.8, 8)
 """Lengths of the calibrator's arm that are looked at [m]."""
 
 FOREARMS = np.linspace(2.4, 4.8, 7)

@@ -193,7 +193,7 @@ def test_unusable_data_say_why(clean):
     other = dataclasses.replace(other, metadata={"machine": "ec20"})
     with pytest.raises(InputError, match="is a log of machine ec20"):
         stage_of(other, MACHINE, LOOP)
-    with pytest.raises(InputError, match="moves like"):
+    with pytest.raises(InputError, match="keep one of them"):
         identify_arm(LOOP, [stages[0], stages[0]])
     still = Strokes("boom", np.full(50, 0.3), np.full(50, 0.4), 1e-3, 1e-3)
     with pytest.raises(InputError, match="l_l, l_c and l_u stay unknown"):
