@@ -20,7 +20,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import Identifiability
 
 SIZES = {"m": 0.1, "rad": np.radians(5.0)}
-"""How far a parameter may be from its nominal value, by unit: what a tape and a protractor leave."""
+"""How far a parameter may be from nominal, by unit: what a tape and a protractor leave."""
 
 LABORATORY = {"m": 1.0e-3, "rad": np.radians(0.05)}
 """The same of the calibrator's own links, which were measured in a laboratory (K 3.6.4)."""
@@ -408,6 +408,7 @@ def _reason(told: Identifiability, name: str, loop: Loop) -> str:
 
 
 def arm_fit(loop, numbers, start, names, covariance, stages, method) -> ArmFit:
+    """The fit of identified numbers, with the ball's place where the first link told it."""
     values = {name: numbers[name] for name in loop.names}
     calibrated = loop.with_values(values)
     first = loop.links[0]

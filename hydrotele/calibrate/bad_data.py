@@ -289,7 +289,8 @@ def identify_without_bad_data(
         told = what_is_told(Equations(loop, poses), at, wanted)
         own = [told.names[k] for k in sorted(told.base)]
 
-        def solve(kept, near, numbers=numbers, poses=poses, own=own, told=told, wanted=wanted):
+        def solve(kept, near, numbers=numbers, poses=poses, own=own, told=told,
+                  wanted=wanted, names=names, covariance=covariance):  # fmt: skip
             return identify_stage(
                 Equations(loop, poses.only(kept)), numbers, own, names, covariance, told, wanted,
                 near=near,

@@ -264,6 +264,47 @@ def told_in_words(told: Identifiability) -> dict[str, list[str]]:
 
 
 @dataclass(frozen=True)
+class Combination:
+    """What the data tell of parameters: one by itself, or some together.
+
+    Attributes:
+        text: the combination written out, such as `a + 2 b`.
+        value: estimated.
+        std: its standard deviation.
+        low: end of the 95 % interval.
+        high: its other end.
+    """
+
+    text: str
+    value: float
+    std: float
+    low: float
+    high: float
+
+
+def told_combinations(fit: ParameterFit) -> tuple[Combination, ...]:
+    """Everything that the data tell, with intervals.
+
+    A parameter that is told with others only has no interval of its own: how a combination is split
+    follows from the prior, or from which parameters were held.
+
+    Args:
+        fit: the fit.
+
+    Returns:
+        One combination per direction that is told.
+    """
+    order = [fit.names.index(name) for name in fit.told.names]
+    values, covariance = fit.values[order], fit.covariance[np.ix_(order, order)]
+    made = []
+    for row, weights in enumerate(fit.told.combination):
+        value, std = float(weights @ values), float(np.sqrt(weights @ covariance @ weights))
+        reach = fit.critical * std
+        made.append(Combination(fit.told.text(row), value, std, value - reach, value + reach))
+    return tuple(made)
+
+
+@dataclass(frozen=True)
 class _Searched:
     """Where a search ended."""
 
@@ -416,7 +457,7 @@ def _trust_region(search: _Search, begin: _Searched, most: int) -> _Searched:
     found = scipy.optimize.least_squares(
         lambda u: search.rows(search.full(base, u)), np.zeros(len(search.free)),
         jac=lambda u: search.matrix(problem.matrix(search.full(base, u))),  # type: ignore
-        ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=most,
+        method="lm", ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=10 * most,
     )  # fmt: skip
     good = found.status > 0
     said = "converged" if good else f"not converged after {most} steps: increase max_iterations"

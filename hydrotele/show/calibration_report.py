@@ -49,8 +49,9 @@ def write_arm_report(
     if regions:
         found = [(r.link, f"{r.first} to {r.last}", r.joint or "the arm's own sensor",
                   f"{np.degrees(r.size):.2f} deg") for r in regions]  # fmt: skip
-        parts.append(section("Corrupted readings", "Left out where a calibrator's joint is to blame.",
-                             table(("moving link", "poses", "joint", "RMS error"), found)))  # fmt: skip
+        parts.append(section("Corrupted readings", "Left out where the calibrator is to blame.",
+                             table(("moving link", "poses", "joint", "RMS error"), found)
+                             ))  # fmt: skip
     parts.append(section("Residuals", "In units of the sensors' errors.", tag(
         "figure", picture(draw_residuals(fit, stages), "residuals"))))  # fmt: skip
     path.write_text(page("calibrate arm", STYLE, parts), encoding="utf-8")

@@ -92,7 +92,9 @@ def defective(machine: Machine, truth: Mapping[str, np.ndarray]) -> dict[str, np
     """
     errors = machine.sensor_errors
     return {
-        c: errors[c].scale * _through_coupling(errors[c], v) + errors[c].offset if c in errors else v
+        c: errors[c].scale * _through_coupling(errors[c], v) + errors[c].offset
+        if c in errors
+        else v
         for c, v in truth.items()
     }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The arm behind a calibrator: chain, identification, bad data, linkages, the calibrated machine."""
+"""Arm behind a calibrator: chain, identification, bad data, linkages, calibrated machine."""
 
 import dataclasses
 

@@ -1,0 +1,253 @@
+"""Link lengths and joint offsets of a planar two-joint arm from measured positions of its end.
+
+The example by which Wang explains calibration: error model, measurement, least squares, corrected
+model. Equation 2 has the two length errors; joint offsets are added where they predict positions
+better that they were not fitted to.
+
+Source: Wang 2012, section 1.1, Eqs 1-3.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hydrotele.calibrate.estimation import ParameterFit, least_squares
+from hydrotele.calibrate.poses import Selection, leave_one_out, select_poses
+from hydrotele.core.datafile import Facts, Positive, parse, read_yaml
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_text
+from hydrotele.kinematics.serial_chain import Element, SerialChain, forward, forward_and_rates
+
+MEASURED, NOMINAL = "measured.csv", "nominal.yaml"
+COLUMNS = ("theta", "phi", "u", "v")
+_SCALES = {"length": 1e-3, "offset": 1e-3}  # m and rad: usual tolerances
+_TURN = 2.0 * np.pi + 0.2  # rad
+
+
+class ScaraFacts(Facts):
+    """Nominal lengths of the links [m]."""
+
+    length_a: Positive
+    length_b: Positive
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Measured poses.
+
+    Attributes:
+        joints: (n, 2) theta of the first and phi of the second joint [rad].
+        ends: (n, 2) measured u, v [m].
+    """
+
+    joints: np.ndarray
+    ends: np.ndarray
+
+
+@dataclass(frozen=True)
+class ScaraCalibration:
+    """A calibrated arm.
+
+    Attributes:
+        fit: of length errors and, with them, joint offsets.
+        offsets: whether joint offsets were fitted.
+        rivals: model -> RMS distance [m] of poses predicted without having been fitted.
+        nominal_rms: of the nominal arm [m].
+        heldout_rms: of the poses of `heldout`, or of every pose left out in turn [m].
+    """
+
+    fit: ParameterFit
+    offsets: bool
+    rivals: dict[str, float]
+    nominal_rms: float
+    heldout_rms: float
+
+
+def scara_chain(nominal: ScaraFacts) -> SerialChain:
+    """The arm of Eq. 2 with the offsets of both joints."""
+    return SerialChain(
+        ("theta", "phi"),
+        (
+            Element("rz", "offset.theta", 0.0, 0),
+            Element("tx", "length.a", nominal.length_a),
+            Element("rz", "offset.phi", 0.0, 1),
+            Element("tx", "length.b", nominal.length_b),
+        ),
+    )
+
+
+def load_scara(folder: Path) -> tuple[ScaraFacts, Positions]:
+    """Read nominal lengths and measured poses.
+
+    Args:
+        folder: with `nominal.yaml` and `measured.csv` (theta, phi [rad], u, v [m], with a head).
+
+    Returns:
+        The lengths and the poses.
+
+    Raises:
+        InputError: names file, row and column of what is not usable.
+    """
+    data, lines = read_yaml(folder / NOMINAL)
+    nominal = parse(ScaraFacts, data, str(folder / NOMINAL), lines)
+    path = folder / MEASURED
+    rows = [line.split(",") for line in read_text(path).splitlines() if line.strip()]
+    if not rows or tuple(word.strip() for word in rows[0]) != COLUMNS:
+        raise InputError(path, f"the first row must be {','.join(COLUMNS)}")
+    values = []
+    for number, words in enumerate(rows[1:], start=2):
+        if len(words) != len(COLUMNS):
+            raise InputError(f"{path}: row {number}", f"has {len(words)} columns, must have 4")
+        for name, word in zip(COLUMNS, words, strict=True):
+            try:
+                good = np.isfinite(float(word))
+            except ValueError:
+                good = False
+            if not good:
+                raise InputError(
+                    f"{path}: row {number}, column {name}", f"{word!r} is no finite number"
+                )
+        values.append([float(word) for word in words])
+    if len(values) < 4:
+        raise InputError(path, f"has {len(values)} poses; measure 4 different ones at least")
+    table = np.array(values)
+    if np.abs(table[:, :2]).max() > _TURN:
+        raise InputError(path, "angles beyond a turn: they must be in rad, positions in m")
+    reach = 1.5 * (nominal.length_a + nominal.length_b)
+    if np.abs(table[:, 2:]).max() > reach:
+        raise InputError(path, f"positions beyond the arm's reach of {reach / 1.5:g} m: in mm?")
+    return nominal, Positions(table[:, :2], table[:, 2:])
+
+
+def calibrate_scara(
+    nominal: ScaraFacts, measured: Positions, heldout: Sequence[int] = ()
+) -> ScaraCalibration:
+    """Fit the arm by least squares on the squared distances of Eq. 3.
+
+    Args:
+        nominal: lengths.
+        measured: poses.
+        heldout: places of poses to judge on, not fitted; none to leave every pose out in turn.
+
+    Returns:
+        The calibration.
+
+    Raises:
+        InputError: the poses tell nothing.
+    """
+    chain = scara_chain(nominal)
+    everything = range(len(measured.joints))
+    fitted = [k for k in everything if k not in set(heldout)]
+
+    def judge(fit: ParameterFit, poses: Sequence[int]) -> float:
+        values = chain.nominal.copy()
+        for name, value in zip(fit.names, fit.values, strict=True):
+            values[chain.parameters.index(name)] = value
+        return _rms(chain, measured, poses, values)
+
+    rivals, whole = {}, {}
+    for model in ("lengths", "lengths and offsets"):
+        whole[model] = fit_scara(chain, measured, fitted, model != "lengths")
+        errors = leave_one_out(
+            fitted,
+            lambda rest, model=model: fit_scara(chain, measured, rest, model != "lengths"),
+            lambda fit, one: judge(fit, [one]),
+        )
+        rivals[model] = float(np.sqrt(np.mean(np.square(list(errors.values())))))
+    best = min(rivals, key=lambda model: rivals[model])
+    left = judge(whole[best], list(heldout)) if len(heldout) else rivals[best]
+    before = _rms(chain, measured, list(heldout) or list(everything), chain.nominal)
+    return ScaraCalibration(whole[best], best != "lengths", rivals, before, left)
+
+
+def fit_scara(
+    chain: SerialChain, measured: Positions, poses: Sequence[int], offsets: bool
+) -> ParameterFit:
+    """Fit lengths, or lengths and offsets, to some poses.
+
+    Args:
+        chain: of the nominal arm.
+        measured: poses.
+        poses: places of those to fit.
+        offsets: whether joint offsets are fitted, too.
+
+    Returns:
+        The fit.
+
+    Raises:
+        InputError: the poses tell nothing, or there are too few.
+    """
+    names = [n for n in chain.parameters if offsets or n.startswith("length")]
+    places = [chain.parameters.index(name) for name in names]
+    joints, ends = measured.joints[list(poses)], measured.ends[list(poses)]
+
+    def whole(x: np.ndarray) -> np.ndarray:
+        values = chain.nominal.copy()
+        values[places] = x
+        return values
+
+    return least_squares(
+        lambda x: (forward(chain, joints, whole(x)).position[:, :2] - ends).ravel(),
+        chain.nominal[places], names, _scales(names),
+        jac=lambda x: forward_and_rates(chain, joints, whole(x))
+        .position_by_parameter[:, :2][:, :, places].reshape(-1, len(places)),
+    )  # fmt: skip
+
+
+def best_poses(nominal: ScaraFacts, measured: Positions, count: int) -> Selection:
+    """The poses whose measurements tell lengths and offsets best (D-optimal).
+
+    Args:
+        nominal: lengths.
+        measured: candidates.
+        count: how many to choose.
+
+    Returns:
+        Their places.
+    """
+    chain = scara_chain(nominal)
+    rates = forward_and_rates(chain, measured.joints).position_by_parameter[:, :2]
+    return select_poses(rates * _scales(chain.parameters), count)
+
+
+def simulated_scara(
+    nominal: ScaraFacts, errors: Sequence[float], poses: int, noise: float, seed: int
+) -> Positions:
+    """Measured poses of an arm with errors.
+
+    Args:
+        nominal: lengths.
+        errors: (4,) of theta's offset [rad], a [m], phi's offset [rad], b [m].
+        poses: number of them.
+        noise: standard deviation of u and v [m].
+        seed: of poses and noise.
+
+    Returns:
+        The poses.
+    """
+    rng = np.random.default_rng(seed)
+    chain = scara_chain(nominal)
+    joints = np.column_stack([rng.uniform(-1.5, 1.5, poses), rng.uniform(0.3, 2.4, poses)])
+    ends = forward(chain, joints, chain.nominal + np.asarray(errors)).position[:, :2]
+    return Positions(joints, ends + noise * rng.standard_normal(ends.shape))
+
+
+def save_scara(folder: Path, nominal: ScaraFacts, measured: Positions) -> None:
+    """Write `nominal.yaml` and `measured.csv`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = f"length_a: {nominal.length_a!r}\nlength_b: {nominal.length_b!r}\n"
+    (folder / NOMINAL).write_text(text, encoding="utf-8")
+    table = np.column_stack([measured.joints, measured.ends])
+    np.savetxt(folder / MEASURED, table, delimiter=",", header=",".join(COLUMNS), comments="",
+               fmt="%.9f")  # fmt: skip
+
+
+def _scales(names: Sequence[str]) -> np.ndarray:
+    return np.array([_SCALES[name.partition(".")[0]] for name in names])
+
+
+def _rms(chain, measured: Positions, poses: Sequence[int], values: np.ndarray) -> float:
+    ends = forward(chain, measured.joints[list(poses)], values).position[:, :2]
+    return float(np.sqrt(np.mean(np.sum((ends - measured.ends[list(poses)]) ** 2, axis=1))))

@@ -1,0 +1,143 @@
+"""Serial robots: files in three formats agree, corrections survive writing, resolved motion."""
+
+import numpy as np
+import pytest
+
+from hydrotele.core.errors import InputError
+from hydrotele.kinematics.robot_file import (
+    corrected_urdf,
+    load_robot,
+    robot_yaml,
+    shipped_robots,
+)
+from hydrotele.kinematics.serial_chain import forward
+from hydrotele.kinematics.serial_robot import (
+    corrected_robot,
+    deflection_names,
+    deflections,
+    frame,
+    joints_for_places,
+    robot_chain,
+    robot_poses,
+    rpy_of,
+)
+
+URDF = """<robot name="two">
+  <link name="world"/><link name="base"/><link name="arm"/><link name="hand"/><link name="ball"/>
+  <link name="finger"/>
+  <joint name="mount" type="fixed"><parent link="world"/><child link="base"/>
+    <origin xyz="0 0 0.1" rpy="0 0 0.3"/></joint>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/>
+    <origin xyz="0 0 0.2" rpy="0.4 0 0"/><axis xyz="0 1 0"/></joint>
+  <joint name="push" type="prismatic"><parent link="arm"/><child link="hand"/>
+    <origin xyz="0.3 0 0" rpy="0 0.2 0"/><axis xyz="1 1 0"/></joint>
+  <joint name="tool" type="fixed"><parent link="hand"/><child link="ball"/>
+    <origin xyz="0.05 0 0.02"/></joint>
+  <joint name="grip" type="prismatic"><parent link="hand"/><child link="finger"/>
+    <origin xyz="0 0 0"/><axis xyz="0 0 1"/></joint>
+</robot>
+"""
+MJCF = """<mujoco><compiler angle="radian"/><worldbody>
+  <body pos="0 0 0.1" euler="0 0 0.3"><body pos="0 0 0.2" euler="0.4 0 0">
+    <joint name="turn" axis="0 1 0"/><geom size="0.1"/>
+    <body pos="0.3 0 0" euler="0 0.2 0"><joint name="push" type="slide" axis="1 1 0"/>
+      <geom size="0.1"/><site name="ball" pos="0.05 0 0.02"/></body></body></body>
+</worldbody></mujoco>
+"""
+Q = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 2))
+
+
+@pytest.fixture
+def files(tmp_path):
+    (tmp_path / "two.urdf").write_text(URDF)
+    (tmp_path / "two.xml").write_text(MJCF)
+    return tmp_path
+
+
+def by_hand(q):
+    turn = np.eye(4)
+    turn[:3, :3] = frame((0, 0, 0), (0, q[0], 0))[:3, :3]
+    slide = frame(q[1] * np.array([1, 1, 0]) / 2**0.5)
+    parts = [frame((0, 0, 0.1), (0, 0, 0.3)), frame((0, 0, 0.2), (0.4, 0, 0)), turn,
+             frame((0.3, 0, 0), (0, 0.2, 0)), slide, frame((0.05, 0, 0.02))]  # fmt: skip
+    return np.linalg.multi_dot(parts)[:3, 3]
+
+
+@pytest.mark.parametrize("name", ["two.urdf", "two.xml"])
+def test_urdf_and_mjcf_are_the_same_chain(files, name):
+    robot = load_robot(files / name, 2)
+    assert robot.names == ("turn", "push")
+    expected = [by_hand(q) for q in Q]
+    np.testing.assert_allclose(robot_poses(robot, Q).position, expected, atol=1e-12)
+
+
+def test_corrections_are_the_chain_with_errors_and_survive_files(files):
+    robot = load_robot(files / "two.urdf", 2)
+    chain = robot_chain(robot)
+    values = chain.nominal + np.random.default_rng(1).normal(0.0, 0.01, len(chain.nominal))
+    expected = forward(chain, Q, values).position
+    made = corrected_robot(robot, dict(zip(chain.parameters, values, strict=True)), {})
+    np.testing.assert_allclose(robot_poses(made, Q).position, expected, atol=1e-12)
+    (files / "new.yaml").write_text(robot_yaml(made, "test"))
+    (files / "new.urdf").write_text(corrected_urdf(made, URDF))
+    for name in ("new.yaml", "new.urdf"):
+        again = load_robot(files / name, 2)
+        np.testing.assert_allclose(robot_poses(again, Q).position, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", shipped_robots())
+def test_shipped_robots_reach_places_by_resolved_motion(name):
+    robot = load_robot(name)
+    rng = np.random.default_rng(2)
+    joints = rng.uniform(-1.5, 1.5, (20, len(robot.joints)))
+    target = robot_poses(robot, joints).position + rng.normal(0.0, 0.01, (20, 3))
+    reached = joints_for_places(robot, target, joints)
+    # Targets a centimetre away may lie out of reach at full stretch only.
+    assert np.median(reached.missed) < 1e-9
+
+
+def test_resolved_motion_with_the_corrections_ends_where_it_should():
+    nominal = load_robot("panda")
+    rng = np.random.default_rng(3)
+    chain = robot_chain(nominal)
+    values = chain.nominal + rng.normal(0.0, 1e-3, len(chain.nominal))
+    sag = {name: 3e-4 for name in deflection_names(nominal, True, False)}
+    true = corrected_robot(nominal, dict(zip(chain.parameters, values, strict=True)), sag)
+    start = np.tile([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.8], (9, 1))
+    target = robot_poses(nominal, start).position + rng.normal(0.0, 0.05, (9, 3))
+    missed = {
+        name: np.linalg.norm(
+            robot_poses(true, joints_for_places(robot, target, start).joints).position - target,
+            axis=1,
+        ).max()
+        for name, robot in {"nominal": nominal, "calibrated": true}.items()
+    }
+    assert missed["calibrated"] < 1e-9
+    assert missed["nominal"] > 1e-3
+
+
+def test_sag_is_the_weight_times_its_lever():
+    robot = load_robot("ur5e")
+    joints = np.zeros((1, 6))
+    names = [n for n in deflection_names(robot, True, False) if n == "sag.joint2.tool"]
+    # At zero the arm is stretched along -x: 0.425 + 0.3922 m and the ball 0.0 beyond in x.
+    lever = abs(robot_poses(robot, joints).position[0, 0])
+    assert abs(deflections(robot, joints, names)[0, 1, 0]) == pytest.approx(9.81 * lever, rel=1e-9)
+
+
+@pytest.mark.parametrize("rpy", [(0.1, -0.4, 2.0), (0.3, np.pi / 2, 0.0), (-0.2, -np.pi / 2, 0.0)])
+def test_angles_of_a_rotation(rpy):
+    rotation = frame((0, 0, 0), rpy)[:3, :3]
+    again = frame((0, 0, 0), tuple(rpy_of(rotation)))[:3, :3]
+    np.testing.assert_allclose(again, rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("<robot", "not valid XML"), ("<sdf/>", "is no robot"), ("<robot/>", "no moving joint"),
+     (URDF.replace("0 0 0.2", "0 0 x"), "three numbers")],
+)  # fmt: skip
+def test_bad_files_are_refused(tmp_path, text, said):
+    (tmp_path / "bad.urdf").write_text(text)
+    with pytest.raises(InputError, match=said):
+        load_robot(tmp_path / "bad.urdf")
