@@ -297,7 +297,8 @@ def without_errors(cases: dict[str, Case], loop: Loop) -> Finding:
     return Finding(
         "readings without error", "section 3.7",
         "the simulations' truth is Table 2 (Tables 4 to 6 are compared with it)",
-        f"every parameter comes out within {worst:.1e} (m, rad) (agrees below 1e-9)", worst < _EXACT,
+        f"every parameter comes out within {worst:.1e} (m, rad) (agrees below 1e-9)",
+        worst < _EXACT,
     )  # fmt: skip
 
 
