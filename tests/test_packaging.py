@@ -67,6 +67,7 @@ def test_every_machine_folder_has_its_numbers():
     numbers = [
         *(ROOT / "models").glob("*/machine.yaml"),
         *(ROOT / "models").glob("*/joystick.yaml"),
+        *(ROOT / "models").glob("*/iwr.yaml"),
     ]
     assert list((ROOT / "models/robots").glob("*.yaml"))
     assert sorted(path.parent.name for path in numbers) == sorted(folders - {"robots"})

@@ -9,9 +9,10 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.experiments.finding import Finding
 from hydrotele.experiments.khoshzaban1992 import khoshzaban1992
+from hydrotele.experiments.wang2012 import wang2012
 from hydrotele.experiments.zhu1994 import zhu1994
 
-SERIES = {"khoshzaban1992": khoshzaban1992, "zhu1994": zhu1994}
+SERIES = {"khoshzaban1992": khoshzaban1992, "wang2012": wang2012, "zhu1994": zhu1994}
 
 
 def experiments_to_folder(
@@ -22,7 +23,7 @@ def experiments_to_folder(
     Args:
         name: of the series.
         target: folder, default `runs/<name>`; with `as_json` none.
-        seeds: operators, or seeds of noise, of the experiments that are repeated.
+        seeds: operators of the experiments that are repeated.
         jobs: processes; as many as there are cores by default.
         as_json: print the findings as JSON instead of words.
 

@@ -28,6 +28,9 @@ OURS = {
     "arm calibration": ("calibration.json", "report.html", "machine.yaml", "*.png"),
     "identify": ("identify.json", "report.html", "identified/machine.*",
                  "identified/machine_assets/*"),
+    "experiments": ("experiments.json", "table.md", "report.html"),
+    "hybrid calibration": ("calibration.json", "robot.yaml", "*.png"),
+    "hybrid measurement": ("*.csv", "*.yaml", "truth/*"),
     "two-port analysis": ("analysis.json", "report.html", "stability.png"),
     "sweep": (
         "sweep.yaml", "journal.jsonl", "table.parquet", "timings.csv", "report.html", "*.png",

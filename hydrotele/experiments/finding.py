@@ -17,12 +17,30 @@ class Panel(NamedTuple):
         time: (n,) [s], or what `over` says.
         curves: label -> (n,) in the title's unit.
         over: label of the horizontal axis.
+        log: whether the vertical axis is logarithmic.
     """
 
     title: str
     time: np.ndarray
     curves: Mapping[str, np.ndarray]
     over: str = "time [s]"
+    log: bool = False
+
+
+class Marginals(NamedTuple):
+    """A sample of a posterior, to be shown in one and two dimensions.
+
+    Attributes:
+        names: p parameters.
+        sample: (n, p) in `unit`.
+        truth: (p,) true values in `unit`.
+        unit: of all.
+    """
+
+    names: tuple[str, ...]
+    sample: np.ndarray
+    truth: np.ndarray
+    unit: str = "mm or mrad"
 
 
 class Finding(NamedTuple):
@@ -35,6 +53,7 @@ class Finding(NamedTuple):
         simulated: what is seen here, with figures.
         ok: whether that is the same.
         panels: curves to look at.
+        marginals: a posterior to look at.
     """
 
     name: str
@@ -43,6 +62,7 @@ class Finding(NamedTuple):
     simulated: str
     ok: bool
     panels: tuple[Panel, ...] = ()
+    marginals: Marginals | None = None
 
     def row(self) -> dict[str, str | bool]:
         """Name, published, simulated and ok, as `--json` prints them."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import hydrotele
 from hydrotele.experiments.finding import Finding, Panel
+from hydrotele.show.calibration_figures import corner
 from hydrotele.show.report_html import (
     STYLE,
     Cell,
@@ -18,7 +19,7 @@ from hydrotele.show.report_html import (
     tag,
 )
 
-_COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0")
+_COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0", "#a33b3b", "#5b6670")
 _MOST = 4000  # points of a curve: more are not seen
 
 
@@ -49,6 +50,7 @@ def write_experiment_report(name: str, findings: Sequence[Finding], path: Path) 
     parts = [head, section("Published and simulated", "", table(
         ("experiment", "published", "simulated", ""), rows))]  # fmt: skip
     parts += [_curves(one) for one in findings if one.panels]
+    parts += [_posterior(one) for one in findings if one.marginals]
     path.write_text(page(f"experiments {name}", STYLE, parts), encoding="utf-8")
 
 
@@ -58,8 +60,17 @@ def _curves(finding: Finding) -> Markup:
                    tag("figure", image, tag("figcaption", finding.simulated)))  # fmt: skip
 
 
+def _posterior(finding: Finding) -> Markup:
+    shown = finding.marginals
+    assert shown is not None
+    drawn = corner(shown.sample, shown.names, shown.truth, "truth", shown.unit)
+    image = picture(drawn, f"posterior: {finding.name}")
+    return section(f"Posterior: {finding.name}", f"{finding.source}: {finding.published}.",
+                   tag("figure", image, tag("figcaption", finding.simulated)))  # fmt: skip
+
+
 def draw_panels(panels: Sequence[Panel]) -> bytes:
-    """Curves below each other on one clock.
+    """Curves below each other; those over time on one clock.
 
     Args:
         panels: what to draw.
@@ -68,12 +79,17 @@ def draw_panels(panels: Sequence[Panel]) -> bytes:
         A PNG.
     """
     with drawing(0.4 + 1.35 * len(panels)) as figure:
-        axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        shared = len({panel.over for panel in panels}) == 1
+        axes = figure.subplots(len(panels), 1, sharex=shared, squeeze=False)[:, 0]
         for panel, place in zip(panels, axes, strict=True):
             every = max(1, len(panel.time) // _MOST)
             for (label, curve), colour in zip(panel.curves.items(), _COLOURS, strict=False):
                 place.plot(panel.time[::every], curve[::every], color=colour, lw=1.0, label=label)
             place.set_title(panel.title)
+            if panel.log:
+                place.set_yscale("log")
+            if not shared:
+                place.set_xlabel(panel.over)
             if len(panel.curves) > 1:
                 place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         axes[-1].set_xlabel(panels[-1].over)

@@ -1,0 +1,489 @@
+"""Kinematic calibration of a hybrid robot from measured platform poses.
+
+The residual is that of the document: readings of the legs less those that the error model predicts
+from the measured pose and the carriage's readings. It is whitened by what legs, carriage and pose
+sensors add to it, so that least squares, differential evolution and MCMC share one likelihood.
+
+Source: Wang 2012, sections 3.1.2 and 3.1.3 (Eq. 29 and its sum of squares); Khalil and Gautier 1991
+(parameters that equations tell).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy.stats
+
+from hydrotele.calibrate.estimation import ParameterFit, Prior, identifiable, least_squares
+from hydrotele.calibrate.hybrid_data import Measurement
+from hydrotele.calibrate.poses import Criterion, select_poses
+from hydrotele.core.errors import InputError
+from hydrotele.identify.identifiability import COMBINATION, FULL, Identifiability
+from hydrotele.kinematics.hybrid import (
+    LEGS,
+    Hybrid,
+    Unreachable,
+    forward,
+    pose_difference,
+)
+from hydrotele.kinematics.hybrid_errors import (
+    ErrorModel,
+    Kind,
+    corrected,
+    document_parameters,
+    error_model,
+    predicted_readings,
+)
+
+_STEP = 1e-2  # of a parameter's size, for central differences: errors are of its square
+_LEFT_OUT = 200  # poses that are left out one by one at most
+_MOST_OUT = 0.2  # share of poses that may be left out as wrong
+_WRONG = 1e-6  # probability under which a pose's residual is no noise
+_LARGE = 20.0  # sizes of an error of manufacture, beyond which it is none
+_UNLIKELY = 1e-4  # probability of residuals so large under the stated noise
+_BETTER = 0.95  # share of the other model's error at which a model is preferred
+_STILL = 1e-3  # m or rad: a joint that moves by less stands still
+_LOADING = 1e-4  # share in a null direction that counts as taking part
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Whitened equations of a measurement: N poses, six each, for some of p parameters.
+
+    Attributes:
+        model: error model.
+        measurement: poses.
+        names: the q parameters that are free; all others are zero.
+        whitening: (N, 6, 6) inverse Cholesky factors of the residuals' covariances.
+    """
+
+    model: ErrorModel
+    measurement: Measurement
+    names: tuple[str, ...]
+    whitening: np.ndarray
+
+    @property
+    def scales(self) -> np.ndarray:
+        """(q,) sizes of the free parameters."""
+        return self.model.scales[self.model.index(self.names)]
+
+    def full(self, values: np.ndarray) -> np.ndarray:
+        """(..., p) errors from (..., q) free ones."""
+        values = np.asarray(values, float)
+        whole = np.zeros((*values.shape[:-1], len(self.model.names)))
+        whole[..., self.model.index(self.names)] = values
+        return whole
+
+    def residuals(self, values: np.ndarray) -> np.ndarray:
+        """Whitened residuals of many parameter sets.
+
+        Args:
+            values: (W, q).
+
+        Returns:
+            (W, 6 N), of standard deviation 1 where the noise is known.
+        """
+        m = self.measurement
+        away = predicted_readings(
+            self.model, self.full(values), m.joints, m.pose.rotation, m.pose.position
+        )
+        away -= m.legs
+        return np.matmul(self.whitening, away[..., None])[..., 0].reshape(len(away), -1)
+
+    def misfit(self, values: np.ndarray) -> np.ndarray:
+        """(W,) half the sum of squared whitened residuals: minus the log likelihood."""
+        return 0.5 * np.einsum("wr,wr->w", *(2 * [self.residuals(values)]))
+
+    def jacobian(self, values: np.ndarray) -> np.ndarray:
+        """(6 N, q) derivatives of the whitened residuals by central differences."""
+        steps = np.diag(_STEP * self.scales)
+        both = self.residuals(np.vstack([values + steps, values - steps]))
+        q = len(self.names)
+        return ((both[:q] - both[q:]) / (2.0 * _STEP * self.scales)[:, None]).T
+
+
+def equations(
+    model: ErrorModel, measurement: Measurement, names: Sequence[str] | None = None
+) -> Equations:
+    """The equations of a measurement.
+
+    Args:
+        model: error model.
+        measurement: poses.
+        names: free parameters; by default all.
+
+    Raises:
+        InputError: no parameter of a name.
+    """
+    names = tuple(names or model.names)
+    model.index(names)
+    factor = np.linalg.cholesky(measurement.covariance)
+    return Equations(model, measurement, names, np.linalg.inv(factor))
+
+
+class Redundancy(NamedTuple):
+    """Which parameters cannot be told apart.
+
+    Attributes:
+        rank: number of independent parameters, from the singular values of the Jacobian.
+        held: names of parameters that are left out for it, by QR with pivots.
+        directions: (null, p) combinations of parameters, in units of their sizes, that change no
+            reading.
+        takes_part: names of parameters with a share in those.
+        words: what this means.
+        singular: (p,) singular values of the Jacobian with columns of length 1, over the largest.
+        told: names of parameters that this noise tells better than half of their sizes.
+    """
+
+    rank: int
+    held: tuple[str, ...]
+    directions: np.ndarray
+    takes_part: tuple[str, ...]
+    words: tuple[str, ...]
+    singular: np.ndarray
+    told: tuple[str, ...]
+
+
+def redundancy(eq: Equations, values: np.ndarray | None = None) -> Redundancy:
+    """Redundant parameters of equations, from singular values and QR of the Jacobian.
+
+    Args:
+        eq: the equations.
+        values: (q,) where the Jacobian is taken; zero by default.
+
+    Returns:
+        What they are.
+
+    Source: Khalil and Gautier 1991; Wang 2012, section 2.1 (minimality).
+    """
+    at = np.zeros(len(eq.names)) if values is None else values
+    matrix = eq.jacobian(at) * eq.scales
+    ones = np.ones(len(eq.names))
+    first = [n for n in document_parameters(eq.model) if n in eq.names]
+    exact = identifiable(matrix, eq.names, ones, first=first)
+    length = np.linalg.norm(matrix, axis=0)
+    there = length > 1e-11 * length.max()
+    s = np.zeros(len(eq.names))
+    s[: there.sum()] = np.linalg.svd(matrix[:, there] / length[there], compute_uv=False)
+    rank = len(exact.base)
+    held = tuple(n for k, n in enumerate(eq.names) if k not in set(exact.base))
+    directions = null_directions(exact)
+    shares = np.abs(directions).max(axis=0, initial=0.0)
+    partners = tuple(n for n, share in zip(eq.names, shares, strict=True) if share > _LOADING)
+    noisy = identifiable(matrix, eq.names, ones, sigma=1.0, first=first)
+    told = tuple(eq.names[k] for k in sorted(noisy.base)
+                 if noisy.status[k] in (FULL, COMBINATION))  # fmt: skip
+    return Redundancy(rank, held, directions, partners, _in_words(eq, exact, held, partners),
+                      s / s[0], told)  # fmt: skip
+
+
+def null_directions(told: Identifiability) -> np.ndarray:
+    """(null, p) orthonormal parameter changes that change no base parameter."""
+    _, s, v = np.linalg.svd(told.combination, full_matrices=True)
+    return v[int(np.sum(s > 1e-9 * s[0])) :] if len(told.base) else np.eye(len(told.names))
+
+
+def _in_words(eq: Equations, told: Identifiability, held, partners) -> tuple[str, ...]:
+    words = []
+    model, last = eq.model, len(eq.model.nominal.joints)
+    for row, base in enumerate(told.base):
+        others = [k for k in np.flatnonzero(told.combination[row]) if k != base]
+        if others:
+            words.append(f"only together: {told.text(row)}")
+    carriage = [n for n in partners if n in model.names[: model.carriage_count]]
+    own = {f"{part}{last}" for part in ("theta", "d", "a", "alpha")}
+    if carriage and model.kind == "dh" and set(carriage) <= own and held:
+        if all(n[0] == "a" for n in partners if n not in carriage):
+            words.insert(
+                0, f"{', '.join(carriage)} place the connecting platform behind the last joint:"
+                f" a common displacement of the universal joints A1 to A6 does the same"
+                f" ({len(held)} redundant parameters)",
+            )  # fmt: skip
+    still = np.ptp(eq.measurement.joints, axis=0)
+    for joint, moved in zip(model.nominal.joints, still, strict=True):
+        if moved < _STILL:
+            words.append(f"joint {joint} never moves: its axis cannot be told; move it")
+    return tuple(words)
+
+
+class Errors(NamedTuple):
+    """Errors of predicted poses.
+
+    Attributes:
+        position: (N,) distances [m].
+        orientation: (N,) angles [rad].
+    """
+
+    position: np.ndarray
+    orientation: np.ndarray
+
+    def summary(self) -> dict[str, float]:
+        """RMS and largest, in mm and mrad."""
+        return {
+            "position_rms_mm": 1e3 * float(np.sqrt(np.mean(self.position**2))),
+            "position_max_mm": 1e3 * float(self.position.max()),
+            "orientation_rms_mrad": 1e3 * float(np.sqrt(np.mean(self.orientation**2))),
+            "orientation_max_mrad": 1e3 * float(self.orientation.max()),
+        }
+
+
+def pose_errors(robot: Hybrid, measurement: Measurement) -> Errors:
+    """Forward kinematics of the readings against the measured poses.
+
+    Args:
+        robot: nominal or calibrated.
+        measurement: poses.
+
+    Raises:
+        InputError: a pose has no solution.
+    """
+    try:
+        found = forward(robot, measurement.joints, measurement.legs, measurement.pose)
+    except Unreachable as error:
+        raise InputError(measurement.source, f"{error}: correct its leg readings") from None
+    away = pose_difference(found, measurement.pose)
+    return Errors(np.linalg.norm(away[:, :3], axis=1), np.linalg.norm(away[:, 3:], axis=1))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrated hybrid robot.
+
+    Attributes:
+        model: error model.
+        equations: from which it was identified.
+        fit: least squares of the free parameters.
+        redundancy: of the free parameters.
+        robot: with the errors built in.
+        before: errors of the nominal robot at the poses.
+        after: of the calibrated one.
+        wrong: rows of poses that were left out because they fit nothing.
+        warnings: what is suspicious about the result, and what to do.
+    """
+
+    model: ErrorModel
+    equations: Equations
+    fit: ParameterFit
+    redundancy: Redundancy
+    robot: Hybrid
+    before: Errors
+    after: Errors
+    wrong: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+    @cached_property
+    def left_out(self) -> Errors:
+        """Errors of robots that are calibrated without the pose that they predict."""
+        return _left_out(self.equations, self.fit)
+
+    @property
+    def errors(self) -> np.ndarray:
+        """(p,) identified errors of all parameters, zero for those that were held."""
+        return self.equations.full(self.fit.values)
+
+
+def calibrate(
+    robot: Hybrid, measurement: Measurement, kind: Kind, names: Sequence[str] | None = None,
+    prior: Prior | None = None,
+) -> Calibration:  # fmt: skip
+    """Identify the errors of a hybrid robot by least squares.
+
+    Parameters that the poses do not tell keep their nominal values. Poses whose residuals cannot be
+    noise are left out, at most a fifth of them, and named.
+
+    Args:
+        robot: nominal.
+        measurement: poses.
+        kind: of the error model.
+        names: free parameters; by default all of the model.
+        prior: of the free parameters; by default none.
+
+    Returns:
+        The calibrated robot.
+
+    Raises:
+        InputError: too few different poses.
+    """
+    model = error_model(robot, kind)
+    eq = equations(model, measurement, names)
+    _check_poses(eq)
+    wrong: list[int] = []
+    while True:
+        fit = _fit(eq, prior)
+        suspect = _suspect(eq, fit)
+        if suspect is None or len(wrong) + 1 > _MOST_OUT * len(measurement):
+            break
+        wrong.append(int(eq.measurement.rows[suspect]))
+        kept = np.arange(len(eq.measurement)) != suspect
+        eq = equations(model, eq.measurement.subset(kept), names)
+    calibrated = corrected(model, eq.full(fit.values))
+    return Calibration(
+        model, eq, fit, redundancy(eq, fit.values), calibrated,
+        pose_errors(model.nominal, eq.measurement), pose_errors(calibrated, eq.measurement),
+        tuple(sorted(wrong)), _warnings(eq, fit),
+    )  # fmt: skip
+
+
+def best(robot: Hybrid, measurement: Measurement, names: Sequence[str] | None = None
+         ) -> Calibration:  # fmt: skip
+    """Calibrate with both error models; the one that predicts left-out poses better.
+
+    `dh` wins a tie of 5 %. Where the robot is stated by its axes there is only `poe`.
+
+    Args:
+        robot: nominal.
+        measurement: poses.
+        names: free parameters, of the `dh` model; by default all.
+
+    Raises:
+        InputError: as `calibrate`.
+    """
+    if not robot.facts.carriage:
+        return calibrate(robot, measurement, "poe", names)
+    dh = calibrate(robot, measurement, "dh", names)
+    if names is not None:
+        return dh
+    poe = calibrate(robot, measurement, "poe")
+    size = [np.sqrt(np.mean(c.left_out.position**2)) for c in (dh, poe)]
+    return poe if size[1] < _BETTER * size[0] else dh
+
+
+def _warnings(eq: Equations, fit: ParameterFit) -> tuple[str, ...]:
+    said = []
+    units = [eq.model.units[k] for k in eq.model.index(eq.names)]
+    large = np.flatnonzero(np.abs(fit.values) > _LARGE * eq.scales)
+    if len(large):
+        which = ", ".join(
+            f"{fit.names[k]} {1e3 * fit.values[k]:.3g} {'mm' if units[k] == 'm' else 'mrad'}"
+            for k in large[:6]
+        )
+        said.append(
+            f"{which}: these are no errors of manufacture; the data are of another robot, a sensor"
+            " has another zero, or a frame differs from the nominal robot's"
+        )
+    if eq.measurement.stated:
+        freedom = max(fit.freedom, 1.0)
+        if scipy.stats.chi2.sf(freedom * fit.chi**2, freedom) < _UNLIKELY:
+            said.append(
+                f"residuals are {fit.chi:.2f} times what the stated noise makes: it is larger than"
+                " stated, or this error model (or choice of parameters) does not describe the robot"
+            )
+    if not fit.converged:
+        said.append(fit.status)
+    return tuple(said)
+
+
+def _fit(eq: Equations, prior: Prior | None) -> ParameterFit:
+    first = [n for n in document_parameters(eq.model) if n in eq.names]
+    known = 1.0 if eq.measurement.stated else None
+    return least_squares(
+        lambda x: eq.residuals(x[None])[0], np.zeros(len(eq.names)), eq.names, eq.scales,
+        sigma=known, prior=prior, jac=eq.jacobian, first=first,
+    )  # fmt: skip
+
+
+def _check_poses(eq: Equations) -> None:
+    """Refuse as many equations as they have independent parameters, or fewer."""
+    m, q = eq.measurement, len(eq.names)
+    matrix = eq.jacobian(np.zeros(q)) * eq.scales
+    rank = len(identifiable(matrix, eq.names, np.ones(q)).base)
+    if LEGS * m.distinct <= rank:
+        same = "" if m.distinct == len(m) else f" ({len(m)} rows, of which many are the same pose)"
+        raise InputError(
+            m.source,
+            f"{m.distinct} different poses{same} give {LEGS * m.distinct} equations for"
+            f" {q} parameters: measure at least {q // LEGS + 1} different poses, better twice as"
+            " many, or identify fewer parameters (--parameters document)",
+        )
+
+
+def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
+    """Place of the pose whose residual is least likely to be noise, None if all may be.
+
+    Each pose's six residuals are freed of the pull that they had on the fit; their square follows
+    F(6, rest) under the noise of the others.
+    """
+    n = len(eq.measurement)
+    residual = fit.residual.reshape(n, LEGS)
+    free = np.flatnonzero(~fit.held)
+    q, _ = np.linalg.qr(fit.jacobian[:, free] * fit.scales[free])
+    q = q.reshape(n, LEGS, -1)
+    leverage = np.einsum("nij,nkj->nik", q, q)
+    rest = LEGS * (n - 1) - len(free)
+    if rest < LEGS:
+        return None
+    inside = np.eye(LEGS) - leverage
+    solid = np.linalg.eigvalsh(inside)[:, 0] > 1e-6
+    squares = np.full(n, 0.0)
+    squares[solid] = np.einsum(
+        "ni,ni->n", residual[solid],
+        np.linalg.solve(inside[solid], residual[solid][..., None])[..., 0],
+    )  # fmt: skip
+    total = float(np.sum(residual**2))
+    left = np.maximum(total - squares, 1e-300)
+    if total < 1e-12:  # no noise at all: rounding
+        return None
+    ratio = (squares / LEGS) / (left / rest)
+    worst = int(np.argmax(ratio))
+    return worst if scipy.stats.f.sf(ratio[worst], LEGS, rest) * n < _WRONG else None
+
+
+def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
+    """Prediction errors of every pose by a calibration without it; of 200 if there are more.
+
+    Parameters change by less than their standard deviations, over which the equations are straight:
+    with the Jacobian Q R, the six rows Q_k and residuals r_k of the pose, the change is
+    R^-1 Q_k' (1 - Q_k Q_k')^-1 r_k. Poses that the calibration cannot do without are left away.
+    """
+    free = np.flatnonzero(~fit.held)
+    n = len(eq.measurement)
+    q, r = np.linalg.qr(fit.jacobian[:, free] * fit.scales[free])
+    q, residual = q.reshape(n, LEGS, -1), fit.residual.reshape(n, LEGS)
+    result = np.full((2, n), np.nan)
+    for k in np.unique(np.linspace(0, n - 1, min(n, _LEFT_OUT)).astype(int)):
+        inside = np.eye(LEGS) - q[k] @ q[k].T
+        if np.linalg.eigvalsh(inside)[0] < 1e-9:
+            continue
+        step = np.linalg.solve(r, q[k].T @ np.linalg.solve(inside, residual[k]))
+        values = fit.values.copy()
+        values[free] += step * fit.scales[free]
+        robot = corrected(eq.model, eq.full(values))
+        try:
+            found = pose_errors(robot, eq.measurement.subset(np.array([k])))
+        except InputError:  # without this pose the calibration is worth nothing there
+            continue
+        result[:, k] = found.position[0], found.orientation[0]
+    known = ~np.isnan(result[0])
+    return Errors(*(result[:, known] if known.any() else result))
+
+
+def subset(calibration: Calibration) -> Equations:
+    """The equations of a calibration with its fitted parameters alone."""
+    eq, held = calibration.equations, calibration.fit.held
+    return replace(eq, names=tuple(n for n, h in zip(eq.names, held, strict=True) if not h))
+
+
+def informative_poses(
+    model: ErrorModel, candidates: Measurement, count: int, criterion: Criterion = "D"
+) -> np.ndarray:
+    """Poses whose measurement tells the parameters best, among candidates.
+
+    Args:
+        model: error model.
+        candidates: poses as the nominal robot would be measured there, with their covariances.
+        count: how many to choose.
+        criterion: `D` or an observability index `O1` to `O5`.
+
+    Returns:
+        (count,) places of the poses.
+
+    Raises:
+        InputError: there are too few candidates or poses.
+    """
+    eq = equations(model, candidates)
+    matrix = eq.jacobian(np.zeros(len(eq.names))) * eq.scales
+    base = identifiable(matrix, eq.names, np.ones(len(eq.names))).base
+    rows = matrix[:, base].reshape(len(candidates), LEGS, -1)
+    return np.sort(select_poses(rows, count, criterion).chosen)

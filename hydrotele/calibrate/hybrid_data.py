@@ -1,0 +1,388 @@
+"""Measured poses of a hybrid robot: a folder with a table of poses, what measured them, and noise.
+
+The folder holds
+
+- `poses.csv` or `poses.parquet`, one row per pose, units in the header (`leg.1 [mm]`) or in the
+  Parquet field metadata (without one: m, rad): `joint.<name>` of every carriage joint, `leg.1` to
+  `leg.6`, and the platform's pose in frame 0, either `pose.x`, `pose.y`, `pose.z`, `pose.rx`,
+  `pose.ry`, `pose.rz` with R = Rz(rz) Ry(ry) Rx(rx), or the lengths `wire.1` to `wire.6`;
+- optionally 21 columns `covariance.x.x`, `covariance.x.y` ... `covariance.rz.rz`, the upper
+  triangle of each pose's covariance in SI, of position and rotation vector in frame 0;
+- `measurement.yaml`: `robot` (its name), `wires` (anchors and points, for `wire.*`), `noise`
+  (standard deviations `leg`, `slide`, `turn`, `wire`, `position`, `orientation`), all optional;
+- optionally `heldout.csv` or `.parquet` of the same form, to judge on, and `robot.yaml`, the
+  nominal robot.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+from pathlib import Path
+
+import numpy as np
+
+from hydrotele.core.datafile import Facts, Positive, parse, read_yaml, suggest
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import replacing
+from hydrotele.core.units import to_si
+from hydrotele.kinematics.hybrid import (
+    LEGS,
+    REVOLUTE,
+    Hybrid,
+    Pose,
+    Unreachable,
+    euler_of_rotation,
+    forward,
+    leg_jacobian,
+    leg_readings,
+    rotation_of_euler,
+)
+from hydrotele.kinematics.wires import NoIntersection, Wires, pose_covariance, pose_of_wires
+from hydrotele.logs.log import read_table
+from hydrotele.logs.log_checks import Table
+
+COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
+COVARIANCE = tuple(f"covariance.{a}.{b}" for a, b in combinations_with_replacement(COORDINATES, 2))
+POSES, HELDOUT, FACTS = "poses", "heldout", "measurement.yaml"
+_KINDS = (".csv", ".parquet")
+_MARGIN = 0.2  # of a joint's range, that a reading may lie beyond it
+_FAR = 0.05  # m: legs that differ by more from the nominal robot are of another one
+_WIRE = 1e-4  # m: of a wire where nothing is stated; only its ratio to the other errors counts
+_SAME = 1e-5  # m or rad: poses that differ by less are one pose, measured again
+
+
+class Noise(Facts):
+    """Standard deviations; None where nothing is known.
+
+    Attributes:
+        leg: of a leg's reading [m].
+        slide: of a prismatic carriage joint's [m].
+        turn: of a revolute one's [rad].
+        wire: of a wire's length [m].
+        position: of a measured pose's coordinates [m].
+        orientation: of its rotation vector's [rad].
+    """
+
+    leg: Positive | None = None
+    slide: Positive | None = None
+    turn: Positive | None = None
+    wire: Positive | None = None
+    position: Positive | None = None
+    orientation: Positive | None = None
+
+
+class MeasurementFacts(Facts):
+    """What `measurement.yaml` states."""
+
+    robot: str = ""
+    wires: Wires | None = None
+    noise: Noise = Noise()
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Measured poses, N of them.
+
+    Attributes:
+        source: the file.
+        rows: (N,) rows of the table that they are, from 0.
+        joints: (N, n) carriage [m] or [rad].
+        legs: (N, 6) readings [m].
+        pose: measured, of the moving platform in frame 0.
+        covariance: (N, 6, 6) of the legs' readings less those predicted from measured pose and
+            carriage [m^2]; up to one factor where `stated` is false.
+        stated: whether the noise is known.
+    """
+
+    source: str
+    rows: np.ndarray
+    joints: np.ndarray
+    legs: np.ndarray
+    pose: Pose
+    covariance: np.ndarray
+    stated: bool
+
+    def __len__(self) -> int:
+        """Number of poses."""
+        return len(self.legs)
+
+    def subset(self, places: np.ndarray) -> "Measurement":
+        """Some of the poses, by their places or a mask."""
+        return replace(
+            self, rows=self.rows[places], joints=self.joints[places], legs=self.legs[places],
+            pose=Pose(self.pose.rotation[places], self.pose.position[places]),
+            covariance=self.covariance[places],
+        )  # fmt: skip
+
+    @property
+    def distinct(self) -> int:
+        """Number of poses that are no repetition of another."""
+        whole = np.hstack([self.joints, self.legs])
+        return len(np.unique(np.round(whole / _SAME), axis=0))
+
+
+def measurement_of_wires(
+    robot: Hybrid, joints: np.ndarray, legs: np.ndarray, lengths: np.ndarray, wires: Wires,
+    noise: Mapping[str, float], source: str,
+) -> Measurement:  # fmt: skip
+    """A measurement from readings of carriage, legs and wires.
+
+    Args:
+        robot: nominal; its forward kinematics select among the solutions of the wires.
+        joints: (N, n) [m] or [rad].
+        legs: (N, 6) [m].
+        lengths: (N, 6) of the wires [m].
+        wires: where they are.
+        noise: standard deviations by the names of `Noise`, in SI.
+        source: what to call it.
+
+    Raises:
+        NoIntersection: the wires do not meet.
+        Unreachable: legs are not of this robot.
+    """
+    pose = pose_of_wires(wires, lengths, forward(robot, joints, legs))
+    stated = Noise(**noise)
+    of_pose = pose_covariance(wires, pose, stated.wire or _WIRE)
+    whole = _covariance(robot, joints, pose, of_pose, stated)
+    known = stated.wire is not None and stated.leg is not None
+    return Measurement(source, np.arange(len(legs)), joints, legs, pose, whole, known)
+
+
+def robot_file(folder: Path) -> Path | None:
+    """The nominal robot that lies in a folder of measurements, None without one."""
+    path = folder / "robot.yaml"
+    return path if path.is_file() else None
+
+
+def read_measurement(folder: Path, robot: Hybrid) -> tuple[Measurement, Measurement | None]:
+    """Read a folder of measurements.
+
+    Args:
+        folder: of the form that the module describes.
+        robot: nominal.
+
+    Returns:
+        (poses to calibrate from, poses to judge on or None).
+
+    Raises:
+        InputError: names file, column, row and what to do.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, f"is no folder: name one with {POSES}.csv or {POSES}.parquet")
+    file = _table(folder, POSES)
+    if file is None:
+        raise InputError(folder, f"holds neither {POSES}.csv nor {POSES}.parquet")
+    facts = MeasurementFacts()
+    if (folder / FACTS).is_file():
+        data, lines = read_yaml(folder / FACTS)
+        facts = parse(MeasurementFacts, data, str(folder / FACTS), lines)
+    if facts.robot and facts.robot != robot.name:
+        raise InputError(
+            folder / FACTS, f"is a measurement of the robot {facts.robot!r}, the model is"
+            f" {robot.name!r}: give that robot with --robot",
+        )  # fmt: skip
+    heldout = _table(folder, HELDOUT)
+    return _measurement(file, facts, robot), _measurement(
+        heldout, facts, robot
+    ) if heldout else None
+
+
+def _table(folder: Path, stem: str) -> Path | None:
+    return next((folder / f"{stem}{k}" for k in _KINDS if (folder / f"{stem}{k}").is_file()), None)
+
+
+def _measurement(file: Path, facts: MeasurementFacts, robot: Hybrid) -> Measurement:
+    table = read_table(file)
+    columns = _columns(table, robot, facts)
+    if not len(table.values) or not len(table.values[0]):
+        raise InputError(file, "holds no pose: write one line per pose")
+    joints = np.column_stack([columns[f"joint.{name}"] for name in robot.joints])
+    legs = np.column_stack([columns[f"leg.{k}"] for k in range(1, LEGS + 1)])
+    _check_ranges(table, robot, joints, legs)
+    noise = facts.noise
+    if "wire.1" in columns:
+        pose = _pose_from_wires(table, columns, facts, robot, joints, legs)
+        assert facts.wires is not None
+        of_pose = pose_covariance(facts.wires, pose, noise.wire or _WIRE)
+        known = noise.wire is not None
+    else:
+        place = np.column_stack([columns[f"pose.{c}"] for c in COORDINATES])
+        pose = Pose(rotation_of_euler(place[:, 3:]), place[:, :3])
+        of_pose, known = _pose_covariance(table, columns, noise, len(legs))
+    _check_robot(table, robot, joints, legs, pose)
+    whole = _covariance(robot, joints, pose, of_pose, noise)
+    return Measurement(
+        str(file), np.arange(len(legs)), joints, legs, pose, whole,
+        known and noise.leg is not None,
+    )  # fmt: skip
+
+
+def _columns(table: Table, robot: Hybrid, facts: MeasurementFacts) -> dict[str, np.ndarray]:
+    """Columns by name in SI, checked for names, units and numbers."""
+    joints = dict(zip((f"joint.{n}" for n in robot.joints), robot.kinds, strict=True))
+    legs, wires = ([f"{what}.{k}" for k in range(1, LEGS + 1)] for what in ("leg", "wire"))
+    poses = [f"pose.{c}" for c in COORDINATES]
+    angles = {*poses[3:], *(name for name, kind in joints.items() if kind == REVOLUTE)}
+    known = [*joints, *legs, *poses, *wires, *COVARIANCE]
+    columns: dict[str, np.ndarray] = {}
+    for name, values, unit in zip(table.names, table.values, table.units, strict=True):
+        if name not in known:
+            raise InputError(table.where(name), f"is no column of {robot.name}: "
+                             f"{suggest(name, known[:-21])}, covariance.x.x ...")  # fmt: skip
+        if name in columns:
+            raise InputError(table.where(name), "is there twice")
+        wrong = np.flatnonzero(~np.isfinite(values))
+        if len(wrong):
+            said = f"is {values[wrong[0]]}: remove the row or measure the pose again"
+            raise InputError(table.where(name, int(wrong[0])), said)
+        needed = "rad" if name in angles else "m"
+        si, factor = to_si(unit) if unit else (needed, 1.0)
+        if si != needed and name not in COVARIANCE:
+            like = "rad, deg or mrad" if needed == "rad" else "m or mm"
+            raise InputError(table.where(name), f"has the unit {unit!r}, it needs {like}")
+        columns[name] = np.asarray(values, float) * (1.0 if name in COVARIANCE else factor)
+    for group in ((*joints, *legs), wires if "wire.1" in columns else poses):
+        missing = [name for name in group if name not in columns]
+        if missing:
+            either = " (or wire.1 to wire.6)" if group is poses else ""
+            raise InputError(table.source, f"lacks {', '.join(missing)}{either}")
+    if "wire.1" in columns and facts.wires is None:
+        raise InputError(
+            Path(table.source).with_name(FACTS), "must state `wires`: anchors and points"
+        )
+    return columns
+
+
+def _check_ranges(table: Table, robot: Hybrid, joints: np.ndarray, legs: np.ndarray) -> None:
+    named = [(f"joint.{n}", v, r) for n, v, r in
+             zip(robot.joints, joints.T, robot.joint_range, strict=True)]  # fmt: skip
+    named += [(f"leg.{k}", v, robot.leg_range) for k, v in enumerate(legs.T, 1)]
+    for name, values, (low, high) in named:
+        room = _MARGIN * (high - low)
+        wrong = np.flatnonzero((values < low - room) | (values > high + room))
+        if len(wrong):
+            row = int(wrong[0])
+            angle = name in {f"joint.{n}" for n, k in zip(robot.joints, robot.kinds, strict=True)
+                             if k == REVOLUTE}  # fmt: skip
+            unit, other = ("rad", "deg") if angle else ("m", "mm")
+            raise InputError(
+                table.where(name, row), f"is {values[row]:.6g} {unit}, the robot {robot.name} goes"
+                f" from {low:.6g} to {high:.6g}: correct the value, state the unit in the header"
+                f" ('{name} [{other}]') or give the robot it is of",
+            )  # fmt: skip
+
+
+def _pose_from_wires(table, columns, facts, robot, joints, legs) -> Pose:
+    lengths = np.column_stack([columns[f"wire.{k}"] for k in range(1, LEGS + 1)])
+    try:
+        near = forward(robot, joints, legs)
+        return pose_of_wires(facts.wires, lengths, near)
+    except (Unreachable, NoIntersection) as error:
+        raise InputError(
+            table.source, f"{error}: check the wires' order and units in it and in {FACTS}"
+        ) from None
+
+
+def _pose_covariance(table, columns, noise, count) -> tuple[np.ndarray, bool]:
+    present = [name for name in COVARIANCE if name in columns]
+    if present:
+        if len(present) < len(COVARIANCE):
+            missing = [name for name in COVARIANCE if name not in columns]
+            raise InputError(table.source, f"lacks {', '.join(missing[:6])}: give all 21 or none")
+        result, at = np.empty((count, 6, 6)), np.triu_indices(6)
+        result[:, at[0], at[1]] = np.column_stack([columns[name] for name in COVARIANCE])
+        result[:, at[1], at[0]] = result[:, at[0], at[1]]
+        for row, matrix in enumerate(result):
+            if np.linalg.eigvalsh(matrix)[0] < 0.0:
+                said = "the covariance of this pose is not positive semidefinite"
+                raise InputError(table.where("covariance.x.x", row), said)
+        return result, True
+    position, orientation = noise.position or 5e-5, noise.orientation or 1e-4
+    known = noise.position is not None and noise.orientation is not None
+    return np.broadcast_to(np.diag([position**2] * 3 + [orientation**2] * 3), (count, 6, 6)), known
+
+
+def _covariance(robot: Hybrid, joints, pose: Pose, of_pose: np.ndarray, noise: Noise):
+    """(N, 6, 6) covariance of readings less predictions: legs, measured pose, carriage sensors."""
+    by_pose = leg_jacobian(robot, joints, pose)
+    by_joint = np.empty((len(joints), LEGS, len(robot.joints)))
+    for k in range(len(robot.joints)):
+        step = np.zeros(len(robot.joints))
+        step[k] = 1e-6
+        change = leg_readings(robot, joints + step, pose) - leg_readings(robot, joints - step, pose)
+        by_joint[..., k] = change / 2e-6
+    sizes = np.where(robot.kinds == REVOLUTE, noise.turn or 0.0, noise.slide or 0.0)
+    by_joint = by_joint * sizes
+    return (
+        (noise.leg or 1e-5) ** 2 * np.eye(LEGS)
+        + by_pose @ of_pose @ np.swapaxes(by_pose, 1, 2)
+        + by_joint @ np.swapaxes(by_joint, 1, 2)
+    )
+
+
+def _check_robot(table: Table, robot: Hybrid, joints, legs, pose: Pose) -> None:
+    """Refuse a table whose legs are not those of the nominal robot at the measured poses."""
+    away = np.abs(leg_readings(robot, joints, pose) - legs)
+    if np.median(away) > _FAR:
+        row = int(np.argmax(away.max(axis=1)))
+        raise InputError(
+            table.source, f"legs differ from those of the robot {robot.name} at the measured poses"
+            f" by {np.median(away):.3g} m in the median (row {row}: {away[row].max():.3g} m): it is"
+            " of another robot, in other units, or its poses are not in frame 0 as Z-Y-X angles",
+        )  # fmt: skip
+
+
+def save_measurement(
+    folder: Path, stem: str, robot: Hybrid, joints: np.ndarray, legs: np.ndarray,
+    pose: Pose | None = None, wires: np.ndarray | None = None,
+) -> None:  # fmt: skip
+    """Write a table of poses in mm and degrees, as `read_measurement` reads it.
+
+    Args:
+        folder: there already.
+        stem: `POSES` or `HELDOUT`.
+        robot: whose joints they are.
+        joints: (N, n) [m] or [rad].
+        legs: (N, 6) [m].
+        pose: measured poses, or
+        wires: (N, 6) lengths [m].
+    """
+    columns: dict[str, np.ndarray] = {}
+    for name, kind, values in zip(robot.joints, robot.kinds, joints.T, strict=True):
+        unit, factor = ("deg", 180.0 / np.pi) if kind == REVOLUTE else ("mm", 1e3)
+        columns[f"joint.{name} [{unit}]"] = factor * values
+    columns |= {f"leg.{k} [mm]": 1e3 * v for k, v in enumerate(legs.T, 1)}
+    if wires is not None:
+        columns |= {f"wire.{k} [mm]": 1e3 * v for k, v in enumerate(wires.T, 1)}
+    if pose is not None:
+        angles = np.degrees(euler_of_rotation(pose.rotation))
+        columns |= {f"pose.{c} [mm]": 1e3 * v
+                    for c, v in zip(COORDINATES, pose.position.T, strict=False)}  # fmt: skip
+        columns |= {f"pose.{c} [deg]": v for c, v in zip(COORDINATES[3:], angles.T, strict=True)}
+    lines = [",".join(columns)]
+    lines += [",".join(f"{v:.9f}" for v in row) for row in np.column_stack([*columns.values()])]
+    with replacing(folder / f"{stem}.csv", ".csv") as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def measurement_text(robot: str, wires: Wires | None, noise: Mapping[str, float]) -> str:
+    """The text of `measurement.yaml`: lengths in mm, angles in degrees.
+
+    Args:
+        robot: its name.
+        wires: where they are.
+        noise: standard deviations by the names of `Noise`, in SI.
+    """
+    import yaml
+
+    angles = ("turn", "orientation")
+    data: dict = {"robot": robot}
+    if wires is not None:
+        data["wires"] = {f"{key}_mm": [[round(1e3 * c, 6) for c in p] for p in getattr(wires, key)]
+                         for key in ("anchors", "points")}  # fmt: skip
+    data["noise"] = {
+        f"{k}_deg" if k in angles else f"{k}_mm":
+        float(f"{np.degrees(v) if k in angles else 1e3 * v:.9g}") for k, v in noise.items()
+    }  # fmt: skip
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None)

@@ -1,0 +1,276 @@
+"""Search by differential evolution, and posteriors by MCMC with differential-evolution moves.
+
+Both take a function of many parameter sets at once. The sampler is emcee's ensemble with DEMove and
+DESnookerMove; what it drew is judged by autocorrelation time, split R-hat and effective sample
+size before anything is concluded from it.
+
+Source: Storn and Price 1997; ter Braak 2006, ter Braak and Vrugt 2008 (moves); Foreman-Mackey et
+al. 2013 (emcee); Gelman et al., Bayesian Data Analysis, 3rd ed., 11.4 (split R-hat); Sokal 1997.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import differential_evolution
+
+from hydrotele.core.errors import InputError
+
+Cost = Callable[[np.ndarray], np.ndarray]  # (S, p) -> (S,)
+_RHAT = 1.05  # above it chains have not mixed
+_LENGTHS = 50.0  # autocorrelation times that a chain must have, as emcee asks
+_JUMP = 0.1  # share of DE moves with the full difference, which leap between modes
+
+
+@dataclass(frozen=True)
+class Evolution:
+    """What a search by differential evolution found.
+
+    Attributes:
+        values: (p,) best parameters.
+        cost: its cost.
+        generations: made.
+        evaluations: of the cost.
+        converged: whether the population agreed before `generations` ran out.
+        history: (generations,) best cost of each.
+    """
+
+    values: np.ndarray
+    cost: float
+    generations: int
+    evaluations: int
+    converged: bool
+    history: np.ndarray
+
+
+def evolve(
+    cost: Cost, low: np.ndarray, high: np.ndarray, *, seed: int = 0, population: int = 6,
+    generations: int = 20000, agreement: float = 1e-5,
+) -> Evolution:  # fmt: skip
+    """Minimise by differential evolution; no gradient, no start.
+
+    `randtobest1bin` with crossover 0.95 and a mutation that varies: errors of a calibration are
+    strongly correlated, so that most coordinates must change together, and a population that only
+    follows its best member agrees too early. The search ends when the costs of the population
+    differ by less than `agreement`.
+
+    Args:
+        cost: of (S, p) parameter sets, such as half the sum of squared weighted residuals.
+        low: (p,) bounds.
+        high: (p,) bounds.
+        seed: of the random numbers.
+        population: members per parameter.
+        generations: at most.
+        agreement: spread of costs in the population that ends the search; with a cost in units of
+            log likelihood the best is then within some 1e-2 of the minimum.
+
+    Returns:
+        What was found, without a gradient search at the end.
+
+    >>> found = evolve(lambda x: np.sum((x - 1.0) ** 2, axis=1), np.zeros(3) - 5, np.zeros(3) + 5)
+    >>> bool(np.abs(found.values - 1.0).max() < 0.02), found.converged
+    (True, True)
+    """
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    history: list[float] = []
+
+    def batch(x: np.ndarray) -> np.ndarray:
+        found = cost(np.ascontiguousarray(x.T) if x.ndim == 2 else x[None])
+        return found if x.ndim == 2 else found[0]
+
+    def watch(intermediate_result) -> bool:
+        history.append(float(intermediate_result.fun))
+        return bool(np.ptp(intermediate_result.population_energies) < agreement)
+
+    found = differential_evolution(
+        batch, list(zip(low, high, strict=True)), strategy="randtobest1bin",
+        mutation=(0.4, 0.9), recombination=0.95, popsize=population, maxiter=generations, tol=0.0,
+        polish=False, init="latinhypercube", rng=np.random.default_rng(seed), vectorized=True,
+        updating="deferred", callback=watch,
+    )  # fmt: skip
+    return Evolution(found.x, float(found.fun), int(found.nit), int(found.nfev),
+                     len(history) > 0 and found.nit < generations, np.array(history))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """A sample of a posterior, with what tells whether it has converged.
+
+    Attributes:
+        names: the p parameters.
+        sample: (draws, walkers, p) after the burn-in, every `thin`-th.
+        log_probability: (draws, walkers).
+        acceptance: mean share of accepted moves.
+        autocorrelation: (p,) integrated autocorrelation times [steps of the chain].
+        rhat: (p,) split R-hat over walkers.
+        effective: (p,) effective sample sizes.
+        steps: made after the burn-in.
+        evaluations: of the log probability.
+        converged: whether all R-hat are below 1.05 and the chain has 50 autocorrelation times.
+        status: this in words.
+    """
+
+    names: tuple[str, ...]
+    sample: np.ndarray
+    log_probability: np.ndarray
+    acceptance: float
+    autocorrelation: np.ndarray
+    rhat: np.ndarray
+    effective: np.ndarray
+    steps: int
+    evaluations: int
+    converged: bool
+    status: str
+
+    @property
+    def flat(self) -> np.ndarray:
+        """(draws times walkers, p)."""
+        return self.sample.reshape(-1, self.sample.shape[-1])
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(p,) posterior means."""
+        return self.flat.mean(axis=0)
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """(p,) posterior standard deviations."""
+        return self.flat.std(axis=0, ddof=1)
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """(p, p) posterior correlations."""
+        return np.corrcoef(self.flat, rowvar=False)
+
+    @property
+    def intervals(self) -> np.ndarray:
+        """(p, 2) central 95 % intervals."""
+        return np.quantile(self.flat, [0.025, 0.975], axis=0).T
+
+
+def sample_posterior(
+    log_probability: Cost, start: np.ndarray, spread: np.ndarray, names: Sequence[str], *,
+    steps: int = 6000, burn: int | None = None, walkers: int | None = None, seed: int = 0,
+    thin: int = 10,
+) -> Posterior:  # fmt: skip
+    """Draw from a posterior with emcee's DEMove (80 %) and DESnookerMove (20 %).
+
+    Args:
+        log_probability: of (S, p) parameter sets; -inf outside the prior.
+        start: (p,) where the walkers begin, or (walkers, p).
+        spread: (p,) or (p, p) standard deviations or covariance of the walkers' begin.
+        names: the p parameters.
+        steps: of every walker after the burn-in.
+        burn: steps that are thrown away; by default half of `steps`.
+        walkers: number of chains; by default 4 p: each half moves along differences of
+            the other, which must span all directions.
+        seed: of the random numbers.
+        thin: of the steps that are kept.
+
+    Returns:
+        The sample with its diagnostics.
+
+    Raises:
+        InputError: the start has no finite probability.
+    """
+    import emcee
+
+    p = len(names)
+    burn = steps // 2 if burn is None else burn
+    rng = np.random.default_rng(seed)
+    count = walkers or 4 * p
+    if np.ndim(start) == 2:
+        begin = np.asarray(start, float)
+    elif np.ndim(spread) == 2:
+        begin = rng.multivariate_normal(start, spread, size=count, method="svd")
+    else:
+        begin = start + np.asarray(spread) * rng.normal(size=(count, p))
+    if not np.isfinite(log_probability(begin)).all():
+        raise InputError("posterior", "the start lies outside the prior: begin nearer to it")
+    full = emcee.moves.DEMove(gamma0=1.0)
+    usual = emcee.moves.DEMove(gamma0=2.38 / np.sqrt(2.0 * p))
+    moves = [(usual, 0.8 - _JUMP), (full, _JUMP), (emcee.moves.DESnookerMove(), 0.2)]
+    sampler = emcee.EnsembleSampler(len(begin), p, log_probability, moves=moves, vectorize=True)
+    sampler.random_state = np.random.RandomState(seed).get_state()
+    state = begin
+    if burn:
+        state = sampler.run_mcmc(begin, burn, store=False, skip_initial_state_check=True)
+    sampler.reset()
+    sampler.run_mcmc(state, -(-steps // thin), thin_by=thin, skip_initial_state_check=True)
+    chain = sampler.get_chain()
+    probability = sampler.get_log_prob()
+    assert chain is not None and probability is not None
+    return judged(names, chain, probability, float(np.mean(sampler.acceptance_fraction)),
+                  (burn + steps) * len(begin), thin)  # fmt: skip
+
+
+def judged(
+    names: Sequence[str], chain: np.ndarray, log_probability: np.ndarray, acceptance: float,
+    evaluations: int, thin: int = 1,
+) -> Posterior:  # fmt: skip
+    """A chain with its diagnostics.
+
+    Args:
+        names: the p parameters.
+        chain: (draws, walkers, p) after the burn-in, every `thin`-th step.
+        log_probability: (draws, walkers).
+        acceptance: share of accepted moves.
+        evaluations: of the log probability.
+        thin: steps between draws.
+
+    Returns:
+        The sample.
+    """
+    tau, rhat = autocorrelation_time(chain), split_rhat(chain)
+    effective = chain.shape[0] * chain.shape[1] / tau
+    long = len(chain) / tau.max()
+    good = bool(rhat.max() < _RHAT and long > _LENGTHS)
+    said = (
+        f"{'converged' if good else 'not converged'}: split R-hat at most {rhat.max():.3f},"
+        f" {long:.0f} autocorrelation times, effective size at least {effective.min():.0f}"
+    )
+    if not good:
+        said += "; draw more steps"
+    return Posterior(
+        tuple(names), chain, np.asarray(log_probability), acceptance, thin * tau, rhat, effective,
+        thin * len(chain), evaluations, good, said,
+    )  # fmt: skip
+
+
+def split_rhat(chain: np.ndarray) -> np.ndarray:
+    """Split R-hat: whether the halves of all chains tell the same.
+
+    With within-chain variance W and between-chain variance B of the 2 m half chains of length n:
+    R = sqrt(((n - 1) / n W + B / n) / W).
+
+    Args:
+        chain: (steps, walkers, p).
+
+    Returns:
+        (p,) 1 where they do; above 1.05 they have not mixed.
+
+    Source: Gelman et al., Bayesian Data Analysis, 3rd ed., 11.4.
+
+    >>> still = np.random.default_rng(0).normal(size=(1000, 4, 1))
+    >>> bool(split_rhat(still)[0] < 1.01), bool(split_rhat(still + np.arange(4)[:, None])[0] > 1.5)
+    (True, True)
+    """
+    n = len(chain) // 2
+    halves = np.concatenate([chain[:n], chain[n : 2 * n]], axis=1)
+    within = halves.var(axis=0, ddof=1).mean(axis=0)
+    between = n * halves.mean(axis=0).var(axis=0, ddof=1)
+    return np.sqrt(((n - 1) / n * within + between / n) / np.maximum(within, 1e-300))
+
+
+def autocorrelation_time(chain: np.ndarray) -> np.ndarray:
+    """Integrated autocorrelation time of an ensemble, with Sokal's automatic window.
+
+    Args:
+        chain: (steps, walkers, p).
+
+    Returns:
+        (p,) [steps], at least 1.
+    """
+    import emcee
+
+    return np.maximum(emcee.autocorr.integrated_time(chain, quiet=True, tol=0), 1.0)

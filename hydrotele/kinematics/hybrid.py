@@ -1,0 +1,613 @@
+"""Serial-parallel hybrid robots: a carriage of revolute and prismatic joints carries a hexapod.
+
+Six legs of variable length join universal joints A_i on the carriage's last link, the connecting
+platform, to spherical joints B_i on the moving platform. Frame 0 is the measurement's; frame n the
+connecting platform's (4 for four joints); frame 5 of the document, the moving platform's, is the
+end-effector's.
+
+The carriage is a chain of constant transforms with a motion about or along z between them:
+T(q) = C_0 M(q_1) C_1 M(q_2) ... C_n. D-H rows give C_0 = 1 and C_i = Rz(theta) Tz(d) Tx(a)
+Rx(alpha); lines of axes with the frame F_i of each give C_0 = F_1, C_i = F_i^-1 F_{i+1},
+C_n = F_n^-1, which is the product of exponentials exp(xi_1 q_1) ... exp(xi_n q_n). Both error
+models are therefore one computation.
+
+Source: Wang 2012, sections 3.1.1 and 3.2.1, Eqs 6 to 11; Park and Okamura 1994 (exponentials).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import yaml
+from pydantic import Field, model_validator
+from scipy.optimize import differential_evolution
+from scipy.spatial.transform import Rotation
+
+from hydrotele.core.compiled import compiled
+from hydrotele.core.datafile import Facts, Number, Positive, Vector, parse, read_yaml, suggest
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import models_folder
+from hydrotele.core.output import replacing
+
+LEGS = 6
+PRISMATIC, REVOLUTE = 0, 1
+_KINDS = {"prismatic": PRISMATIC, "revolute": REVOLUTE}
+SHIPPED = ("iwr",)
+_CONVERGED = 1e-12  # m and rad, of a Newton step
+_STEPS = 50
+
+
+class Unreachable(ValueError):
+    """No pose of the platform has the legs' lengths, or Newton's method does not find it."""
+
+
+class DhRow(Facts):
+    """A carriage joint with its D-H row (Wang, Table 1): lengths [m], angles [rad]."""
+
+    joint: str
+    kind: Literal["prismatic", "revolute"]
+    alpha: Number
+    a: Number
+    d: Number
+    theta: Number
+    range: tuple[Number, Number]
+
+
+class AxisRow(Facts):
+    """A carriage joint by the line of its axis in frame 0 with all joints at zero.
+
+    `direction` is a vector along it, `point` [m] lies on it (of no effect for a prismatic joint).
+    """
+
+    joint: str
+    kind: Literal["prismatic", "revolute"]
+    direction: Vector
+    point: Vector = (0.0, 0.0, 0.0)
+    range: tuple[Number, Number]
+
+    @model_validator(mode="after")
+    def _has_direction(self):
+        if np.linalg.norm(self.direction) < 1e-9:
+            raise ValueError("direction must not be zero")
+        return self
+
+
+class PlatformFrame(Facts):
+    """Connecting platform in frame 0, joints at zero: origin [m] and rotation vector [rad]."""
+
+    position: Vector
+    rotation: Vector
+
+
+_Six = Annotated[tuple[Vector, ...], Field(min_length=LEGS, max_length=LEGS)]
+
+
+class HybridFacts(Facts):
+    """A hybrid robot as its file states it.
+
+    `carriage` holds D-H rows, whose last frame is the connecting platform's; `axes` lines of the
+    joints' axes instead, with the connecting platform's frame where all joints are at zero.
+    """
+
+    name: str
+    carriage: tuple[DhRow, ...] = ()
+    axes: tuple[AxisRow, ...] = ()
+    platform_at_zero: PlatformFrame | None = None
+    universal_joints: _Six
+    spherical_joints: _Six
+    leg_offsets: Annotated[tuple[Number, ...], Field(min_length=LEGS, max_length=LEGS)]
+    leg_range: tuple[Positive, Positive]
+    home: Vector
+    model: str = ""
+
+    @model_validator(mode="after")
+    def _one_form(self):
+        if bool(self.carriage) == bool(self.axes):
+            raise ValueError("give either `carriage` (D-H rows) or `axes` (lines of the axes)")
+        if bool(self.axes) != (self.platform_at_zero is not None):
+            raise ValueError("`platform_at_zero` belongs to `axes`, and is needed there")
+        names = [row.joint for row in self.carriage or self.axes]
+        if twice := {n for n in names if names.count(n) > 1}:
+            raise ValueError(f"the joint {min(twice)!r} is there twice")
+        return self
+
+
+class Pose(NamedTuple):
+    """Poses of the moving platform in frame 0.
+
+    Attributes:
+        rotation: (..., 3, 3) from its frame to frame 0.
+        position: (..., 3) of its origin [m].
+    """
+
+    rotation: np.ndarray
+    position: np.ndarray
+
+
+@dataclass(frozen=True)
+class Hybrid:
+    """A hybrid robot with n carriage joints; what forward and inverse kinematics use.
+
+    Attributes:
+        name: of the robot.
+        joints: names of the carriage joints.
+        kinds: (n,) PRISMATIC or REVOLUTE.
+        constants: (n + 1, 4, 4) transforms C_0 to C_n.
+        universal: (6, 3) joints A_i in the connecting platform's frame [m].
+        spherical: (6, 3) joints B_i in the moving platform's frame [m].
+        offsets: (6,) what is added to the legs' readings [m].
+        joint_range: (n, 2) [m] or [rad].
+        leg_range: shortest and longest reading of a leg [m].
+        home: (3,) moving platform in the connecting platform's frame where the model stands [m].
+        facts: the file's content.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    kinds: np.ndarray
+    constants: np.ndarray
+    universal: np.ndarray
+    spherical: np.ndarray
+    offsets: np.ndarray
+    joint_range: np.ndarray
+    leg_range: tuple[float, float]
+    home: np.ndarray
+    facts: HybridFacts
+
+
+def load_hybrid(name: str | Path) -> Hybrid:
+    """Read a hybrid robot.
+
+    Args:
+        name: a shipped one, a file of the form of `models/iwr/iwr.yaml`, or a folder with
+            `robot.yaml`, such as one that a calibration wrote.
+
+    Raises:
+        InputError: there is none of that name, or the file is not of that form.
+
+    >>> load_hybrid("iwr").joints
+    ('d1', 'd2', 'theta3', 'theta4')
+    """
+    path = Path(name)
+    if str(name) in SHIPPED:
+        path = models_folder() / str(name) / f"{name}.yaml"
+    elif path.is_dir() and (path / "robot.yaml").is_file():
+        path = path / "robot.yaml"
+    elif not path.is_file():
+        raise InputError(
+            f"hybrid robot {str(name)!r}", f"{suggest(name, SHIPPED)}; or a file of their form"
+        )
+    data, lines = read_yaml(path)
+    return hybrid_of(parse(HybridFacts, data, str(path), lines))
+
+
+def save_hybrid(robot: Hybrid, path: str | Path, note: str = "") -> None:
+    """Write a hybrid robot as a file that `load_hybrid` reads; numbers in SI with all digits.
+
+    Args:
+        robot: the robot.
+        path: of the file, `.yaml`.
+        note: comment in its first line.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    data = robot.facts.model_dump(mode="json", exclude_defaults=True)
+    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)
+    with replacing(path, ".yaml") as part:
+        part.write_text((f"# {note}\n" if note else "") + text, encoding="utf-8")
+
+
+def hybrid_of(facts: HybridFacts) -> Hybrid:
+    """The kinematics of a hybrid robot from what its file states."""
+    rows = facts.carriage or facts.axes
+    if facts.carriage:
+        table = np.array([(r.theta, r.d, r.a, r.alpha) for r in facts.carriage])
+        constants = np.concatenate([np.eye(4)[None], dh_transform(*table.T)])
+    else:
+        constants = constants_of_axes(axis_frames(facts.axes), _at_zero(facts))
+    return Hybrid(
+        facts.name, tuple(r.joint for r in rows), np.array([_KINDS[r.kind] for r in rows]),
+        constants, np.array(facts.universal_joints), np.array(facts.spherical_joints),
+        np.array(facts.leg_offsets), np.array([r.range for r in rows]), facts.leg_range,
+        np.array(facts.home), facts,
+    )  # fmt: skip
+
+
+def dh_transform(theta, d, a, alpha) -> np.ndarray:
+    """D-H transforms Rz(theta) Tz(d) Tx(a) Rx(alpha) (Wang Eq. 6).
+
+    Args:
+        theta: (...) [rad].
+        d: (...) [m].
+        a: (...) [m].
+        alpha: (...) [rad].
+
+    Returns:
+        (..., 4, 4).
+
+    >>> dh_transform(0.0, 0.3, 0.5, 0.0)[:3, 3].tolist()
+    [0.5, 0.0, 0.3]
+    """
+    theta, d, a, alpha = np.broadcast_arrays(theta, d, a, alpha)
+    ct, st, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
+    zero, one = np.zeros_like(ct), np.ones_like(ct)
+    rows = [[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st],
+            [zero, sa, ca, d + zero], [zero, zero, zero, one]]  # fmt: skip
+    return np.moveaxis(np.array(rows, float), (0, 1), (-2, -1))
+
+
+def axis_frames(axes: Sequence[AxisRow]) -> np.ndarray:
+    """(n, 4, 4) frames F_i with z along each axis and the origin on it, in frame 0."""
+    frames = np.tile(np.eye(4), (len(axes), 1, 1))
+    for frame, row in zip(frames, axes, strict=True):
+        z = np.array(row.direction) / np.linalg.norm(row.direction)
+        x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+        x /= np.linalg.norm(x)
+        frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+        frame[:3, 3] = row.point
+    return frames
+
+
+def _at_zero(facts: HybridFacts) -> np.ndarray:
+    """(4, 4) connecting platform in frame 0 with all joints at zero."""
+    assert facts.platform_at_zero is not None
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.from_rotvec(facts.platform_at_zero.rotation).as_matrix()
+    frame[:3, 3] = facts.platform_at_zero.position
+    return frame
+
+
+def constants_of_axes(frames: np.ndarray, at_zero: np.ndarray) -> np.ndarray:
+    """Constants C_0 to C_n of a product of exponentials, from the frames of its axes.
+
+    Args:
+        frames: (..., n, 4, 4) F_i.
+        at_zero: (4, 4) connecting platform, joints at zero.
+
+    Returns:
+        (..., n + 1, 4, 4): F_1, F_i^-1 F_{i+1}, F_n^-1 times the platform's frame.
+    """
+    inverse = inverse_transform(frames)
+    between = inverse[..., :-1, :, :] @ frames[..., 1:, :, :]
+    last = inverse[..., -1:, :, :] @ at_zero
+    return np.concatenate([frames[..., :1, :, :], between, last], axis=-3)
+
+
+def inverse_transform(transform: np.ndarray) -> np.ndarray:
+    """(..., 4, 4) inverse of homogeneous transforms."""
+    turned = np.swapaxes(transform[..., :3, :3], -1, -2)
+    result = np.zeros_like(transform)
+    result[..., :3, :3], result[..., 3, 3] = turned, 1.0
+    result[..., :3, 3] = -np.einsum("...ij,...j->...i", turned, transform[..., :3, 3])
+    return result
+
+
+def zero_frames(robot: Hybrid) -> tuple[np.ndarray, np.ndarray]:
+    """Frames of the joints' axes and of the connecting platform in frame 0, all joints at zero.
+
+    Returns:
+        ((n, 4, 4) with each joint's axis along z, (4, 4) connecting platform).
+    """
+    frame, frames = np.eye(4), []
+    for constant in robot.constants[:-1]:
+        frame = frame @ constant
+        frames.append(frame)
+    return np.array(frames), frame @ robot.constants[-1]
+
+
+def with_axes(robot: Hybrid) -> Hybrid:
+    """The same robot stated by the lines of its axes at zero in place of D-H rows.
+
+    >>> same = with_axes(load_hybrid("iwr"))
+    >>> q = np.array([0.3, 0.1, 0.4, -0.2])
+    >>> place = Pose(np.eye(3), np.array([1.2, -0.1, 1.4]))
+    >>> change = leg_readings(same, q, place) - leg_readings(load_hybrid("iwr"), q, place)
+    >>> bool(abs(change).max() < 1e-12)
+    True
+    """
+    frames, last = zero_frames(robot)
+    rows = [
+        AxisRow(joint=name, kind="prismatic" if kind == PRISMATIC else "revolute",
+                direction=tuple(frame[:3, 2]), point=tuple(frame[:3, 3]), range=tuple(limits))
+        for name, kind, frame, limits in zip(
+            robot.joints, robot.kinds, frames, robot.joint_range.tolist(), strict=True)
+    ]  # fmt: skip
+    vector = Rotation.from_matrix(last[:3, :3]).as_rotvec()
+    seat = PlatformFrame(position=tuple(last[:3, 3]), rotation=tuple(vector))
+    changes = {"carriage": (), "axes": tuple(rows), "platform_at_zero": seat}
+    return hybrid_of(robot.facts.model_copy(update=changes))
+
+
+def carriage_pose(robot: Hybrid, joints: np.ndarray) -> np.ndarray:
+    """Poses of the connecting platform.
+
+    Args:
+        robot: the robot.
+        joints: (..., n) positions [m] or [rad].
+
+    Returns:
+        (..., 4, 4) in frame 0.
+    """
+    joints = np.asarray(joints, float)
+    result = np.broadcast_to(robot.constants[0], (*joints.shape[:-1], 4, 4))
+    for i, kind in enumerate(robot.kinds):
+        motion = np.zeros((*joints.shape[:-1], 4, 4))
+        motion[..., range(4), range(4)] = 1.0
+        if kind == REVOLUTE:
+            c, s = np.cos(joints[..., i]), np.sin(joints[..., i])
+            motion[..., 0, 0], motion[..., 0, 1] = c, -s
+            motion[..., 1, 0], motion[..., 1, 1] = s, c
+        else:
+            motion[..., 2, 3] = joints[..., i]
+        result = result @ motion @ robot.constants[i + 1]
+    return result
+
+
+def leg_vectors(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
+    """Vectors from A_i to B_i in the connecting platform's frame (Wang Eqs 8 and 10).
+
+    Args:
+        robot: the robot.
+        joints: (..., n) positions of the carriage [m] or [rad].
+        pose: of the moving platform, (...).
+
+    Returns:
+        (..., 6, 3) [m].
+    """
+    carriage = carriage_pose(robot, joints)
+    ends = np.einsum("...ij,kj->...ki", pose.rotation, robot.spherical)
+    ends = ends + (pose.position - carriage[..., :3, 3])[..., None, :]
+    return np.einsum("...ji,...kj->...ki", carriage[..., :3, :3], ends) - robot.universal
+
+
+def leg_readings(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
+    """Inverse kinematics of the legs (Wang Eq. 11): what the leg sensors read at a pose.
+
+    Args:
+        robot: the robot.
+        joints: (..., n) positions of the carriage [m] or [rad].
+        pose: of the moving platform, (...).
+
+    Returns:
+        (..., 6) distance of A_i and B_i less the leg's offset [m].
+    """
+    return np.linalg.norm(leg_vectors(robot, joints, pose), axis=-1) - robot.offsets
+
+
+def inverse(robot: Hybrid, pose: Pose, joints: np.ndarray) -> np.ndarray:
+    """Inverse kinematics: leg readings for a pose with the carriage where it is put.
+
+    The robot is redundant: ten joints for six coordinates. The carriage's joints are chosen first,
+    the legs follow.
+
+    Args:
+        robot: the robot.
+        pose: of the moving platform, (...).
+        joints: (..., n) positions of the carriage [m] or [rad].
+
+    Returns:
+        (..., 6) readings [m].
+
+    Raises:
+        Unreachable: a leg would be shorter or longer than it can be.
+    """
+    readings = leg_readings(robot, joints, pose)
+    low, high = robot.leg_range
+    if not ((readings >= low) & (readings <= high)).all():
+        worst = readings.flat[np.argmax(np.maximum(low - readings, readings - high))]
+        raise Unreachable(f"a leg would read {worst:.4f} m, it goes from {low:g} to {high:g} m")
+    return readings
+
+
+def home_pose(robot: Hybrid, joints: np.ndarray) -> Pose:
+    """Moving platform at its home over the connecting platform, for carriage positions (..., n)."""
+    carriage = carriage_pose(robot, joints)
+    place = np.einsum("...ij,j->...i", carriage[..., :3, :3], robot.home)
+    return Pose(carriage[..., :3, :3], place + carriage[..., :3, 3])
+
+
+def leg_jacobian(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
+    """Derivatives of the leg readings by the pose: position [m], then rotation vector [rad].
+
+    The rotation is that of exp(w) R in frame 0.
+
+    Args:
+        robot: the robot.
+        joints: (..., n) positions of the carriage [m] or [rad].
+        pose: of the moving platform, (...).
+
+    Returns:
+        (..., 6, 6): row k is (u_k, (R b_k) x u_k), u_k the direction of leg k in frame 0.
+    """
+    carriage = carriage_pose(robot, joints)
+    legs = leg_vectors(robot, joints, pose)
+    unit = legs / np.linalg.norm(legs, axis=-1, keepdims=True)
+    unit = np.einsum("...ij,...kj->...ki", carriage[..., :3, :3], unit)
+    arms = np.einsum("...ij,kj->...ki", pose.rotation, robot.spherical)
+    return np.concatenate([unit, np.cross(arms, unit)], axis=-1)
+
+
+def forward(
+    robot: Hybrid, joints: np.ndarray, readings: np.ndarray, start: Pose | None = None
+) -> Pose:
+    """Forward kinematics by Newton's method on the six leg lengths.
+
+    Of the up to 40 poses with the same lengths the one on the start's branch is found.
+
+    Args:
+        robot: the robot.
+        joints: (N, n) or (n,) positions of the carriage [m] or [rad].
+        readings: (N, 6) or (6,) of the legs [m].
+        start: poses to begin with; the home poses by default.
+
+    Returns:
+        The poses, (N,) or a single one.
+
+    Raises:
+        Unreachable: Newton's method does not converge.
+    """
+    joints, readings = np.asarray(joints, float), np.asarray(readings, float)
+    rotation, position = home_pose(robot, joints) if start is None else start
+    rotation, position = np.array(rotation), np.array(position)
+    size = np.inf
+    for _ in range(_STEPS):
+        pose = Pose(rotation, position)
+        error = leg_readings(robot, joints, pose) - readings
+        jacobian = leg_jacobian(robot, joints, pose)
+        try:
+            step = -np.linalg.solve(jacobian, error[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            raise Unreachable("the hexapod is in a singular pose") from None
+        turn = np.linalg.norm(step[..., 3:], axis=-1, keepdims=True)
+        step = step * np.minimum(1.0, 0.5 / np.maximum(turn, 1e-300))  # rad: stays on the branch
+        position = position + step[..., :3]
+        turned = Rotation.from_rotvec(step[..., 3:].reshape(-1, 3)).as_matrix()
+        rotation = turned.reshape(*step.shape[:-1], 3, 3) @ rotation
+        size = np.max(np.abs(step), initial=0.0)
+        if not np.isfinite(size) or size < _CONVERGED:
+            break
+    pose = Pose(rotation, position)
+    left = np.max(np.abs(leg_readings(robot, joints, pose) - readings), initial=0.0)
+    if not left < 1e-9:  # m: far below any sensor, far above rounding
+        raise Unreachable("no pose of the platform has these leg lengths near the start")
+    return pose
+
+
+def forward_evolution(
+    robot: Hybrid, joints: np.ndarray, readings: np.ndarray, seed: int = 0,
+    reach: float = 0.35, turn: float = 0.6, polish: bool = False,
+) -> Pose:  # fmt: skip
+    """Forward kinematics by differential evolution: no start, no Jacobian.
+
+    The sum of squared errors of the leg lengths is minimised over position and rotation vector in
+    a box about the home pose.
+
+    Args:
+        robot: the robot.
+        joints: (n,) positions of the carriage [m] or [rad].
+        readings: (6,) of the legs [m].
+        seed: of the random numbers.
+        reach: half the box's edge in position [m].
+        turn: half the box's edge in the rotation vector [rad].
+        polish: end with a gradient search.
+
+    Returns:
+        The pose.
+
+    Source: Wang 2012, sections 2.2 and 3.3 (forward kinematics by DE); Storn and Price 1997.
+    """
+    home = home_pose(robot, np.asarray(joints, float))
+
+    def pose_of(x: np.ndarray) -> Pose:  # (6, S) as SciPy passes a population
+        turned = Rotation.from_rotvec(x[3:].T).as_matrix() @ home.rotation
+        return Pose(turned, home.position + x[:3].T)
+
+    def misfit(x: np.ndarray) -> np.ndarray:
+        x = x if x.ndim == 2 else x[:, None]
+        place = np.broadcast_to(joints, (x.shape[1], len(robot.joints)))
+        away = leg_readings(robot, place, pose_of(x)) - readings
+        return np.sum((1e3 * away) ** 2, axis=-1)
+
+    found = differential_evolution(
+        misfit, [(-reach, reach)] * 3 + [(-turn, turn)] * 3, rng=np.random.default_rng(seed),
+        popsize=10, maxiter=2000, tol=1e-16, polish=polish, vectorized=True,
+        updating="deferred",
+    )  # fmt: skip
+    pose = pose_of(found.x[:, None])
+    return Pose(pose.rotation[0], pose.position[0])
+
+
+def rotation_of_euler(angles: np.ndarray) -> np.ndarray:
+    """Rotation Rz(gamma) Ry(beta) Rx(alpha) of Z-Y-X Euler angles (Wang Eq. 9).
+
+    Args:
+        angles: (..., 3) about x, y, z: alpha, beta, gamma [rad].
+
+    Returns:
+        (..., 3, 3).
+    """
+    angles = np.asarray(angles, float)
+    turned = Rotation.from_euler("ZYX", angles.reshape(-1, 3)[:, ::-1]).as_matrix()
+    return turned.reshape(*angles.shape[:-1], 3, 3)
+
+
+def euler_of_rotation(rotation: np.ndarray) -> np.ndarray:
+    """(..., 3) Z-Y-X Euler angles about x, y, z [rad] of rotations (..., 3, 3).
+
+    >>> euler_of_rotation(rotation_of_euler([0.1, -0.2, 0.3])).round(12).tolist()
+    [0.1, -0.2, 0.3]
+    """
+    rotation = np.asarray(rotation, float)
+    angles = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_euler("ZYX")[:, ::-1]
+    return angles.reshape(*rotation.shape[:-2], 3)
+
+
+def pose_difference(found: Pose, true: Pose) -> np.ndarray:
+    """(..., 6) found less true: position [m] and rotation vector [rad], both in frame 0."""
+    turned = found.rotation @ np.swapaxes(true.rotation, -1, -2)
+    vector = Rotation.from_matrix(turned.reshape(-1, 3, 3)).as_rotvec()
+    return np.concatenate(
+        [found.position - true.position, vector.reshape(found.position.shape)], axis=-1
+    )
+
+
+@compiled
+def batch_readings(constants, kinds, universal, spherical, offsets, joints, rotation, position):
+    """Leg readings of W robots at N poses each; what least squares, DE and MCMC evaluate.
+
+    Args:
+        constants: (W, n + 1, 4, 4) transforms of each robot's carriage.
+        kinds: (n,) PRISMATIC or REVOLUTE.
+        universal: (W, 6, 3) [m].
+        spherical: (W, 6, 3) [m].
+        offsets: (W, 6) [m].
+        joints: (N, n) [m] or [rad].
+        rotation: (N, 3, 3) of the moving platform.
+        position: (N, 3) [m].
+
+    Returns:
+        (W, N, 6) readings [m], as `leg_readings`.
+
+    Source: Wang 2012, Eqs 10, 11 and 29.
+    """
+    robots, poses, n = len(constants), len(joints), len(kinds)
+    result = np.empty((robots, poses, 6))
+    t, m = np.empty((3, 4)), np.empty((3, 4))
+    for w in range(robots):
+        for k in range(poses):
+            for i in range(3):
+                for j in range(4):
+                    t[i, j] = constants[w, 0, i, j]
+            for joint in range(n):
+                value = joints[k, joint]
+                if kinds[joint] == 1:
+                    c, s = np.cos(value), np.sin(value)
+                    for i in range(3):
+                        x, y = t[i, 0], t[i, 1]
+                        t[i, 0], t[i, 1] = c * x + s * y, c * y - s * x
+                else:
+                    for i in range(3):
+                        t[i, 3] += t[i, 2] * value
+                for i in range(3):
+                    for j in range(4):
+                        total = t[i, 3] if j == 3 else 0.0
+                        for v in range(3):
+                            total += t[i, v] * constants[w, joint + 1, v, j]
+                        m[i, j] = total
+                for i in range(3):
+                    for j in range(4):
+                        t[i, j] = m[i, j]
+            for leg in range(6):
+                square = 0.0
+                bx, by, bz = spherical[w, leg, 0], spherical[w, leg, 1], spherical[w, leg, 2]
+                ax, ay, az = universal[w, leg, 0], universal[w, leg, 1], universal[w, leg, 2]
+                for i in range(3):  # the same length in frame 0: no transposed product
+                    away = position[k, i] - t[i, 3]
+                    away += rotation[k, i, 0] * bx + rotation[k, i, 1] * by + rotation[k, i, 2] * bz
+                    away -= t[i, 0] * ax + t[i, 1] * ay + t[i, 2] * az
+                    square += away * away
+                result[w, k, leg] = np.sqrt(square) - offsets[w, leg]
+    return result

@@ -1,0 +1,168 @@
+"""The 3-2-1 wire method: six wires to three points of a platform measure its pose.
+
+Three wires end in the first point, two in the second, one in the third. The first point is the
+intersection of three spheres; with its distance to the second known, that is another one, and so is
+the third. Each has two solutions, mirrored in the plane of the centres; the one near an expected
+pose is taken.
+
+Source: Wang 2012, chapter 5 (3-2-1 wire-based pose estimation, three spheres' intersection); the
+chapter is not in the published text we have, so that the equations here are those of trilateration
+by Manolakis 1996 and Thomas and Ros 2005.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from hydrotele.core.datafile import Facts, Vector
+from hydrotele.kinematics.hybrid import Pose
+
+_POINT = (0, 0, 0, 1, 1, 2)  # platform point of each wire
+
+
+class Wires(Facts):
+    """Where six wires begin and end.
+
+    Attributes:
+        anchors: of the six wires in frame 0 [m]: three of the first point, two of the second, one.
+        points: the three points in the moving platform's frame [m].
+    """
+
+    anchors: Annotated[tuple[Vector, ...], Field(min_length=6, max_length=6)]
+    points: Annotated[tuple[Vector, ...], Field(min_length=3, max_length=3)]
+
+
+class NoIntersection(ValueError):
+    """Wires are too short to meet, or too long to reach each other."""
+
+
+def wire_lengths(wires: Wires, pose: Pose) -> np.ndarray:
+    """Lengths of the six wires at poses.
+
+    Args:
+        wires: where they begin and end.
+        pose: of the moving platform, (...).
+
+    Returns:
+        (..., 6) [m].
+    """
+    ends = np.einsum("...ij,kj->...ki", pose.rotation, np.array(wires.points)[list(_POINT)])
+    return np.linalg.norm(ends + pose.position[..., None, :] - np.array(wires.anchors), axis=-1)
+
+
+def trilaterate(centres: np.ndarray, radii: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Intersection of three spheres.
+
+    In the frame with x from centre 1 to 2 and y in the centres' plane, with d = |c2 - c1| and
+    centre 3 at (i, j): x = (r1^2 - r2^2 + d^2) / 2d, y = (r1^2 - r3^2 + i^2 + j^2) / 2j - i x / j,
+    z^2 = r1^2 - x^2 - y^2.
+
+    Args:
+        centres: (..., 3, 3) centres, one per row [m].
+        radii: (..., 3) [m].
+        near: (..., 3) where about the point is: it selects one of the two solutions.
+
+    Returns:
+        (..., 3) [m].
+
+    Raises:
+        NoIntersection: the spheres do not meet.
+
+    >>> c = np.eye(3) * 2.0
+    >>> trilaterate(c, np.linalg.norm(c - 1.0, axis=-1), np.array([0.9, 1.0, 1.0])).round(12)
+    array([1., 1., 1.])
+    """
+    one, two, three = np.moveaxis(np.asarray(centres, float), -2, 0)
+    r1, r2, r3 = np.moveaxis(np.asarray(radii, float), -1, 0)
+    d = np.linalg.norm(two - one, axis=-1)
+    ex = (two - one) / d[..., None]
+    i = np.sum(ex * (three - one), axis=-1)
+    ey = three - one - i[..., None] * ex
+    j = np.linalg.norm(ey, axis=-1)
+    ey = ey / j[..., None]
+    ez = np.cross(ex, ey)
+    x = (r1**2 - r2**2 + d**2) / (2.0 * d)
+    y = (r1**2 - r3**2 + i**2 + j**2) / (2.0 * j) - i * x / j
+    square = r1**2 - x**2 - y**2
+    if not (square > 0.0).all():
+        where = np.flatnonzero(~(np.ravel(square) > 0.0))
+        raise NoIntersection(f"the wires do not meet at pose {where[0] + 1}")
+    flat = one + x[..., None] * ex + y[..., None] * ey
+    side = np.sign(np.sum((near - flat) * ez, axis=-1))
+    return flat + (np.where(side < 0.0, -1.0, 1.0) * np.sqrt(square))[..., None] * ez
+
+
+def pose_of_wires(wires: Wires, lengths: np.ndarray, near: Pose) -> Pose:
+    """Pose of the platform from the six wires' lengths.
+
+    Args:
+        wires: where they begin and end.
+        lengths: (..., 6) [m].
+        near: expected poses (...), such as the nominal kinematics', which select the solutions.
+
+    Returns:
+        The poses.
+
+    Raises:
+        NoIntersection: the lengths do not fit together.
+    """
+    lengths = np.asarray(lengths, float)
+    anchors, points = np.array(wires.anchors), np.array(wires.points)
+    shape = lengths.shape[:-1]
+    expected = np.einsum("...ij,kj->...ki", near.rotation, points) + near.position[..., None, :]
+    of_first = np.broadcast_to(anchors[:3], (*shape, 3, 3))
+    first = trilaterate(of_first, lengths[..., :3], expected[..., 0, :])
+    side = np.linalg.norm(points[:, None] - points, axis=-1)
+    two = np.broadcast_to(anchors[3:5], (*shape, 2, 3))
+    centres = np.concatenate([two, first[..., None, :]], axis=-2)
+    radii = np.concatenate([lengths[..., 3:5], np.full((*shape, 1), side[0, 1])], axis=-1)
+    second = trilaterate(centres, radii, expected[..., 1, :])
+    centres = np.stack([np.broadcast_to(anchors[5], (*shape, 3)), first, second], axis=-2)
+    sides = np.broadcast_to([side[0, 2], side[1, 2]], (*shape, 2))
+    radii = np.concatenate([lengths[..., 5:], sides], axis=-1)
+    third = trilaterate(centres, radii, expected[..., 2, :])
+    rotation = _triad(first, second, third) @ np.swapaxes(_triad(*points), -1, -2)
+    return Pose(rotation, first - np.einsum("...ij,j->...i", rotation, points[0]))
+
+
+def _triad(first, second, third) -> np.ndarray:
+    """(..., 3, 3) axes of three points: x from the first to the second, z across all of them."""
+    x = second - first
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    z = np.cross(x, third - first)
+    z = z / np.linalg.norm(z, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def wire_jacobian(wires: Wires, pose: Pose) -> np.ndarray:
+    """Derivatives of the wires' lengths by the pose, position [m] and rotation vector [rad].
+
+    Args:
+        wires: where they begin and end.
+        pose: of the moving platform, (...).
+
+    Returns:
+        (..., 6, 6): row k is (u_k, (R p_k) x u_k), u_k the direction of wire k.
+    """
+    arms = np.einsum("...ij,kj->...ki", pose.rotation, np.array(wires.points)[list(_POINT)])
+    away = arms + pose.position[..., None, :] - np.array(wires.anchors)
+    unit = away / np.linalg.norm(away, axis=-1, keepdims=True)
+    return np.concatenate([unit, np.cross(arms, unit)], axis=-1)
+
+
+def pose_covariance(wires: Wires, pose: Pose, sigma: float) -> np.ndarray:
+    """Covariance of a pose from wires whose lengths have independent errors.
+
+    J^-1 sigma^2 J^-T with J of `wire_jacobian`: the pose is what reproduces all six lengths.
+
+    Args:
+        wires: where they begin and end.
+        pose: measured, (...).
+        sigma: standard deviation of a wire's length [m].
+
+    Returns:
+        (..., 6, 6) of position [m] and rotation vector [rad] in frame 0.
+    """
+    inverse = np.linalg.inv(wire_jacobian(wires, pose))
+    return sigma**2 * inverse @ np.swapaxes(inverse, -1, -2)

@@ -1,0 +1,355 @@
+"""Hybrid robots in simulation: their closed-chain MuJoCo model, and measured poses with noise.
+
+The mechanism has every joint of the robot: slides and hinges of the carriage, for each leg a
+universal joint, a slide and a ball joint. The moving platform hangs on the first leg; five
+`connect` constraints close the other legs.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hydrotele.kinematics.hybrid import (
+    LEGS,
+    REVOLUTE,
+    Hybrid,
+    Pose,
+    Unreachable,
+    forward,
+    home_pose,
+    leg_readings,
+    rotation_of_euler,
+    zero_frames,
+)
+from hydrotele.kinematics.hybrid_errors import ErrorModel
+from hydrotele.kinematics.wires import Wires, pose_covariance, wire_lengths
+from hydrotele.simulate.closure import closure_error
+
+REACH, TILT = 0.08, 0.25  # m, rad: of the platform about its home, for random poses
+_WIRES_LOSE = 20.0  # times the wires' error that a pose's coordinate may have, per m of lever
+_TRIES = 200
+_CLOSED = 1e-12  # m
+_PIN = dict(solref=[0.002, 1.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0])  # stiff: DESIGN
+_COLOURS = {
+    "rail": (0.35, 0.37, 0.40, 1.0), "carriage": (0.85, 0.60, 0.10, 1.0),
+    "tube": (0.25, 0.30, 0.38, 1.0), "rod": (0.80, 0.82, 0.84, 1.0),
+    "platform": (0.16, 0.45, 0.62, 1.0),
+}  # fmt: skip
+# Masses [kg] of links, tubes, rods and moving platform, and the servos of a model that stands.
+_MASS = {"slide": 400.0, "turn": 250.0, "tube": 18.0, "rod": 9.0, "platform": 60.0}
+
+
+class MeasuredPoses(NamedTuple):
+    """Simulated readings of N poses, and what is true.
+
+    Attributes:
+        joints: (N, n) carriage readings [m] or [rad].
+        legs: (N, 6) leg readings [m].
+        wires: (N, 6) wire readings [m].
+        true_joints: (N, n).
+        true_legs: (N, 6).
+        pose: true, of the moving platform.
+    """
+
+    joints: np.ndarray
+    legs: np.ndarray
+    wires: np.ndarray
+    true_joints: np.ndarray
+    true_legs: np.ndarray
+    pose: Pose
+
+
+def shipped_wires() -> Wires:
+    """Six wires from a hexagon on the floor around the IWR's rails to three arms of a platform.
+
+    The hexagon has a radius of 1.5 m, 1 m below frame 0, its middle at half the rails' length; the
+    arms reach 0.45 m. Of all orders of the wires this one measures best over the workspace.
+    """
+    at = np.arange(LEGS) * np.pi / 3.0
+    corners = np.column_stack([np.full(LEGS, -1.0), 1.5 * np.cos(at), 1.45 + 1.5 * np.sin(at)])
+    arms = np.arange(3) * 2.0 * np.pi / 3.0
+    points = np.column_stack([0.45 * np.cos(arms), 0.45 * np.sin(arms), np.full(3, 0.05)])
+    corners, points = corners[[0, 2, 4, 1, 5, 3]].round(6), points[[1, 2, 0]].round(6)
+    return Wires(anchors=tuple(map(tuple, corners.tolist())),
+                 points=tuple(map(tuple, points.tolist())))  # fmt: skip
+
+
+def manufactured_errors(
+    model: ErrorModel, rng: np.random.Generator, names: tuple[str, ...] | None = None,
+    size: float = 1.0,
+) -> np.ndarray:  # fmt: skip
+    """(p,) errors of a robot as built: normal, of `model.scales` times `size`; others zero."""
+    errors = rng.normal(size=len(model.names)) * model.scales * size
+    if names is not None:
+        kept = np.zeros(len(errors), bool)
+        kept[model.index(names)] = True
+        errors[~kept] = 0.0
+    return errors
+
+
+def random_poses(
+    robot: Hybrid, count: int, rng: np.random.Generator, wires: Wires | None = None,
+    reach: float = REACH, tilt: float = TILT,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Random commands: carriage anywhere in its range, platform about its home.
+
+    Args:
+        robot: nominal.
+        count: number of poses.
+        rng: of the random numbers.
+        wires: poses that they measure badly are avoided.
+        reach: largest displacement of the platform along each axis [m].
+        tilt: largest Euler angle [rad].
+
+    Returns:
+        (joints (N, n), leg readings (N, 6)), all legs within their range.
+
+    Raises:
+        ValueError: the ranges leave none.
+    """
+    low, high = robot.joint_range.T
+    joints, legs = np.empty((0, len(low))), np.empty((0, LEGS))
+    for _ in range(_TRIES):
+        q = rng.uniform(low, high, (count, len(low)))
+        home = home_pose(robot, q)
+        local = rng.uniform(-1.0, 1.0, (count, 6)) * np.repeat([reach, tilt], 3)
+        place = np.einsum("nij,nj->ni", home.rotation, local[:, :3]) + home.position
+        pose = Pose(home.rotation @ rotation_of_euler(local[:, 3:]), place)
+        readings = leg_readings(robot, q, pose)
+        good = (readings > robot.leg_range[0]).all(1) & (readings < robot.leg_range[1]).all(1)
+        if wires is not None:
+            cov = pose_covariance(wires, pose, 1.0)
+            good &= np.sqrt(np.einsum("nii->ni", cov)).max(axis=1) < _WIRES_LOSE
+        joints, legs = np.vstack([joints, q[good]]), np.vstack([legs, readings[good]])
+        if len(legs) >= count:
+            return joints[:count], legs[:count]
+    raise ValueError(f"robot {robot.name}: hardly any random pose is within the legs' range")
+
+
+def measured_poses(
+    robot: Hybrid, joints: np.ndarray, legs: np.ndarray, wires: Wires,
+    noise: Mapping[str, float], rng: np.random.Generator,
+) -> MeasuredPoses:  # fmt: skip
+    """What sensors read of a robot as built.
+
+    Args:
+        robot: as built.
+        joints: (N, n) where the carriage is [m] or [rad].
+        legs: (N, 6) the legs' true readings [m].
+        wires: where they are.
+        noise: standard deviations `leg`, `slide`, `wire` [m], `turn` [rad].
+        rng: of the noise.
+
+    Returns:
+        Readings with noise, and the truth.
+    """
+    pose = forward(robot, joints, legs)
+    sizes = np.where(robot.kinds == REVOLUTE, noise.get("turn", 0.0), noise.get("slide", 0.0))
+    lengths = wire_lengths(wires, pose)
+    return MeasuredPoses(
+        joints + sizes * rng.normal(size=joints.shape),
+        legs + noise.get("leg", 0.0) * rng.normal(size=legs.shape),
+        lengths + noise.get("wire", 0.0) * rng.normal(size=lengths.shape), joints, legs, pose,
+    )  # fmt: skip
+
+
+def hybrid_mechanism(robot: Hybrid) -> mujoco.MjSpec:
+    """The closed-chain mechanism of a hybrid robot, carriage at zero, platform at home.
+
+    All bodies have frame 0's axes there; joints are named as the robot's, `leg1.roll`,
+    `leg1.pitch`, `leg1` (the slide, 0 at home) and `ball`. In the world frame 0's x is up, y to
+    the right and z along the rails.
+
+    Args:
+        robot: nominal or as built.
+
+    Returns:
+        The specification; `compile()` makes the model.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = robot.name
+    spec.compiler.degree = False
+    spec.option.timestep = 1e-3
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.visual.headlight.ambient = [0.35] * 3
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1600, 1200
+    base = spec.worldbody.add_body(name="frame0", pos=[0, 0, 0.3], quat=_world_quaternion())
+    _rails(base, robot)
+    parent, links = base, []
+    frames, last = zero_frames(robot)
+    for i, (name, kind) in enumerate(zip(robot.joints, robot.kinds, strict=True)):
+        body = parent.add_body(name=name)
+        turning = kind == REVOLUTE
+        body.add_joint(
+            name=name, pos=frames[i, :3, 3], axis=frames[i, :3, 2],
+            type=mujoco.mjtJoint.mjJNT_HINGE if turning else mujoco.mjtJoint.mjJNT_SLIDE,
+            damping=2e4 if turning else 1e4,
+        )  # fmt: skip
+        links.append(body)
+        parent = body
+    _carriage_shapes(links, frames, last, robot)
+    home = home_pose(robot, np.zeros(len(robot.joints)))
+    lower = robot.universal @ last[:3, :3].T + last[:3, 3]
+    upper = robot.spherical @ home.rotation.T + home.position
+    _legs(spec, links[-1], lower, upper, home, robot)
+    for name in robot.joints:
+        _servo(spec, name, 4e6)
+    for leg in range(1, LEGS + 1):
+        _servo(spec, f"leg{leg}", 2e6)
+    return spec
+
+
+def _world_quaternion() -> list[float]:
+    axes = np.array([[0, 0, 1], [0, -1, 0], [1, 0, 0]], float)  # rows: world x, y, z in frame 0
+    return Rotation.from_matrix(axes).as_quat(scalar_first=True).tolist()
+
+
+def _servo(spec: mujoco.MjSpec, joint: str, stiffness: float) -> None:
+    spec.add_actuator(
+        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        gainprm=[stiffness] + [0.0] * 9, biasprm=[0.0, -stiffness, -0.02 * stiffness] + [0.0] * 7,
+    )  # fmt: skip
+
+
+def _legs(spec, platform, lower, upper, home: Pose, robot: Hybrid) -> None:
+    """Legs between the joints, the moving platform on the first one, closures of the others."""
+    up = home.rotation[:, 2]
+    moving = None
+    for leg, (a, b) in enumerate(zip(lower, upper, strict=True), 1):
+        along = (b - a) / np.linalg.norm(b - a)
+        roll = np.cross(up, along)
+        roll = roll / np.linalg.norm(roll)
+        pitch = np.cross(along, roll)
+        joint = platform.add_body(name=f"leg{leg}_cross")
+        joint.add_joint(name=f"leg{leg}.roll", pos=a, axis=roll, damping=20.0)
+        joint.mass, joint.inertia, joint.ipos = 3.0, [0.01] * 3, a
+        joint.explicitinertial = True
+        joint.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=a, size=[0.035, 0, 0], mass=0.0,
+                       rgba=_COLOURS["tube"], **_NO_CONTACT)  # fmt: skip
+        tube = joint.add_body(name=f"leg{leg}_tube")
+        tube.add_joint(name=f"leg{leg}.pitch", pos=a, axis=pitch, damping=20.0)
+        length = float(np.linalg.norm(b - a))
+        _bar(tube, a, a + 0.62 * length * along, 0.032, _MASS["tube"], "tube")
+        rod = tube.add_body(name=f"leg{leg}_rod")
+        low, high = robot.leg_range
+        reading = length - robot.offsets[leg - 1]
+        rod.add_joint(
+            name=f"leg{leg}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=along, damping=2e3,
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=[low - reading, high - reading],
+        )  # fmt: skip
+        _bar(rod, a + 0.40 * length * along, b, 0.018, _MASS["rod"], "rod")
+        rod.add_site(name=f"leg{leg}_end", pos=b, size=[0.02, 0, 0])
+        if leg == 1:
+            moving = rod.add_body(name="platform")
+            moving.add_joint(name="ball", type=mujoco.mjtJoint.mjJNT_BALL, pos=b, damping=2.0)
+            turn = Rotation.from_matrix(home.rotation).as_quat(scalar_first=True)
+            moving.add_site(name="frame5", pos=home.position, size=[0.03, 0, 0], quat=turn)
+            _plate(moving, home.position, home.rotation, upper, 0.03, _MASS["platform"], "platform")
+        assert moving is not None
+        moving.add_site(name=f"b{leg}", pos=b, size=[0.025, 0, 0], rgba=_COLOURS["rod"])
+        if leg > 1:
+            pin = spec.add_equality(
+                name=f"leg{leg}", type=mujoco.mjtEq.mjEQ_CONNECT, name1=f"leg{leg}_end",
+                name2=f"b{leg}", objtype=mujoco.mjtObj.mjOBJ_SITE,
+            )  # fmt: skip
+            pin.solref, pin.solimp = _PIN["solref"], _PIN["solimp"]
+
+
+_NO_CONTACT = dict(contype=0, conaffinity=0)
+
+
+def _bar(body, start, end, radius: float, mass: float, colour: str) -> None:
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*start, *end], size=[radius, 0, 0], mass=mass,
+        rgba=_COLOURS[colour], **_NO_CONTACT,
+    )  # fmt: skip
+
+
+def _plate(body, middle, rotation, points, thickness, mass, colour) -> None:
+    radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=middle, size=[radius, 0.5 * thickness, 0],
+        quat=Rotation.from_matrix(rotation).as_quat(scalar_first=True), mass=mass,
+        rgba=_COLOURS[colour], **_NO_CONTACT,
+    )  # fmt: skip
+
+
+def _rails(base, robot: Hybrid) -> None:
+    """Two rails along the first joint, at the height of frame 0."""
+    low, high = robot.joint_range[0]
+    for side in (-0.3, 0.3):
+        base.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, pos=[-0.05, side, 0.5 * (low + high)],
+            size=[0.04, 0.05, 0.5 * (high - low) + 0.3], rgba=_COLOURS["rail"], **_NO_CONTACT,
+        )  # fmt: skip
+
+
+def _carriage_shapes(links, frames, last, robot: Hybrid) -> None:
+    """Bars from axis to axis; each slide a block; a plate under the universal joints."""
+    places = [*frames[:, :3, 3], last[:3, 3]]
+    for i, (body, kind) in enumerate(zip(links, robot.kinds, strict=True)):
+        mass = _MASS["turn"] if kind == REVOLUTE else _MASS["slide"]
+        start, end = places[i], places[i + 1]
+        if np.linalg.norm(end - start) > 0.05:
+            _bar(body, start, end, 0.075, mass, "carriage")
+        else:
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX, pos=start, size=[0.05 + 0.02 * i, 0.3 - 0.12 * i,
+                0.22], mass=mass, rgba=_COLOURS["carriage"], **_NO_CONTACT,
+            )  # fmt: skip
+    points = robot.universal @ last[:3, :3].T + last[:3, 3]
+    _plate(
+        links[-1], last[:3, 3] - 0.03 * last[:3, 2], last[:3, :3], points, 0.05, 80.0, "carriage"
+    )
+
+
+def mechanism_pose(
+    model: mujoco.MjModel, data: mujoco.MjData, robot: Hybrid, joints: np.ndarray,
+    legs: np.ndarray,
+) -> Pose:  # fmt: skip
+    """Platform pose of the closed-chain model: carriage and leg slides set, loops closed by Newton.
+
+    Args:
+        model: of `hybrid_mechanism(robot)`.
+        data: its data; the search starts where it stands.
+        robot: the robot.
+        joints: (n,) carriage [m] or [rad].
+        legs: (6,) leg readings [m].
+
+    Returns:
+        The pose of the site `frame5` in frame 0.
+
+    Raises:
+        Unreachable: the loops do not close.
+    """
+    zero = leg_readings(robot, np.zeros(len(robot.joints)), home_pose(robot, np.zeros(len(joints))))
+    driven = [*robot.joints, *(f"leg{k}" for k in range(1, LEGS + 1))]
+    goal = np.concatenate([joints, legs - zero])
+    at = np.array([model.joint(name).qposadr[0] for name in driven])
+    begin = data.qpos[at].copy()
+    moving = np.setdiff1d(np.arange(model.nv), [model.joint(n).dofadr[0] for n in driven])
+    parts = 1 + int(np.max(np.abs(goal - begin)) / 0.1)
+    error = np.array([np.inf])
+    for part in range(1, parts + 1):
+        data.qpos[at] = begin + (goal - begin) * part / parts
+        for _ in range(30):
+            error, jacobian = closure_error(model, data)
+            if np.abs(error).max() < _CLOSED:
+                break
+            step = np.zeros(model.nv)
+            step[moving] = -np.linalg.lstsq(jacobian[:, moving], error, rcond=None)[0]
+            mujoco.mj_integratePos(model, data.qpos, step, 1.0)
+    if np.abs(error).max() > 1e-9:
+        raise Unreachable("the mechanism's loops do not close at these lengths")
+    return platform_pose(data)
+
+
+def platform_pose(data: mujoco.MjData) -> Pose:
+    """Pose of the site `frame5` in frame 0, with the data's kinematics as they stand."""
+    base, site = data.body("frame0"), data.site("frame5")
+    turned = base.xmat.reshape(3, 3)
+    return Pose(turned.T @ site.xmat.reshape(3, 3), turned.T @ (site.xpos - base.xpos))
