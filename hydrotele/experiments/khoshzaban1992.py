@@ -467,7 +467,7 @@ def bad_readings(loop: Loop) -> tuple[Finding, Finding, Finding]:
         moving = one.theta[:, loop.links.index(one.link)]
         inside = moving > np.quantile(moving, 0.72) if one.link == "stick" else moving > np.inf
         bend = np.radians(3.0) * rng.standard_normal((int(inside.sum()), 2))
-        extra[np.ix_(inside, [loop.moved, loop.moved + 1])] = bend
+        extra[inside, loop.moved : loop.moved + 2] = bend
         marks.append(inside)
         stages.append(with_drift(loop, readings(loop, one, rng, RESOLVER, extra)))
     corrupted = identify_arm(loop, [replace(s, drift=None) for s in stages], weighted=False)
