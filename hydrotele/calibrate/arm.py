@@ -466,7 +466,8 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
             ]).tocsr()  # fmt: skip
 
         found = scipy.optimize.least_squares(
-            residual, x / sizes, jacobian, x_scale="jac", ftol=1e-13, xtol=1e-11, gtol=1e-12,
+            residual, x / sizes, jacobian,  # pyright: ignore[reportArgumentType] - a function, too
+            x_scale="jac", ftol=1e-13, xtol=1e-11, gtol=1e-12,
             tr_solver="lsmr", tr_options={"atol": 1e-13, "btol": 1e-13, "maxiter": 2000},
             max_nfev=100,
         )  # fmt: skip

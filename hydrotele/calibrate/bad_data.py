@@ -167,7 +167,8 @@ def _absorbed(rows: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> n
 
 
 def find_regions(
-    loop: Loop, poses: Poses, numbers: Mapping[str, float], total: int, false_alarm: float = FALSE_ALARM,
+    loop: Loop, poses: Poses, numbers: Mapping[str, float], total: int,
+    false_alarm: float = FALSE_ALARM,
     known: Known | None = None,
 ) -> list[Region]:  # fmt: skip
     """Stretches of poses whose residuals are too large to be chance.
