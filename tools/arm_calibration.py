@@ -151,13 +151,15 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
     half = clean_trials // 2
     lines += [
         f"{trials} measurements of {poses} poses per link, each of another machine, with one"
-        " calibrator joint wrong in 10 to 33 % of one link's poses by 1 to 4 deg (an offset, scatter"
+        " calibrator joint wrong in 10 to 33 % of one link's poses by 1 to 4"
+        " deg (an offset, scatter"
         " or a bend and back).", "",
         "| | |", "| --- | --- |",
         f"| region found (overlap over union at least 0.5, nothing elsewhere) |"
         f" {100 * places / max(trials, 1):.1f} % |",
         f"| region found and joint named | {100 * joints / max(trials, 1):.1f} % |",
-        f"| region found and joint among those not ruled out | {100 * possible / max(trials, 1):.1f} % |",
+        "| region found and joint among those not ruled out |"
+        f" {100 * possible / max(trials, 1):.1f} % |",
         f"| false alarms, held links fixed | {alarms['fixed']} of {half} |",
         f"| false alarms, held links drifting | {alarms['drifting']} of {half} |",
         f"| RMS error of all parameters, in expected sizes, with the bad data | {one:.4f} |",
@@ -197,18 +199,19 @@ def speed() -> str:
     """Time of the hierarchical and the joint identification over the number of poses."""
     nominal = loop_of(load_machine("calibrator"))
     true = perturbed(nominal, np.random.default_rng(TRUTH))
-    rows = ["| poses | hierarchical [s] | joint, from there [s] |", "| --- | --- | --- |"]
+    rows = ["CPU time of one process with one thread.", ""]
+    rows += ["| poses | hierarchical [s] | joint, from there [s] |", "| --- | --- | --- |"]
     for poses in (100, 200, 400, 800):
         rng = np.random.default_rng(5)
         stages = [readings(true, sweep_poses(true, n, s._replace(poses=poses)), rng)
                   for n, s in STILL.items()]  # fmt: skip
         times = []
         for _ in range(3):
-            begin = time.perf_counter()
+            begin = time.process_time()
             fit = identify_arm(nominal, stages)
-            middle = time.perf_counter()
+            middle = time.process_time()
             identify_jointly(fit, stages)
-            times.append((middle - begin, time.perf_counter() - middle))
+            times.append((middle - begin, time.process_time() - middle))
         one, two = np.min(times, axis=0)
         rows.append(f"| {4 * poses} | {one:.2f} | {two:.2f} |")
     return "\n".join(rows)

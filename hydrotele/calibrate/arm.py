@@ -20,7 +20,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import Identifiability
 
 SIZES = {"m": 0.1, "rad": np.radians(5.0)}
-"""How far a parameter may be from its nominal value, by unit: what a tape and a protractor leave."""
+"""How far a parameter may be from nominal, by unit: what a tape and a protractor leave."""
 
 LABORATORY = {"m": 1.0e-3, "rad": np.radians(0.05)}
 """The same of the calibrator's own links, which were measured in a laboratory (K 3.6.4)."""
@@ -408,6 +408,7 @@ def _reason(told: Identifiability, name: str, loop: Loop) -> str:
 
 
 def arm_fit(loop, numbers, start, names, covariance, stages, method) -> ArmFit:
+    """The fit of identified numbers, with the ball's place where the first link told it."""
     values = {name: numbers[name] for name in loop.names}
     calibrated = loop.with_values(values)
     first = loop.links[0]
@@ -465,7 +466,8 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
             ]).tocsr()  # fmt: skip
 
         found = scipy.optimize.least_squares(
-            residual, x / sizes, jacobian, x_scale="jac", ftol=1e-13, xtol=1e-11, gtol=1e-12,
+            residual, x / sizes, jacobian,  # pyright: ignore[reportArgumentType] - a function, too
+            x_scale="jac", ftol=1e-13, xtol=1e-11, gtol=1e-12,
             tr_solver="lsmr", tr_options={"atol": 1e-13, "btol": 1e-13, "maxiter": 2000},
             max_nfev=100,
         )  # fmt: skip

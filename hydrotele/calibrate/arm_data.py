@@ -1,4 +1,4 @@
-"""Logs of a calibrator as poses: which link moved, which rows count, how accurate the sensors are."""
+"""Logs of a calibrator as poses: which link moved, which rows count, how good the sensors are."""
 
 import math
 from collections.abc import Sequence

@@ -6,7 +6,7 @@ its angle about the axis. A stretch of poses in which they do not hold is a regi
 error alone explains it is responsible.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,6 @@ import scipy.stats
 from hydrotele.calibrate.arm import (
     ArmFit,
     Equations,
-    Numbers,
     arm_fit,
     candidates,
     check_poses,
@@ -99,7 +98,9 @@ class Known(NamedTuple):
     covariance: np.ndarray
 
 
-def misfit(loop: Loop, poses: Poses, numbers: Numbers, known: Known | None = None) -> Misfit:
+def misfit(
+    loop: Loop, poses: Poses, numbers: Mapping[str, float], known: Known | None = None
+) -> Misfit:
     """Residuals of a stage with the manipulator's side.
 
     The third equation takes no part in the identification. What the parameters' remaining
@@ -166,7 +167,8 @@ def _absorbed(rows: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> n
 
 
 def find_regions(
-    loop: Loop, poses: Poses, numbers: Numbers, total: int, false_alarm: float = FALSE_ALARM,
+    loop: Loop, poses: Poses, numbers: Mapping[str, float], total: int,
+    false_alarm: float = FALSE_ALARM,
     known: Known | None = None,
 ) -> list[Region]:  # fmt: skip
     """Stretches of poses whose residuals are too large to be chance.
@@ -289,7 +291,8 @@ def identify_without_bad_data(
         told = what_is_told(Equations(loop, poses), at, wanted)
         own = [told.names[k] for k in sorted(told.base)]
 
-        def solve(kept, near, numbers=numbers, poses=poses, own=own, told=told, wanted=wanted):
+        def solve(kept, near, numbers=numbers, poses=poses, own=own, told=told,
+                  wanted=wanted, names=names, covariance=covariance):  # fmt: skip
             return identify_stage(
                 Equations(loop, poses.only(kept)), numbers, own, names, covariance, told, wanted,
                 near=near,
@@ -341,7 +344,7 @@ def _outside(regions: Sequence[Region], count: int) -> np.ndarray:
     return kept
 
 
-def predicted_readings(loop: Loop, poses: Poses, numbers: Numbers) -> np.ndarray:
+def predicted_readings(loop: Loop, poses: Poses, numbers: Mapping[str, float]) -> np.ndarray:
     """What each sensor of the calibrator had to read, from the manipulator's side and the others.
 
     Args:

@@ -17,7 +17,7 @@ from hydrotele.calibrate.loop import Loop, link_chain
 from hydrotele.calibrate.sweeps import STILL, sweep_poses
 from hydrotele.kinematics.serial_chain import forward_and_rates
 
-ARMS = np.linspace(2.0, 4.4, 7)
+ARMS = np.linspace(2.0, 4.8, 8)
 """Lengths of the calibrator's arm that are looked at [m]."""
 
 FOREARMS = np.linspace(2.4, 4.8, 7)
@@ -147,7 +147,8 @@ def look_over_designs(loop: Loop, accuracy: float) -> Survey:
     """
     x, z = float(loop.ball[0]), float(loop.ball[2])
     grid = [design_of(loop, float(a), float(f), x, z, accuracy) for f in FOREARMS for a in ARMS]
-    present = design_of(loop, *map(float, (loop.values[-2, 3], loop.values[-1, 2])), x, z, accuracy)
+    arm, forearm = float(loop.values[-2, 3]), float(loop.values[-1, 2])
+    present = design_of(loop, arm, forearm, x, z, accuracy)
     return Survey(tuple(grid), present)
 
 
@@ -167,7 +168,7 @@ def best_design(loop: Loop, survey: Survey, accuracy: float) -> Design:
     start = min(reaching or [survey.present], key=lambda d: d.tip_error)
 
     def cost(x):
-        found = design_of(loop, *map(float, x), accuracy)
+        found = design_of(loop, x[0], x[1], x[2], x[3], accuracy)
         return np.log(found.tip_error) + 50.0 * max(0.0, _REACH - found.reached)
 
     bounds = [(1.5, 4.8), (1.5, 5.2), (1.0, 2.6), (-1.3, -0.6)]
@@ -176,4 +177,5 @@ def best_design(loop: Loop, survey: Survey, accuracy: float) -> Design:
         cost, first, method="Nelder-Mead", bounds=bounds,
         options={"maxfev": 120, "xatol": 0.02, "fatol": 1e-3},
     )  # fmt: skip
-    return design_of(loop, *map(float, found.x), accuracy)
+    arm, forearm, ball_x, ball_z = found.x.tolist()
+    return design_of(loop, arm, forearm, ball_x, ball_z, accuracy)

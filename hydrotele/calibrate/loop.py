@@ -18,7 +18,7 @@ from hydrotele.kinematics.serial_chain import Element, SerialChain, forward, for
 from hydrotele.machine.machine import Machine
 
 KINDS = ("offset", "alpha", "a", "d", "beta")
-"""Kinds of a link's parameters; `offset` is theta at a sensor's zero, or at rest of a held joint."""
+"""Kinds of a link's parameters; `offset` is theta at the zero of the joint's sensor."""
 
 _PARALLEL = 0.05  # rad within which neighbouring axes count as nominally parallel
 _DOF = {kind: k for k, kind in enumerate(KINDS)}

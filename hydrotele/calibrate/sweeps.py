@@ -1,4 +1,4 @@
-"""Trajectories of a measurement with a calibrator: one link sweeps, the others are held and drift."""
+"""Trajectories of a measurement with a calibrator: one link sweeps, held ones drift."""
 
 from collections.abc import Mapping
 from typing import NamedTuple

@@ -76,7 +76,7 @@ def calibrate_arm(
         raise InputError("--method", f"{choices.method!r} is none; valid: joint, hierarchical")
     every = _every(choices.heldout)
     if target:
-        check_target(target, "calibration")
+        check_target(target, "arm calibration")
     nominal = load_machine(machine)
     result = arm_result(nominal, data, choices, every)
     said = arm_as_data(result)
@@ -220,7 +220,8 @@ def _print_arm(said: Mapping[str, Any]) -> None:
             out.print(f"  {name} {reason}", style="dim")
     for region in said["bad_data"]:
         out.print(f"[yellow]bad data[/] {region['link']}, poses {region['first_pose']} to"
-                  f" {region['last_pose']}: {region['joint']}, {region['size_deg']:.2f} deg")  # fmt: skip
+                  f" {region['last_pose']}: {region['joint']}, {region['size_deg']:.2f} deg"
+                  )  # fmt: skip
     if said["heldout"]:
         held = said["heldout"]
         out.print(f"{held['poses']} poses not fitted: closure {held['rms_nominal_mm']:.1f} mm RMS"
@@ -237,12 +238,12 @@ def _print_target(target: Path | None) -> None:
 
 
 def _write(target: Path, said: Mapping[str, Any], machine: Machine, report) -> None:
-    with whole_folder(target, "calibration") as folder:
+    with whole_folder(target, "arm calibration") as folder:
         text = json.dumps(said, indent=2, allow_nan=False)
         (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
         save_machine(machine, folder / MACHINE_FILE)
         report(folder)
-        summary = {"kind": "calibration", "hydrotele": hydrotele.__version__}
+        summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
         (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
@@ -263,7 +264,7 @@ def calibrate_linkage(
     if angles not in ("measured", "identified"):
         raise InputError("--angles", f"{angles!r} is none; valid: measured, identified")
     if target:
-        check_target(target, "calibration")
+        check_target(target, "arm calibration")
     nominal = load_machine(machine)
     fits = linkage_fits(nominal, data, angles)
     said = plain({"machine": nominal.name, "angles": angles, "axes": {
@@ -324,10 +325,12 @@ def _linkage_as_data(found: LinkageFit) -> dict[str, Any]:
     return {
         "parameters": [
             {"name": name, "unit": "rad" if name == "theta_off" else "m", "nominal": nominal,
-             "value": value, "standard_deviation": deviations.get(name), "held": name in found.fixed}
+             "value": value, "standard_deviation": deviations.get(name),
+             "held": name in found.fixed}
             for name, nominal, value in zip(NAMES, found.nominal, values_of(found), strict=True)
         ],
-        "heldout": {"rms_m": found.rms, "vaf_percent": found.vaf, "rms_nominal_m": found.rms_before},
+        "heldout": {"rms_m": found.rms, "vaf_percent": found.vaf,
+                    "rms_nominal_m": found.rms_before},
         "samples": found.samples,
     }  # fmt: skip
 
@@ -345,7 +348,8 @@ def _print_linkages(said: Mapping[str, Any]) -> None:
         out.print(shown)
         held = found["heldout"]
         out.print(f"samples not fitted: RMS {1e3 * held['rms_m']:.2f} mm (nominal"
-                  f" {1e3 * held['rms_nominal_m']:.2f} mm), VAF {held['vaf_percent']:.3f} %")  # fmt: skip
+                  f" {1e3 * held['rms_nominal_m']:.2f} mm), VAF {held['vaf_percent']:.3f} %"
+                  )  # fmt: skip
 
 
 def design_calibrator(
@@ -355,7 +359,7 @@ def design_calibrator(
     from hydrotele.calibrate.design import best_design, look_over_designs
 
     if target:
-        check_target(target, "calibration")
+        check_target(target, "arm calibration")
     nominal = load_machine(machine)
     loop = loop_of(nominal)
     survey = look_over_designs(loop, float(np.radians(accuracy_deg)))
@@ -367,16 +371,18 @@ def design_calibrator(
     if target:
         from hydrotele.show.calibration_report import draw_designs
 
-        with whole_folder(target, "calibration") as folder:
+        with whole_folder(target, "arm calibration") as folder:
             (folder / "design.png").write_bytes(draw_designs(survey, best))
             text = json.dumps(said, indent=2, allow_nan=False)
             (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
-            summary = {"kind": "calibration", "hydrotele": hydrotele.__version__}
+            summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
             (folder / "summary.json").write_text(json.dumps(summary) + "\n", encoding="utf-8")
     if as_json:
         print_json(said)
         return
     for name, one in (("present", survey.present), ("best", best)):
-        out.print(f"{name}: arm {one.arm:.2f} m, forearm {one.forearm:.2f} m, ball {one.ball_x:.2f} m"
+        out.print(f"{name}: arm {one.arm:.2f} m, forearm {one.forearm:.2f} m, ball joint"
+                  f" {one.ball_x:.2f} m"
                   f" in front and {one.ball_z:+.2f} m: tip of the arm known to"
-                  f" {1e3 * one.tip_error:.1f} mm, {100 * one.reached:.0f} % of the poses reached")  # fmt: skip
+                  f" {1e3 * one.tip_error:.1f} mm, {100 * one.reached:.0f} % of the poses reached"
+                  )  # fmt: skip

@@ -23,7 +23,7 @@ def experiments_to_folder(
     Args:
         name: of the series.
         target: folder, default `runs/<name>`; with `as_json` none.
-        seeds: operators, or seeds of noise, of the experiments that are repeated.
+        seeds: operators of the experiments that are repeated.
         jobs: processes; as many as there are cores by default.
         as_json: print the findings as JSON instead of words.
 

@@ -560,15 +560,13 @@ def export(
 
 @app.command(epilog="Example:  hydrotele experiments zhu1994 --json")
 def experiments(
-    name: Annotated[
-        str, typer.Argument(help="Series of experiments: khoshzaban1992, wang2012 or zhu1994.")
-    ],
+    name: Annotated[str, typer.Argument(help="Series: khoshzaban1992, wang2012 or zhu1994.")],
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder to write; default runs/NAME, with --json none."),
     ] = None,
     seeds: Annotated[
-        int, typer.Option(min=1, help="Repetitions: operators, noise seeds, or tens of trials.")
+        int, typer.Option(min=1, help="Repetitions: operators, noise seeds, trials.")
     ] = 20,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
     json: Json = False,

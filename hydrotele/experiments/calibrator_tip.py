@@ -17,7 +17,7 @@ from hydrotele.simulate.mechanism import TIP_SITE, assemble, mjcf_document
 TARGETS = tuple(
     (r, z, theta) for r in (4.2, 5.0, 5.8) for z in (1.8, 2.6, 3.4) for theta in (-0.6, 0.5)
 )
-"""Places of the tip that are asked for: r [m] from the swing axis, z [m] above ground, theta [rad]."""
+"""Places of the tip that are asked for: r [m], z [m] above ground, theta [rad]."""
 
 
 def tip_errors(

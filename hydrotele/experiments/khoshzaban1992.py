@@ -208,7 +208,8 @@ def mobility(loop: Loop) -> Finding:
         "mobility of the closed chain", "Eq. 3.5, section 3.3.2",
         "at least 1 extra link for the machine with grapple and 3 for the excavator; with 4 sensed"
         " links 2 degrees of mobility",
-        f"Eq. 3.5 gives {machine} and {excavator}; the model's chain with one moving link has {free}",
+        f"Eq. 3.5 gives {machine} and {excavator}; the model's chain with one"
+        f" moving link has {free}",
         (machine, excavator, free) == (1, 3, 2),
     )  # fmt: skip
 
@@ -238,14 +239,16 @@ def identifiable_lists(loop: Loop) -> Finding:
     rng = np.random.default_rng(1)
     fit = identify_arm(loop, [readings(loop, one, rng) for one in clean])
     ours = {s.link: {n for n in s.names if not n.startswith("p_")} for s in fit.stages}
+    listed = {link: ", ".join(sorted(names)) for link, names in ours.items()}
     same = [link for link in LISTS if ours[link] == LISTS[link]]
     return Finding(
         "identifiable parameters of each stage",
         "section 3.6.4",
-        "link 4: offsets of joints 5 to 7, alpha, a, d of link 5, alpha, a of link 4; links 3 and 2:"
+        "link 4: offsets of joints 5 to 7, alpha, a, d of link 5, alpha, a of"
+        " link 4; links 3 and 2:"
         " the held angle outside, alpha, a, beta; link 1: theta_fix 2, d2, alpha 1, a1; besides the"
         " ball's p_xy and p_z",
-        f"found from the equations: {'; '.join(f'{k}: ' + ', '.join(sorted(v)) for k, v in ours.items())}"
+        f"found from the equations: {'; '.join(f'{k}: {listed[k]}' for k in ours)}"
         " (agrees if all four sets are equal; links 6 to 8 count as known to 1 mm and 0.05 deg from"
         " the laboratory)",
         len(same) == len(LISTS),
@@ -266,7 +269,8 @@ def held_links_drift(loop: Loop) -> Finding:
             values = np.degrees(truth[f"angle.{name}"])
             moved.setdefault(name, []).append(abs(float(values[-1] - values[0])))
         panels.append(Panel(f"{link} moves: held links' drift [deg]", truth.time, {
-            n: np.degrees(truth[f"angle.{n}"] - truth[f"angle.{n}"][0]) for n in held}))  # fmt: skip
+            n: np.degrees(truth[f"angle.{n}"] - truth[f"angle.{n}"][0]) for n in held
+        }))  # fmt: skip
         panels.append(Panel(f"{link} moves [deg]", truth.time, {
             "link": np.degrees(truth[f"angle.{link}"]),
             "grapple": np.degrees(truth["angle.grapple"])}))  # fmt: skip
@@ -277,7 +281,8 @@ def held_links_drift(loop: Loop) -> Finding:
         " figures), the swing not",
         f"MuJoCo, closed valves with the nominal leakage, 120 s: boom and stick drift by"
         f" {min(cylinders):.2f} to {max(cylinders):.2f} deg, the swing by {max(moved['swing']):.3f}"
-        f" deg (agrees if boom and stick drift by 0.03 to 1 deg and ten times as much as the swing);"
+        f" deg (agrees if boom and stick drift by 0.03 to 1 deg and ten times"
+        f" as much as the swing);"
         f" the chain of Table 2 closes on MuJoCo's angles within {1e6 * worst:.2f} um",
         0.03 < min(cylinders) and max(cylinders) < 1.0
         and min(cylinders) > 10.0 * max(moved["swing"]) and worst < 1e-5,
@@ -292,7 +297,8 @@ def without_errors(cases: dict[str, Case], loop: Loop) -> Finding:
     return Finding(
         "readings without error", "section 3.7",
         "the simulations' truth is Table 2 (Tables 4 to 6 are compared with it)",
-        f"every parameter comes out within {worst:.1e} (m, rad) (agrees below 1e-9)", worst < _EXACT,
+        f"every parameter comes out within {worst:.1e} (m, rad) (agrees below 1e-9)",
+        worst < _EXACT,
     )  # fmt: skip
 
 
@@ -332,7 +338,8 @@ def table_5(cases: dict[str, Case], loop: Loop, seeds: int) -> Finding:
         " (alpha 2 and beta 2 of 0.2 deg)",
         f"RMS errors of {seeds} seeds: {_sizes(one, _LENGTHS)}; "
         + ", ".join(f"{n} {v:.2f} deg" for n, v in grown.items())
-        + " (agrees if d0 leads with 3 to 20 cm, within a factor of 2 of drift alone, and alpha 2 and"
+        + " (agrees if d0 leads with 3 to 20 cm, within a factor of 2 of drift"
+        " alone, and alpha 2 and"
         " beta 2 have grown to 0.05 to 1 deg)",
         name == "p_z.swing" and 0.03 < size < 0.2 and 0.5 < size / before.rms("p_z.swing") < 2.0
         and all(0.05 < grown[n] < 1.0 and grown[n] > np.degrees(before.rms(n))
@@ -352,7 +359,8 @@ def table_6(cases: dict[str, Case], loop: Loop, seeds: int) -> Finding:
         " 188 mm, alpha 2 13.4 deg, beta 2 -7.4 deg; a3 30 mm",
         f"RMS errors of {seeds} seeds: {_sizes(one, _LENGTHS)}, largest {name} {1e3 * size:.0f} mm"
         f" and {angle} {np.degrees(turn):.1f} deg (agrees if the largest length and the largest"
-        " angle error are at least 1.5 times those with sensors and drift, and a3 stays the smallest)",
+        " angle error are at least 1.5 times those with sensors and drift, and"
+        " a3 stays the smallest)",
         size > 1.5 * before.largest("m")[1] and turn > 1.5 * before.largest("rad")[1]
         and one.rms("a.stick") <= min(one.rms("a.boom"), one.rms("a.swing")),
     )  # fmt: skip
@@ -427,7 +435,8 @@ def start_does_not_matter(loop: Loop) -> Finding:
         "first estimates",
         "sections 3.8.1 and 5.1",
         "a number of different initial conditions always ended up with the same results",
-        f"ten starts within 0.2 m and 10 deg of nominal end within {worst:.1e} (m, rad) of each other"
+        f"ten starts within 0.2 m and 10 deg of nominal end within {worst:.1e}"
+        f" (m, rad) of each other"
         " (agrees below 1e-6)",
         worst < 1e-6,
     )
@@ -458,7 +467,7 @@ def bad_readings(loop: Loop) -> tuple[Finding, Finding, Finding]:
         moving = one.theta[:, loop.links.index(one.link)]
         inside = moving > np.quantile(moving, 0.72) if one.link == "stick" else moving > np.inf
         bend = np.radians(3.0) * rng.standard_normal((int(inside.sum()), 2))
-        extra[np.ix_(inside, [loop.moved, loop.moved + 1])] = bend
+        extra[inside, loop.moved : loop.moved + 2] = bend
         marks.append(inside)
         stages.append(with_drift(loop, readings(loop, one, rng, RESOLVER, extra)))
     corrupted = identify_arm(loop, [replace(s, drift=None) for s in stages], weighted=False)
@@ -489,7 +498,8 @@ def bad_readings(loop: Loop) -> tuple[Finding, Finding, Finding]:
         f"bends of 3 deg on joints 5 and 6 at large stick angles: found without eye in"
         f" {int(marked.sum())} of {int(inside.sum())} poses, overlap {100 * overlap:.0f} % of the"
         f" union, blamed: {', '.join(blamed) or 'none'}; sensors against prediction, RMS there"
-        f" {', '.join(f'{v:.1f}' for v in far)} deg, elsewhere {', '.join(f'{v:.2f}' for v in near)}"
+        f" {', '.join(f'{v:.1f}' for v in far)} deg, elsewhere"
+        f" {', '.join(f'{v:.2f}' for v in near)}"
         " deg (agrees if the overlap is above 80 % and only joints 5 and 6 are blamed)",
         overlap > 0.8 and bool(blamed) and set(blamed) <= set(names[:2]),
         tuple(panels),
@@ -526,15 +536,18 @@ def _models(
         else:
             for letter, k in zip("xyz", range(3), strict=True):
                 panels.append(Panel(f"error of the stick's end, {letter} [m]", pose, {
-                    "stick": (both[0] - true[0])[:, k], "grapple": (both[1] - true[1])[:, k]}, "pose"))  # fmt: skip
+                    "stick": (both[0] - true[0])[:, k], "grapple": (both[1] - true[1])[:, k],
+                }, "pose"))  # fmt: skip
     one, two = rms["identified"], rms["re-identified"]
     ends = Finding(
         "end points without the bad data",
         "Tables 7 and 9, Figs 22 to 25, section 3.8.2",
-        "RMS against the nominal model falls from 0.212 to 0.153 m at the stick's end and from 0.256"
+        "RMS against the nominal model falls from 0.212 to 0.153 m at the"
+        " stick's end and from 0.256"
         " to 0.205 m at the grapple's",
         f"from {1e3 * one[0]:.0f} to {1e3 * two[0]:.0f} mm and from {1e3 * one[1]:.0f} to"
-        f" {1e3 * two[1]:.0f} mm; the calibrator's data here have one corrupted region and drift, the"
+        f" {1e3 * two[1]:.0f} mm; the calibrator's data here have one corrupted"
+        f" region and drift, the"
         " thesis' own have more (agrees if both fall)",
         two[0] < one[0] and two[1] < one[1],
         tuple(panels),
@@ -546,7 +559,8 @@ def _models(
         "manipulator side: identified 0.162 and 0.217 m (VAF 98.32, 98.69 %), re-identified 0.101"
         " and 0.125 m (98.87, 99.07 %) for stick and grapple",
         f"identified {a[0]:.3f} and {b[0]:.3f} m ({a[1]:.2f}, {b[1]:.2f} %), re-identified"
-        f" {c[0]:.3f} and {d[0]:.3f} m ({c[1]:.2f}, {d[1]:.2f} %) (agrees if RMS falls and VAF rises"
+        f" {c[0]:.3f} and {d[0]:.3f} m ({c[1]:.2f}, {d[1]:.2f} %) (agrees if"
+        f" RMS falls and VAF rises"
         " for both)",
         c[0] < a[0] and d[0] < b[0] and c[1] > a[1] and d[1] > b[1],
     )
@@ -577,7 +591,7 @@ def minor_links(machine: Machine, loop: Loop, cases: Mapping[str, Case]) -> tupl
         }  # fmt: skip
         rows[axis] = found
         both[axis] = {k: f.residual for k, f in found.items()}
-        panels.append(Panel(f"{axis}: error of the displacement [mm]", np.arange(len(length), dtype=float),
+        panels.append(Panel(f"{axis}: error of the displacement [mm]", np.arange(len(length)) + 0.0,
                             {k: 1e3 * f.residual for k, f in found.items()}, "pose"))  # fmt: skip
     words = {
         axis: {k: f"{1e3 * f.rms:.2f} mm, {f.vaf:.2f} %" for k, f in found.items()}
@@ -587,7 +601,8 @@ def minor_links(machine: Machine, loop: Loop, cases: Mapping[str, Case]) -> tupl
         "cylinder linkages from measured angles",
         "Tables 11 and 12, section 3.8.3",
         "RMS 0.4 mm and VAF 99.99 % for the boom, 2 mm and 99.98 % for the stick",
-        f"boom {words['boom']['measured']}, stick {words['stick']['measured']} against readings with"
+        f"boom {words['boom']['measured']}, stick {words['stick']['measured']}"
+        f" against readings with"
         " errors within 2 mm (agrees if RMS is below 2 mm and VAF above 99.9 %)",
         all(f["measured"].rms < _LINEAR and f["measured"].vaf > 99.9 for f in rows.values()),
         tuple(panels),

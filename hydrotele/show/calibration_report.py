@@ -44,7 +44,7 @@ def write_arm_report(
         found = [(r.link, f"{r.first} to {r.last}", r.joint or "the arm's own sensor",
                   f"{np.degrees(r.size):.2f} deg") for r in regions]  # fmt: skip
         sections.append(Section(
-            "Corrupted readings", "Left out where a calibrator's joint is to blame.",
+            "Corrupted readings", "Left out where the calibrator is to blame.",
             ("moving link", "poses", "joint", "RMS error"), found,
         ))  # fmt: skip
     sections.append(Section("Residuals", "In units of the sensors' errors.",
@@ -117,17 +117,17 @@ def draw_designs(survey: Survey, best: Design) -> bytes:
     reached = np.array([d.reached for d in survey.designs]).reshape(shape)
     told = np.where(np.isfinite(told), told, np.nan) / np.log(10.0)
     panels = (
-        ("tip of the calibrated arm: standard deviation [mm]", 1e3 * np.minimum(tip, _MOST_TIP),
+        ("tip of the calibrated arm,\nstandard deviation [mm]", 1e3 * np.minimum(tip, _MOST_TIP),
          "viridis_r", "%.0f"),
-        ("information about the arm: log10 of the determinant", told, "viridis", "%.0f"),
-        ("poses that the calibrator reaches [%]", 100.0 * reached, "viridis", "%.0f"),
+        ("information about the arm,\nlog10 of the determinant", told, "viridis", "%.0f"),
+        ("poses that the calibrator\nreaches [%]", 100.0 * reached, "viridis", "%.0f"),
     )  # fmt: skip
     with drawing(4.0) as figure:
         for place, (title, values, colours, form) in zip(
             figure.subplots(1, 3, sharey=True), panels, strict=True
         ):
             shown = place.contourf(ARMS, FOREARMS, values, 12, cmap=colours)
-            figure.colorbar(shown, ax=place, format=form, shrink=0.85)
+            figure.colorbar(shown, ax=place, format=form, shrink=0.7)
             for one, mark, label in ((survey.present, "o", "Khoshzaban 1992"), (best, "*", "best")):
                 place.plot(one.arm, one.forearm, mark, ms=10, mfc="white", mec="black", label=label)
             place.set_title(title, fontsize=8.5)

@@ -87,7 +87,9 @@ def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray]) -> di
     """
     errors = machine.sensor_errors
     return {
-        c: errors[c].scale * _through_coupling(errors[c], v) + errors[c].offset if c in errors else v
+        c: errors[c].scale * _through_coupling(errors[c], v) + errors[c].offset
+        if c in errors
+        else v
         for c, v in truth.items()
     }  # fmt: skip
 
