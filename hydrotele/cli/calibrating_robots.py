@@ -194,7 +194,8 @@ def _robot(
 
 def _warnings(robot: Robot, sockets: Sequence[Socket], options: Options) -> list[str]:
     notes = [
-        f"{robot.joints[k].name} does not move in any file: its errors stay unknown"
+        f"{robot.joints[k].name} does not move in any file:"
+        " its offset shows only together with errors of its neighbours"
         for k in idle_joints(sockets)
     ]
     if options.distance is None:
