@@ -291,8 +291,8 @@ def parameters_54(steps: int) -> list[Finding]:
             "a4 with a1x to a5x, d4 with a3y to a5y, theta4 and alpha4 with a1z to a3z",
             f"all of them take part in the null space: {'yes' if involved else 'no'}; least"
             f" posterior correlation {pairs[least]:.2f} ({least[0]}: {least[1]} and {least[2]};"
-            " criterion: 0.3 each). alpha4 turns about x4, near which A1 lies with the dimensions"
-            " that are chosen here",
+            " criterion: 0.3 each). theta4 and alpha4 act on z of all A_i at once, in shares that"
+            " the dimensions decide",
             involved and pairs[least] > 0.3,
         ),
         Finding(
