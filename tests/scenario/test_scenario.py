@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.run.run import prepare, run_scenario
+from hydrotele.run.run import begin, finished, prepare, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario, shipped_scenarios
 from hydrotele.simulate.closure import pin_opening
 from hydrotele.simulate.record import SimulationFailed
@@ -35,19 +35,22 @@ def shipped(name, **overrides):
 
 @functools.cache
 def watched(name):
-    """A shipped scenario's run and its largest pin opening [m], seen after every physics step."""
-    worst, real = [0.0], mujoco.mj_step
+    """A shipped scenario's run and its largest pin opening [m], seen at every physics step."""
+    worst = [0.0]
 
-    def one_by_one(model, data, nstep=1):
-        for _ in range(nstep):
-            real(model, data)
-            worst[0] = max(worst[0], pin_opening(model, data))
+    def look(model, data):  # positions are those that the step before left
+        worst[0] = max(worst[0], pin_opening(model, data))
 
     changes = {"duration": SHORTER[name]} if name in SHORTER else {}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hydrotele.run.run.mujoco.mj_step", one_by_one)
-        run = run_scenario(load_scenario(name, changes))
-    return run, worst[0]
+    asked = load_scenario(name, changes)
+    session = begin(asked)
+    mujoco.set_mjcb_control(look)
+    try:
+        while session.tick < asked.ticks:
+            session.advance()
+    finally:
+        mujoco.set_mjcb_control(None)
+    return finished(session, asked), worst[0]
 
 
 def scenario(**facts):
