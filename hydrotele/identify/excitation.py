@@ -101,10 +101,7 @@ def information(
         sizes: (p,) to count the parameters in; 1 by default.
     """
     found = project(setup.chain, setup.given, *motions)
-    table = regressor(
-        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
-        offsets=False if setup.offsets is None else setup.offsets,
-    )  # fmt: skip
+    table = setup.table(found)
     scaled = table.matrix[:, :, base] / noise[:, None]
     if sizes is not None:
         scaled = scaled * sizes
@@ -136,10 +133,7 @@ def informative_base(
     ).motion(time)
     motion[0] = np.clip(motion[0], limits.low, limits.high)
     found = project(setup.chain, setup.given, *motion)
-    table = regressor(
-        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
-        offsets=False if setup.offsets is None else setup.offsets,
-    )  # fmt: skip
+    table = setup.table(found)
     forces = np.sqrt(np.mean((table.matrix @ table.nominal) ** 2, axis=0))
     flat = (table.matrix / noise[:, None]).reshape(-1, len(table.names))
     asked = np.ones(len(table.names), bool)
@@ -248,10 +242,7 @@ def _sizes(setup: Setup, base: Sequence[int] | np.ndarray, middle: np.ndarray) -
     """Sizes of base parameters, so that a determinant is no matter of units: those given."""
     still = np.zeros((1, len(middle)))
     found = project(setup.chain, setup.given, middle[None], still, still)
-    table = regressor(
-        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
-        offsets=False if setup.offsets is None else setup.offsets,
-    )  # fmt: skip
+    table = setup.table(found)
     return np.maximum(np.abs(table.nominal[np.asarray(base)]), 1.0)
 
 
