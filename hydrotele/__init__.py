@@ -47,7 +47,7 @@ _PUBLIC = {
     "run.run": ("Run", "run_scenario"),
     "scenario.scenario": ("Scenario", "load_scenario", "shipped_scenarios"),
     "simulate.plant": ("Plant", "build_plant", "initial_state", "rest_state"),
-    "tasks.controllers.catalogue": ("make_controller",),
+    "envs.controllers.catalogue": ("make_controller",),
 }
 _MODULE = {name: module for module, names in _PUBLIC.items() for name in names}
 __all__ = sorted(_MODULE)  # pyright: ignore[reportUnsupportedDunderAll]

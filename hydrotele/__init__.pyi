@@ -3,6 +3,7 @@
 from .control.endpoint_force import endpoint_force_of_log, identify_gravity
 from .core.errors import InputError
 from .effects import EFFECTS, apply_effect, load_effects
+from .envs.controllers.catalogue import make_controller
 from .gap.find import find_gap
 from .gap.patched import write_patch
 from .gap.result import Gap, gap_document
@@ -15,7 +16,6 @@ from .run.replay import Replay, replay_log
 from .run.run import Run, run_scenario
 from .scenario.scenario import Scenario, load_scenario, shipped_scenarios
 from .simulate.plant import Plant, build_plant, initial_state, rest_state
-from .tasks.controllers.catalogue import make_controller
 
 __version__: str
 __all__ = [

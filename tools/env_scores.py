@@ -8,18 +8,18 @@ import sys
 import numpy as np
 from study import options, publish
 
+from hydrotele.envs.catalogue import TASKS
+from hydrotele.envs.controllers.catalogue import CONTROLLERS, REFERENCES, make_controller
+from hydrotele.envs.core import TaskCore
+from hydrotele.envs.episode import DISABLED
+from hydrotele.envs.evaluation import SUCCESS, Scores, evaluate
+from hydrotele.envs.task import REAL, Options
+from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.tasks.catalogue import TASKS
-from hydrotele.tasks.controllers.catalogue import CONTROLLERS, REFERENCES, make_controller
-from hydrotele.tasks.core import TaskCore
-from hydrotele.tasks.evaluation import SUCCESS, Scores, evaluate
-from hydrotele.tasks.memory import DISABLED
-from hydrotele.tasks.task import REAL, Options
-from hydrotele.tasks.variants import typical_variation
 
 HEAD = """Mean ± standard error over episodes that all controllers share (same seeds and machines);
 `reference` knows the nominal machine and what the observation says. Randomised machines have the
-effects of `hydrotele.tasks.variants.usual_spread`: other dead bands, flows and bandwidths of the
+effects of `hydrotele.envs.variants.usual_spread`: other dead bands, flows and bandwidths of the
 valves, friction, stiffness of the oil, delay of the commands, payload.
 """
 

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 import hydrotele.envs
-from hydrotele.tasks.memory import ACTIONS
+from hydrotele.envs.episode import ACTIONS
 from tools.study import options, publish
 
 

@@ -3,11 +3,11 @@
 python tools/environments_page.py --out docs/environments.md
 """
 
-from hydrotele.tasks.catalogue import TASKS
-from hydrotele.tasks.core import set_up
-from hydrotele.tasks.facts import Setup
-from hydrotele.tasks.memory import ACTIONS
-from hydrotele.tasks.task import Options, Task
+from hydrotele.envs.catalogue import TASKS
+from hydrotele.envs.core import set_up
+from hydrotele.envs.episode import ACTIONS
+from hydrotele.envs.facts import Setup
+from hydrotele.envs.task import Options, Task
 from tools.study import options, publish
 
 COMMON = """\

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import hydrotele.envs
 from hydrotele.core.errors import InputError
-from hydrotele.tasks.controllers.catalogue import make_controller
+from hydrotele.envs.controllers.catalogue import make_controller
 
 SECONDS = {"TrackTrajectory": 4.0, "StraightLine": 2.0, "ReachFeller": 1.5, "PlaceLog": 12.0}
 SHOWN = 6.0  # s, of the others

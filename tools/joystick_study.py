@@ -17,7 +17,6 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.teleop.compliance import Flotor
 from hydrotele.teleop.flotor import FlotorFit, identify_flotor
-from hydrotele.teleop.handle import Detent
 from hydrotele.teleop.levitation import (
     Flight,
     designed_step,
@@ -28,6 +27,7 @@ from hydrotele.teleop.levitation import (
     simulate_levitation,
 )
 from hydrotele.teleop.master import master, master_step
+from tools.handle_laws import Detent
 from tools.study import options, publish, side_by_side
 
 JOYSTICK = load_joystick()

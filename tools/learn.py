@@ -16,20 +16,19 @@ from typing import Any
 
 import numpy as np
 
+from hydrotele.envs.catalogue import TASKS
+from hydrotele.envs.controllers.agent import AgentView
+from hydrotele.envs.controllers.catalogue import make_controller, tune
+from hydrotele.envs.controllers.controller import Controller
+from hydrotele.envs.controllers.track import TrackByValves
+from hydrotele.envs.core import TaskCore, set_up
+from hydrotele.envs.episode import DISABLED
+from hydrotele.envs.evaluation import Scores, compare, evaluate
+from hydrotele.envs.facts import Setup
+from hydrotele.envs.task import Options
+from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Servo
-from hydrotele.tasks.catalogue import TASKS
-from hydrotele.tasks.controllers.agent import AgentView
-from hydrotele.tasks.controllers.catalogue import make_controller
-from hydrotele.tasks.controllers.controller import Controller
-from hydrotele.tasks.controllers.track import TrackByValves
-from hydrotele.tasks.controllers.tune import tune
-from hydrotele.tasks.core import TaskCore, set_up
-from hydrotele.tasks.evaluation import Scores, compare, evaluate
-from hydrotele.tasks.facts import Setup
-from hydrotele.tasks.memory import DISABLED
-from hydrotele.tasks.task import Options
-from hydrotele.tasks.variants import typical_variation
 
 try:
     import torch

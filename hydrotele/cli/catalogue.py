@@ -80,7 +80,7 @@ def _scenarios() -> list[dict]:
 
 
 def _sweeps() -> list[dict]:
-    from hydrotele.sweep.facts import load_sweep, shipped_sweeps
+    from hydrotele.run.sweep_facts import load_sweep, shipped_sweeps
 
     rows = []
     for name in shipped_sweeps():
@@ -121,7 +121,7 @@ def _effects() -> list[dict]:
 
 def _environments() -> list[dict]:
     """Gymnasium environments."""
-    from hydrotele.tasks.catalogue import TASKS
+    from hydrotele.envs.catalogue import TASKS
 
     return [
         {
@@ -186,14 +186,14 @@ def _validate(path: Path) -> tuple[str, str]:
 
 
 def _sweep_names() -> list[str]:
-    from hydrotele.sweep.facts import shipped_sweeps
+    from hydrotele.run.sweep_facts import shipped_sweeps
 
     return shipped_sweeps()
 
 
 def _check_sweep(path: Path) -> str:
-    from hydrotele.sweep.checking import check_points, open_base
-    from hydrotele.sweep.facts import load_sweep
+    from hydrotele.run.sweep_checking import check_points, open_base
+    from hydrotele.run.sweep_facts import load_sweep
 
     file = load_sweep(path)
     check_points(open_base(file))

@@ -10,9 +10,7 @@ from hydrotele.cli.console import notes, out, print_json
 from hydrotele.cli.running import print_summary, write_run
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
-from hydrotele.devices.choose import open_device
-from hydrotele.devices.keyboard import Keyboard
-from hydrotele.devices.reading import Device
+from hydrotele.run.devices import Device, Keyboard, open_device
 from hydrotele.run.live import Pacer, Status, Watch, drive, further_axes
 from hydrotele.run.run import Run, scenario_machine
 from hydrotele.run.session import Session

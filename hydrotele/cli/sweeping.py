@@ -9,11 +9,11 @@ import typer
 
 from hydrotele.cli.console import notes, out, print_json, table
 from hydrotele.cli.running import write_run
+from hydrotele.run.sweep import How, Progress, Swept, run_sweep
+from hydrotele.run.sweep_facts import SweepFile, load_sweep
+from hydrotele.run.sweep_runs import JOURNAL, Entry, finished
+from hydrotele.run.sweep_table import default_figures, spread_statistics
 from hydrotele.show.sweep_report import Study, write_sweep_report
-from hydrotele.sweep.facts import SweepFile, load_sweep
-from hydrotele.sweep.journal import JOURNAL, Entry, finished
-from hydrotele.sweep.sweep import How, Progress, Swept, run_sweep
-from hydrotele.sweep.table import default_figures, spread_statistics
 
 _ALL_FAILED = 3
 _LISTED = 10

@@ -38,7 +38,7 @@ def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferen
     Source: Abdellatif 2008, section 5 (computed-force feedforward).
     """
     if servo.force_model is None:
-        nothing = np.zeros_like(plan.reference)
+        nothing = np.zeros(plan.reference.shape)
         return ForceReferences(False, nothing, nothing)
     where = "servo.force_model"
     if servo.force_model != NOMINAL:
@@ -62,8 +62,8 @@ def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferen
     force += np.einsum("nkv,nv->nk", found.share, chain.damping * found.rate)
     ahead = np.minimum(plan.time + servo.lead, plan.time[-1])
     change = np.gradient(force, step, axis=0)
-    rate = np.column_stack([np.interp(ahead, plan.time, column) for column in change.T])
-    return ForceReferences(True, force, rate)
+    rate = np.stack([np.interp(ahead, plan.time, column) for column in change.T], axis=1)
+    return ForceReferences(True, np.ascontiguousarray(force), np.ascontiguousarray(rate))
 
 
 def _smooth(reference: np.ndarray, step: float) -> Smoothed:

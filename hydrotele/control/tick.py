@@ -17,8 +17,9 @@ from hydrotele.control.servo import (
     servo_step,
 )
 from hydrotele.core.compiled import compiled
-from hydrotele.simulate.feedback import FeedbackTable, sample
-from hydrotele.simulate.stepping import Simulation, step_physics
+from hydrotele.simulate.feedback import FeedbackTable, Readings, Sensors, sample
+from hydrotele.simulate.layout import address_record, floats, integers, rows_of
+from hydrotele.simulate.stepping import simulation, step_physics
 
 
 class Controller(NamedTuple):
@@ -84,8 +85,6 @@ class Planned(NamedTuple):
     """A run along a plan of n ticks and k axes.
 
     Attributes:
-        sim: the plant.
-        steps: physics steps per tick.
         controller: its servo.
         feedback: its sensors.
         drives: (n, k) each, references of the drives.
@@ -95,8 +94,6 @@ class Planned(NamedTuple):
         given: (n, k) written: commands of every tick.
     """
 
-    sim: Simulation
-    steps: int
     controller: Controller
     feedback: FeedbackTable
     drives: DriveReferences
@@ -106,13 +103,74 @@ class Planned(NamedTuple):
     given: np.ndarray
 
 
+_I, _SERVO = np.int64, 14
+_PLANNED = np.dtype(
+    [(name, _I) for name in ("axes", "ticks", "channels", "samples", "every", "known")]
+    + [("period", np.float64)]
+    + [(name, _I) for name in ("parameters", "closed", "load", "command")]  # addresses from here on
+    + [(name, _I) for name in ("scale", "offset", "step", "low", "high", "errors")]
+    + [(name, _I) for name in ("joint", "rate", "head", "rod", "supply")]
+    + [(name, _I) for name in ("velocity", "arm", "volume_head", "volume_rod")]
+    + [(name, _I) for name in ("force", "force_rate", "reference", "planned_command", "given")],
+    align=True,
+)
+
+
+def planned_record(run: Planned) -> np.ndarray:
+    """(1,) record of a Planned whose arrays must outlive it."""
+    table, controller = run.feedback, run.controller
+    arrays = {
+        "parameters": controller.parameters, "closed": controller.closed, "load": controller.load,
+        "command": controller.command, **table.sensors._asdict(), "errors": table.errors,
+        **table.readings._asdict(), **run.drives._asdict(), "force": run.forces.force,
+        "force_rate": run.forces.rate, "reference": run.reference, "planned_command": run.command,
+        "given": run.given,
+    }  # fmt: skip
+    record = address_record(_PLANNED, arrays)
+    (record["ticks"], record["axes"]), record["every"] = run.reference.shape, table.every
+    (record["samples"], record["channels"]), record["period"] = table.errors.shape, table.period
+    record["known"] = run.forces.known
+    return record
+
+
 @compiled
-def planned_tick(run, tick, stopped):
+def _planned(r):
+    """The Planned of a record."""
+    n, k, c = r.ticks, r.axes, r.channels
+    controller = Controller(
+        rows_of(r.parameters, k, _SERVO), integers(r.closed, k), floats(r.load, k),
+        floats(r.command, k),
+    )  # fmt: skip
+    sensors = Sensors(
+        floats(r.scale, c), floats(r.offset, c), floats(r.step, c), floats(r.low, c),
+        floats(r.high, c),
+    )  # fmt: skip
+    readings = Readings(
+        floats(r.joint, k), floats(r.rate, k), floats(r.head, k), floats(r.rod, k),
+        floats(r.supply, 1),
+    )  # fmt: skip
+    drives = DriveReferences(
+        rows_of(r.velocity, n, k), rows_of(r.arm, n, k), rows_of(r.volume_head, n, k),
+        rows_of(r.volume_rod, n, k),
+    )  # fmt: skip
+    return Planned(
+        controller,
+        FeedbackTable(r.every, r.period, sensors, rows_of(r.errors, r.samples, c), readings),
+        drives,
+        ForceReferences(r.known != 0, rows_of(r.force, n, k), rows_of(r.force_rate, n, k)),
+        rows_of(r.reference, n, k), rows_of(r.planned_command, n, k), rows_of(r.given, n, k),
+    )  # fmt: skip
+
+
+@compiled
+def planned_tick(simulated, planned, tick, steps, stopped):
     """Go on by one tick and take the readings that are due after it.
 
     Args:
-        run: Planned, with the readings of this tick.
+        simulated: record of `simulate.stepping.simulation_record`.
+        planned: record of `planned_record`, with the readings of this tick.
         tick: control tick, scalar.
+        steps: physics steps per tick, scalar.
         stopped: whether all commands are 0, scalar.
 
     Returns:
@@ -120,6 +178,7 @@ def planned_tick(run, tick, stopped):
 
     Source: `control_tick`.
     """
+    sim, run = simulation(simulated[0]), _planned(planned[0])
     controller, readings = run.controller, run.feedback.readings
     for i in range(len(controller.command)):
         controller.command[i] = run.command[tick, i]
@@ -134,7 +193,7 @@ def planned_tick(run, tick, stopped):
     measured = Measured(
         readings.joint, readings.rate, readings.head, readings.rod, readings.supply[0]
     )
-    control_tick(run.sim, tick, run.steps, controller, reference, measured)
+    control_tick(sim, tick, steps, controller, reference, measured)
     for i in range(len(controller.command)):
         run.given[tick, i] = controller.command[i]
-    sample(run.feedback, run.sim, tick + 1, run.steps)
+    sample(run.feedback, sim, tick + 1, steps)

@@ -10,10 +10,10 @@ import numpy as np
 from dm_control.mujoco import engine, wrapper
 from dm_env import specs
 
+from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.making import info_of, make_core
+from hydrotele.envs.observation import Field
 from hydrotele.envs.stage import FREE, Camera, Stage
-from hydrotele.tasks.memory import DISABLED
-from hydrotele.tasks.observation import Field
 
 FLAT = "observations"  # dm_control's name of the one array
 
@@ -25,11 +25,11 @@ def load(
     """Make a task, as `dm_control.suite.load` does.
 
     Args:
-        task_name: of `hydrotele.tasks.catalogue.TASKS`.
+        task_name: of `hydrotele.envs.catalogue.TASKS`.
         random: seed of the episodes, or a state that one is drawn from; without, they are drawn
             from the computer's own.
         flat_observation: whether observations are one array, under the key `observations`.
-        **options: fields of `hydrotele.tasks.task.Options`.
+        **options: fields of `hydrotele.envs.task.Options`.
 
     Returns:
         The environment. With the same seed and actions its numbers are those of gymnasium's.

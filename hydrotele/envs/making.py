@@ -9,10 +9,10 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
-from hydrotele.tasks.catalogue import TASKS
-from hydrotele.tasks.core import TaskCore
-from hydrotele.tasks.memory import DISABLED, NEXT_STEP, SAME_STEP
-from hydrotele.tasks.task import Options
+from hydrotele.envs.catalogue import TASKS
+from hydrotele.envs.core import TaskCore
+from hydrotele.envs.episode import DISABLED, NEXT_STEP, SAME_STEP
+from hydrotele.envs.task import Options
 
 _STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 _TYPES: dict[str, TypeAdapter] = {

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.making import (
     action_space,
     check_mode,
@@ -22,7 +23,6 @@ from hydrotele.envs.making import (
 from hydrotele.envs.stage import Camera, Stage
 from hydrotele.show.markers import write_markers
 from hydrotele.show.window import check_screen
-from hydrotele.tasks.memory import DISABLED
 
 ADVICE = (
     "use render_mode='rgb_array', which needs none, or make a screen up: xvfb-run -a python ..."
@@ -117,7 +117,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             height: of pictures [pixel].
             camera: a camera of the machine, such as `overview`, `side` or `cab`; without, one that
                 shows all that its arm reaches.
-            **options: fields of `hydrotele.tasks.task.Options`.
+            **options: fields of `hydrotele.envs.task.Options`.
 
         Raises:
             InputError: an option is not known or does not suit, or there is no screen for a window.

@@ -6,9 +6,9 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from hydrotele.core.errors import InputError
+from hydrotele.envs.controllers.agent import AgentView
+from hydrotele.envs.episode import SAME_STEP
 from hydrotele.envs.making import action_space, make_core, observation_space
-from hydrotele.tasks.controllers.agent import AgentView
-from hydrotele.tasks.memory import SAME_STEP
 
 try:
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore - an extra
@@ -37,7 +37,7 @@ class StableVecEnv(_Base):
             num_envs: number of environments n.
             threads: that step them; 0 for one per core.
             view: between environment and agent, made from the same task and options.
-            **options: fields of `hydrotele.tasks.task.Options`.
+            **options: fields of `hydrotele.envs.task.Options`.
 
         Raises:
             InputError: stable-baselines3 is not installed; an option is not known or does not suit.

@@ -17,19 +17,19 @@ from mujoco.batch import MODEL_FIELDS
 
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.errors import InputError
+from hydrotele.envs.core import TaskCore
+from hydrotele.envs.episode import ARM
+from hydrotele.envs.force import FORCE_READ, reference_force
+from hydrotele.envs.grade import CELL, CELLS, FAR, NEAR, START, plane_height
+from hydrotele.envs.line import SETTLE, line_pose
+from hydrotele.envs.place import GOAL_PLACE, HALF_LENGTH, RADIUS
+from hydrotele.envs.track import track_reference
 from hydrotele.kinematics.task import ALONG, BASE_RADIUS, BOOM, SIDE, STICK, task_forward
 from hydrotele.show.canvas import Canvas
 from hydrotele.show.markers import Marker, arrow, ball, box, line, polyline
 from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.fleet import STATE
 from hydrotele.soil.facts import CAT215
-from hydrotele.tasks.core import TaskCore
-from hydrotele.tasks.force import FORCE_READ, reference_force
-from hydrotele.tasks.grade import CELL, CELLS, FAR, NEAR, START, plane_height
-from hydrotele.tasks.line import SETTLE, line_pose
-from hydrotele.tasks.memory import ARM
-from hydrotele.tasks.place import GOAL_PLACE, HALF_LENGTH, RADIUS
-from hydrotele.tasks.track import track_reference
 
 _BANK, _LOOSE = (0.36, 0.25, 0.15, 1.0), (0.62, 0.47, 0.30, 1.0)
 _THIN_SOIL = 1e-3  # m of loose soil that is not drawn

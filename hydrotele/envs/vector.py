@@ -45,7 +45,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             height: of pictures [pixel].
             camera: a camera of the machine; without, one that shows all that its arm reaches.
             shown: number of environments, the first ones, that pictures are made of; without, all.
-            **options: fields of `hydrotele.tasks.task.Options`.
+            **options: fields of `hydrotele.envs.task.Options`.
 
         Raises:
             InputError: an option is not known or does not suit.

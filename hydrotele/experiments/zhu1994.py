@@ -20,7 +20,7 @@ from hydrotele.experiments.finding import Finding, Panel, cylindrical, perform, 
 from hydrotele.run.run import Run
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track
-from hydrotele.teleop.tip_over import tipping_share
+from hydrotele.teleop.master import tipping_share
 
 
 def tree() -> Finding:

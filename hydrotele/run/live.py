@@ -12,9 +12,9 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import arm_axes
 from hydrotele.core.errors import InputError
-from hydrotele.devices.reading import Device, Reading
 from hydrotele.machine.joystick import AXES
 from hydrotele.machine.machine import Machine
+from hydrotele.run.devices import Device, Reading
 from hydrotele.run.run import Run, begin, finished
 from hydrotele.run.session import Session
 from hydrotele.scenario.scenario import Scenario

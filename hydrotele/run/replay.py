@@ -15,8 +15,8 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import usual_unit
-from hydrotele.simulate.drive_side import flexible_axes
 from hydrotele.simulate.feedback import defective
+from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog, late_channels, true_channels
 from hydrotele.simulate.stepping import Stepper

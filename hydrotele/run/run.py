@@ -28,8 +28,8 @@ from hydrotele.machine.noise import sensor_set
 from hydrotele.run.session import Prepared, Session
 from hydrotele.scenario.scenario import Scenario, own_machine
 from hydrotele.simulate.audit import audit
-from hydrotele.simulate.drive_side import flexible_axes
 from hydrotele.simulate.feedback import Feedback, feedback, measure
+from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import Record, late_channels, true_channels
 from hydrotele.simulate.stepping import delayed_commands

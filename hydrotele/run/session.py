@@ -14,7 +14,7 @@ import numpy as np
 from hydrotele.control.feedforward import force_references
 from hydrotele.control.plan import Plan
 from hydrotele.control.servo import drive_references, servo_parameters
-from hydrotele.control.tick import Controller, Planned, planned_tick
+from hydrotele.control.tick import Controller, Planned, planned_record, planned_tick
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Scenario
@@ -91,6 +91,10 @@ class Session:
             InputError: servo, forces or station do not suit the machine.
         """
         plant, data, plan, seen = prepared
+        plan = dataclasses.replace(
+            plan, reference=np.ascontiguousarray(plan.reference, float),
+            command=np.ascontiguousarray(plan.command, float),
+        )  # fmt: skip
         begin_leapfrog(plant.model, data)
         self.plant, self.data, self.seen, self.scenario = plant, data, seen, scenario
         self.start, self.before = full_state(plant.model, data), np.array(data.ctrl)
@@ -98,6 +102,7 @@ class Session:
         self.every = round(scenario.control_rate / scenario.log_rate)
         parameters = servo_parameters(plant.machine, plant.axes, scenario.servo, self._dt)
         drives = drive_references(plant.machine, plan, scenario.servo)
+        drives = drives._make(map(np.ascontiguousarray, drives))
         forces = force_references(nominal, plan, scenario.servo)
         k, ticks = len(plant.axes), scenario.ticks
         self._recorder = Recorder(plant, scenario.rows)
@@ -105,10 +110,8 @@ class Session:
         self.seen.update(0, self._stepper)
         load = parameters[:, 1] * seen.head - parameters[:, 2] * seen.rod - forces.force[0]
         self._commands = np.zeros((ticks, k))
-        self._planned = Planned(
-            sim=self._stepper.sim,
-            steps=self._stepper.steps,
-            controller=Controller(parameters, plan.closed, load, np.zeros(k)),
+        self._run = Planned(
+            controller=Controller(parameters, plan.closed.astype(np.int64), load, np.zeros(k)),
             feedback=seen.table,
             drives=drives,
             forces=forces,
@@ -116,6 +119,7 @@ class Session:
             command=plan.command,
             given=self._commands,
         )
+        self._planned = planned_record(self._run)
         self.station = None
         if isinstance(scenario.pilot, TeleopPilot):
             self.station = Station(plant, scenario, plan, drives, seen, hand)
@@ -140,7 +144,7 @@ class Session:
             self._recorder.take(tick // self.every, tick * self._dt, data, shown)
         tripped = self.station is not None and self.station.tick(tick, data, self.seen)
         self._begin = self._begin if tick else clock.perf_counter()
-        planned_tick(self._planned, tick, tripped)
+        planned_tick(stepper.record, self._planned, tick, stepper.steps, tripped)
         stepper.tick = tick + 1
         if self.scenario.surroundings:
             self._around.update(tick * self._dt, data, self._dt)

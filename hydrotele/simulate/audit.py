@@ -12,10 +12,9 @@ from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import port_flow, pressure_without_air
 from hydrotele.hydraulics.pump import oil_compliance, switched_speed
 from hydrotele.simulate.closure import pin_count
-from hydrotele.simulate.drive_side import drive_and_load_dofs
-from hydrotele.simulate.plant import Plant
+from hydrotele.simulate.mechanism import drive_and_load_dofs
+from hydrotele.simulate.plant import Plant, added_by_terms
 from hydrotele.simulate.record import align_positions, drive_motion, state_flows
-from hydrotele.simulate.term_readout import added_by_terms
 
 _LOOK_EVERY = 10  # steps, to see whether the machine touches something: a hit lasts longer
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -18,8 +18,13 @@ from hydrotele.machine.machine import Machine
 from hydrotele.multibody import closures
 from hydrotele.multibody.chain import Chain, load_chain
 from hydrotele.multibody.closures import close_from
-from hydrotele.simulate.drive_side import drive_and_load_dofs, lock_drives
-from hydrotele.simulate.mechanism import assemble, mjcf_document, pin_site
+from hydrotele.simulate.mechanism import (
+    assemble,
+    drive_and_load_dofs,
+    lock_drives,
+    mjcf_document,
+    pin_site,
+)
 
 _STEP = 0.2  # largest move of an independent joint between two solutions [rad] or [m]
 _TURN = 0.3  # largest move of a joint that follows, in a round of Newton's method [rad] or [m]

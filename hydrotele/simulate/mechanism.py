@@ -2,16 +2,15 @@
 
 The machine's MJCF gives the tree and the shapes, the Machine gives every number. Each cylinder
 becomes a tube (hinged to its base pin), a rod (sliding in the tube; the slide's position is the
-piston displacement x) and a `connect` constraint at the rod pin.
+piston displacement x) and a `connect` constraint at the rod pin. Hundreds of geoms that touch
+nothing double the cost of a step and make assembling slow, so physics leaves out what only a
+picture needs; masses do not come from geoms here. Names of what is added have a prefix, which keeps
+them apart from the user's own.
 
-MJCF text with or without what only a picture needs.
-
-Hundreds of geoms that touch nothing double the cost of a step and make assembling slow, so physics
-leaves them out; masses do not come from geoms here.
-
-The complete MJCF of a machine, with the files that it needs.
-
-Names of what is added to a machine's MJCF; a prefix keeps them apart from the user's own.
+A transmission gives the drive a coordinate of its own beside the load's, in the same parent: a
+rotor about the joint's axis, a slide along it, or a piston in the tube. Its inertia is the armature
+of that coordinate, so that it turns with its parent without weight. A fixed tendon, drive minus
+load, with a dead band as wide as the backlash is the spring and the damper between the two.
 """
 
 import warnings
@@ -32,7 +31,6 @@ from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_d
 from hydrotele.machine.drives import Axis, Cylinder, Pin
 from hydrotele.machine.machine import Link, Machine
 from hydrotele.scenario.surroundings import Thing
-from hydrotele.simulate.drive_side import drive_joint, flexible_axes, write_drive_side
 from hydrotele.simulate.surroundings import write_surroundings
 from hydrotele.terms.table import terms_table
 
@@ -417,3 +415,97 @@ def _write_scene(root, ground: bool, looks: bool) -> None:
         "light", name=f"{OWN}sun", pos=(4, 8, 14), dir=(-0.25, -0.5, -1), directional=True,
         castshadow=True, diffuse=(0.6, 0.6, 0.55),
     )  # fmt: skip
+
+
+_SPECK = (1.0e-6, (1.0e-9, 1.0e-9, 1.0e-9))  # kg, kg m^2: MuJoCo takes no moving body without mass
+_SLACK = 1.0e-9  # m or rad of deflection under a static load so small that it stays inside the gap
+
+
+def drive_joint(machine: Machine, axis: str) -> str:
+    """Name of the joint that the actuator of an axis acts on."""
+    return f"{axis}_drive" if machine.axes[axis].transmission else load_joint(machine, axis)
+
+
+def load_joint(machine: Machine, axis: str) -> str:
+    """Name of the joint on the load side: the rod's slide of a cylinder, else the axis' joint."""
+    facts = machine.axes[axis]
+    return f"{axis}_rod" if facts.cylinder else facts.joint
+
+
+def flexible_axes(machine: Machine) -> list[str]:
+    """Names of the axes with a transmission."""
+    return [name for name, axis in machine.axes.items() if axis.transmission]
+
+
+def write_drive_side(root, machine: Machine, axis: str) -> None:
+    """Add the drive side of an axis with a transmission to an MJCF that has the load side.
+
+    Args:
+        root: the MJCF document.
+        machine: the machine.
+        axis: name of the axis.
+
+    Raises:
+        InputError: a link has the name that the drive side needs.
+    """
+    facts = machine.axes[axis].transmission
+    assert facts
+    name, load = drive_joint(machine, axis), root.find("joint", load_joint(machine, axis))
+    if root.find("body", name) is not None or root.find("joint", name) is not None:
+        message = f"is the name of the drive side of axis {axis}; rename the link"
+        raise InputError(f"links.{name}", message)
+    beside = load.parent
+    body = beside.parent.add("body", name=name, pos=beside.pos)
+    for turn in ("quat", "euler", "axisangle", "xyaxes", "zaxis"):
+        setattr(body, turn, getattr(beside, turn))
+    mass, inertia = _SPECK
+    body.add("inertial", mass=mass, pos=(0, 0, 0), diaginertia=inertia)
+    body.add(
+        "joint", name=name, type=load.type or "hinge", axis=load.axis, armature=facts.inertia,
+        limited="false",
+    )  # fmt: skip
+    gap = facts.backlash / 2.0
+    tendon = root.tendon.add(
+        "fixed", name=name, stiffness=facts.stiffness, damping=facts.damping,
+        springlength=(-gap, gap),
+    )  # fmt: skip
+    tendon.add("joint", joint=name, coef=1.0)
+    tendon.add("joint", joint=load.name, coef=-1.0)
+
+
+def lock_drives(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Put every drive side where its load stands, with the spring at rest; `qpos` is written."""
+    for axis in flexible_axes(machine):
+        drive, load = drive_joint(machine, axis), load_joint(machine, axis)
+        data.qpos[model.joint(drive).qposadr[0]] = data.qpos[model.joint(load).qposadr[0]]
+
+
+def drive_and_load_dofs(machine: Machine, model: mujoco.MjModel) -> tuple[list[int], list[int]]:
+    """Places in `qvel` of the drive sides, and of the load sides that they belong to."""
+    axes = flexible_axes(machine)
+    drives = [int(model.joint(drive_joint(machine, a)).dofadr[0]) for a in axes]
+    loads = [int(model.joint(load_joint(machine, a)).dofadr[0]) for a in axes]
+    return drives, loads
+
+
+def wind_up(
+    machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, force: dict[str, float]
+) -> None:
+    """Wind the transmissions up until they carry static forces.
+
+    Args:
+        machine: the machine.
+        model: its model.
+        data: `qpos` of the drive sides is written, beside their loads.
+        force: axis -> force that its drive gives [N] or [N m]; none leaves it in the middle of
+            its gap.
+    """
+    for axis in flexible_axes(machine):
+        facts = machine.axes[axis].transmission
+        assert facts
+        deflection = force[axis] / facts.stiffness
+        if abs(deflection) > _SLACK:
+            deflection += np.sign(deflection) * facts.backlash / 2.0
+        drive = model.joint(drive_joint(machine, axis)).qposadr[0]
+        load = model.joint(load_joint(machine, axis)).qposadr[0]
+        data.qpos[drive] = data.qpos[load] + deflection

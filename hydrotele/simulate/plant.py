@@ -1,16 +1,13 @@
 """The plant: a Machine compiled to MuJoCo with its hydraulics, and its complete states.
 
-Bristles of presliding friction in a compiled machine: what inertia they hold at home.
+Bristles of presliding friction: an explicit step follows a drive on its bristles only as long as
+these are not too stiff for the inertia that it moves; `hydraulics.actuator.bristle_rate` limits them by the
+inertia at home that is written here.
 
-An explicit step follows a drive on its bristles only as long as these are not too stiff for the
-inertia that it moves; `presliding.bristle_rate` limits them by the number that is written here.
-
-Stiffness and damping of end stops, written into the joint limits of a compiled machine.
-
-A limit of MuJoCo is a soft constraint whose force solves `(A + R) f = a_ref - a_0` with the inverse
-inertia A felt there. With `R = 1 / (h b)`, `a_ref = -v / h - k r / (h b)` and `b = c + h k` that is
-`f = -k r' - c v'` with depth r' and velocity v' at the end of the step h: a spring k and a damper c
-by the implicit Euler rule, stable however light the load and stiff the stop.
+End stops: a limit of MuJoCo is a soft constraint whose force solves `(A + R) f = a_ref - a_0` with
+the inverse inertia A felt there. With `R = 1 / (h b)`, `a_ref = -v / h - k r / (h b)` and
+`b = c + h k` that is `f = -k r' - c v'` with depth r' and velocity v' at the end of the step h: a
+spring k and a damper c by the implicit Euler rule, stable however light the load, stiff the stop.
 """
 
 import dataclasses
@@ -20,17 +17,40 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
+from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.hydraulics.circuit import (
+    ACTIVATIONS,
+    SCRATCH,
+    circuit_supply,
+    delivered_share,
+    drive_state,
+    open_ports,
+)
 from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air
-from hydrotele.hydraulics.parameters import Slot, actuator_order, extra_state_names
+from hydrotele.hydraulics.parameters import (
+    Slot,
+    actuator_order,
+    actuator_parameters,
+    extra_state_names,
+)
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.surroundings import Thing
 from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
-from hydrotele.simulate.drive_side import drive_joint, flexible_axes, load_joint, wind_up
-from hydrotele.simulate.mechanism import TIP_SITE, Mjcf, add_element, assemble, mjcf_document
+from hydrotele.simulate.mechanism import (
+    TIP_SITE,
+    Mjcf,
+    add_element,
+    assemble,
+    drive_joint,
+    flexible_axes,
+    load_joint,
+    mjcf_document,
+    wind_up,
+)
 from hydrotele.simulate.native import install_hydraulics
-from hydrotele.simulate.term_readout import terms_at_rest
+from hydrotele.terms.law import Drives
+from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added, terms_table
 
 
 def set_bristles(machine: Machine, model: mujoco.MjModel) -> None:
@@ -354,3 +374,84 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
         kind, _, owner = name.partition(".")
         data.act[place] = state.get(kind, {}).get(owner, 0.0)
     return data
+
+
+def added_by_terms(
+    machine: Machine, time: np.ndarray, act: np.ndarray, x: np.ndarray, v: np.ndarray,
+    command: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Forces and flows that terms add in n states of a machine with nu drives.
+
+    Args:
+        machine: the machine.
+        time: (n,) [s].
+        act: (n, >= 4 count) activations.
+        x: (n, nu) drive positions [m] or [rad].
+        v: (n, nu) drive velocities [m/s] or [rad/s].
+        command: (n, nu) commands as they arrive [1] or [V].
+
+    Returns:
+        (n, nu, 3): force [N] or [N m], with what a force drive makes of a command's terms; flows
+        into the head-side and the rod-side chamber [m^3/s].
+    """
+    out = np.zeros((len(time), len(machine.axes), 3))
+    if machine.terms:
+        order = actuator_order(machine)
+        drives = [machine.axes[name].force for name in order]
+        _evaluate(
+            np.concatenate(list(actuator_parameters(machine).values())),
+            terms_table(machine.terms, order), len(machine.hydraulic_axes),
+            np.array([drive.gain if drive else 0.0 for drive in drives]),
+            np.ascontiguousarray(time, float), np.ascontiguousarray(act, float),
+            np.ascontiguousarray(x, float), np.ascontiguousarray(v, float),
+            np.ascontiguousarray(command, float), out,
+        )  # fmt: skip
+    return out
+
+
+@compiled
+def _evaluate(user, terms, count, gain, time, act, x, v, command, out):
+    """Fill `out` of `added_by_terms`."""
+    scratch = np.zeros(SCRATCH)
+    for row in range(len(time)):
+        supply = 0.0
+        if count > 0:
+            open_ports(user, act[row], act[row], scratch, 0, count, 0.0, act[row])
+            share = delivered_share(user, 0, act[row])
+            supply = circuit_supply(user, 0, count, scratch, share)
+        drives = Drives(count, act[row], x[row], v[row], command[row])
+        for i in range(len(gain)):
+            s = drive_state(
+                user, i, count, act[row], supply, time[row], x[row, i], v[row, i], command[row, i],
+                gain[i],
+            )  # fmt: skip
+            out[row, i, 0] = added(terms, FORCE, i, s, drives)
+            if i >= count:
+                out[row, i, 0] += gain[i] * added(terms, COMMAND, i, s, drives)
+            out[row, i, 1] = added(terms, FLOW_HEAD, i, s, drives)
+            out[row, i, 2] = added(terms, FLOW_ROD, i, s, drives)
+
+
+def terms_at_rest(
+    machine: Machine, data: mujoco.MjData, drive_qpos: np.ndarray, forces: np.ndarray
+) -> np.ndarray:
+    """Forces that terms add to drives at rest, at time 0 and without commands.
+
+    Args:
+        machine: the machine.
+        data: at rest.
+        drive_qpos: (nu,) places of the drives in `qpos`.
+        forces: (nu,) that hold the machine [N] or [N m]; terms that depend on pressures see them
+            carried on the head side.
+
+    Returns:
+        (nu,) [N] or [N m].
+    """
+    if not machine.terms:
+        return np.zeros(len(forces))
+    act = np.zeros((1, ACTIVATIONS * len(machine.hydraulic_axes) + len(extra_state_names(machine))))
+    for i, axis in enumerate(machine.hydraulic_axes.values()):
+        act[0, ACTIVATIONS * i + 2] = forces[i] / axis.hydraulic_drive.areas[0]
+    still = np.zeros((1, len(forces)))
+    x = data.qpos[drive_qpos][None, :]
+    return added_by_terms(machine, np.zeros(1), act, x, still, still)[0, :, 0]

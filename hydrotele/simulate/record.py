@@ -28,9 +28,8 @@ from hydrotele.hydraulics.circuit import (
 )
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.mechanism import TIP_SITE
-from hydrotele.simulate.plant import Plant
+from hydrotele.simulate.plant import Plant, added_by_terms
 from hydrotele.simulate.surroundings import is_surrounding_object, object_joints
-from hydrotele.simulate.term_readout import added_by_terms
 
 _WHOLE = 1.0e-9  # of a step, by which a delay may miss a whole number of steps through rounding
 

@@ -12,11 +12,18 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.hydraulics.circuit import SCRATCH
+from hydrotele.hydraulics.circuit import SCRATCH, SLOTS
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import first_order
 from hydrotele.machine.sensors import SensorError
-from hydrotele.simulate.layout import call_step, function_address
+from hydrotele.simulate.layout import (
+    address_record,
+    call_step,
+    floats,
+    function_address,
+    integers,
+    rows_of,
+)
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import sensed_channels, split_delay, state_supply
 
@@ -91,6 +98,59 @@ class Simulation(NamedTuple):
     user: np.ndarray
     line: CommandLine
     past: SensorPast
+
+
+_I = np.int64
+_SIMULATION = np.dtype(
+    [(name, _I) for name in ("mj_step", "model", "data", "nq", "nv", "na", "nu")]
+    + [("timestep", np.float64)]
+    + [(name, _I) for name in ("axes", "hydraulic", "rods", "channels", "ticks", "back")]
+    + [(name, _I) for name in ("qpos", "qvel", "act", "ctrl", "user")]  # addresses from here on
+    + [(name, _I) for name in ("joint_qpos", "joint_dof", "rod_qpos", "rod_dof")]
+    + [(name, _I) for name in ("line_ring", "line_delay")]
+    + [(name, _I) for name in ("past_ring", "past_before", "past_delay", "past_ratio")],
+    align=True,
+)
+
+
+def simulation_record(sim: Simulation) -> np.ndarray:
+    """(1,) record of a Simulation whose arrays must outlive it; `simulation` reads it."""
+    line, past = sim.line, sim.past
+    record = address_record(
+        _SIMULATION,
+        {
+            "qpos": sim.qpos, "qvel": sim.qvel, "act": sim.act, "ctrl": sim.ctrl, "user": sim.user,
+            "joint_qpos": sim.joint_qpos, "joint_dof": sim.joint_dof, "rod_qpos": sim.rod_qpos,
+            "rod_dof": sim.rod_dof, "line_ring": line.ring, "line_delay": line.delay,
+            "past_ring": past.ring, "past_before": past.before, "past_delay": past.delay,
+            "past_ratio": past.ratio,
+        },
+    )  # fmt: skip
+    for name, value in {
+        "mj_step": sim.mj_step, "model": sim.model, "data": sim.data, "nq": len(sim.qpos),
+        "nv": len(sim.qvel), "na": len(sim.act), "nu": len(sim.ctrl), "timestep": sim.timestep,
+        "axes": sim.axes, "hydraulic": sim.hydraulic, "rods": len(sim.rod_qpos),
+        "channels": len(past.before), "ticks": len(line.ring), "back": len(past.ring),
+    }.items():  # fmt: skip
+        record[name] = value
+    return record
+
+
+@compiled
+def simulation(r):
+    """The Simulation of a record of `simulation_record`."""
+    k, c = r.axes, r.channels
+    line = CommandLine(rows_of(r.line_ring, r.ticks, k), rows_of(r.line_delay, k, 2))
+    past = SensorPast(
+        rows_of(r.past_ring, r.back, c), floats(r.past_before, c), rows_of(r.past_delay, c, 2),
+        floats(r.past_ratio, c),
+    )  # fmt: skip
+    return Simulation(
+        r.mj_step, r.model, r.data, floats(r.qpos, r.nq), floats(r.qvel, r.nv),
+        floats(r.act, r.na), floats(r.ctrl, r.nu), r.timestep, k, r.hydraulic,
+        integers(r.joint_qpos, k), integers(r.joint_dof, k), integers(r.rod_qpos, r.rods),
+        integers(r.rod_dof, r.rods), floats(r.user, k * SLOTS), line, past,
+    )  # fmt: skip
 
 
 @compiled
@@ -305,6 +365,11 @@ def delayed_commands(plant: Plant, before: np.ndarray, held: np.ndarray, steps: 
     return out
 
 
+@compiled
+def _step(record, tick, steps, command):
+    step_physics(simulation(record[0]), tick, steps, command)
+
+
 class Stepper:
     """Advances a plant by ticks of held commands.
 
@@ -316,6 +381,7 @@ class Stepper:
 
     Attributes:
         sim: the plant as native code sees it.
+        record: (1,) the same as a record.
         steps: physics steps per tick.
         tick: number of the next tick.
         late: whether a sensor shows the past.
@@ -351,11 +417,12 @@ class Stepper:
         )
         self._owners = plant.model, data  # whose memory the addresses are
         self.steps, self.tick, self.late = steps, 0, len(past.ring) > 0
+        self.record = simulation_record(self.sim)
         begin_past(self.sim, np.array(data.ctrl))
 
     def advance(self, command: np.ndarray) -> None:
         """Step through one tick during which a command (nu,) is held."""
-        step_physics(self.sim, self.tick, self.steps, np.asarray(command, float))
+        _step(self.record, self.tick, self.steps, np.asarray(command, float))
         self.tick += 1
 
     def shown(self) -> np.ndarray:

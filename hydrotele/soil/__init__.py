@@ -10,11 +10,12 @@ environment, one array of numbers for all; nothing is allocated or shared:
 >>> from hydrotele.soil.facts import SOILS
 >>> from hydrotele.soil.facts import OUT, FORCE_R, bucket_state, level_profile, soil_parameters
 >>> from hydrotele.soil.facts import CAT215
->>> from hydrotele.soil.step import soil_step
+>>> from hydrotele.soil.step import EdgeMotion, soil_step
 >>> numbers = soil_parameters(SOILS["firm"], CAT215, start=3.0, cell=0.05)
 >>> (surface, loose), state, out = level_profile(140), bucket_state(), np.zeros(OUT)
 >>> for r in np.arange(6.0, 5.5, -0.002):  # drawn in at 0.4 m/s, 0.15 m deep, upright
-...     soil_step(numbers, surface, loose, state, r, -0.15, -0.4, 0.0, -1.5, 0.005, out)
+...     edge = EdgeMotion(r, -0.15, -0.4, 0.0, -1.5)
+...     soil_step(numbers, surface, loose, state, edge, 0.005, out)
 >>> bool(20e3 < out[FORCE_R] < 50e3)  # N, against the motion
 True
 

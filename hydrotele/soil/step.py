@@ -22,6 +22,7 @@ Soil and load on a bucket as the wrench about its centre of mass that MuJoCo's b
 """
 
 import math
+from typing import NamedTuple
 
 from hydrotele.core.compiled import allocation_free
 from hydrotele.soil.facts import (
@@ -430,9 +431,28 @@ def _touch(state, low, high, count):
         state[LOW], state[HIGH] = min(state[LOW], low), max(state[HIGH], high)
 
 
+class EdgeMotion(NamedTuple):
+    """Where the edge of the bucket is and how it moves, in the arm's plane; scalars.
+
+    Attributes:
+        r: radius [m].
+        z: height [m].
+        r_rate: its speed outwards [m/s].
+        z_rate: its speed upwards [m/s].
+        attitude: of the bucket [rad].
+    """
+
+    r: float
+    z: float
+    r_rate: float
+    z_rate: float
+    attitude: float
+
+
 @allocation_free
-def _press(n, surface, loose, state, r, z, attitude, r_rate, z_rate, dt, out):
+def _press(n, surface, loose, state, edge, dt, out):
     """Forces of all surfaces on the bucket; returns depths inside and outside of the edge."""
+    r, z, r_rate, z_rate, attitude = edge
     phi, delta = n[FRICTION], n[TOOL_FRICTION]
     reach = AHEAD * n[CELL]
     height = surface_height(n, surface, r - reach)
@@ -504,7 +524,7 @@ def _press(n, surface, loose, state, r, z, attitude, r_rate, z_rate, dt, out):
 
 
 @allocation_free
-def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out):
+def soil_step(n, surface, loose, state, edge, dt, out):
     """Move the edge of the bucket to a place and say what the soil does to it.
 
     Allocates nothing and touches nothing but its arguments, so that every environment may run in
@@ -515,11 +535,7 @@ def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out)
         surface: (m,) height of the profile, changed [m].
         loose: (m,) how much of it is loose, changed [m].
         state: (STATE,) of the bucket, changed; see `numbers`.
-        r: radius of the edge, scalar [m].
-        z: height of the edge, scalar [m].
-        r_rate: its speed outwards, scalar [m/s].
-        z_rate: its speed upwards, scalar [m/s].
-        attitude: of the bucket, scalar [rad].
+        edge: EdgeMotion.
         dt: time since the step before, scalar [s].
         out: (OUT,) written: force outwards and up [N], moment about the edge [N m], mass carried
             [kg] and its place from the edge [m]. The weight of what is carried is not in the force.
@@ -529,6 +545,7 @@ def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out)
 
     Source: this module and `cutting`, `bucket`, `terrain`.
     """
+    r, z, attitude = edge.r, edge.z, edge.attitude
     for i in range(OUT):
         out[i] = 0.0
     if state[PLACED] == 0.0:
@@ -538,7 +555,7 @@ def soil_step(n, surface, loose, state, r, z, r_rate, z_rate, attitude, dt, out)
         state[LAST_HEEL_Z] = z + n[HEEL_X] * s + n[HEEL_Z] * c
         state[LOW], state[HIGH] = 0.0, len(surface) - 1.0
     z_before, count = state[LAST_Z], len(surface)
-    inside, outside = _press(n, surface, loose, state, r, z, attitude, r_rate, z_rate, dt, out)
+    inside, outside = _press(n, surface, loose, state, edge, dt, out)
     state[DEPTH] = max(inside, 0.0)
     force_r, force_z, moment = out[FORCE_R], out[FORCE_Z], out[MOMENT]
     here = cell_of(n, r)

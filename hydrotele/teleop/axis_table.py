@@ -1,16 +1,16 @@
-"""Numbers of the joystick's axes: gains, of the joystick and the scenario, and what each moves.
+"""Parameters of the joystick's axes: gains of joystick and scenario, and what each axis moves.
 
-Named tuples of arrays that lie one after the other in memory.
-
-So a state can be logged in one go, and handed to a compiled function as one array: what a call of a
-compiled function costs grows with the number of arrays that it is given. Next to each such type is
-a compiled `unpack_...` that shows the parts of the one array again.
+Also named tuples of arrays that lie one after the other in memory. Such a state is logged in one
+go, and handed to a compiled function as one array: what a call of a compiled function costs grows
+with the number of arrays that it is given. Next to each such type is a compiled `unpack_...` that
+shows the parts of the one array again, in their order.
 """
 
 from typing import Any, TypeVar
 
 import numpy as np
 
+from hydrotele.core.compiled import compiled
 from hydrotele.core.datafile import parse, split_unit, suggest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import AXES, AxisGains, Joystick
@@ -20,6 +20,7 @@ from hydrotele.scenario.teleoperation import Coupling, Regulate, Steer, TeleopPi
 # place per displacement
 (NOMINAL, LEAST, MOST, SLOPE, DAMPING, LIMIT, DEADBAND, DROP, OUTSIDE, REACH, COORDINATE, SIGN,
  GAIN, RATIO, COUPLING, COUPLING_DAMPING, REFLECTED_MOST) = range(17)  # fmt: skip
+COLUMNS = REFLECTED_MOST + 1
 LEVER = 0.1  # m, a hand's: makes rotational gains of translational ones
 _SOFT = {"rate": 40.0, "position": 400.0}  # N/m, N per metre of machine or of handle
 _DAMPED = 0.1  # s, of that coupling
@@ -43,7 +44,7 @@ def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, .
     if pilot.gains not in joystick.gains:
         message = f"{pilot.gains!r}; {suggest(pilot.gains, joystick.gains)}"
         raise InputError("pilot.gains", message)
-    table = np.zeros((6, 17))
+    table = np.zeros((6, COLUMNS))
     table[:, COORDINATE] = -1.0
     soft = _SOFT[pilot.mode] if pilot.coupling is None else pilot.coupling
     damped = _DAMPED * soft if pilot.coupling_damping is None else pilot.coupling_damping
@@ -148,3 +149,9 @@ def flat_view(parts: tuple[Any, ...]) -> np.ndarray:
     """The memory of a `flat_state` as one array."""
     base = parts[0].base
     return base if base.ndim == 1 else base.base
+
+
+@compiled
+def split(flat, size):
+    """The first `size` numbers of an array, and the rest of it."""
+    return flat[:size], flat[size:]

@@ -2,18 +2,20 @@
 
 Every axis of the joystick is a spring and damper to its centre, made by the coils about the handle
 (remote centre of compliance), whose stiffness or force follows what comes back from the machine.
-One kernel makes all structures, 200 times a second; `teleop.handle` holds the same laws of one axis
-for people.
+One kernel makes all structures, 200 times a second. Before the machine tips over, the handle is
+pushed back.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.machine.joystick import Joystick
-from hydrotele.scenario.teleoperation import TeleopPilot
+from hydrotele.scenario.teleoperation import TeleopPilot, TipOver
 from hydrotele.teleop.axis_table import (
+    COLUMNS,
     COORDINATE,
     COUPLING,
     COUPLING_DAMPING,
@@ -33,6 +35,7 @@ from hydrotele.teleop.axis_table import (
     axis_table,
     flat_state,
     flattened,
+    split,
 )
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.compliance import GRAVITY, holding_wrench, turn_matrix
@@ -160,9 +163,18 @@ def unpack_master(flat):
 
     Source: order and shapes of Master.
     """
+    axis, rest = split(flat, 6 * COLUMNS)
+    mass, rest = split(rest, 1)
+    turning, rest = split(rest, 3)
+    below, rest = split(rest, 3)
+    handle, rest = split(rest, 3)
+    gravity, rest = split(rest, 3)
+    to_currents, rest = split(rest, 36)
+    most, rest = split(rest, 1)
+    step, kind = split(rest, 6)
     return Master(
-        flat[0:102].reshape(6, 17), flat[102:103], flat[103:106], flat[106:109], flat[109:112],
-        flat[112:115], flat[115:151].reshape(6, 6), flat[151:152], flat[152:158], flat[158:160],
+        axis.reshape(6, COLUMNS), mass, turning, below, handle, gravity, to_currents.reshape(6, 6),
+        most, step, kind,
     )  # fmt: skip
 
 
@@ -178,9 +190,20 @@ def unpack_master_state(flat):
 
     Source: order and shapes of MasterState.
     """
+    handle, rest = split(flat, 6)
+    speed, rest = split(rest, 6)
+    push, rest = split(rest, 6)
+    stiffness, rest = split(rest, 6)
+    hand, rest = split(rest, 6)
+    momentum, rest = split(rest, 6)
+    integral, rest = split(rest, 6)
+    before, rest = split(rest, 6)
+    currents, rest = split(rest, 6)
+    extra, rest = split(rest, 6)
+    limited, energy = split(rest, 1)
     return MasterState(
-        flat[0:6], flat[6:12], flat[12:18], flat[18:24], flat[24:30], flat[30:36], flat[36:42],
-        flat[42:48], flat[48:54], flat[54:60], flat[60:61], flat[61:63],
+        handle, speed, push, stiffness, hand, momentum, integral, before, currents, extra, limited,
+        energy,
     )  # fmt: skip
 
 
@@ -270,7 +293,7 @@ def reflect(numbers, packet, fresh, period, s):
                 slower = share * (packet[WANTED_SPEED, c] - packet[SPEED, c])
                 push -= fresh * (row[COUPLING] * behind + row[COUPLING_DAMPING] * slower)
             elif kind == FOUR_CHANNEL:
-                push += _four_channels(row, mode, x, v, kept, sign, packet, c, fresh, period, s, i)
+                push += _four_channels(row, mode, kept, packet, fresh, period, s, i)
             elif kind == IMPEDANCE:
                 felt = fresh * row[RATIO] * gain
                 stiff = min(row[MOST], max(row[LEAST], stiff + felt * packet[TASK_STIFFNESS, c]))
@@ -289,12 +312,13 @@ def reflect(numbers, packet, fresh, period, s):
 
 
 @compiled
-def _four_channels(row, mode, x, v, force, sign, packet, c, fresh, period, s, i):
+def _four_channels(row, mode, force, packet, fresh, period, s, i):
     """Force back and velocity back of the four-channel structures, and the master's own part.
 
     Under rate control `C2 = s / k_v` differentiates the force, below 20 rad/s.
     """
     gain, spring, damper = row[GAIN], row[COUPLING], row[COUPLING_DAMPING]
+    x, v, c, sign = s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
     place, speed = sign * packet[PLACE, c], sign * packet[SPEED, c]
     reflected = row[RATIO] * force
     if mode == POSITION:
@@ -380,3 +404,62 @@ def master_step(numbers, qpos, packet, fresh, period, first, s):
     read_handle(numbers, qpos, 0.0 if first or s.limited[0] == 0.0 else period, s)
     reflect(numbers, packet, fresh, period, s)
     drive_coils(numbers, qpos[3:7], period, s)
+
+
+_GRAVITY = 9.81
+_FULL = 0.1  # of the tipping moment, beyond the allowed share, over which the spring builds up
+
+
+def tipping_share(facts: TipOver, radius: float, force: float) -> float:
+    """Share of the tipping moment that a vertical force at the tip makes up.
+
+    Args:
+        facts: of the machine.
+        radius: of the tip from the swing axis [m].
+        force: of the environment on the tip, positive up [N].
+
+    Returns:
+        1 where the machine tips: backwards about its rear edge if pushed up, forwards about the
+        front one if pulled down.
+
+    >>> machine = TipOver(mass=20000.0, behind=0.4, edge=1.6)
+    >>> round(tipping_share(machine, 6.4, 29430.0), 3)
+    1.0
+    """
+    weight = facts.mass * _GRAVITY
+    if force > 0.0:
+        return force * (radius + facts.edge) / (weight * (facts.edge - facts.behind))
+    return -force * max(radius - facts.edge, 0.0) / (weight * (facts.edge + facts.behind))
+
+
+def push_back(
+    facts: TipOver, numbers: Master, packet: np.ndarray, start: np.ndarray, handle: np.ndarray,
+    speed: np.ndarray, extra: np.ndarray,
+) -> None:  # fmt: skip
+    """Force on the handle's vertical axis that keeps the machine from tipping.
+
+    A further spring to the centre, with a damper that 200 Hz needs to hold it, on the side that
+    would make it worse: the hand is back inside the dead band, and no motion is ever commanded.
+
+    Args:
+        facts: of the machine.
+        numbers: of the master.
+        packet: (7, k) what came from the machine.
+        start: (5,) pose at the start.
+        handle: (6,) measured displacement [m], [rad].
+        speed: (6,) its rate [m/s], [rad/s].
+        extra: (6,) written [N], [N m].
+
+    Source: Zhu 1994, chapter 6 (tip-over of an excavator that presses too hard).
+    """
+    extra[:] = 0.0
+    force, radius = float(packet[FORCE, 2]), float(packet[PLACE, 0] + start[0])
+    danger = min(1.0, (tipping_share(facts, radius, force) - facts.share) / _FULL)
+    if not danger > 0.0:
+        return
+    for axis in range(6):
+        row = numbers.axis[axis]
+        worse = -math.copysign(1.0, force) * row[SIGN]  # pressing on makes what pushes up larger
+        if row[COORDINATE] == 2.0 and worse * handle[axis] > 0.0:
+            push = facts.stiffness * handle[axis] + facts.damping * speed[axis]
+            extra[axis] = -danger * push

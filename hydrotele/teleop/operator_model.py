@@ -32,6 +32,7 @@ from hydrotele.teleop.axis_table import (
     SIGN,
     SLOPE,
     flattened,
+    split,
 )
 from hydrotele.teleop.master import Master
 
@@ -78,9 +79,16 @@ def unpack_muscles(flat):
 
     Source: order and shapes of Muscles.
     """
+    wanted, rest = split(flat, 6)
+    spring, rest = split(rest, 6)
+    notch, rest = split(rest, 18)
+    correction, rest = split(rest, 6)
+    force, rest = split(rest, 6)
+    arm, rest = split(rest, 6)
+    most, rest = split(rest, 6)
+    weight, gain = split(rest, 6)
     return Muscles(
-        flat[0:6], flat[6:12], flat[12:30].reshape(3, 6), flat[30:36], flat[36:42], flat[42:48],
-        flat[48:54], flat[54:60], flat[60:61],
+        wanted, spring, notch.reshape(3, 6), correction, force, arm, most, weight, gain
     )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ from hydrotele.teleop.axis_table import (
     SIGN,
     flat_state,
     flattened,
+    split,
 )
 from hydrotele.teleop.master import (
     FORCE,
@@ -117,13 +118,12 @@ def unpack_slave(flat, k):
 
     Source: order and shapes of Slave.
     """
-    a = 9 + 2 * k
-    b = a + 5
-    c = b + 11 * k
-    return Slave(
-        flat[0:9], flat[9:a].reshape(k, 2), flat[a:b], flat[b:c].reshape(k, 11), flat[c : c + 5],
-        flat[c + 5 : c + 7],
-    )  # fmt: skip
+    arm, rest = split(flat, 9)
+    ranges, rest = split(rest, 2 * k)
+    start, rest = split(rest, 5)
+    table, rest = split(rest, 11 * k)
+    limits, kind = split(rest, 5)
+    return Slave(arm, ranges.reshape(k, 2), start, table.reshape(k, 11), limits, kind)
 
 
 @compiled
@@ -139,11 +139,18 @@ def unpack_slave_state(flat, k):
 
     Source: order and shapes of SlaveState.
     """
-    a = 10 + 3 * k
+    pose, rest = split(flat, 5)
+    rate, rest = split(rest, 5)
+    joint, rest = split(rest, k)
+    joint_rate, rest = split(rest, k)
+    ahead, rest = split(rest, k)
+    measured, rest = split(rest, 10)
+    command, rest = split(rest, 18)
+    force_integral, rest = split(rest, 5)
+    asked, flags = split(rest, 5)
     return SlaveState(
-        flat[0:5], flat[5:10], flat[10 : 10 + k], flat[10 + k : 10 + 2 * k], flat[10 + 2 * k : a],
-        flat[a : a + 10].reshape(2, 5), flat[a + 10 : a + 28].reshape(3, 6),
-        flat[a + 28 : a + 33], flat[a + 33 : a + 38], flat[a + 38 : a + 42],
+        pose, rate, joint, joint_rate, ahead, measured.reshape(2, 5), command.reshape(3, 6),
+        force_integral, asked, flags,
     )  # fmt: skip
 
 

@@ -36,19 +36,23 @@ from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import contact_force, surrounding_bodies
-from hydrotele.teleop.axis_table import DEADBAND, REACH, flat_view
+from hydrotele.teleop.axis_table import DAMPING, DEADBAND, REACH, flat_view
 from hydrotele.teleop.master import (
     TASK_DAMPING,
     TASK_STIFFNESS,
     MasterState,
     master,
     master_step,
+    push_back,
     unpack_master,
     unpack_master_state,
 )
 from hydrotele.teleop.operator_model import Hand, OperatorModel, pull, unpack_muscles
 from hydrotele.teleop.slave import (
     BLOCKED,
+    HAND,
+    HANDLE,
+    HANDLE_SPEED,
     SILENT,
     TRIPPED,
     SlaveState,
@@ -59,7 +63,6 @@ from hydrotele.teleop.slave import (
     unpack_slave,
     unpack_slave_state,
 )
-from hydrotele.teleop.tip_over import push_back
 
 QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
 
@@ -146,29 +149,30 @@ def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
     k = len(columns)
     slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
     m, hand = unpack_master_state(master_state), unpack_muscles(hand_flat)
-    period, rows = state[2], len(back)
+    period, rows = state[PERIOD], len(back)
     arm = np.empty(k)
     for i in range(k):
         arm[i] = joint[columns[i]]
     measure_task(slave, arm, fresh, elapsed, s)
     report(slave, force, s, back[tick % rows])
     if lost[tick % len(lost), 1]:
-        state[0] += period
+        state[QUIET] += period
     else:
-        state[0] = 0.0
+        state[QUIET] = 0.0
         for row in range(7):
             for i in range(k):  # a number that is none does not count
                 if np.isfinite(back[(tick + 1) % rows, row, i]):
                     packet[row, i] = back[(tick + 1) % rows, row, i]
-    goal = 0.0 if tripped or state[0] > state[3] else 1.0
-    state[1] += (goal - state[1]) * min(1.0, period / state[4])
+    goal = 0.0 if tripped or state[QUIET] > state[SILENCE] else 1.0
+    state[SHARE] += (goal - state[SHARE]) * min(1.0, period / state[FADING])
     numbers = unpack_master(master_flat)
-    master_step(numbers, qpos, packet, state[1], period, tick == 0, m)
+    master_step(numbers, qpos, packet, state[SHARE], period, tick == 0, m)
     pull(hand, past, tremor, m.handle, tick, period)
     ahead = forward[tick % len(forward)]
     for i in range(6):
-        own = m.stiffness[i] * m.handle[i] + numbers.axis[i, 4] * m.speed[i]
-        ahead[0, i], ahead[1, i], ahead[2, i] = m.handle[i], m.speed[i], m.hand[i] - own
+        own = m.stiffness[i] * m.handle[i] + numbers.axis[i, DAMPING] * m.speed[i]
+        ahead[HANDLE, i], ahead[HANDLE_SPEED, i] = m.handle[i], m.speed[i]
+        ahead[HAND, i] = m.hand[i] - own
 
 
 @compiled
@@ -200,7 +204,7 @@ def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, dri
     for i in range(k):
         measured[i] = joint[columns[i]]
     coming = tick >= rows - 1 and lost[tick % len(lost), 0]
-    slave_step(slave, forward[(tick + 1) % rows], not coming, force, measured, state[2], s)
+    slave_step(slave, forward[(tick + 1) % rows], not coming, force, measured, state[PERIOD], s)
     for i in range(k):
         reference[columns[i]], rate[columns[i]] = s.joint[i], s.joint_rate[i]
     drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod)

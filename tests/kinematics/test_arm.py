@@ -17,7 +17,7 @@ from hydrotele.kinematics.arm import (
     inverse,
     jacobian,
 )
-from hydrotele.kinematics.workspace import radial_interval, reach
+from tests.kinematics.workspace import radial_interval, reach
 
 CAT215 = ArmGeometry(
     base_radius=0.340,

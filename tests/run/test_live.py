@@ -9,8 +9,8 @@ import pytest
 
 from hydrotele.cli.driving import DriveOptions, drive_to_folder, first_interrupt
 from hydrotele.core.errors import InputError
-from hydrotele.devices.reading import Reading
 from hydrotele.logs.log import load_log
+from hydrotele.run.devices import Reading
 from hydrotele.run.live import PATIENCE, Pacer, drive, further_axes
 from hydrotele.run.run import run_scenario, scenario_machine
 from hydrotele.scenario.scenario import load_scenario

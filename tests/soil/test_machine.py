@@ -24,7 +24,7 @@ from hydrotele.soil.facts import (
     soil_mass,
     soil_parameters,
 )
-from hydrotele.soil.step import bucket_wrench, soil_step
+from hydrotele.soil.step import EdgeMotion, bucket_wrench, soil_step
 
 AXES = ("swing", "boom", "stick", "bucket")
 DEGREE = math.pi / 180.0
@@ -54,8 +54,8 @@ def dig(plant, steps, seconds=2.5, draw=1.2):
         task_forward(g, data.qpos[plant.qpos[order]], pose)
         task_jacobian(g, data.qpos[plant.qpos[order]], jacobian)
         rate = jacobian @ data.qvel[plant.dof[order]]
-        soil_step(n, surface, loose, state, pose[0], pose[2], rate[0], rate[2], pose[3], period,
-                  out)  # fmt: skip
+        motion = EdgeMotion(pose[0], pose[2], rate[0], rate[2], pose[3])
+        soil_step(n, surface, loose, state, motion, period, out)
         edge = np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
         bucket_wrench(out, edge, pose[1], data.xipos[body], wrench)
         data.xfrc_applied[body] = wrench

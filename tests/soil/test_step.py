@@ -40,7 +40,7 @@ from hydrotele.soil.facts import (
     soil_mass,
     soil_parameters,
 )
-from hydrotele.soil.step import soil_step
+from hydrotele.soil.step import EdgeMotion, soil_step
 
 DEGREE = math.pi / 180.0
 DT = 0.005
@@ -59,8 +59,8 @@ class Ground:
         """Move the edge there in one step and return a copy of what comes out."""
         a, b = self.last or (r, z)
         self.last = (r, z)
-        soil_step(self.numbers, self.surface, self.loose, self.state, r, z, (r - a) / dt,
-                  (z - b) / dt, attitude * DEGREE, dt, self.out)  # fmt: skip
+        edge = EdgeMotion(r, z, (r - a) / dt, (z - b) / dt, attitude * DEGREE)
+        soil_step(self.numbers, self.surface, self.loose, self.state, edge, dt, self.out)
         return self.out.copy()
 
     def path(self, *points, speed=0.5):
@@ -283,8 +283,8 @@ def _native(numbers, profile, count, state, move, out):
     n = carray(numbers, 64)
     cells = carray(profile, 2 * count)
     m = carray(move, 6)
-    soil_step(n, cells[:count], cells[count:], carray(state, STATE), m[0], m[1], m[2], m[3], m[4],
-              m[5], carray(out, OUT))  # fmt: skip
+    edge = EdgeMotion(m[0], m[1], m[2], m[3], m[4])
+    soil_step(n, cells[:count], cells[count:], carray(state, STATE), edge, m[5], carray(out, OUT))
 
 
 def test_native_callback_gives_the_same():
@@ -296,8 +296,8 @@ def test_native_callback_gives_the_same():
         z = 0.02 - 0.001 * min(k, 100)
         move = np.array([6.0 - 0.002 * k, z, -0.4, 0.0, -95.0 * DEGREE, DT])
         soil_step(
-            python.numbers, python.surface, python.loose, python.state, move[0], move[1],
-            move[2], move[3], move[4], move[5], python.out,
+            python.numbers, python.surface, python.loose, python.state, EdgeMotion(*move[:5]),
+            move[5], python.out,
         )  # fmt: skip
         arrays = (numbers, cells, native.state, move, native.out)
         n, c, s, m, o = (a.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for a in arrays)

@@ -11,7 +11,6 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, SIGN, axis_table, flat_view
 from hydrotele.teleop.coils import three_stations
-from hydrotele.teleop.handle import Detent, StiffnessFeedback
 from hydrotele.teleop.master import (
     drive_coils,
     master,
@@ -20,6 +19,7 @@ from hydrotele.teleop.master import (
     unpack_master,
     unpack_master_state,
 )
+from tools.handle_laws import Detent, StiffnessFeedback
 
 STICK = load_joystick()
 NAMES = ("r", "theta", "z", "attitude")

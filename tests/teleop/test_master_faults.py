@@ -8,8 +8,8 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.compliance import holding_wrench
-from hydrotele.teleop.handle import Detent
 from hydrotele.teleop.master import master, master_step
+from tools.handle_laws import Detent
 
 JOYSTICK = load_joystick()
 COORDINATES = ("r", "theta", "z")

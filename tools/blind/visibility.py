@@ -14,7 +14,7 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorError
-from hydrotele.simulate.drive_side import flexible_axes
+from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.record import Recorder, begin_leapfrog, true_channels
 from hydrotele.simulate.stepping import delayed_commands

@@ -1,1 +1,0 @@
-"""What a person drives with: keyboard, gamepad, SpaceMouse, or a script in their place."""

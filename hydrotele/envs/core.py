@@ -1,0 +1,232 @@
+"""A task that runs: n episodes side by side, stepped by one native call.
+
+`gymnasium` and `dm_env` environments, single and batched, are views of this one class.
+"""
+
+import copy
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from hydrotele.control.resolved_motion import arm_axes
+from hydrotele.control.servo import drive_tables
+from hydrotele.core.errors import InputError
+from hydrotele.envs.episode import AXES, CHANNELS, MEASURES, MEMORY, NEXT_STEP, RESET, STEP, streams
+from hydrotele.envs.facts import Setup, make_facts, timing
+from hydrotele.envs.loop import advance
+from hydrotele.envs.observation import machine_fields
+from hydrotele.envs.task import Options, Task
+from hydrotele.envs.variants import make_variants
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.simulate.fleet import Fleet
+from hydrotele.simulate.native import stop_profiling_clock
+from hydrotele.simulate.stepping import line_length, past_length
+
+
+def set_up(task: Task, options: Options) -> Setup:
+    """A task with the user's choices: its machines, observation and clocks.
+
+    Args:
+        task: the task.
+        options: the user's choices.
+
+    Returns:
+        The setup.
+
+    Raises:
+        InputError: an option does not suit the task.
+    """
+    options = dataclasses.replace(
+        options, action=options.action or task.action,
+        duration=task.duration if options.duration is None else options.duration,
+    )  # fmt: skip
+    if options.variants < 1:
+        raise InputError("variants", f"must be at least 1, not {options.variants}")
+    machine, clock = load_machine(task.machine, task.tool), timing(options)
+    arm = arm_axes(machine)
+    axes = (*arm, *task.more_axes)
+    variants = make_variants(task, options, machine)
+    fields = [*machine_fields(machine, axes, len(arm)), *task.fields(machine, axes)]
+    table = drive_tables(machine, variants.plant.axes)[1]
+    return Setup(task, options, clock, machine, axes, len(arm), variants, fields, table)
+
+
+class TaskCore:
+    """n episodes of a task.
+
+    Attributes:
+        setup: the task as it was chosen.
+        count: n.
+        simulations: their states, live.
+        memory: (n,) records of MEMORY, live.
+        observation: (n, o) float32, live.
+        final: (n, o) float32 observations before an autoreset in the same step.
+        reward: (n,) live.
+        terminated: (n,) uint8, live.
+        truncated: (n,) uint8, live.
+        measures: (n, MEASURES) figures of the step, live.
+        final_measures: (n, MEASURES) before an autoreset in the same step.
+    """
+
+    def __init__(
+        self, task: Task, options: Options, count: int = 1, threads: int = 1,
+        autoreset: int = NEXT_STEP,
+    ) -> None:  # fmt: skip
+        """Compile the machines and make room.
+
+        Args:
+            task: the task.
+            options: the user's choices.
+            count: number of episodes side by side.
+            threads: that step them; 0 for one per core.
+            autoreset: NEXT_STEP, SAME_STEP or DISABLED.
+
+        Raises:
+            InputError: an option does not suit the task.
+        """
+        stop_profiling_clock()
+        self.count, self.setup = count, set_up(task, options)
+        if count < 1:
+            raise InputError("num_envs", f"must be at least 1, not {count}")
+        self.simulations = Fleet(self.setup.variants.plant.model, count, threads)
+        self._make_arrays()
+        self.facts = make_facts(self.setup, count, autoreset)
+        self._link()
+        self._begun = np.zeros(count, bool)
+
+    def _make_arrays(self) -> None:
+        n, o, v = self.count, len(self.setup.fields), self.setup.variants
+        self.memory = np.zeros(n, MEMORY)
+        self.action = np.zeros((n, len(self.setup.axes)), np.float32)
+        self.observation, self.final = (np.zeros((n, o), np.float32) for _ in range(2))
+        self.low = np.array([field.low for field in self.setup.fields], np.float32)
+        self.high = np.array([field.high for field in self.setup.fields], np.float32)
+        self.reward = np.zeros(n)
+        self.measures, self.final_measures = (np.zeros((n, MEASURES)) for _ in range(2))
+        self.terminated, self.truncated = (np.zeros(n, np.uint8) for _ in range(2))
+        self.terrain = np.zeros((n, self.setup.task.terrain))
+        self._commands = np.zeros((n, line_length(v.delays, self.setup.clock.substeps), AXES))
+        self._sensed = np.zeros((n, past_length(v.lags, v.ratios), CHANNELS))
+        self._before = np.zeros((n, CHANNELS))
+        self._expanded = {name: self.simulations.expand(name) for name in v.fields}
+        for name, live in self._expanded.items():
+            if live.shape[1] != v.fields[name].shape[1]:  # native code copies the one to the other
+                message = f"variants cannot differ in {name} of a model with meshes that touch"
+                raise InputError("randomise", message)
+        same = np.tile(v.plant.model.actuator_user.ravel(), (len(v.states), 1))
+        self._users = np.ascontiguousarray(v.fields.get("actuator_user", same))
+
+    def _link(self) -> None:
+        """Tell the native code where everything lies."""
+        v, f = self.setup.variants, self.facts
+        f["delayed_command"], f["delayed_sensor"] = self._commands.shape[1], self._sensed.shape[1]
+        rows = [(v.fields[n].ctypes.data, live.ctypes.data, v.fields[n].shape[1])
+                for n, live in self._expanded.items()]  # fmt: skip
+        self._places = np.array(rows, np.int64).reshape(-1, 3)
+        f["fields"] = len(rows)
+        for name, array in (
+            ("memory", self.memory), ("action", self.action), ("observation", self.observation),
+            ("final", self.final), ("low", self.low), ("high", self.high),
+            ("reward", self.reward), ("terminated", self.terminated),
+            ("truncated", self.truncated), ("measures", self.measures),
+            ("final_measures", self.final_measures), ("starts", v.states),
+            ("start_tips", v.tips), ("users", self._users), ("scales", v.scales),
+            ("offsets", v.offsets), ("lags", v.lags), ("ratios", v.ratios),
+            ("delays", v.delays), ("commands", self._commands), ("sensed", self._sensed),
+            ("sensed_before", self._before), ("places", self._places), ("terrain", self.terrain),
+        ):  # fmt: skip
+            f[name] = array.ctypes.data
+        if "eq_data" in self._expanded:
+            f["eq_rows"] = self._expanded["eq_data"].ctypes.data
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """What every action moves: axes, or coordinates of the tip and axes beyond the arm's."""
+        setup = self.setup
+        if setup.options.action != "resolved_motion":
+            return setup.axes
+        names = ("r", "theta", "z", "attitude", "head")[: setup.arm_axes]
+        return (*names, *setup.axes[setup.arm_axes :])
+
+    @property
+    def bytes_per_environment(self) -> int:
+        """Memory that one more environment takes: its state, its records, its results [byte]."""
+        arrays = (
+            self.memory, self.action, self.observation, self.final, self.reward, self.terminated,
+            self.truncated, self.measures, self.final_measures, self.terrain, self._commands,
+            self._sensed, self._before, self.simulations.state, *self._expanded.values(),
+        )  # fmt: skip
+        return sum(array.nbytes for array in arrays) // self.count
+
+    def reset(self, seeds: np.ndarray | None = None, chosen: np.ndarray | None = None) -> None:
+        """Begin new episodes.
+
+        Args:
+            seeds: (m,) integers; without, every episode's random numbers go on.
+            chosen: (m,) numbers of simulations, None for all.
+
+        Raises:
+            RuntimeError: without seeds, before the first seed was given; or the first reset leaves
+                some episodes out.
+            ValueError: a seed is negative or beyond 64 bits.
+        """
+        place = slice(None) if chosen is None else chosen
+        begun = self._begun.copy()
+        begun[place] = True
+        if not begun.all():
+            raise RuntimeError("the first reset must begin all episodes: give it no mask")
+        if seeds is not None:
+            self.memory["random"][place] = streams(seeds)
+        elif not self._begun.all():
+            raise RuntimeError("the first reset needs seeds")
+        self._begun = begun
+        self.facts["call"] = RESET
+        ids = None if chosen is None else np.ascontiguousarray(chosen, np.int32)
+        self.simulations.apply(advance.address, self.facts.ctypes.data, ids)
+
+    def step(self, action: np.ndarray) -> None:
+        """Advance all episodes by one environment step.
+
+        Args:
+            action: (n, a), or (a,) for all, full at +-1; beyond they count as full.
+
+        Raises:
+            ValueError: the shape is wrong, or an action is not a number.
+            RuntimeError: there was no reset before, or the simulations were closed.
+        """
+        if not self._begun.all():
+            raise RuntimeError("reset before the first step")
+        wanted = self.action.shape
+        if np.shape(action) not in (wanted, wanted[1:]):
+            raise ValueError(f"an action has the shape {wanted}, not {np.shape(action)}")
+        self.action[...] = action
+        if not np.isfinite(self.action).all():
+            raise ValueError("an action is not a finite number")
+        self.facts["call"] = STEP
+        self.simulations.apply(advance.address, self.facts.ctypes.data)
+
+    def step_one(self, action: np.ndarray) -> None:
+        """Advance the only episode; as `step`, but for an action (a,) and no other shape."""
+        wanted = self.action.shape[1:]
+        if np.shape(action) != wanted:
+            raise ValueError(f"an action has the shape {wanted}, not {np.shape(action)}")
+        self.step(action)
+
+    def model_and_data(self, number: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Model and state of one simulation, brought up to date by `mj_forward`, to look at."""
+        model = copy.copy(self.setup.variants.plant.model)
+        data = mujoco.MjData(model)
+        self.simulations.get_model(number, model)
+        self.simulations.get_data(number, data)
+        mujoco.mj_forward(model, data)
+        return model, data
+
+    def close(self) -> None:
+        """Give the simulations' memory back."""
+        self._expanded = {}
+        self.simulations.close()
+
+    def __reduce__(self):
+        """Refuse to be copied or pickled."""
+        return self.simulations.__reduce__()

@@ -1,0 +1,208 @@
+"""Numbers that native code reads of a task: clocks, machine, servo, sensors, MuJoCo's layout."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.control.servo import drive_tables, servo_parameters
+from hydrotele.core.datafile import suggest
+from hydrotele.core.errors import InputError
+from hydrotele.envs.episode import ACTIONS, FACTS, VALVE
+from hydrotele.envs.kinds import KINDS
+from hydrotele.envs.observation import Field
+from hydrotele.envs.task import REAL, Options, Task
+from hydrotele.envs.variants import Variants, channels
+from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.noise import channel_sensor, converter, sensor_set
+from hydrotele.machine.sensors import SensorSet
+from hydrotele.simulate.feedback import samples_every
+from hydrotele.simulate.layout import field_offsets, function_address, verify_layout
+from hydrotele.simulate.mechanism import TIP_SITE
+
+_CONTROL_RATE = 200.0  # Hz, of the servo at least
+_SHARE = 0.8  # of the speed at rated flow, or at what the pump gives, that a full action asks for
+_FORCE_RATE = 0.5  # rad/s or m/s of a force drive at full action
+ACCELERATION = 1.0  # rad/s^2 or m/s^2
+POSE_ACCELERATIONS = (1.0, 0.5, 1.0, 1.0, 0.8)  # m/s^2, rad/s^2
+
+
+class Timing(NamedTuple):
+    """Clocks of an environment: control periods per step, physics steps per period, period [s]."""
+
+    ticks: int
+    substeps: int
+    period: float
+    horizon: int
+
+
+class Setup(NamedTuple):
+    """A task as it was chosen.
+
+    Attributes:
+        task: the task.
+        options: the user's choices, complete.
+        clock: its clocks.
+        machine: as a controller knows it, without planted or drawn effects.
+        axes: driven axes in the order of the actions (`valve`, `joint_rate`).
+        arm_axes: how many of them, the first ones, are the arm's.
+        variants: machines and starts that episodes have.
+        fields: of the observation.
+        table: (k, POINTS, 3) of `control.drive_rows.drive_tables`.
+    """
+
+    task: Task
+    options: Options
+    clock: Timing
+    machine: Machine
+    axes: tuple[str, ...]
+    arm_axes: int
+    variants: Variants
+    fields: list[Field]
+    table: np.ndarray
+
+
+def timing(options: Options) -> Timing:
+    """Clocks that the options ask for.
+
+    Raises:
+        InputError: the rates do not divide each other.
+    """
+    rate, step = options.control_rate, options.timestep
+    if not (0.0 < rate <= 1.0e4 and 1.0e-5 <= step <= 5.0e-3):
+        raise InputError("control_rate", f"{rate:g} Hz with a physics step of {step:g} s")
+    ticks = max(1, round(_CONTROL_RATE / rate))
+    substeps = 1.0 / (rate * ticks * step)
+    if substeps < 0.999 or abs(substeps - round(substeps)) > 1e-6:
+        message = f"{rate:g} Hz needs whole physics steps of {step:g} s; for example 50 or 200"
+        raise InputError("control_rate", message)
+    assert options.duration is not None
+    horizon = round(options.duration * rate)
+    if horizon < 1:
+        raise InputError("duration", f"{options.duration:g} s is shorter than one step")
+    return Timing(ticks, round(substeps), round(substeps) * step, horizon)
+
+
+def make_facts(setup: Setup, count: int, autoreset: int) -> np.ndarray:
+    """The record of FACTS of a task; addresses of arrays are left to whoever owns them.
+
+    Args:
+        setup: the task as it was chosen.
+        count: number of environments.
+        autoreset: NEXT_STEP, SAME_STEP or DISABLED.
+
+    Returns:
+        () record.
+
+    Raises:
+        InputError: the action kind or the sensors are not known.
+        RuntimeError: MuJoCo's structs are not laid out as expected.
+    """
+    facts = np.zeros((), FACTS)
+    task, options, plant = setup.task, setup.options, setup.variants.plant
+    if options.action not in ACTIONS:
+        raise InputError(f"action {options.action!r}", suggest(options.action, ACTIONS))
+    facts["kind"], facts["mode"] = KINDS.index(task.kind), ACTIONS.index(options.action)
+    facts["autoreset"], facts["count"] = autoreset, count
+    clock = setup.clock
+    facts["ticks"], facts["substeps"], facts["period"], facts["horizon"] = clock[:2] + clock[2:]
+    facts["timestep"], facts["acceleration"] = options.timestep, ACCELERATION
+    facts["axes"], facts["hydraulic"] = len(plant.axes), plant.hydraulic
+    facts["arm_axes"], facts["axes_driven"] = setup.arm_axes, len(setup.axes)
+    facts["actions"], facts["observations"] = len(setup.axes), len(setup.fields)
+    columns = [plant.axes.index(name) for name in setup.axes]
+    if columns[: setup.arm_axes] != list(range(setup.arm_axes)):
+        raise InputError(f"machine {task.machine}", "its arm's axes must be its first ones")
+    facts["driven_axis"][: len(columns)] = columns
+    k, model = len(plant.axes), plant.model
+    facts["qpos"][:k], facts["dof"][:k] = plant.qpos, plant.dof
+    facts["nq"], facts["nv"], facts["na"] = model.nq, model.nv, model.na
+    facts["nbody"], facts["tip_site"] = model.nbody, model.site(TIP_SITE).id
+    facts["tip_body"] = model.site(TIP_SITE).bodyid[0]
+    theta = 1 if options.action == "resolved_motion" else 0  # place of the swing among actions
+    facts["locked"] = theta if task.swing_locked else -1
+    facts["neq"], facts["eq_width"] = model.eq_data.shape
+    facts["variants"], facts["states"] = setup.variants.states.shape
+    facts["width"] = task.terrain
+    if task.numbers:
+        numbers = task.numbers(setup.machine, model)
+        facts["numbers"][: len(numbers)] = numbers
+    _write_machine(facts, setup, columns)
+    _write_sensors(facts, setup)
+    _write_layout(facts)
+    return facts
+
+
+def full_rate(machine: Machine, axis: str) -> float:
+    """Rate of an axis at full action [rad/s] or [m/s]: what its drive reaches all over its range.
+
+    Args:
+        machine: the machine.
+        axis: its name.
+
+    Returns:
+        A share of rated flow, or of the pump's where that is less, over the longest moment arm.
+    """
+    facts = machine.axes[axis]
+    low, high = machine.joints[facts.joint].range or (-1.0, 1.0)
+    if not (facts.valve and machine.supply):
+        return _FORCE_RATE
+    arm = np.abs(axis_linkage(machine, axis).rate(np.linspace(low, high, 101))).max()
+    flow = min(facts.valve.rated_flow, machine.supply.pump_flow)
+    return _SHARE * flow / facts.hydraulic_drive.areas[0] / float(arm)
+
+
+def _write_machine(facts: np.ndarray, setup: Setup, columns: list[int]) -> None:
+    plant, machine = setup.variants.plant, setup.machine
+    k, servo = len(plant.axes), setup.task.servo
+    facts["limit"][:k] = [
+        drive.command_limit if (drive := machine.axes[name].force) else 1.0 for name in plant.axes
+    ]
+    facts["fastest"][:k] = [full_rate(machine, name) for name in plant.axes]
+    facts["fastest_pose"] = setup.task.pose_rates
+    facts["accelerations"] = POSE_ACCELERATIONS
+    facts["closed"][columns] = int(facts["mode"]) != VALVE
+    ranges = [machine.joints[machine.axes[name].joint].range for name in plant.axes]
+    facts["ranges"][:k] = [limits or (-np.inf, np.inf) for limits in ranges]
+    facts["arm"] = arm_facts(machine)[0]
+    facts["servo"][:k] = servo_parameters(machine, plant.axes, servo, setup.clock.period)
+    facts["feedforward"] = servo.feedforward
+    facts["grid"][:k] = drive_tables(machine, plant.axes)[0]
+    facts["table"] = setup.table.ctypes.data
+
+
+def _write_sensors(facts: np.ndarray, setup: Setup) -> None:
+    plant, machine, clock = setup.variants.plant, setup.machine, setup.clock
+    sensors: SensorSet | None
+    if setup.options.sensors == REAL:
+        if not machine.sensors:
+            raise InputError("sensors 'real'", f"machine {machine.name} has none")
+        sensors = next(iter(machine.sensors.values()))
+    else:
+        sensors = sensor_set(machine, setup.options.sensors)
+    facts["every"], facts["noisy"] = samples_every(1.0 / clock.period, sensors), sensors is not None
+    for c, name in enumerate(channels(plant)):
+        kind = channel_sensor(machine, sensors, name)
+        facts["accuracy"][c] = kind.accuracy or 3**0.5 * kind.standard_deviation  # of equal RMS
+        facts["converters"][:, c] = converter(kind, name)
+
+
+def _write_layout(facts: np.ndarray) -> None:
+    """Where MuJoCo keeps what, and its functions."""
+    verify_layout()
+    facts["mj_step"] = function_address("mj_step")
+    facts["mj_set_state"] = function_address("mj_setState")
+    data, model = field_offsets("mjData"), field_offsets("mjModel")
+    for name, member in (
+        ("at_qpos", "qpos"), ("at_qvel", "qvel"), ("at_act", "act"), ("at_ctrl", "ctrl"),
+        ("at_site", "site_xpos"), ("at_xfrc", "xfrc_applied"), ("at_xpos", "xpos"),
+        ("at_xipos", "xipos"), ("at_xquat", "xquat"), ("at_xmat", "xmat"),
+        ("at_warning", "warning"), ("at_eq_active", "eq_active"),
+    ):  # fmt: skip
+        facts[name] = data[member]
+    for name, member in (
+        ("at_eq_data", "eq_data"), ("at_stiffness", "jnt_stiffness"),
+        ("at_damping", "dof_damping"),
+    ):  # fmt: skip
+        facts[name] = model[member]

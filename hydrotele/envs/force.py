@@ -1,0 +1,244 @@
+"""A force held against a plate on a spring, from above the plate on, with one change of the force.
+
+What the plate's spring and damper carry is the force: a load cell under the plate would read it.
+
+What `HoldForce` is.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+
+from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.core.compiled import compiled
+from hydrotele.envs.episode import between
+from hydrotele.envs.observation import Field
+from hydrotele.envs.starts import draw_start
+from hydrotele.envs.task import Task
+from hydrotele.kinematics.task import task_forward
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Servo
+from hydrotele.scenario.surroundings import Plate, Thing
+from hydrotele.simulate.layout import field
+
+WEAKEST, STRONGEST = 1.0e4, 3.5e4  # N, forces that are wanted
+OVERLOAD = 1.0e5  # N
+FAILURE = -50.0  # reward of an overload or of leaving the plate: what a second on target pays
+CELL = 500.0  # N, largest error of the load cell: 1 % of 50 kN
+_CHANGE = 5.0e3  # N, smallest change of the force wanted
+_EARLY, _LATE = 0.4, 0.6  # shares of the duration between which it changes
+_TOUCH = 200.0  # N, from which on the plate counts as touched
+_RANGE = 2.0e5  # N, of the load cell
+_FIRST, _SECOND, _TIME, _FORCE, FORCE_READ, _PEAK = range(6)  # places in the goal
+PLATE_QPOS, PLATE_DOF, PLATE_JOINT, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y = range(7)  # in the numbers
+
+
+def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+    """What `observe_force` writes: force read and wanted, time since it was last changed."""
+    return [
+        Field("force", "N", -_RANGE, _RANGE),
+        Field("wanted_force", "N", 0.0, STRONGEST),
+        Field("time_since_change", "s", 0.0, 3600.0),
+    ]
+
+
+@compiled
+def plate_force(f, w):
+    """Force that the plate's spring and damper carry, positive when it is pressed down.
+
+    Args:
+        f: record of FACTS.
+        w: World.
+
+    Returns:
+        The force, scalar [N].
+
+    Source: `simulate.surroundings`; positions are a step ahead, see `simulate.record`.
+    """
+    dof, joint = int(f.numbers[PLATE_DOF]), int(f.numbers[PLATE_JOINT])
+    stiffness = field(w.model, f.at_stiffness, joint + 1)[joint]
+    damping = field(w.model, f.at_damping, dof + 1)[dof]
+    speed = w.qvel[dof]
+    place = w.qpos[int(f.numbers[PLATE_QPOS])] - f.timestep * speed
+    return -(stiffness * place + damping * speed)
+
+
+@compiled
+def begin_force(f, e, w):
+    """Draw the forces wanted and when they change.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written.
+        w: World.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    g = e.goal
+    g[_FIRST] = between(e, WEAKEST, STRONGEST)
+    # uniform over what is at least one smallest change away from the first
+    below = max(0.0, g[_FIRST] - _CHANGE - WEAKEST)
+    above = max(0.0, STRONGEST - g[_FIRST] - _CHANGE)
+    place = between(e, 0.0, below + above)
+    g[_SECOND] = WEAKEST + place if place < below else g[_FIRST] + _CHANGE + (place - below)
+    g[_TIME] = between(e, _EARLY, _LATE) * f.horizon * f.ticks * f.period
+    g[_PEAK] = 0.0
+    _read(f, e, w)
+
+
+@compiled
+def _read(f, e, w):
+    """Let the load cell read, if it is due; it is sampled with the other sensors."""
+    e.goal[_FORCE] = plate_force(f, w)
+    if e.tick % f.every == 0:
+        error = between(e, -CELL, CELL) if f.noisy else 0.0
+        e.goal[FORCE_READ] = e.goal[_FORCE] + error
+
+
+@compiled
+def tick_force(f, e, w):
+    """Read the load cell and remember the largest force of this step.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written.
+        w: World.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    _read(f, e, w)
+    e.goal[_PEAK] = max(e.goal[_PEAK], e.goal[_FORCE])
+
+
+@compiled
+def reference_force(g, time):
+    """Force wanted at a time since the start [s], and the time since it was last changed.
+
+    Args:
+        g: (GOAL,) goal of the episode.
+        time: scalar [s].
+
+    Returns:
+        (force [N], time [s]), scalars.
+
+    Source: this module.
+    """
+    if time < g[_TIME]:
+        return g[_FIRST], time
+    return g[_SECOND], time - g[_TIME]
+
+
+@compiled
+def observe_force(f, e, out, at):
+    """Write force read, force wanted and the time since that was changed.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        out: (observations,) float32, written from `at` on.
+        at: scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `force_fields`.
+    """
+    out[at] = e.goal[FORCE_READ]
+    out[at + 1], out[at + 2] = reference_force(e.goal, e.tick * f.period)
+
+
+@compiled
+def reward_force(f, e, w):
+    """Reward of the true force; the episode ends by an overload or away from the plate.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World; `measures` gets the error of the force [N], whether the plate is touched, whether
+            it was overloaded, whether the tip is no longer over it.
+
+    Returns:
+        (reward, whether the episode ends), scalars.
+
+    Source: this module.
+    """
+    g, n = e.goal, f.numbers
+    wanted = reference_force(g, e.tick * f.period)[0]
+    overload = g[_PEAK] > OVERLOAD
+    aside = math.fabs(e.tip[0] - n[MIDDLE_X]) > n[HALF_X]
+    aside = aside or math.fabs(e.tip[1] - n[MIDDLE_Y]) > n[HALF_Y]
+    g[_PEAK] = 0.0
+    w.measures[0] = g[_FORCE] - wanted
+    w.measures[1] = 1.0 if g[_FORCE] > _TOUCH else 0.0
+    w.measures[2] = 1.0 if overload else 0.0
+    w.measures[3] = 1.0 if aside else 0.0
+    if overload or aside:
+        return FAILURE, True
+    return max(-1.0, 1.0 - abs(g[_FORCE] - wanted) / wanted), False
+
+
+_MIDDLE = (6.0, 0.0)  # m, of the plate
+_HALF = (1.2, 1.2)  # m
+_MASS = 300.0  # kg
+_SOFT, _STIFF = 5.0e5, 2.0e6  # N/m
+_DAMPING = 0.87  # of critical, as that of the plate of Zhu 1994's experiment in `press_stiffness`
+_ABOVE = (0.05, 0.15)  # m
+
+
+def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+    """The bucket over the middle of the plate, its teeth down."""
+    return draw_start(machine, rng, (5.6, -0.05, 0.2, -1.92), (6.4, 0.05, 0.9, -1.57))
+
+
+def _plate(
+    machine: Machine, rng: np.random.Generator, start: dict[str, float]
+) -> tuple[Thing, ...]:
+    """A plate below the tip."""
+    numbers, axes, _ = arm_facts(machine)
+    pose = np.zeros(5)
+    task_forward(numbers, np.array([start[name] for name in axes]), pose)
+    stiffness = math.exp(rng.uniform(math.log(_SOFT), math.log(_STIFF)))
+    height = float(pose[2] - rng.uniform(*_ABOVE))
+    damping = 2.0 * _DAMPING * math.sqrt(stiffness * _MASS)
+    return (Plate(position=(*_MIDDLE, height), size=_HALF, mass=_MASS, stiffness=stiffness,
+                  damping=damping),)  # fmt: skip
+
+
+def _numbers(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
+    """Where the plate is in the model and before the machine, as `force` reads it."""
+    joint = model.joint("plate_0")
+    return (joint.qposadr[0], joint.dofadr[0], joint.id, *_MIDDLE, *_HALF)
+
+
+HOLD_FORCE = Task(
+    name="HoldForce",
+    kind="force",
+    sentence=(
+        "The bucket of an excavator presses on a plate on a spring, of unknown stiffness, with a"
+        " force of 10 to 35 kN that changes once."
+    ),
+    reward=(
+        "1 at the force wanted, less the error as a share of it, at least -1; in the air it is 0."
+        " More than 100 kN on the plate, or a tip that is no longer over it, ends the episode"
+        " with -50."
+    ),
+    machine="cat215",
+    tool="bucket",
+    action="resolved_motion",
+    duration=20.0,
+    start=_start,
+    fields=force_fields,
+    measures=(("force_error", "N"), ("contact", "1"), ("overload", "1"), ("beside", "1")),
+    surroundings=_plate,
+    numbers=_numbers,
+    servo=Servo(position_gain=5.0),  # with more, a boom that swings freely comes down as a hammer
+    pose_rates=(0.3, 0.1, 0.3, 0.3, 0.25),  # as `press_stiffness`
+)
+"""A force on a plate."""

@@ -1,0 +1,253 @@
+"""A straight line of the tip, gone by trapezoidal speed with the attitude of the tool kept.
+
+Straight in r and z, and in some episodes turned by the swing in proportion to the way. A line is
+drawn until all of it lies in the workspace and asks less of the drives than they have.
+"""
+
+import math
+
+import numpy as np
+
+from hydrotele.core.compiled import compiled
+from hydrotele.envs.episode import ARM, between, draw
+from hydrotele.envs.observation import Field, pose_fields, reach
+from hydrotele.envs.starts import draw_start, path_effort, pose_read, turned
+from hydrotele.envs.task import Task
+from hydrotele.kinematics.task import task_forward
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Servo
+
+PREVIEWS = (0.1, 0.2, 0.4)  # s ahead
+ACROSS, ALONG, TURNED = 0.1, 0.2, 0.2  # m, m, rad that cost a reward of 1
+SETTLE = 0.5  # s before the line begins
+_SHORT, _LONG = 1.0, 3.0  # m
+_SLOW, _FAST = 0.2, 0.6  # m/s
+_GENTLE, _HARD = 0.5, 1.0  # m/s^2
+_TURN, _TURNING = 0.08, 0.4  # rad of swing per metre at most, share of the episodes with it
+_INNER, _LOW, _HIGH = 3.0, 0.1, 6.0  # m: beyond the tracks, above the ground
+_EFFORT = 0.9  # of the drives
+_DRAWS, _TRUE_SIZE = 240, 200  # draws of a line, the first ones of them at its true size
+_SMALLER = 0.7  # factor of size from one draw to the next after those
+# numbers of the goal: pose at the start (r, theta, z, attitude), change of the pose per metre
+_START, _PER_METRE, _LENGTH, _SPEED, _ACCELERATION = 0, 4, 7, 8, 9
+_R, _THETA, _Z, _ATTITUDE, _HEAD = range(ARM)
+# numbers of the observation, after those of the machine: pose, its rate, places ahead, errors
+_POSE, _RATE, _AHEAD = 0, 4, 7
+_ALONG = _AHEAD + 3 * len(PREVIEWS)
+_ACROSS = _ALONG + 1
+_QUICK = 1.0  # m/s, rad/s: bound of the rates wanted
+
+
+def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+    """What `observe_line` writes: pose now and ahead, its rate, errors by the readings."""
+    k, far = len(axes), reach(machine)
+    fields = pose_fields(machine, k, "wanted")
+    fields += [Field(f"wanted_rate.{c}", unit, -_QUICK, _QUICK)
+               for c, unit in (("r", "m/s"), ("theta", "rad/s"), ("z", "m/s"))]  # fmt: skip
+    for ahead in PREVIEWS:
+        fields += pose_fields(machine, k, f"wanted_in_{ahead * 1000:.0f}_ms")[:3]
+    return [
+        *fields,
+        Field("along_track_error", "m", -2.0 * far, 2.0 * far),
+        Field("cross_track_error", "m", 0.0, 2.0 * far),
+    ]
+
+
+@compiled
+def begin_line(f, e):
+    """Draw a line from where the tip is.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    g, start, change = e.goal, np.zeros(ARM), np.zeros(ARM)
+    task_forward(f.arm, e.position[: f.arm_axes], start)
+    for c in range(4):
+        g[_START + c] = start[c]
+    speed, g[_ACCELERATION] = between(e, _SLOW, _FAST), between(e, _GENTLE, _HARD)
+    turn = between(e, -_TURN, _TURN)
+    if draw(e) >= _TURNING:
+        turn = 0.0
+    size = 1.0
+    for n in range(_DRAWS):
+        if n >= _TRUE_SIZE:
+            size *= _SMALLER  # the start lies inside, so that a small and slow line fits surely
+        way, length = between(e, -math.pi, math.pi), size * between(e, _SHORT, _LONG)
+        g[_PER_METRE + _R], g[_PER_METRE + _THETA] = math.cos(way), turn
+        g[_PER_METRE + _Z] = math.sin(way)
+        g[_LENGTH], g[_SPEED] = length, size * speed
+        for c in range(3):
+            change[c] = length * g[_PER_METRE + c]
+        end = start + change
+        if end[_R] < _INNER or not _LOW <= end[_Z] <= _HIGH:
+            continue
+        if path_effort(f, start, change) * g[_SPEED] / length <= _EFFORT:
+            break
+
+
+@compiled
+def line_way(g, time):
+    """Way gone on the line and its speed.
+
+    Args:
+        g: (GOAL,) goal of the episode.
+        time: since the start, scalar [s].
+
+    Returns:
+        (way [m], speed [m/s]), scalars.
+
+    Source: this module.
+    """
+    length, most = g[_LENGTH], g[_ACCELERATION]
+    speed = min(g[_SPEED], math.sqrt(most * length))
+    ramp = speed / most
+    total = length / speed + ramp
+    t = min(max(time - SETTLE, 0.0), total)
+    if t < ramp:
+        return 0.5 * most * t * t, most * t
+    left = total - t
+    if left < ramp:
+        return length - 0.5 * most * left * left, most * left
+    return speed * (t - 0.5 * ramp), speed
+
+
+@compiled
+def line_pose(g, time, pose, rate):
+    """Pose wanted and its rate.
+
+    Args:
+        g: (GOAL,) goal of the episode.
+        time: since the start, scalar [s].
+        pose: (ARM,) written: r [m], theta [rad], z [m], attitude [rad], 0.
+        rate: (ARM,) written, per second.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    way, speed = line_way(g, time)
+    for c in range(3):
+        pose[c] = g[_START + c] + way * g[_PER_METRE + c]
+        rate[c] = speed * g[_PER_METRE + c]
+    pose[_ATTITUDE], pose[_HEAD] = g[_START + _ATTITUDE], 0.0
+    rate[_ATTITUDE], rate[_HEAD] = 0.0, 0.0
+
+
+@compiled
+def line_errors(g, wanted, r, theta, z):
+    """How far the tip is ahead of its place along the line, and how far beside the line.
+
+    Args:
+        g: (GOAL,) goal of the episode.
+        wanted: (ARM,) pose wanted.
+        r: radius of the tip, scalar [m].
+        theta: its angle about the swing axis, scalar [rad]; whole turns do not count.
+        z: its height, scalar [m].
+
+    Returns:
+        (along, positive ahead [m], across, not negative [m]), scalars.
+
+    Source: this module.
+    """
+    x, up = r - wanted[_R], z - wanted[_Z]
+    y = wanted[_R] * turned(theta - wanted[_THETA])
+    ahead, rise = g[_PER_METRE + _R], g[_PER_METRE + _Z]
+    aside = wanted[_R] * g[_PER_METRE + _THETA]
+    along = (x * ahead + y * aside + up * rise) / math.sqrt(ahead**2 + aside**2 + rise**2)
+    return along, math.sqrt(max(0.0, x * x + y * y + up * up - along * along))
+
+
+@compiled
+def observe_line(f, e, out, at):
+    """Write the pose wanted now and ahead, and the errors that the readings tell.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        out: (observations,) float32, written from `at` on.
+        at: scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `line_fields`.
+    """
+    now, pose, rate, tip = e.tick * f.period, np.empty(ARM), np.empty(ARM), np.empty(ARM)
+    line_pose(e.goal, now, pose, rate)
+    pose_read(f, e, tip)
+    for c in range(4):
+        out[at + _POSE + c] = pose[c]
+    for c in range(3):
+        out[at + _RATE + c] = rate[c]
+    along, across = line_errors(e.goal, pose, tip[_R], tip[_THETA], tip[_Z])
+    out[at + _ALONG], out[at + _ACROSS] = along, across
+    for p in range(len(PREVIEWS)):
+        line_pose(e.goal, now + PREVIEWS[p], pose, rate)
+        for c in range(3):
+            out[at + _AHEAD + 3 * p + c] = pose[c]
+
+
+@compiled
+def line_reward(across, along, attitude):
+    """Reward of errors [m], [m], [rad], scalar: 1 without, at least -1."""
+    costs = across / ACROSS + abs(along) / ALONG + abs(attitude) / TURNED
+    return max(-1.0, 1.0 - costs)
+
+
+@compiled
+def reward_line(f, e, w):
+    """Reward of the tip's true place.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World; `measures` gets the errors across and along [m] and of the attitude [rad].
+
+    Returns:
+        (reward, False), scalars.
+
+    Source: `line_reward`.
+    """
+    pose, rate = np.empty(ARM), np.empty(ARM)
+    line_pose(e.goal, e.tick * f.period, pose, rate)
+    r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
+    along, across = line_errors(e.goal, pose, r, theta, e.tip[2])
+    attitude = e.position[1] + e.position[2] + e.position[3] - pose[_ATTITUDE]
+    w.measures[0], w.measures[1], w.measures[2] = across, along, attitude
+    return line_reward(across, along, attitude), False
+
+
+def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+    """The bucket in the air before the machine, about as in Zhu 1994, Figs 6.45-6.48."""
+    return draw_start(machine, rng, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
+
+
+STRAIGHT_LINE = Task(
+    name="StraightLine",
+    kind="line",
+    sentence=(
+        "The tip of an excavator's bucket goes along a straight line of 1 to 3 m at 0.2 to 0.6 m/s,"
+        " its attitude kept."
+    ),
+    reward=(
+        "1 on the line and in time, less 1 for every 0.1 m beside the line, every 0.2 m behind or"
+        " ahead and every 0.2 rad of attitude, at least -1."
+    ),
+    machine="cat215",
+    tool="bucket",
+    action="resolved_motion",
+    duration=16.5,  # of the longest and slowest line, and a little more
+    start=_start,
+    fields=line_fields,
+    measures=(("cross_track_error", "m"), ("along_track_error", "m"), ("attitude_error", "rad")),
+    servo=Servo(axis_gains={"boom": 2.0}),  # with more, a boom near its end swings on its oil
+    pose_rates=(0.9, 0.3, 0.9, 0.4, 0.25),  # half as much again as the fastest line
+)
+"""A straight line of the tip."""

@@ -1,0 +1,415 @@
+"""An environment step in native code: actions, control tick, sensors, reward, a new episode.
+
+MuJoCo calls `advance` for every simulation from its own threads; nothing of Python runs in it.
+Actions are bounded in their change, since a machine of 20 t follows no jump: joint rates move joint
+references, pose rates those of the arm by resolved motion, and the joint servo follows them.
+"""
+# pyright: reportCallIssue=false, reportPrivateImportUsage=false
+# numba's intrinsics are called without their typing context, and carray is its documented API.
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numba import carray, types
+
+from hydrotele.control.resolved_motion import follow_pose
+from hydrotele.control.servo import POINTS, ComputedForce, DriveReference, Measured, drive_row
+from hydrotele.control.tick import Controller, TickReference, control_tick
+from hydrotele.core.compiled import callback, compiled
+from hydrotele.envs.episode import (
+    ARM,
+    AXES,
+    CHANNELS,
+    DISABLED,
+    FACTS,
+    JOINT_RATE,
+    MEASURES,
+    MEMORY,
+    NEXT_STEP,
+    RESET,
+    RESOLVED_MOTION,
+    SAME_STEP,
+    VALVE,
+    draw,
+)
+from hydrotele.envs.kinds import begin_task, observe_task, reward_task, tick_task
+from hydrotele.hydraulics.parameters import SLOTS
+from hydrotele.kinematics.task import task_forward
+from hydrotele.simulate.feedback import Readings, Sensors, hold_readings, read_sensors
+from hydrotele.simulate.fleet import STATE
+from hydrotele.simulate.layout import call_set_state, field, floats, pointer
+from hydrotele.simulate.stepping import (
+    CommandLine,
+    SensorPast,
+    Simulation,
+    begin_past,
+    look_back,
+    true_values,
+)
+
+_AHEAD = 0.2  # rad or m by which a reference may lead its joint: a stalled arm winds nothing up
+
+
+@compiled
+def _asked(f, action, a):
+    """An action as it counts."""
+    return 0.0 if a == f.locked else min(1.0, max(-1.0, action[a]))
+
+
+@compiled
+def _towards(now, goal, change):
+    return min(now + change, max(now - change, goal))
+
+
+@compiled
+def _joint_rates(f, e, action, first):
+    """Move the references of axes by their own rates; actions from `first` on."""
+    for a in range(first, f.actions):
+        i = f.driven_axis[a]
+        goal = _asked(f, action, a) * f.fastest[i]
+        rate = _towards(e.reference_rate[i], goal, f.acceleration * f.period)
+        place = e.reference[i] + f.period * rate
+        low = max(f.ranges[i, 0], e.joint[i] - _AHEAD)
+        high = min(f.ranges[i, 1], e.joint[i] + _AHEAD)
+        if place < low or place > high:
+            place, rate = min(high, max(low, e.reference[i])), 0.0
+        e.reference[i], e.reference_rate[i] = place, rate
+
+
+@compiled
+def _pose_rates(f, e, action):
+    """Move the references of the arm by rates of its pose."""
+    k, wanted = f.arm_axes, np.empty(ARM)
+    for c in range(ARM):
+        goal = 0.0
+        if c < k:
+            goal = _asked(f, action, c) * f.fastest_pose[c]
+        e.pose_rate[c] = _towards(e.pose_rate[c], goal, f.accelerations[c] * f.period)
+        wanted[c] = e.pose[c] + f.period * e.pose_rate[c]
+    far = False
+    for i in range(k):
+        far = far or abs(e.reference[i] - e.joint[i]) > _AHEAD
+    held = far or follow_pose(
+        f.arm, f.ranges[:k], wanted, e.pose_rate, False, e.pose, e.reference[:k],
+        e.reference_rate[:k],
+    )  # fmt: skip
+    e.blocked = 1 if held else 0
+    if held:
+        e.pose_rate[:] = 0.0
+        e.reference_rate[:k] = 0.0
+    if far:  # the arm is stopped by something: go on from where it stands
+        for i in range(k):
+            e.reference[i] = _towards(e.joint[i], e.reference[i], _AHEAD)
+        task_forward(f.arm, e.reference[:k], e.pose)
+
+
+@compiled
+def act(f, e, action):
+    """Commands of this control period.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `command` and, unless actions are valves, references are written.
+        action: (actions,) of the agent, full at +-1; beyond they count as full.
+
+    Returns:
+        Nothing.
+
+    Source: `control.resolved_motion`, `control.servo`.
+    """
+    if f.mode == VALVE:
+        for a in range(f.actions):
+            i = f.driven_axis[a]
+            e.command[i] = _asked(f, action, a) * f.limit[i]
+        return
+    if f.mode == RESOLVED_MOTION:
+        _pose_rates(f, e, action)
+        _joint_rates(f, e, action, f.arm_axes)
+    elif f.mode == JOINT_RATE:
+        _joint_rates(f, e, action, 0)
+    k = f.axes
+    table = floats(f.table, k * POINTS * 3).reshape((k, POINTS, 3))
+    drive_row(
+        f.grid[:k], table, e.reference[:k], e.reference_rate[:k], f.feedforward, e.drive[0, :k],
+        e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
+    )  # fmt: skip
+
+
+@compiled
+def sense(f, e, sim):
+    """Read the sensors, if a reading is due; otherwise they are held.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; true positions are written, readings where they are due.
+        sim: Simulation of this episode.
+
+    Returns:
+        Nothing.
+
+    Source: `simulate.feedback`, as in scenario runs.
+    """
+    k, c = f.axes, f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
+    if e.tick % f.every != 0:
+        for i in range(k):
+            e.position[i] = sim.qpos[f.qpos[i]] - f.timestep * sim.qvel[f.dof[i]]
+        return
+    values, scales = np.empty(c), f.scales + 8 * e.variant * CHANNELS
+    true_values(sim, values)
+    for i in range(k):
+        e.position[i] = values[i]
+        e.sampled_reference[i] = e.reference[i]
+    look_back(sim.past, e.tick * f.substeps, values)
+    for i in range(c):
+        e.error[i] = f.accuracy[i] * (2.0 * draw(e) - 1.0) if f.noisy else 0.0
+    sensors = Sensors(
+        floats(scales, c), floats(f.offsets + 8 * e.variant * CHANNELS, c), f.converters[0],
+        f.converters[1], f.converters[2],
+    )  # fmt: skip
+    read_sensors(sensors, values, e.error[:c])
+    span = f.every * f.period if e.tick > 0 else 0.0
+    readings = Readings(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], np.empty(1))
+    e.supply = hold_readings(values, f.hydraulic, span, readings)
+
+
+assert CHANNELS >= 3 * AXES + 1
+
+
+class World(NamedTuple):
+    """Live arrays of one simulation.
+
+    Attributes:
+        qpos: (nq,) positions; staggered, see `simulate.record`.
+        qvel: (nv,) velocities.
+        act: (na,) activations.
+        ctrl: (k,) commands that act.
+        tip: (3,) place of the arm's tip at the time of the activations [m].
+        xfrc: (6 nbody,) forces and torques from outside on bodies, world frame [N], [N m].
+        xpos: (3 nbody,) places of bodies [m], of the last physics step.
+        xipos: (3 nbody,) places of their centres of mass [m].
+        xquat: (4 nbody,) quaternions of the bodies.
+        xmat: (9 nbody,) their rotation matrices.
+        eq_active: (neq,) uint8, which equalities act; part of the state.
+        eq_data: (neq eq_width,) numbers of the equalities for the rest of this call.
+        eq_rows: the same from the next call on; empty unless the task writes them.
+        terrain: (width,) what the episode keeps of its ground, empty without.
+        measures: (MEASURES,) figures of this step, for `info`.
+        model: address of mjModel.
+        data: address of mjData.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    act: np.ndarray
+    ctrl: np.ndarray
+    tip: np.ndarray
+    xfrc: np.ndarray
+    xpos: np.ndarray
+    xipos: np.ndarray
+    xquat: np.ndarray
+    xmat: np.ndarray
+    eq_active: np.ndarray
+    eq_data: np.ndarray
+    eq_rows: np.ndarray
+    terrain: np.ndarray
+    measures: np.ndarray
+    model: int
+    data: int
+
+
+@compiled
+def world(f, m, d, sim):
+    """The World of a simulation.
+
+    Args:
+        f: record of FACTS.
+        m: address of its mjModel, scalar.
+        d: address of its mjData, scalar.
+        sim: its number, scalar.
+
+    Returns:
+        The World.
+
+    Source: `simulate.layout`.
+    """
+    place = carray(pointer(d + f.at_site), (1,), np.int64)[0]
+    active = carray(pointer(d + f.at_eq_active), (1,), np.int64)[0]
+    numbers = f.neq * f.eq_width
+    site = f.tip_site if f.tip_site >= 0 else 0
+    return World(
+        field(d, f.at_qpos, f.nq),
+        field(d, f.at_qvel, f.nv),
+        field(d, f.at_act, f.na),
+        field(d, f.at_ctrl, f.axes),
+        floats(place + 24 * site, 3),
+        field(d, f.at_xfrc, 6 * f.nbody),
+        field(d, f.at_xpos, 3 * f.nbody),
+        field(d, f.at_xipos, 3 * f.nbody),
+        field(d, f.at_xquat, 4 * f.nbody),
+        field(d, f.at_xmat, 9 * f.nbody),
+        carray(pointer(active), (f.neq,), np.uint8),
+        field(m, f.at_eq_data, numbers),
+        floats(f.eq_rows + 8 * sim * numbers, numbers if f.eq_rows else 0),
+        floats(f.terrain + 8 * sim * f.width, f.width),
+        floats(f.measures + 8 * sim * MEASURES, MEASURES),
+        m,
+        d,
+    )
+
+
+_WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
+_FIRST_BAD, _LAST_BAD = int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC)
+_SIGNATURE = types.void(types.int64, types.int64, types.intc, types.int64)
+
+
+@compiled
+def _simulation(f, e, w, number):
+    """An episode's plant for `simulate.stepping`."""
+    ring = floats(
+        f.commands + 8 * number * f.delayed_command * AXES, f.delayed_command * AXES
+    ).reshape((f.delayed_command, AXES))
+    delays = floats(f.delays + 8 * e.variant * AXES * 2, AXES * 2).reshape((AXES, 2))
+    c = f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
+    sensed = floats(
+        f.sensed + 8 * number * f.delayed_sensor * CHANNELS, f.delayed_sensor * CHANNELS
+    ).reshape((f.delayed_sensor, CHANNELS))
+    lags = floats(f.lags + 8 * e.variant * CHANNELS * 2, CHANNELS * 2).reshape((CHANNELS, 2))
+    past = SensorPast(
+        sensed, floats(f.sensed_before + 8 * number * CHANNELS, c), lags,
+        floats(f.ratios + 8 * e.variant * CHANNELS, CHANNELS),
+    )  # fmt: skip
+    none = f.qpos[:0]
+    user = floats(f.users + 8 * e.variant * f.axes * SLOTS, f.axes * SLOTS)
+    return Simulation(
+        f.mj_step, w.model, w.data, w.qpos, w.qvel, w.act, w.ctrl, f.timestep, f.axes, f.hydraulic,
+        f.qpos[: f.axes], f.dof[: f.axes], none, none, user, CommandLine(ring, delays), past,
+    )  # fmt: skip
+
+
+@compiled
+def _tick(f, e, sim):
+    """Commands of this control period, and the physics under them."""
+    k, none = f.axes, np.zeros(f.axes)
+    controller = Controller(f.servo[:k], f.closed[:k], e.load[:k], e.command[:k])
+    drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
+    reference = TickReference(
+        e.sampled_reference[:k], drive, ComputedForce(False, none, none), False
+    )  # fmt: skip
+    measured = Measured(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply)
+    control_tick(sim, e.tick, f.substeps, controller, reference, measured)
+
+
+@compiled
+def _unstable(f, e, d):
+    """Count MuJoCo's warnings; whether it met infinite states or such as are not a number."""
+    warnings = carray(pointer(d + f.at_warning), (_WARNINGS, 2), np.int32)  # (information, number)
+    bad = False
+    for kind in range(_WARNINGS):
+        if warnings[kind, 1] > 0:
+            e.warnings += warnings[kind, 1]
+            bad = bad or _FIRST_BAD <= kind <= _LAST_BAD
+            warnings[kind, 1] = 0
+    return bad
+
+
+@compiled
+def _begin_episode(f, e, w, number):
+    """Put the simulation at the start of a variant, and draw a new goal."""
+    e.last_variant, e.last_fault = e.variant, e.fault
+    e.variant = int(draw(e) * f.variants)
+    start = f.starts + 8 * e.variant * f.states
+    call_set_state(f.mj_set_state, w.model, w.data, start, STATE)
+    places = carray(pointer(f.places), (3 * f.fields,), np.int64)
+    for n in range(f.fields):
+        size = places[3 * n + 2]
+        given = floats(places[3 * n] + 8 * e.variant * size, size)
+        taken = floats(places[3 * n + 1] + 8 * number * size, size)
+        for c in range(size):
+            taken[c] = given[c]
+    e.episode += 1
+    e.step, e.tick, e.over, e.fault, e.blocked = 0, 0, 0, 0, 0
+    e.command[:] = 0.0
+    for i in range(f.axes):
+        e.command[i] = w.ctrl[i]
+    sim = _simulation(f, e, w, number)
+    begin_past(sim, w.ctrl)
+    tips = floats(f.start_tips + 24 * e.variant, 3)
+    e.tip[:] = tips
+    e.reference_rate[:], e.pose_rate[:] = 0.0, 0.0
+    sense(f, e, sim)
+    e.reference[:] = e.joint
+    e.sampled_reference[:] = e.joint
+    if f.arm_axes > 0:
+        task_forward(f.arm, e.reference[: f.arm_axes], e.pose)
+    for i in range(f.hydraulic):
+        e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
+    w.measures[:] = 0.0
+    begin_task(f, e, w)
+
+
+@compiled
+def _observe(f, e, w, address, sim):
+    """Write the observation; readings saturate at the ends of their ranges."""
+    n = f.observations
+    out = carray(pointer(address + 4 * sim * n), (n,), np.float32)
+    low = carray(pointer(f.low), (n,), np.float32)
+    high = carray(pointer(f.high), (n,), np.float32)
+    observe_task(f, e, w, out)
+    for c in range(n):
+        if not low[c] <= out[c] <= high[c]:
+            e.saturated += 1
+            out[c] = min(high[c], max(low[c], out[c])) if np.isfinite(out[c]) else low[c]
+
+
+@compiled
+def _step(f, e, w, number, action):
+    """One environment step; reward, whether the task is over, whether the time is."""
+    sim = _simulation(f, e, w, number)
+    for _ in range(f.ticks):
+        act(f, e, action)
+        _tick(f, e, sim)
+        e.tick += 1
+        sense(f, e, sim)
+        tick_task(f, e, w)  # after the physics: before, MuJoCo's places are another simulation's
+    e.tip[:] = w.tip
+    e.step += 1
+    if _unstable(f, e, w.data):
+        e.fault = 1
+        e.faults += 1
+        return 0.0, True, False
+    reward, done = reward_task(f, e, w)
+    return reward, done, e.step >= f.horizon and not done
+
+
+@compiled
+def _advance(m, d, sim, argument):
+    f = carray(pointer(argument), (1,), FACTS)[0]
+    e = carray(pointer(f.memory), (f.count,), MEMORY)[sim]
+    w = world(f, m, d, sim)
+    reward = carray(pointer(f.reward), (f.count,), np.float64)
+    terminated = carray(pointer(f.terminated), (f.count,), np.uint8)
+    truncated = carray(pointer(f.truncated), (f.count,), np.uint8)
+    reward[sim], terminated[sim], truncated[sim] = 0.0, 0, 0
+    fresh = f.call == RESET or (f.autoreset == NEXT_STEP and e.over != 0)
+    if fresh:
+        _begin_episode(f, e, w, sim)
+        _observe(f, e, w, f.observation, sim)
+        return
+    if f.autoreset == DISABLED and e.over != 0:
+        return
+    action = carray(pointer(f.action + 4 * sim * f.actions), (f.actions,), np.float32)
+    value, done, late = _step(f, e, w, sim, action)
+    reward[sim], terminated[sim], truncated[sim] = value, done, late
+    e.over = 1 if done or late else 0
+    if f.autoreset == SAME_STEP and e.over != 0:
+        floats(f.final_measures + 8 * sim * MEASURES, MEASURES)[:] = w.measures
+        _observe(f, e, w, f.final, sim)
+        _begin_episode(f, e, w, sim)
+    _observe(f, e, w, f.observation, sim)
+
+
+@callback(_SIGNATURE)
+def advance(m, d, sim, argument):
+    """A step or a reset of one simulation: (mjModel*, mjData*, number, record of FACTS)."""
+    _advance(m, d, sim, argument)

@@ -1,0 +1,424 @@
+"""A log that a grapple picks up from the ground and lays down at another place, turned as asked.
+
+Where the log lies, and where it shall lie, is drawn for every episode; the log is moved there by
+its own six coordinates, so that one compiled model serves all of them.
+
+What `PlaceLog` is.
+
+A grapple that hangs freely: when its jaw takes a log, and what is read of its two free joints.
+
+Angle sensors of the machine's kind sit on both free joints: same rate, error and resolution.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+
+from hydrotele.core.compiled import compiled
+from hydrotele.envs.episode import ARM, between, draw
+from hydrotele.envs.observation import Field, reach
+from hydrotele.envs.starts import draw_start
+from hydrotele.envs.task import Task
+from hydrotele.kinematics.task import task_forward
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Servo
+from hydrotele.scenario.surroundings import LogOnGround
+from hydrotele.simulate.feedback import convert
+from hydrotele.simulate.surroundings import CENTRE, GRIP, ROW, TAKEN, grip_step, log_grip
+
+HAND, LOG, WELD, JAW, PLACE, RADIUS, HALF_LENGTH = range(GRIP, GRIP + 7)  # in Facts.numbers
+_FREE = GRIP + 7  # place in qpos and qvel of pitch, then of roll
+FREE_JOINTS = ("grapple_pitch", "grapple_roll")
+READ = 0  # first of the readings in the goal: pitch, roll, their rates
+READINGS = 4
+
+
+def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
+    """Numbers of a task with a grapple and one log.
+
+    Args:
+        machine: the machine.
+        model: its MuJoCo model with the log as `log_0`.
+        log: the log.
+
+    Returns:
+        (GRIP + 11,): those of `holding.grip_step`, then numbers of the grapple's body, the log's
+        body and weld, places in `qpos` of jaw and log, the log's radius and half its length [m],
+        places of the free joints.
+    """
+    hand = machine.links[machine.link_of(machine.axes[log.grab].joint)].parent
+    places = [
+        model.body(hand).id, model.body("log_0").id, model.equality("log_0_held").id,
+        model.joint(machine.axes[log.grab].joint).qposadr[0], model.joint("log_0").qposadr[0],
+        log.diameter / 2.0, log.length / 2.0,
+    ]  # fmt: skip
+    for name in FREE_JOINTS:
+        places += [model.joint(name).qposadr[0], model.joint(name).dofadr[0]]
+    return np.concatenate([log_grip(model, log), np.array(places, float)])
+
+
+@compiled
+def is_held(f, w):
+    """Whether the grapple holds the log.
+
+    Args:
+        f: record of FACTS.
+        w: World.
+
+    Returns:
+        bool.
+
+    Source: this module.
+    """
+    return w.eq_active[int(f.numbers[WELD])] != 0
+
+
+@compiled
+def _number(values, count, at):
+    """`count` numbers of body number `at`."""
+    return values[count * at : count * at + count]
+
+
+@compiled
+def _take_or_let_go(f, w):
+    hand, log, weld = int(f.numbers[HAND]), int(f.numbers[LOG]), int(f.numbers[WELD])
+    first = weld * f.eq_width
+    change = grip_step(
+        f.numbers[:GRIP], _number(w.xpos, 3, hand), _number(w.xquat, 4, hand),
+        _number(w.xpos, 3, log), _number(w.xquat, 4, log), w.qpos[int(f.numbers[JAW])],
+        w.eq_active[weld] != 0, w.eq_rows[first : first + ROW],
+    )  # fmt: skip
+    if change == 0:
+        return
+    w.eq_active[weld] = 1 if change == TAKEN else 0
+    for c in range(first, first + ROW):  # now, and from the next call on
+        w.eq_data[c] = w.eq_rows[c]
+
+
+@compiled
+def read_free_joints(f, e, w):
+    """Read the angles of the free joints and difference quotients, if a reading is due.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written from READ on.
+        w: World, staggered as `simulate.record` says.
+
+    Returns:
+        Nothing.
+
+    Source: as `sense.sense`, with the error and resolution of the first axis' sensor.
+    """
+    if e.tick % f.every != 0:
+        return
+    for j in range(2):
+        place, dof = int(f.numbers[_FREE + 2 * j]), int(f.numbers[_FREE + 2 * j + 1])
+        value = w.qpos[place] - f.timestep * w.qvel[dof]
+        if f.noisy:
+            value += f.accuracy[0] * (2.0 * draw(e) - 1.0)
+            value = convert(value, f.converters[0, 0], f.converters[1, 0], f.converters[2, 0])
+        past = e.goal[READ + j]
+        e.goal[READ + 2 + j] = (value - past) / (f.every * f.period) if e.tick > 0 else 0.0
+        e.goal[READ + j] = value
+
+
+@compiled
+def tick_grapple(f, e, w):
+    """Take the log or let it go, and read the free joints.
+
+    Args:
+        f: record of FACTS; its numbers are those of `grapple_parameters`.
+        e: record of MEMORY; `goal` is written.
+        w: World after a physics step; the weld is written.
+
+    Returns:
+        Nothing.
+
+    Source: `simulate.holding.grip_step`.
+    """
+    _take_or_let_go(f, w)
+    read_free_joints(f, e, w)
+
+
+@compiled
+def grip_distance(f, w):
+    """How far the pocket between the jaws is from the log.
+
+    Args:
+        f: record of FACTS.
+        w: World after a physics step.
+
+    Returns:
+        (distance of the pocket's middle from the part of the log's axis that can be held [m],
+        angle between the pocket's line and that axis [rad]), scalars.
+
+    Source: this module.
+    """
+    hand, log, reach = int(f.numbers[HAND]), int(f.numbers[LOG]), f.numbers[GRIP - 1]
+    turn, own = _number(w.xmat, 9, hand), _number(w.xmat, 9, log)
+    along, across, square = 0.0, 0.0, 0.0
+    way = np.empty(3)
+    for c in range(3):
+        way[c] = w.xpos[3 * hand + c] - w.xpos[3 * log + c]
+        for k in range(3):
+            way[c] += turn[3 * c + k] * f.numbers[CENTRE + k]
+        along += way[c] * own[3 * c]
+        across += turn[3 * c + 1] * own[3 * c]
+    along = min(reach, max(-reach, along))
+    for c in range(3):
+        square += (way[c] - along * own[3 * c]) ** 2
+    return np.sqrt(square), np.arccos(min(1.0, abs(across)))
+
+
+@compiled
+def tilt_angle(f, w):
+    """Angle between the grapple and plumb, scalar [rad].
+
+    Args:
+        f: record of FACTS.
+        w: World after a physics step.
+
+    Returns:
+        The angle.
+
+    Source: its x points down.
+    """
+    down = -w.xmat[9 * int(f.numbers[HAND]) + 6]
+    return np.arccos(min(1.0, max(-1.0, down)))
+
+
+NEAR, STRAIGHT, KEEP = 0.3, math.radians(15.0), 0.5  # m, rad, s: what counts as placed
+PROGRESS, TIME, LEANING = 1.0, 0.005, 0.02  # per metre nearer, per step, per step and rad
+TAKING, SUCCESS, LOST = 5.0, 20.0, -20.0
+LEVER, ASKEW = 1.0, 0.5  # m: of what a rad counts, of the log and of the grapple
+_LYING = 0.05  # m by which a log that lies may be higher than it should
+_REACH = (2.3, 8.7)  # m from the axis of the house: where some part of the log can be held
+_RADII = (4.5, 6.5)  # m
+_ASIDE = (0.15, 0.5)  # rad from the grapple to the log
+_SLEW = (math.radians(30.0), math.radians(90.0))  # from the log to its goal
+_X, _Y, _YAW, _LEFT, _KEPT, _TAKEN = range(READ + READINGS, READ + READINGS + 6)  # in the goal
+GOAL_PLACE = slice(_X, _YAW + 1)  # x [m], y [m], yaw [rad] of the goal in the episode's memory
+_FASTEST = 10.0  # rad/s of a difference quotient of noisy readings
+
+
+def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+    """What `observe_place` writes: log, goal, whether it is held, the grapple's free joints."""
+    far = 2.0 * reach(machine)
+    fields = []
+    for what, high in (("log", ("z",)), ("goal", ())):
+        fields += [
+            Field(f"{what}.r", "m", 0.0, far), Field(f"{what}.theta", "rad", -math.pi, math.pi)
+        ]  # fmt: skip
+        fields += [Field(f"{what}.{name}", "m", -far, far) for name in high]
+        fields += [Field(f"{what}.{name}_2_yaw", "1", -1.0, 1.0) for name in ("sin", "cos")]
+    fields.append(Field("held", "1", 0.0, 1.0))
+    for name in FREE_JOINTS:
+        low, top = machine.joints[name].range or (-math.pi, math.pi)
+        fields.append(Field(f"pendulum.{name}", "rad", low - 0.15, top + 0.15))
+    fields += [Field(f"pendulum_rate.{name}", "rad/s", -_FASTEST, _FASTEST) for name in FREE_JOINTS]
+    return fields
+
+
+@compiled
+def begin_place(f, e, w):
+    """Lay the log down before the machine and draw where it shall go.
+
+    Args:
+        f: record of FACTS; its numbers are those of `grapple.grapple_numbers`.
+        e: record of MEMORY; `goal` is written.
+        w: World; the log's coordinates are written.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    g, pose, at = e.goal, np.empty(ARM), int(f.numbers[PLACE])
+    task_forward(f.arm, e.position[: f.arm_axes], pose)
+    radius, theta = between(e, _RADII[0], _RADII[1]), pose[1] + _either_side(e, _ASIDE)
+    half = 0.5 * between(e, 0.0, math.pi)
+    w.qpos[at], w.qpos[at + 1] = radius * math.cos(theta), radius * math.sin(theta)
+    w.qpos[at + 3], w.qpos[at + 4], w.qpos[at + 5] = math.cos(half), 0.0, 0.0
+    w.qpos[at + 6] = math.sin(half)
+    theta += _either_side(e, _SLEW)
+    radius = between(e, _RADII[0], _RADII[1])
+    g[_X], g[_Y] = radius * math.cos(theta), radius * math.sin(theta)
+    g[_YAW] = between(e, 0.0, math.pi)
+    g[_LEFT], g[_KEPT], g[_TAKEN] = -1.0, 0.0, 0.0
+    read_free_joints(f, e, w)
+
+
+@compiled
+def _either_side(e, size):
+    value = between(e, size[0], size[1])
+    return value if draw(e) < 0.5 else -value
+
+
+@compiled
+def log_pose(f, w):
+    """Where the log is.
+
+    Args:
+        f: record of FACTS.
+        w: World.
+
+    Returns:
+        (x [m], y [m], z [m], and of its axis sine and cosine of twice the yaw, sine of the angle
+        to the horizontal plane), scalars; its ends are alike.
+
+    Source: this module.
+    """
+    at = int(f.numbers[PLACE])
+    a, b, c, d = w.qpos[at + 3], w.qpos[at + 4], w.qpos[at + 5], w.qpos[at + 6]
+    ax, ay, az = 1.0 - 2.0 * (c * c + d * d), 2.0 * (b * c + a * d), 2.0 * (b * d - a * c)
+    level = max(1.0e-12, ax * ax + ay * ay)
+    return (
+        w.qpos[at], w.qpos[at + 1], w.qpos[at + 2], 2.0 * ax * ay / level,
+        (ax * ax - ay * ay) / level, az,
+    )  # fmt: skip
+
+
+@compiled
+def yaw_between(sine, cosine, yaw):
+    """Angle between an axis without ends and another, scalar from 0 to pi/2 [rad].
+
+    Args:
+        sine: of twice the yaw of the first, scalar.
+        cosine: of the same, scalar.
+        yaw: of the second, scalar [rad].
+
+    Returns:
+        The angle.
+
+    Source: this module.
+    """
+    s, c = math.sin(2.0 * yaw), math.cos(2.0 * yaw)
+    return 0.5 * abs(math.atan2(sine * c - cosine * s, cosine * c + sine * s))
+
+
+@compiled
+def observe_place(f, e, w, out, at):
+    """Write log, goal, whether it is held, and what is read of the free joints.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World.
+        out: (observations,) float32, written from `at` on.
+        at: scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `place_fields`.
+    """
+    g = e.goal
+    x, y, z, sine, cosine, _ = log_pose(f, w)
+    out[at], out[at + 1], out[at + 2] = math.hypot(x, y), math.atan2(y, x), z
+    out[at + 3], out[at + 4] = sine, cosine
+    out[at + 5], out[at + 6] = math.hypot(g[_X], g[_Y]), math.atan2(g[_Y], g[_X])
+    out[at + 7], out[at + 8] = math.sin(2.0 * g[_YAW]), math.cos(2.0 * g[_YAW])
+    out[at + 9] = 1.0 if is_held(f, w) else 0.0
+    for c in range(READINGS):
+        out[at + 10 + c] = g[READ + c]
+
+
+@compiled
+def reward_place(f, e, w):
+    """Reward of bringing the grapple to the log and the log to its goal.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World; `measures` gets the log's distance from its goal [m], error of its yaw [rad],
+            whether it is held, success, the grapple's angle to plumb [rad].
+
+    Returns:
+        (reward, whether the log is placed or out of reach), scalars.
+
+    Source: this module.
+    """
+    g, held = e.goal, is_held(f, w)
+    x, y, z, sine, cosine, slope = log_pose(f, w)
+    height = z - f.numbers[RADIUS]
+    distance = math.sqrt((x - g[_X]) ** 2 + (y - g[_Y]) ** 2 + height**2)
+    yaw, swing = yaw_between(sine, cosine, g[_YAW]), tilt_angle(f, w)
+    lies = not held and height < _LYING and abs(slope) < _LYING
+    there = lies and distance <= NEAR and yaw <= STRAIGHT
+    left = distance + LEVER * yaw
+    if not (held or there):
+        apart, askew = grip_distance(f, w)
+        left += apart + ASKEW * askew
+    if g[_LEFT] < 0.0:  # the first step: before it no place of the grapple was known
+        g[_LEFT] = left
+    reward = PROGRESS * (g[_LEFT] - left) - TIME - LEANING * swing
+    g[_LEFT] = left
+    if held and g[_TAKEN] == 0.0:
+        g[_TAKEN] = 1.0
+        reward += TAKING
+    step = f.ticks * f.period
+    g[_KEPT] = g[_KEPT] + step if there else 0.0
+    placed = g[_KEPT] >= KEEP - 0.5 * step
+    lost = not held and not _REACH[0] <= math.hypot(x, y) <= _REACH[1]
+    w.measures[0], w.measures[1], w.measures[2] = distance, yaw, 1.0 if held else 0.0
+    w.measures[3], w.measures[4] = 1.0 if placed else 0.0, swing
+    if placed:
+        reward += SUCCESS
+    elif lost:
+        reward += LOST
+    return reward, placed or lost
+
+
+LOG_TO_PLACE = LogOnGround(position=(5.5, 0.0), direction=math.pi / 2.0)
+"""The log; every episode lays it down elsewhere."""
+
+_LOW, _HIGH = (4.5, -0.5, 2.2), (6.5, 0.5, 2.8)  # m, rad, m: the stick's pin at the start
+
+
+def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+    """The open grapple hangs plumb, higher than a log on the ground."""
+    joints = draw_start(machine, rng, _LOW, _HIGH)
+    plumb = -0.5 * math.pi - joints["boom"] - joints["stick"]
+    turned = float(rng.uniform(-0.5, 0.5) * math.pi)
+    return {**joints, "grapple_pitch": plumb, "grapple": turned, "claw": 0.0}
+
+
+def _numbers(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
+    return grapple_parameters(machine, model, LOG_TO_PLACE)
+
+
+PLACE_LOG = Task(
+    name="PlaceLog",
+    kind="place",
+    sentence=(
+        "An excavator takes a log from the ground with a grapple that swings freely and lays it"
+        " down elsewhere, turned as asked. Where log and goal lie is known exactly, also with real"
+        " sensors."
+    ),
+    reward=(
+        "1 for every metre nearer: of the grapple to the log until it is held (a radian askew"
+        " counts as 0.5 m), of the log to its goal (a radian of yaw counts as 1 m); 5 for the first"
+        " taking; less 0.005 for every step and 0.02 for every radian that the grapple is off"
+        " plumb in it. 20 once the log has lain within 0.3 m and 15 deg of its goal, let go, for"
+        " 0.5 s, or -20 when it lies out of reach; both end the episode."
+    ),
+    machine="cat215",
+    tool="grapple_claw",
+    more_axes=("grapple", "claw"),
+    action="resolved_motion",
+    duration=60.0,
+    start=_start,
+    fields=place_fields,
+    measures=(
+        ("log_distance", "m"), ("yaw_error", "rad"), ("held", "1"), ("success", "1"),
+        ("swing_angle", "rad"),
+    ),
+    surroundings=lambda *_: (LOG_TO_PLACE,),
+    ground=True,
+    numbers=_numbers,
+    writes=("eq_data",),
+    # with the usual 4 /s a late, sticky valve lets the boom swing, and the grapple with it
+    servo=Servo(position_gain=2.5, axis_gains={"boom": 2.0}),
+)  # fmt: skip
+"""A log picked up and laid down with the CAT 215's claw."""

@@ -1,0 +1,183 @@
+"""A pose that the head of a feller-buncher is brought to and kept at, by all five axes of its arm.
+
+The pose is drawn until the straight way to it lies in the workspace.
+
+What `ReachFeller` is.
+"""
+
+import math
+
+import numpy as np
+
+from hydrotele.core.compiled import compiled
+from hydrotele.envs.episode import ARM, between
+from hydrotele.envs.observation import Field, pose_fields, reach
+from hydrotele.envs.starts import draw_start, path_effort, pose_read, turned
+from hydrotele.envs.task import Task
+from hydrotele.kinematics.task import task_forward
+from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import Servo
+
+NEAR, LEVEL, KEEP = 0.05, 0.03, 0.5  # m, rad, s: what counts as reached
+PROGRESS, TIME, SUCCESS = 1.0, 0.01, 10.0  # reward per metre nearer, cost of a step, of success
+LEVER = 1.0  # m: of what a rad of attitude counts
+_RADII, _SWING, _HEIGHTS = (4.5, 9.0), 1.0, (0.8, 4.0)  # m, rad to either side, m
+_ATTITUDE, _HEAD = 0.6, 0.4  # rad to either side of level and straight
+_DRAWS, _TRUE_SIZE = 140, 100  # draws of a pose, the first ones of them wherever it lies
+_SMALLER = 0.7  # factor of the way from one draw to the next after those
+_TARGET, _HELD, _LEFT = 0, 5, 6  # places in the goal
+
+
+def reach_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+    """What `observe_reach` writes: the pose wanted, distance by the readings, time held."""
+    return [
+        *pose_fields(machine, len(axes), "wanted"),
+        Field("distance", "m", 0.0, 2.0 * reach(machine)),
+        Field("held", "s", 0.0, 2.0 * KEEP),
+    ]
+
+
+@compiled
+def begin_reach(f, e):
+    """Draw a pose that the arm can go to straight from where it stands.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY; `goal` is written.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    g, start, change = e.goal, np.empty(ARM), np.empty(ARM)
+    task_forward(f.arm, e.position[: f.arm_axes], start)
+    size = 1.0
+    for n in range(_DRAWS):
+        if n >= _TRUE_SIZE:
+            size *= _SMALLER  # the start lies inside, so that a pose near it does too
+        change[0] = size * (between(e, _RADII[0], _RADII[1]) - start[0])
+        change[1] = size * between(e, -_SWING, _SWING)
+        change[2] = size * (between(e, _HEIGHTS[0], _HEIGHTS[1]) - start[2])
+        change[3] = size * (between(e, -_ATTITUDE, _ATTITUDE) - start[3])
+        change[4] = size * (between(e, -_HEAD, _HEAD) - start[4])
+        for c in range(ARM):
+            g[_TARGET + c] = start[c] + change[c]
+        if path_effort(f, start, change) < np.inf:
+            break
+    g[_HELD] = 0.0
+    g[_LEFT] = reach_left(*_true_errors(f, e))
+
+
+@compiled
+def reach_errors(target, x, y, z, attitude, head):
+    """How far a pose of the tip is from the one wanted.
+
+    Args:
+        target: (ARM,) pose wanted: r [m], theta [rad], z [m], attitude, head [rad].
+        x: place of the tip, scalar [m].
+        y: scalar [m].
+        z: scalar [m].
+        attitude: of the tilt link, scalar [rad].
+        head: angle of the head, scalar [rad].
+
+    Returns:
+        (distance [m], angle [rad]), scalars; the angle is the larger one of both errors.
+
+    Source: this module.
+    """
+    dx, dy = x - target[0] * math.cos(target[1]), y - target[0] * math.sin(target[1])
+    distance = math.sqrt(dx * dx + dy * dy + (z - target[2]) ** 2)
+    return distance, max(abs(turned(attitude - target[3])), abs(head - target[4]))
+
+
+@compiled
+def reach_left(distance, angle):
+    """What is left of the way, scalar [m]: distance, and the angle over a lever of `LEVER`."""
+    return distance + LEVER * angle
+
+
+@compiled
+def _true_errors(f, e):
+    attitude = e.position[1] + e.position[2] + e.position[3]
+    target = e.goal[_TARGET : _TARGET + ARM]
+    return reach_errors(target, e.tip[0], e.tip[1], e.tip[2], attitude, e.position[4])
+
+
+@compiled
+def observe_reach(f, e, out, at):
+    """Write the pose wanted, the distance that the readings tell, and how long it was held.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        out: (observations,) float32, written from `at` on.
+        at: scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `reach_fields`.
+    """
+    tip = np.empty(ARM)
+    pose_read(f, e, tip)
+    for c in range(ARM):
+        out[at + c] = e.goal[_TARGET + c]
+    x, y = tip[0] * math.cos(tip[1]), tip[0] * math.sin(tip[1])
+    target = e.goal[_TARGET : _TARGET + ARM]
+    out[at + ARM] = reach_errors(target, x, y, tip[2], tip[3], tip[4])[0]
+    out[at + ARM + 1] = e.goal[_HELD]
+
+
+@compiled
+def reward_reach(f, e, w):
+    """Reward of coming nearer; the episode ends once the pose was kept long enough.
+
+    Args:
+        f: record of FACTS.
+        e: record of MEMORY.
+        w: World; `measures` gets distance [m], error of attitude and head [rad], success.
+
+    Returns:
+        (reward, whether the pose was reached), scalars.
+
+    Source: this module.
+    """
+    g = e.goal
+    distance, angle = _true_errors(f, e)
+    left = reach_left(distance, angle)
+    reward = PROGRESS * (g[_LEFT] - left) - TIME
+    g[_LEFT] = left
+    inside = distance <= NEAR and angle <= LEVEL
+    step = f.ticks * f.period
+    g[_HELD] = g[_HELD] + step if inside else 0.0
+    done = g[_HELD] >= KEEP - 0.5 * step
+    w.measures[0], w.measures[1], w.measures[2] = distance, angle, 1.0 if done else 0.0
+    return reward + (SUCCESS if done else 0.0), done
+
+
+def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+    """The head in the air before the machine, about level."""
+    return draw_start(
+        machine, rng, (5.0, -0.5, 0.8, -0.4, -0.3), (8.0, 0.5, 3.0, 0.4, 0.3)
+    )  # fmt: skip
+
+
+REACH_FELLER = Task(
+    name="ReachFeller",
+    kind="reach",
+    sentence="A feller-buncher brings its head to a pose with all five axes and keeps it there.",
+    reward=(
+        "1 for every metre nearer (a radian of attitude or head counts as one), less 0.01 for every"
+        " step, and 10 once it was within 0.05 m and 0.03 rad for 0.5 s, which ends the episode."
+    ),
+    machine="cat325",
+    tool=None,
+    duration=20.0,
+    start=_start,
+    fields=reach_fields,
+    measures=(("distance", "m"), ("attitude_error", "rad"), ("success", "1")),
+    servo=Servo(axis_gains={"swing": 1.0, "boom": 2.0}),  # heavy on soft oil
+    pose_rates=(0.5, 0.2, 0.5, 0.2, 0.2),
+)
+"""A pose of a feller-buncher's head."""

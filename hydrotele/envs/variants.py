@@ -1,0 +1,258 @@
+"""Machines and starts that episodes are drawn from: exact ones, compiled before the first episode.
+
+Every variant is a complete Machine with the effects that it has, standing still at its start with
+its valves closed. An episode takes one of them by copying numbers, which native code can do.
+
+How machines of one type differ: the ranges from which robustness is usually tried.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import MODEL_FIELDS
+
+from hydrotele.core.errors import InputError
+from hydrotele.effects import EFFECTS, apply_effect
+from hydrotele.envs.episode import AXES, CHANNELS
+from hydrotele.envs.task import Options, Task
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError
+from hydrotele.scenario.surroundings import Thing
+from hydrotele.simulate.fleet import STATE
+from hydrotele.simulate.mechanism import TIP_SITE
+from hydrotele.simulate.plant import Plant, build_plant, rest_state
+from hydrotele.simulate.record import begin_leapfrog, sensed_channels
+from hydrotele.simulate.stepping import command_delays, sensor_delays
+
+_KEPT = 8  # sets of variants: many single environments of one process share theirs
+_KNOWN: dict[str, "Variants"] = {}
+
+
+@dataclasses.dataclass(frozen=True)
+class Variants:
+    """v machines with their starts.
+
+    Attributes:
+        plant: of the first one.
+        machines: the machines.
+        surroundings: what stands around each of them.
+        states: (v, s) complete states at the starts, as `begin_leapfrog` leaves them.
+        tips: (v, 3) places of the tip there [m].
+        fields: field of the model -> (v, size), where they differ or the task writes them.
+        scales: (v, CHANNELS) of the sensors.
+        offsets: (v, CHANNELS).
+        lags: (v, CHANNELS, 2) delays of the sensors: whole physics steps, rest of a step [1].
+        ratios: (v, CHANNELS) a physics step over the time constant of a sensor [1]; 0 without.
+        delays: (v, AXES, 2) of the commands: whole physics steps, rest of a step [1].
+    """
+
+    plant: Plant
+    machines: tuple[Machine, ...]
+    surroundings: tuple[tuple[Thing, ...], ...]
+    states: np.ndarray
+    tips: np.ndarray
+    fields: dict[str, np.ndarray]
+    scales: np.ndarray
+    offsets: np.ndarray
+    lags: np.ndarray
+    ratios: np.ndarray
+    delays: np.ndarray
+
+
+def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
+    """Draw, compile and place all variants; those of the same choices are made once.
+
+    Args:
+        task: the task.
+        options: the user's; its effects are planted.
+        nominal: machine without them.
+
+    Returns:
+        The variants.
+
+    Raises:
+        InputError: an effect does not suit the machine, or what is randomised changes more than
+            numbers.
+    """
+    key = repr((task.name, options.effects, options.randomise, options.variants,
+                options.variant_seed, options.timestep))  # fmt: skip
+    if key not in _KNOWN:
+        _KNOWN[key] = _make(task, options, nominal)
+        while len(_KNOWN) > _KEPT:
+            _KNOWN.pop(next(iter(_KNOWN)))
+    return _KNOWN[key]
+
+
+def _make(task: Task, options: Options, nominal: Machine) -> Variants:
+    machines, plants, states, tips = [], [], [], []
+    for number in range(options.variants):
+        rng = np.random.default_rng([options.variant_seed, number])
+        joints = task.start(nominal, rng)
+        things = task.surroundings(nominal, rng, joints)
+        machine = _changed(nominal, options, rng)
+        known = (p for m, p in zip(machines, plants, strict=True)
+                 if m == machine and p.surroundings == things)  # fmt: skip
+        plant = next(known, None)
+        if plant is None:
+            plant = build_plant(machine, options.timestep, task.ground, things)
+        machines.append(machine)
+        plants.append(plant)
+        data = rest_state(plant, _by_joint(machine, joints))
+        begin_leapfrog(plant.model, data)
+        state = np.zeros(mujoco.mj_stateSize(plant.model, STATE))
+        mujoco.mj_getState(plant.model, data, state, STATE)
+        states.append(state)
+        tips.append(data.site(TIP_SITE).xpos.copy())
+    return Variants(
+        plants[0], tuple(machines), tuple(plant.surroundings for plant in plants),
+        np.array(states), np.array(tips), _differing(plants, task.writes),
+        *_sensor_tables(plants[0], machines), _delays(plants[0], machines),
+    )  # fmt: skip
+
+
+def _by_joint(machine: Machine, places: Mapping[str, float]) -> dict[str, float]:
+    """Positions of axes or joints by the joints' names."""
+    return {machine.axes[n].joint if n in machine.axes else n: v for n, v in places.items()}
+
+
+def _changed(nominal: Machine, options: Options, rng: np.random.Generator) -> Machine:
+    """The machine with what is planted and what is drawn."""
+    machine = nominal
+    for effect in options.effects:
+        machine = apply_effect(machine, *_said(effect), dict(effect.get("parameters", {})))
+    for effect in options.randomise:
+        drawn = {
+            key: float(rng.uniform(*_range(effect, key, value)))
+            for key, value in effect.get("parameters", {}).items()
+        }
+        machine = apply_effect(machine, *_said(effect), drawn)
+    return machine
+
+
+def _said(effect: Mapping[str, Any]) -> tuple[str, str]:
+    """Name and location of an effect that a user gave."""
+    keys = ("name", "location", "parameters")
+    if not isinstance(effect, Mapping) or "name" not in effect or set(effect) - set(keys):
+        raise InputError("effects", f"each needs {', '.join(keys)}, not {effect!r}")
+    return str(effect["name"]), str(effect.get("location", ""))
+
+
+def _range(effect: Mapping[str, Any], key: str, value: Any) -> tuple[float, float]:
+    """Range of a parameter that is drawn; a wrong one is named."""
+    where = f"randomise {effect.get('name')}: {key}"
+    try:
+        low, high = (float(end) for end in value)
+    except (TypeError, ValueError):
+        raise InputError(where, f"needs a range [low, high], not {value!r}") from None
+    if not (np.isfinite([low, high]).all() and low <= high):
+        raise InputError(where, f"needs a range that rises, not {value!r}")
+    return low, high
+
+
+def _differing(plants: list[Plant], also: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Fields of the models that are not the same in all of them, and some that may be."""
+    first, fields = plants[0].model, {}
+    distinct = list({id(plant): plant for plant in plants}.values())
+    for name in sorted(MODEL_FIELDS):
+        values = [np.asarray(_of(plant.model, name)) for plant in distinct]
+        if any(value.shape != values[0].shape for value in values):
+            raise _structure(name)
+        if name not in also and all(np.array_equal(value, values[0]) for value in values):
+            continue
+        if values[0].dtype != np.float64:
+            raise _structure(name)
+        fields[name] = np.array([np.asarray(_of(p.model, name)).ravel() for p in plants])
+    for size in ("nv", "na"):
+        if any(getattr(plant.model, size) != getattr(first, size) for plant in distinct):
+            raise _structure(size)
+    return fields
+
+
+def _structure(name: str) -> InputError:
+    known = ", ".join(sorted(EFFECTS))
+    message = (
+        f"the variants differ in more than numbers ({name} of the model): plant such an effect in"
+        f" all of them with `effects`; the library has {known}"
+    )
+    return InputError("randomise", message)
+
+
+def _of(model: mujoco.MjModel, name: str):
+    return getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)
+
+
+def channels(plant: Plant) -> tuple[str, ...]:
+    """Channels in the order of the native sensors: positions, head and rod pressures, supply."""
+    return tuple(c for c in sensed_channels(plant) if not c.startswith("length."))
+
+
+def _sensor_tables(plant: Plant, machines: list[Machine]):
+    """Scales, offsets, delays and lags of all sensors of all variants."""
+    shape, names = (len(machines), CHANNELS), channels(plant)
+    scales, offsets, ratios = np.ones(shape), np.zeros(shape), np.zeros(shape)
+    lags, c = np.zeros((*shape, 2)), len(names)
+    for v, machine in enumerate(machines):
+        defects = [machine.sensor_errors.get(name, SensorError()) for name in names]
+        scales[v, :c] = [defect.scale for defect in defects]
+        offsets[v, :c] = [defect.offset for defect in defects]
+        lags[v, :c], ratios[v, :c] = sensor_delays(machine, names, plant.model.opt.timestep)
+    return scales, offsets, lags, ratios
+
+
+def _delays(plant: Plant, machines: list[Machine]) -> np.ndarray:
+    delays = np.zeros((len(machines), AXES, 2))
+    for v, machine in enumerate(machines):
+        delays[v, : len(plant.axes)] = command_delays(machine, plant.axes, plant.model.opt.timestep)
+    return delays
+
+
+_DEADBAND = (0.5, 2.0)  # times the nominal overlap
+_FLOW = (0.8, 1.2)  # makers' ratings are good to 5 or 10 %, wear and temperature do the rest
+_BANDWIDTH = (0.6, 1.4)
+_FRICTION = (0.5, 2.0)
+_BULK = (0.6, 1.2)  # air in the oil
+_DELAY = (0.0, 0.05)  # s, of a fieldbus and its valve amplifiers
+_PAYLOAD = (0.0, 0.02)  # times the mass of all links, at the tip
+
+
+def typical_variation(machine: Machine) -> tuple[dict[str, Any], ...]:
+    """Effects with ranges, for `Options.randomise`, of every valve, drive and the whole machine.
+
+    Args:
+        machine: the nominal machine.
+
+    Returns:
+        For every valve its overlap (0.5 to 2 times), flow (0.8 to 1.2) and bandwidth (0.6 to 1.4);
+        for every drive its Coulomb friction (0.5 to 2); for the machine the oil's stiffness (0.6 to
+        1.2), the commands' delay (0 to 50 ms) and a payload (0 to 2 % of its mass).
+    """
+    found = []
+    for name, axis in machine.axes.items():
+        if axis.valve is None:
+            continue
+        found += [
+            _effect("valve_deadband", name, deadband=_times(axis.valve.deadband, _DEADBAND)),
+            _effect("valve_gain", name, ratio=list(_FLOW)),
+            _effect("spool_lag", name, bandwidth=_times(axis.valve.bandwidth, _BANDWIDTH)),
+            _effect(
+                "coulomb_friction", name,
+                coulomb=_times(axis.hydraulic_drive.friction.coulomb, _FRICTION),
+            ),
+        ]  # fmt: skip
+    if machine.supply:
+        bulk = _times(machine.supply.bulk_modulus, _BULK)
+        found.append(_effect("bulk_modulus", "all", bulk_modulus=bulk))
+    weight = sum(link.mass for link in machine.links.values())
+    found.append(_effect("command_delay", "all", delay=list(_DELAY)))
+    return (*found, _effect("payload", "tool", mass=_times(weight, _PAYLOAD)))
+
+
+def _effect(name: str, location: str, **ranges: list[float]) -> dict[str, Any]:
+    return {"name": name, "location": location, "parameters": ranges}
+
+
+def _times(nominal: float, factors: tuple[float, float]) -> list[float]:
+    return [factor * nominal for factor in factors]

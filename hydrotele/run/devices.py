@@ -1,0 +1,525 @@
+"""Devices that a person drives with: keyboard, gamepad, SpaceMouse, or a file in their place.
+
+A device says what it asks for now: six axes of the handle (x out, y left, z up, rx the head, ry the
+tool, positive curls in, rz), commands of further axes, and when to end. The viewer's window reports
+only that a key goes down, not that it comes up: so every press moves an axis on by a part of its
+range, where it stays until the space bar centres everything. Gamepad and SpaceMouse are read
+through SDL, which sees both as joysticks (pygame, the extra `drive`).
+
+A file is CSV, with a first line of names (`time`, any of x, y, z, rx, ry, rz, and further axes of
+the machine), then a row from each time [s] on; or YAML with `time`, `axes`, `commands`, and
+`interpolate: linear` if the handle shall move evenly from row to row. Values are -1 .. 1 of the
+handle's range, or commands. The drive ends with the last time.
+"""
+
+import bisect
+import csv
+import os
+from collections import deque
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hydrotele.core.datafile import Facts, Name, NonNegative, parse, read_yaml, suggest
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_text
+from hydrotele.machine.joystick import AXES
+from hydrotele.scenario.teleoperation import JoystickAxis
+
+_FINE = 2  # decimals of an axis: finer than a hand, and short to write down
+
+
+class Reading(NamedTuple):
+    """What a device asks for now.
+
+    Attributes:
+        axes: x, y, z, rx, ry, rz of the handle, -1 .. 1 of its way.
+        commands: of the axes that the joystick does not move, -1 .. 1, in the machine's order.
+        quit: whether the drive is over.
+        said: what its user should know: unplugged, back again.
+    """
+
+    axes: tuple[float, ...] = (0.0,) * 6
+    commands: tuple[float, ...] = ()
+    quit: bool = False
+    said: str = ""
+
+
+class Device(Protocol):
+    """A device that is open."""
+
+    def read(self, time: float) -> Reading:
+        """What it asks for now, `time` [s] after the start of the run."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it."""
+        ...
+
+
+def outside(value: float, dead: float) -> float:
+    """An axis without its dead zone, whole at the end of its way.
+
+    Args:
+        value: as the device says, -1 .. 1.
+        dead: dead zone.
+
+    Returns:
+        0 inside the dead zone; -1 .. 1, in hundredths.
+
+    >>> outside(0.1, 0.12), outside(-1.2, 0.12), outside(0.56, 0.12)
+    (0.0, -1.0, 0.5)
+    """
+    beyond = min(1.0, abs(value)) - dead
+    if not beyond > 0.0:
+        return 0.0
+    size = round(beyond / (1.0 - dead), _FINE)
+    return size if value > 0.0 else -size
+
+
+class Switches:
+    """Commands of further axes, that buttons switch between -1, 0 and 1.
+
+    Attributes:
+        commands: of every axis.
+    """
+
+    def __init__(self, count: int) -> None:
+        """All off.
+
+        Args:
+            count: number of axes.
+        """
+        self.commands = [0.0] * count
+
+    def up(self, number: int) -> None:
+        """One step up: from -1 to 0, or from 0 to 1."""
+        self._set(number, lambda now: min(1.0, now + 1.0))
+
+    def down(self, number: int) -> None:
+        """One step down."""
+        self._set(number, lambda now: max(-1.0, now - 1.0))
+
+    def turn(self, number: int) -> None:
+        """The next of 0, 1, 0, -1: where one button has to do."""
+        if number < len(self.commands):
+            now = self.commands[number]
+            self._next = -self._next if now else self._next
+            self.commands[number] = 0.0 if now else self._next
+
+    def off(self) -> None:
+        """All off."""
+        self.commands = [0.0] * len(self.commands)
+
+    _next = 1.0
+
+    def _set(self, number: int, step) -> None:
+        if number < len(self.commands):
+            self.commands[number] = step(self.commands[number])
+
+
+NUDGE = 0.25  # of the handle's way, for one press of a key
+
+# GLFW codes of keys that MuJoCo's viewer leaves alone -> (name, axis of the handle, way)
+KEYS = {
+    265: ("Up", "x", 1.0),
+    264: ("Down", "x", -1.0),
+    263: ("Left", "y", 1.0),
+    262: ("Right", "y", -1.0),
+    266: ("Page Up", "z", 1.0),
+    267: ("Page Down", "z", -1.0),
+    269: ("End", "ry", 1.0),
+    268: ("Home", "ry", -1.0),
+    260: ("Insert", "rx", 1.0),
+    261: ("Delete", "rx", -1.0),
+}
+# GLFW code -> (name, number of the further axis, way)
+SWITCH_KEYS = {
+    54: ("6", 0, -1.0),
+    55: ("7", 0, 1.0),
+    56: ("8", 1, -1.0),
+    57: ("9", 1, 1.0),
+}
+CENTRE_KEY, QUIT_KEY = 32, 299  # space, F10
+
+
+class Layout(NamedTuple):
+    """How a device that SDL sees as a joystick is used.
+
+    Attributes:
+        axes: (axis of the handle, number of the device's axis, way).
+        pairs: (axis of the handle, button that pulls it up, button that pulls it down).
+        dead: dead zone of every axis.
+        hat: whether its hat switches: up and down the first further axis, right and left the
+            second.
+        turns: buttons that switch a further axis, by its number, on, off and back.
+        stop: button that switches all off; -1 without.
+        quit: button that ends; -1 without.
+    """
+
+    axes: tuple[tuple[str, int, float], ...]
+    pairs: tuple[tuple[str, int, int], ...]
+    dead: float
+    hat: bool
+    turns: tuple[int, ...]
+    stop: int
+    quit: int
+
+
+LAYOUTS = {
+    # sticks as Linux numbers them for Xbox and PlayStation pads; 4, 5: shoulders, 1: B, 7: Start
+    "gamepad": Layout(
+        axes=(("x", 1, -1.0), ("y", 0, -1.0), ("z", 4, -1.0), ("ry", 3, -1.0)),
+        pairs=(("rx", 4, 5),),
+        dead=0.12,
+        hat=True,
+        turns=(),
+        stop=1,
+        quit=7,
+    ),
+    # right, towards the user, down, pitch, roll, yaw
+    "spacemouse": Layout(
+        axes=(
+            ("x", 1, -1.0),
+            ("y", 0, -1.0),
+            ("z", 2, -1.0),
+            ("rx", 4, 1.0),
+            ("ry", 3, -1.0),
+            ("rz", 5, -1.0),
+        ),
+        pairs=(),
+        dead=0.1,
+        hat=False,
+        turns=(0, 1),
+        stop=-1,
+        quit=-1,
+    ),
+}
+SPACEMOUSE_NAMES = ("space", "3dconnexion")
+
+
+class Keyboard:
+    """The keyboard; `press` may be called by another thread."""
+
+    def __init__(self, further: int) -> None:
+        """Everything is centred.
+
+        Args:
+            further: number of axes that the joystick does not move.
+        """
+        self._pressed: deque[int] = deque()
+        self._axes: dict[str, float] = dict.fromkeys(AXES, 0.0)
+        self._switches = Switches(further)
+        self._quit = False
+
+    def press(self, code: int) -> None:
+        """Take note of a key that goes down, by its GLFW code."""
+        self._pressed.append(code)
+
+    def read(self, time: float) -> Reading:
+        """What the keys ask for now."""
+        while self._pressed:
+            self._take(self._pressed.popleft())
+        return Reading(tuple(self._axes.values()), tuple(self._switches.commands), self._quit)
+
+    def _take(self, code: int) -> None:
+        if code in KEYS:
+            _, axis, way = KEYS[code]
+            self._axes[axis] = min(1.0, max(-1.0, self._axes[axis] + way * NUDGE))
+        elif code in SWITCH_KEYS:
+            _, number, way = SWITCH_KEYS[code]
+            (self._switches.up if way > 0.0 else self._switches.down)(number)
+        elif code == CENTRE_KEY:
+            self._axes = dict.fromkeys(AXES, 0.0)
+            self._switches.off()
+        elif code == QUIT_KEY:
+            self._quit = True
+
+    def close(self) -> None:
+        """Nothing is to be let go of."""
+
+
+class Pad:
+    """A device that is plugged in, and may be unplugged and plugged in again."""
+
+    def __init__(self, kind: str, sticks: Any, further: int) -> None:
+        """Take the first device of its kind.
+
+        Args:
+            kind: key of `LAYOUTS`.
+            sticks: has `find(kind)`, a stick of pygame's or None, `changed()`, whether one was
+                plugged in or out since the last call, and `close()`.
+            further: number of axes that the joystick does not move.
+
+        Raises:
+            InputError: there is none.
+        """
+        self._kind, self._sticks, self._layout = kind, sticks, LAYOUTS[kind]
+        self._stick = sticks.find(kind)
+        if self._stick is None:
+            sticks.close()
+            message = "is not connected: plug it in, or choose --device keyboard"
+            raise InputError(f"--device {kind}", message)
+        self._switches, self._held = Switches(further), set()
+
+    def read(self, time: float) -> Reading:
+        """What it asks for now; nothing while it is unplugged."""
+        said = ""
+        if self._sticks.changed():
+            before, self._stick = self._stick, self._sticks.find(self._kind)
+            if self._stick is None and before is not None:
+                said = f"the {self._kind} is unplugged: the handle goes to its centre"
+                self._switches.off()
+                self._held = set()
+            elif before is None and self._stick is not None:
+                said = f"the {self._kind} is back"
+        if self._stick is None:
+            return Reading(commands=tuple(self._switches.commands), said=said)
+        axes = _axes(self._stick, self._layout)
+        over = self._press(_held(self._stick, self._layout))
+        return Reading(axes, tuple(self._switches.commands), over, said)
+
+    def _press(self, held: set[str]) -> bool:
+        """Switch what has just been pressed; whether it was the button that ends."""
+        fresh, self._held = held - self._held, held
+        switches, layout = self._switches, self._layout
+        for way, act, number in (
+            ("up", switches.up, 0),
+            ("down", switches.down, 0),
+            ("right", switches.up, 1),
+            ("left", switches.down, 1),
+        ):
+            if way in fresh:
+                act(number)
+        for number, button in enumerate(layout.turns):
+            if str(button) in fresh:
+                switches.turn(number)
+        together = len(layout.turns) > 1 and {str(b) for b in layout.turns} <= held
+        if str(layout.stop) in fresh or together:
+            switches.off()
+        return str(layout.quit) in fresh
+
+    def close(self) -> None:
+        """Let go of SDL."""
+        self._sticks.close()
+
+
+def _axes(stick: Any, layout: Layout) -> tuple[float, ...]:
+    values: dict[str, float] = dict.fromkeys(AXES, 0.0)
+    for name, number, way in layout.axes:
+        if number < stick.get_numaxes():
+            values[name] = way * outside(stick.get_axis(number), layout.dead) + 0.0
+    for name, up, down in layout.pairs:
+        if max(up, down) < stick.get_numbuttons():
+            values[name] = float(bool(stick.get_button(up)) - bool(stick.get_button(down)))
+    return tuple(values.values())
+
+
+def _held(stick: Any, layout: Layout) -> set[str]:
+    """Numbers of the buttons that are down, and ways of the hat."""
+    held = {str(b) for b in range(stick.get_numbuttons()) if stick.get_button(b)}
+    if layout.hat and stick.get_numhats():
+        x, y = stick.get_hat(0)
+        held |= {{1: "right", -1: "left"}[x]} if x else set()
+        held |= {{1: "up", -1: "down"}[y]} if y else set()
+    return held
+
+
+class Sticks:
+    """All that SDL sees, through pygame."""
+
+    def __init__(self, kind: str) -> None:
+        """Start SDL.
+
+        Args:
+            kind: for the message.
+
+        Raises:
+            InputError: pygame is not installed.
+        """
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # its window is not wanted
+        try:
+            import pygame  # pyright: ignore[reportMissingImports] - an extra
+        except ImportError:
+            message = "needs pygame: pip install 'hydrotele[drive]' or pip install pygame"
+            raise InputError(f"--device {kind}", message) from None
+        self._pygame = pygame
+        pygame.display.init()  # SDL's events come with it
+        pygame.joystick.init()
+
+    def changed(self) -> bool:
+        """Whether something was plugged in or out; fetches the sticks' state, too."""
+        kinds = (self._pygame.JOYDEVICEADDED, self._pygame.JOYDEVICEREMOVED)
+        return any(event.type in kinds for event in self._pygame.event.get())
+
+    def find(self, kind: str) -> Any:
+        """The first stick of a kind, None without."""
+        for number in range(self._pygame.joystick.get_count()):
+            stick = self._pygame.joystick.Joystick(number)
+            named = any(part in stick.get_name().lower() for part in SPACEMOUSE_NAMES)
+            if named == (kind == "spacemouse"):
+                return stick
+        return None
+
+    def close(self) -> None:
+        """Stop SDL."""
+        self._pygame.quit()
+
+
+_Part = Annotated[float, Field(ge=-1, le=1)]
+
+
+class Script(Facts):
+    """What is asked for over time: `axes` of the handle and `commands` of further axes."""
+
+    time: list[NonNegative]
+    axes: dict[JoystickAxis, list[_Part]] = {}
+    commands: dict[Name, list[_Part]] = {}
+    interpolate: Literal["hold", "linear"] = "hold"
+
+    @model_validator(mode="after")
+    def _check(self):
+        rising = all(a < b for a, b in zip(self.time, self.time[1:], strict=False))
+        if not self.time or self.time[0] != 0.0 or not rising:
+            raise ValueError("time must start at 0 and rise")
+        for name, values in [*self.axes.items(), *self.commands.items()]:
+            if len(values) != len(self.time):
+                raise ValueError(f"{name} has {len(values)} values, time has {len(self.time)}")
+        return self
+
+
+class Scripted:
+    """A device that follows a script."""
+
+    def __init__(self, script: Script, further: tuple[str, ...], where: str) -> None:
+        """Begin at its beginning.
+
+        Args:
+            script: what to do.
+            further: axes that the joystick does not move.
+            where: its file.
+
+        Raises:
+            InputError: it commands an axis that is not among them.
+        """
+        for name in script.commands:
+            if name not in further:
+                message = f"{name!r} is no axis that the joystick leaves alone"
+                raise InputError(where, f"{message}; {suggest(name, further)}")
+        self._script, self._further = script, further
+
+    def read(self, time: float) -> Reading:
+        """What the script asks for at a time of the run [s]."""
+        script = self._script
+        row = max(0, bisect.bisect_right(script.time, time + 1e-9) - 1)
+        commands = [script.commands[n][row] if n in script.commands else 0.0 for n in self._further]
+        axes = [self._axis(script.axes.get(name), row, time) for name in AXES]
+        return Reading(tuple(axes), tuple(commands), time + 1e-9 >= script.time[-1])
+
+    def _axis(self, values: list[float] | None, row: int, time: float) -> float:
+        if values is None:
+            return 0.0
+        if self._script.interpolate == "linear":
+            return float(np.interp(time, self._script.time, values))
+        return values[row]
+
+    def close(self) -> None:
+        """Nothing is to be let go of."""
+
+
+def load_script(path: str | Path) -> Script:
+    """Read a script.
+
+    Args:
+        path: a CSV or YAML file.
+
+    Returns:
+        The script.
+
+    Raises:
+        InputError: names file, line and column of what is wrong.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(path, "no such file; give a .csv or .yaml file after scripted:")
+    if path.suffix.lower() in (".yaml", ".yml"):
+        data, lines = read_yaml(path)
+        return parse(Script, data, str(path), lines)
+    if path.suffix.lower() == ".csv":
+        return _from_csv(path)
+    raise InputError(path, "must be a .csv or a .yaml file")
+
+
+def _from_csv(path: Path) -> Script:
+    try:
+        rows = list(csv.reader(read_text(path).splitlines()))
+    except csv.Error as error:
+        raise InputError(path, f"cannot be read: {error}") from None
+    names = [name.strip() for name in rows[0]] if rows else []
+    if "time" not in names:
+        raise InputError(f"{path}, line 1", f"has no column 'time'; valid: time, {', '.join(AXES)}")
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise InputError(f"{path}, line 1", f"names {', '.join(sorted(twice))} twice")
+    columns: dict[str, list[float]] = {name: [] for name in names}
+    for line, row in enumerate(rows[1:], start=2):
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(names):
+            raise InputError(f"{path}, line {line}", f"has {len(row)} cells, not {len(names)}")
+        for name, cell in zip(names, row, strict=True):
+            columns[name].append(_number(cell, f"{path}, line {line}, column {name!r}", name))
+        _check_time(columns["time"], f"{path}, line {line}, column 'time'")
+    data = {
+        "time": columns.pop("time"),
+        "axes": {name: v for name, v in columns.items() if name in AXES},
+        "commands": {name: v for name, v in columns.items() if name not in AXES},
+    }
+    return parse(Script, data, str(path), {})
+
+
+def _number(cell: str, where: str, name: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        raise InputError(where, f"{cell.strip()!r} is not a number") from None
+    if name != "time" and not -1.0 <= value <= 1.0:
+        raise InputError(where, f"{value:g} is not between -1 and 1")
+    return value
+
+
+def _check_time(time: list[float], where: str) -> None:
+    if len(time) == 1 and time[0] != 0.0:
+        raise InputError(where, f"time must start at 0, not at {time[0]:g}")
+    if len(time) > 1 and not time[-1] > time[-2]:
+        raise InputError(where, f"time must rise: {time[-1]:g} comes after {time[-2]:g}")
+
+
+SCRIPTED = "scripted:"
+NAMES = ("keyboard", *LAYOUTS, f"{SCRIPTED}FILE")
+
+
+def open_device(name: str, further: tuple[str, ...]) -> Device:
+    """Open a device.
+
+    Args:
+        name: one of `NAMES`.
+        further: axes of the machine that the joystick does not move, in its order.
+
+    Returns:
+        The device.
+
+    Raises:
+        InputError: there is no such device, it is not connected, or what it needs is not installed.
+    """
+    if name == "keyboard":
+        return Keyboard(len(further))
+    if name in LAYOUTS:
+        return Pad(name, Sticks(name), len(further))
+    if name.startswith(SCRIPTED):
+        path = name.removeprefix(SCRIPTED)
+        return Scripted(load_script(path), further, path)
+    raise InputError(f"--device {name}", f"is no device; {suggest(name, NAMES)}")

@@ -1,0 +1,526 @@
+"""Do a sweep: check every point, do the runs that are missing, write table and report.
+
+Runs on a dask cluster: the scheduler gives those of a lost worker to another one.
+
+The folder of a sweep: begun whole, gone on with by the same sweep, by one process at a time.
+
+Processes of this computer that do runs: a killed one costs its run, not the sweep.
+
+`concurrent.futures` gives up all runs when one process dies and cannot say which was its own.
+"""
+
+import contextlib
+import csv
+import fcntl
+import json
+import logging
+import multiprocessing
+import os
+import queue
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
+from importlib.metadata import version
+from itertools import islice
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+import hydrotele
+from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_json
+from hydrotele.core.output import check_target, replacing, whole_folder
+from hydrotele.run.sweep_checking import (
+    Base,
+    Checked,
+    check_points,
+    fingerprint,
+    open_base,
+    scenario_of,
+)
+from hydrotele.run.sweep_facts import Point, SweepFile, points
+from hydrotele.run.sweep_runs import (
+    FAILED,
+    JOURNAL,
+    OK,
+    Entry,
+    Journal,
+    Keep,
+    Outcome,
+    Task,
+    check_figures,
+    failed,
+    perform,
+    placed,
+    possible_results,
+    unpack,
+)
+from hydrotele.run.sweep_table import Table, make_table, save_table
+from hydrotele.scenario.scenario import save_scenario
+
+_WAIT = 30  # s for the scheduler and the first worker
+_WHERE = "--dask"
+
+
+def cluster_outcomes(tasks: Iterable[Task], address: str) -> Generator[Outcome]:
+    """Do runs on a cluster, a few more at a time than it has threads.
+
+    Args:
+        tasks: the runs; taken as workers become free.
+        address: of the scheduler, or the file that it wrote.
+
+    Yields:
+        The outcomes, in the order in which they are done. A run that several workers were lost with
+        has failed.
+
+    Raises:
+        InputError: dask is not installed, the cluster does not answer or lacks hydrotele.
+    """
+    try:
+        from dask import distributed
+    except ImportError:
+        message = "needs dask.distributed: pip install 'hydrotele[cluster]'"
+        raise InputError(_WHERE, message) from None
+    for name in list(logging.root.manager.loggerDict):
+        if name.split(".")[0] == "distributed":  # what counts is said here
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+    there = "scheduler_file" if Path(address).is_file() else "address"
+    facts: dict[str, Any] = {there: address, "timeout": f"{_WAIT}s", "set_as_default": False}
+    try:
+        client = distributed.Client(**facts)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(_WHERE, f"no scheduler answers at {address}: {error}") from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_WAIT)
+        except TimeoutError:
+            message = f"the scheduler at {address} has no workers; start some with dask worker"
+            raise InputError(_WHERE, message) from None
+        yield from _outcomes(client, distributed, iter(tasks))
+
+
+def _outcomes(client, distributed, waiting: Iterator[Task]) -> Iterator[Outcome]:
+    ahead = 2 * max(sum(client.nthreads().values()), 1) + 8
+    runs = {}
+
+    def submit(task: Task):
+        future = client.submit(perform, task, pure=False, key=f"hydrotele-{task.run}-{id(runs)}")
+        runs[future.key] = task.run
+        return future
+
+    first = [submit(task) for task in islice(waiting, ahead)]
+    done = distributed.as_completed(first, loop=client.loop)
+    for future in done:
+        run = runs.pop(future.key)
+        yield _outcome(distributed, future, run)
+        if (task := next(waiting, None)) is not None:
+            done.add(submit(task))
+
+
+def _outcome(distributed, future, run: int) -> Outcome:
+    """The outcome of a task of the cluster.
+
+    Raises:
+        InputError: it is the cluster that failed.
+    """
+    if future.status == "finished":
+        return future.result()
+    error = None if future.status in ("cancelled", "lost") else future.exception()
+    if isinstance(error, distributed.KilledWorker):
+        return failed(run, "the workers that did it were lost one after the other")
+    if isinstance(error, ImportError):
+        message = f"its workers need the same hydrotele as this computer: {error}"
+        raise InputError(_WHERE, message)
+    said = f"{type(error).__name__}: {error}" if error else "its scheduler may be gone"
+    kept = "finished runs are kept, the same command goes on"
+    raise InputError(_WHERE, f"the cluster gave up run {run}: {said}; {kept}")
+
+
+KIND = "sweep"
+SCRATCH = ".scratch"
+_FREE = ("name", "description", "figures", "scenario")  # change no run; its content counts
+_MAKERS = ("mujoco", "dm-control", "numpy", "scipy", "numba")  # what the numbers depend on
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a run's numbers depend on."""
+    return {"hydrotele": hydrotele.__version__, **{name: version(name) for name in _MAKERS}}
+
+
+def identity(base: Base, checked: Checked) -> dict[str, Any]:
+    """What must be the same for two sweeps to share their runs."""
+    facts = base.file.sweep.model_dump(mode="json", exclude=set(_FREE))
+    return {"sweep": facts, "scenarios": checked.digest, "versions": versions()}
+
+
+@contextlib.contextmanager
+def sweep_folder(target: Path, base: Base, checked: Checked, fresh: bool) -> Iterator[None]:
+    """Begin the folder of a sweep or go on with it, with nobody else in it.
+
+    Args:
+        target: the folder.
+        base: the sweep.
+        checked: its points.
+        fresh: whether to throw away what an earlier sweep left there.
+
+    Raises:
+        InputError: the folder holds something else or another sweep, or is in use.
+    """
+    check_target(target, KIND)
+    asked = identity(base, checked)
+    if fresh and target.is_dir():
+        with _alone(target):
+            pass
+    if fresh or not (target / "summary.json").is_file():
+        with whole_folder(target, KIND) as folder:
+            unpack(base.inputs.files(), folder)
+            write_summary(folder, base, {"identity": asked})
+    if not os.access(target, os.W_OK | os.X_OK):
+        raise InputError(target, "cannot be written to; choose another --out")
+    with _alone(target):
+        there = read_json(target / "summary.json").get("identity", {})
+        if found := list(_differences(there, asked)):
+            more = f", and {len(found) - 4} more" if len(found) > 4 else ""
+            message = "; ".join(found[:4]) + more + "; --fresh starts anew, or choose another --out"
+            raise InputError(target, f"holds another sweep: {message}")
+        for left in target.glob(".*"):
+            shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink()
+        (target / SCRATCH).mkdir()
+        with replacing(target / "sweep.yaml", ".yaml") as part:
+            part.write_text(_resolved(base))
+        try:
+            yield
+        finally:
+            shutil.rmtree(target / SCRATCH, ignore_errors=True)
+
+
+def write_summary(folder: Path, base: Base, facts: dict[str, Any]) -> None:
+    """Write `summary.json`, which says what the folder is."""
+    summary = {"kind": KIND, "name": base.file.name, "runs": base.file.sweep.runs, **facts}
+    with replacing(folder / "summary.json", ".json") as part:
+        part.write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def _resolved(base: Base) -> str:
+    """The sweep with every default, readable by `load_sweep` from any folder."""
+    scenario = base.file.scenario()
+    named = scenario == base.file.sweep.scenario and not Path(scenario).suffix
+    facts = base.file.sweep.model_dump(mode="json", exclude_none=True)
+    facts |= {"name": base.file.name}
+    facts |= {"scenario": scenario if named else str(Path(scenario).resolve())}
+    return yaml.safe_dump(facts, sort_keys=False, allow_unicode=True)
+
+
+@contextlib.contextmanager
+def _alone(target: Path) -> Iterator[None]:
+    """Hold the folder; the lock goes with the process, however that ends."""
+    handle = os.open(target, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise InputError(target, "another hydrotele sweep works in it; wait for it") from None
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
+    """Sentences on what differs between two identities; the digest only where nothing else does."""
+    before, after = (_flat({k: i.get(k) for k in ("sweep", "versions")}) for i in (old, new))
+    found = False
+    for key in dict.fromkeys([*before, *after]):
+        if before.get(key) != after.get(key):
+            found = True
+            was, now = (json.dumps(d[key]) if key in d else "nothing" for d in (before, after))
+            yield f"{key.partition('.')[2]} was {was}, is {now}"
+    if not found and old.get("scenarios") != new.get("scenarios"):
+        yield "the base scenario, a file that it names, or the order of the keys has changed"
+
+
+def _flat(data: dict[str, Any], above: str = "") -> dict[str, Any]:
+    result = {}
+    for key, value in data.items():
+        if isinstance(value, dict):
+            result |= _flat(value, f"{above}{key}.")
+        elif value is not None:
+            result[f"{above}{key}"] = value
+    return result
+
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_READY = "ready"
+
+
+class _Worker:
+    """A process and the run that it does."""
+
+    def __init__(self, context) -> None:
+        """Start the process; it says _READY when it can work."""
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs,), daemon=True)
+        with _starting():
+            self.process.start()
+        theirs.close()  # so that its end shows here
+        self.ready, self.task = False, None
+
+    def give(self, task: Task) -> None:
+        """Let it do a run; a dead one is found out by the next wait."""
+        self.task = task
+        with contextlib.suppress(OSError):
+            self.connection.send(task)
+
+    def stop(self) -> None:
+        """End the process at once."""
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+
+
+def outcomes(tasks: Iterable[Task], jobs: int) -> Generator[Outcome]:
+    """Do runs in processes of their own, with one thread each.
+
+    Args:
+        tasks: the runs; taken as workers become free.
+        jobs: number of processes.
+
+    Yields:
+        The outcomes, in the order in which they are done. A run whose process dies has failed.
+
+    Raises:
+        InputError: the processes do not start.
+    """
+    context = multiprocessing.get_context("spawn")  # forked compiled code and threads do not mix
+    waiting = iter(tasks)
+    workers: list[_Worker] = []
+    try:
+        for task in waiting:
+            workers.append(_Worker(context))
+            workers[-1].give(task)
+            if len(workers) == jobs:
+                break
+        while busy := {w.connection: w for w in workers if w.task}:
+            for connection in wait(list(busy)):
+                worker = busy[connection]
+                said = _heard(worker)
+                if said == _READY:
+                    worker.ready = True
+                    continue
+                if said is None:
+                    said = _dead(worker)
+                    workers[workers.index(worker)] = worker = _Worker(context)
+                worker.task = None
+                yield said
+                if (task := next(waiting, None)) is not None:
+                    worker.give(task)
+    finally:
+        for worker in workers:
+            worker.stop()
+
+
+def _heard(worker: _Worker) -> Any:
+    """What a worker says, None where it is dead."""
+    try:
+        return worker.connection.recv()
+    except Exception:  # it may have died in the middle of a word
+        return None
+
+
+def _dead(worker: _Worker) -> Outcome:
+    """The outcome of the run whose process died."""
+    worker.stop()
+    code = worker.process.exitcode or 0
+    how = signal.Signals(-code).name if code < 0 else f"exit status {code}"
+    if not worker.ready:
+        raise InputError("--jobs", f"a process for the runs did not start ({how})")
+    assert worker.task
+    memory = "; is there enough memory?" if code == -signal.SIGKILL else ""
+    return failed(worker.task.run, f"its process was ended by {how}{memory}")
+
+
+@contextlib.contextmanager
+def _starting() -> Iterator[None]:
+    """What a process inherits: one thread, and no ear for Ctrl-C, which this process answers."""
+    old = {name: os.environ.get(name) for name in _THREADS}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in old.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _work(connection: Connection) -> None:
+    """Do runs until the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(connection, tasks), daemon=True).start()
+    connection.send(_READY)
+    while True:
+        connection.send(perform(tasks.get()))
+
+
+def _listen(connection: Connection, tasks: queue.SimpleQueue) -> None:
+    """Take tasks; end this process, whatever it computes, when the parent is gone."""
+    try:
+        while True:
+            tasks.put(connection.recv())
+    except (EOFError, OSError):
+        os._exit(1)
+
+
+Progress = Callable[[str, int, int, int], None]
+
+
+class How(NamedTuple):
+    """How the runs of a sweep are done; nothing here changes a result.
+
+    Attributes:
+        jobs: processes of this computer, None for one per core.
+        dask: scheduler of a cluster instead of them: address or scheduler file.
+        fresh: throw away what an earlier sweep left in the folder.
+        retry_failed: do failed runs again.
+        keep: writes a run into a folder, where the sweep asks for logs.
+    """
+
+    jobs: int | None = None
+    dask: str | None = None
+    fresh: bool = False
+    retry_failed: bool = False
+    keep: Keep | None = None
+
+
+class Swept(NamedTuple):
+    """A finished sweep.
+
+    Attributes:
+        table: a row per run.
+        failed: entries of the runs that failed.
+        done: number of runs that were done now, not before.
+    """
+
+    table: Table
+    failed: list[Entry]
+    done: int
+
+
+def run_sweep(
+    file: SweepFile, target: Path, how: How | None = None, progress: Progress | None = None
+) -> Swept:
+    """Do the runs of a sweep that are not done yet; write its table.
+
+    Args:
+        file: the sweep, of `load_sweep`.
+        target: its folder; what an interrupted sweep left there is gone on with.
+        how: where and how the runs are done.
+        progress: called with what is done ("check" or "run"), how many are, of how many, and how
+            many failed.
+
+    Returns:
+        The table, also in `table.parquet`.
+
+    Raises:
+        InputError: a point is wrong, the folder is not this sweep's, or the cluster does not work.
+        KeyboardInterrupt: on Ctrl-C; finished runs are kept.
+    """
+    how, base = how or How(), open_base(file)
+    checked = check_points(
+        base, progress and (lambda done, total: progress("check", done, total, 0))
+    )
+    possible = possible_results(checked.axes, checked.teleoperated)
+    check_figures(file.sweep.figures, possible, file.place("figures"))
+    if how.dask:
+        base.inputs.refuse_bound("--dask")
+    with sweep_folder(target, base, checked, how.fresh):
+        with closing(Journal(target / JOURNAL)) as journal:
+            missing = _missing(base, journal, how.retry_failed)
+            _do(base, target, journal, missing, how, checked, progress)
+        entries = {run: journal.entries[run] for run in sorted(journal.entries)}
+        failures = [entry for entry in entries.values() if entry.status == FAILED]
+        table = make_table(file.sweep, checked.seed, entries, checked.units)
+        save_table(table, file.name, target / "table.parquet")
+        _save_timings(entries, target / "timings.csv")
+        counts = {"ok": len(entries) - len(failures), "failed": len(failures)}
+        write_summary(target, base, {"identity": identity(base, checked), **counts})
+    return Swept(table, failures, len(missing))
+
+
+def _missing(base: Base, journal: Journal, retry_failed: bool) -> dict[int, Point]:
+    """The runs to do, by number."""
+    if retry_failed:
+        done = {run for run, entry in journal.entries.items() if entry.status == OK}
+    else:
+        done = set(journal.entries)
+    return {point.run: point for point in points(base.file.sweep) if point.run not in done}
+
+
+def _do(
+    base: Base, target: Path, journal: Journal, missing: dict[int, Point], how: How,
+    checked: Checked, progress: Progress | None,
+) -> None:  # fmt: skip
+    """Do the missing runs and write each into the journal."""
+    total, done = base.file.sweep.runs, base.file.sweep.runs - len(missing)
+    failed = sum(e.status == FAILED for r, e in journal.entries.items() if r not in missing)
+    tasks = (_task(base, target, how, checked, point) for point in missing.values())
+    jobs = min(how.jobs or os.cpu_count() or 1, max(len(missing), 1))
+    found = cluster_outcomes(tasks, how.dask) if how.dask and missing else outcomes(tasks, jobs)
+    if progress:
+        progress("run", done, total, failed)
+    with closing(found):
+        for outcome in found:
+            _check_versions(outcome)
+            if outcome.files:
+                _keep(base, target, missing[outcome.entry.run], outcome)
+            journal.add(outcome.entry)
+            done, failed = done + 1, failed + (outcome.entry.status == FAILED)
+            if progress:
+                progress("run", done, total, failed)
+
+
+def _task(base: Base, target: Path, how: How, checked: Checked, point: Point) -> Task:
+    scenario = scenario_of(base, point)
+    if fingerprint(scenario) != checked.fingerprints[point.run - 1]:
+        message = "a file that it names changed while the sweep ran; the finished runs are kept"
+        raise InputError(base.scenario.path, message)
+    keep = how.keep if base.file.sweep.logs else None
+    if how.dask:
+        return Task(point.run, scenario, None, base.inputs.files_of(scenario), keep, None)
+    folder = target.resolve()
+    return Task(point.run, scenario, str(folder), {}, keep, str(folder / SCRATCH))
+
+
+def _check_versions(outcome: Outcome) -> None:
+    """Refuse a result of other software: numbers of one table come from one."""
+    ours = versions()
+    for name, theirs in outcome.versions.items():
+        if ours.get(name, theirs) != theirs:
+            raise InputError("--dask", f"a worker has {name} {theirs}, this computer {ours[name]}")
+
+
+def _keep(base: Base, target: Path, point: Point, outcome: Outcome) -> None:
+    """Write the folder of a run, whole or not at all."""
+    name = f"{point.run:0{max(4, len(str(base.file.sweep.runs)))}d}"
+    with whole_folder(target / "runs" / name, "run") as folder:
+        for file, content in outcome.files.items():
+            (folder / file).write_bytes(content)
+        # A worker's own names its machine where only it has it.
+        save_scenario(placed(scenario_of(base, point), target.resolve()), folder / "scenario.yaml")
+
+
+def _save_timings(entries: dict[int, Entry], path: Path) -> None:
+    """Write what differs between runs of equal content, beside the table."""
+    with replacing(path, ".csv") as part, open(part, "w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["run", "wall [s]"])
+        for entry in entries.values():
+            rows.writerow([entry.run, entry.wall_seconds])

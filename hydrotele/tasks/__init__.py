@@ -1,1 +1,0 @@
-"""Control tasks on simulated machines: whole episodes in native code, one or thousands."""

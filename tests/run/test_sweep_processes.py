@@ -1,0 +1,108 @@
+"""The real program, killed, interrupted and on a cluster."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import hydrotele
+from hydrotele.core.files import models_folder, scenarios_folder
+from tests.run.conftest import rows_of, write_sweep
+
+ROOT = Path(hydrotele.__file__).parents[1]
+CLUSTER = """
+import sys
+from distributed import LocalCluster
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+def environment() -> dict[str, str]:
+    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "COLUMNS": "200"}
+
+
+def start(*words) -> subprocess.Popen:
+    """`hydrotele sweep` in a group of its own, as a terminal's foreground job is."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "hydrotele.cli", "sweep", *map(str, words)], env=environment(),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=_heed_interrupts,
+    )  # fmt: skip
+
+
+def _heed_interrupts() -> None:
+    """A shell's job in the background ignores them, and so do all programs that it starts."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def lines(journal: Path) -> int:
+    return journal.read_bytes().count(b"\n") if journal.exists() else 0
+
+
+@pytest.mark.slow
+def test_interrupted_and_killed_sweeps_end_as_uninterrupted_ones(done, tmp_path):
+    journal = tmp_path / "out" / "journal.jsonl"
+    words = (write_sweep(tmp_path), "--out", tmp_path / "out", "--jobs", "1")
+    for number in (signal.SIGINT, signal.SIGKILL):
+        process, before = start(*words), lines(journal)
+        while lines(journal) < before + 2 and process.poll() is None:
+            time.sleep(0.005)
+        if number == signal.SIGINT:
+            os.killpg(process.pid, number)  # as Ctrl-C does: the workers hear it, too
+        else:
+            process.kill()
+        _, said = process.communicate(timeout=60)
+        if number == signal.SIGINT:
+            assert process.returncode == 130 and "Traceback" not in said
+            assert f"{lines(journal)} of 8 runs are done" in said and "goes on" in said
+    process = start(*words[:-1], "2")  # nor does the number of processes change anything
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 0, said
+    assert (tmp_path / "out/table.parquet").read_bytes() == (done / "table.parquet").read_bytes()
+    assert lines(journal) == 8  # nothing was done twice
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_table(done, tmp_path):
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "mine").symlink_to(models_folder() / "rig")
+    text = (scenarios_folder() / "rig_steps.yaml").read_text()
+    (tmp_path / "there" / "s.yaml").write_text(text.replace("machine: rig", "machine: mine"))
+    script = tmp_path / "cluster.py"
+    script.write_text(CLUSTER)
+    with subprocess.Popen(
+        [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL, text=True, env=environment(), cwd=tmp_path,
+    ) as cluster:  # fmt: skip
+        assert cluster.stdout and cluster.stdin
+        address = cluster.stdout.readline().strip()
+        file = write_sweep(tmp_path / "there", scenario="s.yaml", logs=True)
+        process = start(file, "--out", tmp_path / "out", "--dask", address)
+        _, said = process.communicate(timeout=180)
+        cluster.stdin.close()
+    assert process.returncode == 0, said
+    assert rows_of(tmp_path / "out") == rows_of(done)
+    for name in ("measured.parquet", "truth.parquet"):
+        there, here = (folder / "runs" / "0003" / name for folder in (tmp_path / "out", done))
+        assert there.read_bytes() == here.read_bytes()
+
+
+def test_a_cluster_that_is_not_there_is_said(tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    from hydrotele.core.errors import InputError
+    from hydrotele.run import sweep as cluster
+    from hydrotele.run.sweep import How, run_sweep
+    from hydrotele.run.sweep_facts import load_sweep
+
+    monkeypatch.setattr(cluster, "_WAIT", 1)
+    with pytest.raises(InputError, match="no scheduler answers at tcp://127.0.0.1:1"):
+        run_sweep(load_sweep(write_sweep(tmp_path)), tmp_path / "o", How(dask="tcp://127.0.0.1:1"))
