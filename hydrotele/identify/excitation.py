@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.optimize import minimize
@@ -14,7 +14,6 @@ from hydrotele.identify.identifiability import identifiable_in_noise, reference_
 from hydrotele.identify.setup import Setup
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.inverse_dynamics import Projection, project
-from hydrotele.multibody.regressor import regressor
 
 _ROWS = 12  # per period of the highest harmonic
 _MARGIN = 0.05  # of a range, stroke or limit that is left free
@@ -96,13 +95,18 @@ def information(
     Args:
         setup: of the regressor.
         motions: (3, n, k) positions, rates and accelerations.
-        noise: (k,) standard deviation of the drives' force errors [N] or [N m].
+        noise: of the drives' force errors: (k,) standard deviations [N] or [N m], or their (k, k)
+            covariance.
         base: places of the p base parameters.
         sizes: (p,) to count the parameters in; 1 by default.
     """
     found = project(setup.chain, setup.given, *motions)
     table = setup.table(found)
-    scaled = table.matrix[:, :, base] / noise[:, None]
+    noise = np.asarray(noise, float)
+    if noise.ndim == 1:
+        scaled = table.matrix[:, :, base] / noise[:, None]
+    else:
+        scaled = np.linalg.solve(np.linalg.cholesky(noise), table.matrix[:, :, base])
     if sizes is not None:
         scaled = scaled * sizes
     flat = scaled.reshape(-1, len(base))
@@ -178,7 +182,69 @@ def design_excitation(
             _WHERE, f"{', '.join(plain)} has a plain drive, whose feedback depends on its use:"
             " write a scenario with a `fourier` pilot and a `servo` of your own",
         )  # fmt: skip
-    limits = _Limits(machine, setup)
+    return design_motion(
+        _Limits(machine, setup), setup, noise, base, period=period, harmonics=harmonics,
+        starts=starts, iterations=iterations, seed=seed, progress=progress,
+    )  # fmt: skip
+
+
+class Limits(Protocol):
+    """What k given joints, and the drives with them, may do.
+
+    Attributes:
+        axes: names of the k joints or of their axes.
+        low: (k,) lowest positions [rad] or [m].
+        high: (k,) highest positions [rad] or [m].
+        middle: (k,) between them.
+        half: (k,) of the distance.
+    """
+
+    axes: tuple[str, ...]
+    low: np.ndarray
+    high: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
+
+    def use(self, motions: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Use of every limit at every row.
+
+        Args:
+            motions: (3, n, k) positions, rates and accelerations.
+            held: the same with positions inside of `low` and `high`.
+
+        Returns:
+            (n, l), 1 at the limit.
+        """
+        ...
+
+
+def design_motion(
+    limits: Limits, setup: Setup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
+    period: float = 20.0, harmonics: int = 8, starts: int = 2, iterations: int = 150,
+    seed: int = 0, progress: Callable[[str, float], None] | None = None,
+) -> Excitation:  # fmt: skip
+    """D-optimal Fourier motion of the setup's given joints within any limits.
+
+    Args:
+        limits: of the motion.
+        setup: of the regressor.
+        noise: of the drives' force errors, as of `information`.
+        base: places of the base parameters that count.
+        period: [s].
+        harmonics: number H of them.
+        starts: random motions from which to search.
+        iterations: of each search, per weight of the limits.
+        seed: of these.
+        progress: told what is being done and how far, 0 .. 1.
+
+    Returns:
+        The best motion found.
+
+    Raises:
+        InputError: no start moves within the limits.
+
+    Source: Abdellatif 2008, (22)-(26).
+    """
     rows = max(60, _ROWS * harmonics)
     time = np.arange(rows) * period / rows
     k, rng, best = len(setup.given), np.random.default_rng(seed), None
@@ -246,6 +312,48 @@ def _sizes(setup: Setup, base: Sequence[int] | np.ndarray, middle: np.ndarray) -
     return np.maximum(np.abs(table.nominal[np.asarray(base)]), 1.0)
 
 
+class DriveLimits:
+    """Limits of the drives alone, for given joints that may be any coordinates, such as a pose."""
+
+    def __init__(
+        self, setup: Setup, low: np.ndarray, high: np.ndarray, stroke: np.ndarray, speed: float,
+        acceleration: float,
+    ):  # fmt: skip
+        """Limits of a motion in coordinates of a pose.
+
+        Args:
+            setup: of the regressor.
+            low: (k,) lowest positions of the given joints [rad] or [m].
+            high: (k,) highest positions.
+            stroke: (d, 2) lowest and highest positions of the d drives [rad] or [m].
+            speed: that no drive may exceed [rad/s] or [m/s].
+            acceleration: that no drive may exceed [rad/s^2] or [m/s^2].
+
+        Source: Abdellatif 2008, (25).
+        """
+        self.setup, self.axes = setup, setup.given
+        self.low, self.high = np.asarray(low, float), np.asarray(high, float)
+        self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        stroke = np.asarray(stroke, float)
+        self.drive_middle, self.drive_half = stroke.mean(axis=1), 0.5 * np.ptp(stroke, axis=1)
+        self.speed, self.acceleration = speed, acceleration
+        self.drives = [setup.chain.index(d) for d in setup.chain.drives]
+
+    def use(self, motions: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Use of every limit at every row (n, l), 1 at the limit."""
+        found = project(self.setup.chain, self.setup.given, *held)
+        return np.concatenate(
+            [
+                1.0 + (motions[0] - self.high) / self.half,
+                1.0 + (self.low - motions[0]) / self.half,
+                np.abs(found.position[:, self.drives] - self.drive_middle) / self.drive_half,
+                np.abs(found.rate[:, self.drives]) / self.speed,
+                np.abs(found.acceleration[:, self.drives]) / self.acceleration,
+            ],
+            axis=1,
+        )
+
+
 class _Limits:
     """What the machine allows: ranges, strokes, flows and forces."""
 
@@ -268,10 +376,7 @@ class _Limits:
             1.0 + (self.low - motions[0]) / self.half,
         ]
         found = project(self.setup.chain, self.setup.given, *held)
-        table = regressor(
-            self.setup.chain, found, bodies=self.setup.bodies, rubbing=self.setup.rubbing,
-            offsets=False,
-        )  # fmt: skip
+        table = replace(self.setup, offsets=None).table(found)
         forces = table.matrix @ table.nominal
         flow = np.zeros(len(forces))
         for i, axis in enumerate(self.axes):
