@@ -5,6 +5,7 @@ The pictures of an identification report: forces on the held-out run, and the pa
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from hydrotele.identify.result import (
     counts,
     parameter_rows,
 )
-from hydrotele.logs.dataset import Dataset
 from hydrotele.show.report_html import (
     STYLE,
     Markup,
@@ -83,40 +83,60 @@ def draw_forces(forces: Forces, drive: str, judged: HeldOut) -> bytes:
 _MEMBERS = 6  # of a combination that are written out
 
 
+class Learned(NamedTuple):
+    """What an identification learned from.
+
+    Attributes:
+        name: of the machine or mechanism.
+        tool: of the machine; None for a mechanism without a machine.
+        fit: names of the fitted runs.
+        heldout: name of the run to judge on.
+        notes: on the data.
+    """
+
+    name: str
+    tool: str | None
+    fit: tuple[str, ...]
+    heldout: str
+    notes: tuple[str, ...] = ()
+
+
 def write_identify_report(
-    dataset: Dataset, found: Identification | None, hydraulics: Hydraulics | None,
+    learned: Learned, found: Identification | None, hydraulics: Hydraulics | None,
     best: Consistent | None, path: str | Path,
 ) -> None:  # fmt: skip
     """Write an identification as one self-contained HTML file.
 
     Args:
-        dataset: what it learned from.
+        learned: what it learned from.
         found: the mechanism, None where no force is known.
         hydraulics: the hydraulics, None where not asked for.
         best: the nearest machine that can exist, None without a mechanism.
         path: file to write.
     """
-    sections = [_header(dataset, found, hydraulics)]
+    sections = [_header(learned, found, hydraulics)]
     if found:
         sections += [_proof(found), _parameters(found), _tests(found, best), _others(found)]
     if hydraulics:
         sections.append(_hydraulics(hydraulics))
-    notes = found.notes if found else dataset.notes
+    notes = found.notes if found else learned.notes
     if notes:
         items = tag("ul", *(tag("li", note) for note in notes))
         sections.append(section("Notes", "On the data and on what was left out.", items))
-    sections.append(_use(found, hydraulics))
-    title = f"{dataset.machine.name}: identification"
+    sections.append(_use(learned, found, hydraulics))
+    title = f"{learned.name}: identification"
     Path(path).write_text(page(title, STYLE, sections), encoding="utf-8")
 
 
 def _header(
-    dataset: Dataset, found: Identification | None, hydraulics: Hydraulics | None
+    learned: Learned, found: Identification | None, hydraulics: Hydraulics | None
 ) -> Markup:
-    machine, runs = dataset.machine, ", ".join(run.name for run in dataset.fit)
+    of = f"mechanism {learned.name}"
+    if learned.tool is not None:
+        of = f"machine {learned.name}, tool {learned.tool}"
     over = (
-        f"IDENTIFICATION REPORT  ·  machine {machine.name}, tool {machine.tool}  ·  judged on"
-        f" {dataset.heldout.name}, fitted on {runs}"
+        f"IDENTIFICATION REPORT  ·  {of}  ·  judged on"
+        f" {learned.heldout}, fitted on {', '.join(learned.fit)}"
     )
     cards = []
     for drive, h in list(found.heldout.items())[:3] if found else ():
@@ -239,11 +259,15 @@ def _hydraulics(found: Hydraulics) -> Markup:
     return section("Valves, oil and supply", why, table(head, rows, numbers="  nnn"))
 
 
-def _use(found: Identification | None, hydraulics: Hydraulics | None) -> Markup:
+def _use(
+    learned: Learned, found: Identification | None, hydraulics: Hydraulics | None
+) -> Markup:
     commands = (
         "hydrotele replay LOG --machine identified/\nhydrotele run SCENARIO --machine identified/"
     )
     seconds = sum(part.seconds for part in (found, hydraulics) if part)
     took = text(f"hydrotele {hydrotele.__version__}, identified in {seconds:.1f} s.")
+    if learned.tool is None:
+        return tag("footer", tag("p", took))
     return tag("footer", tag("p", "The identified machine stands beside this page:"),
                tag("pre", commands), tag("p", took))  # fmt: skip
