@@ -26,9 +26,9 @@ RATE = 1000.0  # Hz
 FORCE_NOISE = 40.0  # force noise over the standard deviation of a drive's dry friction
 LENGTH_NOISE = 10e-6  # m, standard deviation of a measured leg length
 CORRELATION = 0.8  # of the force noise of any two drives
-STROKE, SPEED, ACCELERATION = (0.70, 1.20), 1.2, 25.0  # m, m/s, m/s^2 of every drive
-LOW = np.array([-0.20, -0.20, 0.42, -0.35, -0.35, -0.45])  # of the pose [m], [rad]
-HIGH = np.array([0.20, 0.20, 0.70, 0.35, 0.35, 0.45])
+STROKE, SPEED, ACCELERATION = (0.60, 1.06), 1.2, 25.0  # m, m/s, m/s^2 of every drive
+LOW = np.array([-0.20, -0.20, 0.42, -0.35, -0.35, -0.25])  # of the pose [m], [rad]
+HIGH = np.array([0.20, 0.20, 0.70, 0.35, 0.35, 0.25])
 
 
 class Published(NamedTuple):
@@ -184,7 +184,7 @@ def excited() -> Experiment:
 
 
 def measured(
-    of: Experiment, periods: int, rng: np.random.Generator, reaction: np.ndarray | None = None
+    of: Experiment, periods: int, rng: np.random.Generator, reaction: tuple[float, float] | None = None
 ) -> Record:
     """Simulated measurement: repeated periods of true lengths and forces, and noise.
 
@@ -192,9 +192,9 @@ def measured(
         of: one period.
         periods: how many.
         rng: of the noise.
-        reaction: (3,) force [N] of every drive per error of its measured length [m], its rate
-            [m/s] and acceleration [m/s^2]: what a controller does about the encoder's noise, which
-            is then in the forces, too; None for noise that is not.
+        reaction: force of every drive per error of its measured length [N/m] and of its rate
+            [N s/m]: what a controller does about the encoder's noise, which is then in the forces,
+            too; None for noise that is not.
 
     Returns:
         A record of leg lengths and drive forces.
@@ -203,9 +203,7 @@ def measured(
     error = LENGTH_NOISE * rng.standard_normal((n, 6))
     noise = rng.standard_normal((n, 6)) @ np.linalg.cholesky(force_covariance()).T
     if reaction is not None:
-        rate = np.gradient(error, 1.0 / RATE, axis=0)
-        noise -= reaction[0] * error + reaction[1] * rate
-        noise -= reaction[2] * np.gradient(rate, 1.0 / RATE, axis=0)
+        noise -= reaction[0] * error + reaction[1] * np.gradient(error, 1.0 / RATE, axis=0)
     drives = robot().setup.chain.drives
     return Record(
         "excitation", 1.0 / RATE, drives, np.tile(of.length, (periods, 1)) + error,
@@ -218,6 +216,12 @@ def measured(
 MASS, BANDWIDTH, DAMPING = 4.0, 12.0, 0.8  # kg that a drive moves on average, Hz, 1
 INTEGRAL = 3.0  # 1/s, of the proportional part
 _FADE = 1.0  # s in which a path starts from rest
+
+
+def control_gains() -> tuple[float, float]:
+    """Stiffness [N/m] and damping [N s/m] of every drive's controller."""
+    turn = 2.0 * np.pi * BANDWIDTH
+    return MASS * turn**2, 2.0 * DAMPING * MASS * turn
 
 
 def circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.ndarray:
@@ -316,8 +320,7 @@ def track(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> 
     place = model.joint("platform").qposadr[0]
     data.qpos[place : place + 3] = motion[0, 0, :3]
     data.qpos[place + 3 : place + 7] = _quaternion(motion[0, 0, 3:])
-    stiff = MASS * (2.0 * np.pi * BANDWIDTH) ** 2
-    damp = 2.0 * DAMPING * MASS * 2.0 * np.pi * BANDWIDTH
+    stiff, damp = control_gains()
     held = own.matrix(np.stack([motion[0, :1], 0 * motion[1, :1], 0 * motion[2, :1]]))[0] @ own.truth
     if feedforward is not None:
         held = held - model_force[0]  # the integral part holds the robot where it starts

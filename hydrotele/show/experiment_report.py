@@ -77,5 +77,5 @@ def draw_panels(panels: Sequence[Panel]) -> bytes:
             place.set_title(panel.title)
             if len(panel.curves) > 1:
                 place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-        axes[-1].set_xlabel("time [s]")
+        axes[-1].set_xlabel(panels[-1].across)
         return png(figure)
