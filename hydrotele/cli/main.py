@@ -582,16 +582,18 @@ def export(
 
 @app.command(epilog="Example:  hydrotele experiments zhu1994 --json")
 def experiments(
-    name: Annotated[str, typer.Argument(help="Series of experiments: zhu1994.")],
+    name: Annotated[str, typer.Argument(help="Series: zhu1994 or abdellatif2008.")],
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder to write; default runs/NAME, with --json none."),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Operators of repeated experiments.")] = 20,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Repetitions: 20 operators, or 100 trials.")
+    ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
     json: Json = False,
 ) -> None:
-    """Repeat published machine experiments with a simulated operator, beside what was published."""
+    """Repeat published experiments in simulation, beside what was published."""
     from hydrotele.cli.experimenting import experiments_to_folder
 
     experiments_to_folder(name, out, seeds, jobs, json)

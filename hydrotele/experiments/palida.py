@@ -23,9 +23,9 @@ CHI2_95 = 36.42  # of 24 degrees of freedom, as the document prints it
 HOME = np.array([0.0, 0.0, 0.55, 0.0, 0.0, 0.0])
 # Assumed, as README.md of the model says: the document prints neither noise nor limits.
 RATE = 1000.0  # Hz
-FORCE_NOISE = 40.0  # force noise over the standard deviation of a drive's dry friction
+FORCE_NOISE = 53.0  # of a drive, over the published standard deviation of its dry friction
 LENGTH_NOISE = 10e-6  # m, standard deviation of a measured leg length
-CORRELATION = 0.8  # of the force noise of any two drives
+CORRELATION = 0.6  # of the force noise of any two drives
 STROKE, SPEED, ACCELERATION = (0.60, 1.06), 1.2, 25.0  # m, m/s, m/s^2 of every drive
 LOW = np.array([-0.20, -0.20, 0.42, -0.35, -0.35, -0.25])  # of the pose [m], [rad]
 HIGH = np.array([0.20, 0.20, 0.70, 0.35, 0.35, 0.25])
@@ -131,8 +131,8 @@ def force_covariance() -> np.ndarray:
     """Covariance (6, 6) of the drives' force noise [N^2], white at `RATE`.
 
     The document calls it high and cross-correlated and prints no number. Ratios of the drives are
-    those of the published standard deviations of their dry friction; the level is chosen so that
-    the standard deviations of all parameters are, in the geometric mean, the published ones.
+    those of the published standard deviations of their dry friction; the level, 10 to 19 N, is
+    chosen so that the standard deviations of the parameters are about the published ones.
     """
     size = FORCE_NOISE * np.array([one.std for one in TABLE[12:18]])
     return np.outer(size, size) * (CORRELATION + (1.0 - CORRELATION) * np.eye(6))

@@ -20,6 +20,7 @@ _MARGIN = 0.05  # of a range, stroke or limit that is left free
 _FLOW, _FORCE, _VALVE = 0.95, 0.8, 0.8  # of the pump, of the relief pressure, of a valve's rating
 _PRESS = (1e1, 1e3, 1e5)  # weights of violated limits, growing, so that the end lies inside them
 _READ = 0.02  # s between force readings of an ordinary log
+_BETWEEN = 8  # times more rows on which the limits are checked at last
 _DRAWN = 12  # random motions of which the best is where a search starts
 _WHERE = "excitation"
 
@@ -259,7 +260,7 @@ def design_motion(
             limits.axes, period, mean, wide[:, :harmonics], wide[:, harmonics:], 0.0, 0.0, len(base)
         )
 
-    def measure(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def measure(x: np.ndarray, time: np.ndarray = time) -> tuple[float, np.ndarray]:
         motions = excitation(x).motion(time)
         inside = np.clip(motions[0], limits.low, limits.high)
         held = np.stack([inside, motions[1], motions[2]])
@@ -290,17 +291,19 @@ def design_motion(
             best = (value, x, float(use.max()))
     if best is None:
         raise InputError(_WHERE, "no motion within the limits was found: give more starts")
-    value, x, worst = best
-    made = excitation(x)
+    between = np.arange(_BETWEEN * rows) * period / (_BETWEEN * rows)
+    x = _inside(best[1], lambda x: measure(x, between), 0.998)
+    value, use = measure(x, between)
+    made, worst = excitation(x), float(use.max())
     return Excitation(made.axes, period, made.mean, made.sin, made.cos, value, worst, len(base))
 
 
-def _inside(x: np.ndarray, measure: Callable) -> np.ndarray:
+def _inside(x: np.ndarray, measure: Callable, step: float = 0.97) -> np.ndarray:
     """A motion shrunk until it keeps all limits."""
     for _ in range(60):
         if measure(x)[1].max() <= 1.0:
             return x
-        x = 0.97 * x
+        x = step * x
     return x
 
 

@@ -59,14 +59,14 @@ class Reduction:
 
 def reduce_parameters(
     matrix: np.ndarray, forces: np.ndarray, covariance: np.ndarray, names: Sequence[str],
-    candidates: Sequence[Sequence[str]], correlation: float = 0.3,
+    candidates: Sequence[Sequence[str]],
 ) -> Reduction:  # fmt: skip
     """Drop and merge candidates, one after the other.
 
-    First the least significant candidate goes, until all that are left stand above the noise: a
-    normal deviate that all candidates together exceed by chance with 5 % only. Then, among
-    candidates of one kind, the two with the largest correlation of their estimates get a common
-    parameter, until none is above the limit, as long as the residuals allow it.
+    The least significant candidate goes first, until all that are left stand above the noise: a
+    normal deviate that all candidates together exceed by chance with 5 % only. Among
+    candidates of one kind, the two whose estimates correlate most get a common parameter, unless
+    the residuals say by the same deviate that they differ. What is then below the noise goes, too.
 
     Args:
         matrix: (n, k, p) regressor of independent parameters.
@@ -74,7 +74,6 @@ def reduce_parameters(
         covariance: (k, k) of their errors.
         names: the p parameters.
         candidates: groups of names of one kind, within which parameters may be merged.
-        correlation: magnitude above which two estimates count as strongly correlated.
 
     Returns:
         The reduction, with all its steps.
@@ -109,39 +108,42 @@ def reduce_parameters(
         wide = max((s / first[g] for g, s in std.items() if g[0] not in kind), default=1.0)
         steps.append(Step(action, which, figure, len(groups), float(wide), misfit / free))
 
-    value, spread, misfit, free = fit()
-    note("start", tuple(names), 0.0, spread, misfit, free)
-    while True:
-        std = np.sqrt(np.diag(spread))
-        ratio = np.abs(value) / std
-        open_ = [k for k, g in enumerate(groups) if g[0] in kind]
-        weakest = min(open_, key=lambda k: ratio[k], default=None)
-        if weakest is None or ratio[weakest] >= significant:
-            break
-        gone, figure = groups.pop(weakest), float(ratio[weakest])
-        value, spread, misfit, free = fit()
-        note("drop", gone, figure, spread, misfit, free)
-    while True:
-        std = np.sqrt(np.diag(spread))
-        pairs = [
-            (abs(spread[a, b]) / (std[a] * std[b]), a, b)
-            for a in range(len(groups))
-            for b in range(a)
-            if groups[a][0] in kind and kind[groups[a][0]] == kind.get(groups[b][0])
-            and (groups[a], groups[b]) not in separate
-        ]  # fmt: skip
-        if not pairs or max(pairs)[0] < correlation:
-            break
-        figure, a, b = max(pairs)
-        before, old = list(groups), misfit
-        merged = groups[b] + groups[a]
-        groups[b] = merged
-        groups.pop(a)
-        value, spread, misfit, free = fit()
-        if misfit - old > significant**2:  # they differ by more than the noise
-            separate.add((before[a], before[b]))
-            groups = before
-            value, spread, misfit, free = fit()
-            continue
-        note("merge", merged, float(figure), spread, misfit, free)
-    return Reduction(tuple(steps), tuple(groups), value, np.sqrt(np.diag(spread)))
+    def drop(now):
+        while True:
+            ratio = np.abs(now[0]) / np.sqrt(np.diag(now[1]))
+            open_ = [k for k, g in enumerate(groups) if g[0] in kind]
+            weakest = min(open_, key=lambda k: ratio[k], default=None)
+            if weakest is None or ratio[weakest] >= significant:
+                return now
+            gone, figure = groups.pop(weakest), float(ratio[weakest])
+            now = fit()
+            note("drop", gone, figure, *now[1:])
+
+    def merge(now):
+        while True:
+            std = np.sqrt(np.diag(now[1]))
+            pairs = [
+                (abs(now[1][a, b]) / (std[a] * std[b]), a, b)
+                for a, one in enumerate(groups)
+                for b, other in enumerate(groups[:a])
+                if one[0] in kind and kind[one[0]] == kind.get(other[0])
+                and (one, other) not in separate
+            ]  # fmt: skip
+            if not pairs:
+                return now
+            figure, a, b = max(pairs)
+            before, old = list(groups), now
+            groups[b] = groups[b] + groups[a]
+            merged = groups[b]
+            groups.pop(a)
+            now = fit()
+            if now[2] - old[2] > significant**2:  # they differ by more than the noise
+                separate.add((before[a], before[b]))
+                groups[:], now = before, old
+                continue
+            note("merge", merged, float(figure), *now[1:])
+
+    now = fit()
+    note("start", tuple(names), 0.0, *now[1:])
+    now = drop(merge(drop(now)))
+    return Reduction(tuple(steps), tuple(groups), now[0], np.sqrt(np.diag(now[1])))

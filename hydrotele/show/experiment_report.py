@@ -35,8 +35,8 @@ def write_experiment_report(name: str, findings: Sequence[Finding], path: Path) 
         "header",
         tag("p", f"hydrotele {hydrotele.__version__} - experiments {name}", class_="over"),
         tag("h1", f"{same} of {len(findings)} experiments as published"),
-        tag("p", "A simulated operator repeats what a person did on the machines; every row says"
-            " what the source reports and what is seen here."),
+        tag("p", "Published experiments repeated in simulation; every row says what the source"
+            " reports and what is seen here."),
     )  # fmt: skip
     rows = [
         (
