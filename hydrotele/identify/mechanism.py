@@ -8,6 +8,7 @@ import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.identify.motion import GAP
 from hydrotele.identify.record import Record
 from hydrotele.identify.setup import Setup, mechanism_setup
-from hydrotele.logs.log import Log, load_log, load_logs
+from hydrotele.logs.log import LEFT_OUT, Log, load_log, read_table
 from hydrotele.logs.rows import fit_clock
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.poses import joint_positions
@@ -155,18 +156,12 @@ def mechanism_records(
         InputError: a file is unusable, lacks a column, or there is no such run.
     """
     runs, notes = {}, []
-    for path in map(Path, paths):
-        aliases = _aliases(mechanism)
-        some = (
-            load_logs(path, aliases=aliases, maximum_dropped=1.0)
-            if path.is_dir()
-            else (load_log(path, aliases=aliases, maximum_dropped=1.0, missing=True),)
-        )
-        for log in some:
-            if log.name in runs:
-                raise InputError(log.source, f"run {log.name!r} is there twice: rename one")
-            runs[log.name], said = _record(log, mechanism)
-            notes += said
+    for path in _logs(paths):
+        log, columns = _load(path, mechanism)
+        if log.name in runs:
+            raise InputError(log.source, f"run {log.name!r} is there twice: rename one")
+        runs[log.name], said = _record(log, columns, mechanism)
+        notes += said
     if heldout is not None and heldout not in runs:
         raise InputError("--heldout", f"there is no run {heldout!r}; {suggest(heldout, runs)}")
     if len(runs) == 1:
@@ -186,34 +181,70 @@ def mechanism_records(
     return tuple(runs[n] for n in named if n != chosen), runs[chosen], tuple(notes)
 
 
-def _aliases(mechanism: Mechanism) -> dict[str, str]:
-    return {mechanism.mapping.time: "time"} if mechanism.mapping.time != "time" else {}
+def _logs(paths: Sequence[str | Path]) -> list[Path]:
+    out: list[Path] = []
+    for path in map(Path, paths):
+        if not path.is_dir():
+            out.append(path)
+            continue
+        some = sorted(p for p in path.iterdir() if p.suffix.lower() in (".csv", ".parquet"))
+        if not some:
+            raise InputError(path, "the folder holds no log: put .parquet or .csv files there")
+        out += some
+    if not out:
+        raise InputError("the data", "no file was given: name a folder with logs, or logs")
+    return out
 
 
-def _column(log: Log, joint: str, stated, usual: Sequence[str], what: str, source: str):
-    """Values (n,) of a joint's column; None where none is stated and none has a usual name."""
-    if isinstance(stated, dict):
-        if (name := stated.get(joint)) is None:
-            return None
-    elif stated is not None:
-        name = stated.replace("{joint}", joint)
-    else:
-        names = [one.replace("{joint}", joint) for one in usual]
-        name = next((one for one in names if one in log), None)
-        if name is None:
-            return None
-    sign = -1.0 if name.startswith("-") else 1.0
-    name = name.removeprefix("-")
-    if name not in log:
-        raise InputError(
-            log.source, f"has no column {name!r}, which {source} names for the {what} of {joint};"
-            f" {suggest(name, log.columns)}",
-        )  # fmt: skip
-    return sign * log[name]
+class _Column(NamedTuple):
+    """Channel under which a column is read, and its sign."""
+
+    channel: str
+    sign: float
 
 
-def _record(log: Log, mechanism: Mechanism) -> tuple[Record, tuple[str, ...]]:
+def _load(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], _Column]]:
+    """Read a log; (`position` or `force`, joint) -> the column that has it."""
     mapping, chain, source = mechanism.mapping, mechanism.setup.chain, mechanism.source
+    raw, columns = read_table(path, missing=True), {}
+    names, ours = raw.names, "hydrotele" in raw.metadata  # those keep their names
+    aliases = dict.fromkeys(names, LEFT_OUT)
+    if mapping.time not in names:
+        raise InputError(path, f"has no column {mapping.time!r} of the time: name it in the mapping,"
+                         f" as `time: COLUMN`; columns: {', '.join(names)}")  # fmt: skip
+    aliases[mapping.time] = "time"
+    for what, joints, stated, usual in (
+        ("position", mechanism.measured, mapping.position, _POSITIONS),
+        ("force", chain.drives, mapping.force, _FORCES),
+    ):
+        for number, joint in enumerate(joints):
+            if isinstance(stated, dict):
+                name = stated.get(joint)
+            elif stated is not None:
+                name = stated.replace("{joint}", joint)
+            else:
+                expected = [one.replace("{joint}", joint) for one in usual]
+                name = next((one for one in expected if one in names), None)
+            if name is None:
+                continue
+            sign, name = (-1.0, name[1:]) if name.startswith("-") else (1.0, name)
+            if name not in names:
+                raise InputError(
+                    path, f"has no column {name!r}, which {source} names for the {what} of"
+                    f" {joint}; {suggest(name, names)}",
+                )  # fmt: skip
+            straight = chain.tree.slides[chain.index(joint)]
+            kinds = {"position": ("angle", "position"), "force": ("torque", "force")}[what]
+            aliases[name] = f"{kinds[int(straight)]}.{what[0]}{number}"
+            columns[what, joint] = _Column(name if ours else aliases[name], sign)
+    log = load_log(path, aliases=aliases, maximum_dropped=1.0, missing=True)
+    return log, columns
+
+
+def _record(
+    log: Log, columns: dict[tuple[str, str], _Column], mechanism: Mechanism
+) -> tuple[Record, tuple[str, ...]]:
+    chain = mechanism.setup.chain
     clock, notes = fit_clock(log.time, log.source)
     time, period = log.time[clock.row], clock.period
     if clock.tick[-1] > _SPARSE * len(time):  # no common clock: rows at their usual distance
@@ -233,23 +264,23 @@ def _record(log: Log, mechanism: Mechanism) -> tuple[Record, tuple[str, ...]]:
         apart = np.diff(time[known], prepend=time[known][0])[after.clip(0, known.sum() - 1)]
         return np.where(apart > GAP, np.nan, out)
 
+    def values_of(what: str, joint: str) -> np.ndarray | None:
+        column = columns.get((what, joint))
+        return None if column is None else column.sign * log[column.channel]
+
     position = []
     for joint in mechanism.measured:
-        values = _column(log, joint, mapping.position, _POSITIONS, "position", source)
-        if values is None:
+        if (values := values_of("position", joint)) is None:
             raise InputError(
                 log.source, f"has no column for the position of {joint}: name it in the mapping, as"
-                f" `position: {{{joint}: COLUMN}}`; columns: {', '.join(log.columns)}",
+                f" `position: {{{joint}: COLUMN}}`",
             )  # fmt: skip
         position.append(spread(values))
-    force = [
-        spread(_column(log, drive, mapping.force, _FORCES, "force", source))
-        for drive in chain.drives
-    ]
+    force = [spread(values_of("force", drive)) for drive in chain.drives]
     if not np.isfinite(force).any():
         raise InputError(
             log.source, "has no force of any drive: name the columns in the mapping, as `force:"
-            f" {{{chain.drives[0]}: COLUMN}}`; columns: {', '.join(log.columns)}",
+            f" {{{chain.drives[0]}: COLUMN}}`",
         )  # fmt: skip
     unknown = np.full(len(mechanism.measured), np.nan)
     record = Record(

@@ -118,9 +118,11 @@ def _merged(
         raise InputError("setup", f"{strange[0]} is stated absent but is no parameter")
     kept = [name for name in names if name not in absent]
     groups = [members[name] for name in kept]
+    sums = np.zeros((len(whole.names), len(kept)))
+    for k, group in enumerate(groups):
+        sums[group, k] = 1.0
     return Regressor(
-        np.stack([whole.matrix[:, :, group].sum(axis=2) for group in groups], axis=2),
-        whole.drives, tuple(kept), tuple(whole.units[group[0]] for group in groups),
+        whole.matrix @ sums, whole.drives, tuple(kept), tuple(whole.units[group[0]] for group in groups),
         np.array([whole.nominal[group].mean() for group in groups]),
     )  # fmt: skip
 

@@ -294,7 +294,7 @@ def load_log(
         InputError: the file cannot be used; names file, column and row, and what to do.
     """
     path = Path(path)
-    table = _read(path, missing)
+    table = read_table(path, missing)
     if "hydrotele" not in table.metadata:
         table = with_valid(_renamed(table, aliases or {}))
         table = in_range(table, commands or {})
@@ -406,7 +406,19 @@ def _parquet_bytes(table: Table) -> memoryview:
     return memoryview(stream.getvalue())
 
 
-def _read(path: Path, missing: bool) -> Table:
+def read_table(path: Path, missing: bool = False) -> Table:
+    """Read a log's columns as they are, without checks of their names and values.
+
+    Args:
+        path: the file.
+        missing: read empty cells as NaN instead of refusing them.
+
+    Returns:
+        Its columns.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     if not path.is_file():
         raise InputError(path, "is not a file: give the path of a .parquet or .csv log")
     if path.suffix.lower() == ".csv":
