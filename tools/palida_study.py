@@ -39,10 +39,12 @@ CUTS = (
 )
 
 
-def cut(first: int, second: int, wide, high) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def cut(
+    first: int, second: int, wide: tuple[float, float], high: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Grid values (c,), (c,), condition numbers (c, c) and whether a pose is allowed (c, c)."""
     own, chain = robot(), robot().setup.chain
-    a, b = np.linspace(*wide, CELLS), np.linspace(*high, CELLS)
+    a, b = np.linspace(wide[0], wide[1], CELLS), np.linspace(high[0], high[1], CELLS)
     condition, allowed = np.full((2, CELLS, CELLS), np.nan)
     drives = [chain.index(name) for name in chain.drives]
     scale = np.array([1.0, 1.0, 1.0, RADIUS, RADIUS, RADIUS])
@@ -76,14 +78,21 @@ def draw(target: Path) -> None:
     for place, (x, y, first, second, wide, high, unit) in zip(axes, CUTS, strict=True):
         a, b, condition, allowed = cut(first, second, wide, high)
         shown = place.pcolormesh(
-            unit * a, b, np.log10(condition), cmap="viridis_r", vmin=0.5, vmax=3.0, shading="nearest"
+            unit * a,
+            b,
+            np.log10(condition),
+            cmap="viridis_r",
+            vmin=0.5,
+            vmax=3.0,
+            shading="nearest",
         )
         place.contour(unit * a, b, allowed, levels=[0.5], colors="white", linewidths=1.6)
         place.set_xlabel(x)
         place.set_ylabel(y)
+    assert shown is not None
     bar = figure.colorbar(shown, ax=axes)
     bar.set_label("condition of the inverse Jacobian, log10")
-    figure.suptitle("PaLiDA: singularities, and the workspace that strokes and hinges allow (white line)")
+    figure.suptitle("Singularities, and the workspace that strokes and hinges allow (white line)")
     figure.savefig(target, dpi=110)
 
 
@@ -104,8 +113,10 @@ def design(seed: int, iterations: int) -> None:
         limits(), own.setup, force_covariance(), own.told.base, period=3.0, harmonics=5, starts=1,
         iterations=iterations, seed=seed, progress=lambda said, share: print(said, f"{share:.2f}"),
     )  # fmt: skip
-    parts = {"period": found.period, "mean": found.mean.tolist(), "sin": found.sin.tolist(),
-             "cos": found.cos.tolist(), "criterion": found.criterion, "worst": found.worst}  # fmt: skip
+    parts = {
+        "period": found.period, "mean": found.mean.tolist(), "sin": found.sin.tolist(),
+        "cos": found.cos.tolist(), "criterion": found.criterion, "worst": found.worst,
+    }  # fmt: skip
     target = models_folder() / "palida" / "excitation.json"
     target.write_text(json.dumps(parts, indent=1) + "\n", encoding="utf-8")
 
@@ -126,9 +137,11 @@ def main() -> None:
     home = np.linalg.cond(jacobian(chain, q, chain.drives, own.setup.given) / scale)
     found = assemblies(chain, chain.drives, legs, body="platform", starts=2000)
     rows.append(f"| condition of the inverse Jacobian at home | {home:.1f} |")
-    rows.append(f"| poses of the platform with the leg lengths of home, found by 2000 starts | {len(found)} |")
+    rows.append(f"| poses with the leg lengths of home, found by 2000 starts | {len(found)} |")
     count, seconds = speed()
-    rows.append(f"| regressor of {count} rows, 24 joints, 19 bodies | {seconds:.2f} s of one core |")
+    rows.append(
+        f"| regressor of {count} rows, 24 joints, 19 bodies | {seconds:.2f} s of one core |"
+    )
     publish("\n".join(rows) + "\n", "Kinematics of the hexapod PaLiDA", asked)
 
 

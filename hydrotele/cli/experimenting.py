@@ -22,7 +22,7 @@ def experiments_to_folder(
     Args:
         name: of the series.
         target: folder, default `runs/<name>`; with `as_json` none.
-        seeds: operators or trials of the experiments that are repeated; as many as usual by default.
+        seeds: operators or trials of repeated experiments; as many as usual by default.
         jobs: processes; as many as there are cores by default.
         as_json: print the findings as JSON instead of words.
 

@@ -345,7 +345,10 @@ def processed(record: Record, period: float, way: str) -> np.ndarray:
     found = resolution(pose.position, pose.period, pose.position_noise)
     how = Processing("periodic", period=period, harmonics=_HARMONICS)
     smoothed = joint_motion(
-        pose.position, pose.period, found, how if way == "periodic" else Processing(way)  # pyright: ignore
+        pose.position,
+        pose.period,
+        found,
+        how if way == "periodic" else Processing(way),  # pyright: ignore
     )
     return np.stack([smoothed.value, smoothed.rate, smoothed.acceleration])
 
@@ -499,8 +502,12 @@ def least_squares_exact(trials: Sequence[tuple[np.ndarray, float, float]]) -> Fi
 
 
 def exact_trial(seed: int, periods: int = _PERIODS) -> tuple[np.ndarray, float, float]:
-    """Ordinary least squares: estimates, squared distance of truth by its own covariance, and the
-    mean logarithm of its true standard deviations over those of Gauss-Markov."""
+    """Ordinary least squares on mean periods.
+
+    Returns:
+        Estimates (24,), squared distance of the truth by the covariance that it claims, and the
+        mean logarithm of its true standard deviations over those of Gauss-Markov.
+    """
     own, data = robot(), excited()
     record = measured(data, periods, np.random.default_rng([2008, seed]))
     mean = mean_period(record, data.period)
@@ -639,4 +646,3 @@ def abdellatif2008(
         least_squares_exact(done[exact_trial]), biased(done[bias_trial]),
         *control(done[controlled]),
     ]  # fmt: skip
-

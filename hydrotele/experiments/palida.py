@@ -101,7 +101,7 @@ class Robot:
         return self.mechanism.setup
 
     def matrix(self, motion: np.ndarray) -> np.ndarray:
-        """Regressor (n, 6, 24) of Table 2's parameters along poses, rates, accelerations (3, n, 6)."""
+        """Regressor (n, 6, 24) of Table 2's parameters along a motion (3, n, 6) of the pose."""
         found = project(self.setup.chain, self.setup.given, *motion)
         return self.setup.table(found).matrix[:, :, self.told.base[self.order]]
 
@@ -142,9 +142,16 @@ def force_covariance() -> np.ndarray:
 def excitation() -> Excitation:
     """The designed motion that comes with the model; `tools/palida_study.py` designs it anew."""
     found = json.loads((models_folder() / "palida" / "excitation.json").read_text(encoding="utf-8"))
-    parts = (np.array(found[key]) for key in ("mean", "sin", "cos"))
+    mean, sin, cos = (np.array(found[key]) for key in ("mean", "sin", "cos"))
     return Excitation(
-        robot().setup.given, found["period"], *parts, found["criterion"], found["worst"], len(TABLE)
+        robot().setup.given,
+        found["period"],
+        mean,
+        sin,
+        cos,
+        found["criterion"],
+        found["worst"],
+        len(TABLE),
     )
 
 
@@ -184,7 +191,10 @@ def excited() -> Experiment:
 
 
 def measured(
-    of: Experiment, periods: int, rng: np.random.Generator, reaction: tuple[float, float] | None = None
+    of: Experiment,
+    periods: int,
+    rng: np.random.Generator,
+    reaction: tuple[float, float] | None = None,
 ) -> Record:
     """Simulated measurement: repeated periods of true lengths and forces, and noise.
 
@@ -321,7 +331,9 @@ def track(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> 
     data.qpos[place : place + 3] = motion[0, 0, :3]
     data.qpos[place + 3 : place + 7] = _quaternion(motion[0, 0, 3:])
     stiff, damp = control_gains()
-    held = own.matrix(np.stack([motion[0, :1], 0 * motion[1, :1], 0 * motion[2, :1]]))[0] @ own.truth
+    held = (
+        own.matrix(np.stack([motion[0, :1], 0 * motion[1, :1], 0 * motion[2, :1]]))[0] @ own.truth
+    )
     if feedforward is not None:
         held = held - model_force[0]  # the integral part holds the robot where it starts
     slides = chain.places[drives]

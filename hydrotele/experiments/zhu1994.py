@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 
 from hydrotele.control.endpoint_force import endpoint_force_of_log
-from hydrotele.experiments.finding import Finding, Panel, Progress, cylindrical, perform, performed, truth
+from hydrotele.experiments.finding import (
+    Finding,
+    Panel,
+    Progress,
+    cylindrical,
+    perform,
+    performed,
+    truth,
+)
 from hydrotele.run.run import Run
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track

@@ -210,8 +210,8 @@ def _load(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], 
     names, ours = raw.names, "hydrotele" in raw.metadata  # those keep their names
     aliases = dict.fromkeys(names, LEFT_OUT)
     if mapping.time not in names:
-        raise InputError(path, f"has no column {mapping.time!r} of the time: name it in the mapping,"
-                         f" as `time: COLUMN`; columns: {', '.join(names)}")  # fmt: skip
+        raise InputError(path, f"has no column {mapping.time!r} of the time: name it in the"
+                         f" mapping, as `time: COLUMN`; columns: {', '.join(names)}")  # fmt: skip
     aliases[mapping.time] = "time"
     for what, joints, stated, usual in (
         ("position", mechanism.measured, mapping.position, _POSITIONS),

@@ -87,10 +87,12 @@ def reduce_parameters(
     if strange := [name for name in kind if name not in names]:
         raise InputError(_WHERE, f"{strange[0]} is no parameter: {', '.join(names)}")
     significant = float(norm.isf(0.5 * _FALSE / max(len(kind), 1)))
-    groups = [(name,) for name in names]
+    groups: list[tuple[str, ...]] = [(name,) for name in names]
     columns = {name: matrix[:, :, k] for k, name in enumerate(names)}
     whitened = np.linalg.inv(np.linalg.cholesky(covariance))
-    steps, first, separate = [], {}, set()
+    steps: list[Step] = []
+    first: dict[tuple[str, ...], float] = {}
+    separate: set[tuple[tuple[str, ...], tuple[str, ...]]] = set()
 
     def fit():
         stacked = np.stack([sum(columns[n] for n in group) for group in groups], axis=2)

@@ -99,9 +99,7 @@ class Setup:
         return _merged(whole, self.alike, self.absent) if self.alike or self.absent else whole
 
 
-def _merged(
-    whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[str]
-) -> Regressor:
+def _merged(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[str]) -> Regressor:
     """A regressor with summed columns for places that are alike, without those absent."""
     first = {place: group[0] for group in alike for place in group}
     names, members = [], {}
@@ -122,7 +120,8 @@ def _merged(
     for k, group in enumerate(groups):
         sums[group, k] = 1.0
     return Regressor(
-        whole.matrix @ sums, whole.drives, tuple(kept), tuple(whole.units[group[0]] for group in groups),
+        whole.matrix @ sums, whole.drives, tuple(kept),
+        tuple(whole.units[group[0]] for group in groups),
         np.array([whole.nominal[group].mean() for group in groups]),
     )  # fmt: skip
 

@@ -259,9 +259,7 @@ def _hydraulics(found: Hydraulics) -> Markup:
     return section("Valves, oil and supply", why, table(head, rows, numbers="  nnn"))
 
 
-def _use(
-    learned: Learned, found: Identification | None, hydraulics: Hydraulics | None
-) -> Markup:
+def _use(learned: Learned, found: Identification | None, hydraulics: Hydraulics | None) -> Markup:
     commands = (
         "hydrotele replay LOG --machine identified/\nhydrotele run SCENARIO --machine identified/"
     )

@@ -33,12 +33,14 @@ FOUR_BAR = """\
 ANKLE = """\
 <mujoco model="ankle"><compiler angle="radian"/>
 <worldbody>
-  <body name="foot" pos="0 0 -0.4"><joint name="pitch" axis="0 1 0"/><joint name="roll" axis="1 0 0"/>
+  <body name="foot" pos="0 0 -0.4">
+    <joint name="pitch" axis="0 1 0"/><joint name="roll" axis="1 0 0"/>
     <inertial pos="0.05 0.004 -0.03" mass="1.2" diaginertia="0.004 0.006 0.006"/>
     <site name="left" pos="-0.06 0.05 0"/><site name="right" pos="-0.06 -0.05 0"/></body>
   %s
 </worldbody>
-<equality><connect site1="end_left" site2="left"/><connect site1="end_right" site2="right"/></equality>
+<equality><connect site1="end_left" site2="left"/>
+  <connect site1="end_right" site2="right"/></equality>
 <actuator><motor joint="crank_left"/><motor joint="crank_right"/></actuator></mujoco>
 """
 ROD = """
@@ -69,7 +71,9 @@ def logged(folder, xml, size, frequency, noise, seed=0, rate=200.0, seconds=20.0
         for k in range(5):
             w = 2.0 * np.pi * frequency * (k + 1)
             angle = w * t[:, None] + phase[k]
-            for order, shape in enumerate((np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle))):
+            for order, shape in enumerate(
+                (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle))
+            ):
                 motion[order] += size / (k + 1) * shape
         found = project(chain, chain.drives, *motion)
         forces = found.bodies @ chain.inertia.ravel()
@@ -78,7 +82,11 @@ def logged(folder, xml, size, frequency, noise, seed=0, rate=200.0, seconds=20.0
         forces += np.einsum("nkv,nv->nk", found.share, joint)
         angles = motion[0] + 1e-5 * rng.standard_normal(motion[0].shape)
         forces += noise * rng.standard_normal(forces.shape)
-        head = ["t [s]", *(f"q_{d} [deg]" for d in chain.drives), *(f"i_{d} [N m]" for d in chain.drives)]
+        head = [
+            "t [s]",
+            *(f"q_{d} [deg]" for d in chain.drives),
+            *(f"i_{d} [N m]" for d in chain.drives),
+        ]
         table = np.column_stack([t, np.degrees(angles), -forces])
         np.savetxt(folder / "logs" / f"{name}.csv", table, delimiter=",", header=",".join(head),
                    comments="", fmt="%.9g")  # fmt: skip
@@ -119,8 +127,8 @@ def test_a_single_run_is_split_and_columns_with_usual_names_need_no_mapping(tmp_
     (tmp_path / "robot.xml").write_text(FOUR_BAR)
     t = np.arange(0.0, 10.0, 0.01)
     table = np.column_stack([t, np.sin(t), np.cos(t)])
-    np.savetxt(tmp_path / "one.csv", table, delimiter=",", header="time [s],angle.crank,torque.crank",
-               comments="")  # fmt: skip
+    np.savetxt(tmp_path / "one.csv", table, delimiter=",", comments="",
+               header="time [s],angle.crank,torque.crank")  # fmt: skip
     mechanism = load_mechanism(tmp_path / "robot.xml")
     fit, heldout, notes = mechanism_records([tmp_path / "one.csv"], mechanism)
     assert len(fit[0].force) + len(heldout.force) == len(t) and "only run" in notes[-1]

@@ -34,6 +34,7 @@ def test_what_is_not_there_is_refused():
         (mechanism_setup(chain, alike=[("ring_1", "wing")]), "belong to wing"),
         (mechanism_setup(chain, absent=["mass.wing"]), "mass.wing is stated absent"),
     ):
-        found = project(chain, chain.drives, chain.start[[chain.index(d) for d in chain.drives]][None], still, still)  # fmt: skip
+        legs = chain.start[[chain.index(d) for d in chain.drives]][None]
+        found = project(chain, chain.drives, legs, still, still)
         with pytest.raises(InputError, match=message):
             setup.table(found)
