@@ -59,7 +59,7 @@ def _soak(name: str, action: str, sensors: str, steps: int, asked) -> list[str]:
         outside += int(not space.contains(seen))
     speed = steps * asked.batch * 1000.0 / core.setup.options.control_rate
     speed /= time.perf_counter() - begin
-    memory = core.memory
+    memory = core.episodes
     row = [name, action, sensors, f"{steps * asked.batch:,}", f"{memory['episode'].sum():,}"]
     row += [str(infinite), str(outside), str(memory["warnings"].sum())]
     row += [str(memory["faults"].sum()), f"{memory['saturated'].sum():,}", f"{speed:,.0f}"]

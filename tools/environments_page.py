@@ -6,7 +6,7 @@ python tools/environments_page.py --out docs/environments.md
 from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import set_up
 from hydrotele.envs.episode import ACTIONS
-from hydrotele.envs.facts import Setup
+from hydrotele.envs.facts import TaskSetup
 from hydrotele.envs.task import Options, Task
 from tools.study import options, publish
 
@@ -83,7 +83,7 @@ def _section(task: Task) -> str:
     return "\n".join(lines)
 
 
-def _actions(setup: Setup, kind: str) -> str:
+def _actions(setup: TaskSetup, kind: str) -> str:
     names = list(setup.axes)
     if kind == "resolved_motion":
         names[: setup.arm_axes] = ["r", "theta", "z", "attitude", "head"][: setup.arm_axes]

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import records
-from hydrotele.identify.setup import Setup, machine_setup
+from hydrotele.identify.setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
@@ -31,7 +31,7 @@ FIT, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"
 OFF = 0.15
 
 
-def wrong_setup(setup: Setup, rng: np.random.Generator) -> Setup:
+def wrong_setup(setup: RegressorSetup, rng: np.random.Generator) -> RegressorSetup:
     """The setup with other given numbers: bodies stretched and weighted anew, friction scaled."""
     inertia = setup.chain.inertia * rng.uniform(1 - OFF, 1 + OFF, (len(setup.chain.inertia), 1))
     inertia[:, 1:4] *= rng.uniform(1 - OFF, 1 + OFF, (len(inertia), 1))

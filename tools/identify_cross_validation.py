@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.identify.identification import identify_dynamics
-from hydrotele.identify.record import Record, records
+from hydrotele.identify.record import IdentificationRecord, records
 from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import load_dataset, make_dataset
@@ -37,7 +37,9 @@ THESIS = {  # Khoshzaban 1992, cross-validation of the CAT 215's models
 Errors = dict[str, tuple[float, float, float, float]]  # of a drive: complete, reduced, given, noise
 
 
-def judged(machine: Machine, fit: Sequence[Record], heldout: Record, rng) -> Errors:
+def judged(
+    machine: Machine, fit: Sequence[IdentificationRecord], heldout: IdentificationRecord, rng
+) -> Errors:
     """Errors of the three models on a run."""
     chain, found = closed_chain(machine), []
     state = rng.bit_generator.state

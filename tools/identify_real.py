@@ -15,9 +15,9 @@ import numpy as np
 
 from hydrotele.identify.identification import identify_with_shapes
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import Record, records
+from hydrotele.identify.record import IdentificationRecord, records
 from hydrotele.identify.result import Identification, parameter_rows
-from hydrotele.identify.setup import Setup, machine_setup
+from hydrotele.identify.setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine
@@ -53,7 +53,7 @@ def panda_chain() -> Chain:
     return load_chain(spec.compile())
 
 
-def panda_records(path: Path) -> list[Record]:
+def panda_records(path: Path) -> list[IdentificationRecord]:
     """The record on a uniform clock, whole, without its last quarter, and that quarter."""
     log = load_log(path, maximum_dropped=1.0)
     period = float(np.median(np.diff(log.time)))
@@ -66,7 +66,9 @@ def panda_records(path: Path) -> list[Record]:
     cut = round((1.0 - HELD_OUT) * len(time))
     unknown = np.full(7, np.nan)
     return [
-        Record(name, period, tuple(names), position[rows], unknown, torque[rows], unknown)
+        IdentificationRecord(
+            name, period, tuple(names), position[rows], unknown, torque[rows], unknown
+        )
         for name, rows in (
             ("whole", slice(None)), ("fit", slice(0, cut)), ("heldout", slice(cut, None))
         )
@@ -79,7 +81,7 @@ def panda(real: Path) -> None:
     chain = panda_chain()
     for friction in (False, True):
         kinds = {"coulomb": 0.0, "viscous": 0.0} if friction else {}
-        setup = Setup(
+        setup = RegressorSetup(
             chain, chain.joints, chain.bodies, tuple(FrictionTerm(j, kinds) for j in chain.joints),
             offsets={} if friction else None,
         )  # fmt: skip

@@ -18,7 +18,7 @@ from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import records
-from hydrotele.identify.setup import Setup, machine_setup
+from hydrotele.identify.setup import RegressorSetup, machine_setup
 from hydrotele.kinematics.arm import inverse
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.logs.dataset import make_dataset
@@ -60,7 +60,7 @@ def circle(machine: Machine, lap: float) -> np.ndarray:
     return np.stack([now, (after - before) / (2 * step), (after - 2 * now + before) / step**2])
 
 
-def forces(setup: Setup, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def forces(setup: RegressorSetup, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Regressor (n, k, m) along a motion and the given parameters (m,)."""
     found = project(setup.chain, setup.given, *motion)
     table = regressor(

@@ -18,7 +18,7 @@ from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.teleop.compliance import Flotor
 from hydrotele.teleop.flotor import FlotorFit, identify_flotor
 from hydrotele.teleop.levitation import (
-    Flight,
+    LevitationRun,
     designed_step,
     excitation_path,
     levitation,
@@ -43,14 +43,14 @@ QUIET = np.zeros((7, 3))
 MICRO = np.array([1e6] * 3 + [np.rad2deg(1.0) * 1e3] * 3)  # um and 0.001 deg
 
 
-def step(axis: int, joystick=JOYSTICK, **how) -> Flight:
+def step(axis: int, joystick=JOYSTICK, **how) -> LevitationRun:
     """0.6 s after a step of one axis."""
     target = np.zeros((121, 6))
     target[:, axis] = SIZES[axis]
     return simulate_levitation(joystick, target, **how)
 
 
-def step_figures(flight: Flight, axis: int) -> tuple[float, float, float]:
+def step_figures(flight: LevitationRun, axis: int) -> tuple[float, float, float]:
     """Deviation from the designed response, largest cross motion (shares), largest current [A]."""
     alone, share = JOYSTICK.alone, flight.pose / SIZES
     designed = designed_step(flight.time, alone.frequency[axis], alone.ratio[axis])
@@ -117,7 +117,7 @@ def crooked():
     return JOYSTICK.model_copy(update={"flotor": JOYSTICK.flotor.model_copy(update={"com": COM})})
 
 
-def identified(seed: int, diodes: bool = False) -> tuple[FlotorFit, Flight]:
+def identified(seed: int, diodes: bool = False) -> tuple[FlotorFit, LevitationRun]:
     """12 s of wobbling under a control that takes the flotor for another one."""
     joystick = crooked()
     control = levitation(joystick, GUESS)

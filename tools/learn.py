@@ -24,7 +24,7 @@ from hydrotele.envs.controllers.track import TrackByValves
 from hydrotele.envs.core import TaskCore, set_up
 from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.evaluation import Scores, compare, evaluate
-from hydrotele.envs.facts import Setup
+from hydrotele.envs.facts import TaskSetup
 from hydrotele.envs.task import Options
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
@@ -66,7 +66,7 @@ class Recipe:
     """
 
     options: dict[str, Any]
-    law: Callable[[Setup, Gains], Controller]
+    law: Callable[[TaskSetup, Gains], Controller]
     gains: Gains
     figure: str
     most: Gains = dataclasses.field(default_factory=dict)
@@ -79,7 +79,7 @@ class Recipe:
     spread: float = -1.5
 
 
-def track_law(setup: Setup, gains: Gains) -> Controller:
+def track_law(setup: TaskSetup, gains: Gains) -> Controller:
     servo = Servo(
         position_gain=gains["position"], axis_gains={"swing": gains["swing"]},
         pressure_feedback=gains["pressure"], load_time=gains["load_time"],
@@ -161,7 +161,7 @@ def choices(name: str, variants: int) -> dict[str, Any]:
     return {**recipe.options, "randomise": spread, "variants": variants}
 
 
-def make_view(name: str, setup: Setup) -> AgentView:
+def make_view(name: str, setup: TaskSetup) -> AgentView:
     recipe = RECIPES[name]
     law = recipe.law(setup, recipe.gains) if recipe.corrects else None
     return AgentView(setup, recipe.history, law, recipe.share)

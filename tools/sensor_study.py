@@ -19,8 +19,8 @@ from hydrotele.identify.equations import build_equations, stacked
 from hydrotele.identify.estimation import estimate
 from hydrotele.identify.identifiability import identifiability, reference_sizes
 from hydrotele.identify.motion import Processing, resolution
-from hydrotele.identify.record import Record, records
-from hydrotele.identify.setup import Setup, machine_setup
+from hydrotele.identify.record import IdentificationRecord, records
+from hydrotele.identify.setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine import Machine
@@ -40,7 +40,7 @@ ANGLE = 0.1  # deg
 MEASURED, TRUE = "angles +-0.1 deg, differentiated", "true motion"
 
 
-def noisy_force(record: Record, machine: Machine, level: float, rng) -> np.ndarray:
+def noisy_force(record: IdentificationRecord, machine: Machine, level: float, rng) -> np.ndarray:
     """Forces (n, k) of a record of true values with uniform errors of the pressures [Pa]."""
     rows, force = len(record.force), record.force.copy()
     for k, axis in enumerate(record.axes):
@@ -50,7 +50,7 @@ def noisy_force(record: Record, machine: Machine, level: float, rng) -> np.ndarr
     return force
 
 
-def measured_motion(setup: Setup, records_of: list[Record], rng):
+def measured_motion(setup: RegressorSetup, records_of: list[IdentificationRecord], rng):
     """Low-passed regressor and forces of angles with uniform errors; parameters."""
     made = []
     for record in records_of:
@@ -64,7 +64,7 @@ def measured_motion(setup: Setup, records_of: list[Record], rng):
     return stacked(runs, lambda e: e.matrix), stacked(runs, lambda e: e.force), made[0][1]
 
 
-def true_motion(setup: Setup, runs: list[Run], forces: list[np.ndarray]):
+def true_motion(setup: RegressorSetup, runs: list[Run], forces: list[np.ndarray]):
     """Regressor of the simulator's own motion, and the forces; parameters."""
     tables = []
     for run in runs:

@@ -44,7 +44,7 @@ from hydrotele.simulate.plant import build_plant
 
 
 @dataclass(frozen=True)
-class Mechanism:
+class MechanismResult:
     """What was found of bodies, friction and offsets.
 
     Attributes:
@@ -151,7 +151,7 @@ def identify_mjcf_to_folder(
     Raises:
         InputError: data, mechanism, mapping or target are not usable.
     """
-    from hydrotele.show.identify_report import Learned, write_identify_report
+    from hydrotele.show.identify_report import LearnedFrom, write_identify_report
 
     target = target or Path(f"identify_{data_name(data)}")
     check_target(target, "identify")
@@ -168,7 +168,7 @@ def identify_mjcf_to_folder(
         document = plain(identify_document(found))
         text = json.dumps(document, indent=2, allow_nan=False)
         (folder / "identify.json").write_text(text + "\n", encoding="utf-8")
-        learned = Learned(name, None, tuple(run.name for run in fit), judge.name)
+        learned = LearnedFrom(name, None, tuple(run.name for run in fit), judge.name)
         write_identify_report(learned, found, None, None, folder / "report.html")
         summary = {
             "kind": "identify", "mjcf": str(mjcf), "columns": str(columns) if columns else None,
@@ -184,7 +184,7 @@ def identify_mjcf_to_folder(
     return target
 
 
-def identify_mechanism(dataset: Dataset, choices: Choices) -> Mechanism:
+def identify_mechanism(dataset: Dataset, choices: Choices) -> MechanismResult:
     """Identify bodies, friction and offsets.
 
     Args:
@@ -202,7 +202,7 @@ def identify_mechanism(dataset: Dataset, choices: Choices) -> Mechanism:
     except InputError as error:
         if not choices.hydraulics:
             raise
-        return Mechanism(None, None, dataset.machine, str(error))
+        return MechanismResult(None, None, dataset.machine, str(error))
     setup = machine_setup(
         dataset.machine, closed_chain(dataset.machine), choices.model, pins=choices.pins,
         asymmetry=choices.asymmetry,
@@ -211,11 +211,11 @@ def identify_mechanism(dataset: Dataset, choices: Choices) -> Mechanism:
         fit, heldout, setup, choices.processing, choices.estimator, notes=(*dataset.notes, *said)
     )  # fmt: skip
     patched, best = identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
-    return Mechanism(found, best, patched)
+    return MechanismResult(found, best, patched)
 
 
 def _write(
-    folder: Path, dataset: Dataset, mechanism: Mechanism, hydraulics: Hydraulics | None,
+    folder: Path, dataset: Dataset, mechanism: MechanismResult, hydraulics: Hydraulics | None,
     data: Sequence[Path], choices: Choices,
 ) -> None:  # fmt: skip
     found, patched = mechanism.found, hydraulics.machine if hydraulics else mechanism.machine
@@ -226,10 +226,10 @@ def _write(
     made.mkdir()
     save_machine(patched, made / MACHINE_FILE)
     build_plant(patched).document.save(made / "machine.xml")
-    from hydrotele.show.identify_report import Learned, write_identify_report
+    from hydrotele.show.identify_report import LearnedFrom, write_identify_report
 
     notes.print("writing report.html ...", style="dim")
-    learned = Learned(
+    learned = LearnedFrom(
         dataset.machine.name, dataset.machine.tool, tuple(run.name for run in dataset.fit),
         dataset.heldout.name, tuple(dataset.notes),
     )  # fmt: skip
@@ -247,7 +247,7 @@ def _write(
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
-def _print(mechanism: Mechanism, hydraulics: Hydraulics | None, dataset: Dataset) -> None:
+def _print(mechanism: MechanismResult, hydraulics: Hydraulics | None, dataset: Dataset) -> None:
     if mechanism.found:
         _print_mechanism(mechanism.found, dataset.heldout.name)
     else:

@@ -9,7 +9,7 @@ import typer
 
 from hydrotele.cli.console import notes, out, print_json, table
 from hydrotele.cli.running import write_run
-from hydrotele.run.sweep import How, Progress, Swept, run_sweep
+from hydrotele.run.sweep import Progress, SweepResult, SweepSettings, run_sweep
 from hydrotele.run.sweep_facts import SweepFile, load_sweep
 from hydrotele.run.sweep_runs import JOURNAL, Entry, finished
 from hydrotele.run.sweep_table import default_figures, spread_statistics
@@ -44,7 +44,7 @@ def sweep_to_folder(name: str, target: Path | None, wishes: SweepOptions) -> Non
     """
     file = load_sweep(name)
     target = target or Path("runs", file.name)
-    how = How(wishes.jobs, wishes.dask, wishes.fresh, wishes.retry_failed, write_run)
+    how = SweepSettings(wishes.jobs, wishes.dask, wishes.fresh, wishes.retry_failed, write_run)
     try:
         with _bar(file.name, wishes.json) as progress:
             swept = run_sweep(file, target, how, progress)
@@ -65,7 +65,7 @@ def sweep_to_folder(name: str, target: Path | None, wishes: SweepOptions) -> Non
         raise typer.Exit(_ALL_FAILED)
 
 
-def _study(file: SweepFile, swept: Swept, figures: list[str]) -> Study:
+def _study(file: SweepFile, swept: SweepResult, figures: list[str]) -> Study:
     """What the report shows."""
     sampled = tuple(file.sweep.sample.keys) if file.sweep.sample else ()
     logarithmic = [k for k in sampled if file.sweep.sample.keys[k].log_uniform]  # pyright: ignore - it has one
@@ -76,7 +76,9 @@ def _study(file: SweepFile, swept: Swept, figures: list[str]) -> Study:
     )  # fmt: skip
 
 
-def _say(file: SweepFile, target: Path, swept: Swept, figures: list[str], as_json: bool) -> None:
+def _say(
+    file: SweepFile, target: Path, swept: SweepResult, figures: list[str], as_json: bool
+) -> None:
     found = spread_statistics(swept.table, figures)
     if as_json:
         print_json({
@@ -110,7 +112,7 @@ def _say(file: SweepFile, target: Path, swept: Swept, figures: list[str], as_jso
     out.print(f"written to [bold]{target}[/]; open {target}/report.html", soft_wrap=True)
 
 
-def _values(swept: Swept, entry: Entry) -> dict[str, Any]:
+def _values(swept: SweepResult, entry: Entry) -> dict[str, Any]:
     columns = swept.table.columns
     return {key: columns[key][entry.run - 1] for key in (*swept.table.varied, "seed")}
 

@@ -230,10 +230,10 @@ def identify_gravity(machine: Machine, log: Log, friction: bool = True) -> Gravi
 
 
 WAITING, GOOD, BAD, SINGULAR = range(4)
-_JOINT, _HEAD, _ROD = range(3)  # rows of `Readings.last`
+_JOINT, _HEAD, _ROD = range(3)  # rows of `DriveReadings.last`
 
 
-class Readings(NamedTuple):
+class DriveReadings(NamedTuple):
     """What is kept of the readings; n independent coordinates, h valves, k axes.
 
     Attributes:
@@ -265,7 +265,7 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
 
     Args:
         arm: Arm.
-        readings: Readings.
+        readings: DriveReadings.
         dynamic: whether the complete model is used, or gravity alone; scalar.
         count: number of readings before; scalar. The first ones are averaged, as of a machine at
             rest.
@@ -476,13 +476,13 @@ def _readings(
     bandwidth: float,
     fast: float,
     where: str,
-) -> Readings:
+) -> DriveReadings:
     """Where the readings are and what they go through."""
     free, valves = free_axes(machine, where), actuator_order(machine)[: len(machine.hydraulic_axes)]
     if missing := [name for name in free if name not in axes]:
         raise InputError(where, f"readings of {', '.join(missing)} are missing")
     n, h, k = len(free), len(valves), len(axes)
-    return Readings(
+    return DriveReadings(
         period=period,
         settle=max(1, round(_SETTLE / (fast * period))),
         tables=np.array([filter_table(fast, period), filter_table(bandwidth, period)]),

@@ -33,7 +33,7 @@ def follow_pose(g, ranges, wanted, rate, blocked, pose, q, speed):
     """Move joint references to a pose, or hold them where it cannot be reached.
 
     Args:
-        g: (9,) of `kinematics.task.task_numbers`.
+        g: (9,) of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         wanted: (5,) pose asked for: r [m], theta [rad], z [m], attitude [rad], head [rad].
         rate: (5,) its rate [m/s], [rad/s].
@@ -75,7 +75,7 @@ class ResolvedMotion:
     """State of the resolved-motion controller.
 
     Attributes:
-        numbers: (9,) the arm, of `kinematics.task.task_numbers`.
+        numbers: (9,) the arm, of `kinematics.task.arm_parameters`.
         axes: k axis names from swing outwards, 3 to 5.
         ranges: (k, 2) joint ranges [rad], same order.
         joints: (k,) joint references [rad], same order.

@@ -185,14 +185,14 @@ class Measured(NamedTuple):
         rate: (k,) joint velocities [rad/s] or [m/s].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
-        supply: supply pressure [Pa].
+        supply: supply pressure [Pa], one number per row where there are many.
     """
 
     joint: np.ndarray
     rate: np.ndarray
     head: np.ndarray
     rod: np.ndarray
-    supply: float
+    supply: float | np.ndarray
 
 
 class ComputedForce(NamedTuple):
@@ -224,11 +224,11 @@ class ForceReferences(NamedTuple):
 
 
 @compiled
-def servo_step(numbers, closed, drive, reference, measured, load, computed, out):
+def servo_step(parameters, closed, drive, reference, measured, load, computed, out):
     """Commands of all axes for one control period.
 
     Args:
-        numbers: (k, 14) of `servo_parameters`.
+        parameters: (k, 14) of `servo_parameters`.
         closed: (k,) whether the axis is under feedback; the others keep `out`.
         drive: DriveReference.
         reference: (k,) joint reference when the joint was measured [rad] or [m].
@@ -244,33 +244,35 @@ def servo_step(numbers, closed, drive, reference, measured, load, computed, out)
     """
     velocity, arm, volume_head, volume_rod = drive
     joint, rate, head, rod, supply = measured
-    for i in range(numbers.shape[0]):
+    for i in range(parameters.shape[0]):
         error = reference[i] - joint[i]
-        gain, rate_gain = numbers[i, 8], numbers[i, 9]
-        if numbers[i, 0] == _FORCE:
+        gain, rate_gain = parameters[i, 8], parameters[i, 9]
+        if parameters[i, 0] == _FORCE:
             if closed[i]:
                 force = rate_gain * (gain * error + velocity[i] - rate[i])
                 if computed.known:
                     force += computed.force[i]
-                limit = numbers[i, 6]
-                out[i] = min(limit, max(-limit, force / numbers[i, 7]))
+                limit = parameters[i, 6]
+                out[i] = min(limit, max(-limit, force / parameters[i, 7]))
             continue
-        area_head, area_rod = numbers[i, 1], numbers[i, 2]
+        area_head, area_rod = parameters[i, 1], parameters[i, 2]
         force = area_head * head[i] - area_rod * rod[i]
         model = computed.force[i] if computed.known else 0.0
-        load[i] += numbers[i, 11] * (force - model - load[i])
+        load[i] += parameters[i, 11] * (force - model - load[i])
         if not closed[i]:
             continue
-        stiffness = numbers[i, 12] * (area_head**2 / volume_head[i] + area_rod**2 / volume_rod[i])
+        stiffness = parameters[i, 12] * (
+            area_head**2 / volume_head[i] + area_rod**2 / volume_rod[i]
+        )
         wanted = velocity[i] + gain * arm[i] * error
-        wanted -= numbers[i, 13] * (force - model - load[i]) / stiffness
+        wanted -= parameters[i, 13] * (force - model - load[i]) / stiffness
         if computed.known:
             wanted += computed.rate[i] / stiffness
         opening = feedforward_opening(
-            wanted, head[i], rod[i], supply, numbers[i, 5], area_head, area_rod, volume_head[i],
-            volume_rod[i], numbers[i, 3],
+            wanted, head[i], rod[i], supply, parameters[i, 5], area_head, area_rod, volume_head[i],
+            volume_rod[i], parameters[i, 3],
         )  # fmt: skip
-        deadband = numbers[i, 4] * numbers[i, 10]
+        deadband = parameters[i, 4] * parameters[i, 10]
         command = opening * (1.0 - deadband) + deadband * math.tanh(opening / _CENTRE)
         out[i] = min(1.0, max(-1.0, command))
 

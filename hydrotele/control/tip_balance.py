@@ -17,36 +17,36 @@ from hydrotele.hydraulics.circuit import actuator_friction
 from hydrotele.hydraulics.parameters import SLOTS, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.machine import Machine
-from hydrotele.multibody.reduced_mechanism import DAMPING, HOME, Mechanism, coordinate_names
-from hydrotele.multibody.reduced_motion import BIAS, DRIFT, RATE, Motion, gather_forces
+from hydrotele.multibody.reduced_mechanism import DAMPING, HOME, ReducedMechanism, coordinate_names
+from hydrotele.multibody.reduced_motion import BIAS, DRIFT, RATE, ReducedMotion, gather_forces
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _ODDS = 8.0
 _SINGULAR = 1.0e-6  # pivot against the largest entry
 
 
-class Body(NamedTuple):
+class BalanceModel(NamedTuple):
     """What is needed of `estimate.reduced_model.Model`, whose attributes these are.
 
     Every array that Python hands over costs a tenth of a microsecond.
     """
 
-    mech: Mechanism
+    mech: ReducedMechanism
     user: np.ndarray
     hydraulic: int
     gear: np.ndarray
     transmission: np.ndarray
 
 
-class Work(NamedTuple):
+class BalanceSpace(NamedTuple):
     """What is needed of `estimate.reduced_model.Space`, whose attributes these are."""
 
-    motion: Motion
+    motion: ReducedMotion
     drive: np.ndarray
     row: np.ndarray
 
 
-class Arm(NamedTuple):
+class ArmBalance(NamedTuple):
     """An arm in its machine, without transmissions: m joints, n independent coordinates.
 
     Attributes:
@@ -55,7 +55,7 @@ class Arm(NamedTuple):
         z: (2 n + 4 h,) state of the model: positions, rates, and four numbers per valve, of which
             the last two are its pressures [Pa].
         joint: (m,) independent coordinate of every joint, swing first.
-        task: (9,) of `kinematics.task.task_numbers`.
+        task: (9,) of `kinematics.task.arm_parameters`.
         gravity: (p,) parameters of the static model [N m].
         acceleration: (n,) of the independent coordinates.
         rate_noise: (n,) standard deviation of the independent coordinates' rates.
@@ -64,8 +64,8 @@ class Arm(NamedTuple):
         work: (n,) work space.
     """
 
-    model: Body
-    space: Work
+    model: BalanceModel
+    space: BalanceSpace
     z: np.ndarray
     joint: np.ndarray
     task: np.ndarray
@@ -84,7 +84,7 @@ def dynamic_balance(arm, outside):
     `tau = B' (M (B q'' + d) + h + D q') - sum r_i (F_i - f_i(v_i))`
 
     Args:
-        arm: Arm; z and acceleration are read.
+        arm: ArmBalance; z and acceleration are read.
         outside: (n,) written: forces on the independent coordinates [N m] or [N].
 
     Returns:
@@ -117,7 +117,7 @@ def static_balance(arm, outside):
     `tau = Y(q) P - sum r_i F_i`
 
     Args:
-        arm: Arm; z and gravity are read.
+        arm: ArmBalance; z and gravity are read.
         outside: (n,) written: forces on the independent coordinates [N m]; those of joints that
             are not the arm's without gravity.
 
@@ -214,7 +214,7 @@ def tip_force(arm, outside, out):
     """Force at the tip that gives the forces outside.
 
     Args:
-        arm: Arm; z is read, table and work are destroyed.
+        arm: ArmBalance; z is read, table and work are destroyed.
         outside: (n,) forces on the independent coordinates from outside [N m] or [N].
         out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m]; left alone
             where the Jacobian is singular.
@@ -306,7 +306,7 @@ def free_axes(machine: Machine, where: str) -> tuple[str, ...]:
     return tuple(driver[joint] for joint in free)
 
 
-def arm_tables(machine: Machine, where: str) -> Arm:
+def arm_tables(machine: Machine, where: str) -> ArmBalance:
     """Tables of an arm, whose transmissions are taken as rigid and without inertia.
 
     Args:
@@ -325,9 +325,9 @@ def arm_tables(machine: Machine, where: str) -> Arm:
     space, z, (task, axes, _) = model_space(model), np.zeros(state_size(model)), arm_facts(machine)
     n, m = len(free), len(axes)
     z[:n] = model.mech.joint[HOME][model.mech.free]
-    return Arm(
-        model=Body(model.mech, model.user, model.hydraulic, model.gear, model.transmission),
-        space=Work(space.motion, space.drive, space.row),
+    return ArmBalance(
+        model=BalanceModel(model.mech, model.user, model.hydraulic, model.gear, model.transmission),
+        space=BalanceSpace(space.motion, space.drive, space.row),
         z=z,
         joint=np.array([free.index(name) for name in axes]),
         task=task,

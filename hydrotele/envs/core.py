@@ -12,8 +12,17 @@ import numpy as np
 from hydrotele.control.resolved_motion import arm_axes
 from hydrotele.control.servo import drive_tables
 from hydrotele.core.errors import InputError
-from hydrotele.envs.episode import AXES, CHANNELS, MEASURES, MEMORY, NEXT_STEP, RESET, STEP, streams
-from hydrotele.envs.facts import Setup, make_facts, timing
+from hydrotele.envs.episode import (
+    AXES,
+    CHANNELS,
+    EPISODE_STATE,
+    MEASURES,
+    NEXT_STEP,
+    RESET,
+    STEP,
+    seed_streams,
+)
+from hydrotele.envs.facts import TaskSetup, make_facts, timing
 from hydrotele.envs.loop import advance
 from hydrotele.envs.observation import machine_fields
 from hydrotele.envs.task import Options, Task
@@ -24,7 +33,7 @@ from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.stepping import line_length, past_length
 
 
-def set_up(task: Task, options: Options) -> Setup:
+def set_up(task: Task, options: Options) -> TaskSetup:
     """A task with the user's choices: its machines, observation and clocks.
 
     Args:
@@ -49,7 +58,7 @@ def set_up(task: Task, options: Options) -> Setup:
     variants = make_variants(task, options, machine)
     fields = [*machine_fields(machine, axes, len(arm)), *task.fields(machine, axes)]
     table = drive_tables(machine, variants.plant.axes)[1]
-    return Setup(task, options, clock, machine, axes, len(arm), variants, fields, table)
+    return TaskSetup(task, options, clock, machine, axes, len(arm), variants, fields, table)
 
 
 class TaskCore:
@@ -59,7 +68,7 @@ class TaskCore:
         setup: the task as it was chosen.
         count: n.
         simulations: their states, live.
-        memory: (n,) records of MEMORY, live.
+        episodes: (n,) records of EPISODE_STATE, live.
         observation: (n, o) float32, live.
         final: (n, o) float32 observations before an autoreset in the same step.
         reward: (n,) live.
@@ -97,7 +106,7 @@ class TaskCore:
 
     def _make_arrays(self) -> None:
         n, o, v = self.count, len(self.setup.fields), self.setup.variants
-        self.memory = np.zeros(n, MEMORY)
+        self.episodes = np.zeros(n, EPISODE_STATE)
         self.action = np.zeros((n, len(self.setup.axes)), np.float32)
         self.observation, self.final = (np.zeros((n, o), np.float32) for _ in range(2))
         self.low = np.array([field.low for field in self.setup.fields], np.float32)
@@ -126,7 +135,7 @@ class TaskCore:
         self._places = np.array(rows, np.int64).reshape(-1, 3)
         f["fields"] = len(rows)
         for name, array in (
-            ("memory", self.memory), ("action", self.action), ("observation", self.observation),
+            ("episodes", self.episodes), ("action", self.action), ("observation", self.observation),
             ("final", self.final), ("low", self.low), ("high", self.high),
             ("reward", self.reward), ("terminated", self.terminated),
             ("truncated", self.truncated), ("measures", self.measures),
@@ -153,7 +162,7 @@ class TaskCore:
     def bytes_per_environment(self) -> int:
         """Memory that one more environment takes: its state, its records, its results [byte]."""
         arrays = (
-            self.memory, self.action, self.observation, self.final, self.reward, self.terminated,
+            self.episodes, self.action, self.observation, self.final, self.reward, self.terminated,
             self.truncated, self.measures, self.final_measures, self.terrain, self._commands,
             self._sensed, self._before, self.simulations.state, *self._expanded.values(),
         )  # fmt: skip
@@ -177,7 +186,7 @@ class TaskCore:
         if not begun.all():
             raise RuntimeError("the first reset must begin all episodes: give it no mask")
         if seeds is not None:
-            self.memory["random"][place] = streams(seeds)
+            self.episodes["random"][place] = seed_streams(seeds)
         elif not self._begun.all():
             raise RuntimeError("the first reset needs seeds")
         self._begun = begun

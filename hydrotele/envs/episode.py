@@ -12,7 +12,7 @@ AXES = 8  # axes of a machine at most
 ARM = 5  # of them those of the arm
 CHANNELS = 3 * AXES + 1  # sensors: positions, then head and rod of every valve, then the supply
 GOAL = 96  # numbers that a task keeps of its goal and its course
-NUMBERS = 64  # numbers of a task
+PARAMETERS = 64  # parameters of a task at most
 MEASURES = 8  # figures of a step that a task tells in `info`
 
 VALVE, JOINT_RATE, RESOLVED_MOTION = range(3)  # Facts.mode: what actions are
@@ -22,7 +22,7 @@ STEP, RESET = range(2)  # Facts.call: what the native function is called for
 
 _F, _I, _U = np.float64, np.int64, np.uint64
 
-MEMORY = np.dtype(
+EPISODE_STATE = np.dtype(
     [
         ("random", _U),  # state of the episode's own random numbers
         ("variant", _I),  # machine and start that this episode has
@@ -59,7 +59,7 @@ MEMORY = np.dtype(
 )
 """State of one episode."""
 
-FACTS = np.dtype(
+TASK_PARAMETERS = np.dtype(
     [
         ("call", _I),
         ("count", _I),
@@ -97,14 +97,14 @@ FACTS = np.dtype(
         ("fastest_pose", _F, ARM),  # the same of the pose [m/s], [rad/s]
         ("accelerations", _F, ARM),  # of the pose [m/s^2], [rad/s^2]
         ("limit", _F, AXES),  # commands at full action [1], or in the drive's unit
-        ("arm", _F, 9),  # of kinematics.task.task_numbers
+        ("arm", _F, 9),  # of kinematics.task.arm_parameters
         ("ranges", _F, (AXES, 2)),  # of the axes [rad], [m]
         ("servo", _F, (AXES, 14)),  # of control.servo.servo_parameters
         ("feedforward", _F),
         ("grid", _F, (AXES, 2)),  # of control.servo.drive_tables
         ("accuracy", _F, CHANNELS),
         ("converters", _F, (3, CHANNELS)),
-        ("numbers", _F, NUMBERS),  # of the task
+        ("parameters", _F, PARAMETERS),  # of the task
         ("delayed_command", _I),  # control ticks in the ring of commands, 0 without delays
         ("delayed_sensor", _I),  # physics steps in the ring of sensed values, 0 where none is late
         ("variants", _I),
@@ -112,7 +112,7 @@ FACTS = np.dtype(
         ("fields", _I),  # number of fields of the model that differ between variants
         ("width", _I),  # of the terrain of an episode, 0 without
         # addresses
-        ("memory", _I),
+        ("episodes", _I),
         ("action", _I),  # (n, actions) float32
         ("observation", _I),  # (n, observations) float32
         ("final", _I),  # (n, observations) float32, before an autoreset in the same step
@@ -170,7 +170,7 @@ _UNIT = 2.0**-53
 
 
 @compiled
-def mixed(z):
+def mix64(z):
     """A 64-bit integer, scalar, of which every bit depends on every bit of `z`, scalar."""
     z = (z ^ (z >> _30)) * _FIRST
     z = (z ^ (z >> _27)) * _SECOND
@@ -178,11 +178,11 @@ def mixed(z):
 
 
 @compiled
-def draw(e):
+def uniform(e):
     """A number of an episode, uniform in [0, 1), scalar; its `random` goes on.
 
     Args:
-        e: its record of MEMORY.
+        e: its record of EPISODE_STATE.
 
     Returns:
         The number, scalar [1].
@@ -190,15 +190,15 @@ def draw(e):
     Source: see the module.
     """
     e.random += _STEP
-    return (mixed(e.random) >> _11) * _UNIT
+    return (mix64(e.random) >> _11) * _UNIT
 
 
 @compiled
-def between(e, low, high):
+def uniform_between(e, low, high):
     """A number of an episode, uniform from `low` to `high`, scalars.
 
     Args:
-        e: its record of MEMORY.
+        e: its record of EPISODE_STATE.
         low: scalar.
         high: scalar.
 
@@ -207,17 +207,17 @@ def between(e, low, high):
 
     Source: see the module.
     """
-    return low + (high - low) * draw(e)
+    return low + (high - low) * uniform(e)
 
 
-def streams(seeds: np.ndarray) -> np.ndarray:
+def seed_streams(seeds: np.ndarray) -> np.ndarray:
     """Where the streams of seeds begin.
 
     Args:
         seeds: (n,) integers >= 0.
 
     Returns:
-        (n,) values of `random` in MEMORY; seeds that follow each other give unrelated streams.
+        (n,) values of `random`; seeds that follow each other give unrelated streams.
 
     Raises:
         ValueError: a seed is no integer from 0 to 2^64 - 1.
@@ -226,4 +226,4 @@ def streams(seeds: np.ndarray) -> np.ndarray:
     if seeds.dtype.kind not in "iu" or (seeds < 0).any():
         raise ValueError("a seed must be an integer from 0 to 2^64 - 1")
     with np.errstate(over="ignore"):
-        return mixed.py_func(np.asarray(seeds, np.uint64) * _STEP + _SECOND)
+        return mix64.py_func(np.asarray(seeds, np.uint64) * _STEP + _SECOND)

@@ -85,12 +85,12 @@ def _batch(core: TaskCore, controller: Controller) -> dict[str, np.ndarray]:
         total += np.where(alive, core.reward, 0.0)
         seen = np.where(alive[:, None], core.measures[:, : len(names)], 0.0)
         sums, squares, steps = sums + seen, squares + seen**2, steps + alive
-        alive = core.memory["over"] == 0
+        alive = core.episodes["over"] == 0
     clock = core.setup.clock
     figures = {
         "return": total,
         "length": steps * clock.ticks * clock.period,
-        "fault": (core.memory["fault"] != 0).astype(float),
+        "fault": (core.episodes["fault"] != 0).astype(float),
     }
     for i, name in enumerate(names):
         last = core.measures[:, i].copy()

@@ -8,7 +8,7 @@ from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.control.servo import drive_tables, servo_parameters
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
-from hydrotele.envs.episode import ACTIONS, FACTS, VALVE
+from hydrotele.envs.episode import ACTIONS, TASK_PARAMETERS, VALVE
 from hydrotele.envs.kinds import KINDS
 from hydrotele.envs.observation import Field
 from hydrotele.envs.task import REAL, Options, Task
@@ -37,7 +37,7 @@ class Timing(NamedTuple):
     horizon: int
 
 
-class Setup(NamedTuple):
+class TaskSetup(NamedTuple):
     """A task as it was chosen.
 
     Attributes:
@@ -49,7 +49,7 @@ class Setup(NamedTuple):
         arm_axes: how many of them, the first ones, are the arm's.
         variants: machines and starts that episodes have.
         fields: of the observation.
-        table: (k, POINTS, 3) of `control.drive_rows.drive_tables`.
+        table: (k, POINTS, 3) of `control.servo.drive_tables`.
     """
 
     task: Task
@@ -84,8 +84,8 @@ def timing(options: Options) -> Timing:
     return Timing(ticks, round(substeps), round(substeps) * step, horizon)
 
 
-def make_facts(setup: Setup, count: int, autoreset: int) -> np.ndarray:
-    """The record of FACTS of a task; addresses of arrays are left to whoever owns them.
+def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
+    """The record of TASK_PARAMETERS of a task; addresses of arrays are left to whoever owns them.
 
     Args:
         setup: the task as it was chosen.
@@ -99,7 +99,7 @@ def make_facts(setup: Setup, count: int, autoreset: int) -> np.ndarray:
         InputError: the action kind or the sensors are not known.
         RuntimeError: MuJoCo's structs are not laid out as expected.
     """
-    facts = np.zeros((), FACTS)
+    facts = np.zeros((), TASK_PARAMETERS)
     task, options, plant = setup.task, setup.options, setup.variants.plant
     if options.action not in ACTIONS:
         raise InputError(f"action {options.action!r}", suggest(options.action, ACTIONS))
@@ -125,9 +125,9 @@ def make_facts(setup: Setup, count: int, autoreset: int) -> np.ndarray:
     facts["neq"], facts["eq_width"] = model.eq_data.shape
     facts["variants"], facts["states"] = setup.variants.states.shape
     facts["width"] = task.terrain
-    if task.numbers:
-        numbers = task.numbers(setup.machine, model)
-        facts["numbers"][: len(numbers)] = numbers
+    if task.parameters:
+        numbers = task.parameters(setup.machine, model)
+        facts["parameters"][: len(numbers)] = numbers
     _write_machine(facts, setup, columns)
     _write_sensors(facts, setup)
     _write_layout(facts)
@@ -153,7 +153,7 @@ def full_rate(machine: Machine, axis: str) -> float:
     return _SHARE * flow / facts.hydraulic_drive.areas[0] / float(arm)
 
 
-def _write_machine(facts: np.ndarray, setup: Setup, columns: list[int]) -> None:
+def _write_machine(facts: np.ndarray, setup: TaskSetup, columns: list[int]) -> None:
     plant, machine = setup.variants.plant, setup.machine
     k, servo = len(plant.axes), setup.task.servo
     facts["limit"][:k] = [
@@ -172,7 +172,7 @@ def _write_machine(facts: np.ndarray, setup: Setup, columns: list[int]) -> None:
     facts["table"] = setup.table.ctypes.data
 
 
-def _write_sensors(facts: np.ndarray, setup: Setup) -> None:
+def _write_sensors(facts: np.ndarray, setup: TaskSetup) -> None:
     plant, machine, clock = setup.variants.plant, setup.machine, setup.clock
     sensors: SensorSet | None
     if setup.options.sensors == REAL:

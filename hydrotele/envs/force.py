@@ -12,14 +12,14 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.episode import between
+from hydrotele.envs.episode import uniform_between
 from hydrotele.envs.observation import Field
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Task
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
-from hydrotele.scenario.surroundings import Plate, Thing
+from hydrotele.scenario.surroundings import Plate, SurroundingObject
 from hydrotele.simulate.layout import field
 
 WEAKEST, STRONGEST = 1.0e4, 3.5e4  # N, forces that are wanted
@@ -31,7 +31,7 @@ _EARLY, _LATE = 0.4, 0.6  # shares of the duration between which it changes
 _TOUCH = 200.0  # N, from which on the plate counts as touched
 _RANGE = 2.0e5  # N, of the load cell
 _FIRST, _SECOND, _TIME, _FORCE, FORCE_READ, _PEAK = range(6)  # places in the goal
-PLATE_QPOS, PLATE_DOF, PLATE_JOINT, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y = range(7)  # in the numbers
+PLATE_QPOS, PLATE_DOF, PLATE_JOINT, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y = range(7)  # in `parameters`
 
 
 def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
@@ -48,7 +48,7 @@ def plate_force(f, w):
     """Force that the plate's spring and damper carry, positive when it is pressed down.
 
     Args:
-        f: record of FACTS.
+        f: record of TASK_PARAMETERS.
         w: World.
 
     Returns:
@@ -56,11 +56,11 @@ def plate_force(f, w):
 
     Source: `simulate.surroundings`; positions are a step ahead, see `simulate.record`.
     """
-    dof, joint = int(f.numbers[PLATE_DOF]), int(f.numbers[PLATE_JOINT])
+    dof, joint = int(f.parameters[PLATE_DOF]), int(f.parameters[PLATE_JOINT])
     stiffness = field(w.model, f.at_stiffness, joint + 1)[joint]
     damping = field(w.model, f.at_damping, dof + 1)[dof]
     speed = w.qvel[dof]
-    place = w.qpos[int(f.numbers[PLATE_QPOS])] - f.timestep * speed
+    place = w.qpos[int(f.parameters[PLATE_QPOS])] - f.timestep * speed
     return -(stiffness * place + damping * speed)
 
 
@@ -69,8 +69,8 @@ def begin_force(f, e, w):
     """Draw the forces wanted and when they change.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `goal` is written.
         w: World.
 
     Returns:
@@ -79,13 +79,13 @@ def begin_force(f, e, w):
     Source: this module.
     """
     g = e.goal
-    g[_FIRST] = between(e, WEAKEST, STRONGEST)
+    g[_FIRST] = uniform_between(e, WEAKEST, STRONGEST)
     # uniform over what is at least one smallest change away from the first
     below = max(0.0, g[_FIRST] - _CHANGE - WEAKEST)
     above = max(0.0, STRONGEST - g[_FIRST] - _CHANGE)
-    place = between(e, 0.0, below + above)
+    place = uniform_between(e, 0.0, below + above)
     g[_SECOND] = WEAKEST + place if place < below else g[_FIRST] + _CHANGE + (place - below)
-    g[_TIME] = between(e, _EARLY, _LATE) * f.horizon * f.ticks * f.period
+    g[_TIME] = uniform_between(e, _EARLY, _LATE) * f.horizon * f.ticks * f.period
     g[_PEAK] = 0.0
     _read(f, e, w)
 
@@ -95,7 +95,7 @@ def _read(f, e, w):
     """Let the load cell read, if it is due; it is sampled with the other sensors."""
     e.goal[_FORCE] = plate_force(f, w)
     if e.tick % f.every == 0:
-        error = between(e, -CELL, CELL) if f.noisy else 0.0
+        error = uniform_between(e, -CELL, CELL) if f.noisy else 0.0
         e.goal[FORCE_READ] = e.goal[_FORCE] + error
 
 
@@ -104,8 +104,8 @@ def tick_force(f, e, w):
     """Read the load cell and remember the largest force of this step.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `goal` is written.
         w: World.
 
     Returns:
@@ -140,8 +140,8 @@ def observe_force(f, e, out, at):
     """Write force read, force wanted and the time since that was changed.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         out: (observations,) float32, written from `at` on.
         at: scalar.
 
@@ -159,8 +159,8 @@ def reward_force(f, e, w):
     """Reward of the true force; the episode ends by an overload or away from the plate.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World; `measures` gets the error of the force [N], whether the plate is touched, whether
             it was overloaded, whether the tip is no longer over it.
 
@@ -169,7 +169,7 @@ def reward_force(f, e, w):
 
     Source: this module.
     """
-    g, n = e.goal, f.numbers
+    g, n = e.goal, f.parameters
     wanted = reference_force(g, e.tick * f.period)[0]
     overload = g[_PEAK] > OVERLOAD
     aside = math.fabs(e.tip[0] - n[MIDDLE_X]) > n[HALF_X]
@@ -199,7 +199,7 @@ def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
 
 def _plate(
     machine: Machine, rng: np.random.Generator, start: dict[str, float]
-) -> tuple[Thing, ...]:
+) -> tuple[SurroundingObject, ...]:
     """A plate below the tip."""
     numbers, axes, _ = arm_facts(machine)
     pose = np.zeros(5)
@@ -211,7 +211,7 @@ def _plate(
                   damping=damping),)  # fmt: skip
 
 
-def _numbers(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
+def _parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
     """Where the plate is in the model and before the machine, as `force` reads it."""
     joint = model.joint("plate_0")
     return (joint.qposadr[0], joint.dofadr[0], joint.id, *_MIDDLE, *_HALF)
@@ -237,7 +237,7 @@ HOLD_FORCE = Task(
     fields=force_fields,
     measures=(("force_error", "N"), ("contact", "1"), ("overload", "1"), ("beside", "1")),
     surroundings=_plate,
-    numbers=_numbers,
+    parameters=_parameters,
     servo=Servo(position_gain=5.0),  # with more, a boom that swings freely comes down as a hammer
     pose_rates=(0.3, 0.1, 0.3, 0.3, 0.25),  # as `press_stiffness`
 )

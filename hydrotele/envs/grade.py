@@ -17,7 +17,7 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.envs.episode import ARM, NUMBERS, between, draw
+from hydrotele.envs.episode import ARM, PARAMETERS, uniform, uniform_between
 from hydrotele.envs.observation import Field, reach
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Task
@@ -58,7 +58,7 @@ def bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray
         bucket: that digs.
 
     Returns:
-        (at most NUMBERS,) those of the first soil with bucket and profile, then what differs.
+        (at most PARAMETERS,) those of the first soil with bucket and profile, then what differs.
 
     Raises:
         InputError: there are no soils or more than three, or the bucket has other corners.
@@ -149,7 +149,7 @@ def lay_bed(f, w, soil):
     """Begin with level undisturbed soil at height 0 and an empty bucket.
 
     Args:
-        f: record of FACTS; its numbers are those of `bed_parameters`.
+        f: record of TASK_PARAMETERS; its parameters are those of `bed_parameters`.
         w: World; `terrain` is written.
         soil: number of the soil, scalar [1].
 
@@ -161,11 +161,11 @@ def lay_bed(f, w, soil):
     w.terrain[:] = 0.0
     numbers = soil_of(w)
     for i in range(_SHARED):
-        numbers[i] = f.numbers[i]
+        numbers[i] = f.parameters[i]
     if soil > 0:
         first = _SHARED + (soil - 1) * WIDTH
         for i in range(WIDTH):
-            numbers[i] = f.numbers[first + i]
+            numbers[i] = f.parameters[first + i]
 
 
 @compiled
@@ -176,8 +176,8 @@ def edge_rates(f, e, w, rates):
     longer, is the same.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World.
         rates: (2,) written [m/s].
 
@@ -201,15 +201,15 @@ def tick_bed(f, e, w):
     """Move soil and bucket on by one control period; the force acts in the next one.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World after a physics step; `terrain` and the tip's body in `xfrc` are written.
 
     Returns:
         Nothing.
 
-    Source: `soil.step`, `soil.wrench`; places are MuJoCo's own, so that every variant's geometry
-        is exact.
+    Source: `soil.step.soil_step`, `bucket_wrench`; places are MuJoCo's own, so that every
+        variant's geometry is exact.
     """
     body = f.tip_body
     theta = math.atan2(w.tip[1], w.tip[0])
@@ -226,7 +226,7 @@ def tick_bed(f, e, w):
     )
 
 
-assert _SHARED + (SOILS_MOST - 1) * WIDTH <= NUMBERS
+assert _SHARED + (SOILS_MOST - 1) * WIDTH <= PARAMETERS
 
 
 NEAR, FAR = 3.8, 5.8  # m, radii between which the ground is graded
@@ -323,8 +323,8 @@ def begin_grade(f, e, w):
     """Draw the soil, the ground and the plane.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `goal` is written.
         w: World; `terrain` and the first `measures` are written.
 
     Returns:
@@ -333,21 +333,26 @@ def begin_grade(f, e, w):
     Source: this module.
     """
     g = e.goal
-    soils = int(f.numbers[len(f.numbers) - 1])
-    soil = int(draw(e) * soils)
+    soils = int(f.parameters[len(f.parameters) - 1])
+    soil = int(uniform(e) * soils)
     g[SOIL] = soil
     lay_bed(f, w, soil)
-    ground = between(e, _LEVEL[0], _LEVEL[1])
-    g[TILT] = between(e, -_SLOPE, _SLOPE)
+    ground = uniform_between(e, _LEVEL[0], _LEVEL[1])
+    g[TILT] = uniform_between(e, -_SLOPE, _SLOPE)
     g[PLANE] = ground
     surface = surface_of(w)
     for i in range(CELLS):
         surface[i] = plane_height(g, START + (i + 0.5) * CELL)
-    g[PLANE] = ground - between(e, _DOWN[0], _DOWN[1])
-    half = between(e, _LONG[0], _LONG[1])
-    _heap(surface, between(e, NEAR + 0.3, FAR - 0.3), half, between(e, _HIGH[0], _HIGH[1]))
-    half = between(e, _LONG[0], _LONG[1])
-    _heap(surface, between(e, NEAR, FAR), half, between(e, _LOW[0], _LOW[1]))
+    g[PLANE] = ground - uniform_between(e, _DOWN[0], _DOWN[1])
+    half = uniform_between(e, _LONG[0], _LONG[1])
+    _heap(
+        surface,
+        uniform_between(e, NEAR + 0.3, FAR - 0.3),
+        half,
+        uniform_between(e, _HIGH[0], _HIGH[1]),
+    )
+    half = uniform_between(e, _LONG[0], _LONG[1])
+    _heap(surface, uniform_between(e, NEAR, FAR), half, uniform_between(e, _LOW[0], _LOW[1]))
     g[ERROR], g[HELD] = profile_error(g, surface, FIRST, LAST)[1], 0.0
     w.measures[0], w.measures[3] = g[ERROR], g[SOIL]
 
@@ -357,8 +362,8 @@ def observe_grade(f, e, w, out, at):
     """Write errors of the profile, the edge over it, the mass carried and the plane.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World.
         out: (observations,) float32, written from `at` on.
         at: scalar.
@@ -375,11 +380,11 @@ def observe_grade(f, e, w, out, at):
     for p in range(POINTS):
         first = FIRST + p * _EACH
         mean = profile_error(g, surface, first, first + _EACH)[0]
-        out[at + p] = mean + (between(e, -scan, scan) if f.noisy else 0.0)
+        out[at + p] = mean + (uniform_between(e, -scan, scan) if f.noisy else 0.0)
     height = surface_height(soil_of(w), surface, pose[0])
-    out[at + POINTS] = pose[2] - height - (between(e, -scan, scan) if f.noisy else 0.0)
+    out[at + POINTS] = pose[2] - height - (uniform_between(e, -scan, scan) if f.noisy else 0.0)
     load = result_of(w)[MASS]
-    out[at + POINTS + 1] = load + (between(e, -scales, scales) if f.noisy else 0.0)
+    out[at + POINTS + 1] = load + (uniform_between(e, -scales, scales) if f.noisy else 0.0)
     out[at + POINTS + 2] = g[PLANE]
     out[at + POINTS + 3] = g[TILT]
 
@@ -389,8 +394,8 @@ def reward_grade(f, e, w):
     """Pay every centimetre that the ground comes nearer to the plane; time costs.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `goal` is written.
         w: World; `measures` gets the error [m], mass carried [kg], force of the soil [N], number
             of the soil, whether the ground is graded, whether it was spoiled.
 
@@ -430,10 +435,10 @@ def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     return draw_start(machine, rng, _LEAST_POSE, _LARGEST_POSE)
 
 
-def _numbers(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
+def _parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
     """Soils, bucket and profile; the last one is the number of soils."""
     bed = bed_parameters([SOILS[name] for name in GRADE_SOILS]).tolist()
-    return (*bed, *[0.0] * (NUMBERS - 1 - len(bed)), float(len(GRADE_SOILS)))
+    return (*bed, *[0.0] * (PARAMETERS - 1 - len(bed)), float(len(GRADE_SOILS)))
 
 
 GRADE = Task(
@@ -459,7 +464,7 @@ GRADE = Task(
         ("profile_rms", "m"), ("carried_mass", "kg"), ("soil_force", "N"), ("soil", "1"),
         ("success", "1"), ("spoiled", "1"),
     ),
-    numbers=_numbers,
+    parameters=_parameters,
     terrain=TERRAIN,
     pose_rates=(0.5, 0.3, 0.4, 0.5, 0.25),
     swing_locked=True,

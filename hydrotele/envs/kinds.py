@@ -22,8 +22,8 @@ def begin_task(f, e, w):
     """Draw the goal of a new episode.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `goal` is written.
         w: World.
 
     Returns:
@@ -50,8 +50,8 @@ def tick_task(f, e, w):
     """What a task does after a control period: forces of the ground, a grapple that takes a log.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World.
 
     Returns:
@@ -72,8 +72,8 @@ def observe_task(f, e, w, out):
     """Write the observation: of the machine, then of the task.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World.
         out: (observations,) float32, written.
 
@@ -102,8 +102,8 @@ def reward_task(f, e, w):
     """Reward of the step that is over, and whether the task is.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World; `measures` is written.
 
     Returns:

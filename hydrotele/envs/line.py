@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.episode import ARM, between, draw
+from hydrotele.envs.episode import ARM, uniform, uniform_between
 from hydrotele.envs.observation import Field, pose_fields, reach
 from hydrotele.envs.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.envs.task import Task
@@ -58,8 +58,8 @@ def begin_line(f, e):
     """Draw a line from where the tip is.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `goal` is written.
 
     Returns:
         Nothing.
@@ -70,15 +70,18 @@ def begin_line(f, e):
     task_forward(f.arm, e.position[: f.arm_axes], start)
     for c in range(4):
         g[_START + c] = start[c]
-    speed, g[_ACCELERATION] = between(e, _SLOW, _FAST), between(e, _GENTLE, _HARD)
-    turn = between(e, -_TURN, _TURN)
-    if draw(e) >= _TURNING:
+    speed, g[_ACCELERATION] = uniform_between(e, _SLOW, _FAST), uniform_between(e, _GENTLE, _HARD)
+    turn = uniform_between(e, -_TURN, _TURN)
+    if uniform(e) >= _TURNING:
         turn = 0.0
     size = 1.0
     for n in range(_DRAWS):
         if n >= _TRUE_SIZE:
             size *= _SMALLER  # the start lies inside, so that a small and slow line fits surely
-        way, length = between(e, -math.pi, math.pi), size * between(e, _SHORT, _LONG)
+        way, length = (
+            uniform_between(e, -math.pi, math.pi),
+            size * uniform_between(e, _SHORT, _LONG),
+        )
         g[_PER_METRE + _R], g[_PER_METRE + _THETA] = math.cos(way), turn
         g[_PER_METRE + _Z] = math.sin(way)
         g[_LENGTH], g[_SPEED] = length, size * speed
@@ -169,8 +172,8 @@ def observe_line(f, e, out, at):
     """Write the pose wanted now and ahead, and the errors that the readings tell.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         out: (observations,) float32, written from `at` on.
         at: scalar.
 
@@ -206,8 +209,8 @@ def reward_line(f, e, w):
     """Reward of the tip's true place.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World; `measures` gets the errors across and along [m] and of the attitude [rad].
 
     Returns:

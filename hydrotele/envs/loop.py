@@ -22,16 +22,16 @@ from hydrotele.envs.episode import (
     AXES,
     CHANNELS,
     DISABLED,
-    FACTS,
+    EPISODE_STATE,
     JOINT_RATE,
     MEASURES,
-    MEMORY,
     NEXT_STEP,
     RESET,
     RESOLVED_MOTION,
     SAME_STEP,
+    TASK_PARAMETERS,
     VALVE,
-    draw,
+    uniform,
 )
 from hydrotele.envs.kinds import begin_task, observe_task, reward_task, tick_task
 from hydrotele.hydraulics.parameters import SLOTS
@@ -44,7 +44,7 @@ from hydrotele.simulate.stepping import (
     SensorPast,
     Simulation,
     begin_past,
-    look_back,
+    delayed_values,
     true_values,
 )
 
@@ -109,8 +109,9 @@ def act(f, e, action):
     """Commands of this control period.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `command` and, unless actions are valves, references are written.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `command` and, unless actions are valves, references are
+            written.
         action: (actions,) of the agent, full at +-1; beyond they count as full.
 
     Returns:
@@ -141,8 +142,8 @@ def sense(f, e, sim):
     """Read the sensors, if a reading is due; otherwise they are held.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; true positions are written, readings where they are due.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; true positions are written, readings where they are due.
         sim: Simulation of this episode.
 
     Returns:
@@ -160,9 +161,9 @@ def sense(f, e, sim):
     for i in range(k):
         e.position[i] = values[i]
         e.sampled_reference[i] = e.reference[i]
-    look_back(sim.past, e.tick * f.substeps, values)
+    delayed_values(sim.past, e.tick * f.substeps, values)
     for i in range(c):
-        e.error[i] = f.accuracy[i] * (2.0 * draw(e) - 1.0) if f.noisy else 0.0
+        e.error[i] = f.accuracy[i] * (2.0 * uniform(e) - 1.0) if f.noisy else 0.0
     sensors = Sensors(
         floats(scales, c), floats(f.offsets + 8 * e.variant * CHANNELS, c), f.converters[0],
         f.converters[1], f.converters[2],
@@ -223,7 +224,7 @@ def world(f, m, d, sim):
     """The World of a simulation.
 
     Args:
-        f: record of FACTS.
+        f: record of TASK_PARAMETERS.
         m: address of its mjModel, scalar.
         d: address of its mjData, scalar.
         sim: its number, scalar.
@@ -317,7 +318,7 @@ def _unstable(f, e, d):
 def _begin_episode(f, e, w, number):
     """Put the simulation at the start of a variant, and draw a new goal."""
     e.last_variant, e.last_fault = e.variant, e.fault
-    e.variant = int(draw(e) * f.variants)
+    e.variant = int(uniform(e) * f.variants)
     start = f.starts + 8 * e.variant * f.states
     call_set_state(f.mj_set_state, w.model, w.data, start, STATE)
     places = carray(pointer(f.places), (3 * f.fields,), np.int64)
@@ -384,8 +385,8 @@ def _step(f, e, w, number, action):
 
 @compiled
 def _advance(m, d, sim, argument):
-    f = carray(pointer(argument), (1,), FACTS)[0]
-    e = carray(pointer(f.memory), (f.count,), MEMORY)[sim]
+    f = carray(pointer(argument), (1,), TASK_PARAMETERS)[0]
+    e = carray(pointer(f.episodes), (f.count,), EPISODE_STATE)[sim]
     w = world(f, m, d, sim)
     reward = carray(pointer(f.reward), (f.count,), np.float64)
     terminated = carray(pointer(f.terminated), (f.count,), np.uint8)
@@ -411,5 +412,5 @@ def _advance(m, d, sim, argument):
 
 @callback(_SIGNATURE)
 def advance(m, d, sim, argument):
-    """A step or a reset of one simulation: (mjModel*, mjData*, number, record of FACTS)."""
+    """A step or a reset of one simulation: mjModel*, mjData*, number, TASK_PARAMETERS."""
     _advance(m, d, sim, argument)

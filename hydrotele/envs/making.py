@@ -83,8 +83,8 @@ def info_of(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
     told, which = core.setup.task.measures, "last_" if final else ""
     figures = core.final_measures if final else core.measures
     info = {name: figures[:, i].copy() for i, (name, _) in enumerate(told)}
-    info["variant"] = core.memory[f"{which}variant"].copy()
-    info["fault"] = core.memory[f"{which}fault"] != 0
+    info["variant"] = core.episodes[f"{which}variant"].copy()
+    info["fault"] = core.episodes[f"{which}fault"] != 0
     return info
 
 

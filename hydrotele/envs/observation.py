@@ -102,8 +102,8 @@ def observe_machine(f, e, out):
     """Write what the machine's sensors say.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         out: (observations,) float32; the first ones are written.
 
     Returns:

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.episode import ARM, between, draw
+from hydrotele.envs.episode import ARM, uniform, uniform_between
 from hydrotele.envs.observation import Field, reach
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Task
@@ -27,7 +27,7 @@ from hydrotele.scenario.surroundings import LogOnGround
 from hydrotele.simulate.feedback import convert
 from hydrotele.simulate.surroundings import CENTRE, GRIP, ROW, TAKEN, grip_step, log_grip
 
-HAND, LOG, WELD, JAW, PLACE, RADIUS, HALF_LENGTH = range(GRIP, GRIP + 7)  # in Facts.numbers
+HAND, LOG, WELD, JAW, PLACE, RADIUS, HALF_LENGTH = range(GRIP, GRIP + 7)  # in `parameters`
 _FREE = GRIP + 7  # place in qpos and qvel of pitch, then of roll
 FREE_JOINTS = ("grapple_pitch", "grapple_roll")
 READ = 0  # first of the readings in the goal: pitch, roll, their rates
@@ -43,9 +43,9 @@ def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround
         log: the log.
 
     Returns:
-        (GRIP + 11,): those of `holding.grip_step`, then numbers of the grapple's body, the log's
-        body and weld, places in `qpos` of jaw and log, the log's radius and half its length [m],
-        places of the free joints.
+        (GRIP + 11,): those of `simulate.surroundings.grip_step`, then numbers of the grapple's
+        body, the log's body and weld, places in `qpos` of jaw and log, the log's radius and half
+        its length [m], places of the free joints.
     """
     hand = machine.links[machine.link_of(machine.axes[log.grab].joint)].parent
     places = [
@@ -63,7 +63,7 @@ def is_held(f, w):
     """Whether the grapple holds the log.
 
     Args:
-        f: record of FACTS.
+        f: record of TASK_PARAMETERS.
         w: World.
 
     Returns:
@@ -71,7 +71,7 @@ def is_held(f, w):
 
     Source: this module.
     """
-    return w.eq_active[int(f.numbers[WELD])] != 0
+    return w.eq_active[int(f.parameters[WELD])] != 0
 
 
 @compiled
@@ -82,11 +82,11 @@ def _number(values, count, at):
 
 @compiled
 def _take_or_let_go(f, w):
-    hand, log, weld = int(f.numbers[HAND]), int(f.numbers[LOG]), int(f.numbers[WELD])
+    hand, log, weld = int(f.parameters[HAND]), int(f.parameters[LOG]), int(f.parameters[WELD])
     first = weld * f.eq_width
     change = grip_step(
-        f.numbers[:GRIP], _number(w.xpos, 3, hand), _number(w.xquat, 4, hand),
-        _number(w.xpos, 3, log), _number(w.xquat, 4, log), w.qpos[int(f.numbers[JAW])],
+        f.parameters[:GRIP], _number(w.xpos, 3, hand), _number(w.xquat, 4, hand),
+        _number(w.xpos, 3, log), _number(w.xquat, 4, log), w.qpos[int(f.parameters[JAW])],
         w.eq_active[weld] != 0, w.eq_rows[first : first + ROW],
     )  # fmt: skip
     if change == 0:
@@ -101,22 +101,22 @@ def read_free_joints(f, e, w):
     """Read the angles of the free joints and difference quotients, if a reading is due.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `goal` is written from READ on.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `goal` is written from READ on.
         w: World, staggered as `simulate.record` says.
 
     Returns:
         Nothing.
 
-    Source: as `sense.sense`, with the error and resolution of the first axis' sensor.
+    Source: as `envs.loop.sense`, with the error and resolution of the first axis' sensor.
     """
     if e.tick % f.every != 0:
         return
     for j in range(2):
-        place, dof = int(f.numbers[_FREE + 2 * j]), int(f.numbers[_FREE + 2 * j + 1])
+        place, dof = int(f.parameters[_FREE + 2 * j]), int(f.parameters[_FREE + 2 * j + 1])
         value = w.qpos[place] - f.timestep * w.qvel[dof]
         if f.noisy:
-            value += f.accuracy[0] * (2.0 * draw(e) - 1.0)
+            value += f.accuracy[0] * (2.0 * uniform(e) - 1.0)
             value = convert(value, f.converters[0, 0], f.converters[1, 0], f.converters[2, 0])
         past = e.goal[READ + j]
         e.goal[READ + 2 + j] = (value - past) / (f.every * f.period) if e.tick > 0 else 0.0
@@ -128,14 +128,14 @@ def tick_grapple(f, e, w):
     """Take the log or let it go, and read the free joints.
 
     Args:
-        f: record of FACTS; its numbers are those of `grapple_parameters`.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS; its parameters are those of `grapple_parameters`.
+        e: record of EPISODE_STATE; `goal` is written.
         w: World after a physics step; the weld is written.
 
     Returns:
         Nothing.
 
-    Source: `simulate.holding.grip_step`.
+    Source: `simulate.surroundings.grip_step`.
     """
     _take_or_let_go(f, w)
     read_free_joints(f, e, w)
@@ -146,7 +146,7 @@ def grip_distance(f, w):
     """How far the pocket between the jaws is from the log.
 
     Args:
-        f: record of FACTS.
+        f: record of TASK_PARAMETERS.
         w: World after a physics step.
 
     Returns:
@@ -155,14 +155,14 @@ def grip_distance(f, w):
 
     Source: this module.
     """
-    hand, log, reach = int(f.numbers[HAND]), int(f.numbers[LOG]), f.numbers[GRIP - 1]
+    hand, log, reach = int(f.parameters[HAND]), int(f.parameters[LOG]), f.parameters[GRIP - 1]
     turn, own = _number(w.xmat, 9, hand), _number(w.xmat, 9, log)
     along, across, square = 0.0, 0.0, 0.0
     way = np.empty(3)
     for c in range(3):
         way[c] = w.xpos[3 * hand + c] - w.xpos[3 * log + c]
         for k in range(3):
-            way[c] += turn[3 * c + k] * f.numbers[CENTRE + k]
+            way[c] += turn[3 * c + k] * f.parameters[CENTRE + k]
         along += way[c] * own[3 * c]
         across += turn[3 * c + 1] * own[3 * c]
     along = min(reach, max(-reach, along))
@@ -176,7 +176,7 @@ def tilt_angle(f, w):
     """Angle between the grapple and plumb, scalar [rad].
 
     Args:
-        f: record of FACTS.
+        f: record of TASK_PARAMETERS.
         w: World after a physics step.
 
     Returns:
@@ -184,7 +184,7 @@ def tilt_angle(f, w):
 
     Source: its x points down.
     """
-    down = -w.xmat[9 * int(f.numbers[HAND]) + 6]
+    down = -w.xmat[9 * int(f.parameters[HAND]) + 6]
     return np.arccos(min(1.0, max(-1.0, down)))
 
 
@@ -198,7 +198,7 @@ _RADII = (4.5, 6.5)  # m
 _ASIDE = (0.15, 0.5)  # rad from the grapple to the log
 _SLEW = (math.radians(30.0), math.radians(90.0))  # from the log to its goal
 _X, _Y, _YAW, _LEFT, _KEPT, _TAKEN = range(READ + READINGS, READ + READINGS + 6)  # in the goal
-GOAL_PLACE = slice(_X, _YAW + 1)  # x [m], y [m], yaw [rad] of the goal in the episode's memory
+GOAL_PLACE = slice(_X, _YAW + 1)  # x [m], y [m], yaw [rad] of the goal of the episode
 _FASTEST = 10.0  # rad/s of a difference quotient of noisy readings
 
 
@@ -225,8 +225,8 @@ def begin_place(f, e, w):
     """Lay the log down before the machine and draw where it shall go.
 
     Args:
-        f: record of FACTS; its numbers are those of `grapple.grapple_numbers`.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS; its parameters are those of `grapple_parameters`.
+        e: record of EPISODE_STATE; `goal` is written.
         w: World; the log's coordinates are written.
 
     Returns:
@@ -234,25 +234,25 @@ def begin_place(f, e, w):
 
     Source: this module.
     """
-    g, pose, at = e.goal, np.empty(ARM), int(f.numbers[PLACE])
+    g, pose, at = e.goal, np.empty(ARM), int(f.parameters[PLACE])
     task_forward(f.arm, e.position[: f.arm_axes], pose)
-    radius, theta = between(e, _RADII[0], _RADII[1]), pose[1] + _either_side(e, _ASIDE)
-    half = 0.5 * between(e, 0.0, math.pi)
+    radius, theta = uniform_between(e, _RADII[0], _RADII[1]), pose[1] + _either_side(e, _ASIDE)
+    half = 0.5 * uniform_between(e, 0.0, math.pi)
     w.qpos[at], w.qpos[at + 1] = radius * math.cos(theta), radius * math.sin(theta)
     w.qpos[at + 3], w.qpos[at + 4], w.qpos[at + 5] = math.cos(half), 0.0, 0.0
     w.qpos[at + 6] = math.sin(half)
     theta += _either_side(e, _SLEW)
-    radius = between(e, _RADII[0], _RADII[1])
+    radius = uniform_between(e, _RADII[0], _RADII[1])
     g[_X], g[_Y] = radius * math.cos(theta), radius * math.sin(theta)
-    g[_YAW] = between(e, 0.0, math.pi)
+    g[_YAW] = uniform_between(e, 0.0, math.pi)
     g[_LEFT], g[_KEPT], g[_TAKEN] = -1.0, 0.0, 0.0
     read_free_joints(f, e, w)
 
 
 @compiled
 def _either_side(e, size):
-    value = between(e, size[0], size[1])
-    return value if draw(e) < 0.5 else -value
+    value = uniform_between(e, size[0], size[1])
+    return value if uniform(e) < 0.5 else -value
 
 
 @compiled
@@ -260,7 +260,7 @@ def log_pose(f, w):
     """Where the log is.
 
     Args:
-        f: record of FACTS.
+        f: record of TASK_PARAMETERS.
         w: World.
 
     Returns:
@@ -269,7 +269,7 @@ def log_pose(f, w):
 
     Source: this module.
     """
-    at = int(f.numbers[PLACE])
+    at = int(f.parameters[PLACE])
     a, b, c, d = w.qpos[at + 3], w.qpos[at + 4], w.qpos[at + 5], w.qpos[at + 6]
     ax, ay, az = 1.0 - 2.0 * (c * c + d * d), 2.0 * (b * c + a * d), 2.0 * (b * d - a * c)
     level = max(1.0e-12, ax * ax + ay * ay)
@@ -302,8 +302,8 @@ def observe_place(f, e, w, out, at):
     """Write log, goal, whether it is held, and what is read of the free joints.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World.
         out: (observations,) float32, written from `at` on.
         at: scalar.
@@ -329,8 +329,8 @@ def reward_place(f, e, w):
     """Reward of bringing the grapple to the log and the log to its goal.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World; `measures` gets the log's distance from its goal [m], error of its yaw [rad],
             whether it is held, success, the grapple's angle to plumb [rad].
 
@@ -341,7 +341,7 @@ def reward_place(f, e, w):
     """
     g, held = e.goal, is_held(f, w)
     x, y, z, sine, cosine, slope = log_pose(f, w)
-    height = z - f.numbers[RADIUS]
+    height = z - f.parameters[RADIUS]
     distance = math.sqrt((x - g[_X]) ** 2 + (y - g[_Y]) ** 2 + height**2)
     yaw, swing = yaw_between(sine, cosine, g[_YAW]), tilt_angle(f, w)
     lies = not held and height < _LYING and abs(slope) < _LYING
@@ -384,7 +384,7 @@ def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     return {**joints, "grapple_pitch": plumb, "grapple": turned, "claw": 0.0}
 
 
-def _numbers(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
+def _parameters(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
     return grapple_parameters(machine, model, LOG_TO_PLACE)
 
 
@@ -416,7 +416,7 @@ PLACE_LOG = Task(
     ),
     surroundings=lambda *_: (LOG_TO_PLACE,),
     ground=True,
-    numbers=_numbers,
+    parameters=_parameters,
     writes=("eq_data",),
     # with the usual 4 /s a late, sticky valve lets the boom swing, and the grapple with it
     servo=Servo(position_gain=2.5, axis_gains={"boom": 2.0}),

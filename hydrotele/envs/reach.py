@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.episode import ARM, between
+from hydrotele.envs.episode import ARM, uniform_between
 from hydrotele.envs.observation import Field, pose_fields, reach
 from hydrotele.envs.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.envs.task import Task
@@ -42,8 +42,8 @@ def begin_reach(f, e):
     """Draw a pose that the arm can go to straight from where it stands.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `goal` is written.
 
     Returns:
         Nothing.
@@ -56,11 +56,11 @@ def begin_reach(f, e):
     for n in range(_DRAWS):
         if n >= _TRUE_SIZE:
             size *= _SMALLER  # the start lies inside, so that a pose near it does too
-        change[0] = size * (between(e, _RADII[0], _RADII[1]) - start[0])
-        change[1] = size * between(e, -_SWING, _SWING)
-        change[2] = size * (between(e, _HEIGHTS[0], _HEIGHTS[1]) - start[2])
-        change[3] = size * (between(e, -_ATTITUDE, _ATTITUDE) - start[3])
-        change[4] = size * (between(e, -_HEAD, _HEAD) - start[4])
+        change[0] = size * (uniform_between(e, _RADII[0], _RADII[1]) - start[0])
+        change[1] = size * uniform_between(e, -_SWING, _SWING)
+        change[2] = size * (uniform_between(e, _HEIGHTS[0], _HEIGHTS[1]) - start[2])
+        change[3] = size * (uniform_between(e, -_ATTITUDE, _ATTITUDE) - start[3])
+        change[4] = size * (uniform_between(e, -_HEAD, _HEAD) - start[4])
         for c in range(ARM):
             g[_TARGET + c] = start[c] + change[c]
         if path_effort(f, start, change) < np.inf:
@@ -109,8 +109,8 @@ def observe_reach(f, e, out, at):
     """Write the pose wanted, the distance that the readings tell, and how long it was held.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         out: (observations,) float32, written from `at` on.
         at: scalar.
 
@@ -134,8 +134,8 @@ def reward_reach(f, e, w):
     """Reward of coming nearer; the episode ends once the pose was kept long enough.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World; `measures` gets distance [m], error of attitude and head [rad], success.
 
     Returns:

@@ -2,7 +2,7 @@
 
 What an agent is asked to do, as markers in pictures: one function per kind of task.
 
-A function gets the running task and the number of the episode and reads the goal from its memory.
+A function gets the running task and the number of the episode and reads its goal.
 
 A bed of soil as boxes along the arm's plane, the bank darker than what lies loose on it.
 """
@@ -37,7 +37,7 @@ _THIN_SOIL = 1e-3  # m of loose soil that is not drawn
 
 def _turn(core: TaskCore, number: int) -> np.ndarray:
     """(3, 3) rotation of the house, and with it of the arm's plane."""
-    swing = float(core.memory["position"][number][0])
+    swing = float(core.episodes["position"][number][0])
     c, s = math.cos(swing), math.sin(swing)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -78,7 +78,7 @@ def plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
     Returns:
         The lines, in the world.
     """
-    goal, turn = core.memory["goal"][number], _turn(core, number)
+    goal, turn = core.episodes["goal"][number], _turn(core, number)
     side, out = float(core.facts["arm"][SIDE]), 0.5 * CAT215.width + 0.03
     corners = [
         turn @ [r, side + y, plane_height.py_func(goal, r)]
@@ -118,42 +118,42 @@ def place_of_pose(pose: np.ndarray) -> np.ndarray:
 
 def _track(core: TaskCore, number: int) -> list[Marker]:
     """The tip on its reference, its way ahead, and how far off it is."""
-    memory, k = core.memory[number], core.setup.arm_axes
-    now = float(memory["tick"]) * core.setup.clock.period
+    episode, k = core.episodes[number], core.setup.arm_axes
+    now = float(episode["tick"]) * core.setup.clock.period
 
     def place(time: float) -> np.ndarray:
         joints, pose = np.empty(k), np.empty(ARM)
         for axis in range(k):
-            joints[axis] = track_reference(memory["goal"], axis, time)[0]
+            joints[axis] = track_reference(episode["goal"], axis, time)[0]
         task_forward(core.facts["arm"], joints, pose)
         return place_of_pose(pose)
 
     way = np.array([place(now + ahead) for ahead in np.linspace(0.0, _WAY, _PIECES + 1)])
-    off = line(memory["tip"], way[0], _THICK, _OFF)
+    off = line(episode["tip"], way[0], _THICK, _OFF)
     return [ball(way[0], _BALL, _GOAL), off, *polyline(way, _THIN, _AHEAD)]
 
 
 def _line(core: TaskCore, number: int) -> list[Marker]:
     """The line, the place of the tip on it, and how far off the tip is."""
-    memory = core.memory[number]
-    now, pose, rate = float(memory["tick"]) * core.setup.clock.period, np.zeros(ARM), np.zeros(ARM)
+    episode = core.episodes[number]
+    now, pose, rate = float(episode["tick"]) * core.setup.clock.period, np.zeros(ARM), np.zeros(ARM)
 
     def place(time: float) -> np.ndarray:
-        line_pose(memory["goal"], time, pose, rate)
+        line_pose(episode["goal"], time, pose, rate)
         return place_of_pose(pose)
 
     end = core.setup.clock.horizon * core.setup.clock.ticks * core.setup.clock.period
     way = np.array([place(time) for time in np.linspace(SETTLE, end, _PIECES + 1)])
     wanted = place(now)
-    off = line(memory["tip"], wanted, _THICK, _OFF)
+    off = line(episode["tip"], wanted, _THICK, _OFF)
     return [ball(wanted, _BALL, _GOAL), off, *polyline(way, _THIN, _AHEAD)]
 
 
 def _force(core: TaskCore, number: int) -> list[Marker]:
     """Arrows on the plate before the tip: the force wanted, and that which the load cell read."""
-    memory, side = core.memory[number], np.array([0.0, 0.5 * _BESIDE, 0.0])
-    goal, foot = memory["goal"], memory["tip"] - np.array([0.6, 0.0, 0.0])
-    now = float(memory["tick"]) * core.setup.clock.period
+    episode, side = core.episodes[number], np.array([0.0, 0.5 * _BESIDE, 0.0])
+    goal, foot = episode["goal"], episode["tip"] - np.array([0.6, 0.0, 0.0])
+    now = float(episode["tick"]) * core.setup.clock.period
     wanted, _ = reference_force(goal, now)
     up = np.array([0.0, 0.0, _METRES])
     pushes = ((wanted, -side, _GOAL), (float(goal[FORCE_READ]), side, _OFF))
@@ -165,12 +165,12 @@ def _force(core: TaskCore, number: int) -> list[Marker]:
 
 def _reach(core: TaskCore, number: int) -> list[Marker]:
     """The place wanted, how far off the tip is, and the attitude wanted."""
-    memory = core.memory[number]
-    pose = memory["goal"][:ARM]
+    episode = core.episodes[number]
+    pose = episode["goal"][:ARM]
     wanted, level = place_of_pose(pose), math.cos(pose[3])
     ahead = np.array([level * math.cos(pose[1]), level * math.sin(pose[1]), math.sin(pose[3])])
     pointer = line(wanted - _POINTER * ahead, wanted, _THICK, _AHEAD)
-    return [ball(wanted, _BALL, _GOAL), line(memory["tip"], wanted, _THICK, _OFF), pointer]
+    return [ball(wanted, _BALL, _GOAL), line(episode["tip"], wanted, _THICK, _OFF), pointer]
 
 
 def _grade(core: TaskCore, number: int) -> list[Marker]:
@@ -180,8 +180,8 @@ def _grade(core: TaskCore, number: int) -> list[Marker]:
 
 def _place(core: TaskCore, number: int) -> list[Marker]:
     """The log's middle line where it shall lie, and its rim on the ground."""
-    x, y, yaw = core.memory[number]["goal"][GOAL_PLACE]
-    radius, half = core.facts["numbers"][RADIUS], core.facts["numbers"][HALF_LENGTH]
+    x, y, yaw = core.episodes[number]["goal"][GOAL_PLACE]
+    radius, half = core.facts["parameters"][RADIUS], core.facts["parameters"][HALF_LENGTH]
     way = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     aside = radius * np.array([-math.sin(yaw), math.cos(yaw), 0.0])
     middle = np.array([x, y, 0.02])
@@ -258,7 +258,7 @@ class Stage:
         Args:
             number: of the simulation.
         """
-        variant = int(self._core.memory["variant"][number])
+        variant = int(self._core.episodes["variant"][number])
         if (wanted := self._looks(variant)) is not self._shown:
             copy_parameters(wanted, self.model)
             self._shown = wanted

@@ -54,7 +54,7 @@ def path_effort(f, start, change):
     """Most that a straight path of the pose asks of the drives, for one that takes a second.
 
     Args:
-        f: record of FACTS.
+        f: record of TASK_PARAMETERS.
         start: (ARM,) pose where it begins: r [m], theta [rad], z [m], attitude, head [rad].
         change: (ARM,) from there to its end, the same units.
 
@@ -90,8 +90,8 @@ def pose_read(f, e, pose):
     """Pose of the tip by the readings of the joints.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         pose: (ARM,) written.
 
     Returns:

@@ -11,7 +11,7 @@ from hydrotele.envs.episode import ACTIONS
 from hydrotele.envs.observation import Field
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
-from hydrotele.scenario.surroundings import Thing
+from hydrotele.scenario.surroundings import SurroundingObject
 
 ActionKind = Literal["valve", "joint_rate", "resolved_motion"]
 REAL = "real"
@@ -36,7 +36,7 @@ class Task:
         measures: name and unit of every figure in `info`.
         surroundings: (machine, random generator, start) -> what stands around.
         ground: whether there is a hard ground.
-        numbers: (machine, MuJoCo model) -> up to NUMBERS that the task's native code reads.
+        parameters: (machine, MuJoCo model) -> up to PARAMETERS that the task's native code reads.
         terrain: floats that an episode keeps of its ground, 0 without.
         swing_locked: whether the swing's action does nothing.
         writes: fields of the model that its native code writes; a new episode has them anew.
@@ -56,11 +56,11 @@ class Task:
     more_axes: tuple[str, ...] = ()
     action: ActionKind = "valve"
     duration: float = 20.0
-    surroundings: Callable[[Machine, np.random.Generator, dict[str, float]], tuple[Thing, ...]] = (
-        lambda *_: ()
-    )
+    surroundings: Callable[
+        [Machine, np.random.Generator, dict[str, float]], tuple[SurroundingObject, ...]
+    ] = lambda *_: ()
     ground: bool = False
-    numbers: Callable[[Machine, mujoco.MjModel], Sequence[float] | np.ndarray] | None = None
+    parameters: Callable[[Machine, mujoco.MjModel], Sequence[float] | np.ndarray] | None = None
     terrain: int = 0
     swing_locked: bool = False
     writes: tuple[str, ...] = ()

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.episode import ARM, AXES, between, draw
+from hydrotele.envs.episode import ARM, AXES, uniform, uniform_between
 from hydrotele.envs.observation import Field, position_field, rate_field
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
@@ -43,8 +43,8 @@ def begin_track(f, e):
     """Draw references that the machine can follow.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY; `goal` is written.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `goal` is written.
 
     Returns:
         Nothing.
@@ -52,15 +52,15 @@ def begin_track(f, e):
     Source: this module.
     """
     g = e.goal
-    g[_FREQUENCY] = 2.0 * math.pi / between(e, _SHORT, _LONG)
+    g[_FREQUENCY] = 2.0 * math.pi / uniform_between(e, _SHORT, _LONG)
     for a in range(f.axes_driven):
         i = f.driven_axis[a]
         g[_BASE + i] = e.reference[i]
-        fastest = between(e, _SLOW, _FAST) * f.fastest[i]
+        fastest = uniform_between(e, _SLOW, _FAST) * f.fastest[i]
         total, rate = 0.0, 0.0
         for h in range(_HARMONICS):
             place = _HARMONICS * i + h
-            size, phase = draw(e), between(e, -math.pi, math.pi)
+            size, phase = uniform(e), uniform_between(e, -math.pi, math.pi)
             g[_SINE + place], g[_COSINE + place] = size * math.cos(phase), size * math.sin(phase)
             total += size
             rate += size * (h + 1) * g[_FREQUENCY]
@@ -111,8 +111,8 @@ def observe_track(f, e, out, at):
     """Write references now and ahead.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         out: (observations,) float32, written from `at` on.
         at: scalar.
 
@@ -134,8 +134,8 @@ def reward_track(f, e, w):
     """Reward 1 on the trajectory, less 1 for every 0.1 m that the tip is off, at least -1.
 
     Args:
-        f: record of FACTS.
-        e: record of MEMORY.
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
         w: World; `measures` gets the tip's distance from its place [m].
 
     Returns:

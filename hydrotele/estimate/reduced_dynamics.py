@@ -251,7 +251,7 @@ def place(model, sp, z):
     Returns:
         Nothing.
 
-    Source: `place_mechanism`, `supply.feel`.
+    Source: `place_mechanism`, `set_activations`.
     """
     place_mechanism(model, sp, z)
     set_activations(model, sp, z)

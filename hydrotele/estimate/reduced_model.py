@@ -9,8 +9,8 @@ from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters,
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import parse_channel
-from hydrotele.multibody.reduced_mechanism import Mechanism, coordinate_names, mechanism
-from hydrotele.multibody.reduced_motion import Motion, motion_space
+from hydrotele.multibody.reduced_mechanism import ReducedMechanism, coordinate_names, mechanism
+from hydrotele.multibody.reduced_motion import ReducedMotion, motion_space
 from hydrotele.terms.table import terms_table
 
 POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)
@@ -26,9 +26,9 @@ class Model(NamedTuple):
     """Numbers of the reduced model; n independent coordinates, t transmissions, h valves.
 
     A state is `(n positions, t drive positions, n rates, t drive rates, 4 h activations)` and what
-    bristles and a slow pump remember, see `parameters.memory_names`. Its pressures are those that
-    the oil would have if it held its air (`laws.pressure_without_air`): any number is one, which a
-    filter needs, and they are the felt ones wherever these are not below the atmosphere's.
+    bristles and a slow pump remember, see `parameters.extra_state_names`. Its pressures are those
+    that the oil would have if it held its air (`laws.pressure_without_air`): any number is one,
+    which a filter needs, and they are the felt ones wherever these are not below the atmosphere's.
 
     Attributes:
         mech: the mechanism.
@@ -49,7 +49,7 @@ class Model(NamedTuple):
             the compiled functions are then those of a model that knows no memory.
     """
 
-    mech: Mechanism
+    mech: ReducedMechanism
     user: np.ndarray
     hydraulic: int
     gain: np.ndarray
@@ -83,7 +83,7 @@ class Space(NamedTuple):
         time: (2,) now, and of the run's first row; only terms see it [s].
     """
 
-    motion: Motion
+    motion: ReducedMotion
     drive: np.ndarray
     row: np.ndarray
     mass: np.ndarray

@@ -35,9 +35,9 @@ from hydrotele.experiments.palida import (
 )
 from hydrotele.identify.estimation import Estimate, estimate
 from hydrotele.identify.excitation import Excitation, information
-from hydrotele.identify.mechanism import Mapping, in_coordinates, load_mechanism
+from hydrotele.identify.mechanism import ColumnMapping, in_coordinates, load_mechanism
 from hydrotele.identify.motion import Processing, joint_motion, resolution
-from hydrotele.identify.record import Record
+from hydrotele.identify.record import IdentificationRecord
 from hydrotele.identify.reduction import Reduction, reduce_parameters
 from hydrotele.multibody.inverse_dynamics import project
 
@@ -140,7 +140,7 @@ def reduced_friction(seed: int = 0, periods: int = _PERIODS) -> Reduction:
     """Reduction of the model in which every passive hinge has dry and viscous friction."""
     own, folder = robot(), models_folder() / "palida"
     mapping = own.mechanism.mapping
-    full = Mapping(
+    full = ColumnMapping(
         position=mapping.position, force=mapping.force, coordinates=mapping.coordinates,
         passive_friction=mapping.passive_friction, offsets=False,
         alike=tuple(g for g in mapping.alike if not g[0].startswith(("alpha", "beta"))),
@@ -226,7 +226,7 @@ class Processed(NamedTuple):
     covariance: np.ndarray
 
 
-def mean_period(record: Record, period: float) -> Processed:
+def mean_period(record: IdentificationRecord, period: float) -> Processed:
     """Frequency-domain processing of repeated periods.
 
     The leg lengths' mean over the periods goes through forward kinematics; the pose keeps its first
@@ -339,7 +339,7 @@ WAYS = ("raw", "zero_phase", "periodic")
 _SAID = {"raw": "raw", "zero_phase": "time domain", "periodic": "frequency domain"}
 
 
-def processed(record: Record, period: float, way: str) -> np.ndarray:
+def processed(record: IdentificationRecord, period: float, way: str) -> np.ndarray:
     """Poses, rates and accelerations (3, n, 6) of measured lengths, by one of the `WAYS`."""
     pose = in_coordinates(record, robot().setup)
     found = resolution(pose.position, pose.period, pose.position_noise)

@@ -12,8 +12,8 @@ from hydrotele.core.files import models_folder
 from hydrotele.identify.excitation import DriveLimits, Excitation
 from hydrotele.identify.identifiability import Identifiability, identifiability
 from hydrotele.identify.mechanism import Mechanism, load_mechanism
-from hydrotele.identify.record import Record
-from hydrotele.identify.setup import Setup
+from hydrotele.identify.record import IdentificationRecord
+from hydrotele.identify.setup import RegressorSetup
 from hydrotele.multibody.chain import cardan_angles
 from hydrotele.multibody.inverse_dynamics import project
 from hydrotele.multibody.poses import joint_positions
@@ -96,7 +96,7 @@ class Robot:
     truth: np.ndarray
 
     @property
-    def setup(self) -> Setup:
+    def setup(self) -> RegressorSetup:
         """Of the regressor, in coordinates of the pose."""
         return self.mechanism.setup
 
@@ -195,7 +195,7 @@ def measured(
     periods: int,
     rng: np.random.Generator,
     reaction: tuple[float, float] | None = None,
-) -> Record:
+) -> IdentificationRecord:
     """Simulated measurement: repeated periods of true lengths and forces, and noise.
 
     Args:
@@ -215,7 +215,7 @@ def measured(
     if reaction is not None:
         noise -= reaction[0] * error + reaction[1] * np.gradient(error, 1.0 / RATE, axis=0)
     drives = robot().setup.chain.drives
-    return Record(
+    return IdentificationRecord(
         "excitation", 1.0 / RATE, drives, np.tile(of.length, (periods, 1)) + error,
         np.full(6, LENGTH_NOISE), np.tile(of.force, (periods, 1)) + noise,
         np.sqrt(np.diag(force_covariance())),

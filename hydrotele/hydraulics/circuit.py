@@ -210,7 +210,7 @@ def step_circuit(
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators, <= MAX_AXES.
         act: (>= 4 count,) spool [1], spool rate [1/s] and pressures [Pa] at the start of the step,
-            then what is remembered, see `parameters.memory_names`.
+            then what is remembered, see `parameters.extra_state_names`.
         command: (nu,) valve commands, clipped here to [-1, 1] [1].
         length: (nu,) piston displacements x at the end of the step, where MuJoCo's leapfrog has
             them [m] (joint angle for a motor).

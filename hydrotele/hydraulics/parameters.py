@@ -21,7 +21,7 @@ class Slot(enum.IntEnum):
     Beyond the plain valve and drive, 0 switches a law off (a metering ratio of 1 does). BRISTLE,
     DELIVERY and ADDED_DELIVERY are places among the activations, counted from the first hydraulic
     axis, and MEMORY is how many of them follow those of the hydraulic axes (see
-    `parameters.memory_names`). CURVES, the last, begins two flow curves, of the positive and of the
+    `extra_state_names`). CURVES, the last, begins two flow curves, of the positive and of the
     negative direction: number of knots (0: straight), CURVE_KNOTS travels and CURVE_KNOTS openings
     each.
     """
@@ -183,7 +183,7 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
         machine: the machine.
 
     Returns:
-        Axis name -> (SLOTS,) numbers in SI, placed as `circuit.Slot` says.
+        Axis name -> (SLOTS,) numbers in SI, placed as `Slot` says.
     """
     count = len(machine.hydraulic_axes)
     memory = {name: 4 * count + k for k, name in enumerate(extra_state_names(machine))}

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hydrotele.identify.result import Identification
-from hydrotele.multibody.regressor import BODY_PARAMETERS, RUBBING
+from hydrotele.multibody.regressor import BODY_PARAMETERS, FRICTION_TERMS
 
 _USUAL = 0.3  # deformation that counts as one standard deviation: masses to 60 %, sizes to 30 %
 _THIN = 1e-4  # of the largest second moment, that a body has at least in every direction
@@ -92,7 +92,7 @@ def consistent(found: Identification, freedom: Mapping[str, Freedom] | None = No
     low = np.full(ends[-1] + len(others), -np.inf)
     for i, k in enumerate(others):
         kind = found.names[k].partition(".")[0]
-        if kind in RUBBING and not kind.endswith(_SIGNED):
+        if kind in FRICTION_TERMS and not kind.endswith(_SIGNED):
             low[ends[-1] + i] = -found.nominal[k] / sizes[i]
     start = np.zeros(len(low))
     start[ends[-1] :] = np.maximum(

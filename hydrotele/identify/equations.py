@@ -17,11 +17,11 @@ from hydrotele.identify.motion import (
     joint_motion,
     rate_deviations,
 )
-from hydrotele.identify.record import Record
-from hydrotele.identify.setup import Setup
+from hydrotele.identify.record import IdentificationRecord
+from hydrotele.identify.setup import RegressorSetup
 from hydrotele.identify.smoothing import Smoothed, error_draws, smooth
 from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import Regressor, sign_doubt
+from hydrotele.multibody.regressor import Regressor, sign_uncertainty
 
 _TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
 _KAISER = 5.0  # its ripple is 50 dB down
@@ -70,7 +70,7 @@ class Equations:
 
 
 def build_equations(
-    record: Record, setup: Setup, processing: Processing, found: Resolution,
+    record: IdentificationRecord, setup: RegressorSetup, processing: Processing, found: Resolution,
     with_noise: bool = False,
 ) -> tuple[Equations, Regressor]:  # fmt: skip
     """Equations of a run.
@@ -129,7 +129,7 @@ def build_equations(
     return made, empty
 
 
-def _motion(record: Record, found: Resolution, processing: Processing) -> Smoothed:
+def _motion(record: IdentificationRecord, found: Resolution, processing: Processing) -> Smoothed:
     """Motion of the joints, refused with a remedy where a filter cannot bridge a gap."""
     known = np.isfinite(record.position)
     if processing.method in ("raw", "zero_phase"):
@@ -148,7 +148,7 @@ def _motion(record: Record, found: Resolution, processing: Processing) -> Smooth
 
 
 def _motion_noise(
-    record: Record, setup: Setup, found: Resolution, motions: np.ndarray,
+    record: IdentificationRecord, setup: RegressorSetup, found: Resolution, motions: np.ndarray,
     rate_std: np.ndarray, low: np.ndarray, thin: int,
 ) -> np.ndarray:  # fmt: skip
     """What the motion's errors leave in the drives' forces (k, m, m); see `Equations`.
@@ -168,7 +168,10 @@ def _motion_noise(
 
 
 def row_forces(
-    setup: Setup, motions: np.ndarray, value: np.ndarray, rate_std: np.ndarray | None = None
+    setup: RegressorSetup,
+    motions: np.ndarray,
+    value: np.ndarray,
+    rate_std: np.ndarray | None = None,
 ) -> np.ndarray:
     """Drive forces along a motion.
 
@@ -190,7 +193,12 @@ def row_forces(
     return np.concatenate(out)
 
 
-def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start: np.ndarray | None):
+def _rows(
+    setup: RegressorSetup,
+    motions: np.ndarray,
+    rate_std: np.ndarray | None,
+    start: np.ndarray | None,
+):
     """Some rows (3, n, k): regressor, doubt of the signs, forces of damping, and the last pose."""
     chain = setup.chain
     found = project(chain, setup.given, *motions, start=start)
@@ -201,7 +209,7 @@ def _rows(setup: Setup, motions: np.ndarray, rate_std: np.ndarray | None, start:
     table = setup.table(found, spread)
     doubt = np.zeros((len(found.rate), len(table.drives)))
     if spread is not None:
-        doubt = sign_doubt(chain, found, table.drives, setup.rubbing, spread)
+        doubt = sign_uncertainty(chain, found, table.drives, setup.rubbing, spread)
     damping = np.einsum("nkv,nv->nk", found.share, chain.damping * found.rate)
     return table, doubt, damping, found.position[-1]
 
@@ -288,7 +296,7 @@ class Gathered:
         notes: on what was left out.
     """
 
-    runs: tuple[tuple[Record, Resolution], ...]
+    runs: tuple[tuple[IdentificationRecord, Resolution], ...]
     table: Regressor
     columns: list[int]
     rows: np.ndarray
@@ -358,7 +366,9 @@ def cycle_on(values: np.ndarray, step: int) -> np.ndarray:
 
 
 def gather(
-    runs: Sequence[tuple[Record, Resolution]], setup: Setup, processing: Processing
+    runs: Sequence[tuple[IdentificationRecord, Resolution]],
+    setup: RegressorSetup,
+    processing: Processing,
 ) -> Gathered:
     """Equations of all runs.
 

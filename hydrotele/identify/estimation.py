@@ -21,8 +21,8 @@ from hydrotele.identify.identifiability import (
     identifiable_in_noise,
     reference_sizes,
 )
-from hydrotele.identify.setup import Setup
-from hydrotele.multibody.regressor import RUBBING, Regressor
+from hydrotele.identify.setup import RegressorSetup
+from hydrotele.multibody.regressor import FRICTION_TERMS, Regressor
 
 _ESTIMATE = "estimate"
 _NORMAL95 = 1.959964
@@ -388,7 +388,7 @@ def weighted(
 
 
 def identifiable_from(
-    data: Weighted, structure: Identifiability, setup: Setup, resting: Sequence[str],
+    data: Weighted, structure: Identifiability, setup: RegressorSetup, resting: Sequence[str],
     drives: Sequence[str],
 ) -> Identifiability:  # fmt: skip
     """What data tell in spite of their noise.
@@ -414,7 +414,7 @@ def identifiable_from(
     noise = _long_run(plain.fitted(structure, order=0).residual)
     table = data.table
     sizes = reference_sizes(table, setup, np.sqrt(np.mean(data.force**2, axis=0)), drives)
-    held = {f"{kind}.{drive}" for kind in RUBBING for drive in resting}
+    held = {f"{kind}.{drive}" for kind in FRICTION_TERMS for drive in resting}
     asked = np.array([name not in held for name in table.names])
     rows = (data.matrix / noise[:, None]).reshape(-1, data.matrix.shape[2])
     told = identifiable_in_noise(rows, table.names, sizes, asked)

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.identify.identifiability import identifiable_in_noise, reference_sizes
-from hydrotele.identify.setup import Setup
+from hydrotele.identify.setup import RegressorSetup
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.inverse_dynamics import Projection, project
 
@@ -88,7 +88,7 @@ class Excitation:
 
 
 def information(
-    setup: Setup, motions: np.ndarray, noise: np.ndarray, base: Sequence[int] | np.ndarray,
+    setup: RegressorSetup, motions: np.ndarray, noise: np.ndarray, base: Sequence[int] | np.ndarray,
     sizes: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Information (p, p) per row that a motion holds of base parameters.
@@ -115,7 +115,7 @@ def information(
 
 
 def informative_base(
-    machine: Machine, setup: Setup, noise: np.ndarray, period: float = 20.0, seed: int = 0
+    machine: Machine, setup: RegressorSetup, noise: np.ndarray, period: float = 20.0, seed: int = 0
 ) -> np.ndarray:
     """Places of base parameters that an ordinary motion tells in spite of the noise.
 
@@ -148,7 +148,7 @@ def informative_base(
 
 
 def design_excitation(
-    machine: Machine, setup: Setup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
+    machine: Machine, setup: RegressorSetup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
     period: float = 20.0, harmonics: int = 8, starts: int = 2, iterations: int = 150,
     seed: int = 0, progress: Callable[[str, float], None] | None = None,
 ) -> Excitation:  # fmt: skip
@@ -189,7 +189,7 @@ def design_excitation(
     )  # fmt: skip
 
 
-class Limits(Protocol):
+class MotionLimits(Protocol):
     """What k given joints, and the drives with them, may do.
 
     Attributes:
@@ -220,7 +220,7 @@ class Limits(Protocol):
 
 
 def design_motion(
-    limits: Limits, setup: Setup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
+    limits: MotionLimits, setup: RegressorSetup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
     period: float = 20.0, harmonics: int = 8, starts: int = 2, iterations: int = 150,
     seed: int = 0, progress: Callable[[str, float], None] | None = None,
 ) -> Excitation:  # fmt: skip
@@ -307,7 +307,9 @@ def _inside(x: np.ndarray, measure: Callable, step: float = 0.97) -> np.ndarray:
     return x
 
 
-def _sizes(setup: Setup, base: Sequence[int] | np.ndarray, middle: np.ndarray) -> np.ndarray:
+def _sizes(
+    setup: RegressorSetup, base: Sequence[int] | np.ndarray, middle: np.ndarray
+) -> np.ndarray:
     """Sizes of base parameters, so that a determinant is no matter of units: those given."""
     still = np.zeros((1, len(middle)))
     found = project(setup.chain, setup.given, middle[None], still, still)
@@ -319,8 +321,8 @@ class DriveLimits:
     """Limits of the drives alone, for given joints that may be any coordinates, such as a pose."""
 
     def __init__(
-        self, setup: Setup, low: np.ndarray, high: np.ndarray, stroke: np.ndarray, speed: float,
-        acceleration: float,
+        self, setup: RegressorSetup, low: np.ndarray, high: np.ndarray, stroke: np.ndarray,
+        speed: float, acceleration: float,
     ):  # fmt: skip
         """Limits of a motion in coordinates of a pose.
 
@@ -360,7 +362,7 @@ class DriveLimits:
 class _Limits:
     """What the machine allows: ranges, strokes, flows and forces."""
 
-    def __init__(self, machine: Machine, setup: Setup):
+    def __init__(self, machine: Machine, setup: RegressorSetup):
         self.machine, self.setup = machine, setup
         self.axes = tuple(actuator_order(machine))
         ranges = []

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.identify.setup import Setup
+from hydrotele.identify.setup import RegressorSetup
 from hydrotele.multibody.regressor import BODY_PARAMETERS, Regressor
 
 UNIDENTIFIABLE, COMBINATION, FULL = "unidentifiable", "combination", "full"
@@ -200,7 +200,7 @@ _LEVER = 0.1  # m: friction of a pin acts on its radius, that of a drive on a le
 
 
 def reference_sizes(
-    table: Regressor, setup: Setup, forces: np.ndarray, drives: Sequence[str] | None = None
+    table: Regressor, setup: RegressorSetup, forces: np.ndarray, drives: Sequence[str] | None = None
 ) -> np.ndarray:
     """Sizes of all parameters.
 

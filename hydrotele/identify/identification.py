@@ -42,9 +42,9 @@ from hydrotele.identify.estimation import (
 )
 from hydrotele.identify.identifiability import Identifiability, identifiability
 from hydrotele.identify.motion import Processing, Resolution, adjoint, joint_motion, resolution
-from hydrotele.identify.record import Record, beginning, check_repeats, whole_cycles
+from hydrotele.identify.record import IdentificationRecord, beginning, check_repeats, whole_cycles
 from hydrotele.identify.result import Forces, HeldOut, Identification
-from hydrotele.identify.setup import Setup
+from hydrotele.identify.setup import RegressorSetup
 from hydrotele.identify.smoothing import Smoothed, smooth
 from hydrotele.multibody.regressor import Regressor
 
@@ -53,8 +53,8 @@ _BLOCK = 4  # parameters at a time, so that long logs need little memory
 
 
 def propagated(
-    record: Record, found: Resolution, gain: np.ndarray, setup: Setup, processing: Processing,
-    value: np.ndarray,
+    record: IdentificationRecord, found: Resolution, gain: np.ndarray, setup: RegressorSetup,
+    processing: Processing, value: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Covariance that the noise of one run's readings leaves in an estimate.
 
@@ -97,7 +97,7 @@ def propagated(
     return out + np.einsum("pnj,j,qnj->pq", on_position, stated, on_position, optimize=True)
 
 
-def _slopes(motion: Smoothed, count: int, setup: Setup, value: np.ndarray) -> np.ndarray:
+def _slopes(motion: Smoothed, count: int, setup: RegressorSetup, value: np.ndarray) -> np.ndarray:
     """Slopes (3, n, k, j) of drive forces over positions, rates and accelerations of the joints.
 
     They change as slowly as the motion: in long runs those of every few rows tell the others.
@@ -128,7 +128,7 @@ _PERIODS = 12.0  # of the band that a piece has at least: its low-pass takes thr
 
 def motion_bias(
     data: Gathered, equations: Weighted, base: np.ndarray, found: Estimate, value: np.ndarray,
-    setup: Setup, processing: Processing, pairs: int, seed: int = 0,
+    setup: RegressorSetup, processing: Processing, pairs: int, seed: int = 0,
 ) -> np.ndarray:  # fmt: skip
     """Mean error of an estimate whose regressor comes from noisy positions.
 
@@ -178,8 +178,12 @@ def motion_bias(
 
 
 def _world(
-    record: Record, found: Resolution, setup: Setup, processing: Processing, value: np.ndarray
-) -> Record:
+    record: IdentificationRecord,
+    found: Resolution,
+    setup: RegressorSetup,
+    processing: Processing,
+    value: np.ndarray,
+) -> IdentificationRecord:
     """A record whose forces are those of its motion, and as unknown as they were."""
     if processing.method == "periodic":
         motion = joint_motion(record.position, record.period, found, processing)
@@ -192,7 +196,7 @@ def _world(
 
 def _pieces(
     data: Gathered, processing: Processing
-) -> Iterator[tuple[Record, Resolution, np.ndarray]]:
+) -> Iterator[tuple[IdentificationRecord, Resolution, np.ndarray]]:
     """Pieces of the runs, what their positions resolve, and the noise (k,) of a position.
 
     The noise of a mean cycle is that of all cycles.
@@ -229,7 +233,11 @@ _FOREIGN = 3.0  # times the fitted runs' residuals; beyond it they tell too litt
 
 
 def heldout_errors(
-    judged: Equations, table: Regressor, value: np.ndarray, columns: list[int], setup: Setup
+    judged: Equations,
+    table: Regressor,
+    value: np.ndarray,
+    columns: list[int],
+    setup: RegressorSetup,
 ) -> dict[str, HeldOut]:
     """Drive -> prediction of the held-out run, of the drives at `columns` with known forces."""
     noise = judged.noise_of(value)
@@ -266,7 +274,7 @@ def whiteness(residual: np.ndarray) -> np.ndarray:
 
 
 def status_of(
-    heldout: dict[str, HeldOut], fitted: dict[str, float], still: np.ndarray, setup: Setup
+    heldout: dict[str, HeldOut], fitted: dict[str, float], still: np.ndarray, setup: RegressorSetup
 ) -> str:
     """`ok`, or what is wrong and what to do about it.
 
@@ -335,7 +343,7 @@ class Fitted:
 
 
 def identify_dynamics(
-    fit: Sequence[Record], heldout: Record, setup: Setup,
+    fit: Sequence[IdentificationRecord], heldout: IdentificationRecord, setup: RegressorSetup,
     processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
 ) -> Identification:  # fmt: skip
@@ -397,7 +405,10 @@ def identify_dynamics(
 
 
 def fit_runs(
-    fit: Sequence[Record], setup: Setup, processing: Processing, estimator: Estimator
+    fit: Sequence[IdentificationRecord],
+    setup: RegressorSetup,
+    processing: Processing,
+    estimator: Estimator,
 ) -> Fitted:
     """Fit base parameters to runs, without care for bias or a run to judge on.
 
@@ -443,7 +454,7 @@ def fit_runs(
     return Fitted(data, processing, equations, structure, told, found, still)
 
 
-def _cycles(record: Record, processing: Processing) -> int:
+def _cycles(record: IdentificationRecord, processing: Processing) -> int:
     """How many cycles of a motion are taken the mean of."""
     if processing.method != "periodic" or not processing.period:
         return 1
@@ -472,7 +483,7 @@ def _noise_stated(data: Gathered) -> bool:
     )
 
 
-def _covariance(fitted: Fitted, setup: Setup) -> np.ndarray:
+def _covariance(fitted: Fitted, setup: RegressorSetup) -> np.ndarray:
     """Covariance (r, r) by the sensors' noise, larger where residuals are.
 
     Residuals alone tell it in long logs, and where a smoother adapts to the data.
@@ -496,7 +507,7 @@ _TRIED = 600.0  # s of data that tell the shape
 
 
 def identify_with_shapes(
-    fit: Sequence[Record], heldout: Record, setup: Setup,
+    fit: Sequence[IdentificationRecord], heldout: IdentificationRecord, setup: RegressorSetup,
     processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
 ) -> Identification:  # fmt: skip
@@ -532,7 +543,7 @@ def identify_with_shapes(
     return replace(found, seconds=time.perf_counter() - started)
 
 
-def _some(fit: Sequence[Record], period: float | None) -> list[Record]:
+def _some(fit: Sequence[IdentificationRecord], period: float | None) -> list[IdentificationRecord]:
     """The first runs, as many as last long enough; one that alone is longer is cut."""
     some, seconds = [], 0.0
     for record in fit:
@@ -544,7 +555,10 @@ def _some(fit: Sequence[Record], period: float | None) -> list[Record]:
 
 
 def _misfit(
-    fit: Sequence[Record], setup: Setup, processing: Processing, estimator: Estimator
+    fit: Sequence[IdentificationRecord],
+    setup: RegressorSetup,
+    processing: Processing,
+    estimator: Estimator,
 ) -> float:
     """What the residuals' likelihood asks to be small."""
     found = fit_runs(fit, setup, processing, estimator)

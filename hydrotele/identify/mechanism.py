@@ -15,8 +15,8 @@ import numpy as np
 from hydrotele.core.datafile import Facts, parse, read_yaml, suggest
 from hydrotele.core.errors import InputError
 from hydrotele.identify.motion import GAP
-from hydrotele.identify.record import Record
-from hydrotele.identify.setup import Setup, mechanism_setup
+from hydrotele.identify.record import IdentificationRecord
+from hydrotele.identify.setup import RegressorSetup, mechanism_setup
 from hydrotele.logs.log import LEFT_OUT, Log, load_log, read_table
 from hydrotele.logs.rows import fit_clock
 from hydrotele.multibody.chain import load_chain
@@ -29,7 +29,7 @@ _FORCES = ("force.{joint}", "torque.{joint}", "effort.{joint}")
 _SPARSE = 1.5  # ticks of a clock per row
 
 
-class Mapping(Facts):
+class ColumnMapping(Facts):
     """Which column is which, and what is known of the mechanism.
 
     Names of joints, bodies and closures are those of the MJCF; `*` and `?` stand for any letters.
@@ -68,18 +68,20 @@ class Mechanism:
         source: of the mapping or the MJCF, for messages.
     """
 
-    setup: Setup
+    setup: RegressorSetup
     measured: tuple[str, ...]
-    mapping: Mapping
+    mapping: ColumnMapping
     source: str
 
 
-def load_mechanism(mjcf: str | Path, mapping: str | Path | Mapping | None = None) -> Mechanism:
+def load_mechanism(
+    mjcf: str | Path, mapping: str | Path | ColumnMapping | None = None
+) -> Mechanism:
     """Read a mechanism and its mapping.
 
     Args:
         mjcf: the file.
-        mapping: YAML file with the keys of `Mapping`, or one; None where columns have the joints'
+        mapping: YAML file with the keys of `ColumnMapping`, or one; None where columns have the joints'
             names, alone or after `position.`, `angle.`, `force.`, `torque.` or `effort.`.
 
     Returns:
@@ -90,12 +92,12 @@ def load_mechanism(mjcf: str | Path, mapping: str | Path | Mapping | None = None
     """
     chain, source = load_chain(mjcf), str(mapping if isinstance(mapping, str | Path) else mjcf)
     if mapping is None:
-        facts = Mapping()
-    elif isinstance(mapping, Mapping):
+        facts = ColumnMapping()
+    elif isinstance(mapping, ColumnMapping):
         facts = mapping
     else:
         data, lines = read_yaml(mapping)
-        facts = parse(Mapping, data, source, lines)
+        facts = parse(ColumnMapping, data, source, lines)
     measured = chain.drives
     if isinstance(facts.position, dict):
         measured = tuple(_named(chain.joints, facts.position, source, "joint"))
@@ -139,7 +141,7 @@ def _named(known: Sequence[str], patterns, source: str, what: str) -> list[str]:
 def mechanism_records(
     paths: Sequence[str | Path], mechanism: Mechanism, heldout: str | None = None,
     period: float | None = None,
-) -> tuple[tuple[Record, ...], Record, tuple[str, ...]]:  # fmt: skip
+) -> tuple[tuple[IdentificationRecord, ...], IdentificationRecord, tuple[str, ...]]:  # fmt: skip
     """Read logs of a mechanism.
 
     Args:
@@ -243,7 +245,7 @@ def _load(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], 
 
 def _record(
     log: Log, columns: dict[tuple[str, str], _Column], mechanism: Mechanism
-) -> tuple[Record, tuple[str, ...]]:
+) -> tuple[IdentificationRecord, tuple[str, ...]]:
     chain = mechanism.setup.chain
     clock, notes = fit_clock(log.time, log.source)
     time, period = log.time[clock.row], clock.period
@@ -283,14 +285,14 @@ def _record(
             f" {{{chain.drives[0]}: COLUMN}}`",
         )  # fmt: skip
     unknown = np.full(len(mechanism.measured), np.nan)
-    record = Record(
+    record = IdentificationRecord(
         log.name, period, mechanism.measured, np.array(position).T, unknown,
         np.array(force).T, np.full(len(chain.drives), np.nan),
     )  # fmt: skip
     return in_coordinates(record, mechanism.setup), notes
 
 
-def in_coordinates(record: Record, setup: Setup) -> Record:
+def in_coordinates(record: IdentificationRecord, setup: RegressorSetup) -> IdentificationRecord:
     """A record whose positions are those of the setup's given joints.
 
     Args:
@@ -318,5 +320,5 @@ def in_coordinates(record: Record, setup: Setup) -> Record:
     )  # fmt: skip
 
 
-def _rows(record: Record, rows: slice) -> Record:
+def _rows(record: IdentificationRecord, rows: slice) -> IdentificationRecord:
     return replace(record, position=record.position[rows], force=record.force[rows])

@@ -21,7 +21,7 @@ _UNLIKE = 8.0  # times noise: servos answer to noise, and no cycle is quite like
 
 
 @dataclass(frozen=True)
-class Record:
+class IdentificationRecord:
     """One run of k axes over n rows of a uniform clock.
 
     Attributes:
@@ -45,7 +45,9 @@ class Record:
     force_noise: np.ndarray
 
 
-def records(dataset: Dataset) -> tuple[tuple[Record, ...], Record, tuple[str, ...]]:
+def records(
+    dataset: Dataset,
+) -> tuple[tuple[IdentificationRecord, ...], IdentificationRecord, tuple[str, ...]]:
     """Positions and forces of all runs.
 
     A joint with its own sensor and a sensor of its cylinder's length is told by both, each weighted
@@ -115,7 +117,7 @@ def force_noise(machine: Machine, sensors: str) -> np.ndarray:
     return np.array(out)
 
 
-def whole_cycles(record: Record, period: float) -> Record:
+def whole_cycles(record: IdentificationRecord, period: float) -> IdentificationRecord:
     """The last whole cycles of a record: those before may still hold its fade-in.
 
     Args:
@@ -142,7 +144,7 @@ def whole_cycles(record: Record, period: float) -> Record:
     return replace(record, position=record.position[-count:], force=record.force[-count:])
 
 
-def check_repeats(record: Record, period: float, noise: np.ndarray) -> None:
+def check_repeats(record: IdentificationRecord, period: float, noise: np.ndarray) -> None:
     """Refuse a record whose motion does not repeat.
 
     Args:
@@ -166,7 +168,9 @@ def check_repeats(record: Record, period: float, noise: np.ndarray) -> None:
             )  # fmt: skip
 
 
-def beginning(record: Record, seconds: float, period: float | None = None) -> Record:
+def beginning(
+    record: IdentificationRecord, seconds: float, period: float | None = None
+) -> IdentificationRecord:
     """The first part of a record.
 
     Args:
@@ -188,7 +192,7 @@ def beginning(record: Record, seconds: float, period: float | None = None) -> Re
     return trimmed(replace(record, position=record.position[:rows], force=record.force[:rows]))
 
 
-def _record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> Record:
+def _record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> IdentificationRecord:
     rows = len(run.command)
     position, force = np.full((2, rows, len(axes)), np.nan)
     position_noise, force_noise = np.full((2, len(axes)), np.nan)
@@ -196,11 +200,13 @@ def _record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> Record:
         position[:, k], position_noise[k] = _position(dataset, run, axis)
         force[:, k], force_noise[k] = _force(dataset, run, axis)
     return trimmed(
-        Record(run.name, run.period, tuple(axes), position, position_noise, force, force_noise)
+        IdentificationRecord(
+            run.name, run.period, tuple(axes), position, position_noise, force, force_noise
+        )
     )
 
 
-def trimmed(record: Record) -> Record:
+def trimmed(record: IdentificationRecord) -> IdentificationRecord:
     """The rows from the first to the last at which every position was read.
 
     Args:

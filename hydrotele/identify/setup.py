@@ -54,7 +54,7 @@ Model = Literal["complete", "reduced"]
 
 
 @dataclass(frozen=True)
-class Setup:
+class RegressorSetup:
     """What a regressor is built of.
 
     Attributes:
@@ -129,7 +129,7 @@ def _merged(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[s
 def machine_setup(
     machine: Machine, chain: Chain, model: Model = "complete", *, pins: bool = False,
     asymmetry: bool = False,
-) -> Setup:  # fmt: skip
+) -> RegressorSetup:  # fmt: skip
     """Setup for a machine.
 
     Args:
@@ -156,7 +156,7 @@ def machine_setup(
         for drive, facts in zip(chain.drives, (machine.axes[a] for a in order), strict=True)
         if facts.force
     }
-    return Setup(
+    return RegressorSetup(
         chain=chain, given=tuple(machine.axes[a].joint for a in order), bodies=bodies,
         rubbing=(*rubbing, *(pin_friction(chain) if pins else ())), offsets=offsets,
     )  # fmt: skip
@@ -175,7 +175,7 @@ def cylinder_bars(machine: Machine) -> dict[str, tuple[str, str]]:
 def mechanism_setup(
     chain: Chain, given: Sequence[str] | None = None, *, passive: Sequence[str] = (),
     offsets: bool = True, alike: Sequence[Sequence[str]] = (), absent: Sequence[str] = (),
-) -> Setup:  # fmt: skip
+) -> RegressorSetup:  # fmt: skip
     """Setup for any mechanism, without a machine.
 
     Drives, and the passive joints that are named, have dry and viscous friction; the file's
@@ -201,7 +201,7 @@ def mechanism_setup(
             numbers = {"coulomb": float(chain.frictionloss[j]), "viscous": float(damping[j])}
             damping[j] = 0.0  # it has a column
         rubbing.append(FrictionTerm(place, numbers))
-    return Setup(
+    return RegressorSetup(
         chain=replace(chain, damping=damping),
         given=tuple(chain.drives if given is None else given),
         bodies=moved, rubbing=tuple(rubbing), offsets={} if offsets else None,

@@ -423,7 +423,7 @@ def load_dataset(
         heldout: name of the run to judge on; see `split`.
         aliases: the files' own column name -> channel, besides the machine's `log_columns`.
         force: accept logs whose metadata names another machine or tool.
-        mask: file of stretches that may not be used, see `mask.read_mask`; a log may also say so
+        mask: file of stretches that may not be used, see `rows.read_mask`; a log may also say so
             itself, in a column `valid` or `mask`.
 
     Raises:

@@ -15,12 +15,12 @@ from hydrotele.multibody.tree_motion import Frames, move_tree, new_frames, point
 from hydrotele.multibody.vectors import (
     add,
     cross,
-    factor,
-    least,
+    qr_factor,
+    qr_solve,
+    rotated,
+    rotating_acceleration,
     rotation,
-    swept,
-    times,
-    turned,
+    scaled,
     vector,
 )
 
@@ -53,7 +53,7 @@ def loop_errors(tree, frames, error, slope):
         weld = tree.row[c + 1] - first == 6
         for side in range(2):
             body, sign = tree.ends[c, side], 1.0 - 2.0 * side
-            arm = turned(rotation(frames.turn, body), vector(tree.points[c], side))
+            arm = rotated(rotation(frames.turn, body), vector(tree.points[c], side))
             point = add(vector(frames.place, body), arm)
             for k in range(3):
                 error[first + k, 0] += sign * point[k]
@@ -78,10 +78,10 @@ def _rotation_error(tree, frames, c):
     own, other = tree.turns[c, 0], tree.turns[c, 1]
     total = (0.0, 0.0, 0.0)
     for k in range(3):
-        a = turned(one, (own[0, k], own[1, k], own[2, k]))
-        b = turned(two, (other[0, k], other[1, k], other[2, k]))
+        a = rotated(one, (own[0, k], own[1, k], own[2, k]))
+        b = rotated(two, (other[0, k], other[1, k], other[2, k]))
         total = add(total, cross(b, a))
-    return times(0.5, total)
+    return scaled(0.5, total)
 
 
 @allocation_free
@@ -96,9 +96,9 @@ def closure_acceleration(tree, frames, out):
         weld = tree.row[c + 1] - first == 6
         for side in range(2):
             body, sign = tree.ends[c, side], 1.0 - 2.0 * side
-            arm = turned(rotation(frames.turn, body), vector(tree.points[c], side))
+            arm = rotated(rotation(frames.turn, body), vector(tree.points[c], side))
             w, dw = vector(frames.spin, body), vector(frames.spin_rate, body)
-            part = add(vector(frames.acceleration, body), swept(w, dw, arm))
+            part = add(vector(frames.acceleration, body), rotating_acceleration(w, dw, arm))
             for k in range(3):
                 out[first + k, 0] += sign * part[k]
                 if weld:
@@ -160,14 +160,14 @@ def close_near(tree, q, others, space):
         if len(error) == 0:
             return True
         loop_errors(tree, space.frames, error, space.slope)
-        if not factor(space.slope, others, space.q_factor, space.r_factor):
+        if not qr_factor(space.slope, others, space.q_factor, space.r_factor):
             return False
         open_by = 0.0
         for m in range(len(error)):
             open_by = max(open_by, abs(error[m, 0]))
         if open_by < CLOSED:
             return True
-        least(space.q_factor, space.r_factor, len(others), error, 0, part, 0)
+        qr_solve(space.q_factor, space.r_factor, len(others), error, 0, part, 0)
         for o in range(len(others)):
             if not abs(part[o, 0]) < _LEAP:
                 return False

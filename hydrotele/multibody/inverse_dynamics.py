@@ -22,7 +22,7 @@ from hydrotele.multibody.closures import (
     loop_space,
 )
 from hydrotele.multibody.tree_motion import move_tree, point_column, wrenches
-from hydrotele.multibody.vectors import dot, factor, least, less, vector
+from hydrotele.multibody.vectors import dot, qr_factor, qr_solve, subtract, vector
 
 _STRIDE = 0.1  # rad or m, to which the given joints move at once, lest a loop change its branch
 _WHERE = "closures"
@@ -156,7 +156,7 @@ def _project(tree, given, others, drives, q, out):
             if not close_near(tree, q, others, space):
                 return row
         for i in range(k if hidden else 0):
-            least(space.q_factor, space.r_factor, hidden, space.slope, given.joints[i], part, i)
+            qr_solve(space.q_factor, space.r_factor, hidden, space.slope, given.joints[i], part, i)
             for o in range(hidden):
                 moves[others[o], i] = -part[o, i]
         rate, acceleration = out.rate[row], out.acceleration[row]
@@ -167,7 +167,7 @@ def _project(tree, given, others, drives, q, out):
         if hidden:
             move_tree(tree, q, rate, space.still, space.none, frames)
             closure_acceleration(tree, frames, space.error)
-            least(space.q_factor, space.r_factor, hidden, space.error, 0, part, 0)
+            qr_solve(space.q_factor, space.r_factor, hidden, space.error, 0, part, 0)
             for o in range(hidden):
                 acceleration[others[o]] = -part[o, 0]
         for j in range(v):
@@ -175,10 +175,10 @@ def _project(tree, given, others, drives, q, out):
             for i in range(k):
                 acceleration[j] += moves[j, i] * given.acceleration[row, i]
         move_tree(tree, q, rate, acceleration, ground, frames)
-        if not factor(moves[drives].T.copy(), every, q_drive, r_drive):
+        if not qr_factor(moves[drives].T.copy(), every, q_drive, r_drive):
             return row
         for i in range(k):
-            least(q_drive, r_drive, k, unit, i, inverse, i)
+            qr_solve(q_drive, r_drive, k, unit, i, inverse, i)
         share = out.share[row]
         for i in range(k):
             for j in range(v):
@@ -219,7 +219,7 @@ def _load(tree, frames, body, forces, torques, share, out):
 def _rub(tree, frames, closure, share, out):
     """Carry viscous friction in a closure to the drives; return the rate of its turning."""
     one, two = tree.ends[closure, 0], tree.ends[closure, 1]
-    spin = less(vector(frames.spin, one), vector(frames.spin, two))
+    spin = subtract(vector(frames.spin, one), vector(frames.spin, two))
     for i in range(len(share)):
         out[i, closure] = 0.0
     for j in range(share.shape[1]):

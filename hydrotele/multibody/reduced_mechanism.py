@@ -22,7 +22,7 @@ DAMPING, HOME = range(2)  # rows of `joint`
 BAR, JOINT = range(2)  # columns of `drive`
 
 
-class Mechanism(NamedTuple):
+class ReducedMechanism(NamedTuple):
     """Frames 0 = world, 1 .. l = links, tube and rod of every bar, both pins of every closure.
 
     Attributes:
@@ -71,7 +71,7 @@ def coordinate_names(machine: Machine) -> list[str]:
     return [link.joint.name for link in links if link.joint]
 
 
-def mechanism(machine: Machine) -> Mechanism:
+def mechanism(machine: Machine) -> ReducedMechanism:
     """Tables of a machine's mechanism.
 
     Args:
@@ -106,7 +106,7 @@ def mechanism(machine: Machine) -> Mechanism:
         tree.append((index[pin.link], PIN, -1))
         shape.append(_row(pin.position))
     following = following_joints(machine)
-    return Mechanism(
+    return ReducedMechanism(
         tree=_with_reach(np.array(tree, int)),
         shape=np.array(shape),
         links=len(order),

@@ -21,7 +21,7 @@ from hydrotele.multibody.reduced_mechanism import (
     POSITION,
     REACH,
     SLIDE,
-    Mechanism,
+    ReducedMechanism,
 )
 
 # columns of `frame`
@@ -31,7 +31,7 @@ LENGTH, LENGTH_RATE, LENGTH_BIAS, LENGTH_ROW = range(4)  # columns of `bar`
 Q, RATE, DRIFT, BIAS = range(4)  # rows of `joint`
 
 
-class Motion(NamedTuple):
+class ReducedMotion(NamedTuple):
     """Work space and result of `place_frames` and `move_frames`, for f frames, N coordinates.
 
     Attributes:
@@ -62,7 +62,7 @@ class Motion(NamedTuple):
     normal: np.ndarray
 
 
-def motion_space(mech: Mechanism) -> Motion:
+def motion_space(mech: ReducedMechanism) -> ReducedMotion:
     """Fresh work space, standing at home; the world's row stays as it is written here."""
     f, n, bound = len(mech.tree), mech.joint.shape[1], len(mech.bound)
     frame = np.zeros((f, FRAME))
@@ -72,7 +72,7 @@ def motion_space(mech: Mechanism) -> Motion:
     basis[mech.free, np.arange(len(mech.free))] = 1.0
     joint = np.zeros((4, n))
     joint[Q] = mech.joint[HOME]
-    return Motion(
+    return ReducedMotion(
         frame, np.zeros((f, n, 6)), np.zeros((f, n, 6)), np.zeros((mech.bars, LENGTH_ROW + n)),
         np.zeros((n, n)), joint, basis, np.zeros((3 * (f - mech.bodies) // 2, n + 2)),
         np.zeros((bound + 1, bound)),
@@ -100,11 +100,11 @@ def cross(ax, ay, az, bx, by, bz):
 
 
 @allocation_free
-def turned(frame, i, x, y, z):
+def rotated(frame, i, x, y, z):
     """A vector given in a frame, in the world's axes.
 
     Args:
-        frame: see `Motion`.
+        frame: see `ReducedMotion`.
         i: index of the frame.
         x: scalar.
         y: scalar.
@@ -127,10 +127,10 @@ def place_origin(tree, shape, frame, jacobian, i):
     """Origin of a frame as a point of its parent, and its Jacobian.
 
     Args:
-        tree: see `Mechanism`.
-        shape: see `Mechanism`.
-        frame: see `Motion`.
-        jacobian: see `Motion`; the spin's part is that of the parent.
+        tree: see `ReducedMechanism`.
+        shape: see `ReducedMechanism`.
+        frame: see `ReducedMotion`.
+        jacobian: see `ReducedMotion`; the spin's part is that of the parent.
         i: index of the frame.
 
     Returns:
@@ -139,7 +139,7 @@ def place_origin(tree, shape, frame, jacobian, i):
     Source: rigid-body kinematics.
     """
     p = tree[i, PARENT]
-    rx, ry, rz = turned(
+    rx, ry, rz = rotated(
         frame, p, shape[i, POSITION], shape[i, POSITION + 1], shape[i, POSITION + 2]
     )
     frame[i, ORIGIN] = frame[p, ORIGIN] + rx
@@ -160,8 +160,8 @@ def move_origin(tree, frame, i):
     """Rates and accelerations of a placed frame as if it were fixed to its parent.
 
     Args:
-        tree: see `Mechanism`.
-        frame: see `Motion`.
+        tree: see `ReducedMechanism`.
+        frame: see `ReducedMotion`.
         i: index of the frame.
 
     Returns:
@@ -208,12 +208,12 @@ def place_links(tree, shape, links, joint, frame, jacobian):
     """Places and Jacobians of the links.
 
     Args:
-        tree: see `Mechanism`.
-        shape: see `Mechanism`.
+        tree: see `ReducedMechanism`.
+        shape: see `ReducedMechanism`.
         links: number of links.
-        joint: see `Motion`; its positions.
-        frame: see `Motion`; written.
-        jacobian: see `Motion`; written.
+        joint: see `ReducedMotion`; its positions.
+        frame: see `ReducedMotion`; written.
+        jacobian: see `ReducedMotion`; written.
 
     Returns:
         Nothing.
@@ -224,7 +224,7 @@ def place_links(tree, shape, links, joint, frame, jacobian):
         p, j = tree[i, PARENT], tree[i, COORDINATE]
         place_origin(tree, shape, frame, jacobian, i)
         lx, ly, lz = shape[i, AXIS], shape[i, AXIS + 1], shape[i, AXIS + 2]
-        x, y, z = turned(frame, p, lx, ly, lz)
+        x, y, z = rotated(frame, p, lx, ly, lz)
         if tree[i, KIND] == HINGE:
             _rotate(frame, i, p, lx, ly, lz, joint[Q, j])
             jacobian[i, j, 3], jacobian[i, j, 4], jacobian[i, j, 5] = x, y, z
@@ -251,11 +251,11 @@ def move_links(tree, links, joint, frame, jacobian):
     """Rates and accelerations of the placed links.
 
     Args:
-        tree: see `Mechanism`.
+        tree: see `ReducedMechanism`.
         links: number of links.
-        joint: see `Motion`; its rates.
-        frame: see `Motion`; written.
-        jacobian: see `Motion`; has the joints' axes.
+        joint: see `ReducedMotion`; its rates.
+        frame: see `ReducedMotion`; written.
+        jacobian: see `ReducedMotion`; has the joints' axes.
 
     Returns:
         Nothing.
@@ -287,9 +287,9 @@ def gather_forces(mech, m):
     `M = sum J' P` and `h = sum J' F` with the momenta P and the wrenches F of all bodies.
 
     Args:
-        mech: Mechanism.
-        m: Motion after `close_chains`; `momentum`, `mass`, the columns FORCE of `frame` and the
-            row BIAS of `joint` are written.
+        mech: ReducedMechanism.
+        m: ReducedMotion after `close_chains`; `momentum`, `mass`, the columns FORCE of `frame` and
+            the row BIAS of `joint` are written.
 
     Returns:
         Nothing.
@@ -321,7 +321,7 @@ def gather_forces(mech, m):
 def _load_body(shape, frame, jacobian, b, reach, momentum):
     """Momentum per unit rate, and force and torque of inertia and gravity, about the origin."""
     mass = shape[b, MASS]
-    rx, ry, rz = turned(frame, b, shape[b, COM], shape[b, COM + 1], shape[b, COM + 2])
+    rx, ry, rz = rotated(frame, b, shape[b, COM], shape[b, COM + 1], shape[b, COM + 2])
     i0, i1, i2 = shape[b, INERTIA], shape[b, INERTIA + 1], shape[b, INERTIA + 2]
     t0, t1, t2 = frame[b, 0], frame[b, 1], frame[b, 2]
     t3, t4, t5 = frame[b, 3], frame[b, 4], frame[b, 5]

@@ -33,7 +33,7 @@ class FrictionTerm:
 
     Attributes:
         place: a joint, or a closure, whose bodies turn against each other.
-        nominal: parameter -> its value; the columns that there are. See `RUBBING`.
+        nominal: parameter -> its value; the columns that there are. See `FRICTION_TERMS`.
         smoothing: v_0 [rad/s] or [m/s]; 0 is the sign of v.
         stribeck: v_s [rad/s] or [m/s].
     """
@@ -44,7 +44,7 @@ class FrictionTerm:
     stribeck: float = 0.02
 
 
-RUBBING = (
+FRICTION_TERMS = (
     "coulomb", "stribeck", "coulomb_asymmetry", "stribeck_asymmetry", "viscous",
     "viscous_asymmetry",
 )  # fmt: skip
@@ -135,7 +135,7 @@ def regressor(
     return Regressor(matrix, drives, tuple(names), tuple(units), np.array(nominal))
 
 
-def sign_doubt(
+def sign_uncertainty(
     chain: Chain, found: Projection, drives: Sequence[str], rubbing: Sequence[FrictionTerm],
     rate_std: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
@@ -167,9 +167,9 @@ def _friction_terms(
     chain: Chain, found: Projection, one: FrictionTerm, rate_std: np.ndarray | None
 ):
     """Parameter -> (column (n, k), unit)."""
-    strange = [kind for kind in one.nominal if kind not in RUBBING]
+    strange = [kind for kind in one.nominal if kind not in FRICTION_TERMS]
     if strange:
-        raise InputError(_WHERE, f"friction has no {strange[0]}: {', '.join(RUBBING)}")
+        raise InputError(_WHERE, f"friction has no {strange[0]}: {', '.join(FRICTION_TERMS)}")
     if one.place in chain.closures:
         return _pin(chain.closures.index(one.place), found, one)
     j = chain.index(one.place)

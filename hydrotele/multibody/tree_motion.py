@@ -6,18 +6,18 @@ import numpy as np
 
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.multibody.vectors import (
-    about,
     add,
-    after,
+    axis_rotation,
+    composed,
     cross,
-    less,
-    put,
-    put_rotation,
+    rotated,
+    rotated_back,
+    rotating_acceleration,
     rotation,
-    swept,
-    times,
-    turned,
-    turned_back,
+    scaled,
+    store,
+    store_rotation,
+    subtract,
     vector,
 )
 
@@ -59,49 +59,49 @@ def new_frames(tree):
 @allocation_free
 def move_tree(tree, q, rate, acceleration, ground, frames):
     """Place and move all bodies, from (v,) positions, rates, accelerations; ground: (3,)."""
-    put(frames.place, 0, (0.0, 0.0, 0.0))
-    put(frames.spin, 0, (0.0, 0.0, 0.0))
-    put(frames.spin_rate, 0, (0.0, 0.0, 0.0))
-    put(frames.acceleration, 0, (ground[0], ground[1], ground[2]))
-    put_rotation(frames.turn, 0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    store(frames.place, 0, (0.0, 0.0, 0.0))
+    store(frames.spin, 0, (0.0, 0.0, 0.0))
+    store(frames.spin_rate, 0, (0.0, 0.0, 0.0))
+    store(frames.acceleration, 0, (ground[0], ground[1], ground[2]))
+    store_rotation(frames.turn, 0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
     for b in range(1, len(tree.parent)):
         up = tree.parent[b]
         t, w, dw = rotation(frames.turn, up), vector(frames.spin, up), vector(frames.spin_rate, up)
-        arm = turned(t, vector(tree.offset, b))
+        arm = rotated(t, vector(tree.offset, b))
         p = add(vector(frames.place, up), arm)
-        a = add(vector(frames.acceleration, up), swept(w, dw, arm))
-        t = after(t, rotation(tree.turn, b))
+        a = add(vector(frames.acceleration, up), rotating_acceleration(w, dw, arm))
+        t = composed(t, rotation(tree.turn, b))
         for j in range(tree.first[b], tree.first[b + 1]):
             own, center = vector(tree.axis, j), vector(tree.anchor, j)
-            way, arm = turned(t, own), turned(t, center)
-            put(frames.axis, j, way)
-            put(frames.anchor, j, add(p, arm))
+            way, arm = rotated(t, own), rotated(t, center)
+            store(frames.axis, j, way)
+            store(frames.anchor, j, add(p, arm))
             step, turning = q[j] - tree.zero[j], cross(w, way)
             if tree.slides[j]:
-                arm = times(step, way)
-                a = add(a, swept(w, dw, arm))
-                a = add(a, add(times(2.0 * rate[j], turning), times(acceleration[j], way)))
+                arm = scaled(step, way)
+                a = add(a, rotating_acceleration(w, dw, arm))
+                a = add(a, add(scaled(2.0 * rate[j], turning), scaled(acceleration[j], way)))
                 p = add(p, arm)
                 continue
-            a = add(a, swept(w, dw, arm))
-            dw = add(dw, add(times(acceleration[j], way), times(rate[j], turning)))
-            w = add(w, times(rate[j], way))
-            t = after(t, about(own, step))
-            back = times(-1.0, turned(t, center))
-            a = add(a, swept(w, dw, back))
+            a = add(a, rotating_acceleration(w, dw, arm))
+            dw = add(dw, add(scaled(acceleration[j], way), scaled(rate[j], turning)))
+            w = add(w, scaled(rate[j], way))
+            t = composed(t, axis_rotation(own, step))
+            back = scaled(-1.0, rotated(t, center))
+            a = add(a, rotating_acceleration(w, dw, back))
             p = add(add(p, arm), back)
-        put(frames.place, b, p)
-        put_rotation(frames.turn, b, t)
-        put(frames.spin, b, w)
-        put(frames.spin_rate, b, dw)
-        put(frames.acceleration, b, a)
+        store(frames.place, b, p)
+        store_rotation(frames.turn, b, t)
+        store(frames.spin, b, w)
+        store(frames.spin_rate, b, dw)
+        store(frames.acceleration, b, a)
 
 
 @allocation_free
 def point_column(tree, frames, j, point):
     """Velocity of a point per unit rate of a joint that moves it."""
     way = vector(frames.axis, j)
-    return way if tree.slides[j] else cross(way, less(point, vector(frames.anchor, j)))
+    return way if tree.slides[j] else cross(way, subtract(point, vector(frames.anchor, j)))
 
 
 @allocation_free
@@ -115,10 +115,10 @@ def wrenches(frames, body, forces, torques):
     for k in range(3):
         forces[k, 0], torques[k, 0] = a[k], 0.0
         way = (t[0][k], t[1][k], t[2][k])
-        f, n = swept(w, dw, way), cross(way, a)
+        f, n = rotating_acceleration(w, dw, way), cross(way, a)
         for m in range(3):
             forces[m, 1 + k], torques[m, 1 + k] = f[m], n[m]
-    v, dv = turned_back(t, w), turned_back(t, dw)
+    v, dv = rotated_back(t, w), rotated_back(t, dw)
     for p in range(6):
         i, j = _PAIRS[p, 0], _PAIRS[p, 1]
         x, y, z = 0.0, 0.0, 0.0  # I w, with a unit at (i, j) and (j, i)
@@ -134,6 +134,6 @@ def wrenches(frames, body, forces, torques):
                 y, dy = v[i], dv[i]
             else:
                 z, dz = v[i], dv[i]
-        n = turned(t, add((dx, dy, dz), cross(v, (x, y, z))))
+        n = rotated(t, add((dx, dy, dz), cross(v, (x, y, z))))
         for m in range(3):
             forces[m, 4 + p], torques[m, 4 + p] = 0.0, n[m]

@@ -16,7 +16,7 @@ def vector(rows, k):
 
 
 @allocation_free
-def put(rows, k, a):
+def store(rows, k, a):
     """Write a tuple (x, y, z) into row k of (n, 3) rows."""
     rows[k, 0], rows[k, 1], rows[k, 2] = a
 
@@ -28,13 +28,13 @@ def add(a, b):
 
 
 @allocation_free
-def less(a, b):
+def subtract(a, b):
     """Difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @allocation_free
-def times(s, a):
+def scaled(s, a):
     """A vector times a number."""
     return s * a[0], s * a[1], s * a[2]
 
@@ -52,7 +52,7 @@ def cross(a, b):
 
 
 @allocation_free
-def swept(w, dw, arm):
+def rotating_acceleration(w, dw, arm):
     """Acceleration `dw x r + w x (w x r)` of a point at an arm r of a turning body."""
     return add(cross(dw, arm), cross(w, cross(w, arm)))
 
@@ -67,7 +67,7 @@ def rotation(rows, k):
 
 
 @allocation_free
-def put_rotation(rows, k, r):
+def store_rotation(rows, k, r):
     """Write three row vectors into matrix k of (n, 3, 3)."""
     m = rows[k]
     m[0, 0], m[0, 1], m[0, 2] = r[0]
@@ -76,25 +76,25 @@ def put_rotation(rows, k, r):
 
 
 @allocation_free
-def turned(r, a):
+def rotated(r, a):
     """A vector turned by a rotation."""
     return dot(r[0], a), dot(r[1], a), dot(r[2], a)
 
 
 @allocation_free
-def turned_back(r, a):
+def rotated_back(r, a):
     """A vector turned by the inverse of a rotation."""
-    return add(add(times(a[0], r[0]), times(a[1], r[1])), times(a[2], r[2]))
+    return add(add(scaled(a[0], r[0]), scaled(a[1], r[1])), scaled(a[2], r[2]))
 
 
 @allocation_free
-def after(r, s):
+def composed(r, s):
     """The rotation that first does s, then r."""
-    return turned_back(s, r[0]), turned_back(s, r[1]), turned_back(s, r[2])
+    return rotated_back(s, r[0]), rotated_back(s, r[1]), rotated_back(s, r[2])
 
 
 @allocation_free
-def about(axis, angle):
+def axis_rotation(axis, angle):
     """Rotation about a unit axis by an angle [rad] (Rodrigues)."""
     c, s = math.cos(angle), math.sin(angle)
     x, y, z = axis
@@ -110,7 +110,7 @@ _STIFF = 1e-7  # least ratio of a column's own part to the largest column; below
 
 
 @allocation_free
-def factor(matrix, columns, q, r):
+def qr_factor(matrix, columns, q, r):
     """QR of chosen columns by modified Gram-Schmidt, twice; False if they lack rank."""
     rows, count, size = len(matrix), len(columns), 0.0
     for j in range(count):
@@ -142,7 +142,7 @@ def factor(matrix, columns, q, r):
 
 
 @allocation_free
-def least(q, r, count, right, column, answer, k):
+def qr_solve(q, r, count, right, column, answer, k):
     """Least squares after `_factor`, of one column of the right side into one of the answer."""
     for j in range(count - 1, -1, -1):
         total = 0.0

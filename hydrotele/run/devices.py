@@ -120,7 +120,7 @@ class Switches:
             self.commands[number] = step(self.commands[number])
 
 
-NUDGE = 0.25  # of the handle's way, for one press of a key
+KEY_STEP = 0.25  # of the handle's way, for one press of a key
 
 # GLFW codes of keys that MuJoCo's viewer leaves alone -> (name, axis of the handle, way)
 KEYS = {
@@ -227,7 +227,7 @@ class Keyboard:
     def _take(self, code: int) -> None:
         if code in KEYS:
             _, axis, way = KEYS[code]
-            self._axes[axis] = min(1.0, max(-1.0, self._axes[axis] + way * NUDGE))
+            self._axes[axis] = min(1.0, max(-1.0, self._axes[axis] + way * KEY_STEP))
         elif code in SWITCH_KEYS:
             _, number, way = SWITCH_KEYS[code]
             (self._switches.up if way > 0.0 else self._switches.down)(number)

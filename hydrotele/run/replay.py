@@ -15,7 +15,7 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms, sensor_set
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import usual_unit
-from hydrotele.simulate.feedback import defective
+from hydrotele.simulate.feedback import apply_sensor_errors
 from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog, late_channels, true_channels
@@ -109,7 +109,7 @@ def replay_log(
     factor = (log.time[-1] - log.time[0]) / max(clock.perf_counter() - begin, 1e-9)
     values, units = true_channels(plant, record)
     if not any(name.startswith("truth.") for name in log.columns):
-        values |= defective(machine, values | late_channels(plant, record))
+        values |= apply_sensor_errors(machine, values | late_channels(plant, record))
     simulated = Log(
         time=log.time, columns=values, units=units, source=f"replay of {log.source}",
         metadata={"machine": machine.name, "tool": machine.tool, "run": f"replay {log.name}"},

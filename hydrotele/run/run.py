@@ -25,7 +25,7 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.noise import sensor_set
-from hydrotele.run.session import Prepared, Session
+from hydrotele.run.session import PreparedRun, Session
 from hydrotele.scenario.scenario import Scenario, own_machine
 from hydrotele.simulate.audit import audit
 from hydrotele.simulate.feedback import Feedback, feedback, measure
@@ -185,7 +185,7 @@ def scenario_machine(scenario: Scenario) -> Machine:
     return machine
 
 
-def prepare(scenario: Scenario) -> Prepared:
+def prepare(scenario: Scenario) -> PreparedRun:
     """Compile the machine of a scenario, put it at its start and plan the run.
 
     Raises:
@@ -201,7 +201,7 @@ def prepare(scenario: Scenario) -> Prepared:
     if sensors and round(scenario.control_rate / scenario.log_rate) % seen.every:
         message = f"sample at {sensors.rate:g} Hz; log_rate {scenario.log_rate:g} Hz must divide it"
         raise InputError(f"sensors {scenario.sensors}", message)
-    return Prepared(plant, data, plan, seen)
+    return PreparedRun(plant, data, plan, seen)
 
 
 def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:

@@ -30,7 +30,7 @@ from hydrotele.teleop.operator_model import Hand
 from hydrotele.teleop.station import Station
 
 
-class Prepared(NamedTuple):
+class PreparedRun(NamedTuple):
     """A scenario before its first step."""
 
     plant: Plant
@@ -39,7 +39,7 @@ class Prepared(NamedTuple):
     seen: Feedback
 
 
-class Looped(NamedTuple):
+class SessionResult(NamedTuple):
     """What the ticks leave.
 
     Attributes:
@@ -77,7 +77,7 @@ class Session:
     """
 
     def __init__(
-        self, prepared: Prepared, scenario: Scenario, nominal: Machine, hand: Hand | None = None
+        self, prepared: PreparedRun, scenario: Scenario, nominal: Machine, hand: Hand | None = None
     ) -> None:
         """Make room for the whole run.
 
@@ -169,7 +169,7 @@ class Session:
         """What has happened around the machine: (time [s], sentence)."""
         return self._around.events
 
-    def finish(self) -> Looped:
+    def finish(self) -> SessionResult:
         """End the run here; everything is cut to its whole rows.
 
         Raises:
@@ -191,7 +191,7 @@ class Session:
         record = self._recorder.record(rows)
         commands = self._commands[: self.tick]
         events = tuple(self._around.events)
-        return Looped(plan, record, commands, self._worst, wall, station, events)
+        return SessionResult(plan, record, commands, self._worst, wall, station, events)
 
 
 def _cut_plan(plan: Plan, ticks: int) -> Plan:

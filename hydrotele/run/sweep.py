@@ -51,7 +51,7 @@ from hydrotele.run.sweep_runs import (
     Journal,
     Keep,
     Outcome,
-    Task,
+    RunTask,
     check_figures,
     failed,
     perform,
@@ -59,14 +59,14 @@ from hydrotele.run.sweep_runs import (
     possible_results,
     unpack,
 )
-from hydrotele.run.sweep_table import Table, make_table, save_table
+from hydrotele.run.sweep_table import SweepTable, make_table, save_table
 from hydrotele.scenario.scenario import save_scenario
 
 _WAIT = 30  # s for the scheduler and the first worker
 _WHERE = "--dask"
 
 
-def cluster_outcomes(tasks: Iterable[Task], address: str) -> Generator[Outcome]:
+def cluster_outcomes(tasks: Iterable[RunTask], address: str) -> Generator[Outcome]:
     """Do runs on a cluster, a few more at a time than it has threads.
 
     Args:
@@ -103,11 +103,11 @@ def cluster_outcomes(tasks: Iterable[Task], address: str) -> Generator[Outcome]:
         yield from _outcomes(client, distributed, iter(tasks))
 
 
-def _outcomes(client, distributed, waiting: Iterator[Task]) -> Iterator[Outcome]:
+def _outcomes(client, distributed, waiting: Iterator[RunTask]) -> Iterator[Outcome]:
     ahead = 2 * max(sum(client.nthreads().values()), 1) + 8
     runs = {}
 
-    def submit(task: Task):
+    def submit(task: RunTask):
         future = client.submit(perform, task, pure=False, key=f"hydrotele-{task.run}-{id(runs)}")
         runs[future.key] = task.run
         return future
@@ -269,7 +269,7 @@ class _Worker:
         theirs.close()  # so that its end shows here
         self.ready, self.task = False, None
 
-    def give(self, task: Task) -> None:
+    def give(self, task: RunTask) -> None:
         """Let it do a run; a dead one is found out by the next wait."""
         self.task = task
         with contextlib.suppress(OSError):
@@ -282,7 +282,7 @@ class _Worker:
         self.connection.close()
 
 
-def outcomes(tasks: Iterable[Task], jobs: int) -> Generator[Outcome]:
+def outcomes(tasks: Iterable[RunTask], jobs: int) -> Generator[Outcome]:
     """Do runs in processes of their own, with one thread each.
 
     Args:
@@ -363,7 +363,7 @@ def _starting() -> Iterator[None]:
 def _work(connection: Connection) -> None:
     """Do runs until the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
+    tasks: queue.SimpleQueue[RunTask] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(connection, tasks), daemon=True).start()
     connection.send(_READY)
     while True:
@@ -382,7 +382,7 @@ def _listen(connection: Connection, tasks: queue.SimpleQueue) -> None:
 Progress = Callable[[str, int, int, int], None]
 
 
-class How(NamedTuple):
+class SweepSettings(NamedTuple):
     """How the runs of a sweep are done; nothing here changes a result.
 
     Attributes:
@@ -400,7 +400,7 @@ class How(NamedTuple):
     keep: Keep | None = None
 
 
-class Swept(NamedTuple):
+class SweepResult(NamedTuple):
     """A finished sweep.
 
     Attributes:
@@ -409,14 +409,17 @@ class Swept(NamedTuple):
         done: number of runs that were done now, not before.
     """
 
-    table: Table
+    table: SweepTable
     failed: list[Entry]
     done: int
 
 
 def run_sweep(
-    file: SweepFile, target: Path, how: How | None = None, progress: Progress | None = None
-) -> Swept:
+    file: SweepFile,
+    target: Path,
+    how: SweepSettings | None = None,
+    progress: Progress | None = None,
+) -> SweepResult:
     """Do the runs of a sweep that are not done yet; write its table.
 
     Args:
@@ -433,7 +436,7 @@ def run_sweep(
         InputError: a point is wrong, the folder is not this sweep's, or the cluster does not work.
         KeyboardInterrupt: on Ctrl-C; finished runs are kept.
     """
-    how, base = how or How(), open_base(file)
+    how, base = how or SweepSettings(), open_base(file)
     checked = check_points(
         base, progress and (lambda done, total: progress("check", done, total, 0))
     )
@@ -452,7 +455,7 @@ def run_sweep(
         _save_timings(entries, target / "timings.csv")
         counts = {"ok": len(entries) - len(failures), "failed": len(failures)}
         write_summary(target, base, {"identity": identity(base, checked), **counts})
-    return Swept(table, failures, len(missing))
+    return SweepResult(table, failures, len(missing))
 
 
 def _missing(base: Base, journal: Journal, retry_failed: bool) -> dict[int, Point]:
@@ -465,7 +468,7 @@ def _missing(base: Base, journal: Journal, retry_failed: bool) -> dict[int, Poin
 
 
 def _do(
-    base: Base, target: Path, journal: Journal, missing: dict[int, Point], how: How,
+    base: Base, target: Path, journal: Journal, missing: dict[int, Point], how: SweepSettings,
     checked: Checked, progress: Progress | None,
 ) -> None:  # fmt: skip
     """Do the missing runs and write each into the journal."""
@@ -487,16 +490,16 @@ def _do(
                 progress("run", done, total, failed)
 
 
-def _task(base: Base, target: Path, how: How, checked: Checked, point: Point) -> Task:
+def _task(base: Base, target: Path, how: SweepSettings, checked: Checked, point: Point) -> RunTask:
     scenario = scenario_of(base, point)
     if fingerprint(scenario) != checked.fingerprints[point.run - 1]:
         message = "a file that it names changed while the sweep ran; the finished runs are kept"
         raise InputError(base.scenario.path, message)
     keep = how.keep if base.file.sweep.logs else None
     if how.dask:
-        return Task(point.run, scenario, None, base.inputs.files_of(scenario), keep, None)
+        return RunTask(point.run, scenario, None, base.inputs.files_of(scenario), keep, None)
     folder = target.resolve()
-    return Task(point.run, scenario, str(folder), {}, keep, str(folder / SCRATCH))
+    return RunTask(point.run, scenario, str(folder), {}, keep, str(folder / SCRATCH))
 
 
 def _check_versions(outcome: Outcome) -> None:

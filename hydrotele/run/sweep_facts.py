@@ -201,7 +201,7 @@ def load_sweep(name_or_path: str | Path) -> SweepFile:
     """Read a sweep file, a shipped one by its name.
 
     Returns:
-        The validated sweep; its points are checked by `points.check_points`.
+        The validated sweep; its points are checked by `sweep_checking.check_points`.
 
     Raises:
         InputError: names file, line, key path and what is allowed.

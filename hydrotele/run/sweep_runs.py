@@ -287,7 +287,7 @@ Keep = Callable[[Run, Path, bool], Any]
 _ONE = threading.Lock()  # a worker of a cluster may have threads; runs share MuJoCo's callbacks
 
 
-class Task(NamedTuple):
+class RunTask(NamedTuple):
     """A run to do.
 
     Attributes:
@@ -321,7 +321,7 @@ class Outcome(NamedTuple):
     files: Files
 
 
-def perform(task: Task) -> Outcome:
+def perform(task: RunTask) -> Outcome:
     """Do a run. Never raises: a run that fails says why."""
     try:
         with _ONE, tempfile.TemporaryDirectory(prefix="sweep_", dir=task.scratch) as scratch:
@@ -339,7 +339,7 @@ def failed(run: int, reason: str) -> Outcome:
     return Outcome(Entry(run, FAILED, reason.strip().partition("\n")[0]), {}, {})
 
 
-def _perform(task: Task, scratch: Path) -> Outcome:
+def _perform(task: RunTask, scratch: Path) -> Outcome:
     stop_profiling_clock()
     unpack(task.files, scratch)
     there = Path(task.folder) if task.folder else scratch

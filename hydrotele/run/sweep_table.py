@@ -16,7 +16,7 @@ from hydrotele.run.sweep_facts import Sweep, points
 from hydrotele.run.sweep_runs import Entry, key_unit
 
 
-class Table(NamedTuple):
+class SweepTable(NamedTuple):
     """Columns of one length, in order of the runs.
 
     Attributes:
@@ -34,7 +34,7 @@ class Table(NamedTuple):
 
 def make_table(
     sweep: Sweep, seed: int, entries: Mapping[int, Entry], effect_units: Mapping[str, str]
-) -> Table:
+) -> SweepTable:
     """The table of all runs.
 
     Args:
@@ -58,10 +58,10 @@ def make_table(
     known = {name: unit for entry in found for name, (_, unit) in entry.numbers.items()}
     for name, unit in known.items():
         columns[name] = [entry.numbers.get(name, (None, unit))[0] for entry in found]
-    return Table(columns, units | known, varied, tuple(known))
+    return SweepTable(columns, units | known, varied, tuple(known))
 
 
-def save_table(table: Table, name: str, path: Path) -> None:
+def save_table(table: SweepTable, name: str, path: Path) -> None:
     """Write the table as Parquet, whole or not at all; the same runs give the same bytes.
 
     Args:
@@ -112,7 +112,7 @@ _LAST = (
 )  # fmt: skip
 
 
-def default_figures(table: Table) -> list[str]:
+def default_figures(table: SweepTable) -> list[str]:
     """At most six numbers that differ between runs: tracking first, then forces and balances."""
     axes = [n for n in table.figures if n.startswith("tracking.") and n.endswith(".rms")]
     followed = [n for n in _FIRST if n in axes] or axes
@@ -120,14 +120,14 @@ def default_figures(table: Table) -> list[str]:
     return [name for name in ordered if len(set(_known(table, name).values())) > 1][:_MOST]
 
 
-def _known(table: Table, name: str) -> dict[int, float]:
+def _known(table: SweepTable, name: str) -> dict[int, float]:
     """Run -> value of a number, where there is one."""
     values = table.columns.get(name, [])
     return {run: float(v) for run, v in zip(table.columns["run"], values, strict=False)
             if v is not None}  # fmt: skip
 
 
-def spread_statistics(table: Table, figures: list[str]) -> dict[str, dict[str, Any]]:
+def spread_statistics(table: SweepTable, figures: list[str]) -> dict[str, dict[str, Any]]:
     """Smallest, median and largest value of numbers, with the runs that have them."""
     found = {}
     for name in figures:

@@ -25,7 +25,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import beyond, scenarios_folder
 from hydrotele.logs.log import load_log
 from hydrotele.machine.signals import parse_channel
-from hydrotele.scenario.surroundings import Thing
+from hydrotele.scenario.surroundings import SurroundingObject
 from hydrotele.scenario.teleoperation import TeleopPilot
 
 
@@ -217,7 +217,7 @@ class Scenario(Facts):
     log_rate: Positive = 50.0
     sensors: str = "ideal"
     ground: bool = True
-    surroundings: tuple[Thing, ...] = ()
+    surroundings: tuple[SurroundingObject, ...] = ()
     start: Start = Start()
     pilot: Pilot
     servo: Servo = Servo()

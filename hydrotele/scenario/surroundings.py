@@ -24,7 +24,7 @@ class Plate(Facts):
     damping: NonNegative = 3.0e4
 
 
-class Tree(Facts):
+class StandingTree(Facts):
     """A standing tree that a disc saw cuts from its stump and a grab arm then holds.
 
     `position` [m] on the ground; `kerf` [m] is the height at which it can be cut, `energy` [J/m^3]
@@ -78,4 +78,4 @@ class LogOnGround(Facts):
         return self.density * math.pi * self.diameter**2 / 4.0 * self.length
 
 
-Thing = Annotated[Plate | Tree | LogOnGround, Field(discriminator="kind")]
+SurroundingObject = Annotated[Plate | StandingTree | LogOnGround, Field(discriminator="kind")]

@@ -83,7 +83,7 @@ def draw_forces(forces: Forces, drive: str, judged: HeldOut) -> bytes:
 _MEMBERS = 6  # of a combination that are written out
 
 
-class Learned(NamedTuple):
+class LearnedFrom(NamedTuple):
     """What an identification learned from.
 
     Attributes:
@@ -102,7 +102,7 @@ class Learned(NamedTuple):
 
 
 def write_identify_report(
-    learned: Learned, found: Identification | None, hydraulics: Hydraulics | None,
+    learned: LearnedFrom, found: Identification | None, hydraulics: Hydraulics | None,
     best: Consistent | None, path: str | Path,
 ) -> None:  # fmt: skip
     """Write an identification as one self-contained HTML file.
@@ -129,7 +129,7 @@ def write_identify_report(
 
 
 def _header(
-    learned: Learned, found: Identification | None, hydraulics: Hydraulics | None
+    learned: LearnedFrom, found: Identification | None, hydraulics: Hydraulics | None
 ) -> Markup:
     of = f"mechanism {learned.name}"
     if learned.tool is not None:
@@ -259,7 +259,9 @@ def _hydraulics(found: Hydraulics) -> Markup:
     return section("Valves, oil and supply", why, table(head, rows, numbers="  nnn"))
 
 
-def _use(learned: Learned, found: Identification | None, hydraulics: Hydraulics | None) -> Markup:
+def _use(
+    learned: LearnedFrom, found: Identification | None, hydraulics: Hydraulics | None
+) -> Markup:
     commands = (
         "hydrotele replay LOG --machine identified/\nhydrotele run SCENARIO --machine identified/"
     )

@@ -9,12 +9,12 @@ from pydantic import TypeAdapter
 
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.surroundings import Thing
+from hydrotele.scenario.surroundings import SurroundingObject
 from hydrotele.simulate.closure import follow_loops, following_joints
 from hydrotele.simulate.mechanism import assemble, mjcf_document
 from hydrotele.simulate.surroundings import object_joints
 
-_THINGS = TypeAdapter(list[Thing])
+_THINGS = TypeAdapter(list[SurroundingObject])
 
 
 class Poses(NamedTuple):
@@ -32,7 +32,7 @@ class Poses(NamedTuple):
 
 
 def model_with_looks(
-    machine: Machine, ground: bool = True, surroundings: tuple[Thing, ...] = ()
+    machine: Machine, ground: bool = True, surroundings: tuple[SurroundingObject, ...] = ()
 ) -> mujoco.MjModel:
     """Compile a machine with all that a picture needs; a plant leaves that out for speed.
 
@@ -78,7 +78,7 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
     return found
 
 
-def logged_surroundings(log: Log) -> tuple[Thing, ...]:
+def logged_surroundings(log: Log) -> tuple[SurroundingObject, ...]:
     """Plates, trees and logs that a log of truth knows of."""
     return tuple(_THINGS.validate_json(log.metadata.get("surroundings", "[]")))
 

@@ -19,7 +19,7 @@ from hydrotele.machine.noise import channel_sensor, converter
 from hydrotele.machine.sensors import Sensor, SensorError, SensorSet
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import sensed_channels
-from hydrotele.simulate.stepping import Stepper, look_back, true_values
+from hydrotele.simulate.stepping import Stepper, delayed_values, true_values
 
 
 def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:
@@ -73,7 +73,7 @@ def _convert_all(values, step, low, high):
     return readings
 
 
-def defective(machine: Machine, truth: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """What sensors without noise read: `scale * value + offset` of the machine's sensor errors.
 
     Args:
@@ -99,7 +99,7 @@ def measure(
         sensors: the set, None for ideal.
         seed: the scenario's seed.
         truth: channel -> (n,) true values; where a sensor reads late, those that it reads
-            (`readout.late_channels`).
+            (`record.late_channels`).
         errors: channel -> (n,) errors already drawn; others are drawn here.
 
     Returns:
@@ -109,7 +109,7 @@ def measure(
         the machine, ideal sensors have them too) before both.
     """
     readings = {}
-    for channel, values in defective(machine, truth).items():
+    for channel, values in apply_sensor_errors(machine, truth).items():
         sensor = channel_sensor(machine, sensors, channel)
         if sensor.error_rms or sensor.bits:
             error = (errors or {}).get(channel)
@@ -234,7 +234,7 @@ def sample(table, sim, tick, steps):
         return
     values = np.empty(len(sim.past.before))
     true_values(sim, values)
-    look_back(sim.past, tick * steps, values)
+    delayed_values(sim.past, tick * steps, values)
     read_sensors(table.sensors, values, table.errors[tick // table.every])
     span = table.period if tick > 0 else 0.0
     table.readings.supply[0] = hold_readings(values, sim.hydraulic, span, table.readings)

@@ -30,7 +30,7 @@ from hydrotele.hydraulics.parameters import SLOTS, Slot, actuator_order, actuato
 from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
 from hydrotele.machine.drives import Axis, Cylinder, Pin
 from hydrotele.machine.machine import Link, Machine
-from hydrotele.scenario.surroundings import Thing
+from hydrotele.scenario.surroundings import SurroundingObject
 from hydrotele.simulate.surroundings import write_surroundings
 from hydrotele.terms.table import terms_table
 
@@ -179,7 +179,7 @@ def assemble(
     timestep: float = 1.0e-3,
     ground: bool = True,
     looks: bool = True,
-    surroundings: tuple[Thing, ...] = (),
+    surroundings: tuple[SurroundingObject, ...] = (),
 ) -> mjcf.RootElement:
     """Build the MJCF of a machine, with scene, closures and actuators.
 
@@ -207,7 +207,7 @@ def assemble(
 
 def _completed(
     root, machine: Machine, timestep: float, ground: bool, looks: bool,
-    surroundings: tuple[Thing, ...],
+    surroundings: tuple[SurroundingObject, ...],
 ) -> mjcf.RootElement:  # fmt: skip
     """The document with what the machine file, the surroundings and the scene say."""
     root.model = machine.name
@@ -488,7 +488,7 @@ def drive_and_load_dofs(machine: Machine, model: mujoco.MjModel) -> tuple[list[i
     return drives, loads
 
 
-def wind_up(
+def preload_transmissions(
     machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, force: dict[str, float]
 ) -> None:
     """Wind the transmissions up until they carry static forces.

@@ -1,8 +1,8 @@
 """Hydraulics inside MuJoCo at native speed: the actuator callbacks.
 
 Every hydraulic actuator has four activations and carries its numbers in `actuator_user`
-(`circuit.Slot`). The last one advances all of them, because they share the supply (MuJoCo clears an
-actuator's rates just before it calls back for it), and owns what the bristles of all and a slow
+(`parameters.Slot`). The last one advances all of them, because they share the supply (MuJoCo clears
+an actuator's rates just before it calls back for it), and owns what the bristles of all and a slow
 pump remember; a force drive with bristles has two activations of its own, these and, as MuJoCo
 gives force from the last activation, its command. The force is that of the pressures at the end of
 the step, as `actearly` does, or explicit stepping would add negative damping. The callbacks touch

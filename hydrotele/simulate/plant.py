@@ -1,8 +1,8 @@
 """The plant: a Machine compiled to MuJoCo with its hydraulics, and its complete states.
 
 Bristles of presliding friction: an explicit step follows a drive on its bristles only as long as
-these are not too stiff for the inertia that it moves; `hydraulics.actuator.bristle_rate` limits them by the
-inertia at home that is written here.
+these are not too stiff for the inertia that it moves; `hydraulics.actuator.bristle_rate` limits
+them by the inertia at home that is written here.
 
 End stops: a limit of MuJoCo is a soft constraint whose force solves `(A + R) f = a_ref - a_0` with
 the inverse inertia A felt there. With `R = 1 / (h b)`, `a_ref = -v / h - k r / (h b)` and
@@ -35,7 +35,7 @@ from hydrotele.hydraulics.parameters import (
     extra_state_names,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.surroundings import Thing
+from hydrotele.scenario.surroundings import SurroundingObject
 from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
 from hydrotele.simulate.mechanism import (
     TIP_SITE,
@@ -46,7 +46,7 @@ from hydrotele.simulate.mechanism import (
     flexible_axes,
     load_joint,
     mjcf_document,
-    wind_up,
+    preload_transmissions,
 )
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.terms.law import Drives
@@ -151,13 +151,13 @@ class Plant:
         drive_dof: (nu,) the same in `qvel`.
         rod_qpos: (nu,) place of the piston displacement in `qpos`, -1 without cylinder.
         hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i+3.
-        memory: name of every other state, as `parameters.memory_names` has them -> its activation.
+        memory: name of every other state, of `parameters.extra_state_names` -> its activation.
     """
 
     machine: Machine
     model: mujoco.MjModel
     ground: bool
-    surroundings: tuple[Thing, ...]
+    surroundings: tuple[SurroundingObject, ...]
     axes: tuple[str, ...]
     qpos: np.ndarray
     dof: np.ndarray
@@ -234,7 +234,7 @@ class Plant:
 
 def build_plant(
     machine: Machine, timestep: float = 1.0e-3, ground: bool = True,
-    surroundings: tuple[Thing, ...] = (),
+    surroundings: tuple[SurroundingObject, ...] = (),
 ) -> Plant:  # fmt: skip
     """Compile a machine.
 
@@ -315,7 +315,9 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
     data = mujoco.MjData(plant.model)
     close_loops(plant.machine, plant.model, data, dict(joints or {}))
     forces = holding_forces(plant.machine, plant.model, data)
-    wind_up(plant.machine, plant.model, data, dict(zip(plant.axes, forces, strict=True)))
+    preload_transmissions(
+        plant.machine, plant.model, data, dict(zip(plant.axes, forces, strict=True))
+    )
     forces = forces - terms_at_rest(plant.machine, data, plant.drive_qpos, forces)
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
         axis = plant.machine.axes[name]

@@ -5,6 +5,8 @@ delay does not reach the native hydraulics, which read `ctrl` itself, and would 
 step; here a command that changes inside a step acts as its mean over the step, which is of second
 order. Whoever steps a model bare steps it without delays.
 """
+# pyright: reportCallIssue=false
+# numba's intrinsics are called without their typing context.
 
 from typing import NamedTuple
 
@@ -202,7 +204,7 @@ def begin_past(sim, command):
 
 
 @compiled
-def arrived(line, axes, tick, step, steps, out):
+def arriving_commands(line, axes, tick, step, steps, out):
     """Commands that act in one physics step.
 
     Args:
@@ -257,7 +259,7 @@ def step_physics(sim, tick, steps, command):
             line.ring[(tick + 1) % len(line.ring), i] = command[i]
     for step in range(steps):
         if len(line.ring) > 0:
-            arrived(line, sim.axes, tick, step, steps, sim.ctrl)
+            arriving_commands(line, sim.axes, tick, step, steps, sim.ctrl)
         call_step(sim.mj_step, sim.model, sim.data)
         if len(past.ring) > 0:
             _keep(sim, tick * steps + step + 1)
@@ -279,7 +281,7 @@ def _keep(sim, number):
 
 
 @compiled
-def look_back(past, number, values):
+def delayed_values(past, number, values):
     """Replace true values by what late sensors show, linear between two physics steps.
 
     Args:
@@ -361,7 +363,9 @@ def delayed_commands(plant: Plant, before: np.ndarray, held: np.ndarray, steps: 
         for tick, command in enumerate(held):
             line.ring[(tick + 1) % length] = command
             for step in range(steps):
-                arrived(line, len(plant.axes), tick, step, steps, out[tick * steps + step])
+                arriving_commands(
+                    line, len(plant.axes), tick, step, steps, out[tick * steps + step]
+                )
     return out
 
 
@@ -429,5 +433,5 @@ class Stepper:
         """(c,) what sensors without error show now, in the order of `sensed_channels`."""
         values = np.empty(len(self.sim.past.before))
         true_values(self.sim, values)
-        look_back(self.sim.past, self.tick * self.steps, values)
+        delayed_values(self.sim.past, self.tick * self.steps, values)
         return values

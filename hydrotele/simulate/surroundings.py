@@ -22,7 +22,7 @@ from hydrotele.core.compiled import allocation_free
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.surroundings import LogOnGround, Plate, Thing, Tree
+from hydrotele.scenario.surroundings import LogOnGround, Plate, StandingTree, SurroundingObject
 
 CLOSED, OPEN, LINE, STRAIGHT, CENTRE, HALF, OWN, BEFORE, BEHIND = 0, 1, 2, 3, 4, 7, 10, 11, 12
 GRIP = 13
@@ -142,7 +142,7 @@ _PREFIXES = ("plate_", "tree_", "log_")
 
 
 def write_surroundings(
-    root, machine: Machine, things: tuple[Thing, ...], looks: bool = True
+    root, machine: Machine, things: tuple[SurroundingObject, ...], looks: bool = True
 ) -> None:
     """Add what is around to an assembled MJCF.
 
@@ -159,7 +159,7 @@ def write_surroundings(
         where = f"surroundings.{number}"
         if isinstance(thing, Plate):
             _write_plate(root, f"plate_{number}", thing)
-        elif isinstance(thing, Tree):
+        elif isinstance(thing, StandingTree):
             _write_tree(root, f"tree_{number}", thing, machine, where)
         else:
             body = _write_log(root, f"log_{number}", thing, machine, where)
@@ -241,7 +241,7 @@ def _draw_log(body, name: str, log: LogOnGround) -> None:
         )  # fmt: skip
 
 
-def _write_tree(root, name: str, tree: Tree, machine: Machine, where: str) -> None:
+def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: str) -> None:
     for part in ("saw", "grab"):
         _need_axis(machine, getattr(tree, part), f"{where}.{part}")
     x, y = tree.position
@@ -294,7 +294,7 @@ def is_surrounding_object(name: str) -> bool:
 
 
 def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
-    """Numbers of `holding.grip_step` for a log.
+    """Numbers of `grip_step` for a log.
 
     Args:
         model: the machine's. The box site `<grab>_pocket` is the room between the jaws: logs lie
@@ -320,7 +320,9 @@ class Surroundings:
         events: (time [s], what happened).
     """
 
-    def __init__(self, machine: Machine, model: mujoco.MjModel, things: tuple[Thing, ...]) -> None:
+    def __init__(
+        self, machine: Machine, model: mujoco.MjModel, things: tuple[SurroundingObject, ...]
+    ) -> None:
         """Look up what is where.
 
         Args:
@@ -333,7 +335,7 @@ class Surroundings:
         self._trees = [
             _Standing(machine, model, f"tree_{n}", thing)
             for n, thing in enumerate(things)
-            if isinstance(thing, Tree)
+            if isinstance(thing, StandingTree)
         ]
         self._logs = [
             _Grip(machine, model, f"log_{n}", thing.grab, log_grip(model, thing))
@@ -387,7 +389,9 @@ class _Grip:
 class _Standing:
     """One tree of a run."""
 
-    def __init__(self, machine: Machine, model: mujoco.MjModel, name: str, tree: Tree) -> None:
+    def __init__(
+        self, machine: Machine, model: mujoco.MjModel, name: str, tree: StandingTree
+    ) -> None:
         self._model, self._tree, self.name = model, tree, name
         saw = machine.link_of(machine.axes[tree.saw].joint)
         grip = grip_parameters(tree.closed, tree.closed, 2, _LEANING, *_STEM_POCKET, 2)

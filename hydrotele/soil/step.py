@@ -535,7 +535,7 @@ def soil_step(n, surface, loose, state, edge, dt, out):
         surface: (m,) height of the profile, changed [m].
         loose: (m,) how much of it is loose, changed [m].
         state: (STATE,) of the bucket, changed; see `numbers`.
-        edge: EdgeMotion.
+        edge: EdgeMotion, where the edge is and how it moves [m], [m/s], [rad].
         dt: time since the step before, scalar [s].
         out: (OUT,) written: force outwards and up [N], moment about the edge [N m], mass carried
             [kg] and its place from the edge [m]. The weight of what is carried is not in the force.

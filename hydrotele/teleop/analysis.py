@@ -128,7 +128,7 @@ class Side(Facts):
         return Impedance(self.mass, self.damping, self.stiffness)
 
 
-class Body(Facts):
+class RigidBody(Facts):
     """Master or slave, which have a mass [kg], and perhaps damping [N s/m], stiffness [N/m]."""
 
     mass: Positive
@@ -208,8 +208,8 @@ class TeleopCase(Facts):
     """Everything that an analysis needs; one axis, all in one scale of lengths and forces."""
 
     name: Name
-    master: Body
-    slave: Body
+    master: RigidBody
+    slave: RigidBody
     master_control: Controller
     slave_control: Controller
     hand: Side

@@ -39,7 +39,7 @@ _TRIPS = 40  # there and back that a run lasts at least
 _FINEST = 2e-6  # s, a step below which a run takes minutes
 
 
-class Law(NamedTuple):
+class ControlLaw(NamedTuple):
     """Coefficients on the signals (10,).
 
     Attributes:
@@ -53,7 +53,7 @@ class Law(NamedTuple):
     back: np.ndarray
 
 
-class Run(NamedTuple):
+class SimulatedRun(NamedTuple):
     """A simulated run.
 
     Attributes:
@@ -65,7 +65,7 @@ class Run(NamedTuple):
     felt: complex
 
 
-def law_of(case: Case, structure: str, reflected: float = 1.0) -> Law:
+def control_law(case: Case, structure: str, reflected: float = 1.0) -> ControlLaw:
     """The control law of a structure in time.
 
     Args:
@@ -96,7 +96,7 @@ def law_of(case: Case, structure: str, reflected: float = 1.0) -> Law:
     if structure == "four_channel_rate":
         forward[IMPULSE] = kv
         back = back + on_motion(case.task, W) / kv
-    return Law(own, forward, reflected * back)
+    return ControlLaw(own, forward, reflected * back)
 
 
 def on_motion(impedance: Impedance, position: int) -> np.ndarray:
@@ -128,7 +128,9 @@ def step_of(case: Case) -> float:
     return step
 
 
-def kicked(case: Case, structure: str, reflected: float = 1.0, seconds: float = 40.0) -> Run:
+def impulse_response(
+    case: Case, structure: str, reflected: float = 1.0, seconds: float = 40.0
+) -> SimulatedRun:
     """Simulate a kick of the hand, with hand and task in place.
 
     Args:
@@ -142,10 +144,10 @@ def kicked(case: Case, structure: str, reflected: float = 1.0, seconds: float = 
         The run.
     """
     seconds = max(seconds, _TRIPS * 2.0 * case.delay)
-    return _simulated(case, law_of(case, structure, reflected), seconds, 0.0, 0.0)
+    return _simulated(case, control_law(case, structure, reflected), seconds, 0.0, 0.0)
 
 
-def grows(run: Run) -> bool:
+def is_growing(run: SimulatedRun) -> bool:
     """Whether a kick grows: speeds late in the run are larger than early ones."""
     reached = run.largest[run.largest > 0.0]
     if len(reached) < _BLOCKS:
@@ -153,7 +155,7 @@ def grows(run: Run) -> bool:
     return bool(run.largest[-4:].max() > run.largest[4:8].max())
 
 
-def swept(case: Case, structure: str, frequency: float) -> complex:
+def simulate_sine(case: Case, structure: str, frequency: float) -> complex:
     """Impedance felt where the master's motion is an imposed sine.
 
     Transients are given more and more time, until that changes nothing.
@@ -166,7 +168,7 @@ def swept(case: Case, structure: str, frequency: float) -> complex:
     Returns:
         Force over velocity, of two periods [N s/m].
     """
-    law, period = law_of(case, structure), 2.0 * math.pi / frequency
+    law, period = control_law(case, structure), 2.0 * math.pi / frequency
     felt = 0.0
     for settle in _SETTLE:
         before, seconds = felt, (math.ceil(settle / period) + _PERIODS) * period
@@ -176,7 +178,9 @@ def swept(case: Case, structure: str, frequency: float) -> complex:
     return felt
 
 
-def _simulated(case: Case, law: Law, seconds: float, frequency: float, measured: float) -> Run:
+def _simulated(
+    case: Case, law: ControlLaw, seconds: float, frequency: float, measured: float
+) -> SimulatedRun:
     step = step_of(case)
     if frequency:  # a whole number of steps in a period, so that the sine's mean is 0
         step = 2.0 * math.pi / frequency / math.ceil(2.0 * math.pi / frequency / step)
@@ -192,11 +196,11 @@ def _simulated(case: Case, law: Law, seconds: float, frequency: float, measured:
         inverse, inverse @ now[:, _KNOWN], inverse @ delayed, np.array(lags), late - lags, step,
         round(seconds / step), round(measured / step), frequency,
     )  # fmt: skip
-    return Run(largest, complex(sums[0] / sums[1]) if frequency else 0.0)
+    return SimulatedRun(largest, complex(sums[0] / sums[1]) if frequency else 0.0)
 
 
 def _equations(
-    case: Case, law: Law, lags: tuple[int, int], imposed: bool
+    case: Case, law: ControlLaw, lags: tuple[int, int], imposed: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (4, 10) on signals now, and on delayed ones (4, 20): forward, then back.
 
@@ -307,7 +311,7 @@ SWEPT = 2.0 * np.pi * np.geomspace(0.1, 5.0, 9)  # rad/s, what a hand moves
 
 
 @dataclass(frozen=True)
-class Sweep:
+class SineSweep:
     """Impedance felt in a simulated sine sweep.
 
     Attributes:
@@ -359,7 +363,7 @@ class Agreement:
         return float(np.mean(self.predicted == self.seen))
 
 
-def sweep(case: Case, structure: str, frequencies: np.ndarray = SWEPT) -> Sweep:
+def sweep(case: Case, structure: str, frequencies: np.ndarray = SWEPT) -> SineSweep:
     """Measure what is felt with imposed sines, and compute it.
 
     Args:
@@ -374,8 +378,8 @@ def sweep(case: Case, structure: str, frequencies: np.ndarray = SWEPT) -> Sweep:
     expected = transmitted(port, 1j * frequencies, case.task)
     measured = []
     if unstable_held(port, case.task) == 0:
-        measured = [swept(case, structure, float(w)) for w in frequencies]
-    return Sweep(
+        measured = [simulate_sine(case, structure, float(w)) for w in frequencies]
+    return SineSweep(
         structure, case.delay_forward, case.delay_back, frequencies, expected, np.array(measured)
     )
 
@@ -393,7 +397,10 @@ def agreement(case: Case, structure: str, delays: np.ndarray, factors: np.ndarra
         Prediction and simulation.
     """
     seen = [
-        [not grows(kicked(case.with_delay(float(t)), structure, float(k))) for t in delays]
+        [
+            not is_growing(impulse_response(case.with_delay(float(t)), structure, float(k)))
+            for t in delays
+        ]
         for k in factors
     ]
     predicted = stability_map(case, structure, delays, factors)

@@ -21,7 +21,7 @@ from hydrotele.teleop.analysis import (
     loop_gain,
     stability_map,
 )
-from hydrotele.teleop.confirm import Agreement, Sweep, agreement, sweep
+from hydrotele.teleop.confirm import Agreement, SineSweep, agreement, sweep
 from hydrotele.teleop.linear_case import STRUCTURES, LinearCase, local_ratio
 from hydrotele.teleop.switching import Spring
 from hydrotele.teleop.two_port import OnTheAxis, unstable_poles
@@ -53,7 +53,7 @@ class Findings:
     factors: np.ndarray
     maps: dict[str, np.ndarray]
     spring: Spring | None = None
-    sweeps: tuple[Sweep, ...] = ()
+    sweeps: tuple[SineSweep, ...] = ()
     agreements: tuple[Agreement, ...] = ()
 
 
@@ -206,7 +206,7 @@ def _spring(one: Spring) -> dict:
     }  # fmt: skip
 
 
-def _sweep(one: Sweep) -> dict:
+def _sweep(one: SineSweep) -> dict:
     return {
         "structure": one.structure, "delay_forward": one.delay_forward,
         "delay_back": one.delay_back, "error": one.error, "frequency": one.frequencies,

@@ -73,7 +73,7 @@ class ControllerState(NamedTuple):
     same: float
 
 
-class Levitated(NamedTuple):
+class CoilOutput(NamedTuple):
     """What the coils get.
 
     Attributes:
@@ -123,7 +123,7 @@ def initial_controller_state() -> ControllerState:
 def levitation_step(
     control: Levitation, before: ControllerState, place: np.ndarray, quaternion: np.ndarray,
     target: np.ndarray, turned: np.ndarray,
-) -> tuple[ControllerState, Levitated]:  # fmt: skip
+) -> tuple[ControllerState, CoilOutput]:  # fmt: skip
     """One period: velocities by differences, wrench, currents.
 
     A reading that is no number, or has been the same for longer than noise allows, switches the
@@ -144,11 +144,11 @@ def levitation_step(
     Source: Zhu 1994, 5.1.3.
     """
     if not (np.isfinite(place).all() and np.isfinite(quaternion).all()):
-        return initial_controller_state(), Levitated(_NONE, True, True)
+        return initial_controller_state(), CoilOutput(_NONE, True, True)
     same = np.array_equal(place, before.place) and np.array_equal(quaternion, before.quaternion)
     after = ControllerState(place, quaternion, before.same + control.period if same else 0.0)
     if after.same > control.frozen:
-        return after, Levitated(_NONE, True, True)
+        return after, CoilOutput(_NONE, True, True)
     velocity, rate = np.zeros(3), np.zeros(3)
     if np.isfinite(before.place).all():
         velocity = (place - before.place) / control.period
@@ -156,7 +156,7 @@ def levitation_step(
     motion = Motion(place, quaternion, velocity, rate)
     wrench = compliance_wrench(control.body, control.axes, control.handle, motion, target, turned)
     found = control.coils.currents(wrench)
-    return after, Levitated(found.value, found.limited, False)
+    return after, CoilOutput(found.value, found.limited, False)
 
 
 def coils_from_handle(handle: np.ndarray, place: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
@@ -282,7 +282,7 @@ _TONES = 6
 
 
 @dataclass(frozen=True)
-class Flight:
+class LevitationRun:
     """What happened, one row per control period.
 
     Attributes:
@@ -358,7 +358,7 @@ def simulate_levitation(
     start: np.ndarray | None = None, noise: float = 1.0, diodes: bool = False, seed: int = 0,
     cab: tuple[np.ndarray, np.ndarray] | None = None, push: np.ndarray | None = None,
     spoil: Callable[[int, Reading], Reading] | None = None,
-) -> Flight:  # fmt: skip
+) -> LevitationRun:  # fmt: skip
     """Levitate the flotor along a path.
 
     Args:
@@ -400,7 +400,7 @@ def simulate_levitation(
             flotor.step(currents[k], push[k])
     time = control.period * np.arange(n)
     warnings = int(np.sum(flotor.data.warning.number))
-    return Flight(time, pose, place, quaternion, currents, limited, blind, warnings)
+    return LevitationRun(time, pose, place, quaternion, currents, limited, blind, warnings)
 
 
 def excitation_path(

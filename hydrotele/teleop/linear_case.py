@@ -39,7 +39,7 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import COORDINATES, arm_axes, pose_to_joints
 from hydrotele.control.state_filter import butterworth
-from hydrotele.control.tip_balance import Arm, arm_tables
+from hydrotele.control.tip_balance import ArmBalance, arm_tables
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.reduced_dynamics import place_mechanism
 from hydrotele.estimate.reduced_model import X
@@ -149,7 +149,7 @@ def tip_drive(
     )  # fmt: skip
 
 
-def _inertia(arm: Arm, row: int) -> tuple[float, np.ndarray, np.ndarray]:
+def _inertia(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
     """Effective mass, Jacobian row (k,), and joint rates (k,) for a unit rate of the coordinate."""
     motion, k = arm.space.motion, len(arm.joint)
     place_mechanism(arm.model, arm.space, arm.z)
@@ -163,7 +163,7 @@ def _inertia(arm: Arm, row: int) -> tuple[float, np.ndarray, np.ndarray]:
     return mass, lever, np.linalg.solve(table, np.eye(k)[row])
 
 
-def _turning_stiffness(arm: Arm, valve: int) -> float:
+def _turning_stiffness(arm: ArmBalance, valve: int) -> float:
     """Stiffness of a joint on its drive's oil [N m/rad], after `place`."""
     user = arm.model.user[valve * SLOTS : (valve + 1) * SLOTS]
     head, rod = user[Slot.VOLUME_HEAD], user[Slot.VOLUME_ROD]
@@ -208,7 +208,7 @@ def drive_follows(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) ->
     Returns:
         (...) [1].
 
-    Source: this module's docstring; `teleop.slave.ask` for the look ahead.
+    Source: this module's docstring; `teleop.slave.update_references` for the look ahead.
     """
     valve, place_lag, _ = _lags(tip, servo, clocks, s)
     held = np.exp(-0.5 * clocks.control * s)
@@ -234,7 +234,7 @@ STRUCTURES = ("rate_force", "position_force", "rate_position", "position_positio
 
 @dataclass(frozen=True)
 class LinearCase:
-    """A teleoperated axis with hand, machine and task; as `teleop.case.Case` to an analysis.
+    """A teleoperated axis with hand, machine and task; as `teleop.analysis.Case` to an analysis.
 
     Attributes:
         pilot: the scenario's.

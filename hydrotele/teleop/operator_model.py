@@ -151,7 +151,7 @@ Hand = Callable[[], np.ndarray]
 """Where a live operator wants the handle now, (6,) [m], [rad]."""
 
 
-class Seen(Protocol):
+class Perceived(Protocol):
     """What there was to see and feel, by tick (`StationLog`)."""
 
     touching: np.ndarray
@@ -178,7 +178,7 @@ class OperatorModel:
     """
 
     def __init__(
-        self, pilot: TeleopPilot, joystick: Joystick, numbers: Master, seen: Seen, ticks: int,
+        self, pilot: TeleopPilot, joystick: Joystick, numbers: Master, seen: Perceived, ticks: int,
         period: float, seed: int, hand: Hand | None = None,
     ) -> None:  # fmt: skip
         """Sit down.

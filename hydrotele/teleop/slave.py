@@ -57,7 +57,7 @@ class Slave(NamedTuple):
     """Numbers of the slave's side; k joints and task coordinates.
 
     Attributes:
-        arm: (9,) of `kinematics.task.task_numbers`.
+        arm: (9,) of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         start: (5,) pose at the start: r [m], theta [rad], z [m], attitude [rad], head [rad].
         table: (k, 11) of every coordinate: joystick axis (-1 without), sign, gain, dead band,

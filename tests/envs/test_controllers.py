@@ -52,12 +52,12 @@ def test_references_between_those_shown_are_those_of_the_task():
     controller.begin(4)
     for _ in range(120):  # past the fade, whose second derivative jumps
         core.step(controller(core.observation))
-    preview, now = Preview(core.setup), core.memory["tick"][0] * core.setup.clock.period
+    preview, now = Preview(core.setup), core.episodes["tick"][0] * core.setup.clock.period
     for ahead in (0.0, 0.06, 0.3, PREVIEWS[-1]):
         place, rate = preview.at(core.observation, ahead)
         for n in range(4):
             true = [
-                track_reference.py_func(core.memory["goal"][n], i, now + ahead) for i in (0, 1, 2)
+                track_reference.py_func(core.episodes["goal"][n], i, now + ahead) for i in (0, 1, 2)
             ]
             # fifth derivative of 0.3 rad at 2.4 rad/s over 0.4 s: some 1e-4
             assert place[n] == pytest.approx([t[0] for t in true], abs=5e-4)

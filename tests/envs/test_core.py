@@ -44,7 +44,7 @@ def test_a_step_is_that_of_a_scenario_run(effects):
     core.reset(np.array([4]))
     machine = core.setup.variants.machines[0]
     plant = build_plant(machine, ground=False)
-    position = core.memory["position"][0]
+    position = core.episodes["position"][0]
     names = [machine.axes[name].joint for name in plant.axes]
     data = rest_state(plant, dict(zip(names, position[:3].tolist(), strict=True)))
     begin_leapfrog(plant.model, data)
@@ -70,7 +70,7 @@ def test_readings_are_those_of_a_scenario_run():
     seen, stepper = feedback(plant, None, 0, 300, 200.0), Stepper(plant, data, 5)
     seen.update(0, stepper)
     for tick, command in enumerate(commands(200)):
-        e = core.memory[0]
+        e = core.episodes[0]
         for own, theirs in (("joint", seen.joint), ("head", seen.head), ("rod", seen.rod)):
             assert np.array_equal(e[own][:3], theirs)
         assert e["supply"] == seen.supply
@@ -87,9 +87,9 @@ def test_real_sensors_err_within_their_accuracy_and_are_held():
     bound = sensor.accuracy + 0.5 * sensor.span / 2**sensor.bits
     errors, changes = [], 0
     for tick, command in enumerate(commands(400)):
-        before = core.memory["joint"][0].copy()
+        before = core.episodes["joint"][0].copy()
         core.step(command)
-        e = core.memory[0]
+        e = core.episodes[0]
         if (tick + 1) % 4 == 0:
             errors.append(e["joint"][:3] - e["position"][:3])
             changes += not np.array_equal(e["joint"], before)
@@ -118,7 +118,7 @@ def test_threads_and_company_change_no_bit():
             first = getattr(cores[0], name)
             assert np.array_equal(first, getattr(cores[1], name))
             assert np.array_equal(first, np.concatenate([getattr(c, name) for c in alone]))
-    assert (cores[0].memory["episode"] == 3).all()
+    assert (cores[0].episodes["episode"] == 3).all()
 
 
 def test_an_episode_that_is_over_stands_still_without_autoreset():
@@ -144,7 +144,7 @@ RANGES = (
 def test_every_variant_behaves_as_its_own_machine():
     core = TaskCore(TRACK, Options(randomise=RANGES, variants=4), 6)
     core.reset(np.arange(6))
-    chosen = core.memory["variant"].copy()
+    chosen = core.episodes["variant"].copy()
     starts = core.simulations.state.copy()
     assert len(set(chosen.tolist())) > 1
     machines = core.setup.variants.machines
@@ -170,8 +170,8 @@ def test_the_first_reading_of_an_episode_is_of_its_own_machine():
     core.reset(np.arange(3))
     seen = set()
     for _ in range(10):
-        fresh = core.memory["step"] == 0
-        for e in core.memory[fresh]:
+        fresh = core.episodes["step"] == 0
+        for e in core.episodes[fresh]:
             # valves are closed, so that the pump's flow goes over its relief valve
             machine = core.setup.variants.machines[e["variant"]]
             assert e["supply"] == pytest.approx(machine.supply.relief_pressure, rel=1e-9)
@@ -183,12 +183,12 @@ def test_the_first_reading_of_an_episode_is_of_its_own_machine():
 def test_variants_stand_still_under_their_own_load():
     core = TaskCore(TRACK, Options(randomise=RANGES, variants=4), 8)
     core.reset(np.arange(8))
-    start = core.memory["position"].copy()
+    start = core.episodes["position"].copy()
     for _ in range(25):
         core.step(np.zeros((8, 3)))
     # leakage of 2e-12 m^3/(s Pa) at 10 MPa moves the boom's piston by 0.5 mm in half a second, on
     # an arm of 0.35 m; a payload that the chambers do not hold would give 7 mrad by compression
-    assert np.abs(core.memory["position"] - start).max() < 1.5e-3
+    assert np.abs(core.episodes["position"] - start).max() < 1.5e-3
 
 
 @pytest.mark.parametrize(

@@ -49,8 +49,8 @@ def test_an_episode_that_ended_early_counts_no_further(monkeypatch):
 
     def faulty(action):
         step(action)
-        if core.memory["step"][1] == 7:
-            core.memory["over"][1] = 1
+        if core.episodes["step"][1] == 7:
+            core.episodes["over"][1] = 1
 
     monkeypatch.setattr(core, "step", faulty)
     scores = evaluate(core, make_controller("zero", core.setup), 3)

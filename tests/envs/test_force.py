@@ -40,7 +40,7 @@ def press(core: TaskCore, seconds: float) -> None:
 
 def test_the_load_cell_reads_the_contact_force_of_every_plate(core):
     core.reset(np.arange(COUNT))
-    assert len(set(core.memory["variant"].tolist())) > 1
+    assert len(set(core.episodes["variant"].tolist())) > 1
     assert not seen(core, "force").any()
     press(core, 7.0)
     around = surrounding_bodies(core.setup.variants.plant)
@@ -54,7 +54,7 @@ def test_the_load_cell_reads_the_contact_force_of_every_plate(core):
         assert core.measures[n, 0] == pytest.approx(up - seen(core, "wanted_force")[n], abs=400.0)
         plates.add(float(model.joint("plate_0").stiffness[0]))
         height = (
-            core.setup.variants.tips[core.memory["variant"][n], 2] - model.body("plate_0").pos[2]
+            core.setup.variants.tips[core.episodes["variant"][n], 2] - model.body("plate_0").pos[2]
         )
         assert 0.1 < height < 0.2  # 50 to 150 mm, and 50 mm from the plate's middle to its face
     assert len(plates) > 1
@@ -76,7 +76,7 @@ def test_forces_wanted_lie_in_their_range_and_change_once(core):
     wanted = []
     for _ in range(60):
         core.reset()
-        wanted.append(core.memory["goal"][:, :3].copy())
+        wanted.append(core.episodes["goal"][:, :3].copy())
     first, second, time = np.concatenate(wanted).T
     for force in (first, second):
         assert force.min() >= 1.0e4
@@ -85,11 +85,11 @@ def test_forces_wanted_lie_in_their_range_and_change_once(core):
     assert np.abs(second - first).min() >= 5.0e3
     assert ((second > first).mean() > 0.3) and ((second < first).mean() > 0.3)
     assert (8.0 <= time).all() and (time <= 12.0).all()
-    core.memory["goal"][:, 2] = 0.09  # the change comes soon
+    core.episodes["goal"][:, 2] = 0.09  # the change comes soon
     for step in range(1, 8):
         core.step(np.zeros((COUNT, 4)))
         now = 0.02 * step
-        asked = core.memory["goal"][:, 0 if now < 0.09 else 1]
+        asked = core.episodes["goal"][:, 0 if now < 0.09 else 1]
         assert np.allclose(seen(core, "wanted_force"), asked, rtol=1e-6)
         since = now if now < 0.09 else now - 0.09
         assert np.allclose(seen(core, "time_since_change"), since, atol=1e-6)
@@ -100,7 +100,7 @@ def test_reward_is_one_less_the_error_as_a_share(core):
     for _ in range(3):
         press(core, 0.7)
         wanted = seen(core, "wanted_force").astype(float)
-        force = core.memory["goal"][:, 3]
+        force = core.episodes["goal"][:, 3]
         expected = np.maximum(-1.0, 1.0 - np.abs(force - wanted) / wanted)
         assert np.allclose(core.reward, expected, atol=1e-6)  # float32 of what is wanted
         assert np.allclose(core.measures[:, 0], force - wanted, atol=0.01)
@@ -116,7 +116,7 @@ def test_a_tip_beside_the_plate_ends_the_episode():
         new = (core.terminated != 0) & ~ended
         assert (core.reward[new] == FAILURE).all()
         assert (core.measures[new, 3] == 1.0).all()
-        assert (np.abs(core.memory["tip"][new, :2] - [6.0, 0.0]).max(axis=1) > 1.2).all()
+        assert (np.abs(core.episodes["tip"][new, :2] - [6.0, 0.0]).max(axis=1) > 1.2).all()
         ended |= new
     assert ended.all()
 

@@ -77,7 +77,7 @@ def mass(core: TaskCore, number: int) -> float:
 
 def error(core: TaskCore, number: int) -> np.ndarray:
     """Heights over the plane in the stretch, from the goal's numbers."""
-    goal = core.memory["goal"][number]
+    goal = core.episodes["goal"][number]
     plane = goal[PLANE] + math.tan(goal[TILT]) * (RADII - MIDDLE)
     return (parts(core, number)[0] - plane)[(RADII > NEAR) & (RADII < FAR)]
 
@@ -87,7 +87,7 @@ def graded():
     """Three soils by the reference controller until all have been dumped once."""
     core = core_of(8, duration=60.0)
     before = [mass(core, n) for n in range(8)]
-    start = core.memory["goal"][:, ERROR].copy()
+    start = core.episodes["goal"][:, ERROR].copy()
     controller = Grade(core.setup)
     controller.begin(8)
     total, live, dumped = np.zeros(8), np.ones(8, bool), np.zeros(8, bool)
@@ -98,20 +98,20 @@ def graded():
         dumped |= controller._phase == DUMP
         least = np.minimum(least, core.measures[:, 0])
         live &= core.terminated == 0
-        if not live.any() or (dumped.all() and core.memory["step"].max() > 1250):
+        if not live.any() or (dumped.all() and core.episodes["step"].max() > 1250):
             break
     return core, before, start, total, least
 
 
 def test_reference_controller_halves_the_error_in_every_soil(graded):
     core, _, start, total, least = graded
-    assert set(core.memory["goal"][:, SOIL]) == set(range(len(GRADE_SOILS)))
+    assert set(core.episodes["goal"][:, SOIL]) == set(range(len(GRADE_SOILS)))
     assert (least < 0.5 * start).all()
     done = core.measures[:, 4] > 0.0
     assert done.any()
     assert (core.measures[done, 0] < GRADED).all()
     # what is paid is the error that went, less time, and the end's bonus
-    time = core.memory["step"] / core.setup.options.control_rate
+    time = core.episodes["step"] / core.setup.options.control_rate
     gone = (start - core.measures[:, 0]) / SCALE
     assert total == pytest.approx(gone - TIME_COST * time + SUCCESS * done, abs=1e-6)
 
@@ -161,8 +161,8 @@ def test_error_and_observation_are_those_of_the_profile():
     core = core_of(6)
     for n in range(6):
         over = error(core, n)
-        assert core.memory["goal"][n, ERROR] == pytest.approx(np.sqrt(np.mean(over**2)))
-        assert core.measures[n, 0] == core.memory["goal"][n, ERROR]
+        assert core.episodes["goal"][n, ERROR] == pytest.approx(np.sqrt(np.mean(over**2)))
+        assert core.measures[n, 0] == core.episodes["goal"][n, ERROR]
         seen = core.observation[n, columns(core.setup, "profile_error", map(str, range(POINTS)))]
         assert seen == pytest.approx(over.reshape(POINTS, -1).mean(1), abs=1e-6)
         middles = RADII[(RADII > NEAR) & (RADII < FAR)].reshape(POINTS, -1).mean(1)
@@ -191,11 +191,11 @@ def test_a_new_episode_has_fresh_ground():
 def test_the_swing_is_locked(action):
     core = core_of(2, action=action)
     place = 1 if action == "resolved_motion" else 0
-    start = core.memory["position"][:, 0].copy()
+    start = core.episodes["position"][:, 0].copy()
     for _ in range(50):
         core.step(np.eye(4)[place])
-    assert np.abs(core.memory["position"][:, 0] - start).max() < 1e-3
-    assert not core.memory["reference_rate"][:, 0].any()
+    assert np.abs(core.episodes["position"][:, 0] - start).max() < 1e-3
+    assert not core.episodes["reference_rate"][:, 0].any()
 
 
 def test_an_edge_deep_below_the_plane_ends_the_episode():
@@ -207,7 +207,7 @@ def test_an_edge_deep_below_the_plane_ends_the_episode():
     ended = np.flatnonzero(core.terminated)
     assert len(ended)
     for n in ended:
-        depth = core.memory["goal"][n, PLANE] - core.memory["tip"][n, 2]
+        depth = core.episodes["goal"][n, PLANE] - core.episodes["tip"][n, 2]
         assert depth > DEEPEST - 0.1  # the plane slopes by up to 0.06 over 1.5 m
         assert core.measures[n, 5] == 1.0
         assert core.reward[n] < FAILURE + 1.0
@@ -217,7 +217,7 @@ def test_all_planes_that_are_drawn_can_be_reached():
     core = core_of(64, variants=1)
     arm, ranges, q = core.facts["arm"], core.facts["ranges"][:4], np.zeros(4)
     for n in range(64):
-        goal = core.memory["goal"][n]
+        goal = core.episodes["goal"][n]
         for r, attitude in ((NEAR, -121.0), (MIDDLE, -113.0), (FAR, -106.0)):
             z = goal[PLANE] + math.tan(goal[TILT]) * (r - MIDDLE)
             pose = np.array([r, 0.0, z, math.radians(attitude), 0.0])

@@ -60,8 +60,8 @@ def test_random_actions_leave_no_space_and_raise_no_warning(name, action):
         assert env.observation_space.contains(seen)
         seen, reward, *_ = env.step(env.action_space.sample())
         assert np.isfinite(reward).all()
-    assert not core.memory["warnings"].any()
-    assert not core.memory["fault"].any()
+    assert not core.episodes["warnings"].any()
+    assert not core.episodes["fault"].any()
     env.close()
 
 
@@ -77,7 +77,7 @@ def test_batched_is_single_with_the_same_seed(name):
         for left, right in zip(first[:4], other[:4], strict=True):
             assert np.array_equal(left, right)
         assert_same_info(first[4], other[4])
-    assert (one.unwrapped.core.memory["episode"] > 1).all()
+    assert (one.unwrapped.core.episodes["episode"] > 1).all()
 
 
 def assert_same_info(left: dict, right: dict) -> None:
@@ -119,7 +119,7 @@ def test_without_autoreset_a_mask_says_who_begins_again():
     assert truncated.all()
     mask = np.array([True, False, True])
     env.reset(options={"reset_mask": mask})
-    assert env.unwrapped.core.memory["step"].tolist() == [0, 5, 0]
+    assert env.unwrapped.core.episodes["step"].tolist() == [0, 5, 0]
     with pytest.raises(ValueError, match="reset_mask"):
         env.reset(options={"reset_mask": np.zeros(3, bool)})
 

@@ -27,7 +27,7 @@ def goals(core) -> np.ndarray:
     found = []
     for _ in range(6):
         core.reset()
-        found.append(core.memory["goal"].copy())
+        found.append(core.episodes["goal"].copy())
     return np.concatenate(found)
 
 
@@ -102,9 +102,9 @@ def test_reward_and_errors_are_those_of_the_true_tip(core):
     rng = np.random.default_rng(3)
     for _ in range(40):
         core.step(rng.uniform(-1, 1, (COUNT, 4)))
-    time = core.memory["tick"][0] * core.setup.clock.period
+    time = core.episodes["tick"][0] * core.setup.clock.period
     for n in range(COUNT):
-        e = core.memory[n]
+        e = core.episodes[n]
         pose, _ = place(e["goal"], time)
         after, _ = place(e["goal"], time + 0.01)
         radial = np.array([np.cos(pose[1]), np.sin(pose[1]), 0.0])

@@ -119,7 +119,7 @@ def test_threads_company_and_episodes_before_change_no_bit(sensors):
             first = getattr(cores[0], name)
             assert np.array_equal(first, getattr(cores[1], name))
             assert np.array_equal(first, np.concatenate([getattr(c, name) for c in alone]))
-    assert were_held == 2 and (cores[0].memory["episode"] == 2).all()
+    assert were_held == 2 and (cores[0].episodes["episode"] == 2).all()
 
 
 def test_an_episode_after_one_that_held_its_log_is_as_a_first_one():
@@ -129,7 +129,7 @@ def test_an_episode_after_one_that_held_its_log_is_as_a_first_one():
         used.step(SHUT)
     assert used.measures[0, HELD] == 1.0
     for core in (used, fresh):
-        core.memory["random"] = 4711
+        core.episodes["random"] = 4711
         core.reset()
         for _ in range(25):
             core.step(LIFT)
@@ -171,7 +171,7 @@ def test_taking_and_nearing_pay_and_time_and_swinging_cost():
 )
 def test_a_log_that_lies_at_its_goal_for_half_a_second_ends_the_episode(off, turned, ends):
     core = make()
-    x, y, yaw = core.memory["goal"][0, GOAL_PLACE]
+    x, y, yaw = core.episodes["goal"][0, GOAL_PLACE]
     lay(core, 0, x + off, y, yaw + turned)
     paid = []
     for _ in range(27):
@@ -203,7 +203,7 @@ def test_what_is_observed_is_what_stands_in_the_simulation():
         x, y, z = data.body("log_0").xpos
         axis = data.body("log_0").xmat.reshape(3, 3)[:, 0]
         yaw = math.atan2(axis[1], axis[0])
-        gx, gy, goal = core.memory["goal"][number, GOAL_PLACE]
+        gx, gy, goal = core.episodes["goal"][number, GOAL_PLACE]
         for what, true in (
             ("log.r", math.hypot(x, y)), ("log.theta", math.atan2(y, x)), ("log.z", z),
             ("log.sin_2_yaw", math.sin(2.0 * yaw)), ("log.cos_2_yaw", math.cos(2.0 * yaw)),

@@ -23,13 +23,13 @@ def core() -> TaskCore:
 
 def true_pose(core: TaskCore, n: int) -> np.ndarray:
     pose = np.zeros(ARM)
-    task_forward(core.facts["arm"], core.memory["position"][n, :5], pose)
+    task_forward(core.facts["arm"], core.episodes["position"][n, :5], pose)
     return pose
 
 
 def left(core: TaskCore) -> tuple[np.ndarray, np.ndarray]:
     """Distance and largest angle that are left, of all episodes, by places in space."""
-    e, target = core.memory, core.memory["goal"][:, :ARM]
+    e, target = core.episodes, core.episodes["goal"][:, :ARM]
     place = np.stack([target[:, 0] * np.cos(target[:, 1]), target[:, 0] * np.sin(target[:, 1]),
                       target[:, 2]], axis=1)  # fmt: skip
     attitude = np.abs(e["position"][:, 1:4].sum(axis=1) - target[:, 3])
@@ -44,7 +44,7 @@ def test_the_straight_way_to_every_pose_lies_in_the_workspace(core):
     for _ in range(6):
         core.reset()
         for n in range(COUNT):
-            start, goal = true_pose(core, n), core.memory["goal"][n, :ARM].copy()
+            start, goal = true_pose(core, n), core.episodes["goal"][n, :ARM].copy()
             for part in np.linspace(0.0, 1.0, 50):
                 pose = start + part * (goal - start)
                 assert task_inverse(arm, pose, pose[1], joints) == REACHED
@@ -80,8 +80,8 @@ def test_a_pose_that_is_kept_for_half_a_second_is_success(core):
     offset[1::3, 2] = 0.06
     offset[2::3, 4] = 0.035
     for n in range(COUNT):
-        core.memory["goal"][n, :ARM] = true_pose(core, n) + offset[n]
-    core.memory["goal"][:, 6] = sum(left(core))
+        core.episodes["goal"][n, :ARM] = true_pose(core, n) + offset[n]
+    core.episodes["goal"][:, 6] = sum(left(core))
     for step in range(1, 25):
         core.step(np.zeros((COUNT, 5)))
         assert not core.terminated.any()
@@ -97,10 +97,10 @@ def test_a_pose_that_is_kept_for_half_a_second_is_success(core):
 def test_leaving_the_pose_begins_the_time_anew(core):
     core.reset(np.arange(COUNT))
     for n in range(COUNT):
-        core.memory["goal"][n, :ARM] = true_pose(core, n)
+        core.episodes["goal"][n, :ARM] = true_pose(core, n)
     for _ in range(10):
         core.step(np.zeros((COUNT, 5)))
-    core.memory["goal"][:, 2] += 0.2
+    core.episodes["goal"][:, 2] += 0.2
     core.step(np.zeros((COUNT, 5)))
     assert not core.observation[:, -1].any()
 

@@ -101,7 +101,7 @@ def test_the_drawn_machine_stands_where_the_simulated_one_does(env):
 
 def test_the_goal_starts_at_the_tip_and_goes_where_the_reference_does(env):
     ball, off, *way = goal_markers(env.core, 0)
-    tip = env.core.memory["tip"][0]
+    tip = env.core.episodes["tip"][0]
     # float arithmetic of closed kinematics against MuJoCo's pins, which open by 0.1 mm
     assert ball.start == pytest.approx(tip, abs=2e-3)
     assert np.array_equal(off.end, ball.start) and np.array_equal(way[0].start, ball.start)

@@ -38,7 +38,7 @@ def test_lines_are_followed_within_centimetres(action):
 
 def test_the_force_is_held_within_five_per_cent():
     core, figures = played("HoldForce")
-    wanted = core.memory["goal"][:, 1]
+    wanted = core.episodes["goal"][:, 1]
     assert np.sqrt((figures[-50:, :, 0] ** 2).mean(axis=0) / wanted**2).max() < 0.05
     with pytest.raises(InputError, match="resolved_motion"):
         played("HoldForce", action="valve")
@@ -47,5 +47,5 @@ def test_the_force_is_held_within_five_per_cent():
 @pytest.mark.parametrize("action", ACTIONS)
 def test_poses_are_reached(action):
     core, figures = played("ReachFeller", action=action, sensors="real")
-    assert core.memory["over"].all()
+    assert core.episodes["over"].all()
     assert (figures[-1, :, 2] == 1.0).all()

@@ -18,7 +18,7 @@ def core() -> TaskCore:
 
 def course(core: TaskCore, number: int, axis: int, times: np.ndarray) -> np.ndarray:
     """(n, 2) reference and rate."""
-    goal = core.memory["goal"][number]
+    goal = core.episodes["goal"][number]
     return np.array([track_reference.py_func(goal, axis, time) for time in times])
 
 
@@ -26,7 +26,7 @@ def test_rates_are_derivatives_and_it_begins_at_rest_where_the_arm_stands(core):
     times = np.arange(0.0, 6.0, 1.0e-4)
     for axis in range(3):
         place, rate = course(core, 0, axis, times).T
-        assert place[0] == core.memory["joint"][0, axis] and rate[0] == 0.0
+        assert place[0] == core.episodes["joint"][0, axis] and rate[0] == 0.0
         # central differences of 0.1 ms are good to 1e-8 where the third derivative is below 1; the
         # acceleration jumps where fading in ends, at 2 s
         smooth = np.abs(times - 2.0) > 2.0e-4

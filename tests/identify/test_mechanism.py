@@ -11,7 +11,7 @@ from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.identify.identification import identify_dynamics
-from hydrotele.identify.mechanism import Mapping, load_mechanism, mechanism_records
+from hydrotele.identify.mechanism import ColumnMapping, load_mechanism, mechanism_records
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.inverse_dynamics import project
 from tests.measured import REAL, needs_real
@@ -138,12 +138,12 @@ def test_a_single_run_is_split_and_columns_with_usual_names_need_no_mapping(tmp_
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        (Mapping(position={"crnk": "a"}), "has no joint 'crnk': did you mean 'crank'"),
-        (Mapping(force={"rocker": "a"}), "has no drive 'rocker'"),
-        (Mapping(passive_friction=("x_*",)), "has no joint without drive 'x_"),
-        (Mapping(absent=("mass.wing",)), "has no parameter 'mass.wing'"),
-        (Mapping(position="q_{joint}"), "has no column 'q_crank'"),
-        (Mapping(force={"crank": "tau"}), "has no column 'tau'"),
+        (ColumnMapping(position={"crnk": "a"}), "has no joint 'crnk': did you mean 'crank'"),
+        (ColumnMapping(force={"rocker": "a"}), "has no drive 'rocker'"),
+        (ColumnMapping(passive_friction=("x_*",)), "has no joint without drive 'x_"),
+        (ColumnMapping(absent=("mass.wing",)), "has no parameter 'mass.wing'"),
+        (ColumnMapping(position="q_{joint}"), "has no column 'q_crank'"),
+        (ColumnMapping(force={"crank": "tau"}), "has no column 'tau'"),
     ],
 )
 def test_refusals(tmp_path, mapping, message):

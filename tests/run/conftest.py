@@ -33,11 +33,11 @@ def rows_of(folder: Path) -> list[dict]:
 def done(tmp_path_factory) -> Path:
     """The folder of the tiny sweep, done once without interruption, with logs."""
     from hydrotele.cli.running import write_run
-    from hydrotele.run.sweep import How, run_sweep
+    from hydrotele.run.sweep import SweepSettings, run_sweep
     from hydrotele.run.sweep_facts import load_sweep
 
     folder = tmp_path_factory.mktemp("sweep")
     file = load_sweep(write_sweep(folder, logs=True))
-    run_sweep(file, folder / "out", How(jobs=1, keep=write_run))
+    run_sweep(file, folder / "out", SweepSettings(jobs=1, keep=write_run))
     assert json.loads((folder / "out" / "summary.json").read_text())["failed"] == 0
     return folder / "out"

@@ -18,7 +18,7 @@ from hydrotele.core.files import models_folder, scenarios_folder
 from hydrotele.logs.log import save_log
 from hydrotele.run import sweep_runs as running
 from hydrotele.run.run import run_scenario
-from hydrotele.run.sweep import How, outcomes, run_sweep, sweep_folder
+from hydrotele.run.sweep import SweepSettings, outcomes, run_sweep, sweep_folder
 from hydrotele.run.sweep_checking import check_points, open_base, scenario_of
 from hydrotele.run.sweep_facts import load_sweep, overrides, points
 from hydrotele.run.sweep_runs import (
@@ -26,7 +26,7 @@ from hydrotele.run.sweep_runs import (
     OK,
     Entry,
     Journal,
-    Task,
+    RunTask,
     numbers_of,
     perform,
     possible_results,
@@ -133,7 +133,7 @@ def test_a_failed_run_says_why(error, reason, monkeypatch, tmp_path):
     monkeypatch.setattr(running, "run_scenario", fail)
     base = open_base(load_sweep(write_sweep(tmp_path)))
     scenario = scenario_of(base, next(points(base.file.sweep)))
-    outcome = perform(Task(7, scenario, str(tmp_path), {}, None, str(tmp_path)))
+    outcome = perform(RunTask(7, scenario, str(tmp_path), {}, None, str(tmp_path)))
     assert outcome.entry == Entry(7, FAILED, reason)
 
 
@@ -174,7 +174,7 @@ def test_a_half_written_journal_is_gone_on_with(done, tmp_path):
     for name in ("table.parquet", "timings.csv"):
         (out / name).unlink()
     (out / ".table.0a.parquet").write_bytes(b"half")
-    swept = run_sweep(load_sweep(file), out, How(jobs=1))
+    swept = run_sweep(load_sweep(file), out, SweepSettings(jobs=1))
     assert swept.done == 4
     assert (out / "table.parquet").read_bytes() == (done / "table.parquet").read_bytes()
     assert not list(out.glob(".*"))
@@ -200,7 +200,7 @@ def test_what_a_sweep_did_not_write_is_left_alone(tmp_path, monkeypatch):
     for target in (tmp_path / "mine", tmp_path / "mine" / "thesis.txt"):
         for fresh in (False, True):
             with pytest.raises(InputError, match="was not written by a sweep"):
-                run_sweep(file, target, How(fresh=fresh))
+                run_sweep(file, target, SweepSettings(fresh=fresh))
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(InputError, match="no folder that can be written to"):
@@ -226,7 +226,7 @@ def test_a_machine_of_ones_own_travels_as_content(own, tmp_path):
     assert base.inputs.files_of(shipped) == {}
     shutil.rmtree(tmp_path / "mine")
     found = [
-        perform(Task(k, scenario, None, files, None, str(tmp_path))).entry
+        perform(RunTask(k, scenario, None, files, None, str(tmp_path))).entry
         for k, scenario in enumerate((mine, shipped))
     ]
     assert found[0].status == OK and found[0].numbers == found[1].numbers
@@ -242,7 +242,7 @@ def test_a_machine_with_further_files_is_refused_on_a_cluster(own, tmp_path):
     text = model.read_text()
     model.write_text(text.replace("<worldbody>", '<!-- mesh file="a.stl" --><worldbody>', 1))
     with pytest.raises(InputError, match="needs files beside its MJCF, which cannot be sent"):
-        run_sweep(load_sweep(own), tmp_path / "out", How(dask="tcp://127.0.0.1:1"))
+        run_sweep(load_sweep(own), tmp_path / "out", SweepSettings(dask="tcp://127.0.0.1:1"))
     assert not (tmp_path / "out").exists()
 
 
@@ -258,7 +258,7 @@ def test_a_killed_process_costs_its_run_alone(tmp_path):
     quick = [scenario_of(base, point) for point in list(points(base.file.sweep))[:2]]
     endless = quick[0].model_copy(update={"duration": 3600.0, "control_rate": 1000.0})
     scenarios = [quick[0], endless, quick[1]]
-    tasks = [Task(k, s, str(tmp_path), {}, None, str(tmp_path)) for k, s in enumerate(scenarios)]
+    tasks = [RunTask(k, s, str(tmp_path), {}, None, str(tmp_path)) for k, s in enumerate(scenarios)]
     found = outcomes(iter(tasks), 1)
     assert next(found).entry.status == OK
     (process,) = multiprocessing.active_children()

@@ -100,9 +100,13 @@ def test_a_cluster_that_is_not_there_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     from hydrotele.core.errors import InputError
     from hydrotele.run import sweep as cluster
-    from hydrotele.run.sweep import How, run_sweep
+    from hydrotele.run.sweep import SweepSettings, run_sweep
     from hydrotele.run.sweep_facts import load_sweep
 
     monkeypatch.setattr(cluster, "_WAIT", 1)
     with pytest.raises(InputError, match="no scheduler answers at tcp://127.0.0.1:1"):
-        run_sweep(load_sweep(write_sweep(tmp_path)), tmp_path / "o", How(dask="tcp://127.0.0.1:1"))
+        run_sweep(
+            load_sweep(write_sweep(tmp_path)),
+            tmp_path / "o",
+            SweepSettings(dask="tcp://127.0.0.1:1"),
+        )

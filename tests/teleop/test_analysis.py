@@ -17,7 +17,7 @@ from hydrotele.teleop.analysis import (
     loop_gain,
     stability_map,
 )
-from hydrotele.teleop.confirm import grows, kicked, step_of, swept
+from hydrotele.teleop.confirm import impulse_response, is_growing, simulate_sine, step_of
 from hydrotele.teleop.findings import find, findings_document, why_unstable
 from hydrotele.teleop.switching import Spring, worst_growth
 from hydrotele.teleop.two_port import (
@@ -153,8 +153,8 @@ def test_what_holds_a_spring_adds_to_it():
 
 def test_a_kick_without_a_loop_decays_as_its_poles_say():
     """No reflection: the master alone, whose slowest pole ends the motion."""
-    run = kicked(CASE, "position_force", 0.0, 4.0)
-    assert not grows(run)
+    run = impulse_response(CASE, "position_force", 0.0, 4.0)
+    assert not is_growing(run)
     mass = CASE.master.mass + CASE.hand.mass
     damping = CASE.master.damping + CASE.hand.damping + CASE.master_control.damping
     decay = damping / (2.0 * mass)  # under-damped
@@ -178,7 +178,7 @@ def test_different_delays_there_and_back():
     w = 6.0
     expected = transmitted(uneven.port("rate_force"), 1j * w, uneven.task)
     # 3 % are asked for; the delay is rounded to steps
-    assert abs(swept(uneven, "rate_force", w) / expected - 1.0) < 0.01
+    assert abs(simulate_sine(uneven, "rate_force", w) / expected - 1.0) < 0.01
     for structure in STRUCTURES:
         same = CASE.with_delay(0.04)
         assert analyse(uneven, structure).unstable_poles == analyse(same, structure).unstable_poles
@@ -211,6 +211,6 @@ def test_tasks_with_mass_and_sides_with_springs(structure):
             continue  # nothing settles
         expected = transmitted(case.port(structure), 1j * w, case.task)
         # second order in steps of at most 0.5 ms: (w h)^2 is 2e-5; settled to 1e-3
-        assert abs(swept(case, structure, w) / expected - 1.0) < 2e-3
-        kick = kicked(case, structure)
-        assert grows(kick) != stable(case.port(structure), case.hand, case.task)
+        assert abs(simulate_sine(case, structure, w) / expected - 1.0) < 2e-3
+        kick = impulse_response(case, structure)
+        assert is_growing(kick) != stable(case.port(structure), case.hand, case.task)

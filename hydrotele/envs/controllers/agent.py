@@ -7,12 +7,12 @@ differences are given to it. What a machine is like shows only over time, so it 
 import numpy as np
 
 from hydrotele.envs.controllers.controller import Controller
-from hydrotele.envs.facts import Setup
+from hydrotele.envs.facts import TaskSetup
 
 _ASKED = ("reference", "wanted")  # first words of fields that say what is asked for
 
 
-def difference_columns(setup: Setup) -> tuple[np.ndarray, np.ndarray]:
+def difference_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of columns: what is asked for, and what is measured of the same.
 
     Args:
@@ -45,7 +45,7 @@ class AgentView:
     """
 
     def __init__(
-        self, setup: Setup, history: int = 3, law: Controller | None = None, share: float = 1.0
+        self, setup: TaskSetup, history: int = 3, law: Controller | None = None, share: float = 1.0
     ) -> None:
         """Choose what the agent sees and does.
 

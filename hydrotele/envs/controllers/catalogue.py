@@ -9,9 +9,9 @@ from hydrotele.envs.controllers.grade import grade_controller
 from hydrotele.envs.controllers.place import place_controller
 from hydrotele.envs.controllers.tip import line_controller, press_controller, reach_controller
 from hydrotele.envs.controllers.track import track_controller
-from hydrotele.envs.facts import Setup
+from hydrotele.envs.facts import TaskSetup
 
-REFERENCES: dict[str, Callable[[Setup], Controller]] = {
+REFERENCES: dict[str, Callable[[TaskSetup], Controller]] = {
     "TrackTrajectory": track_controller,
     "Grade": grade_controller,
     "StraightLine": line_controller,
@@ -24,7 +24,7 @@ REFERENCES: dict[str, Callable[[Setup], Controller]] = {
 CONTROLLERS = ("reference", "zero", "random")
 
 
-def make_controller(name: str, setup: Setup) -> Controller:
+def make_controller(name: str, setup: TaskSetup) -> Controller:
     """A controller of a task.
 
     Args:

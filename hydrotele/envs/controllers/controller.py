@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.facts import Setup
+from hydrotele.envs.facts import TaskSetup
 
 
 class Controller(Protocol):
@@ -39,7 +39,7 @@ class Controller(Protocol):
 class Zero:
     """Never acts: valves closed, or no rate."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Remember the number of actions."""
         self._actions = len(setup.axes)
 
@@ -57,7 +57,7 @@ class Zero:
 class Random:
     """Uniform actions, drawn anew in every step, as an agent that has learned nothing."""
 
-    def __init__(self, setup: Setup, seed: int = 0) -> None:
+    def __init__(self, setup: TaskSetup, seed: int = 0) -> None:
         """Remember the number of actions."""
         self._actions, self._seed = len(setup.axes), seed
 
@@ -73,12 +73,12 @@ class Random:
         return self._chance.uniform(-1.0, 1.0, (len(observation), self._actions))
 
 
-def step_time(setup: Setup) -> float:
+def step_time(setup: TaskSetup) -> float:
     """Time from one action to the next [s]."""
     return setup.clock.ticks * setup.clock.period
 
 
-def columns(setup: Setup, what: str, where: Iterable[str]) -> np.ndarray:
+def columns(setup: TaskSetup, what: str, where: Iterable[str]) -> np.ndarray:
     """Columns of the observation with the fields `what.where`.
 
     Args:
@@ -99,7 +99,7 @@ def columns(setup: Setup, what: str, where: Iterable[str]) -> np.ndarray:
     return np.array([places[name] for name in names], int)
 
 
-def position_columns(setup: Setup) -> np.ndarray:
+def position_columns(setup: TaskSetup) -> np.ndarray:
     """Columns (k,) of the driven axes' measured positions."""
     return np.concatenate([
         columns(setup, setup.machine.position_kind(axis), [axis]) for axis in setup.axes

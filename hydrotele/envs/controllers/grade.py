@@ -7,10 +7,10 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import COORDINATES, arm_facts
 from hydrotele.envs.controllers.controller import Controller, columns, position_columns, step_time
-from hydrotele.envs.controllers.rows import ValveLaw, inverse_rows
-from hydrotele.envs.controllers.track import Asked
+from hydrotele.envs.controllers.rows import ValveLaw, inverse_joints
+from hydrotele.envs.controllers.track import RateFeedback
 from hydrotele.envs.episode import ARM
-from hydrotele.envs.facts import ACCELERATION, POSE_ACCELERATIONS, Setup, full_rate
+from hydrotele.envs.facts import ACCELERATION, POSE_ACCELERATIONS, TaskSetup, full_rate
 from hydrotele.envs.grade import FAR, MIDDLE, NEAR, POINTS, grade_radii
 
 _INTEGRAL = 2.0  # 1/s^2
@@ -21,7 +21,7 @@ _POSE = (4.0, 1.0)
 class PoseFollower:
     """The tip of an arm without axes beyond it, on a pose that moves."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Look up the nominal machine."""
         k = setup.arm_axes
         self._arm, _, self._ranges = arm_facts(setup.machine)
@@ -32,10 +32,12 @@ class PoseFollower:
             self._law = ValveLaw(setup, setup.task.servo, _INTEGRAL)
         elif setup.options.action == "joint_rate":
             fastest = np.array([full_rate(setup.machine, axis) for axis in setup.axes])
-            self._asked = Asked(setup, fastest, np.full(k, ACCELERATION), _JOINTS)
+            self._asked = RateFeedback(setup, fastest, np.full(k, ACCELERATION), _JOINTS)
         else:
             accelerations = np.array(POSE_ACCELERATIONS[:k])
-            self._asked = Asked(setup, np.array(setup.task.pose_rates[:k]), accelerations, _POSE)
+            self._asked = RateFeedback(
+                setup, np.array(setup.task.pose_rates[:k]), accelerations, _POSE
+            )
         self._by_pose = setup.options.action == "resolved_motion"
 
     def begin(self, count: int) -> None:
@@ -66,7 +68,7 @@ class PoseFollower:
         self._q[self._fresh], self._fresh[:] = measured[self._fresh], False
         before, full = self._q.copy(), np.zeros((len(pose), ARM))
         full[:, : self._k] = pose
-        inverse_rows(self._arm, self._ranges, full, self._q)
+        inverse_joints(self._arm, self._ranges, full, self._q)
         speed = (self._q - before) / self._dt
         if self._law:
             return self._law(observation, self._q, speed)
@@ -103,7 +105,7 @@ _NEAREST = np.array([3.0, 3.0, 3.0, 3.45, 3.86, 4.30, 5.10, 6.70]) + 0.05  # m
 class Grade:
     """Passes of the bucket along the plane, at most 0.15 m deep."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Find the columns."""
         self._tip = columns(setup, "tip", COORDINATES[:4])
         self._errors = columns(setup, "profile_error", [str(p) for p in range(POINTS)])
@@ -224,6 +226,6 @@ class Grade:
         self._rate = np.clip((self._place - before) / self._dt, -fast, fast)
 
 
-def grade_controller(setup: Setup) -> Controller:
+def grade_controller(setup: TaskSetup) -> Controller:
     """Controller of Grade for the chosen kind of actions."""
     return Grade(setup)

@@ -10,17 +10,17 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.envs.controllers.controller import Controller, columns, position_columns, step_time
-from hydrotele.envs.controllers.rows import ValveLaw, inverse_rows
-from hydrotele.envs.controllers.track import Asked
+from hydrotele.envs.controllers.rows import ValveLaw, inverse_joints
+from hydrotele.envs.controllers.track import RateFeedback
 from hydrotele.envs.episode import ARM
-from hydrotele.envs.facts import ACCELERATION, POSE_ACCELERATIONS, Setup, full_rate
+from hydrotele.envs.facts import ACCELERATION, POSE_ACCELERATIONS, TaskSetup, full_rate
 
 ABOVE, TAKE, CARRY, LAY = 2.5, 1.34, 2.6, 1.36  # m: heights of the stick's pin over the ground
 SWAY = 0.03  # m by which the closing jaw pushes the grapple to its own side
 PERIOD = 2.0  # s of the pendulum
 SHUT, OPEN = 1.3, 0.0  # rad
 _SPEEDS = np.array([0.35, 0.2, 0.35, 0.5, 0.8])  # m/s, rad/s, m/s, rad/s, rad/s
-_GAINS = (3.0, 0.3)  # 1/s of `Asked`
+_GAINS = (3.0, 0.3)  # 1/s of `RateFeedback`
 _LEAD = 0.06  # s by which valves are opened ahead: the spool's lag and half a step
 _R, _THETA, _Z, _TURN, _JAW = range(5)
 GO, DOWN, CLOSE, UP, SLEW, LOWER, RELEASE, LEAVE = range(8)
@@ -52,7 +52,7 @@ def _nearest(angle: np.ndarray, turn: float) -> np.ndarray:
     return angle - turn * np.round(angle / turn)
 
 
-def pin_columns(setup: Setup) -> np.ndarray:
+def pin_columns(setup: TaskSetup) -> np.ndarray:
     """Columns (5,) of r, theta and z of the pin, of the grapple's rotation and of its jaw."""
     return np.concatenate([columns(setup, "tip", ("r", "theta", "z")), position_columns(setup)[3:]])
 
@@ -60,7 +60,7 @@ def pin_columns(setup: Setup) -> np.ndarray:
 class Moves:
     """Where the stick's pin, the grapple's rotation and its jaw should be, phase by phase."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Look up the nominal machine and the columns."""
         self._aside = float(arm_facts(setup.machine)[0][2])
         self._tip = pin_columns(setup)
@@ -164,13 +164,13 @@ class Moves:
 class PlaceByTip:
     """Moves by rates of the pin."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Look up the nominal machine."""
         self.moves, self._tip, self._dt = Moves(setup), pin_columns(setup), step_time(setup)
         rates = [full_rate(setup.machine, name) for name in setup.axes[3:]]
         change = np.array([*POSE_ACCELERATIONS[:3], ACCELERATION, ACCELERATION])
         fastest = np.array([*setup.task.pose_rates[:3], *rates])
-        self._asked = Asked(setup, fastest, change, _GAINS)
+        self._asked = RateFeedback(setup, fastest, change, _GAINS)
 
     def begin(self, count: int) -> None:
         """Start `count` episodes."""
@@ -194,14 +194,14 @@ class PlaceByTip:
 class PlaceByAxes:
     """Moves by references of the axes, which are followed by their rates or by their valves."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Look up the nominal machine."""
         self.moves, self._joint = Moves(setup), position_columns(setup)
         (self._arm, _, self._ranges), self._dt = arm_facts(setup.machine), step_time(setup)
         fastest = np.array([full_rate(setup.machine, axis) for axis in setup.axes])
         by_valves = setup.options.action == "valve"
         self._valves = ValveLaw(setup, setup.task.servo) if by_valves else None
-        self._asked = Asked(setup, fastest, np.full(len(fastest), ACCELERATION), _GAINS)
+        self._asked = RateFeedback(setup, fastest, np.full(len(fastest), ACCELERATION), _GAINS)
 
     def begin(self, count: int) -> None:
         """Start `count` episodes."""
@@ -220,7 +220,7 @@ class PlaceByAxes:
         places, q = self.moves.at(ahead), joint[:, :3].copy()
         pose = np.zeros((len(places), ARM))
         pose[:, :3] = places[:, :3]
-        inverse_rows(self._arm, self._ranges, pose, q)
+        inverse_joints(self._arm, self._ranges, pose, q)
         return np.hstack([q, places[:, 3:]])
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
@@ -237,6 +237,6 @@ class PlaceByAxes:
         return self._asked.rates(joint, now, rate)
 
 
-def place_controller(setup: Setup) -> Controller:
+def place_controller(setup: TaskSetup) -> Controller:
     """Controller of PlaceLog for the chosen kind of actions."""
     return (PlaceByTip if setup.options.action == "resolved_motion" else PlaceByAxes)(setup)

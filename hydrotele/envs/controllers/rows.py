@@ -20,13 +20,13 @@ from hydrotele.control.servo import (
 )
 from hydrotele.core.compiled import compiled
 from hydrotele.envs.controllers.controller import columns, position_columns, step_time
-from hydrotele.envs.facts import Setup
+from hydrotele.envs.facts import TaskSetup
 from hydrotele.kinematics.task import task_forward, task_inverse
 from hydrotele.scenario.scenario import Servo
 
 
 @compiled
-def servo_rows(numbers, grid, table, reference, rate_ahead, measured, load, out):
+def servo_commands(numbers, grid, table, reference, rate_ahead, measured, load, out):
     """Commands of n episodes by the joint servo.
 
     Args:
@@ -61,11 +61,11 @@ def servo_rows(numbers, grid, table, reference, rate_ahead, measured, load, out)
 
 
 @compiled
-def forward_rows(arm, q, pose):
+def forward_poses(arm, q, pose):
     """Poses of the tip of n episodes.
 
     Args:
-        arm: (9,) of `kinematics.task.task_numbers`.
+        arm: (9,) of `kinematics.task.arm_parameters`.
         q: (n, k) joint angles [rad].
         pose: (n, 5) written: r [m], theta [rad], z [m], attitude [rad], head [rad].
 
@@ -79,11 +79,11 @@ def forward_rows(arm, q, pose):
 
 
 @compiled
-def inverse_rows(arm, ranges, pose, q):
+def inverse_joints(arm, ranges, pose, q):
     """Joint angles of n episodes for poses of the tip; those out of reach keep their angles.
 
     Args:
-        arm: (9,) of `kinematics.task.task_numbers`.
+        arm: (9,) of `kinematics.task.arm_parameters`.
         ranges: (k, 2) of the joints [rad].
         pose: (n, 5) r [m], theta [rad], z [m], attitude [rad], head [rad].
         q: (n, k) joint angles, updated [rad].
@@ -109,7 +109,7 @@ _MOST = 0.05  # rad/s or m/s that the integral may ask for
 class ValveLaw:
     """Actions of valves (and of drives without any) from references of the axes."""
 
-    def __init__(self, setup: Setup, servo: Servo, integral_gain: float = 0.0) -> None:
+    def __init__(self, setup: TaskSetup, servo: Servo, integral_gain: float = 0.0) -> None:
         """Look up the nominal machine.
 
         Args:
@@ -164,7 +164,7 @@ class ValveLaw:
         free = np.abs(self._out) < limit  # a drive at its limit winds nothing up
         self._integral += self._integral_gain * self._dt * free * (reference - joint)
         np.clip(self._integral, -_MOST, _MOST, out=self._integral)
-        servo_rows(
+        servo_commands(
             self._numbers, self._grid, self._table, np.ascontiguousarray(reference, float),
             np.ascontiguousarray(rate_ahead + self._integral),
             Measured(joint, seen[:, self._rate], head, rod, supply), self._load, self._out,

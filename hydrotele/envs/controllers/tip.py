@@ -11,9 +11,9 @@ import numpy as np
 from hydrotele.control.resolved_motion import COORDINATES, arm_facts
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller, columns, position_columns
-from hydrotele.envs.controllers.rows import ValveLaw, inverse_rows
+from hydrotele.envs.controllers.rows import ValveLaw, inverse_joints
 from hydrotele.envs.episode import ARM
-from hydrotele.envs.facts import Setup, full_rate
+from hydrotele.envs.facts import TaskSetup, full_rate
 from hydrotele.envs.line import PREVIEWS
 
 _LINE_GAIN = 0.5  # 1/s
@@ -26,7 +26,7 @@ _GENTLY = 0.6  # share of a joint's full rate that a reach uses
 class Tip:
     """Pose and rates of the tip into actions of the chosen kind."""
 
-    def __init__(self, setup: Setup, integral: float = 0.0) -> None:
+    def __init__(self, setup: TaskSetup, integral: float = 0.0) -> None:
         """Look up the nominal machine; the gain of the valves' integral is in [1/s^2]."""
         k = self._k = setup.arm_axes
         self._kind = setup.options.action
@@ -54,14 +54,14 @@ class Tip:
         found = np.ascontiguousarray(observation[:, self._joint], float)
         whole = np.zeros((len(pose), ARM))
         whole[:, : self._k] = pose
-        inverse_rows(self._arm, self._ranges, whole, found)
+        inverse_joints(self._arm, self._ranges, whole, found)
         return found
 
 
 class LineController(Tip):
     """Follows the line by the rate shortly ahead and the error of now."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Find the columns."""
         super().__init__(setup)
         self._wanted = columns(setup, "wanted", COORDINATES[: self._k])
@@ -89,7 +89,7 @@ class LineController(Tip):
 class ReachController(Tip):
     """Goes to the pose, the slower the nearer."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Find the columns."""
         super().__init__(setup, _INTEGRAL)
         self._wanted = columns(setup, "wanted", COORDINATES[: self._k])
@@ -113,12 +113,12 @@ class ReachController(Tip):
         return rate / self._fastest
 
 
-def line_controller(setup: Setup) -> Controller:
+def line_controller(setup: TaskSetup) -> Controller:
     """Controller of StraightLine for the chosen kind of actions."""
     return LineController(setup)
 
 
-def reach_controller(setup: Setup) -> Controller:
+def reach_controller(setup: TaskSetup) -> Controller:
     """Controller of ReachFeller for the chosen kind of actions."""
     return ReachController(setup)
 
@@ -131,7 +131,7 @@ _GAIN = 2.0e-6  # m/s per N: two per second on 1e6 N/m
 class Press:
     """The rate of the tip's height from the error of the force; nothing is remembered."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Find the columns.
 
         Raises:
@@ -158,6 +158,6 @@ class Press:
         return actions
 
 
-def press_controller(setup: Setup) -> Controller:
+def press_controller(setup: TaskSetup) -> Controller:
     """Controller of HoldForce, whose actions must be rates of the tip."""
     return Press(setup)

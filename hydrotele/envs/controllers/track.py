@@ -10,12 +10,12 @@ from hydrotele.envs.controllers.controller import (
     position_columns,
     step_time,
 )
-from hydrotele.envs.controllers.rows import ValveLaw, forward_rows
+from hydrotele.envs.controllers.rows import ValveLaw, forward_poses
 from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import (
     ACCELERATION,
     POSE_ACCELERATIONS,
-    Setup,
+    TaskSetup,
     full_rate,
 )
 from hydrotele.envs.track import PREVIEWS
@@ -35,7 +35,7 @@ class Preview:
     Positions at now and the PREVIEWS and the rate now make it one of fourth order.
     """
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Find the columns."""
         ahead = [f"reference_in_{time * 1000:.0f}_ms" for time in PREVIEWS]
         self._columns = [
@@ -58,7 +58,11 @@ class TrackByValves:
     """The joint servo with an integral, its velocities ahead by the spools' lag."""
 
     def __init__(
-        self, setup: Setup, servo: Servo = SERVO, integral: float = _INTEGRAL, lead: float = _LEAD
+        self,
+        setup: TaskSetup,
+        servo: Servo = SERVO,
+        integral: float = _INTEGRAL,
+        lead: float = _LEAD,
     ) -> None:
         """Look up the nominal machine."""
         self._law, self._preview = ValveLaw(setup, servo, integral), Preview(setup)
@@ -72,14 +76,16 @@ class TrackByValves:
         return self._law(observation, now, rate)
 
 
-class Asked:
+class RateFeedback:
     """Rates for loops below that integrate them, by a model of what they were asked for so far.
 
     Feedback of the measured error through the loops below can only be slow; that of the model's
     place, which rates move at once, is fast. The model creeps to what is measured.
     """
 
-    def __init__(self, setup: Setup, fastest: np.ndarray, accelerations: np.ndarray, gains) -> None:
+    def __init__(
+        self, setup: TaskSetup, fastest: np.ndarray, accelerations: np.ndarray, gains
+    ) -> None:
         """Remember clocks and limits, both (k,), and gains [1/s]."""
         self._stiff, self._slow = gains
         self._fastest, self._dt = fastest, step_time(setup)
@@ -121,11 +127,11 @@ class Asked:
 class TrackByJointRates:
     """Joint references by their rates."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Look up the nominal machine."""
         self._preview, self._joint = Preview(setup), position_columns(setup)
         fastest = np.array([full_rate(setup.machine, axis) for axis in setup.axes])
-        self._asked = Asked(setup, fastest, np.full(len(fastest), ACCELERATION), _JOINTS)
+        self._asked = RateFeedback(setup, fastest, np.full(len(fastest), ACCELERATION), _JOINTS)
         self.begin, self.reset = self._asked.begin, self._asked.reset
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
@@ -137,7 +143,7 @@ class TrackByJointRates:
 class TrackByResolvedMotion:
     """The pose of the references, through the arm's kinematics, by its rates."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: TaskSetup) -> None:
         """Look up the nominal machine.
 
         Raises:
@@ -149,14 +155,14 @@ class TrackByResolvedMotion:
         self._preview, self._arm = Preview(setup), arm_facts(setup.machine)[0]
         self._tip = columns(setup, "tip", COORDINATES[:k])
         fastest = np.array(setup.task.pose_rates[:k])
-        self._asked = Asked(setup, fastest, np.array(POSE_ACCELERATIONS[:k]), _POSE)
+        self._asked = RateFeedback(setup, fastest, np.array(POSE_ACCELERATIONS[:k]), _POSE)
         self.begin, self.reset = self._asked.begin, self._asked.reset
 
     def _pose(self, observation: np.ndarray, time: float) -> np.ndarray:
         """Pose (n, k) of the references `time` [s] from now."""
         q = self._preview.at(observation, time)[0]
         pose = np.zeros((len(q), ARM))
-        forward_rows(self._arm, np.ascontiguousarray(q), pose)
+        forward_poses(self._arm, np.ascontiguousarray(q), pose)
         return pose[:, : q.shape[1]]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
@@ -168,7 +174,7 @@ class TrackByResolvedMotion:
         return self._asked.rates(measured, self._pose(observation, 0.0), rate)
 
 
-def track_controller(setup: Setup) -> Controller:
+def track_controller(setup: TaskSetup) -> Controller:
     """Controller of TrackTrajectory for the chosen kind of actions."""
     kinds = {"valve": TrackByValves, "joint_rate": TrackByJointRates}
     return kinds.get(setup.options.action or "", TrackByResolvedMotion)(setup)
