@@ -300,8 +300,9 @@ def histories(trials: Sequence[Trial]) -> Finding:
         ones = np.ones(len(trials))
         panels.append(Panel(
             f"{SYMBOLS[k]} over its mean [1]", number,
-            {"estimate": values[:, k] / mean[k], "bounds": (1 + abs(reach[k] / mean[k])) * ones,
-             "": (1 - abs(reach[k] / mean[k])) * ones}, "trial",
+            {"estimate": values[:, k] / mean[k],
+             "upper bound": (1.0 + abs(reach[k] / mean[k])) * ones,
+             "lower bound": (1.0 - abs(reach[k] / mean[k])) * ones}, "trial",
         ))  # fmt: skip
     return Finding(
         "history of the estimates",

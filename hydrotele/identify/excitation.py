@@ -220,7 +220,8 @@ class MotionLimits(Protocol):
 
 
 def design_motion(
-    limits: MotionLimits, setup: RegressorSetup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
+    limits: MotionLimits, setup: RegressorSetup, noise: np.ndarray,
+    base: Sequence[int] | np.ndarray, *,
     period: float = 20.0, harmonics: int = 8, starts: int = 2, iterations: int = 150,
     seed: int = 0, progress: Callable[[str, float], None] | None = None,
 ) -> Excitation:  # fmt: skip

@@ -81,8 +81,8 @@ def load_mechanism(
 
     Args:
         mjcf: the file.
-        mapping: YAML file with the keys of `ColumnMapping`, or one; None where columns have the joints'
-            names, alone or after `position.`, `angle.`, `force.`, `torque.` or `effort.`.
+        mapping: YAML file with the keys of `ColumnMapping`, or one; None where columns have the
+            joints' names, alone or after `position.`, `angle.`, `force.`, `torque.` or `effort.`.
 
     Returns:
         The mechanism.

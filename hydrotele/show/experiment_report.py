@@ -18,7 +18,7 @@ from hydrotele.show.report_html import (
     tag,
 )
 
-_COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0")
+_COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0", "#b5302a", "#7a6a58")
 _MOST = 4000  # points of a curve: more are not seen
 
 
