@@ -39,6 +39,10 @@ class ColumnMapping(Facts):
         position: joint -> column of its position [rad] or [m], with a minus before it where the
             sign is the other way round; or one name for all, such as `angle.{joint}`.
         force: drive -> column of its force or torque [N] or [N m], likewise.
+        position_noise: standard deviation of a position reading [rad] or [m], joint by joint or one
+            for all; where both noises are stated, they tell the covariance, and the bias that the
+            positions' noise leaves is taken off.
+        force_noise: standard deviation of a force reading [N] or [N m], likewise.
         coordinates: joints in which the motion is described and filtered, such as those of a
             platform, where they are not those that are measured.
         passive_friction: joints without drive, and closures, that have friction.
@@ -50,6 +54,8 @@ class ColumnMapping(Facts):
     time: str = "time"
     position: str | dict[str, str] | None = None
     force: str | dict[str, str] | None = None
+    position_noise: float | dict[str, float] | None = None
+    force_noise: float | dict[str, float] | None = None
     coordinates: tuple[str, ...] = ()
     passive_friction: tuple[str, ...] = ()
     alike: tuple[tuple[str, ...], ...] = ()
@@ -101,8 +107,11 @@ def load_mechanism(
     measured = chain.drives
     if isinstance(facts.position, dict):
         measured = tuple(_named(chain.joints, facts.position, source, "joint"))
-    if isinstance(facts.force, dict):
-        _named(chain.drives, facts.force, source, "drive")
+    for stated in (facts.force, facts.force_noise):
+        if isinstance(stated, dict):
+            _named(chain.drives, stated, source, "drive")
+    if isinstance(facts.position_noise, dict):
+        _named(measured, facts.position_noise, source, "measured joint")
     places = (*chain.joints, *chain.closures)
     bodies = [f"{kind}.{body}" for body in chain.bodies for kind in BODY_PARAMETERS]
     alike = tuple(
@@ -284,12 +293,20 @@ def _record(
             log.source, "has no force of any drive: name the columns in the mapping, as `force:"
             f" {{{chain.drives[0]}: COLUMN}}`",
         )  # fmt: skip
-    unknown = np.full(len(mechanism.measured), np.nan)
+    mapping = mechanism.mapping
     record = IdentificationRecord(
-        log.name, period, mechanism.measured, np.array(position).T, unknown,
-        np.array(force).T, np.full(len(chain.drives), np.nan),
+        log.name, period, mechanism.measured, np.array(position).T,
+        _noise(mapping.position_noise, mechanism.measured), np.array(force).T,
+        _noise(mapping.force_noise, chain.drives),
     )  # fmt: skip
     return in_coordinates(record, mechanism.setup), notes
+
+
+def _noise(stated: float | dict[str, float] | None, joints: Sequence[str]) -> np.ndarray:
+    """Noise (k,) of readings, NaN where it is not stated."""
+    if isinstance(stated, dict):
+        return np.array([stated.get(joint, np.nan) for joint in joints])
+    return np.full(len(joints), np.nan if stated is None else stated)
 
 
 def in_coordinates(record: IdentificationRecord, setup: RegressorSetup) -> IdentificationRecord:
