@@ -223,10 +223,14 @@ def pin_friction(chain: Chain) -> list[FrictionTerm]:
         chain: the chain.
 
     Returns:
-        One per hinge that no actuator moves, and per closure.
+        One per hinge that no actuator moves, and per closure; none for ball and free joints.
 
     Source: Khoshzaban 1992, 4.3: joint and pin friction of the complete model.
     """
     slides = chain.tree.slides
-    hinges = [j for k, j in enumerate(chain.joints) if not slides[k] and j not in chain.drives]
+    hinges = [
+        j
+        for k, j in enumerate(chain.joints)
+        if not slides[k] and chain.places[k] >= 0 and j not in chain.drives
+    ]
     return [FrictionTerm(place, {"coulomb": 0.0}) for place in (*hinges, *chain.closures)]
