@@ -7,23 +7,30 @@ import hydrotele
 from hydrotele.cli.console import notes, out, print_json, stages
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
+from hydrotele.experiments.abdellatif2008 import abdellatif2008
 from hydrotele.experiments.finding import Finding
 from hydrotele.experiments.khoshzaban1992 import khoshzaban1992
 from hydrotele.experiments.wang2012 import wang2012
 from hydrotele.experiments.zhu1994 import zhu1994
 
-SERIES = {"khoshzaban1992": khoshzaban1992, "wang2012": wang2012, "zhu1994": zhu1994}
+SERIES = {
+    "abdellatif2008": (abdellatif2008, 100),
+    "khoshzaban1992": (khoshzaban1992, 20),
+    "wang2012": (wang2012, 20),
+    "zhu1994": (zhu1994, 20),
+}
+"""Name -> (function, usual number of repetitions)."""
 
 
 def experiments_to_folder(
-    name: str, target: Path | None, seeds: int, jobs: int | None, as_json: bool
+    name: str, target: Path | None, seeds: int | None, jobs: int | None, as_json: bool
 ) -> list[Finding]:
     """Run a series of experiments; write the table and the curves, whole or not at all.
 
     Args:
         name: of the series.
         target: folder, default `runs/<name>`; with `as_json` none.
-        seeds: operators of the experiments that are repeated.
+        seeds: operators or trials of repeated experiments; as many as usual by default.
         jobs: processes; as many as there are cores by default.
         as_json: print the findings as JSON instead of words.
 
@@ -35,11 +42,13 @@ def experiments_to_folder(
     """
     if name not in SERIES:
         raise InputError(f"experiments {name!r}", f"valid: {', '.join(SERIES)}")
+    series, usual = SERIES[name]
+    seeds = seeds or usual
     target = target or (None if as_json else Path("runs") / name)
     if target:
         check_target(target, "experiments")
     with stages(f"experiments {name}", as_json) as progress:
-        findings = SERIES[name](seeds, jobs, progress)
+        findings = series(seeds, jobs, progress)
     if target:
         with whole_folder(target, "experiments") as folder:
             _write(folder, name, seeds, findings)

@@ -24,6 +24,7 @@ from hydrotele.identify.excitation import design_excitation, informative_base
 from hydrotele.identify.hydraulic import Hydraulics, identify_hydraulics
 from hydrotele.identify.identification import identify_with_shapes
 from hydrotele.identify.identified_machine import identified_machine, identify_document
+from hydrotele.identify.mechanism import load_mechanism, mechanism_records
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import force_noise, records
 from hydrotele.identify.result import MEANING, Identification, counts, parameter_rows
@@ -128,6 +129,61 @@ def identify_to_folder(
     return target
 
 
+def identify_mjcf_to_folder(
+    data: Sequence[Path], mjcf: Path, columns: Path | None, heldout: str | None,
+    target: Path | None, as_json: bool, processing: Processing, estimator: Estimator,
+) -> Path:  # fmt: skip
+    """Identify any mechanism that an MJCF describes, without a Machine.
+
+    Args:
+        data: log files, folders of logs.
+        mjcf: the mechanism, with `connect` and `weld` closures.
+        columns: YAML file that says which column is which; None for columns with usual names.
+        heldout: name of the run to judge on, None to choose.
+        target: folder, default `identify_<data>`.
+        as_json: print `identify.json` instead of words.
+        processing: of the signals.
+        estimator: of the parameters.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: data, mechanism, mapping or target are not usable.
+    """
+    from hydrotele.show.identify_report import LearnedFrom, write_identify_report
+
+    target = target or Path(f"identify_{data_name(data)}")
+    check_target(target, "identify")
+    mechanism = load_mechanism(mjcf, columns)
+    name = mechanism.setup.chain.name
+    fit, judge, said = mechanism_records(data, mechanism, heldout, processing.period)
+    with stages(f"identify {name}", as_json) as progress:
+        if progress:
+            progress("mechanism", 0.0)
+        found = identify_with_shapes(
+            fit, judge, mechanism.setup, processing, estimator, notes=said
+        )  # fmt: skip
+    with whole_folder(target, "identify") as folder:
+        document = plain(identify_document(found))
+        text = json.dumps(document, indent=2, allow_nan=False)
+        (folder / "identify.json").write_text(text + "\n", encoding="utf-8")
+        learned = LearnedFrom(name, None, tuple(run.name for run in fit), judge.name)
+        write_identify_report(learned, found, None, None, folder / "report.html")
+        summary = {
+            "kind": "identify", "mjcf": str(mjcf), "columns": str(columns) if columns else None,
+            "data": [str(path) for path in data], "heldout": judge.name,
+            "status": document["status"], "hydrotele": hydrotele.__version__,
+        }  # fmt: skip
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    if as_json:
+        print_json(identify_document(found))
+    else:
+        _print_mechanism(found, judge.name)
+        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    return target
+
+
 def identify_mechanism(dataset: Dataset, choices: Choices) -> MechanismResult:
     """Identify bodies, friction and offsets.
 
@@ -170,10 +226,14 @@ def _write(
     made.mkdir()
     save_machine(patched, made / MACHINE_FILE)
     build_plant(patched).document.save(made / "machine.xml")
-    from hydrotele.show.identify_report import write_identify_report
+    from hydrotele.show.identify_report import LearnedFrom, write_identify_report
 
     notes.print("writing report.html ...", style="dim")
-    write_identify_report(dataset, found, hydraulics, mechanism.best, folder / "report.html")
+    learned = LearnedFrom(
+        dataset.machine.name, dataset.machine.tool, tuple(run.name for run in dataset.fit),
+        dataset.heldout.name, tuple(dataset.notes),
+    )  # fmt: skip
+    write_identify_report(learned, found, hydraulics, mechanism.best, folder / "report.html")
     summary = {
         "kind": "identify",
         "machine": dataset.machine.name,
@@ -189,7 +249,7 @@ def _write(
 
 def _print(mechanism: MechanismResult, hydraulics: Hydraulics | None, dataset: Dataset) -> None:
     if mechanism.found:
-        _print_mechanism(mechanism.found, dataset)
+        _print_mechanism(mechanism.found, dataset.heldout.name)
     else:
         out.print(f"[yellow]note[/] {mechanism.lacking}")
     if hydraulics:
@@ -205,7 +265,7 @@ def _print(mechanism: MechanismResult, hydraulics: Hydraulics | None, dataset: D
         )
 
 
-def _print_mechanism(found: Identification, dataset: Dataset) -> None:
+def _print_mechanism(found: Identification, heldout: str) -> None:
     rows = parameter_rows(found)
     many = counts(rows)
     out.print(f"[bold]{found.status}[/]", soft_wrap=True)
@@ -219,7 +279,7 @@ def _print_mechanism(found: Identification, dataset: Dataset) -> None:
     for status, number in many.items():
         out.print(f"{number:4d} {status}: {MEANING[status]}")
     judged = table(
-        f"force on {dataset.heldout.name}, not fitted, below {found.band:.3g} Hz", "drive",
+        f"force on {heldout}, not fitted, below {found.band:.3g} Hz", "drive",
         "as given", "identified", "noise alone", "unit", "relative",
     )  # fmt: skip
     for drive, h in found.heldout.items():

@@ -363,6 +363,13 @@ def identify(
     more: MoreLogs = None,
     machine: MachineName = None,
     tool: ToolName = None,
+    mjcf: Annotated[
+        Path | None, typer.Option("--mjcf", help="Any mechanism (.xml) instead of a machine.")
+    ] = None,
+    columns: Annotated[
+        Path | None,
+        typer.Option("--columns", help="With --mjcf: which column is which (.yaml)."),
+    ] = None,
     heldout: HeldOut = None,
     sensors: Sensors = None,
     out: Annotated[
@@ -405,8 +412,11 @@ def identify(
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Identify masses, friction and hydraulics from measured logs; write the identified machine."""
-    from hydrotele.cli.identifying import Choices, identify_to_folder
+    """Identify masses, friction and hydraulics from measured logs; write the identified machine.
+
+    With --mjcf: any mechanism of hinges, slides and balls, its loops closed by connect and weld.
+    """
+    from hydrotele.cli.identifying import Choices, identify_mjcf_to_folder, identify_to_folder
     from hydrotele.identify.estimation import Estimator
     from hydrotele.identify.motion import Processing
 
@@ -418,6 +428,20 @@ def identify(
         ),
         hydraulics=hydraulics,
     )  # fmt: skip
+    if mjcf is not None:
+        given = {
+            "--machine": machine, "--tool": tool, "--sensors": sensors, "--reduced": reduced,
+            "--pins": pins, "--asymmetry": asymmetry, "--hydraulics": hydraulics,
+        }  # fmt: skip
+        if strange := [option for option, value in given.items() if value]:
+            raise InputError(strange[0], "belongs to a machine: leave it out with --mjcf")
+        identify_mjcf_to_folder(
+            [*data, *(more or [])], mjcf, columns, heldout, out, json, choices.processing,
+            choices.estimator,
+        )  # fmt: skip
+        return
+    if columns is not None:
+        raise InputError("--columns", "says which column is which of --mjcf: name that, too")
     identify_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, choices, force
     )
@@ -560,14 +584,18 @@ def export(
 
 @app.command(epilog="Example:  hydrotele experiments zhu1994 --json")
 def experiments(
-    name: Annotated[str, typer.Argument(help="Series: khoshzaban1992, wang2012 or zhu1994.")],
+    name: Annotated[
+        str,
+        typer.Argument(help="Series: abdellatif2008, khoshzaban1992, wang2012 or zhu1994."),
+    ],
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder to write; default runs/NAME, with --json none."),
     ] = None,
     seeds: Annotated[
-        int, typer.Option(min=1, help="Repetitions: operators, noise seeds, trials.")
-    ] = 20,
+        int | None,
+        typer.Option(min=1, help="Repetitions: operators, noise seeds, trials; 20, or 100 trials."),
+    ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
     json: Json = False,
 ) -> None:

@@ -1,7 +1,10 @@
 """What an experiment found: a sentence from the source beside a sentence with figures of ours."""
 
-from collections.abc import Mapping
-from typing import NamedTuple
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -90,3 +93,30 @@ def cylindrical(run: Run) -> dict[str, np.ndarray]:
     bends = [truth(run, f"angle.{axes[j]}") for j in (arm.boom, arm.stick, arm.tool) if j]
     return {"r": np.hypot(x, y), "theta": np.unwrap(np.arctan2(y, x)), "z": z,
             "attitude": np.sum(bends, axis=0)}  # fmt: skip
+
+
+Progress = Callable[[str, float], None]
+
+
+def performed(
+    tasks: Sequence[tuple[Callable[..., Any], tuple]], jobs: int | None = None
+) -> Iterator[Any]:
+    """Results in order, from processes of their own if there are several.
+
+    Args:
+        tasks: functions with their arguments.
+        jobs: processes; as many as there are cores by default.
+
+    Yields:
+        What the functions return.
+    """
+    count = jobs or os.cpu_count() or 1
+    if count == 1:
+        for function, arguments in tasks:
+            yield function(*arguments)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=context) as pool:
+        waiting = [pool.submit(function, *arguments) for function, arguments in tasks]
+        for future in waiting:
+            yield future.result()

@@ -7,16 +7,21 @@ Zhu's experiments on contact force: held by feel, reflected directly, tracked on
 Zhu's experiments on motion: straight lines, rate against position control, step responses.
 """
 
-import multiprocessing
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
 
 from hydrotele.control.endpoint_force import endpoint_force_of_log
-from hydrotele.experiments.finding import Finding, Panel, cylindrical, perform, truth
+from hydrotele.experiments.finding import (
+    Finding,
+    Panel,
+    Progress,
+    cylindrical,
+    perform,
+    performed,
+    truth,
+)
 from hydrotele.run.run import Run
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track
@@ -341,9 +346,6 @@ def _false_force(run) -> Finding:
     )
 
 
-Progress = Callable[[str, float], None]
-
-
 def zhu1994(seeds: int = 20, jobs: int | None = None, progress: Progress | None = None
             ) -> list[Finding]:  # fmt: skip
     """Run all experiments.
@@ -369,7 +371,7 @@ def zhu1994(seeds: int = 20, jobs: int | None = None, progress: Progress | None 
     for reflection in ("stiffness", "none"):
         tasks += [(tracking_error, (reflection, seed)) for seed in range(1, seeds + 1)]
     results: list[Any] = []
-    for number, result in enumerate(_performed(tasks, jobs)):
+    for number, result in enumerate(performed(tasks, jobs)):
         results.append(result)
         if progress:
             progress(_said(tasks[number]), (number + 1) / len(tasks))
@@ -384,17 +386,3 @@ def zhu1994(seeds: int = 20, jobs: int | None = None, progress: Progress | None 
 def _said(task) -> str:
     function, arguments = task
     return " ".join([function.__name__.replace("_", " "), *map(str, arguments)])
-
-
-def _performed(tasks, jobs: int | None):
-    """Results in order, from processes of their own if there are several."""
-    count = jobs or os.cpu_count() or 1
-    if count == 1:
-        for function, arguments in tasks:
-            yield function(*arguments)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=context) as pool:
-        waiting = [pool.submit(function, *arguments) for function, arguments in tasks]
-        for future in waiting:
-            yield future.result()

@@ -21,7 +21,7 @@ from hydrotele.identify.record import IdentificationRecord
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.identify.smoothing import Smoothed, error_draws, smooth
 from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import Regressor, regressor, sign_uncertainty
+from hydrotele.multibody.regressor import Regressor, sign_uncertainty
 
 _TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
 _KAISER = 5.0  # its ripple is 50 dB down
@@ -206,11 +206,7 @@ def _rows(
     spread = None
     if rate_std is not None and np.isfinite(rate_std).all():
         spread = rate_deviations(found, given, rate_std)
-    table = regressor(
-        chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
-        offsets=False if setup.offsets is None else setup.offsets,
-        drive_inertia=setup.drive_inertia, rate_std=spread,
-    )  # fmt: skip
+    table = setup.table(found, spread)
     doubt = np.zeros((len(found.rate), len(table.drives)))
     if spread is not None:
         doubt = sign_uncertainty(chain, found, table.drives, setup.rubbing, spread)

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.optimize import minimize
@@ -14,13 +14,13 @@ from hydrotele.identify.identifiability import identifiable_in_noise, reference_
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.inverse_dynamics import Projection, project
-from hydrotele.multibody.regressor import regressor
 
 _ROWS = 12  # per period of the highest harmonic
 _MARGIN = 0.05  # of a range, stroke or limit that is left free
 _FLOW, _FORCE, _VALVE = 0.95, 0.8, 0.8  # of the pump, of the relief pressure, of a valve's rating
 _PRESS = (1e1, 1e3, 1e5)  # weights of violated limits, growing, so that the end lies inside them
 _READ = 0.02  # s between force readings of an ordinary log
+_BETWEEN = 8  # times more rows on which the limits are checked at last
 _DRAWN = 12  # random motions of which the best is where a search starts
 _WHERE = "excitation"
 
@@ -96,16 +96,18 @@ def information(
     Args:
         setup: of the regressor.
         motions: (3, n, k) positions, rates and accelerations.
-        noise: (k,) standard deviation of the drives' force errors [N] or [N m].
+        noise: of the drives' force errors: (k,) standard deviations [N] or [N m], or their (k, k)
+            covariance.
         base: places of the p base parameters.
         sizes: (p,) to count the parameters in; 1 by default.
     """
     found = project(setup.chain, setup.given, *motions)
-    table = regressor(
-        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
-        offsets=False if setup.offsets is None else setup.offsets,
-    )  # fmt: skip
-    scaled = table.matrix[:, :, base] / noise[:, None]
+    table = setup.table(found)
+    noise = np.asarray(noise, float)
+    if noise.ndim == 1:
+        scaled = table.matrix[:, :, base] / noise[:, None]
+    else:
+        scaled = np.linalg.solve(np.linalg.cholesky(noise), table.matrix[:, :, base])
     if sizes is not None:
         scaled = scaled * sizes
     flat = scaled.reshape(-1, len(base))
@@ -136,10 +138,7 @@ def informative_base(
     ).motion(time)
     motion[0] = np.clip(motion[0], limits.low, limits.high)
     found = project(setup.chain, setup.given, *motion)
-    table = regressor(
-        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
-        offsets=False if setup.offsets is None else setup.offsets,
-    )  # fmt: skip
+    table = setup.table(found)
     forces = np.sqrt(np.mean((table.matrix @ table.nominal) ** 2, axis=0))
     flat = (table.matrix / noise[:, None]).reshape(-1, len(table.names))
     asked = np.ones(len(table.names), bool)
@@ -184,7 +183,70 @@ def design_excitation(
             _WHERE, f"{', '.join(plain)} has a plain drive, whose feedback depends on its use:"
             " write a scenario with a `fourier` pilot and a `servo` of your own",
         )  # fmt: skip
-    limits = _Limits(machine, setup)
+    return design_motion(
+        _Limits(machine, setup), setup, noise, base, period=period, harmonics=harmonics,
+        starts=starts, iterations=iterations, seed=seed, progress=progress,
+    )  # fmt: skip
+
+
+class MotionLimits(Protocol):
+    """What k given joints, and the drives with them, may do.
+
+    Attributes:
+        axes: names of the k joints or of their axes.
+        low: (k,) lowest positions [rad] or [m].
+        high: (k,) highest positions [rad] or [m].
+        middle: (k,) between them.
+        half: (k,) of the distance.
+    """
+
+    axes: tuple[str, ...]
+    low: np.ndarray
+    high: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
+
+    def use(self, motions: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Use of every limit at every row.
+
+        Args:
+            motions: (3, n, k) positions, rates and accelerations.
+            held: the same with positions inside of `low` and `high`.
+
+        Returns:
+            (n, l), 1 at the limit.
+        """
+        ...
+
+
+def design_motion(
+    limits: MotionLimits, setup: RegressorSetup, noise: np.ndarray,
+    base: Sequence[int] | np.ndarray, *,
+    period: float = 20.0, harmonics: int = 8, starts: int = 2, iterations: int = 150,
+    seed: int = 0, progress: Callable[[str, float], None] | None = None,
+) -> Excitation:  # fmt: skip
+    """D-optimal Fourier motion of the setup's given joints within any limits.
+
+    Args:
+        limits: of the motion.
+        setup: of the regressor.
+        noise: of the drives' force errors, as of `information`.
+        base: places of the base parameters that count.
+        period: [s].
+        harmonics: number H of them.
+        starts: random motions from which to search.
+        iterations: of each search, per weight of the limits.
+        seed: of these.
+        progress: told what is being done and how far, 0 .. 1.
+
+    Returns:
+        The best motion found.
+
+    Raises:
+        InputError: no start moves within the limits.
+
+    Source: Abdellatif 2008, (22)-(26).
+    """
     rows = max(60, _ROWS * harmonics)
     time = np.arange(rows) * period / rows
     k, rng, best = len(setup.given), np.random.default_rng(seed), None
@@ -199,7 +261,7 @@ def design_excitation(
             limits.axes, period, mean, wide[:, :harmonics], wide[:, harmonics:], 0.0, 0.0, len(base)
         )
 
-    def measure(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def measure(x: np.ndarray, time: np.ndarray = time) -> tuple[float, np.ndarray]:
         motions = excitation(x).motion(time)
         inside = np.clip(motions[0], limits.low, limits.high)
         held = np.stack([inside, motions[1], motions[2]])
@@ -230,17 +292,19 @@ def design_excitation(
             best = (value, x, float(use.max()))
     if best is None:
         raise InputError(_WHERE, "no motion within the limits was found: give more starts")
-    value, x, worst = best
-    made = excitation(x)
+    between = np.arange(_BETWEEN * rows) * period / (_BETWEEN * rows)
+    x = _inside(best[1], lambda x: measure(x, between), 0.998)
+    value, use = measure(x, between)
+    made, worst = excitation(x), float(use.max())
     return Excitation(made.axes, period, made.mean, made.sin, made.cos, value, worst, len(base))
 
 
-def _inside(x: np.ndarray, measure: Callable) -> np.ndarray:
+def _inside(x: np.ndarray, measure: Callable, step: float = 0.97) -> np.ndarray:
     """A motion shrunk until it keeps all limits."""
     for _ in range(60):
         if measure(x)[1].max() <= 1.0:
             return x
-        x = 0.97 * x
+        x = step * x
     return x
 
 
@@ -250,11 +314,50 @@ def _sizes(
     """Sizes of base parameters, so that a determinant is no matter of units: those given."""
     still = np.zeros((1, len(middle)))
     found = project(setup.chain, setup.given, middle[None], still, still)
-    table = regressor(
-        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing,
-        offsets=False if setup.offsets is None else setup.offsets,
-    )  # fmt: skip
+    table = setup.table(found)
     return np.maximum(np.abs(table.nominal[np.asarray(base)]), 1.0)
+
+
+class DriveLimits:
+    """Limits of the drives alone, for given joints that may be any coordinates, such as a pose."""
+
+    def __init__(
+        self, setup: RegressorSetup, low: np.ndarray, high: np.ndarray, stroke: np.ndarray,
+        speed: float, acceleration: float,
+    ):  # fmt: skip
+        """Limits of a motion in coordinates of a pose.
+
+        Args:
+            setup: of the regressor.
+            low: (k,) lowest positions of the given joints [rad] or [m].
+            high: (k,) highest positions.
+            stroke: (d, 2) lowest and highest positions of the d drives [rad] or [m].
+            speed: that no drive may exceed [rad/s] or [m/s].
+            acceleration: that no drive may exceed [rad/s^2] or [m/s^2].
+
+        Source: Abdellatif 2008, (25).
+        """
+        self.setup, self.axes = setup, setup.given
+        self.low, self.high = np.asarray(low, float), np.asarray(high, float)
+        self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        stroke = np.asarray(stroke, float)
+        self.drive_middle, self.drive_half = stroke.mean(axis=1), 0.5 * np.ptp(stroke, axis=1)
+        self.speed, self.acceleration = speed, acceleration
+        self.drives = [setup.chain.index(d) for d in setup.chain.drives]
+
+    def use(self, motions: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Use of every limit at every row (n, l), 1 at the limit."""
+        found = project(self.setup.chain, self.setup.given, *held)
+        return np.concatenate(
+            [
+                1.0 + (motions[0] - self.high) / self.half,
+                1.0 + (self.low - motions[0]) / self.half,
+                np.abs(found.position[:, self.drives] - self.drive_middle) / self.drive_half,
+                np.abs(found.rate[:, self.drives]) / self.speed,
+                np.abs(found.acceleration[:, self.drives]) / self.acceleration,
+            ],
+            axis=1,
+        )
 
 
 class _Limits:
@@ -279,10 +382,7 @@ class _Limits:
             1.0 + (self.low - motions[0]) / self.half,
         ]
         found = project(self.setup.chain, self.setup.given, *held)
-        table = regressor(
-            self.setup.chain, found, bodies=self.setup.bodies, rubbing=self.setup.rubbing,
-            offsets=False,
-        )  # fmt: skip
+        table = replace(self.setup, offsets=None).table(found)
         forces = table.matrix @ table.nominal
         flow = np.zeros(len(forces))
         for i, axis in enumerate(self.axes):

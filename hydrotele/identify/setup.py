@@ -1,14 +1,18 @@
 """Which parameters the regressor of a machine has: its bodies, and the friction of its drives."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import numpy as np
+
+from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine.drives import Friction
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.chain import Chain
-from hydrotele.multibody.regressor import FrictionTerm, pin_friction
+from hydrotele.multibody.inverse_dynamics import Projection
+from hydrotele.multibody.regressor import FrictionTerm, Regressor, pin_friction, regressor
 
 
 def drive_friction(machine: Machine, chain: Chain) -> list[FrictionTerm]:
@@ -60,6 +64,9 @@ class RegressorSetup:
         rubbing: friction, place by place.
         offsets: constant forces of the drives as given [N] or [N m]; None for no such columns.
         drive_inertia: joints whose drive has an inertia of its own.
+        alike: bodies, joints or closures that have the same parameters; one column, named after
+            the first, stands for all of a group.
+        absent: parameters that are known to be 0, such as `moment_x.stator`.
     """
 
     chain: Chain
@@ -68,6 +75,55 @@ class RegressorSetup:
     rubbing: tuple[FrictionTerm, ...]
     offsets: Mapping[str, float] | None = field(default_factory=dict)
     drive_inertia: tuple[str, ...] = ()
+    alike: tuple[tuple[str, ...], ...] = ()
+    absent: tuple[str, ...] = ()
+
+    def table(self, found: Projection, rate_std: np.ndarray | None = None) -> Regressor:
+        """Regressor along a motion.
+
+        Args:
+            found: projection of the chain along it.
+            rate_std: (n, v) of the rates [rad/s] or [m/s]; None if they are certain.
+
+        Returns:
+            The regressor, with one column for what is alike and none for what is absent.
+
+        Raises:
+            InputError: a body, joint or parameter is not known.
+        """
+        whole = regressor(
+            self.chain, found, bodies=self.bodies, rubbing=self.rubbing,
+            offsets=False if self.offsets is None else self.offsets,
+            drive_inertia=self.drive_inertia, rate_std=rate_std,
+        )  # fmt: skip
+        return _merged(whole, self.alike, self.absent) if self.alike or self.absent else whole
+
+
+def _merged(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[str]) -> Regressor:
+    """A regressor with summed columns for places that are alike, without those absent."""
+    first = {place: group[0] for group in alike for place in group}
+    names, members = [], {}
+    for k, name in enumerate(whole.names):
+        kind, _, place = name.partition(".")
+        stands = f"{kind}.{first.get(place, place)}"
+        if stands not in members:
+            names.append(stands)
+        members.setdefault(stands, []).append(k)
+    places = {name.partition(".")[2] for name in whole.names}
+    if strange := [place for place in first if place not in places]:
+        raise InputError("setup", f"no parameters belong to {strange[0]}, which is stated alike")
+    if strange := [name for name in absent if name not in members]:
+        raise InputError("setup", f"{strange[0]} is stated absent but is no parameter")
+    kept = [name for name in names if name not in absent]
+    groups = [members[name] for name in kept]
+    sums = np.zeros((len(whole.names), len(kept)))
+    for k, group in enumerate(groups):
+        sums[group, k] = 1.0
+    return Regressor(
+        whole.matrix @ sums, whole.drives, tuple(kept),
+        tuple(whole.units[group[0]] for group in groups),
+        np.array([whole.nominal[group].mean() for group in groups]),
+    )  # fmt: skip
 
 
 def machine_setup(
@@ -114,3 +170,41 @@ def cylinder_bars(machine: Machine) -> dict[str, tuple[str, str]]:
         if axis.cylinder
         for part in ("tube", "rod")
     }
+
+
+def mechanism_setup(
+    chain: Chain, given: Sequence[str] | None = None, *, passive: Sequence[str] = (),
+    offsets: bool = True, alike: Sequence[Sequence[str]] = (), absent: Sequence[str] = (),
+) -> RegressorSetup:  # fmt: skip
+    """Setup for any mechanism, without a machine.
+
+    Drives, and the passive joints that are named, have dry and viscous friction; the file's
+    `damping` and `frictionloss` are the given numbers.
+
+    Args:
+        chain: the mechanism.
+        given: joints whose motion is measured; the drives by default.
+        passive: joints and closures without drive that have friction.
+        offsets: whether the drives may have constant forces.
+        alike: as of `Setup`.
+        absent: as of `Setup`.
+
+    Returns:
+        The setup. Bodies that no joint moves have no columns; joints with an `armature` have one.
+    """
+    moved = tuple(b for k, b in enumerate(chain.bodies) if chain.tree.above[k + 1].any())
+    rubbing, damping = [], chain.damping.copy()
+    for place in (*passive, *chain.drives):
+        numbers = {"coulomb": 0.0, "viscous": 0.0}
+        if place not in chain.closures:
+            j = chain.index(place)
+            numbers = {"coulomb": float(chain.frictionloss[j]), "viscous": float(damping[j])}
+            damping[j] = 0.0  # it has a column
+        rubbing.append(FrictionTerm(place, numbers))
+    return RegressorSetup(
+        chain=replace(chain, damping=damping),
+        given=tuple(chain.drives if given is None else given),
+        bodies=moved, rubbing=tuple(rubbing), offsets={} if offsets else None,
+        drive_inertia=tuple(j for j, a in zip(chain.joints, chain.armature, strict=True) if a),
+        alike=tuple(tuple(group) for group in alike), absent=tuple(absent),
+    )  # fmt: skip

@@ -407,14 +407,17 @@ def _parquet_bytes(table: Table) -> memoryview:
 
 
 def read_table(path: Path, missing: bool = False) -> Table:
-    """Read a table of numbers by the ending of its name, before any check of names or values.
+    """Read a log's columns as they are, without checks of their names and values.
 
     Args:
-        path: a .parquet or .csv file; see `read_csv`.
+        path: the file.
         missing: read empty cells as NaN instead of refusing them.
 
+    Returns:
+        Its columns.
+
     Raises:
-        InputError: it is no such file, or is not readable.
+        InputError: the file cannot be read.
     """
     if not path.is_file():
         raise InputError(path, "is not a file: give the path of a .parquet or .csv log")

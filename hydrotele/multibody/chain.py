@@ -72,6 +72,7 @@ class Chain:
         inertia: (b - 1, 10) inertial parameters of the bodies, about their frames' origins.
         armature: (v,) inertia of a joint's drive [kg] or [kg m^2].
         damping: (v,) [N s/m] or [N m s/rad].
+        frictionloss: (v,) dry friction [N] or [N m].
         drives: joints that an actuator moves, in the actuators' order.
         places: (v,) place of a joint in MuJoCo's `qpos`, -1 for those of ball and free joints.
         dofs: (v,) place of a joint in MuJoCo's `qvel`, -1 likewise.
@@ -86,6 +87,7 @@ class Chain:
     inertia: np.ndarray
     armature: np.ndarray
     damping: np.ndarray
+    frictionloss: np.ndarray
     drives: tuple[str, ...]
     places: np.ndarray
     dofs: np.ndarray
@@ -113,6 +115,7 @@ class _Joint(NamedTuple):
     start: float
     armature: float
     damping: float
+    frictionloss: float
     place: int
     dof: int
 
@@ -131,7 +134,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
 
     Raises:
         InputError: no such file, an actuator on a ball or free joint, such a joint with damping or
-            armature, or an active constraint other than `connect` and `weld`.
+            armature or friction, or an active constraint other than `connect` and `weld`.
 
     Source: MuJoCo manual, `mj_kinematics` and `mjData`.
     """
@@ -190,6 +193,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         inertia=np.array([_inertia(model, b) for b in range(1, model.nbody)]).reshape(-1, 10),
         armature=np.array([joint.armature for joint in joints]),
         damping=np.array([joint.damping for joint in joints]),
+        frictionloss=np.array([joint.frictionloss for joint in joints]),
         drives=tuple(dict.fromkeys(whole[int(model.jnt_qposadr[j])] for j in moved)) or names,
         places=np.array([joint.place for joint in joints], np.int64),
         dofs=np.array([joint.dof for joint in joints], np.int64),
@@ -216,13 +220,14 @@ def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joi
             _Joint(
                 name, body, kind == _SLIDE, tuple(model.jnt_axis[j]), anchor,
                 float(model.qpos0[place]), float(pose[place]), float(model.dof_armature[dof]),
-                float(model.dof_damping[dof]), place, dof,
+                float(model.dof_damping[dof]), float(model.dof_frictionloss[dof]), place, dof,
             )
         ]  # fmt: skip
     last = dof + (3 if kind == _BALL else 6)
-    if model.dof_damping[dof:last].any() or model.dof_armature[dof:last].any():
+    stated = (model.dof_damping, model.dof_armature, model.dof_frictionloss)
+    if any(values[dof:last].any() for values in stated):
         raise InputError(
-            _WHERE, f"joint {name}: only hinges and slides may have damping or armature"
+            _WHERE, f"joint {name}: only hinges and slides may have damping, armature or friction"
         )
     out, unit = [], np.eye(3)
     if kind == _FREE:
@@ -230,14 +235,14 @@ def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joi
         for k, letter in _AXES:
             out.append(
                 _Joint(f"{name}_{letter}", body, True, tuple(unit[k]), anchor, 0.0,
-                       float(ground[k]), 0.0, 0.0, -1, -1)
+                       float(ground[k]), 0.0, 0.0, 0.0, -1, -1)
             )  # fmt: skip
         place += 3
     angles = cardan_angles(_turn(pose[place : place + 4]))
     for k, letter in _AXES:
         out.append(
             _Joint(f"{name}_r{letter}", body, False, tuple(unit[k]), anchor, 0.0,
-                   float(angles[k]), 0.0, 0.0, -1, -1)
+                   float(angles[k]), 0.0, 0.0, 0.0, -1, -1)
         )  # fmt: skip
     return out
 

@@ -102,8 +102,9 @@ def regressor(
     drives = tuple(chain.drives if drives is None else drives)
     columns, names, units, nominal = [], [], [], []
 
-    def add(column: np.ndarray, name: str, unit: str, value: float) -> None:
-        columns.append(column)
+    def add(column: np.ndarray | None, name: str, unit: str, value: float) -> None:
+        if column is not None:
+            columns.append(column[:, :, None])
         names.append(name)
         units.append(unit)
         nominal.append(value)
@@ -112,8 +113,9 @@ def regressor(
         if body not in chain.bodies:
             raise InputError(_WHERE, f"{chain.name} has no body {body}: {', '.join(chain.bodies)}")
         b = chain.bodies.index(body)
+        columns.append(found.bodies[:, :, 10 * b : 10 * (b + 1)])
         for p, (kind, unit) in enumerate(BODY_PARAMETERS.items()):
-            add(found.bodies[:, :, 10 * b + p], f"{kind}.{body}", unit, chain.inertia[b, p])
+            add(None, f"{kind}.{body}", unit, chain.inertia[b, p])
     for joint in drive_inertia:
         j = chain.index(joint)
         unit = "kg" if chain.tree.slides[j] else "kg m^2"
@@ -128,7 +130,8 @@ def regressor(
         column[:, i] = 1.0
         unit = "N" if chain.tree.slides[chain.index(drive)] else "N m"
         add(column, f"offset.{drive}", unit, given.get(drive, 0.0))
-    matrix = np.stack(columns, axis=2) if columns else np.zeros((*found.share.shape[:2], 0))
+    empty = np.zeros((*found.share.shape[:2], 0))
+    matrix = np.concatenate([empty, *columns], axis=2)
     return Regressor(matrix, drives, tuple(names), tuple(units), np.array(nominal))
 
 
@@ -220,10 +223,14 @@ def pin_friction(chain: Chain) -> list[FrictionTerm]:
         chain: the chain.
 
     Returns:
-        One per hinge that no actuator moves, and per closure.
+        One per hinge that no actuator moves, and per closure; none for ball and free joints.
 
     Source: Khoshzaban 1992, 4.3: joint and pin friction of the complete model.
     """
     slides = chain.tree.slides
-    hinges = [j for k, j in enumerate(chain.joints) if not slides[k] and j not in chain.drives]
+    hinges = [
+        j
+        for k, j in enumerate(chain.joints)
+        if not slides[k] and chain.places[k] >= 0 and j not in chain.drives
+    ]
     return [FrictionTerm(place, {"coulomb": 0.0}) for place in (*hinges, *chain.closures)]

@@ -5,7 +5,7 @@ The pictures of an identification report: forces on the held-out run, and the pa
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from hydrotele.identify.result import (
     counts,
     parameter_rows,
 )
-from hydrotele.logs.dataset import Dataset
 from hydrotele.show import report_html
 from hydrotele.show.report_html import drawing, png
 
@@ -73,31 +72,52 @@ def draw_forces(forces: Forces, drive: str, judged: HeldOut) -> bytes:
 _MEMBERS = 6  # of a combination that are written out
 
 
+class LearnedFrom(NamedTuple):
+    """What an identification learned from.
+
+    Attributes:
+        name: of the machine or mechanism.
+        tool: of the machine; None for a mechanism without a machine.
+        fit: names of the fitted runs.
+        heldout: name of the run to judge on.
+        notes: on the data.
+    """
+
+    name: str
+    tool: str | None
+    fit: tuple[str, ...]
+    heldout: str
+    notes: tuple[str, ...] = ()
+
+
 def write_identify_report(
-    dataset: Dataset, found: Identification | None, hydraulics: Hydraulics | None,
+    learned: LearnedFrom, found: Identification | None, hydraulics: Hydraulics | None,
     best: Consistent | None, path: str | Path,
 ) -> None:  # fmt: skip
     """Write an identification as one self-contained HTML file.
 
     Args:
-        dataset: what it learned from.
+        learned: what it learned from.
         found: the mechanism, None where no force is known.
         hydraulics: the hydraulics, None where not asked for.
         best: the nearest machine that can exist, None without a mechanism.
         path: file to write.
     """
-    machine, runs = dataset.machine, ", ".join(run.name for run in dataset.fit)
+    of = f"mechanism {learned.name}"
+    if learned.tool is not None:
+        of = f"machine {learned.name}, tool {learned.tool}"
     status = found.status if found else hydraulics.status if hydraulics else ""
     good = status == "ok" and (hydraulics is None or hydraulics.status == "ok")
     report_html.write_report(
-        "identify", path, title=f"{machine.name}: identification",
-        over=f"IDENTIFICATION REPORT  ·  machine {machine.name}, tool {machine.tool}  ·  judged on"
-        f" {dataset.heldout.name}, fitted on {runs}",
+        "identify", path, title=f"{learned.name}: identification",
+        over=f"IDENTIFICATION REPORT  ·  {of}  ·  judged on {learned.heldout}, fitted on"
+        f" {', '.join(learned.fit)}",
         heading="The machine's numbers, from its logs" if good else status,
         chip=("no_gap", "Identified") if good else ("ambiguous", "See below"),
         figures=_figures(found, hydraulics), found=_mechanism(found, best) if found else None,
         hydraulics=_hydraulics(hydraulics) if hydraulics else None,
-        notes=found.notes if found else dataset.notes, version=hydrotele.__version__,
+        notes=found.notes if found else learned.notes, version=hydrotele.__version__,
+        runs=learned.tool is not None,
         seconds=f"{sum(part.seconds for part in (found, hydraulics) if part):.1f}",
     )  # fmt: skip
 

@@ -70,7 +70,7 @@ def test_json_is_a_list_of_rows(monkeypatch, tmp_path):
     panel = Panel("tip [m]", time, {"r": np.sin(time), "z": np.cos(time)})
     made = [Finding("a line", "Fig. 1", "straight", "1 mm", True, (panel,)),
             Finding("a force", "Fig. 2", "held", "12 % off", False)]  # fmt: skip
-    monkeypatch.setitem(experimenting.SERIES, "zhu1994", lambda *_: made)
+    monkeypatch.setitem(experimenting.SERIES, "zhu1994", (lambda *_: made, 1))
     result = CliRunner().invoke(app, ["experiments", "zhu1994", "--json"])
     assert result.exit_code == 0
     rows = json.loads(result.stdout)

@@ -1,0 +1,371 @@
+"""PaLiDA, the hexapod of Abdellatif 2008: published numbers, simulated measurements and control."""
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from hydrotele.core.files import models_folder
+from hydrotele.identify.excitation import DriveLimits, Excitation
+from hydrotele.identify.identifiability import Identifiability, identifiability
+from hydrotele.identify.mechanism import Mechanism, load_mechanism
+from hydrotele.identify.record import IdentificationRecord
+from hydrotele.identify.setup import RegressorSetup
+from hydrotele.multibody.chain import cardan_angles
+from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.poses import joint_positions
+
+LEGS = range(1, 7)
+CHI2_95 = 36.42  # of 24 degrees of freedom, as the document prints it
+HOME = np.array([0.0, 0.0, 0.55, 0.0, 0.0, 0.0])
+# Assumed, as README.md of the model says: the document prints neither noise nor limits.
+RATE = 1000.0  # Hz
+FORCE_NOISE = 53.0  # of a drive, over the published standard deviation of its dry friction
+LENGTH_NOISE = 10e-6  # m, standard deviation of a measured leg length
+CORRELATION = 0.6  # of the force noise of any two drives
+STROKE, SPEED, ACCELERATION = (0.60, 1.06), 1.2, 25.0  # m, m/s, m/s^2 of every drive
+LOW = np.array([-0.20, -0.20, 0.42, -0.35, -0.35, -0.25])  # of the pose [m], [rad]
+HIGH = np.array([0.20, 0.20, 0.70, 0.35, 0.35, 0.25])
+
+
+class Published(NamedTuple):
+    """One row of the document's Table 2.
+
+    Attributes:
+        symbol: as printed.
+        column: of the regressor, which stands for the combination.
+        value: identified.
+        std: standard deviation; that of the printed interval for p6 and p9, whose printed standard
+            deviations are those of each other.
+        prior: a-priori value; 0 for friction, which has none. That of p5 is printed without sign.
+    """
+
+    symbol: str
+    column: str
+    value: float
+    std: float
+    prior: float = 0.0
+
+
+TABLE = (
+    Published("p1", "inertia_zz.ring_1", -0.0447, 0.0039, 0.0074),
+    Published("p2", "inertia_xx.stator_1", 1.0892, 0.0070, 0.9439),
+    Published("p3", "inertia_zz.stator_1", 1.0077, 0.0045, 0.9458),
+    Published("p4", "moment_y.stator_1", 0.5995, 0.0036, 0.6201),
+    Published("p5", "moment_z.slider_1", -1.2885, 0.0056, -1.2295),
+    Published("p6", "inertia_xx.platform", 0.3078, 0.0014, 0.2878),
+    Published("p7", "inertia_yy.platform", 0.3021, 0.0014, 0.2878),
+    Published("p8", "inertia_zz.platform", 0.1176, 0.0012, 0.1217),
+    Published("p9", "moment_z.platform", 1.8896, 0.0061, 1.9012),
+    Published("p10", "mass.platform", 16.3081, 0.0460, 16.1920),
+    Published("r_alpha", "coulomb.alpha_1", 0.5756, 0.0158),
+    Published("r_beta", "coulomb.beta_1", 0.9195, 0.0179),
+    Published("r11", "coulomb.slide_1", 11.9772, 0.2485),
+    Published("r12", "coulomb.slide_2", 4.8071, 0.1861),
+    Published("r13", "coulomb.slide_3", 20.1528, 0.3226),
+    Published("r14", "coulomb.slide_4", 5.1518, 0.1817),
+    Published("r15", "coulomb.slide_5", 1.5857, 0.2618),
+    Published("r16", "coulomb.slide_6", 5.0057, 0.3519),
+    Published("r21", "viscous.slide_1", 16.8771, 0.5268),
+    Published("r22", "viscous.slide_2", 16.7406, 0.3712),
+    Published("r23", "viscous.slide_3", 6.3408, 0.5720),
+    Published("r24", "viscous.slide_4", 23.1662, 0.3799),
+    Published("r25", "viscous.slide_5", 26.4675, 0.4461),
+    Published("r26", "viscous.slide_6", 22.8053, 0.5539),
+)
+SYMBOLS = tuple(one.symbol for one in TABLE)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """The model, and its parameters in the order of Table 2.
+
+    Attributes:
+        mechanism: as a user of `hydrotele identify --mjcf` has it.
+        told: base parameters found from the regressor alone.
+        order: (24,) place of every row of Table 2 among the base parameters.
+        truth: (24,) values of the model.
+    """
+
+    mechanism: Mechanism
+    told: Identifiability
+    order: np.ndarray
+    truth: np.ndarray
+
+    @property
+    def setup(self) -> RegressorSetup:
+        """Of the regressor, in coordinates of the pose."""
+        return self.mechanism.setup
+
+    def matrix(self, motion: np.ndarray) -> np.ndarray:
+        """Regressor (n, 6, 24) of Table 2's parameters along a motion (3, n, 6) of the pose."""
+        found = project(self.setup.chain, self.setup.given, *motion)
+        return self.setup.table(found).matrix[:, :, self.told.base[self.order]]
+
+    def lengths(self, motion: np.ndarray) -> np.ndarray:
+        """Leg lengths (n, 6) [m] at poses (n, 6)."""
+        q = joint_positions(self.setup.chain, self.setup.given, motion)
+        return q[:, [self.setup.chain.index(name) for name in self.setup.chain.drives]]
+
+
+@cache
+def robot() -> Robot:
+    """The shipped model; base parameters from the null space of 100 random states."""
+    folder = models_folder() / "palida"
+    mechanism = load_mechanism(folder / "palida.xml", folder / "columns.yaml")
+    setup, rng = mechanism.setup, np.random.default_rng(0)
+    poses = 0.5 * (LOW + HIGH) + 0.4 * (HIGH - LOW) * rng.uniform(-1.0, 1.0, (100, 6))
+    states = (poses, rng.normal(0.0, 1.0, (100, 6)), rng.normal(0.0, 10.0, (100, 6)))
+    table = setup.table(project(setup.chain, setup.given, *states))
+    rows = table.matrix.reshape(-1, len(table.names))
+    told = identifiability(rows, table.names, table.units, [one.column for one in TABLE])
+    names = [table.names[b] for b in told.base]
+    order = np.array([names.index(one.column) for one in TABLE])
+    return Robot(mechanism, told, order, (told.combination @ table.nominal)[order])
+
+
+def force_covariance() -> np.ndarray:
+    """Covariance (6, 6) of the drives' force noise [N^2], white at `RATE`.
+
+    The document calls it high and cross-correlated and prints no number. Ratios of the drives are
+    those of the published standard deviations of their dry friction; the level, 10 to 19 N, is
+    chosen so that the standard deviations of the parameters are about the published ones.
+    """
+    size = FORCE_NOISE * np.array([one.std for one in TABLE[12:18]])
+    return np.outer(size, size) * (CORRELATION + (1.0 - CORRELATION) * np.eye(6))
+
+
+@cache
+def excitation() -> Excitation:
+    """The designed motion that comes with the model; `tools/palida_study.py` designs it anew."""
+    found = json.loads((models_folder() / "palida" / "excitation.json").read_text(encoding="utf-8"))
+    mean, sin, cos = (np.array(found[key]) for key in ("mean", "sin", "cos"))
+    return Excitation(
+        robot().setup.given,
+        found["period"],
+        mean,
+        sin,
+        cos,
+        found["criterion"],
+        found["worst"],
+        len(TABLE),
+    )
+
+
+def limits() -> DriveLimits:
+    """What the drives may do."""
+    return DriveLimits(robot().setup, LOW, HIGH, np.tile(STROKE, (6, 1)), SPEED, ACCELERATION)
+
+
+class Experiment(NamedTuple):
+    """What is measured of a repeated motion; n rows per period.
+
+    Attributes:
+        period: of the motion [s].
+        motion: (3, n, 6) true poses, rates and accelerations of one period.
+        length: (n, 6) true leg lengths [m].
+        force: (n, 6) true drive forces [N].
+    """
+
+    period: float
+    motion: np.ndarray
+    length: np.ndarray
+    force: np.ndarray
+
+
+def experiment(motion: np.ndarray, period: float) -> Experiment:
+    """One period of a motion (3, n, 6), with the lengths and forces of the model."""
+    own = robot()
+    return Experiment(period, motion, own.lengths(motion[0]), own.matrix(motion) @ own.truth)
+
+
+@cache
+def excited() -> Experiment:
+    """The designed motion at 1 kHz."""
+    motion = excitation()
+    time = np.arange(round(motion.period * RATE)) / RATE
+    return experiment(motion.motion(time), motion.period)
+
+
+def measured(
+    of: Experiment,
+    periods: int,
+    rng: np.random.Generator,
+    reaction: tuple[float, float] | None = None,
+) -> IdentificationRecord:
+    """Simulated measurement: repeated periods of true lengths and forces, and noise.
+
+    Args:
+        of: one period.
+        periods: how many.
+        rng: of the noise.
+        reaction: force of every drive per error of its measured length [N/m] and of its rate
+            [N s/m]: what a controller does about the encoder's noise, which is then in the forces,
+            too; None for noise that is not.
+
+    Returns:
+        A record of leg lengths and drive forces.
+    """
+    n = len(of.length) * periods
+    error = LENGTH_NOISE * rng.standard_normal((n, 6))
+    noise = rng.standard_normal((n, 6)) @ np.linalg.cholesky(force_covariance()).T
+    if reaction is not None:
+        noise -= reaction[0] * error + reaction[1] * np.gradient(error, 1.0 / RATE, axis=0)
+    drives = robot().setup.chain.drives
+    return IdentificationRecord(
+        "excitation", 1.0 / RATE, drives, np.tile(of.length, (periods, 1)) + error,
+        np.full(6, LENGTH_NOISE), np.tile(of.force, (periods, 1)) + noise,
+        np.sqrt(np.diag(force_covariance())),
+    )  # fmt: skip
+
+
+# Control: one linear controller per drive (PID), and forces of a model along the reference.
+MASS, BANDWIDTH, DAMPING = 4.0, 12.0, 0.8  # kg that a drive moves on average, Hz, 1
+INTEGRAL = 3.0  # 1/s, of the proportional part
+_FADE = 1.0  # s in which a path starts from rest
+
+
+def control_gains() -> tuple[float, float]:
+    """Stiffness [N/m] and damping [N s/m] of every drive's controller."""
+    turn = 2.0 * np.pi * BANDWIDTH
+    return MASS * turn**2, 2.0 * DAMPING * MASS * turn
+
+
+def circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.ndarray:
+    """A horizontal circle about the home pose, started from rest.
+
+    Args:
+        speed: of the tool [m/s].
+        radius: [m].
+        laps: at full speed.
+
+    Returns:
+        (3, n, 6) poses, rates and accelerations at `RATE`.
+    """
+    turn = speed / radius
+    time = np.arange(0.0, _FADE + laps * 2.0 * np.pi / turn, 1.0 / RATE)
+    r = np.clip(time / _FADE, 0.0, 1.0)  # the speed rises as 10 r^3 - 15 r^4 + 6 r^5
+    faded = _FADE * (2.5 * r**4 - 3.0 * r**5 + r**6)
+    angle = turn * (faded + np.maximum(time - _FADE, 0.0))
+    return _differentiated(radius * np.cos(angle), radius * np.sin(angle))
+
+
+def square(speed: float, side: float = 0.16, laps: float = 2.0) -> np.ndarray:
+    """A horizontal square about the home pose, at rest in its corners.
+
+    Args:
+        speed: of the tool in the middle of a side [m/s].
+        side: [m].
+        laps: of it.
+
+    Returns:
+        (3, n, 6) poses, rates and accelerations at `RATE`.
+
+    Source: quintic of a side, whose largest speed is 15/8 of the mean one.
+    """
+    span = 15.0 / 8.0 * side / speed
+    time = np.arange(0.0, 4.0 * laps * span, 1.0 / RATE)
+    place = time / span
+    corner = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * 0.5 * side
+    at = place.astype(int)
+    s = place - at
+    share = (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5)[:, None]
+    path = corner[at % 4] + share * (corner[(at + 1) % 4] - corner[at % 4])
+    return _differentiated(path[:, 0], path[:, 1])
+
+
+def _differentiated(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    pose = np.tile(HOME, (len(x), 1))
+    pose[:, 0] += x
+    pose[:, 1] += y
+    rate = np.gradient(pose, 1.0 / RATE, axis=0)
+    return np.stack([pose, rate, np.gradient(rate, 1.0 / RATE, axis=0)])
+
+
+class Tracked(NamedTuple):
+    """A path under control; n rows at `RATE`.
+
+    Attributes:
+        time: (n,) [s].
+        error: (n, 6) reference less true leg length [m].
+        pose_error: (n, 6) reference less true pose [m], [rad].
+        warnings: that MuJoCo counted.
+    """
+
+    time: np.ndarray
+    error: np.ndarray
+    pose_error: np.ndarray
+    warnings: int
+
+
+def track(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> Tracked:
+    """Drive a path in MuJoCo, with closed chains, friction and encoder noise.
+
+    Args:
+        motion: (3, n, 6) poses, rates and accelerations of the reference.
+        feedforward: (24,) parameters of a model whose forces are added; None for none.
+        seed: of the encoders' noise.
+
+    Returns:
+        How well the path is followed.
+
+    Source: Abdellatif 2008, section 5.4.
+    """
+    own, rng = robot(), np.random.default_rng(seed)
+    chain = own.setup.chain
+    model = mujoco.MjModel.from_xml_path(str(models_folder() / "palida" / "palida.xml"))
+    data = mujoco.MjData(model)
+    q = joint_positions(chain, own.setup.given, motion[0])
+    drives = [chain.index(name) for name in chain.drives]
+    reference = q[:, drives]
+    rate = np.gradient(reference, 1.0 / RATE, axis=0)
+    model_force = np.zeros_like(reference)
+    if feedforward is not None:
+        model_force = own.matrix(motion) @ feedforward
+    here = chain.places >= 0
+    data.qpos[chain.places[here]] = q[0, here]
+    place = model.joint("platform").qposadr[0]
+    data.qpos[place : place + 3] = motion[0, 0, :3]
+    data.qpos[place + 3 : place + 7] = _quaternion(motion[0, 0, 3:])
+    stiff, damp = control_gains()
+    held = (
+        own.matrix(np.stack([motion[0, :1], 0 * motion[1, :1], 0 * motion[2, :1]]))[0] @ own.truth
+    )
+    if feedforward is not None:
+        held = held - model_force[0]  # the integral part holds the robot where it starts
+    slides = chain.places[drives]
+    steps = round(1.0 / RATE / model.opt.timestep)
+    error, pose_error = np.empty_like(reference), np.empty_like(reference)
+    last, speed = None, np.zeros(6)
+    for row in range(len(reference)):
+        true = data.qpos[slides]
+        error[row] = reference[row] - true
+        pose_error[row] = motion[0, row] - _pose(data.qpos[place : place + 7])
+        reading = true + LENGTH_NOISE * rng.standard_normal(6)
+        if last is not None:  # first-order low-pass at 100 Hz of the differences
+            speed += (1.0 - np.exp(-2.0 * np.pi * 100.0 / RATE)) * (
+                (reading - last) * RATE - speed)  # fmt: skip
+        last = reading
+        away = reference[row] - reading
+        held = held + stiff * INTEGRAL * away / RATE
+        data.ctrl[:] = stiff * away + damp * (rate[row] - speed) + held + model_force[row]
+        mujoco.mj_step(model, data, steps)
+    time = np.arange(len(reference)) / RATE
+    return Tracked(time, error, pose_error, int(sum(w.number for w in data.warning)))
+
+
+def _quaternion(angles: np.ndarray) -> np.ndarray:
+    out, one = np.array([1.0, 0.0, 0.0, 0.0]), np.empty(4)
+    for axis, angle in zip(np.eye(3), angles, strict=True):
+        mujoco.mju_axisAngle2Quat(one, axis, angle)
+        mujoco.mju_mulQuat(out, out.copy(), one)
+    return out
+
+
+def _pose(qpos: np.ndarray) -> np.ndarray:
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, qpos[3:])
+    return np.concatenate([qpos[:3], cardan_angles(turn.reshape(3, 3))])

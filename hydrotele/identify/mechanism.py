@@ -1,0 +1,341 @@
+"""Identification of any mechanism: an MJCF, logs, and which column is which.
+
+Nothing of a Machine is needed: the MJCF gives bodies, joints, closures (`connect`, `weld`) and
+drives, a short mapping names the columns of positions and forces.
+"""
+
+import fnmatch
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.core.datafile import Facts, parse, read_yaml, suggest
+from hydrotele.core.errors import InputError
+from hydrotele.identify.motion import GAP
+from hydrotele.identify.record import IdentificationRecord
+from hydrotele.identify.setup import RegressorSetup, mechanism_setup
+from hydrotele.logs.log import LEFT_OUT, Log, load_log, read_table
+from hydrotele.logs.rows import fit_clock
+from hydrotele.multibody.chain import load_chain
+from hydrotele.multibody.poses import joint_positions
+from hydrotele.multibody.regressor import BODY_PARAMETERS
+
+_FITTED = 2.0 / 3.0  # of a single run; the rest judges
+_POSITIONS = ("position.{joint}", "angle.{joint}", "{joint}")
+_FORCES = ("force.{joint}", "torque.{joint}", "effort.{joint}")
+_SPARSE = 1.5  # ticks of a clock per row
+
+
+class ColumnMapping(Facts):
+    """Which column is which, and what is known of the mechanism.
+
+    Names of joints, bodies and closures are those of the MJCF; `*` and `?` stand for any letters.
+
+    Attributes:
+        time: column of the time [s].
+        position: joint -> column of its position [rad] or [m], with a minus before it where the
+            sign is the other way round; or one name for all, such as `angle.{joint}`.
+        force: drive -> column of its force or torque [N] or [N m], likewise.
+        position_noise: standard deviation of a position reading [rad] or [m], joint by joint or one
+            for all; where both noises are stated, they tell the covariance, and the bias that the
+            positions' noise leaves is taken off.
+        force_noise: standard deviation of a force reading [N] or [N m], likewise.
+        coordinates: joints in which the motion is described and filtered, such as those of a
+            platform, where they are not those that are measured.
+        passive_friction: joints without drive, and closures, that have friction.
+        alike: groups of bodies or joints that have the same parameters.
+        absent: parameters that are known to be 0, such as `moment_x.stator_*`.
+        offsets: whether drives may have constant forces.
+    """
+
+    time: str = "time"
+    position: str | dict[str, str] | None = None
+    force: str | dict[str, str] | None = None
+    position_noise: float | dict[str, float] | None = None
+    force_noise: float | dict[str, float] | None = None
+    coordinates: tuple[str, ...] = ()
+    passive_friction: tuple[str, ...] = ()
+    alike: tuple[tuple[str, ...], ...] = ()
+    absent: tuple[str, ...] = ()
+    offsets: bool = True
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """A mechanism that is identified.
+
+    Attributes:
+        setup: what the regressor is built of.
+        measured: joints whose positions are measured.
+        mapping: which column is which.
+        source: of the mapping or the MJCF, for messages.
+    """
+
+    setup: RegressorSetup
+    measured: tuple[str, ...]
+    mapping: ColumnMapping
+    source: str
+
+
+def load_mechanism(
+    mjcf: str | Path, mapping: str | Path | ColumnMapping | None = None
+) -> Mechanism:
+    """Read a mechanism and its mapping.
+
+    Args:
+        mjcf: the file.
+        mapping: YAML file with the keys of `ColumnMapping`, or one; None where columns have the
+            joints' names, alone or after `position.`, `angle.`, `force.`, `torque.` or `effort.`.
+
+    Returns:
+        The mechanism.
+
+    Raises:
+        InputError: a file is unusable, or a name in the mapping is not in the MJCF.
+    """
+    chain, source = load_chain(mjcf), str(mapping if isinstance(mapping, str | Path) else mjcf)
+    if mapping is None:
+        facts = ColumnMapping()
+    elif isinstance(mapping, ColumnMapping):
+        facts = mapping
+    else:
+        data, lines = read_yaml(mapping)
+        facts = parse(ColumnMapping, data, source, lines)
+    measured = chain.drives
+    if isinstance(facts.position, dict):
+        measured = tuple(_named(chain.joints, facts.position, source, "joint"))
+    for stated in (facts.force, facts.force_noise):
+        if isinstance(stated, dict):
+            _named(chain.drives, stated, source, "drive")
+    if isinstance(facts.position_noise, dict):
+        _named(measured, facts.position_noise, source, "measured joint")
+    places = (*chain.joints, *chain.closures)
+    bodies = [f"{kind}.{body}" for body in chain.bodies for kind in BODY_PARAMETERS]
+    alike = tuple(
+        tuple(_named((*chain.bodies, *places), group, source, "body or joint"))
+        for group in facts.alike
+    )
+    passive = _named(
+        [p for p in places if p not in chain.drives], facts.passive_friction, source,
+        "joint without drive",
+    )  # fmt: skip
+    rubbed = [f"{kind}.{p}" for kind in ("coulomb", "viscous") for p in (*passive, *chain.drives)]
+    firsts = {name: group[0] for group in alike for name in group}
+    absent = [
+        name
+        for name in _named([*bodies, *rubbed], facts.absent, source, "parameter")
+        if firsts.get(name.partition(".")[2], name.partition(".")[2]) == name.partition(".")[2]
+    ]
+    given = _named(chain.joints, facts.coordinates, source, "joint") or measured
+    setup = mechanism_setup(
+        chain, given, passive=passive, offsets=facts.offsets, alike=alike, absent=absent
+    )
+    return Mechanism(setup, measured, facts, source)
+
+
+def _named(known: Sequence[str], patterns, source: str, what: str) -> list[str]:
+    """Names that patterns stand for, in the order of the patterns."""
+    out: list[str] = []
+    for pattern in patterns:
+        found = fnmatch.filter(known, pattern)
+        if not found:
+            raise InputError(source, f"has no {what} {pattern!r}: {suggest(pattern, known)}")
+        out += [name for name in found if name not in out]
+    return out
+
+
+def mechanism_records(
+    paths: Sequence[str | Path], mechanism: Mechanism, heldout: str | None = None,
+    period: float | None = None,
+) -> tuple[tuple[IdentificationRecord, ...], IdentificationRecord, tuple[str, ...]]:  # fmt: skip
+    """Read logs of a mechanism.
+
+    Args:
+        paths: log files (.csv, .parquet) and folders of them.
+        mechanism: what they are of.
+        heldout: name of the run to judge on; by default one that begins with `test`, else the last;
+            a single run is split in time.
+        period: of a repeated motion [s]; a single run is then split at a whole period.
+
+    Returns:
+        Records of the runs to fit, of the run to judge on, and notes.
+
+    Raises:
+        InputError: a file is unusable, lacks a column, or there is no such run.
+    """
+    runs, notes = {}, []
+    for path in _logs(paths):
+        log, columns = _load(path, mechanism)
+        if log.name in runs:
+            raise InputError(log.source, f"run {log.name!r} is there twice: rename one")
+        runs[log.name], said = _record(log, columns, mechanism)
+        notes += said
+    if heldout is not None and heldout not in runs:
+        raise InputError("--heldout", f"there is no run {heldout!r}; {suggest(heldout, runs)}")
+    if len(runs) == 1:
+        (whole,) = runs.values()
+        first = round(_FITTED * len(whole.force))
+        if period:
+            step = round(period / whole.period)
+            first = max(1, round(first / step)) * step
+        fit, judge = (_rows(whole, slice(0, first)), _rows(whole, slice(first, None)))
+        notes.append(
+            f"{whole.name} is the only run: fitted up to {first * whole.period:.3g} s, judged on"
+            " the rest."
+        )
+        return (fit,), replace(judge, name=f"{whole.name}, last part"), tuple(notes)
+    named = sorted(runs)
+    chosen = heldout or next((n for n in named if n.startswith("test")), named[-1])
+    return tuple(runs[n] for n in named if n != chosen), runs[chosen], tuple(notes)
+
+
+def _logs(paths: Sequence[str | Path]) -> list[Path]:
+    out: list[Path] = []
+    for path in map(Path, paths):
+        if not path.is_dir():
+            out.append(path)
+            continue
+        some = sorted(p for p in path.iterdir() if p.suffix.lower() in (".csv", ".parquet"))
+        if not some:
+            raise InputError(path, "the folder holds no log: put .parquet or .csv files there")
+        out += some
+    if not out:
+        raise InputError("the data", "no file was given: name a folder with logs, or logs")
+    return out
+
+
+class _Column(NamedTuple):
+    """Channel under which a column is read, and its sign."""
+
+    channel: str
+    sign: float
+
+
+def _load(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], _Column]]:
+    """Read a log; (`position` or `force`, joint) -> the column that has it."""
+    mapping, chain, source = mechanism.mapping, mechanism.setup.chain, mechanism.source
+    raw, columns = read_table(path, missing=True), {}
+    names, ours = raw.names, "hydrotele" in raw.metadata  # those keep their names
+    aliases = dict.fromkeys(names, LEFT_OUT)
+    if mapping.time not in names:
+        raise InputError(path, f"has no column {mapping.time!r} of the time: name it in the"
+                         f" mapping, as `time: COLUMN`; columns: {', '.join(names)}")  # fmt: skip
+    aliases[mapping.time] = "time"
+    for what, joints, stated, usual in (
+        ("position", mechanism.measured, mapping.position, _POSITIONS),
+        ("force", chain.drives, mapping.force, _FORCES),
+    ):
+        for number, joint in enumerate(joints):
+            if isinstance(stated, dict):
+                name = stated.get(joint)
+            elif stated is not None:
+                name = stated.replace("{joint}", joint)
+            else:
+                expected = [one.replace("{joint}", joint) for one in usual]
+                name = next((one for one in expected if one in names), None)
+            if name is None:
+                continue
+            sign, name = (-1.0, name[1:]) if name.startswith("-") else (1.0, name)
+            if name not in names:
+                raise InputError(
+                    path, f"has no column {name!r}, which {source} names for the {what} of"
+                    f" {joint}; {suggest(name, names)}",
+                )  # fmt: skip
+            straight = chain.tree.slides[chain.index(joint)]
+            kinds = {"position": ("angle", "position"), "force": ("torque", "force")}[what]
+            aliases[name] = f"{kinds[int(straight)]}.{what[0]}{number}"
+            columns[what, joint] = _Column(name if ours else aliases[name], sign)
+    log = load_log(path, aliases=aliases, maximum_dropped=1.0, missing=True)
+    return log, columns
+
+
+def _record(
+    log: Log, columns: dict[tuple[str, str], _Column], mechanism: Mechanism
+) -> tuple[IdentificationRecord, tuple[str, ...]]:
+    chain = mechanism.setup.chain
+    clock, notes = fit_clock(log.time, log.source)
+    time, period = log.time[clock.row], clock.period
+    if clock.tick[-1] > _SPARSE * len(time):  # no common clock: rows at their usual distance
+        period = float(np.median(np.diff(time)))
+        notes = (f"{log.name}: {notes[0].rpartition('; ')[0].partition(': ')[2]}; interpolated to"
+                 f" {1.0 / period:.4g} Hz.",)  # fmt: skip
+    ticks = time[0] + period * np.arange(round((time[-1] - time[0]) / period) + 1)
+
+    def spread(values: np.ndarray | None) -> np.ndarray:
+        if values is None:
+            return np.full(len(ticks), np.nan)
+        known = np.isfinite(values[clock.row])
+        if not known.any():
+            return np.full(len(ticks), np.nan)
+        out = np.interp(ticks, time[known], values[clock.row][known])
+        after = np.searchsorted(time[known], ticks).clip(1, max(1, known.sum() - 1))
+        apart = np.diff(time[known], prepend=time[known][0])[after.clip(0, known.sum() - 1)]
+        return np.where(apart > GAP, np.nan, out)
+
+    def values_of(what: str, joint: str) -> np.ndarray | None:
+        column = columns.get((what, joint))
+        return None if column is None else column.sign * log[column.channel]
+
+    position = []
+    for joint in mechanism.measured:
+        if (values := values_of("position", joint)) is None:
+            raise InputError(
+                log.source, f"has no column for the position of {joint}: name it in the mapping, as"
+                f" `position: {{{joint}: COLUMN}}`",
+            )  # fmt: skip
+        position.append(spread(values))
+    force = [spread(values_of("force", drive)) for drive in chain.drives]
+    if not np.isfinite(force).any():
+        raise InputError(
+            log.source, "has no force of any drive: name the columns in the mapping, as `force:"
+            f" {{{chain.drives[0]}: COLUMN}}`",
+        )  # fmt: skip
+    mapping = mechanism.mapping
+    record = IdentificationRecord(
+        log.name, period, mechanism.measured, np.array(position).T,
+        _noise(mapping.position_noise, mechanism.measured), np.array(force).T,
+        _noise(mapping.force_noise, chain.drives),
+    )  # fmt: skip
+    return in_coordinates(record, mechanism.setup), notes
+
+
+def _noise(stated: float | dict[str, float] | None, joints: Sequence[str]) -> np.ndarray:
+    """Noise (k,) of readings, NaN where it is not stated."""
+    if isinstance(stated, dict):
+        return np.array([stated.get(joint, np.nan) for joint in joints])
+    return np.full(len(joints), np.nan if stated is None else stated)
+
+
+def in_coordinates(record: IdentificationRecord, setup: RegressorSetup) -> IdentificationRecord:
+    """A record whose positions are those of the setup's given joints.
+
+    Args:
+        record: of the measured joints, which determine all others.
+        setup: whose given joints are wanted.
+
+    Returns:
+        The record, by forward kinematics row by row where the joints are others.
+
+    Raises:
+        InputError: a row lacks a position, or cannot be reached.
+
+    Source: Abdellatif 2008, section 4.1.
+    """
+    if record.axes == setup.given:
+        return record
+    places = [setup.chain.index(name) for name in setup.given]
+    try:
+        q = joint_positions(setup.chain, record.axes, record.position)
+    except InputError as error:
+        raise InputError(record.name, str(error)) from None
+    return replace(
+        record, axes=setup.given, position=q[:, places],
+        position_noise=np.full(len(places), np.nan),
+    )  # fmt: skip
+
+
+def _rows(record: IdentificationRecord, rows: slice) -> IdentificationRecord:
+    return replace(record, position=record.position[rows], force=record.force[rows])
