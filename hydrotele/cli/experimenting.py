@@ -11,7 +11,7 @@ from hydrotele.experiments.abdellatif2008 import abdellatif2008
 from hydrotele.experiments.finding import Finding
 from hydrotele.experiments.zhu1994 import zhu1994
 
-SERIES = {"abdellatif2008": (abdellatif2008, 100), "zhu1994": (zhu1994, 20)}  # and repetitions
+SERIES = {"abdellatif2008": 100, "zhu1994": 20}  # usual repetitions
 
 
 def experiments_to_folder(
@@ -34,8 +34,8 @@ def experiments_to_folder(
     """
     if name not in SERIES:
         raise InputError(f"experiments {name!r}", f"valid: {', '.join(SERIES)}")
-    series, usual = SERIES[name]
-    seeds = seeds or usual
+    series = {"abdellatif2008": abdellatif2008, "zhu1994": zhu1994}[name]
+    seeds = seeds or SERIES[name]
     target = target or (None if as_json else Path("runs") / name)
     if target:
         check_target(target, "experiments")
