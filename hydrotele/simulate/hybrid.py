@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hydrotele.core.errors import InputError
 from hydrotele.kinematics.hybrid import (
     LEGS,
     REVOLUTE,
@@ -26,12 +27,12 @@ from hydrotele.kinematics.hybrid import (
 )
 from hydrotele.kinematics.hybrid_errors import ErrorModel
 from hydrotele.kinematics.wires import Wires, pose_covariance, wire_lengths
-from hydrotele.simulate.closure import closure_error
+from hydrotele.multibody.chain import load_chain
+from hydrotele.multibody.poses import joint_positions
 
 REACH, TILT = 0.08, 0.25  # m, rad: of the platform about its home, for random poses
 _WIRES_LOSE = 20.0  # times the wires' error that a pose's coordinate may have, per m of lever
 _TRIES = 200
-_CLOSED = 1e-12  # m
 _PIN = dict(solref=[0.002, 1.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0])  # stiff: DESIGN
 _COLOURS = {
     "rail": (0.35, 0.37, 0.40, 1.0), "carriage": (0.85, 0.60, 0.10, 1.0),
@@ -311,7 +312,7 @@ def mechanism_pose(
     model: mujoco.MjModel, data: mujoco.MjData, robot: Hybrid, joints: np.ndarray,
     legs: np.ndarray,
 ) -> Pose:  # fmt: skip
-    """Platform pose of the closed-chain model: carriage and leg slides set, loops closed by Newton.
+    """Platform pose of the closed-chain model: carriage and leg slides set, the loops closed.
 
     Args:
         model: of `hybrid_mechanism(robot)`.
@@ -328,23 +329,13 @@ def mechanism_pose(
     """
     zero = leg_readings(robot, np.zeros(len(robot.joints)), home_pose(robot, np.zeros(len(joints))))
     driven = [*robot.joints, *(f"leg{k}" for k in range(1, LEGS + 1))]
-    goal = np.concatenate([joints, legs - zero])
-    at = np.array([model.joint(name).qposadr[0] for name in driven])
-    begin = data.qpos[at].copy()
-    moving = np.setdiff1d(np.arange(model.nv), [model.joint(n).dofadr[0] for n in driven])
-    parts = 1 + int(np.max(np.abs(goal - begin)) / 0.1)
-    error = np.array([np.inf])
-    for part in range(1, parts + 1):
-        data.qpos[at] = begin + (goal - begin) * part / parts
-        for _ in range(30):
-            error, jacobian = closure_error(model, data)
-            if np.abs(error).max() < _CLOSED:
-                break
-            step = np.zeros(model.nv)
-            step[moving] = -np.linalg.lstsq(jacobian[:, moving], error, rcond=None)[0]
-            mujoco.mj_integratePos(model, data.qpos, step, 1.0)
-    if np.abs(error).max() > 1e-9:
-        raise Unreachable("the mechanism's loops do not close at these lengths")
+    goal, chain = np.concatenate([joints, legs - zero]), load_chain(model)
+    try:
+        found = joint_positions(chain, driven, goal[None], data.qpos[chain.places])
+    except InputError as error:
+        raise Unreachable("the mechanism's loops do not close at these lengths") from error
+    data.qpos[chain.places] = found[0]
+    mujoco.mj_kinematics(model, data)
     return platform_pose(data)
 
 

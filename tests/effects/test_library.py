@@ -46,6 +46,7 @@ PUMPED = {
     "motor_viscous_drag": {"piston"}, "line_compliance": {"piston.head", "piston.rod"},
     "accumulator_pressure": {"piston"}, "load_relief": {"piston"}, "load_friction": {"piston"},
 }  # fmt: skip
+SENSED = {"joint_bending", "sensor_misalignment", "sensor_backlash"}  # of a calibrator's joints
 machine_of = functools.cache(load_machine)
 untouched = functools.cache(lambda name, tool: load_machine(name, tool))  # no test gets hold of it
 CASES = [
@@ -80,7 +81,11 @@ def test_names_and_places_are_those_agreed():
     found = {name: set(effect.locations(machine)) for name, effect in EFFECTS.items()}
     assert {name: places for name, places in found.items() if places} == PLACES
     pumped = machine_of("eha", "load_30_bar")
-    assert {n: set(EFFECTS[n].locations(pumped)) for n in set(found) - set(PLACES)} == PUMPED
+    others = set(found) - set(PLACES) - SENSED
+    assert {n: set(EFFECTS[n].locations(pumped)) for n in others} == PUMPED
+    calibrator = machine_of("calibrator", None)
+    for name in SENSED:
+        assert set(EFFECTS[name].locations(calibrator)) == set(calibrator.sensed_joints)
     # its length is its position, and where its pins sit across the slide changes nothing
     for geometric in ("pin_offset", "length_offset"):
         assert not EFFECTS[geometric].locations(pumped)
