@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hydrotele.core.errors import InputError
 from hydrotele.kinematics.hybrid import (
     LEGS,
     REVOLUTE,
@@ -27,12 +26,11 @@ from hydrotele.kinematics.hybrid import (
 )
 from hydrotele.kinematics.hybrid_errors import ErrorModel
 from hydrotele.kinematics.wires import Wires, pose_covariance, wire_lengths
-from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.poses import joint_positions
 
 REACH, TILT = 0.08, 0.25  # m, rad: of the platform about its home, for random poses
 _WIRES_LOSE = 20.0  # times the wires' error that a pose's coordinate may have, per m of lever
 _TRIES = 200
+_CLOSED = 1e-12  # m
 _PIN = dict(solref=[0.002, 1.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0])  # stiff: DESIGN
 _COLOURS = {
     "rail": (0.35, 0.37, 0.40, 1.0), "carriage": (0.85, 0.60, 0.10, 1.0),
@@ -312,7 +310,10 @@ def mechanism_pose(
     model: mujoco.MjModel, data: mujoco.MjData, robot: Hybrid, joints: np.ndarray,
     legs: np.ndarray,
 ) -> Pose:  # fmt: skip
-    """Platform pose of the closed-chain model: carriage and leg slides set, the loops closed.
+    """Platform pose of the closed-chain model: carriage and leg slides set, loops closed by Newton.
+
+    Its ball joints are damped, which `multibody.chain` does not read, and what is compared are
+    MuJoCo's own positions, ball joints' quaternions included.
 
     Args:
         model: of `hybrid_mechanism(robot)`.
@@ -329,14 +330,40 @@ def mechanism_pose(
     """
     zero = leg_readings(robot, np.zeros(len(robot.joints)), home_pose(robot, np.zeros(len(joints))))
     driven = [*robot.joints, *(f"leg{k}" for k in range(1, LEGS + 1))]
-    goal, chain = np.concatenate([joints, legs - zero]), load_chain(model)
-    try:
-        found = joint_positions(chain, driven, goal[None], data.qpos[chain.places])
-    except InputError as error:
-        raise Unreachable("the mechanism's loops do not close at these lengths") from error
-    data.qpos[chain.places] = found[0]
-    mujoco.mj_kinematics(model, data)
+    goal = np.concatenate([joints, legs - zero])
+    at = np.array([model.joint(name).qposadr[0] for name in driven])
+    begin = data.qpos[at].copy()
+    moving = np.setdiff1d(np.arange(model.nv), [model.joint(n).dofadr[0] for n in driven])
+    parts = 1 + int(np.max(np.abs(goal - begin)) / 0.1)
+    error = np.array([np.inf])
+    for part in range(1, parts + 1):
+        data.qpos[at] = begin + (goal - begin) * part / parts
+        for _ in range(30):
+            error, jacobian = _loop_errors(model, data)
+            if np.abs(error).max() < _CLOSED:
+                break
+            step = np.zeros(model.nv)
+            step[moving] = -np.linalg.lstsq(jacobian[:, moving], error, rcond=None)[0]
+            mujoco.mj_integratePos(model, data.qpos, step, 1.0)
+    if np.abs(error).max() > 1e-9:
+        raise Unreachable("the mechanism's loops do not close at these lengths")
     return platform_pose(data)
+
+
+def _loop_errors(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+    """Openings (3 pins,) [m] of all connects and their Jacobian (3 pins, nv); moves the sites."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    errors, slopes = [], []
+    for one, two in zip(model.eq_obj1id, model.eq_obj2id, strict=True):
+        ends = []
+        for site in (one, two):
+            slope = np.zeros((3, model.nv))
+            mujoco.mj_jacSite(model, data, slope, None, site)
+            ends.append(slope)
+        errors.append(data.site_xpos[one] - data.site_xpos[two])
+        slopes.append(ends[0] - ends[1])
+    return np.concatenate(errors), np.vstack(slopes)
 
 
 def platform_pose(data: mujoco.MjData) -> Pose:
