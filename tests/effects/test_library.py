@@ -219,7 +219,10 @@ def test_patched_machine_is_a_file_that_runs_the_same(machine, tool, tmp_path):
             patched = apply_effect(patched, name, place, given)
     save_machine(patched, tmp_path / "machine.yaml")
     loaded = load_machine(tmp_path / "machine.yaml")
-    where = {"folder": patched.folder, "mjcf": patched.mjcf, "tools": patched.tools}
+    where = {
+        "folder": patched.folder, "mjcf": patched.mjcf, "tools": patched.tools,
+        "attached": patched.attached,
+    }  # fmt: skip
     assert loaded.model_copy(update=where) == patched
     here = {"machine": str(tmp_path / "machine.yaml"), "tool": None}
     run = run_scenario(short(machine, tool).model_copy(update=here))
