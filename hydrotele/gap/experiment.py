@@ -401,6 +401,9 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "accumulator_pressure": ("poses",),
     "load_relief": ("reversals",),
     "load_friction": ("reversals",),
+    "joint_bending": ("sweeps", "poses"),
+    "sensor_misalignment": ("sweeps",),
+    "sensor_backlash": ("sweeps", "reversals"),
 }
 """Effect -> the motions that bring it out."""
 

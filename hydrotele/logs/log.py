@@ -339,7 +339,8 @@ def load_logs(
 ) -> tuple[Log, ...]:
     """Read one file, or every `.parquet` and `.csv` of a folder, sorted by name.
 
-    The arguments are those of `load_log`.
+    A folder without such files may hold folders of runs, whose `measured.parquet` or
+    `measured.csv` is read. The arguments are those of `load_log`.
 
     Raises:
         InputError: as `load_log` for the first bad file; also for a folder without logs, or with
@@ -350,11 +351,18 @@ def load_logs(
     if path.is_dir():
         seen = [p for p in path.iterdir() if not p.name.startswith(".")]
         files = sorted(p for p in seen if p.suffix.lower() in (".parquet", ".csv"))
+        files = files or sorted(
+            file
+            for p in seen
+            for file in p.glob("measured.*")
+            if file.suffix in (".parquet", ".csv")
+        )
     if not files:
         raise InputError(path, "the folder holds no log: put .parquet or .csv files there")
-    for stem, count in Counter(file.stem for file in files).items():
+    names = Counter(f.stem if f.parent == path else f.parent.name for f in files)
+    for run, count in names.items():
         if count > 1:
-            raise InputError(path, f"run {stem!r} is there {count} times: keep one file of it")
+            raise InputError(path, f"run {run!r} is there {count} times: keep one file of it")
     return tuple(
         load_log(
             file,
