@@ -17,6 +17,8 @@ LONGER = {
     "simulate/native.py:_advance_with_memory",
     # Filter and smoother of one run: the arguments of `track`, of which it is the second half.
     "estimate/track.py:_cross",
+    # Options of an optimiser by keyword, as SciPy's function of that name has them.
+    "calibrate/estimation.py:least_squares",
 }
 
 

@@ -26,7 +26,7 @@ EFFECT = "set: {effects: [{name: payload, location: tool, parameters: {mass: 100
         ("set: {servo.lead: 0}\ngrid: {servo.lead: [1]}", ":1", "given twice"),
         ("grid: {tool: [bucket, spoon]}", ":2: grid.tool", "no tool 'spoon'; valid: bucket"),
         ("grid: {sensors: [perfect]}", ":2: grid.sensors", "valid: ideal"),
-        ("grid: {machine: [nix]}", ":2: grid.machine", "valid: cat215"),
+        ("grid: {machine: [nix]}", ":2: grid.machine", "valid: calibrator, cat215"),
         ("grid: {effects.0.parameters.mass: [1]}", ":2: grid.effects", "there is no entry 0"),
         (f"{EFFECT}grid: {{effects.0.parameters.mass: [-4]}}", ":3: grid.effects", "outside 0"),
         (f"{EFFECT}grid: {{effects.0.parameters.mas: [4]}}", ":3: grid.effects", "none of them"),
