@@ -15,7 +15,8 @@ from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
 
 MACHINES = [("cat215", "none"), ("cat215", "bucket"), ("cat215", "grapple"), ("rig", None),
-            ("ec20", None), ("emps", None), ("cat325", None), ("eha", "load_30_bar"), ("calibrator", None)]  # fmt: skip
+            ("ec20", None), ("emps", None), ("cat325", None), ("eha", "load_30_bar"),
+            ("calibrator", None)]  # fmt: skip
 LAWS = {"force", "flow", "valve", "supply", "geometry", "timing", "sensor"}
 ARM = {"swing", "boom", "stick"}
 # Names are fixed, because scripts read them; with them the places on the CAT 215 without a tool.

@@ -85,5 +85,7 @@ def test_json_is_a_list_of_rows(monkeypatch, tmp_path):
 
 
 def test_another_series_is_refused():
-    with pytest.raises(InputError, match="valid: abdellatif2008, khoshzaban1992, wang2012, zhu1994"):
+    with pytest.raises(
+        InputError, match="valid: abdellatif2008, khoshzaban1992, wang2012, zhu1994"
+    ):
         experimenting.experiments_to_folder("parker1992", None, 1, 1, True)
