@@ -5,10 +5,7 @@ figures and tables say what was done. Dimensions, noise and errors are chosen he
 (models/iwr/README.md), so that rows compare what is claimed, not digits.
 """
 
-import multiprocessing
-import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -26,7 +23,7 @@ from hydrotele.calibrate.hybrid import (
 )
 from hydrotele.calibrate.hybrid_data import Measurement, measurement_of_wires
 from hydrotele.calibrate.posterior import Evolution, Posterior, evolve, sample_posterior
-from hydrotele.experiments.finding import Finding, Marginals, Panel
+from hydrotele.experiments.finding import Finding, Marginals, Panel, performed
 from hydrotele.kinematics.hybrid import (
     Hybrid,
     Pose,
@@ -612,7 +609,7 @@ def wang2012(
     runs = len(tasks)
     tasks += [(covered, (seed,)) for seed in range(10 * seeds)]
     results = []
-    for number, result in enumerate(_performed(tasks, jobs)):
+    for number, result in enumerate(performed(tasks, jobs)):
         results.append(result)
         if progress:
             progress(tasks[number][0].__name__.replace("_", " "), (number + 1) / len(tasks))
@@ -625,17 +622,3 @@ def wang2012(
             findings.append(coverage(results[runs:]))
             findings.append(evolution_runs(results[single + 5 : runs], "poe"))
     return findings
-
-
-def _performed(tasks, jobs: int | None):
-    """Results in order, from processes of their own if there are several."""
-    count = jobs or os.cpu_count() or 1
-    if count == 1:
-        for function, arguments in tasks:
-            yield function(*arguments)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=context) as pool:
-        waiting = [pool.submit(function, *arguments) for function, arguments in tasks]
-        for future in waiting:
-            yield future.result()
