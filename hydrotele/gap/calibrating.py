@@ -329,7 +329,7 @@ def promoted(
     ends = {e[:2] for key in _at_ends(group, deviation) if (e := table[key].effect)}
     told = {key: gain for key, gain in moved.items() if gain > BEYOND or key in ends}
     options = {
-        key: _let_out(evidence, now.guess, place, next(c for c in candidates if c.key == key))
+        key: let_out(evidence, now.guess, place, next(c for c in candidates if c.key == key))
         for key in told
     }
     stuck = {key: _further(evidence, options[key]) for key in told if key in ends}
@@ -340,7 +340,7 @@ def promoted(
     return None if key is None or told[key] <= BEYOND else (options[key], told[key])
 
 
-def _let_out(evidence: Evidence, guess: Guess, place: int, known: Hypothesis) -> Guess:
+def let_out(evidence: Evidence, guess: Guess, place: int, known: Hypothesis) -> Guess:
     """A guess whose calibration, at `place`, leaves the numbers of an effect to the effect."""
     group, deviation = guess.parts[place]
     table, keys = numbers(evidence.data.machine), list(group.parameters)
@@ -351,8 +351,8 @@ def _let_out(evidence: Evidence, guess: Guess, place: int, known: Hypothesis) ->
         if full in keys:
             gone.add(full)
             start[-1] = deviation[keys.index(full)] * table[full].parameter.scale / p.scale
-    let_out = guess.plus(known, np.clip(start, known.low, known.high))
-    return uncalibrated(let_out, evidence.data.machine, gone)
+    more = guess.plus(known, np.clip(start, known.low, known.high))
+    return uncalibrated(more, evidence.data.machine, gone)
 
 
 def _further(evidence: Evidence, guess: Guess) -> tuple[Guess, float]:

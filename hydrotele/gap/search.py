@@ -30,6 +30,7 @@ from hydrotele.gap.calibrating import (
     fit_until_settled,
     fitted,
     free_of_calibration,
+    let_out,
     loss_of,
     mostly_right,
     polished,
@@ -60,6 +61,7 @@ _TRIED = 5  # candidates that are fitted
 _MOST = 3  # effects, one after the other
 _PART = 0.5  # of what is left of the errors' squares, that an effect must take at least
 _ROUNDS = 2  # of a calibration beside effects
+_ALIKE = 0.5  # of the squares of what an effect changes, that a number that does the same leaves
 
 
 @dataclass(frozen=True)
@@ -239,7 +241,8 @@ def search(
         grown = _toothed(evidence, base, grown, teeth, candidates, tell)
     if grown.fit and mostly_right(grown.now.guess, grown.fit):
         grown = _sparse(evidence, base, grown, candidates, tell)
-    return _compared(evidence, base, _plain(evidence, grown, candidates), tell)
+    grown = _by_number(evidence, _plain(evidence, grown, candidates), candidates)
+    return _compared(evidence, base, grown, tell)
 
 
 @dataclass(frozen=True)
@@ -435,6 +438,65 @@ def _plain(evidence: Evidence, grown: _Grown, candidates: Sequence[Hypothesis]) 
             return _plain(evidence, other, candidates)
         evidence.set_base(grown.now)
     return grown
+
+
+def _by_number(evidence: Evidence, grown: _Grown, candidates: Sequence[Hypothesis]) -> _Grown:
+    """Effects that do what fewer calibrated numbers of their place would do become these numbers.
+
+    A calibrated number is no candidate. One that is off by far more than it is uncertain is held
+    near by its prior, and a richer effect, as friction of the position over all of its range, does
+    the rest.
+    """
+    group = calibration_of(grown.now.guess)
+    if group is None or grown.fit is None:
+        return grown
+    names = grown.now.guess.names
+    slopes = evidence.base_slopes(evidence.slope_step)
+    whole = evidence.errors(grown.now.guess, evidence.slope_step)
+    place = grown.now.guess.hypotheses.index(group)
+    for index, (effect, _) in enumerate(grown.now.guess.parts):
+        if effect.name == CALIBRATION or effect.name not in EFFECTS:
+            continue
+        change: np.ndarray | None = None
+        for known in candidates:
+            keys = [f"{known.name}.{known.location}.{key}" for key in known.parameters]
+            if (
+                known.size >= effect.size
+                or known.location != effect.location
+                or not all(key in group.parameters for key in keys)
+            ):
+                continue
+            if change is None:
+                rest = evidence.errors(grown.now.guess.without(index), evidence.slope_step)
+                change = whole - rest
+            columns = slopes[:, [names.index(f"{CALIBRATION}.{group.location}.{k}") for k in keys]]
+            move = np.linalg.lstsq(columns, change, rcond=None)[0]
+            left = change - columns @ move
+            if left @ left > _ALIKE * (change @ change):
+                continue
+            other = _replaced(evidence, grown, index, place, known, keys, move)
+            if _total(other) < _total(grown):
+                return _by_number(evidence, other, candidates)
+            evidence.set_base(grown.now)
+    return grown
+
+
+def _replaced(
+    evidence: Evidence, grown: _Grown, index: int, place: int, known: Hypothesis,
+    keys: Sequence[str], move: np.ndarray,
+) -> _Grown:  # fmt: skip
+    """The search with an effect replaced by calibrated numbers as an effect, and settled."""
+    parts = list(grown.now.guess.parts)
+    group, deviation = parts[place]
+    moved = deviation.copy()
+    order = list(group.parameters)
+    for key, more in zip(keys, move, strict=True):
+        moved[order.index(key)] += more
+    parts[place] = (group, moved)
+    del parts[index]
+    guess = let_out(evidence, Guess(tuple(parts)), place - (index < place), known)
+    now, fit = fit_until_settled(evidence, evidence.judged(guess))
+    return replace(grown, now=now, fit=fit)
 
 
 def _total(grown: _Grown) -> float:
