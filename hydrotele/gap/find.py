@@ -64,6 +64,7 @@ _MINOR = 0.02  # share of the gap up to which something is a detail; laws are ra
 # machine than 15 % of what they do
 _TRACE_OF_FORM = 0.005  # share up to which an effect only mends the form of one beside it
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
+_SAME_READINGS = 1.0  # squares, in standard deviations: less than chance makes of one reading
 _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
 _OFF = 0.05  # by which noise must differ from the stated to be noted
@@ -360,10 +361,21 @@ def _chances(found: Found, index: int, rest: Judged) -> tuple[float, tuple[Alter
     rivals = [r for r in found.rivals[index] if np.isfinite(r.judged.loss)]
     table = effect_probabilities(found.judged, found.charges[index], rest, rivals)
     others = [
-        Alternative(r.hypothesis.name, r.hypothesis.location, float(chance))
+        Alternative(
+            r.hypothesis.name, r.hypothesis.location, float(chance),
+            apart(found.judged, r.judged) < _SAME_READINGS,
+        )
         for r, chance in zip(rivals, table[2:], strict=True) if chance >= _WORTH_TELLING
     ]  # fmt: skip
     return float(table[0]), tuple(others)
+
+
+def apart(one: Judged, other: Judged) -> float:
+    """Sum of squares of what two guesses predict differently, in standard deviations."""
+    return sum(
+        float(np.nansum((a.whitened - b.whitened) ** 2))
+        for a, b in zip(one.tracks, other.tracks, strict=True)
+    )
 
 
 def _prediction(track: Track, data: Dataset) -> Prediction:

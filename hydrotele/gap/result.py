@@ -33,11 +33,19 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another explanation that the data cannot rule out."""
+    """Another explanation that the data cannot rule out.
+
+    Attributes:
+        name: of the library's effect.
+        location: where it sits.
+        probability: of it in the place of the named effect.
+        same: whether it predicts the same readings, so that no data of these channels tell.
+    """
 
     name: str
     location: str
     probability: float
+    same: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,12 +70,16 @@ class NamedEffect:
 
     @property
     def other_forms(self) -> tuple[Alternative, ...]:
-        """Alternatives that are the same mechanism at the same place, in another form."""
+        """Alternatives that are the same mechanism at the same place, in another form.
+
+        Also those at the same place that predict the same readings, as an offset of a centre of
+        mass does what a larger inertia does where the axis of rotation is vertical.
+        """
         own = EFFECTS[self.name].mechanism if self.name in EFFECTS else ""
         return tuple(
             a for a in self.alternatives
-            if own and a.location == self.location and a.name in EFFECTS
-            and EFFECTS[a.name].mechanism == own
+            if a.location == self.location
+            and (a.same or (own and a.name in EFFECTS and EFFECTS[a.name].mechanism == own))
         )  # fmt: skip
 
     @property
@@ -333,7 +345,12 @@ def effect_document(effect: NamedEffect) -> dict[str, Any]:
             for name, e in effect.parameters.items()
         },
         "alternatives": [
-            {"name": a.name, "location": a.location, "probability": a.probability}
+            {
+                "name": a.name,
+                "location": a.location,
+                "probability": a.probability,
+                "same": a.same,
+            }
             for a in effect.alternatives
         ],
     }
