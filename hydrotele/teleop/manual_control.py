@@ -21,9 +21,10 @@ from hydrotele.teleop.operator_parameters import Operator
 
 GAIN, INTEGRATOR, DOUBLE_INTEGRATOR = range(3)
 FORMS = ("K", "K/s", "K/s^2")
-LAGS = (0.0, 0.1, 0.2, 0.35, 0.6, 1.0)  # s, first-order lags of an element that he tells apart
+_LAGS = (0.0, 0.15, 0.3, 0.6, 1.0)  # s, first-order lags of an element that he tells apart
+_DELAYS = (0.0, 0.1, 0.2, 0.3, 0.45)  # s, and dead times
 LEAD = 2.5  # s, of what he generates for a double integrator
-_WASHOUT = 0.4  # rad/s: slower motion is drift, not an effect of his hand
+_WASHOUT = 1.5  # rad/s: slower motion is drift, not an effect of his hand
 _SCATTER = 0.5  # s between errors of prediction that are independent of each other
 _VARIANCE = 5.0  # s over which he feels how large his errors are
 _FLOOR = 1e-24  # of a sum of squares: nothing has moved
@@ -39,6 +40,7 @@ class Loop(NamedTuple):
         facts: (9,) step [s], visual delay [s], remnant [1], threshold of the error, memory [s],
             surprise [1], largest output, number of integrations, expected gain.
         lag: (n,) first-order lag of each candidate [s].
+        dead: (n,) dead time of each [s].
         action: (n,) his gain with each, for an element of unit gain.
         past: (rows, 3) error, seen output and own hand of the last steps, a ring.
         noise: (m, 2) standard normal, of error and rate.
@@ -51,6 +53,7 @@ class Loop(NamedTuple):
 
     facts: np.ndarray
     lag: np.ndarray
+    dead: np.ndarray
     action: np.ndarray
     past: np.ndarray
     noise: np.ndarray
@@ -83,16 +86,18 @@ def visual_loop(
     """
     off = math.exp(him.surprise * rng.standard_normal())
     late = him.visual_delay + (him.lead_delay if form == DOUBLE_INTEGRATOR else 0.0)
-    rows = 4 + math.ceil(late / step)
+    rows = 4 + math.ceil((late + max(_DELAYS)) / step)
+    places = [(lag, dead) for lag in _LAGS for dead in _DELAYS]
     margin = him.tracking_margin if margin is None else margin
-    n = len(LAGS)
+    n = len(places)
     return Loop(
         facts=np.array([
             step, late - 0.5 * step, him.remnant, threshold, him.memory, him.surprise, most, form,
             off * prior,
         ]),
-        lag=np.array(LAGS),
-        action=np.array([_action(him, form, lag, late, margin) for lag in LAGS]),
+        lag=np.array([lag for lag, _ in places]),
+        dead=np.array([dead for _, dead in places]),
+        action=np.array([_action(him, form, lag, late + dead, margin) for lag, dead in places]),
         past=np.zeros((rows, 3)),
         noise=rng.standard_normal((steps, 2)),
         hand=np.zeros((n, 4)),
@@ -103,7 +108,7 @@ def visual_loop(
 
 
 @compiled
-def learn(loop, hand, seen):
+def learn(loop, tick, late, seen):
     """Compare what the hand did with what came of it, for every candidate element.
 
     Both go through a third-order wash-out, so that each candidate's effect is a finite filter of
@@ -111,15 +116,16 @@ def learn(loop, hand, seen):
 
     Args:
         loop: Loop; `hand`, `seen`, `sums` and `state` are written.
-        hand: displacement of the hand, scalar.
-        seen: output of the element at the same time, scalar.
+        tick: number of the decision, scalar.
+        late: steps by which what he sees is old, scalar.
+        seen: output of the element then, scalar.
 
     Returns:
         Nothing.
 
     Source: recursive least squares with forgetting, over a bank of models.
     """
-    step, a = loop.facts[STEP], _WASHOUT
+    step, a, rows = loop.facts[STEP], _WASHOUT, len(loop.past)
     share = 1.0 - np.exp(-a * step)
     keep = np.exp(-step / loop.facts[MEMORY])
     low = loop.seen
@@ -130,6 +136,13 @@ def learn(loop, hand, seen):
     best, least = 0, np.inf
     for i in range(len(loop.lag)):
         row, lag = loop.hand[i], loop.lag[i]
+        back = late + loop.dead[i] / step
+        whole = int(back)
+        hand = 0.0
+        if tick > whole:
+            part = back - whole
+            hand = (1.0 - part) * loop.past[(tick - whole) % rows, 2]
+            hand += part * loop.past[(tick - whole - 1) % rows, 2]
         row[0] += (1.0 - np.exp(-step / lag) if lag > 0.0 else 1.0) * (hand - row[0])
         row[1] += share * (row[0] - row[1])
         row[2] += share * (row[1] - row[2])
@@ -207,7 +220,7 @@ def look_and_act(loop, tick, target, seen, hand):
     error = (1.0 - part) * one[0] + part * two[0]
     three = past[(tick - whole - 2) % rows]
     rate = (error - (1.0 - part) * two[0] - part * three[0]) / step
-    learn(loop, (1.0 - part) * one[2] + part * two[2], (1.0 - part) * one[1] + part * two[1])
+    learn(loop, tick, late, (1.0 - part) * one[1] + part * two[1])
     best = int(state[CHOSEN])
     gain = believe(loop)
     share = 1.0 - np.exp(-step / _VARIANCE)
