@@ -27,7 +27,7 @@ from hydrotele.teleop.manual_control import FORMS, TrackingRecord
 from hydrotele.teleop.operator_parameters import load_operator_file
 
 EQUALISATIONS = ("integral", "lag", "gain", "lead")
-_SLOWEST, _FASTEST = 10.0, 50.0  # Hz of the samples that are used
+_SLOWEST, _FASTEST = 10.0, 25.0  # Hz of the samples that are used
 _SHORTEST = 20.0  # s
 _MISSING = 0.05  # share of the samples that may be interpolated
 _HIGHPASS = 0.15  # rad/s: slower motion of the hand is drift
@@ -46,6 +46,7 @@ _CERTAIN = 0.5  # standard error of a logarithm beyond which a parameter is not 
 _QUANTILE = 2.1  # of Student's t with the degrees of freedom that the blocks leave
 _BLOCK = 4.0  # s, longer than what the operator remembers of an error
 _DRAWS = 400
+_UNSETTLED = 20.0  # of the criterion, for a fit whose iterations did not settle
 
 
 class Estimate(NamedTuple):
@@ -188,7 +189,7 @@ def identify_operator(
     fits = [fit for kind in kinds if (fit := _fit(data, kind)) is not None]
     if not fits:
         raise InputError("record", "shows no answer of the hand to the target: check the columns")
-    best = min(fits, key=lambda fit: (not fit.settled, fit.criterion))
+    best = min(fits, key=lambda fit: fit.criterion + _UNSETTLED * (not fit.settled))
     if not best.settled:
         notes.append("the fit did not settle: record longer, or with more motion of the target")
     return _finished(best, data, signals, record, notes)
