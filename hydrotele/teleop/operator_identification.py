@@ -74,8 +74,8 @@ class OperatorFit(NamedTuple):
         equalisation: `gain`, `lead`, `lag` or `integral`.
         estimates: name -> estimate: gain (hand per error), delay, time_constant of lead or lag,
             neuromuscular_frequency, neuromuscular_damping, remnant; crossover, phase_margin and
-            gain_margin where there is a response.
-        element: form of the controlled element, as `K/s`, empty without a response.
+            gain_margin where the controlled element is one of the known forms.
+        element: form of the controlled element, as `K/s`, empty where it is none of them.
         explained: share of the hand's variance that the model predicts from the target [1].
         rate: of the samples that were used [Hz].
         duration: that was used [s].
@@ -110,7 +110,7 @@ def read_tracking(
         names: `time`, `target`, `response`, `hand` -> column.
 
     Returns:
-        The record as it was sampled, with NaN for a response that is not there, and notes.
+        The record as it was sampled, and notes.
 
     Raises:
         InputError: names file, column and row, and what to do.
@@ -124,8 +124,6 @@ def read_tracking(
         if key == "hand" and name is None and "force" in lower:
             name = lower["force"]
             notes.append("no hand: the force is taken as what the operator does")
-        if name is None and key == "response":
-            continue
         if name not in table.names:
             has = ", ".join(table.names)
             message = f"has no column {name or key!r}; it has {has}; name it with --{key} COLUMN"
@@ -136,7 +134,7 @@ def read_tracking(
             values *= to_si(unit)[1]
         if np.isinf(values).any():
             row = int(np.flatnonzero(np.isinf(values))[0])
-            raise InputError(table.where(name, row), "is infinite: remove the row")
+            raise InputError(table.where(str(name), row), "is infinite: remove the row")
         columns[key] = values
     time = columns.pop("time")
     if len(time) < 10:
@@ -157,19 +155,18 @@ def read_tracking(
             columns[key] = np.interp(time, time[~missing], values[~missing])
         if np.ptp(columns[key]) == 0.0:
             raise InputError(f"{path}, column {given.get(key, key)}", "never changes")
-    response = columns.get("response", np.full(len(time), np.nan))
-    return TrackingRecord(time, columns["target"], response, columns["hand"]), notes
+    return TrackingRecord(time, *(columns[k] for k in ("target", "response", "hand"))), notes
 
 
 def identify_operator(
-    record: TrackingRecord, equalisation: str | None = None, error: np.ndarray | None = None
-) -> OperatorFit:  # fmt: skip
+    record: TrackingRecord, equalisation: str | None = None, source: str = "record"
+) -> OperatorFit:
     """Fit the operator model to a record of compensatory tracking.
 
     Args:
         record: as it was sampled.
         equalisation: `gain`, `lead`, `lag` or `integral`; chosen by the record without one.
-        error: (n,) what was displayed, where there is no response.
+        source: what messages call the record.
 
     Returns:
         The fit.
@@ -180,7 +177,7 @@ def identify_operator(
     if equalisation is not None and equalisation not in EQUALISATIONS:
         message = f"{equalisation!r}; valid: {', '.join(EQUALISATIONS)}"
         raise InputError("--equalisation", message)
-    step, signals, notes = _uniform(record, error)
+    step, signals, notes = _uniform(record, source)
     filtered = {name: _filter(values, step, _highpass) for name, values in signals.items()}
     target, seen, hand = filtered["target"], filtered["error"], filtered["hand"]
     from_target = _instrument(target, seen, step)
@@ -188,7 +185,7 @@ def identify_operator(
     kinds = (equalisation,) if equalisation else EQUALISATIONS
     fits = [fit for kind in kinds if (fit := _fit(data, kind)) is not None]
     if not fits:
-        raise InputError("record", "shows no answer of the hand to the target: check the columns")
+        raise InputError(source, "shows no answer of the hand to the target: check the columns")
     best = min(fits, key=lambda fit: fit.criterion + _UNSETTLED * (not fit.settled))
     if not best.settled:
         notes.append("the fit did not settle: record longer, or with more motion of the target")
@@ -213,40 +210,33 @@ class _Fit(NamedTuple):
     settled: bool
 
 
-def _uniform(
-    record: TrackingRecord, error: np.ndarray | None
-) -> tuple[float, dict[str, np.ndarray], list[str]]:
+def _uniform(record: TrackingRecord, source: str) -> tuple[float, dict[str, np.ndarray], list[str]]:
     """Equidistant signals without mean, and notes."""
     time, notes = record.time, []
     spacing = float(np.median(np.diff(time)))
     if time[-1] - time[0] < _SHORTEST:
         message = f"is {time[-1] - time[0]:.1f} s long: at least {_SHORTEST:g} s are needed"
-        raise InputError("record", message)
+        raise InputError(source, message)
     if 1.0 / spacing < _SLOWEST:
         message = f"has {1.0 / spacing:.2g} samples per second: at least {_SLOWEST:g} are needed"
-        raise InputError("record", message)
+        raise InputError(source, message)
     if (gap := float(np.diff(time).max())) > 0.5:
         at = float(time[int(np.argmax(np.diff(time)))])
         message = f"has a gap of {gap:.2f} s at {at:.2f} s: cut it there, and use the longer part"
-        raise InputError("record", message)
+        raise InputError(source, message)
     if np.abs(np.diff(time) / spacing - 1.0).max() > 0.5:
         notes.append("samples are not equidistant: they were interpolated")
-    if error is None:
-        error = record.target - record.response
-    if not np.isfinite(error).all():
-        raise InputError("record", "has neither a response nor an error")
+    error = record.target - record.response
     every = max(1, math.ceil(1.0 / spacing / _FASTEST - 0.01))
     grid = np.arange(time[0], time[-1], spacing)
     made = {}
     for name, values in (("target", record.target), ("error", error), ("hand", record.hand),
                          ("response", record.response)):  # fmt: skip
         even = np.interp(grid, time, values)
-        if every > 1 and np.isfinite(even).all():
+        if every > 1:
             from scipy.signal import decimate
 
             even = decimate(even, every, ftype="fir", zero_phase=True)
-        elif every > 1:
-            even = even[::every]
         made[name] = even - even.mean()
     return spacing * every, made, notes
 
@@ -434,9 +424,7 @@ def _finished(
     if explained < 0.3:
         notes.append(f"only {100 * explained:.0f} % of the hand's motion come from the target")
     w = np.geomspace(0.1, 30.0, 600)
-    element = ""
-    if np.isfinite(signals["response"]).all():
-        element = _close(fit, data, signals, w, estimates, notes)
+    element = _close(fit, data, signals, w, estimates, notes)
     return OperatorFit(
         fit.kind, estimates, element, explained, 1.0 / data.step,
         float(record.time[-1] - record.time[0]), tuple(dict.fromkeys(notes)), w,
