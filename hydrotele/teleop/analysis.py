@@ -49,6 +49,7 @@ class Case:
         gains: of the channels.
         delay_forward: from the master to the slave [s].
         delay_back: from the slave to the master [s].
+        wave: impedance b of wave variables [N s/m]; 0 for the slave controller's damping.
     """
 
     master: Impedance
@@ -60,6 +61,7 @@ class Case:
     gains: Gains = field(default_factory=Gains)
     delay_forward: float = 0.0
     delay_back: float = 0.0
+    wave: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse controllers that hold a mass: they would need accelerations."""

@@ -16,9 +16,9 @@ import numpy as np
 from hydrotele.core.errors import InputError
 
 Block = Callable[[np.ndarray], np.ndarray]  # transfer function of the complex frequency [rad/s]
-_RATE = ("rate_position", "rate_force", "four_channel_rate")
+RATE_STRUCTURES = ("rate_position", "rate_force", "four_channel_rate")
 _DIRECT = ("position_position", "position_force", "four_channel_position")
-STRUCTURES = (*_DIRECT, *_RATE)
+STRUCTURES = (*_DIRECT, *RATE_STRUCTURES)
 _WHERE = "two-port"
 
 
@@ -133,7 +133,7 @@ def two_port(
         raise InputError(_WHERE, f"{structure!r} is not known: {', '.join(STRUCTURES)}")
     if min(delay_forward, delay_back) < 0.0:
         raise InputError(_WHERE, f"delays must not be negative: {delay_forward}, {delay_back} s")
-    if structure in _RATE and not gains.velocity > 0.0:
+    if structure in RATE_STRUCTURES and not gains.velocity > 0.0:
         raise InputError(_WHERE, f"the velocity gain must be positive, got {gains.velocity} 1/s")
     k = gains.velocity
 

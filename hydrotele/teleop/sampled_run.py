@@ -1,0 +1,325 @@
+"""A sampled teleoperator in time, packet by packet: confirms what `sampled` predicts.
+
+Master with hand and slave with task are integrated with many steps a period. Every period each side
+measures, sends a packet and uses the newest one that has arrived; packets have their own delays, may
+overtake each other and get lost. Independent of `sampled`: nothing here is a polynomial, a mean or a
+prediction, and passivity control and energy-limited waves are the nonlinear laws themselves.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.core.compiled import compiled
+from hydrotele.teleop.analysis import Case
+from hydrotele.teleop.sampled import (
+    PASSIVITY,
+    WAVE,
+    ages_of,
+    in_periods,
+    wave_impedance,
+)
+from hydrotele.teleop.two_port import RATE_STRUCTURES, Impedance
+
+# what a side measures: sum, place, difference, acceleration, sum and difference of the force on
+# hand or task, that force
+SUM, X, V, A, IMPULSE, CHANGE, FORCE = range(7)
+_SIGNALS = 7
+_PER_RATE = 0.1  # integration steps over the time constant of the fastest rate
+_KICK = np.array([0.1, 0.03])  # m/s, of master and slave
+_BLOCKS = 40
+_GROWN, _GONE = 1e8, 1e-8  # times the kick
+_LINEAR, _WAVES, _CONTROLLED = range(3)
+
+
+class Motion(NamedTuple):
+    """What a kick did.
+
+    Attributes:
+        largest: (40,) of both speeds in fortieths of the run [m/s]; 0 after it was ended.
+        grows: whether it grows, or does not die out.
+        line_energy: (periods,) energy that the line has taken in, of both ends [J]; 0 of the six
+            structures without waves or passivity control.
+    """
+
+    largest: np.ndarray
+    grows: bool
+    line_energy: np.ndarray
+
+
+def laws(case: Case, structure: str, reflected: float = 1.0) -> np.ndarray:
+    """Coefficients on what a side measures.
+
+    Args:
+        case: the teleoperator.
+        structure: one of `two_port.STRUCTURES`.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        (4, 7): own force of the master, force on the slave from the master's packet, own force of
+        the slave, force on the master from the slave's packet.
+
+    Source: Zhu 1994, 3.9-3.62.
+    """
+    made, gains, rate = np.zeros((4, _SIGNALS)), case.gains, structure in RATE_STRUCTURES
+    own, forward, slave, back = made
+
+    def add(row: np.ndarray, z: Impedance, place: int, factor: float = 1.0) -> None:
+        row[place : place + 2] += factor * np.array([z.stiffness, z.damping])
+        if place == X:
+            row[A] += factor * z.mass
+
+    add(slave, case.slave_control, X)
+    ahead = gains.velocity if rate else gains.position
+    if structure == "four_channel_position":
+        ahead = 1.0
+    add(forward, case.slave_control, SUM if rate else X, ahead)
+    shared = structure in ("rate_position", "four_channel_rate")
+    add(own, case.master_control, SUM if shared else X, gains.velocity if shared else 1.0)
+    if structure in ("position_force", "rate_force"):
+        back[FORCE] = -gains.force
+    else:
+        add(back, case.master_control, X)
+    if structure == "four_channel_position":
+        add(forward, case.slave, X)
+        add(back, case.master, X)
+        forward[FORCE], back[FORCE] = -1.0, -1.0
+    if structure == "four_channel_rate":
+        forward[IMPULSE], back[CHANGE] = -gains.velocity, -1.0 / gains.velocity
+    back *= reflected
+    return made
+
+
+def kick(
+    case: Case, structure: str, period: float, delays_forward: np.ndarray, delays_back: np.ndarray,
+    reflected: float = 1.0,
+) -> Motion:  # fmt: skip
+    """Simulate a kick of master and slave.
+
+    Args:
+        case: the teleoperator with hand and task; the delays are those given here.
+        structure: one of `sampled.SAMPLED_STRUCTURES`.
+        period: T of both sides [s].
+        delays_forward: (n,) of the packets sent in every period, which tells the length of the run
+            [s]; NaN where lost.
+        delays_back: (n,) the same from the slave.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        What happened.
+
+    Source: this module's docstring.
+    """
+    way = _LINEAR
+    table = np.zeros((4, _SIGNALS))
+    if structure in (WAVE, PASSIVITY):
+        way = _WAVES if structure == WAVE else _CONTROLLED
+    else:
+        table = laws(case, structure, reflected)
+    ages = [ages_of(in_periods(d, period)) for d in (delays_forward, delays_back)]
+    firm = case.slave_control
+    bodies = np.array([
+        [a.mass, a.damping, a.stiffness, b.mass, b.damping, b.stiffness]
+        for a, b in ((case.master, case.hand), (case.slave, case.task))
+    ])  # fmt: skip
+    steps = max(1, math.ceil(period * _fastest_rate(bodies) / _PER_RATE))
+    numbers = np.array([period, firm.stiffness, firm.damping, wave_impedance(case)])
+    largest, energy = _march(way, table, bodies, numbers, steps, ages[0], ages[1], _KICK)
+    return Motion(largest, _grows(largest), energy)
+
+
+def _fastest_rate(bodies: np.ndarray) -> float:
+    mass, damping, stiffness = bodies[:, :3].T + bodies[:, 3:].T
+    return float(max((damping / mass).max(), np.sqrt(stiffness / mass).max()))
+
+
+def _grows(largest: np.ndarray) -> bool:
+    """Whether the last quarter of what was reached moves more than the second one."""
+    reached = int(np.count_nonzero(largest > 0.0))
+    if reached < _BLOCKS:
+        return bool(largest[reached - 1] > _KICK.max())
+    quarter = _BLOCKS // 4
+    return bool(largest[-quarter:].max() >= largest[quarter : 2 * quarter].max())
+
+
+@compiled
+def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
+    """Largest speeds (40,), and energy in the line (n,)."""
+    count = len(age_forward)
+    period = numbers[0]
+    largest, energy = np.zeros(_BLOCKS), np.zeros(count)
+    sent = np.zeros((2, count, _SIGNALS))
+    state = np.zeros((2, 2))  # place, speed
+    state[0, 1], state[1, 1] = first[0], first[1]
+    seen, force = np.zeros((2, _SIGNALS)), np.zeros(2)
+    ends = np.zeros((2, 8))
+    for n in range(count):
+        for side in range(2):
+            _measure(bodies[side], state[side], force[side], period, seen[side])
+        newest = n - age_forward[n], n - age_back[n]
+        if way == _LINEAR:
+            sent[0, n], sent[1, n] = seen[0], seen[1]
+            for side in range(2):
+                force[side] = 0.0
+                come = newest[1 - side]
+                for j in range(_SIGNALS):
+                    force[side] -= table[2 * side, j] * seen[side, j]
+                    if come >= 0:
+                        force[side] += table[3 - 2 * side, j] * sent[1 - side, come, j]
+        elif way == _WAVES:
+            _waves(n, newest[0], newest[1], numbers, seen, sent, ends, force)
+        else:
+            mass = bodies[0, 0]
+            _controlled(n, newest[0], newest[1], numbers, mass, seen, sent, ends, force)
+        energy[n] = ends[0, 0] + ends[1, 0]
+        for side in range(2):
+            _integrate(bodies[side], state[side], force[side], period, steps)
+        block = n * _BLOCKS // count
+        speed = abs(state[0, 1]) + abs(state[1, 1])
+        largest[block] = max(largest[block], speed)
+        if (n + 1) * _BLOCKS % count < _BLOCKS:
+            if largest[block] < _GONE * first[0] or not largest[block] < _GROWN * first[0]:
+                break
+    return largest, energy
+
+
+@compiled
+def _measure(body, state, force, period, seen):
+    """Sensors of a side, just before its force changes."""
+    x, v = state[0], state[1]
+    mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
+    a = (force - damping * v - stiffness * x) / mass
+    held = body[3] * a + body[4] * v + body[5] * x
+    seen[SUM] += period * x
+    seen[V] = (x - seen[X]) / period
+    seen[X], seen[A] = x, a
+    seen[IMPULSE] += period * held
+    seen[CHANGE] = (held - seen[FORCE]) / period
+    seen[FORCE] = held
+
+
+# of `ends`, master's and slave's row
+ENERGY, GONE_IN, GONE_OUT, USED, SPENT, BEFORE, STRETCH, GOAL = range(8)
+BUDGET_IN = BEFORE  # of the slave's row
+# of packets of waves: the sum of all waves sent, and their energy; of passivity control: place or
+# force, and energy that has gone in
+TOTAL, BUDGET = range(2)
+
+
+@compiled
+def _waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force):
+    """Wave variables whose arriving energy is never used twice.
+
+    Packets carry the sum of all waves and of their energy, so that a lost one leaves no offset and
+    one that comes twice counts once. STRETCH is the spring of the slave's controller [m].
+    """
+    period, stiffness, damping, b = numbers[0], numbers[1], numbers[2], numbers[3]
+    root, less = math.sqrt(2.0 * b), math.sqrt(2.0 / b)
+    master, slave = ends[0], ends[1]
+    w = _arrived(master, sent[1], newest_back, period)
+    pushed = b * seen[0, V] - root * w
+    _send(sent[0], n, root * seen[0, V] - w, period)
+    force[0] = -pushed
+    u = _arrived(slave, sent[0], newest_forward, period)
+    stiff = damping + stiffness * period
+    pull = (stiffness * slave[STRETCH] + stiff * (less * u - seen[1, V])) / (1.0 + stiff / b)
+    slave[STRETCH] += period * (less * u - pull / b - seen[1, V])
+    _send(sent[1], n, u - less * pull, period)
+    force[1] = pull
+    master[ENERGY] += period * pushed * seen[0, V]
+    slave[ENERGY] -= period * pull * (less * u - pull / b)
+
+
+@compiled
+def _send(sent, n, wave, period):
+    before, energy = 0.0, 0.0
+    if n > 0:
+        before, energy = sent[n - 1, TOTAL], sent[n - 1, BUDGET]
+    sent[n, TOTAL] = before + period * wave
+    sent[n, BUDGET] = energy + period * wave * wave
+
+
+@compiled
+def _arrived(end, sent, newest, period):
+    """Wave to use: what has come and was not used yet, as far as its energy reaches."""
+    if newest < 0:
+        return 0.0
+    wave = (sent[newest, TOTAL] - end[USED]) / period
+    left = max(0.0, sent[newest, BUDGET] - end[SPENT]) / period
+    if wave * wave > left:
+        wave = math.copysign(math.sqrt(left), wave)
+    end[USED] += period * wave
+    end[SPENT] += period * wave * wave
+    return wave
+
+
+@compiled
+def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends, force):
+    """Two-port time-domain passivity control: place forward, force back, energies with them.
+
+    The slave's reference is held back so that no more goes out than came in; the master's damper
+    takes away what came out too much a period before, at most what stops its mass in two periods.
+    """
+    period, stiffness, damping = numbers[0], numbers[1], numbers[2]
+    master, slave = ends[0], ends[1]
+    # BEFORE: force that the line has put against the master's motion since the last sample
+    gone = master[BEFORE] * seen[0, V] * period
+    master[ENERGY] += gone
+    master[GONE_IN] += max(gone, 0.0)
+    master[GONE_OUT] += max(-gone, 0.0)
+    sent[0, n, TOTAL], sent[0, n, BUDGET] = seen[0, X], master[GONE_IN]
+    back, budget = 0.0, 0.0
+    if newest_back >= 0:
+        back, budget = sent[1, newest_back, TOTAL], sent[1, newest_back, BUDGET]
+    too_much, v = master[GONE_OUT] - budget, seen[0, V]
+    if too_much > 0.0 and v != 0.0:
+        back += min(0.5 * mass / period, too_much / (v * v * period)) * v
+    master[BEFORE] = back
+    force[0] = -back
+    if newest_forward >= 0:
+        slave[GOAL], slave[BUDGET_IN] = (
+            sent[0, newest_forward, TOTAL], sent[0, newest_forward, BUDGET]
+        )  # fmt: skip
+    stiff = damping + stiffness * period
+    wanted = (slave[GOAL] - slave[USED]) / period
+    pull, wanted = _allowed(
+        wanted, stiffness * slave[STRETCH] - stiff * seen[1, V], stiff,
+        max(0.0, slave[BUDGET_IN] - slave[GONE_OUT]) / period,
+    )  # fmt: skip
+    slave[USED] += period * wanted
+    slave[STRETCH] += period * (wanted - seen[1, V])
+    gone = -pull * wanted * period
+    slave[ENERGY] += gone
+    slave[GONE_IN] += max(gone, 0.0)
+    slave[GONE_OUT] += max(-gone, 0.0)
+    sent[1, n, TOTAL], sent[1, n, BUDGET] = pull, slave[GONE_IN]
+    force[1] = pull
+
+
+@compiled
+def _allowed(wanted, offset, stiff, power):
+    """Force and rate nearest to the wanted one with `(offset + stiff rate) rate <= power`."""
+    root = math.sqrt(offset * offset + 4.0 * stiff * power)
+    least, most = (-offset - root) / (2.0 * stiff), (-offset + root) / (2.0 * stiff)
+    rate = min(most, max(least, wanted))
+    return offset + stiff * rate, rate
+
+
+@compiled
+def _integrate(body, state, force, period, steps):
+    """Runge and Kutta's method of fourth order over a period with a held force."""
+    mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
+    h = period / steps
+    x, v = state[0], state[1]
+    for _ in range(steps):
+        a = (force - damping * v - stiffness * x) / mass
+        x2, v2 = x + 0.5 * h * v, v + 0.5 * h * a
+        a2 = (force - damping * v2 - stiffness * x2) / mass
+        x3, v3 = x + 0.5 * h * v2, v + 0.5 * h * a2
+        a3 = (force - damping * v3 - stiffness * x3) / mass
+        x4, v4 = x + h * v3, v + h * a3
+        a4 = (force - damping * v4 - stiffness * x4) / mass
+        x += h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+        v += h / 6.0 * (a + 2.0 * a2 + 2.0 * a3 + a4)
+    state[0], state[1] = x, v
