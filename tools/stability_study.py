@@ -5,22 +5,24 @@ python tools/stability_study.py --trials 400 --seed 0 --jobs 2
 
 from collections import Counter
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from study import options, publish, side_by_side
 
 from hydrotele.teleop.analysis import Case, load_teleop_case
-from hydrotele.teleop.sampled import SAMPLED_STRUCTURES, jittering_line, predict
+from hydrotele.teleop.sampled import SAMPLED_STRUCTURES, Line, jittering_line, predict
 from hydrotele.teleop.sampled_run import kick
-from hydrotele.teleop.two_port import Gains, Impedance
+from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance
 
 SPREAD = 0.5  # decades by which every number of the shipped case is varied, up and down
-PERIODS = (1e-3, 1e-2)  # s, of both sides' sampling
+PERIODS = (1e-3, 5e-2)  # s, of both sides' sampling
 DELAYS = (1e-3, 0.2)  # s, mean each way, of each its own
 JITTER = 0.5  # largest standard deviation of the delays over their mean
 LOST = 0.05  # largest share of lost packets
 FACTORS = (-1.5, 1.0)  # decades of the factor on what comes back
 SECONDS, TRIPS = 60.0, 100  # of a run, the longer of both
+REACH, ASIDE = (0.03, 30.0), 0.4  # factors searched for a limit; e-folds aimed beside it
 NEAR = 0.1  # of the factor on what comes back: so near to it stability is predicted to change
 
 
@@ -57,19 +59,74 @@ def drawn_delays(rng: np.random.Generator, count: int, period: float) -> np.ndar
     return delays
 
 
-def trial(seed: int, number: int) -> list[tuple]:
-    """For every structure: hands on, contact, predicted, simulated, near its limit, reason."""
+def scaled(case: Case, factor: float, linear: bool) -> tuple[Case, float]:
+    """Case and factor on what comes back: that changed, or the line's own gains without any."""
+    if linear:
+        return case, factor
+    z = case.slave_control
+    firm = Impedance(0.0, factor * z.damping, factor * z.stiffness)
+    return replace(case, slave_control=firm, wave=factor * case.wave), 1.0
+
+
+def limit(case: Case, name: str, line: Line, linear: bool) -> float | None:
+    """Factor at which what is predicted changes, of a first change from small ones up."""
+
+    def holds(factor: float) -> bool:
+        one, back = scaled(case, factor, linear)
+        return predict(one, name, line, back).stable
+
+    points = np.geomspace(*REACH, 13)
+    told = [holds(float(p)) for p in points]
+    change = [k for k in range(12) if told[k] != told[k + 1]]
+    if not change:
+        return None
+    least, most = float(points[change[0]]), float(points[change[0] + 1])
+    first = told[change[0]]
+    for _ in range(8):
+        middle = (least * most) ** 0.5
+        least, most = (middle, most) if holds(middle) == first else (least, middle)
+    return (least * most) ** 0.5
+
+
+class Row(NamedTuple):
+    """One case of one structure."""
+
+    held: bool
+    touching: bool
+    told: bool
+    seen: bool
+    near: bool
+    reason: str
+    dies_out: bool
+
+
+def trial(seed: int, number: int) -> list[Row]:
+    """One random case for every structure; every second one aimed at the limit."""
     rng = np.random.default_rng([seed, number])
     case, period, factor = drawn_case(rng)
+    aside = float(np.exp(rng.uniform(-ASIDE, ASIDE)))
     count = round(max(SECONDS, TRIPS * 2.0 * DELAYS[1]) / period)
     there, back = (drawn_delays(rng, 2 * count, period) for _ in range(2))
     # what is predicted sees the first half of the packets, what is simulated the second half
     line = jittering_line(period, there[:count], back[:count])
     rows = []
     for name in SAMPLED_STRUCTURES:
-        told = predict(case, name, line, factor)
-        seen = not kick(case, name, period, there[count:], back[count:], factor).grows
-        near = {predict(case, name, line, factor * k).stable for k in (1 - NEAR, 1 + NEAR)}
-        rows.append((bool(case.hand.mass), bool(case.task.mass), told.stable, seen, len(near) > 1,
-                     told.reason, told.rate))  # fmt: skip
+        linear = name in STRUCTURES
+        k = factor if linear else 1.0
+        if number % 2:
+            found = limit(case, name, line, linear)
+            k = k if found is None else aside * found
+        told = predict(*scaled_for(case, name, line, k, linear))
+        one, back_factor = scaled(case, k, linear)
+        motion = kick(one, name, period, there[count:], back[count:], back_factor)
+        sides = [predict(*scaled_for(case, name, line, m * k, linear)).stable
+                 for m in (1.0 - NEAR, 1.0 + NEAR)]  # fmt: skip
+        rows.append(Row(bool(case.hand.mass), bool(case.task.mass), told.stable, not motion.grows,
+                        sides[0] != sides[1], told.reason, motion.dies_out))  # fmt: skip
     return rows
+
+
+def scaled_for(case: Case, name: str, line: Line, factor: float, linear: bool) -> tuple:
+    """Arguments of `predict`."""
+    one, back = scaled(case, factor, linear)
+    return one, name, line, back

@@ -379,6 +379,11 @@ def _inside(function, radius: float, centre: float = 0.0) -> int:
     return round(float(np.angle(values[1:] / values[:-1]).sum()) / math.pi)
 
 
+def _angles() -> np.ndarray:
+    """Points of the unit circle up to half the sampling rate."""
+    return np.exp(-1j * np.geomspace(1e-6, math.pi, 4000))
+
+
 def passive_end(case: Case, line: Line) -> bool:
     """Whether what the line meets at the slave is passive as it is sampled.
 
@@ -395,22 +400,76 @@ def passive_end(case: Case, line: Line) -> bool:
 
     Source: Colgate and Schenkel 1997 (passivity of sampled walls); passivity theorem.
     """
-    angle = np.geomspace(1e-6, math.pi, 4000)
-    q = np.exp(-1j * angle)
+    q = _angles()
     far, firm = _side(case.slave, case.task, line.period, q), case.slave_control
     held = firm.damping * (1.0 - q) + firm.stiffness * line.period
     port = held * far.below / ((1.0 - q) * far.below + held * far.rate)
-    return bool(np.all(port.real > -1e-6 * np.abs(port))) and slave_alone(case, line) < 0.0
+    grows = _inside(lambda p: slave_characteristic(case, line, p), math.exp(_NEUTRAL * line.period))
+    return bool(np.all(port.real > -1e-6 * np.abs(port))) and not grows
 
 
-def slave_alone(case: Case, line: Line) -> float:
-    """Growth rate of the slave on its controller and task, with a held reference [1/s]."""
+def _answers(case: Case, structure: str, line: Line, q: np.ndarray, reflected: float):
+    """What master and slave send per what they receive, at points q."""
+    near = _side(case.master, case.hand, line.period, q)
+    far = _side(case.slave, case.task, line.period, q)
+    if structure == WAVE:
+        b, firm = wave_impedance(case), case.slave_control
+        held = firm.damping * (1.0 - q) + firm.stiffness * line.period
+        master = (b * near.rate - near.below) / (b * near.rate + near.below)
+        share = b * (1.0 - q) + held
+        return master, 1.0 - 2.0 * held * far.below / (share * far.below + b * held * far.rate)
+    own, forward = _master_laws(case, structure, near)
+    free = near.below * ((1.0 - q) if structure in RATE_STRUCTURES else 1.0)
+    back = reflected * _slave_law(case, structure, far)
+    return forward / (free + own), back / (far.below + far.digital(case.slave_control))
 
-    def function(q: np.ndarray) -> np.ndarray:
-        far = _side(case.slave, case.task, line.period, q)
-        return far.below + far.digital(case.slave_control)
 
-    return _fastest(function, line)
+def jitter_gain(case: Case, structure: str, line: Line, reflected: float = 1.0) -> float:
+    """How much of the noise that jitter makes comes back as noise; in the mean square, below 1.
+
+    A signal of frequency w through a line of random age leaves `E(q)` of it, and noise with the
+    share `1 - |E(q)|^2` of its power, white if the ages of successive packets are independent. The
+    noise goes round the loop, at either end through the closed loop's transfer functions, and makes
+    new noise: the spectral radius of that map of powers.
+
+    Args:
+        case: the teleoperator with hand and task.
+        structure: a linear one.
+        line: period and ages.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        The radius [1]; it means something only where the loop is stable in the mean.
+
+    Source: mean-square small gain, Elia 2005 (Remote stabilization over fading channels).
+    """
+    angle = np.geomspace(1e-4, math.pi, 6000)
+    q = np.exp(-1j * angle)
+    master, slave = _answers(case, structure, line, q, reflected)
+    ahead, home = _late(line.forward, q), _late(line.back, q)
+    left = 1.0 - master * slave * ahead * home
+    powers = np.array([
+        [master * home * slave / left, master / left],
+        [slave / left, slave * ahead * master / left],
+    ])  # fmt: skip
+    share = 1.0 - np.abs(np.array([ahead, home])[:, None]) ** 2
+    table = np.trapezoid(np.abs(powers) ** 2 * share, angle, axis=-1) / math.pi
+    return float(np.abs(np.linalg.eigvals(table)).max())
+
+
+def slave_characteristic(case: Case, line: Line, q: np.ndarray) -> np.ndarray:
+    """What is 0 at the poles of the slave on its controller and task, with a held reference.
+
+    Args:
+        case: the teleoperator with its task.
+        line: of which the period counts.
+        q: (...) points.
+
+    Returns:
+        (...).
+    """
+    far = _side(case.slave, case.task, line.period, np.asarray(q, complex))
+    return far.below + far.digital(case.slave_control)
 
 
 @dataclass(frozen=True)
@@ -418,14 +477,13 @@ class Prediction:
     """What is predicted of a sampled structure.
 
     Attributes:
-        stable: whether a disturbance dies out.
-        rate: growth rate of the linear loop, without passivity control [1/s].
-        reason: `poles`, or for passivity control `passive ends`, `slave alone`, `no control needed`
-            or `ends not passive`.
+        stable: whether a disturbance dies out; under passivity control, whether it stays bounded.
+        reason: `poles`, `jitter` (noise that jitter makes grows, though the mean does not), or of
+            passivity control `slave alone` (its own controller is unstable), `no control needed`,
+            `passive ends`, `bounded` (the slave's end is stable and not passive).
     """
 
     stable: bool
-    rate: float
     reason: str
 
 
@@ -442,17 +500,25 @@ def predict(case: Case, structure: str, line: Line, reflected: float = 1.0) -> P
         The prediction.
 
     Raises:
-        InputError: as of `growth_rate`.
+        InputError: the structure is not known, or the phase cannot be followed.
     """
+
+    def whole(q: np.ndarray) -> np.ndarray:
+        return sampled_characteristic(case, structure, line, q, reflected)
+
+    def alone(q: np.ndarray) -> np.ndarray:
+        return slave_characteristic(case, line, q)
+
+    slowest = math.exp(-_NEUTRAL * line.period)
+    steady = _inside(whole, slowest) == 0
     if structure != PASSIVITY:
-        rate = growth_rate(case, structure, line, reflected)
-        return Prediction(rate <= _NEUTRAL, rate, "poles")
-    alone = slave_alone(case, line)
-    rate = growth_rate(case, structure, line)
-    if alone > _NEUTRAL:
-        return Prediction(False, alone, "slave alone")
-    if passive_end(case, line):
-        return Prediction(True, rate, "passive ends")
-    if rate <= _NEUTRAL:
-        return Prediction(True, rate, "no control needed")
-    return Prediction(False, rate, "ends not passive")
+        if not steady:
+            return Prediction(False, "poles")
+        if jitter_gain(case, structure, line, reflected) >= 1.0:
+            return Prediction(False, "jitter")
+        return Prediction(True, "poles")
+    if _inside(alone, slowest):
+        return Prediction(False, "slave alone")
+    if steady:
+        return Prediction(True, "no control needed")
+    return Prediction(True, "passive ends" if passive_end(case, line) else "bounded")

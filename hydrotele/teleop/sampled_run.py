@@ -38,7 +38,8 @@ class Motion(NamedTuple):
 
     Attributes:
         largest: (40,) of both speeds in fortieths of the run [m/s]; 0 after it was ended.
-        grows: whether it grows, or does not die out.
+        grows: whether late motion is larger than early one; under passivity control, which bounds
+            motions and need not end them, whether it has more kinetic energy than the kick gave.
         line_energy: (periods,) energy that the line has taken in, of both ends [J]; 0 of the six
             structures without waves or passivity control.
     """
@@ -46,6 +47,11 @@ class Motion(NamedTuple):
     largest: np.ndarray
     grows: bool
     line_energy: np.ndarray
+
+    @property
+    def dies_out(self) -> bool:
+        """Whether less than a thousandth of the kick is left in the end."""
+        return bool(self.largest[self.largest > 0.0][-1] < 1e-3 * _KICK.max())
 
 
 def laws(case: Case, structure: str, reflected: float = 1.0) -> np.ndarray:
@@ -125,8 +131,10 @@ def kick(
     ])  # fmt: skip
     steps = max(1, math.ceil(period * _fastest_rate(bodies) / _PER_RATE))
     numbers = np.array([period, firm.stiffness, firm.damping, wave_impedance(case)])
-    largest, energy = _march(way, table, bodies, numbers, steps, ages[0], ages[1], _KICK)
-    return Motion(largest, _grows(largest), energy)
+    largest, moving, energy = _march(way, table, bodies, numbers, steps, ages[0], ages[1], _KICK)
+    given = 0.5 * float((bodies[:, 0] + bodies[:, 3]) @ _KICK**2)
+    grows = _beyond(moving, given) if way == _CONTROLLED else _grows(largest)
+    return Motion(largest, grows, energy)
 
 
 def _fastest_rate(bodies: np.ndarray) -> float:
@@ -134,21 +142,30 @@ def _fastest_rate(bodies: np.ndarray) -> float:
     return float(max((damping / mass).max(), np.sqrt(stiffness / mass).max()))
 
 
+_GROWTH = 1.05  # of what moved before, that a drift stays below
+
+
 def _grows(largest: np.ndarray) -> bool:
-    """Whether the last quarter of what was reached moves more than the second one."""
+    """Whether the last quarter of the run moves more than the second one."""
     reached = int(np.count_nonzero(largest > 0.0))
     if reached < _BLOCKS:
         return bool(largest[reached - 1] > _KICK.max())
     quarter = _BLOCKS // 4
-    return bool(largest[-quarter:].max() >= largest[quarter : 2 * quarter].max())
+    return bool(largest[-quarter:].max() > _GROWTH * largest[quarter : 2 * quarter].max())
+
+
+def _beyond(largest: np.ndarray, given: float) -> bool:
+    """Whether late motion has more energy than the kick gave."""
+    late = largest[largest > 0.0][-_BLOCKS // 4 :]
+    return bool(late.max() > _GROWTH * given)
 
 
 @compiled
 def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
-    """Largest speeds (40,), and energy in the line (n,)."""
+    """Largest speeds (40,) and kinetic energies (40,), and energy in the line (n,)."""
     count = len(age_forward)
     period = numbers[0]
-    largest, energy = np.zeros(_BLOCKS), np.zeros(count)
+    largest, moving, energy = np.zeros(_BLOCKS), np.zeros(_BLOCKS), np.zeros(count)
     sent = np.zeros((2, count, _SIGNALS))
     state = np.zeros((2, 2))  # place, speed
     state[0, 1], state[1, 1] = first[0], first[1]
@@ -178,10 +195,14 @@ def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
         block = n * _BLOCKS // count
         speed = abs(state[0, 1]) + abs(state[1, 1])
         largest[block] = max(largest[block], speed)
+        kinetic = 0.0
+        for side in range(2):
+            kinetic += 0.5 * (bodies[side, 0] + bodies[side, 3]) * state[side, 1] ** 2
+        moving[block] = max(moving[block], kinetic)
         if (n + 1) * _BLOCKS % count < _BLOCKS:
             if largest[block] < _GONE * first[0] or not largest[block] < _GROWN * first[0]:
                 break
-    return largest, energy
+    return largest, moving, energy
 
 
 @compiled
@@ -258,8 +279,9 @@ def _arrived(end, sent, newest, period):
 def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends, force):
     """Two-port time-domain passivity control: place forward, force back, energies with them.
 
-    The slave's reference is held back so that no more goes out than came in; the master's damper
-    takes away what came out too much a period before, at most what stops its mass in two periods.
+    The slave's reference is held back so that no more goes out than came in, and so is the force on
+    the master, as far as one knows now how far its mass will move; what came out too much is taken
+    away in the next periods, at most all of its kinetic energy.
     """
     period, stiffness, damping = numbers[0], numbers[1], numbers[2]
     master, slave = ends[0], ends[1]
@@ -272,9 +294,8 @@ def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends,
     back, budget = 0.0, 0.0
     if newest_back >= 0:
         back, budget = sent[1, newest_back, TOTAL], sent[1, newest_back, BUDGET]
-    too_much, v = master[GONE_OUT] - budget, seen[0, V]
-    if too_much > 0.0 and v != 0.0:
-        back += min(0.5 * mass / period, too_much / (v * v * period)) * v
+    v = seen[0, V] - 0.5 * period / mass * master[BEFORE]  # now, of what the line moves alone
+    back = _bounded(back, v, mass / period, 2.0 * (budget - master[GONE_OUT]) / mass)
     master[BEFORE] = back
     force[0] = -back
     if newest_forward >= 0:
@@ -295,6 +316,17 @@ def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends,
     slave[GONE_OUT] += max(-gone, 0.0)
     sent[1, n, TOTAL], sent[1, n, BUDGET] = pull, slave[GONE_IN]
     force[1] = pull
+
+
+@compiled
+def _bounded(force, v, firm, room):
+    """Force against a mass of speed v that gives it no more than the energy that has come.
+
+    With `x = v T - F T^2 / (2 M)` of the next period, `-F x <= E` is a quadratic inequality; firm is
+    M / T, room 2 E / M.
+    """
+    root = math.sqrt(max(0.0, v * v + room))
+    return min(firm * (v + root), max(firm * (v - root), force))
 
 
 @compiled
