@@ -121,7 +121,7 @@ def trial(seed: int, number: int) -> list[Row]:
         motion = kick(one, name, period, there[count:], back[count:], back_factor)
         sides = [predict(*scaled_for(case, name, line, m * k, linear)).stable
                  for m in (1.0 - NEAR, 1.0 + NEAR)]  # fmt: skip
-        rows.append(Row(bool(case.hand.mass), bool(case.task.mass), told.stable, not motion.grows,
+        rows.append(Row(bool(case.hand.mass), bool(case.task.stiffness), told.stable, not motion.grows,
                         sides[0] != sides[1], told.reason, motion.dies_out))  # fmt: skip
     return rows
 
@@ -130,3 +130,72 @@ def scaled_for(case: Case, name: str, line: Line, factor: float, linear: bool) -
     """Arguments of `predict`."""
     one, back = scaled(case, factor, linear)
     return one, name, line, back
+
+
+def share(rows: list[Row]) -> str:
+    """Right of all, in words."""
+    right = sum(r.told == r.seen for r in rows)
+    return f"{right} of {len(rows)} ({100.0 * right / len(rows):.1f} %)" if rows else "-"
+
+
+def table(found: list[list[Row]]) -> list[str]:
+    lines = ["| structure | right | hands on | let go | stable | near | right of near |"
+             " right of the others |", "| --- |" + " ---: |" * 7]  # fmt: skip
+    for name, rows in zip(SAMPLED_STRUCTURES, zip(*found, strict=True), strict=True):
+        near = [r for r in rows if r.near]
+        lines.append(
+            f"| `{name}` | {share(rows)} | {share([r for r in rows if r.held])} |"
+            f" {share([r for r in rows if not r.held])} |"
+            f" {100 * sum(r.seen for r in rows) / len(rows):.0f} % |"
+            f" {100 * len(near) / len(rows):.0f} % | {share(near)} |"
+            f" {share([r for r in rows if not r.near])} |"
+        )
+    every = [r for rows in found for r in rows]
+    lines.append(f"| all | {share(every)} | {share([r for r in every if r.held])} |"
+                 f" {share([r for r in every if not r.held])} |"
+                 f" {100 * sum(r.seen for r in every) / len(every):.0f} % |"
+                 f" {100 * sum(r.near for r in every) / len(every):.0f} % |"
+                 f" {share([r for r in every if r.near])} |"
+                 f" {share([r for r in every if not r.near])} |")  # fmt: skip
+    return lines
+
+
+def main() -> None:
+    asked = options(__doc__, trials=400, seed=0, jobs=2)
+    found = side_by_side(trial, asked)
+    plain, aimed = found[::2], found[1::2]
+    wrong = Counter(
+        (name, row.reason, "stable" if row.told else "unstable")
+        for rows in found for name, row in zip(SAMPLED_STRUCTURES, rows, strict=True)
+        if row.told != row.seen
+    )  # fmt: skip
+    guarded = [rows[-1] for rows in found if rows[-1].seen]
+    shipped = "the shipped case (`hydrotele/teleop/cat215_axis.yaml`)"
+    text = "\n".join([
+        "Every structure of every case is told stable or not by the analysis, and simulated: a kick",
+        f"of {SECONDS:g} s or more, packet by packet, with the nonlinear laws of waves and passivity",
+        "control. What is told knows the ages of other packets of the same network.",
+        "", f"Drawn: all numbers of {shipped} times 10^u,",
+        f"u uniform within {SPREAD} either way; no hand in half of the cases, no task in 30 %;",
+        f"periods from {1e3 * PERIODS[0]:g} to {1e3 * PERIODS[1]:g} ms; each way a delay with a mean of"
+        f" {1e3 * DELAYS[0]:g} to {1e3 * DELAYS[1]:g} ms,",
+        f"gamma-distributed with a deviation of up to {100 * JITTER:g} % of it, packets overtake each",
+        f"other, up to {100 * LOST:g} % are lost. In every second case the factor on what comes back",
+        "is as drawn (0.03 to 10), in the others it is aimed at the predicted limit: within",
+        f"{ASIDE:g} e-folds of it, where there is one. Waves and passivity control have no such",
+        "factor; their slave's controller and wave impedance are aimed instead. Near: what is told",
+        f"changes within {100 * NEAR:g} % of that factor. No case is left out.",
+        "", "## All cases", "", *table(found),
+        "", "## As drawn", "", *table(plain),
+        "", "## Aimed at the limit", "", *table(aimed),
+        "", "## Wrong ones", "", "| structure | told | because of | cases |", "| --- | --- | --- | ---: |",
+        *(f"| `{n}` | {what} | {why} | {k} |" for (n, why, what), k in sorted(wrong.items())),
+        "", "Passivity control bounds a motion and need not end it: it counts as stable where late",
+        "motion has no more kinetic energy than the kick gave. Of its"
+        f" {len(guarded)} stable runs {sum(r.dies_out for r in guarded)} died out, too.", "",
+    ])  # fmt: skip
+    publish(text, "Stability of sampled teleoperators: analysis against simulation", asked)
+
+
+if __name__ == "__main__":
+    main()

@@ -39,6 +39,9 @@ _FIRST = 400
 _MOST = 400_000
 _NEUTRAL = 1e-3  # 1/s: slower than this is drift, as of a free handle, not growth
 _FASTEST = 2e3  # 1/s of growth and decay that are told apart
+# jitter gain at which single runs grow: their power grows as the mean of its logarithm, which for a
+# noise of many parts (exponentially distributed power) is the logarithm of the mean less Euler's gamma
+_PATHS = math.exp(np.euler_gamma)
 _REFINED = 1e-3  # 1/s, and of the rate
 
 
@@ -425,7 +428,7 @@ def _answers(case: Case, structure: str, line: Line, q: np.ndarray, reflected: f
 
 
 def jitter_gain(case: Case, structure: str, line: Line, reflected: float = 1.0) -> float:
-    """How much of the noise that jitter makes comes back as noise; in the mean square, below 1.
+    """How much of the noise that jitter makes comes back as noise; in the mean square.
 
     A signal of frequency w through a line of random age leaves `E(q)` of it, and noise with the
     share `1 - |E(q)|^2` of its power, white if the ages of successive packets are independent. The
@@ -439,7 +442,8 @@ def jitter_gain(case: Case, structure: str, line: Line, reflected: float = 1.0) 
         reflected: factor on what comes back [1].
 
     Returns:
-        The radius [1]; it means something only where the loop is stable in the mean.
+        The radius [1], which means something only where the loop is stable in the mean. Below 1 the
+        mean square dies out; single runs do so up to `exp(0.577)`, about 1.78.
 
     Source: mean-square small gain, Elia 2005 (Remote stabilization over fading channels).
     """
@@ -514,11 +518,11 @@ def predict(case: Case, structure: str, line: Line, reflected: float = 1.0) -> P
     if structure != PASSIVITY:
         if not steady:
             return Prediction(False, "poles")
-        if jitter_gain(case, structure, line, reflected) >= 1.0:
+        if jitter_gain(case, structure, line, reflected) >= _PATHS:
             return Prediction(False, "jitter")
         return Prediction(True, "poles")
-    if _inside(alone, slowest):
-        return Prediction(False, "slave alone")
     if steady:
         return Prediction(True, "no control needed")
+    if _inside(alone, slowest):
+        return Prediction(False, "slave alone")
     return Prediction(True, "passive ends" if passive_end(case, line) else "bounded")

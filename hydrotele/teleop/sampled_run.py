@@ -223,6 +223,7 @@ def _measure(body, state, force, period, seen):
 # of `ends`, master's and slave's row
 ENERGY, GONE_IN, GONE_OUT, USED, SPENT, BEFORE, STRETCH, GOAL = range(8)
 BUDGET_IN = BEFORE  # of the slave's row
+_CATCH_UP = 2.0  # 1/s at which a reference that was held back makes up for it
 # of packets of waves: the sum of all waves sent, and their energy; of passivity control: place or
 # force, and energy that has gone in
 TOTAL, BUDGET = range(2)
@@ -298,12 +299,13 @@ def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends,
     back = _bounded(back, v, mass / period, 2.0 * (budget - master[GONE_OUT]) / mass)
     master[BEFORE] = back
     force[0] = -back
+    wanted = _CATCH_UP * (slave[GOAL] - slave[USED])
     if newest_forward >= 0:
+        wanted += (sent[0, newest_forward, TOTAL] - slave[GOAL]) / period
         slave[GOAL], slave[BUDGET_IN] = (
             sent[0, newest_forward, TOTAL], sent[0, newest_forward, BUDGET]
         )  # fmt: skip
     stiff = damping + stiffness * period
-    wanted = (slave[GOAL] - slave[USED]) / period
     pull, wanted = _allowed(
         wanted, stiffness * slave[STRETCH] - stiff * seen[1, V], stiff,
         max(0.0, slave[BUDGET_IN] - slave[GONE_OUT]) / period,
