@@ -11,7 +11,7 @@ import numpy as np
 from study import options, publish, side_by_side
 
 from hydrotele.teleop.analysis import Case, load_teleop_case
-from hydrotele.teleop.sampled import SAMPLED_STRUCTURES, Line, jittering_line, predict
+from hydrotele.teleop.sampled import SAMPLED_STRUCTURES, PacketAges, jittering_line, predict
 from hydrotele.teleop.sampled_run import kick
 from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance
 
@@ -68,7 +68,7 @@ def scaled(case: Case, factor: float, linear: bool) -> tuple[Case, float]:
     return replace(case, slave_control=firm, wave=factor * case.wave), 1.0
 
 
-def limit(case: Case, name: str, line: Line, linear: bool) -> float | None:
+def limit(case: Case, name: str, line: PacketAges, linear: bool) -> float | None:
     """Factor at which what is predicted changes, of a first change from small ones up."""
 
     def holds(factor: float) -> bool:
@@ -126,7 +126,7 @@ def trial(seed: int, number: int) -> list[Row]:
     return rows
 
 
-def scaled_for(case: Case, name: str, line: Line, factor: float, linear: bool) -> tuple:
+def scaled_for(case: Case, name: str, line: PacketAges, factor: float, linear: bool) -> tuple:
     """Arguments of `predict`."""
     one, back = scaled(case, factor, linear)
     return one, name, line, back

@@ -15,7 +15,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import Case, first_change, holds
 from hydrotele.teleop.sampled import (
     SAMPLED_STRUCTURES,
-    Line,
+    PacketAges,
     Prediction,
     growth_rate,
     predict,
@@ -251,7 +251,7 @@ class WorstCase:
 
 
 def worst_case(
-    case: Case, structure: str, line: Line, spread: Spread, pairs: int, seed: int = 0
+    case: Case, structure: str, line: PacketAges, spread: Spread, pairs: int, seed: int = 0
 ) -> WorstCase:
     """Stability over drawn hands and tasks, sampled and with the line's jitter.
 
@@ -306,7 +306,7 @@ class Robustness:
 
 
 def robustness(
-    case: Case, structure: str, line: Line, spread: Spread, pairs: int = 20
+    case: Case, structure: str, line: PacketAges, spread: Spread, pairs: int = 20
 ) -> Robustness:
     """Find what a structure withstands.
 
@@ -342,7 +342,6 @@ def robustness(
     )
 
 
-def steady_case_line(case: Case, period: float) -> Line:
+def steady_case_line(case: Case, period: float) -> PacketAges:
     """The case's own delays, sampled [s]."""
     return steady_line(period, case.delay_forward, case.delay_back)
-

@@ -19,16 +19,15 @@ back:
   ends are passive, see `passive_end`.
 """
 
-import csv
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.linalg import expm
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import Case
+from hydrotele.teleop.network import ages_of, in_periods
 from hydrotele.teleop.two_port import RATE_STRUCTURES, STRUCTURES, Impedance
 
 WAVE, PASSIVITY = "wave_variables", "passivity_control"
@@ -46,7 +45,7 @@ _REFINED = 1e-3  # 1/s, and of the rate
 
 
 @dataclass(frozen=True)
-class Line:
+class PacketAges:
     """How old packets are when they are used.
 
     Attributes:
@@ -77,7 +76,7 @@ class Line:
         return forward, back
 
 
-def steady_line(period: float, delay_forward: float, delay_back: float) -> Line:
+def steady_line(period: float, delay_forward: float, delay_back: float) -> PacketAges:
     """A line with constant delays, rounded to periods.
 
     Args:
@@ -92,32 +91,12 @@ def steady_line(period: float, delay_forward: float, delay_back: float) -> Line:
     array([0., 0., 1.])
     """
     share = [np.eye(1 + round(d / period))[-1] for d in (delay_forward, delay_back)]
-    return Line(period, *share)
+    return PacketAges(period, *share)
 
 
-def ages_of(delays: np.ndarray) -> np.ndarray:
-    """Ages of the newest packets that have arrived; those that were overtaken are dropped.
-
-    Args:
-        delays: (n,) of the packets sent in periods 0 .. n - 1, in whole periods; below 0 lost.
-
-    Returns:
-        (n,) ages in periods; the number of the period itself, plus 1, before any has arrived.
-
-    >>> ages_of(np.array([2, 0, 3, 1, 0])).tolist()  # the first and the third are overtaken
-    [1, 0, 1, 2, 0]
-    """
-    delays = np.asarray(delays)
-    count = len(delays)
-    newest = np.full(count, -1)
-    sent = np.arange(count)
-    arrival = sent + delays
-    there = (delays >= 0) & (arrival < count)
-    np.maximum.at(newest, arrival[there], sent[there])
-    return sent - np.maximum.accumulate(newest)
-
-
-def jittering_line(period: float, delays_forward: np.ndarray, delays_back: np.ndarray) -> Line:
+def jittering_line(
+    period: float, delays_forward: np.ndarray, delays_back: np.ndarray
+) -> PacketAges:
     """A line with the delays of packets sent one after the other, once a period.
 
     Args:
@@ -128,13 +107,9 @@ def jittering_line(period: float, delays_forward: np.ndarray, delays_back: np.nd
     Returns:
         The line; delays are rounded to periods.
     """
-    return Line(period, *(_shares(in_periods(d, period)) for d in (delays_forward, delays_back)))
-
-
-def in_periods(delays: np.ndarray, period: float) -> np.ndarray:
-    """Delays [s] as whole periods, -1 for lost packets (NaN)."""
-    rounded = np.where(np.isnan(delays), -1.0, np.round(np.nan_to_num(delays) / period))
-    return rounded.astype(int)
+    return PacketAges(
+        period, *(_shares(in_periods(d, period)) for d in (delays_forward, delays_back))
+    )
 
 
 def _shares(delays: np.ndarray) -> np.ndarray:
@@ -144,48 +119,6 @@ def _shares(delays: np.ndarray) -> np.ndarray:
         raise InputError(_WHERE, "no packet arrives within the delays that are given")
     ages = ages[started[0] :]
     return np.bincount(ages) / len(ages)
-
-
-def load_delays(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Measured delays of a network.
-
-    Args:
-        path: CSV file with the columns `forward` and `back` [s], one row for every packet in the
-            order in which they were sent; an empty cell is a packet that was lost.
-
-    Returns:
-        ((n,), (n,)) delays forward and back [s], NaN where lost.
-
-    Raises:
-        InputError: the file cannot be read, a column is missing, a cell is no delay.
-    """
-    try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"cannot be read: {error}") from None
-    if not rows:
-        raise InputError(path, "has no rows; give one for every packet")
-    found = []
-    for name in ("forward", "back"):
-        if name not in rows[0]:
-            have = ", ".join(map(str, rows[0]))
-            raise InputError(path, f"has no column {name!r}; it has {have}; delays are in seconds")
-        found.append(np.array([_delay(path, k + 2, name, row[name]) for k, row in enumerate(rows)]))
-    return found[0], found[1]
-
-
-def _delay(path: str | Path, line: int, name: str, cell: str | None) -> float:
-    if cell is None or not cell.strip():
-        return math.nan
-    try:
-        value = float(cell)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value <= 10.0:
-        message = f"line {line}, {name}: {cell!r} is no delay from 0 to 10 s; leave lost ones empty"
-        raise InputError(path, message)
-    return value
 
 
 @dataclass(frozen=True)
@@ -235,7 +168,7 @@ def wave_impedance(case: Case) -> float:
 
 
 def sampled_characteristic(
-    case: Case, structure: str, line: Line, q: np.ndarray, reflected: float = 1.0
+    case: Case, structure: str, line: PacketAges, q: np.ndarray, reflected: float = 1.0
 ) -> np.ndarray:
     """What is 0 at the poles `z = 1/q` of the whole loop, without poles of its own.
 
@@ -262,6 +195,7 @@ def sampled_characteristic(
     near = _side(case.master, case.hand, line.period, q)
     far = _side(case.slave, case.task, line.period, q)
     if structure in (WAVE, PASSIVITY):
+        home = reflected * _after_slave(line, q)
         return _serial(case, structure == WAVE, near, far, ahead, home)
     own, forward = _master_laws(case, structure, near)
     own_slave = far.digital(case.slave_control)
@@ -276,6 +210,11 @@ def _late(share: np.ndarray, q: np.ndarray) -> np.ndarray:
     for part in share[::-1]:
         total = total * q + part
     return total
+
+
+def _after_slave(line: PacketAges, q: np.ndarray) -> np.ndarray:
+    """E(q) back where the slave answers packets of the same period, after the master has acted."""
+    return _late(line.back, q) - line.back[0] * (1.0 - q)
 
 
 def _master_laws(case: Case, structure: str, near: _Side) -> tuple[np.ndarray, np.ndarray]:
@@ -331,7 +270,7 @@ def _serial(
     return master * first - second
 
 
-def growth_rate(case: Case, structure: str, line: Line, reflected: float = 1.0) -> float:
+def growth_rate(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
     """Rate of the motion that grows fastest, below 0 where all decay; drift does not count.
 
     Args:
@@ -349,7 +288,7 @@ def growth_rate(case: Case, structure: str, line: Line, reflected: float = 1.0) 
     return _fastest(lambda q: sampled_characteristic(case, structure, line, q, reflected), line)
 
 
-def _fastest(function, line: Line) -> float:
+def _fastest(function, line: PacketAges) -> float:
     still = _inside(function, 0.5 * _NEUTRAL * line.period, centre=1.0)
 
     def grows(rate: float) -> bool:
@@ -387,7 +326,7 @@ def _angles() -> np.ndarray:
     return np.exp(-1j * np.geomspace(1e-6, math.pi, 4000))
 
 
-def passive_end(case: Case, line: Line) -> bool:
+def passive_end(case: Case, line: PacketAges) -> bool:
     """Whether what the line meets at the slave is passive as it is sampled.
 
     The slave's controller on its mass and task, `C / (1 + C v_s)` from the velocity that is asked
@@ -411,7 +350,7 @@ def passive_end(case: Case, line: Line) -> bool:
     return bool(np.all(port.real > -1e-6 * np.abs(port))) and not grows
 
 
-def _answers(case: Case, structure: str, line: Line, q: np.ndarray, reflected: float):
+def _answers(case: Case, structure: str, line: PacketAges, q: np.ndarray, reflected: float):
     """What master and slave send per what they receive, at points q."""
     near = _side(case.master, case.hand, line.period, q)
     far = _side(case.slave, case.task, line.period, q)
@@ -427,7 +366,7 @@ def _answers(case: Case, structure: str, line: Line, q: np.ndarray, reflected: f
     return forward / (free + own), back / (far.below + far.digital(case.slave_control))
 
 
-def jitter_gain(case: Case, structure: str, line: Line, reflected: float = 1.0) -> float:
+def jitter_gain(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
     """How much of the noise that jitter makes comes back as noise; in the mean square.
 
     A signal of frequency w through a line of random age leaves `E(q)` of it, and noise with the
@@ -450,7 +389,8 @@ def jitter_gain(case: Case, structure: str, line: Line, reflected: float = 1.0) 
     angle = np.geomspace(1e-4, math.pi, 6000)
     q = np.exp(-1j * angle)
     master, slave = _answers(case, structure, line, q, reflected)
-    ahead, home = _late(line.forward, q), _late(line.back, q)
+    ahead = _late(line.forward, q)
+    home = _after_slave(line, q) if structure == WAVE else _late(line.back, q)
     left = 1.0 - master * slave * ahead * home
     powers = np.array([
         [master * home * slave / left, master / left],
@@ -461,7 +401,7 @@ def jitter_gain(case: Case, structure: str, line: Line, reflected: float = 1.0) 
     return float(np.abs(np.linalg.eigvals(table)).max())
 
 
-def slave_characteristic(case: Case, line: Line, q: np.ndarray) -> np.ndarray:
+def slave_characteristic(case: Case, line: PacketAges, q: np.ndarray) -> np.ndarray:
     """What is 0 at the poles of the slave on its controller and task, with a held reference.
 
     Args:
@@ -491,7 +431,7 @@ class Prediction:
     reason: str
 
 
-def predict(case: Case, structure: str, line: Line, reflected: float = 1.0) -> Prediction:
+def predict(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> Prediction:
     """Predict whether a sampled structure is stable.
 
     Args:

@@ -13,13 +13,17 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.teleop.analysis import Case
-from hydrotele.teleop.sampled import (
-    PASSIVITY,
-    WAVE,
-    ages_of,
-    in_periods,
-    wave_impedance,
+from hydrotele.teleop.passive_line import (
+    END,
+    ENERGY,
+    GONE_IN,
+    controlled_master,
+    controlled_slave,
+    wave_master,
+    wave_slave,
 )
+from hydrotele.teleop.network import ages_of, in_periods
+from hydrotele.teleop.sampled import PASSIVITY, WAVE, wave_impedance
 from hydrotele.teleop.two_port import RATE_STRUCTURES, Impedance
 
 # what a side measures: sum, place, difference, acceleration, sum and difference of the force on
@@ -170,7 +174,7 @@ def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
     state = np.zeros((2, 2))  # place, speed
     state[0, 1], state[1, 1] = first[0], first[1]
     seen, force = np.zeros((2, _SIGNALS)), np.zeros(2)
-    ends = np.zeros((2, 8))
+    ends, come = np.zeros((2, END)), np.zeros((2, _SIGNALS))
     for n in range(count):
         for side in range(2):
             _measure(bodies[side], state[side], force[side], period, seen[side])
@@ -178,18 +182,18 @@ def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
         if way == _LINEAR:
             sent[0, n], sent[1, n] = seen[0], seen[1]
             for side in range(2):
+                if newest[side] >= 0:  # else none has come yet
+                    come[side] = sent[side, newest[side]]
+            for side in range(2):
                 force[side] = 0.0
-                come = newest[1 - side]
                 for j in range(_SIGNALS):
                     force[side] -= table[2 * side, j] * seen[side, j]
-                    if come >= 0:
-                        force[side] += table[3 - 2 * side, j] * sent[1 - side, come, j]
+                    force[side] += table[3 - 2 * side, j] * come[1 - side, j]
         elif way == _WAVES:
             _waves(n, newest[0], newest[1], numbers, seen, sent, ends, force)
         else:
-            mass = bodies[0, 0]
-            _controlled(n, newest[0], newest[1], numbers, mass, seen, sent, ends, force)
-        energy[n] = ends[0, 0] + ends[1, 0]
+            _controlled(n, newest[0], newest[1], numbers, bodies[0, 0], seen, sent, ends, force)
+        energy[n] = ends[0, ENERGY] + ends[1, ENERGY]
         for side in range(2):
             _integrate(bodies[side], state[side], force[side], period, steps)
         block = n * _BLOCKS // count
@@ -220,37 +224,29 @@ def _measure(body, state, force, period, seen):
     seen[FORCE] = held
 
 
-# of `ends`, master's and slave's row
-ENERGY, GONE_IN, GONE_OUT, USED, SPENT, BEFORE, STRETCH, GOAL = range(8)
-BUDGET_IN = BEFORE  # of the slave's row
-_CATCH_UP = 2.0  # 1/s at which a reference that was held back makes up for it
-# of packets of waves: the sum of all waves sent, and their energy; of passivity control: place or
-# force, and energy that has gone in
+# of packets: sum of all waves, place of the master or force of the slave; their energy
 TOTAL, BUDGET = range(2)
 
 
 @compiled
-def _waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force):
-    """Wave variables whose arriving energy is never used twice.
+def _newest(sent, row, n):
+    """Sum or signal, and energy, of a packet; zeros before any has come."""
+    if row < 0:
+        return 0.0, 0.0
+    return sent[min(row, n), TOTAL], sent[min(row, n), BUDGET]
 
-    Packets carry the sum of all waves and of their energy, so that a lost one leaves no offset and
-    one that comes twice counts once. STRETCH is the spring of the slave's controller [m].
-    """
+
+@compiled
+def _waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force):
+    """Both ends of waves; the master acts first, so that it knows of the slave's last period."""
     period, stiffness, damping, b = numbers[0], numbers[1], numbers[2], numbers[3]
-    root, less = math.sqrt(2.0 * b), math.sqrt(2.0 / b)
-    master, slave = ends[0], ends[1]
-    w = _arrived(master, sent[1], newest_back, period)
-    pushed = b * seen[0, V] - root * w
-    _send(sent[0], n, root * seen[0, V] - w, period)
-    force[0] = -pushed
-    u = _arrived(slave, sent[0], newest_forward, period)
-    stiff = damping + stiffness * period
-    pull = (stiffness * slave[STRETCH] + stiff * (less * u - seen[1, V])) / (1.0 + stiff / b)
-    slave[STRETCH] += period * (less * u - pull / b - seen[1, V])
-    _send(sent[1], n, u - less * pull, period)
-    force[1] = pull
-    master[ENERGY] += period * pushed * seen[0, V]
-    slave[ENERGY] -= period * pull * (less * u - pull / b)
+    total, budget = _newest(sent[1], newest_back, n - 1)
+    pushed, wave = wave_master(seen[0, V], total, budget, b, period, ends[0])
+    _send(sent[0], n, wave, period)
+    total, budget = _newest(sent[0], newest_forward, n)
+    pull, wave = wave_slave(seen[1, V], total, budget, stiffness, damping, b, period, ends[1])
+    _send(sent[1], n, wave, period)
+    force[0], force[1] = -pushed, pull
 
 
 @compiled
@@ -263,81 +259,15 @@ def _send(sent, n, wave, period):
 
 
 @compiled
-def _arrived(end, sent, newest, period):
-    """Wave to use: what has come and was not used yet, as far as its energy reaches."""
-    if newest < 0:
-        return 0.0
-    wave = (sent[newest, TOTAL] - end[USED]) / period
-    left = max(0.0, sent[newest, BUDGET] - end[SPENT]) / period
-    if wave * wave > left:
-        wave = math.copysign(math.sqrt(left), wave)
-    end[USED] += period * wave
-    end[SPENT] += period * wave * wave
-    return wave
-
-
-@compiled
 def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends, force):
-    """Two-port time-domain passivity control: place forward, force back, energies with them.
-
-    The slave's reference is held back so that no more goes out than came in, and so is the force on
-    the master, as far as one knows now how far its mass will move; what came out too much is taken
-    away in the next periods, at most all of its kinetic energy.
-    """
+    """Both ends of passivity control; the master acts first, as for waves."""
     period, stiffness, damping = numbers[0], numbers[1], numbers[2]
-    master, slave = ends[0], ends[1]
-    # BEFORE: force that the line has put against the master's motion since the last sample
-    gone = master[BEFORE] * seen[0, V] * period
-    master[ENERGY] += gone
-    master[GONE_IN] += max(gone, 0.0)
-    master[GONE_OUT] += max(-gone, 0.0)
-    sent[0, n, TOTAL], sent[0, n, BUDGET] = seen[0, X], master[GONE_IN]
-    back, budget = 0.0, 0.0
-    if newest_back >= 0:
-        back, budget = sent[1, newest_back, TOTAL], sent[1, newest_back, BUDGET]
-    v = seen[0, V] - 0.5 * period / mass * master[BEFORE]  # now, of what the line moves alone
-    back = _bounded(back, v, mass / period, 2.0 * (budget - master[GONE_OUT]) / mass)
-    master[BEFORE] = back
-    force[0] = -back
-    wanted = _CATCH_UP * (slave[GOAL] - slave[USED])
-    if newest_forward >= 0:
-        wanted += (sent[0, newest_forward, TOTAL] - slave[GOAL]) / period
-        slave[GOAL], slave[BUDGET_IN] = (
-            sent[0, newest_forward, TOTAL], sent[0, newest_forward, BUDGET]
-        )  # fmt: skip
-    stiff = damping + stiffness * period
-    pull, wanted = _allowed(
-        wanted, stiffness * slave[STRETCH] - stiff * seen[1, V], stiff,
-        max(0.0, slave[BUDGET_IN] - slave[GONE_OUT]) / period,
-    )  # fmt: skip
-    slave[USED] += period * wanted
-    slave[STRETCH] += period * (wanted - seen[1, V])
-    gone = -pull * wanted * period
-    slave[ENERGY] += gone
-    slave[GONE_IN] += max(gone, 0.0)
-    slave[GONE_OUT] += max(-gone, 0.0)
-    sent[1, n, TOTAL], sent[1, n, BUDGET] = pull, slave[GONE_IN]
-    force[1] = pull
-
-
-@compiled
-def _bounded(force, v, firm, room):
-    """Force against a mass of speed v that gives it no more than the energy that has come.
-
-    With `x = v T - F T^2 / (2 M)` of the next period, `-F x <= E` is a quadratic inequality; firm is
-    M / T, room 2 E / M.
-    """
-    root = math.sqrt(max(0.0, v * v + room))
-    return min(firm * (v + root), max(firm * (v - root), force))
-
-
-@compiled
-def _allowed(wanted, offset, stiff, power):
-    """Force and rate nearest to the wanted one with `(offset + stiff rate) rate <= power`."""
-    root = math.sqrt(offset * offset + 4.0 * stiff * power)
-    least, most = (-offset - root) / (2.0 * stiff), (-offset + root) / (2.0 * stiff)
-    rate = min(most, max(least, wanted))
-    return offset + stiff * rate, rate
+    total, budget = _newest(sent[1], newest_back, n - 1)
+    force[0] = -controlled_master(seen[0, V], total, budget, mass, period, ends[0])
+    sent[0, n, TOTAL], sent[0, n, BUDGET] = seen[0, X], ends[0, GONE_IN]
+    total, budget = _newest(sent[0], newest_forward, n)
+    force[1] = controlled_slave(seen[1, V], total, budget, stiffness, damping, period, ends[1])
+    sent[1, n, TOTAL], sent[1, n, BUDGET] = force[1], ends[1, GONE_IN]
 
 
 @compiled
