@@ -10,7 +10,8 @@ more energy is used than was sent.
 
 Passivity control carries place forward and force back, each with the energy that has gone into the
 line at its end so far. The slave's reference and the master's force are held back so that no more
-comes out at either end than had gone in at the other.
+comes out at either end than had gone in at the other, and a trickle of power, without which a
+slave that needs energy to move, and a master that gives it only to a slave that moves, both wait.
 
 Source: Niemeyer and Slotine 1991, 2004 (wave variables, wave integrals); Hannaford and Ryu 2002;
 Ryu, Artigas and Preusche 2010 (two ports with delay).
@@ -111,9 +112,9 @@ def wave_slave(v, total, budget, stiffness, damping, b, period, end):
 def controlled_master(v, force, budget, mass, period, end):
     """Master's end of passivity control.
 
-    How far the mass will move in the next period follows from its speed and the line's own force;
-    what came out too much nevertheless, because a hand pushes too, is taken away in the next ones,
-    at most all of the kinetic energy.
+    How far the mass will move in the next period follows from its speed and the line's own force.
+    What came out too much nevertheless, because a hand pushes too, is taken away by a damper in the
+    next ones, which at most stops the mass in two.
 
     Args:
         v: mean speed of the handle over the last period, scalar [m/s].
@@ -132,15 +133,30 @@ def controlled_master(v, force, budget, mass, period, end):
     end[ENERGY] += gone
     end[GONE_IN] += max(gone, 0.0)
     end[GONE_OUT] += max(-gone, 0.0)
-    firm, now = mass / period, v - 0.5 * period / mass * end[PUSHED]
+    firm, left = mass / period, budget - end[GONE_OUT]
+    if left < 0.0:
+        end[PUSHED] = _damped(v, force, -left / period, 0.5 * firm)
+        return end[PUSHED]
+    now = v - 0.5 / firm * end[PUSHED]
     # -F x <= E with x = v T - F T^2 / (2 M) is quadratic in F
-    root = math.sqrt(max(0.0, now * now + 2.0 * (budget - end[GONE_OUT]) / mass))
+    root = math.sqrt(now * now + 2.0 * left / mass)
     end[PUSHED] = min(firm * (now + root), max(firm * (now - root), force))
     return end[PUSHED]
 
 
 @compiled
-def controlled_slave(v, place, budget, stiffness, damping, period, end):
+def _damped(v, force, power, most):
+    """Force that takes a power out of a speed, or the one that came if that takes more."""
+    speed = abs(v)
+    if speed == 0.0:
+        return 0.0
+    against = force if v > 0.0 else -force
+    size = min(most * speed, max(power / speed, against))
+    return size if v > 0.0 else -size
+
+
+@compiled
+def controlled_slave(v, place, budget, stiffness, damping, trickle, period, end):
     """Slave's end of passivity control.
 
     Args:
@@ -149,6 +165,7 @@ def controlled_slave(v, place, budget, stiffness, damping, period, end):
         budget: energy that had gone in at the master then, scalar [J].
         stiffness: of the slave's controller, scalar [N/m].
         damping: of the same, scalar [N s/m].
+        trickle: power that it may always take, scalar [W].
         period: scalar [s].
         end: (8,) state, written; GONE_IN is what the next packet tells.
 
@@ -161,7 +178,7 @@ def controlled_slave(v, place, budget, stiffness, damping, period, end):
     end[GOAL], end[BUDGET_IN] = place, budget
     stiff = damping + stiffness * period
     offset = stiffness * end[STRETCH] - stiff * v
-    power = max(0.0, budget - end[GONE_OUT]) / period
+    power = trickle + max(0.0, budget - end[GONE_OUT]) / period
     # (offset + stiff rate) rate <= power
     root = math.sqrt(offset * offset + 4.0 * stiff * power)
     asked = min((-offset + root) / (2.0 * stiff), max((-offset - root) / (2.0 * stiff), asked))
@@ -171,5 +188,5 @@ def controlled_slave(v, place, budget, stiffness, damping, period, end):
     gone = -pull * asked * period
     end[ENERGY] += gone
     end[GONE_IN] += max(gone, 0.0)
-    end[GONE_OUT] += max(-gone, 0.0)
+    end[GONE_OUT] += max(-gone - trickle * period, 0.0)
     return pull

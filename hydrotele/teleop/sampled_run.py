@@ -31,6 +31,7 @@ from hydrotele.teleop.two_port import RATE_STRUCTURES, Impedance
 SUM, X, V, A, IMPULSE, CHANGE, FORCE = range(7)
 _SIGNALS = 7
 _PER_RATE = 0.1  # integration steps over the time constant of the fastest rate
+_TRICKLE = 1e-5  # W of passivity control: in a run less than a tenth of the kick's energy
 _KICK = np.array([0.1, 0.03])  # m/s, of master and slave
 _BLOCKS = 40
 _GROWN, _GONE = 1e8, 1e-8  # times the kick
@@ -266,7 +267,9 @@ def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends,
     force[0] = -controlled_master(seen[0, V], total, budget, mass, period, ends[0])
     sent[0, n, TOTAL], sent[0, n, BUDGET] = seen[0, X], ends[0, GONE_IN]
     total, budget = _newest(sent[0], newest_forward, n)
-    force[1] = controlled_slave(seen[1, V], total, budget, stiffness, damping, period, ends[1])
+    force[1] = controlled_slave(
+        seen[1, V], total, budget, stiffness, damping, _TRICKLE, period, ends[1]
+    )
     sent[1, n, TOTAL], sent[1, n, BUDGET] = force[1], ends[1, GONE_IN]
 
 

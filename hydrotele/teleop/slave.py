@@ -168,6 +168,7 @@ def unpack_slave_state(flat, k):
 
 
 SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
+_TRICKLE = 1e-3  # W, what a hand does not notice: of passivity control
 _BRAKE = 0.8  # of the acceleration: the rest makes up for the filter's lag
 AHEAD = 0.02  # s over which the change of a rate is averaged before it is looked ahead
 _BLEND = 30.0  # rad/s, of measured task rates from held angles
@@ -385,7 +386,8 @@ def _pulled_rate(numbers, row, c, total, budget, force, period, s):
         end[SENT] += period * wave
         end[SENT + 1] += period * wave * wave
     else:
-        pull = controlled_slave(speed, total, row[WAY] * budget, spring, damper, period, end)
+        budget = row[WAY] * budget
+        pull = controlled_slave(speed, total, budget, spring, damper, _TRICKLE, period, end)
         end[SENT], end[SENT + 1] = pull, end[GONE_IN]
     push = pull
     if np.isfinite(force):
