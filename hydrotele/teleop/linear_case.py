@@ -341,9 +341,15 @@ class LinearCase:
             return -reflected * self._coupling(rate, s)
 
         def own(s: np.ndarray) -> np.ndarray:
-            line = np.exp(-s * (self.delay_forward + self.delay_back)) * self._asked(rate, s)
-            linked = 0.0 if feels_force else reflected * self._coupling(rate, s) * line
-            return self._centred(rate, s) + linked
+            if feels_force:
+                return self._centred(rate, s)
+            if self.pilot.coordinating == "handle":
+                held = np.exp(0.5 * self.clocks.samples * s)  # the handle is not held by them
+                asked = held * (self.row[GAIN] / s if rate else self.row[GAIN])
+            else:
+                late = self.delay_forward + self.delay_back
+                asked = np.exp(-s * late) * self._asked(rate, s)
+            return self._centred(rate, s) + reflected * self._coupling(rate, s) * asked
 
         return TwoPort(
             self.master, slave, own, control, forward, back if feels_force else nothing, nothing,

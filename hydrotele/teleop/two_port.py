@@ -248,10 +248,11 @@ def characteristic(
 
 
 def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
-    """Margin of the theorem of stiffness feedback, `B^2 - 4 M K_max`; stable if positive.
+    """Margin of the theorem of stiffness feedback, `B^2 - 4 M K_max`.
 
-    `M x'' + B x' + K(t) x = 0` with a stiffness that stays between bounds is then uniformly
-    asymptotically stable, however fast it changes, and whatever delay or task changes it.
+    `M x'' + B x' + K(t) x = 0` with a stiffness that stays between `K_min > 0` and K_max is
+    uniformly asymptotically stable if the margin and B are positive, however fast the stiffness
+    changes, and whatever delay or task changes it. With `K_min = 0` the theorem says nothing.
 
     Args:
         mass: of joystick and hand, M [kg] or [kg m^2].
@@ -261,7 +262,7 @@ def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
     Returns:
         The margin.
 
-    Source: Zhu 1994, 4.2.
+    Source: Zhu 1994, theorem 4-2, 4.11-4.14.
 
     >>> stiffness_margin(1.0, 30.0, 200.0)
     100.0
