@@ -121,8 +121,9 @@ def trial(seed: int, number: int) -> list[Row]:
         motion = kick(one, name, period, there[count:], back[count:], back_factor)
         sides = [predict(*scaled_for(case, name, line, m * k, linear)).stable
                  for m in (1.0 - NEAR, 1.0 + NEAR)]  # fmt: skip
-        rows.append(Row(bool(case.hand.mass), bool(case.task.stiffness), told.stable, not motion.grows,
-                        sides[0] != sides[1], told.reason, motion.dies_out))  # fmt: skip
+        held, touching = bool(case.hand.mass), bool(case.task.stiffness)
+        rows.append(Row(held, touching, told.stable, not motion.grows, sides[0] != sides[1],
+                        told.reason, motion.dies_out))  # fmt: skip
     return rows
 
 
@@ -172,23 +173,25 @@ def main() -> None:
     guarded = [rows[-1] for rows in found if rows[-1].seen]
     shipped = "the shipped case (`hydrotele/teleop/cat215_axis.yaml`)"
     text = "\n".join([
-        "Every structure of every case is told stable or not by the analysis, and simulated: a kick",
-        f"of {SECONDS:g} s or more, packet by packet, with the nonlinear laws of waves and passivity",
-        "control. What is told knows the ages of other packets of the same network.",
+        "Every structure of every case is told stable or not by the analysis, and simulated: a",
+        f"kick of {SECONDS:g} s or more, packet by packet, with the nonlinear laws of waves and",
+        "passivity control. What is told knows the ages of other packets of the same network.",
         "", f"Drawn: all numbers of {shipped} times 10^u,",
         f"u uniform within {SPREAD} either way; no hand in half of the cases, no task in 30 %;",
-        f"periods from {1e3 * PERIODS[0]:g} to {1e3 * PERIODS[1]:g} ms; each way a delay with a mean of"
-        f" {1e3 * DELAYS[0]:g} to {1e3 * DELAYS[1]:g} ms,",
-        f"gamma-distributed with a deviation of up to {100 * JITTER:g} % of it, packets overtake each",
-        f"other, up to {100 * LOST:g} % are lost. In every second case the factor on what comes back",
-        "is as drawn (0.03 to 10), in the others it is aimed at the predicted limit: within",
-        f"{ASIDE:g} e-folds of it, where there is one. Waves and passivity control have no such",
-        "factor; their slave's controller and wave impedance are aimed instead. Near: what is told",
-        f"changes within {100 * NEAR:g} % of that factor. No case is left out.",
+        f"periods from {1e3 * PERIODS[0]:g} to {1e3 * PERIODS[1]:g} ms; each way a delay with a",
+        f"mean of {1e3 * DELAYS[0]:g} to {1e3 * DELAYS[1]:g} ms, gamma-distributed, with a",
+        f"deviation of up to {100 * JITTER:g} % of it, packets overtake each other, up to {100 * LOST:g} %",
+        "are lost. In every second case the factor on what comes back is as drawn (0.03 to 10), in",
+        "the others",
+        f"it is aimed at the predicted limit: within {ASIDE:g} e-folds of it, where there is one.",
+        "Waves and passivity control have no such factor; their slave's controller and wave",
+        "impedance are aimed instead. Near: what is told changes within"
+        f" {100 * NEAR:g} % of that factor.", "No case is left out.",
         "", "## All cases", "", *table(found),
         "", "## As drawn", "", *table(plain),
         "", "## Aimed at the limit", "", *table(aimed),
-        "", "## Wrong ones", "", "| structure | told | because of | cases |", "| --- | --- | --- | ---: |",
+        "", "## Wrong ones", "",
+        "| structure | told | because of | cases |", "| --- | --- | --- | ---: |",
         *(f"| `{n}` | {what} | {why} | {k} |" for (n, why, what), k in sorted(wrong.items())),
         "", "Passivity control bounds a motion and need not end it: it counts as stable where late",
         "motion has no more kinetic energy than the kick gave. Of its"

@@ -206,6 +206,20 @@ class MapRange(Facts):
         return self
 
 
+class SideRange(Facts):
+    """Impedances that are drawn, every number log-uniform between least and most."""
+
+    least: Side
+    most: Side
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        for name in ("mass", "damping", "stiffness"):
+            if not getattr(self.least, name) <= getattr(self.most, name):
+                raise ValueError(f"{name}: least must not be above most")
+        return self
+
+
 class TeleopCase(Facts):
     """Everything that an analysis needs; one axis, all in one scale of lengths and forces."""
 
@@ -220,6 +234,9 @@ class TeleopCase(Facts):
     delays: Delays = Field(default_factory=Delays)
     structures: Annotated[tuple[str, ...], Field(min_length=1)] = STRUCTURES
     stiffness: VaryingSpring | None = None
+    wave: NonNegative = 0.0
+    hands: SideRange | None = None
+    tasks: SideRange | None = None
     map: MapRange = Field(default_factory=MapRange)
 
     @field_validator("structures")
@@ -233,19 +250,21 @@ class TeleopCase(Facts):
         return Case(
             self.master.impedance(), self.slave.impedance(), self.master_control.impedance(),
             self.slave_control.impedance(), self.hand.impedance(), self.task.impedance(), gains,
-            self.delays.forward, self.delays.back,
+            self.delays.forward, self.delays.back, self.wave,
         )  # fmt: skip
 
 
-def known_structures(names: tuple[str, ...]) -> tuple[str, ...]:
+def known_structures(
+    names: tuple[str, ...], known: tuple[str, ...] = STRUCTURES
+) -> tuple[str, ...]:
     """The same names, once each.
 
     Raises:
         ValueError: one is not known.
     """
     for name in names:
-        if name not in STRUCTURES:
-            raise ValueError(f"no structure {name!r}; {suggest(name, STRUCTURES)}")
+        if name not in known:
+            raise ValueError(f"no structure {name!r}; {suggest(name, known)}")
     return tuple(dict.fromkeys(names))
 
 

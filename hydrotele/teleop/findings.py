@@ -145,12 +145,12 @@ def format_delay(delay: float) -> str:
 
 
 def format_number(value: float) -> str:
-    """A number with four digits, without an exponent.
+    """A number with five digits, without an exponent.
 
     >>> format_number(-20026.0), format_number(0.0123456)
-    ('-20030', '0.01235')
+    ('-20026', '0.012346')
     """
-    return np.format_float_positional(value, precision=4, fractional=False, trim="-")
+    return np.format_float_positional(value, precision=5, fractional=False, trim="-")
 
 
 def format_error(error: float | None) -> str:
@@ -188,8 +188,9 @@ def findings_document(found: Findings) -> dict:
         document["stiffness_feedback"] = {name: _spring(one) for name, one in pair.items()}
     if found.robust:
         document["robust"] = {
-            "period": found.period, "structures": {one.structure: _robust(one) for one in found.robust}
-        }  # fmt: skip
+            "period": found.period,
+            "structures": {one.structure: _robust(one) for one in found.robust},
+        }
     if found.agreements:
         document["confirmed"] = {
             "sweeps": [_sweep(one) for one in found.sweeps],

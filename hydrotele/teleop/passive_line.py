@@ -5,8 +5,8 @@ comes and the slave: their force moves the slave, and comes back to the master.
 
 Wave variables carry `u = (b v + F) / sqrt(2 b)` forward and `w = (b v - F) / sqrt(2 b)` back; a
 constant delay between them is lossless. Packets carry the sums of all waves and of their energy:
-a packet that was lost leaves no offset, one that comes twice counts once, and where delays jitter no
-more energy is used than was sent.
+a packet that was lost leaves no offset, one that comes twice counts once, and where delays jitter
+no more energy is used than was sent.
 
 Passivity control carries place forward and force back, each with the energy that has gone into the
 line at its end so far. The slave's reference and the master's force are held back so that no more

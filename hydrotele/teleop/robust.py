@@ -1,4 +1,4 @@
-"""What a teleoperator withstands: any passive hand, drawn operators, stiff tasks, a released handle.
+"""What a teleoperator withstands: passive hands, drawn operators, stiff tasks, a released handle.
 
 Passivity asks that a two-port gives no energy; absolute stability asks less, that no passive hand
 and no passive task make it unstable (Llewellyn). Between both and the one operator of a case lie
@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import Case, first_change, holds
+from hydrotele.teleop.analysis import Case, TeleopCase, first_change, holds
 from hydrotele.teleop.sampled import (
     SAMPLED_STRUCTURES,
     PacketAges,
     Prediction,
     growth_rate,
     predict,
-    steady_line,
 )
 from hydrotele.teleop.two_port import (
     RATE_STRUCTURES,
@@ -218,6 +217,36 @@ class Spread:
         return hand, task
 
 
+# a hand that holds loosely and one that holds firmly, near and far; orders of magnitude after
+# Mussa-Ivaldi, Hogan and Bizzi 1985 and Tsuji et al. 1995, the numbers are assumptions
+HANDS = (Impedance(0.4, 4.0, 80.0), Impedance(0.8, 17.0, 780.0))
+_TASKS = 3.0  # times softer and stiffer than the case's task
+
+
+def spread_of(facts: TeleopCase) -> Spread:
+    """Hands and tasks of a case file, or the usual hands and three times softer or stiffer tasks.
+
+    Args:
+        facts: the case.
+
+    Returns:
+        The spread.
+    """
+    task = facts.task.impedance()
+    hands, tasks = (
+        HANDS,
+        tuple(
+            Impedance(task.mass, k * task.damping, k * task.stiffness)
+            for k in (1.0 / _TASKS, _TASKS)
+        ),
+    )
+    if facts.hands:
+        hands = facts.hands.least.impedance(), facts.hands.most.impedance()
+    if facts.tasks:
+        tasks = facts.tasks.least.impedance(), facts.tasks.most.impedance()
+    return Spread(hands, (tasks[0], tasks[1]))
+
+
 def _between(least: Impedance, most: Impedance, rng: np.random.Generator) -> Impedance:
     found = []
     for name in ("mass", "damping", "stiffness"):
@@ -340,8 +369,3 @@ def robustness(
         (four[0], four[1], four[2], four[3]),
         worst_case(case, structure, line, spread, pairs),
     )
-
-
-def steady_case_line(case: Case, period: float) -> PacketAges:
-    """The case's own delays, sampled [s]."""
-    return steady_line(period, case.delay_forward, case.delay_back)

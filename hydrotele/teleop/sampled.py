@@ -5,18 +5,19 @@ backward differences, integrals are sums. Between samples master with hand, and 
 masses, dampers and springs, so that one period is an exact map. A packet that is n periods old when
 it is used is the factor `q^n`, `q = 1/z`. With jitter the age changes from period to period; in the
 mean the line is then `E(q) = sum of P(age = n) q^n`. All signals are polynomials of q, and so is
-what is 0 at the poles of the whole loop: its zeros inside `|q| < exp(-sigma T)` are the motions that
-grow faster than sigma, counted by the turns of its phase along that circle.
+what is 0 at the poles of the whole loop: its zeros inside `|q| < exp(-sigma T)` are the motions
+that grow faster than sigma, counted by the turns of its phase along that circle. What jitter does
+beyond the mean is `jitter_gain`.
 
 Two structures beyond those of `two_port`, both with the slave's own controller, whose force comes
 back:
 
-- `wave_variables`: `u = (b v + F) / sqrt(2 b)` goes forward, `w = (b v - F) / sqrt(2 b)` comes back,
-  which makes a late line lossless (Niemeyer and Slotine 1991).
-- `passivity_control`: velocity forward, force back, and at either end a controller that lets no more
-  energy out than came in at the other end (Hannaford and Ryu 2002; with delay Ryu, Artigas and
-  Preusche 2010). Nonlinear: it is predicted stable where the line needs no control, or where both
-  ends are passive, see `passive_end`.
+- `wave_variables`: `u = (b v + F) / sqrt(2 b)` goes forward, `w = (b v - F) / sqrt(2 b)` comes
+  back, which makes a late line lossless (Niemeyer and Slotine 1991).
+- `passivity_control`: velocity forward, force back, and at either end a controller that lets no
+  more energy out than came in at the other end (Hannaford and Ryu 2002; with delay Ryu, Artigas and
+  Preusche 2010). Nonlinear: it is predicted stable where the line needs no control, or where the
+  slave's end by itself is stable.
 """
 
 import math
@@ -38,8 +39,8 @@ _FIRST = 400
 _MOST = 400_000
 _NEUTRAL = 1e-3  # 1/s: slower than this is drift, as of a free handle, not growth
 _FASTEST = 2e3  # 1/s of growth and decay that are told apart
-# jitter gain at which single runs grow: their power grows as the mean of its logarithm, which for a
-# noise of many parts (exponentially distributed power) is the logarithm of the mean less Euler's gamma
+# jitter gain at which single runs grow: their power grows as the mean of its logarithm, which for
+# noise of many parts (exponentially distributed power) is the mean's logarithm less Euler's gamma
 _PATHS = math.exp(np.euler_gamma)
 _REFINED = 1e-3  # 1/s, and of the rate
 
@@ -163,7 +164,7 @@ def _side(own: Impedance, held: Impedance, period: float, q: np.ndarray) -> _Sid
 
 
 def wave_impedance(case: Case) -> float:
-    """b of the wave variables [N s/m]; the damping of the slave's controller if none is given."""
+    """Impedance b of waves [N s/m]; the damping of the slave's controller if none is given."""
     return case.wave or case.slave_control.damping or 1.0
 
 
@@ -264,7 +265,8 @@ def _serial(
     share = b * step + held  # F_s = b held / share (sqrt(2 / b) U - v_s)
     slave = share * far.below + b * held * far.rate
     master = near.below + b * near.rate
-    # [master, -a home, 2 home D] [-a ahead n, 1 + ahead home, -c ahead home D] [0, -b c held, slave]
+    # determinant of [master, -a home, 2 home D], [-a ahead n, 1 + ahead home, -c ahead home D],
+    # [0, -b c held, slave] with a = sqrt(2 b), c = sqrt(2 / b)
     first = (1.0 + ahead * home) * slave - ahead * home * 2.0 * held * far.below
     second = 2.0 * b * near.rate * ahead * home * (slave - 2.0 * held * far.below)
     return master * first - second

@@ -1,9 +1,10 @@
 """A sampled teleoperator in time, packet by packet: confirms what `sampled` predicts.
 
-Master with hand and slave with task are integrated with many steps a period. Every period each side
-measures, sends a packet and uses the newest one that has arrived; packets have their own delays, may
-overtake each other and get lost. Independent of `sampled`: nothing here is a polynomial, a mean or a
-prediction, and passivity control and energy-limited waves are the nonlinear laws themselves.
+Master with hand and slave with task are integrated with many steps a period. Every period each
+side measures, sends a packet and uses the newest one that has arrived; packets have their own
+delays, may overtake each other and get lost. Independent of `sampled`: nothing here is a
+polynomial, a mean or a prediction, and waves and passivity control are the nonlinear laws that
+teleoperated scenarios use (`passive_line`).
 """
 
 import math
@@ -13,6 +14,7 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.teleop.analysis import Case
+from hydrotele.teleop.network import ages_of, in_periods
 from hydrotele.teleop.passive_line import (
     END,
     ENERGY,
@@ -22,7 +24,6 @@ from hydrotele.teleop.passive_line import (
     wave_master,
     wave_slave,
 )
-from hydrotele.teleop.network import ages_of, in_periods
 from hydrotele.teleop.sampled import PASSIVITY, WAVE, wave_impedance
 from hydrotele.teleop.two_port import RATE_STRUCTURES, Impedance
 
