@@ -133,8 +133,7 @@ def test_coordinating_force_of_the_document_compares_with_the_handle(mode):
 
 @pytest.mark.parametrize("reflection", PASSIVE_LINES)
 def test_passive_lines_bring_place_and_force_over_a_bad_network(reflection):
-    """100 ms each way, 20 ms of jitter, 2 % lost: free, the tip follows the handle; in contact the
-    handle takes no energy out.
+    """100 ms each way, 20 ms of jitter, 2 % lost: the tip follows; the handle gives no energy.
 
     10 mm of 200 mm: two steps of the handle's tremor of 50 um, times 100, as for four channels.
     """
@@ -150,12 +149,18 @@ def test_passive_lines_bring_place_and_force_over_a_bad_network(reflection):
         12.0, plate={"stiffness": 1e5, "damping": 3e4}, z=0.4, operator=hand, **keys
     ))  # fmt: skip
     log, late = run.station.log, slice(-600, None)
-    assert log.force[late, 2].mean() > 2e3
+    assert log.force[late, 2].mean() > 500.0  # it bounces: the plate's force is felt late
     assert run.summary["teleoperation"]["handle_least_energy_J"] > -1e-3
-    # the reflected force is the ratio times the machine's in the mean, of which damping of the
-    # virtual mass and what jitter holds back takes a part
-    felt = -log.master("push")[late, 2].mean()
-    assert felt == pytest.approx(-2e-5 * log.force[late, 2].mean(), rel=0.5)
+    # without delay the hand holds the ratio times the machine's force in the mean; 15 %: it swings
+    # by a fifth, and the estimate of the hand's force is a tenth off
+    down = {"kind": "follow", "time": [0.0, 0.5, 3.5, 12.0], "path": {"z": [0, 0, -0.003, -0.003]}}
+    run = run_scenario(scenario(
+        12.0, plate={"stiffness": 1e5, "damping": 3e4}, z=0.5, operator=down, **keys | {"channel": {}}
+    ))  # fmt: skip
+    log = run.station.log
+    force = log.force[late, 2].mean()
+    assert force > 5e3
+    assert log.master("hand")[late, 2].mean() == pytest.approx(-2e-5 * force, rel=0.15)
 
 
 def test_a_trace_of_measured_delays(tmp_path):
@@ -175,9 +180,10 @@ def test_a_trace_of_measured_delays(tmp_path):
 
 
 def test_decoupled_axes_in_the_loop():
-    """A push along x turns the handle by springs at the handle; decoupled it does not by itself.
+    """Decoupled axes turn the flotor that a hand pushes: the coils then act at its centre of mass.
 
-    The hand's own push still acts beside the centre of mass, so that the turn is only smaller.
+    The torque of 2.4 N at 0.1 m turns it by degrees until the operator corrects it; with springs at
+    the handle, which is what scenarios use, there is next to none.
     """
     hand = {"kind": "follow", "time": [0.0, 0.2, 0.4, 2.0], "path": {"x": [0, 0, 0.004, 0.004]}}
     turns = {}
@@ -187,7 +193,7 @@ def test_decoupled_axes_in_the_loop():
         turns[kind] = np.abs(run.station.log.master("handle")[:, 3:5]).max()
         place = run.station.log.master("handle")[-50:, 0].mean()
         assert place == pytest.approx(0.004, abs=2e-4)  # tremor of 50 um
-    print(turns)
+    assert turns["springs"] < 0.1 * turns["decoupled"]
 
 
 def test_four_channels_under_position_control_are_transparent_at_rest():
