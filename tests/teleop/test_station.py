@@ -153,10 +153,9 @@ def test_passive_lines_bring_place_and_force_over_a_bad_network(reflection):
     assert run.summary["teleoperation"]["handle_least_energy_J"] > -1e-3
     # without delay the hand holds the ratio times the machine's force in the mean; 15 %: it swings
     # by a fifth, and the estimate of the hand's force is a tenth off
-    down = {"kind": "follow", "time": [0.0, 0.5, 3.5, 12.0], "path": {"z": [0, 0, -0.003, -0.003]}}
-    run = run_scenario(scenario(
-        12.0, plate={"stiffness": 1e5, "damping": 3e4}, z=0.5, operator=down, **keys | {"channel": {}}
-    ))  # fmt: skip
+    down = hand | {"path": {"z": [0, 0, -0.003, -0.003]}}
+    keys |= {"operator": down, "channel": {}}
+    run = run_scenario(scenario(12.0, plate={"stiffness": 1e5, "damping": 3e4}, z=0.5, **keys))
     log = run.station.log
     force = log.force[late, 2].mean()
     assert force > 5e3
