@@ -57,10 +57,10 @@ def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
     """
     h = hybrid(port, np.asarray(s, complex))
     across = h[..., 0, 1] * h[..., 1, 0]
-    first, second = h[..., 0, 0].real, h[..., 1, 1].real
+    first, second = np.real(h[..., 0, 0]), np.real(h[..., 1, 1])
     slack = _ROUNDING * np.abs(h)
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = (2.0 * first * second - across.real) / np.abs(across)
+        found = (2.0 * first * second - np.real(across)) / np.abs(across)
     found = np.where(np.abs(across) > 0.0, found, np.inf)
     return np.where((first < -slack[..., 0, 0]) | (second < -slack[..., 1, 1]), -np.inf, found)
 

@@ -84,7 +84,9 @@ class Spring:
         def growth(damping: float) -> float:
             return worst_growth(self.mass, damping, self.least, self.most) - 1.0
 
-        return float(brentq(growth, 0.0, self.enough_damping, xtol=1e-3 * self.enough_damping))
+        most = self.enough_damping
+        found: float = brentq(growth, 0.0, most, xtol=1e-3 * most)  # pyright: ignore - not full
+        return found
 
     @property
     def growth(self) -> float:
