@@ -39,7 +39,7 @@ ROWS = (("mass", "kg", 1.0), ("centre x", "mm", 1e3), ("centre y", "mm", 1e3),
         ("centre z", "mm", 1e3), ("I_xx", "g m^2", 1e3), ("I_yy", "g m^2", 1e3),
         ("I_zz", "g m^2", 1e3), ("I_xy", "g m^2", 1e3), ("I_xz", "g m^2", 1e3),
         ("I_yz", "g m^2", 1e3))  # fmt: skip
-QUIET = np.zeros((7, 3))
+QUIET = np.zeros((8, 3))
 MICRO = np.array([1e6] * 3 + [np.rad2deg(1.0) * 1e3] * 3)  # um and 0.001 deg
 
 

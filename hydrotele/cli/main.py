@@ -491,7 +491,8 @@ def analyse_teleop(
         typer.Option(
             "--structure",
             help="position_position, position_force, four_channel_position, rate_position, "
-            "rate_force or four_channel_rate; may be repeated; default the case's.",
+            "rate_force, four_channel_rate, with --robust also wave_variables and "
+            "passivity_control; may be repeated; default the case's.",
         ),
     ] = None,
     delay: Annotated[
@@ -501,17 +502,25 @@ def analyse_teleop(
         bool,
         typer.Option("--confirm", help="Simulate sine sweeps and every cell of the map, too."),
     ] = False,
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Sampling, jitter, drawn operators, Z-width, too.")
+    ] = False,
+    period: Annotated[float, typer.Option(help="With --robust: sampling period, s.")] = 0.005,
+    delays: Annotated[
+        Path | None,
+        typer.Option(help="With --robust: CSV of measured delays, columns forward and back, s."),
+    ] = None,
+    operators: Annotated[int, typer.Option(help="With --robust: hands and tasks drawn.")] = 20,
     coordinate: Annotated[str | None, typer.Option(help="Of a scenario: r, theta, z ...")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="Of a scenario.")] = None,
     json: Json = False,
 ) -> None:
     """Two-port of a teleoperator: what is felt, passivity, stability with delay, margins."""
-    from hydrotele.cli.analysing import analyse_any_to_folder
-
-    pass
+    from hydrotele.cli.analysing import Robustly, analyse_any_to_folder
 
     pairs = overrides_of(set_ or [])
-    analyse_any_to_folder(file, out, structure, delay, confirm, coordinate, pairs, json)
+    how = Robustly(period, delays, operators) if robust or delays else None
+    analyse_any_to_folder(file, out, structure, delay, confirm, coordinate, pairs, json, how)
 
 
 @app.command(

@@ -15,8 +15,9 @@ from hydrotele.core.datafile import Facts, Name, NonNegative, Positive
 Coordinate = Literal["r", "theta", "z", "attitude", "head"]
 JoystickAxis = Literal["x", "y", "z", "rx", "ry", "rz"]
 Reflection = Literal[
-    "none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance"
-]
+    "none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance",
+    "wave_variables", "passivity_control",
+]  # fmt: skip
 _WHERE: dict[str, tuple[str, float]] = {
     "r": ("x", 1.0), "theta": ("y", 1.0), "z": ("z", 1.0), "attitude": ("ry", -1.0),
     "head": ("rx", 1.0),
@@ -46,14 +47,26 @@ class Coupling(Facts):
 class Channel(Facts):
     """The line between operator and machine: delays [s] either way, share of packets lost.
 
-    Delays are rounded to whole control periods. Packets are lost from `lost_from` [s] on: each with
-    the probability `lost`.
+    Delays are rounded to whole control periods; one packet is sent a period. Packets are lost from
+    `lost_from` [s] on: each with the probability `lost`. Each is later than the delay by a time of
+    its own with the mean `jitter` [s], exponentially distributed; packets that were overtaken are
+    not used. `trace` is a CSV file of measured delays with the columns `forward` and `back` [s],
+    one row a packet, empty where lost, used again from its beginning where the run is longer; it
+    takes the place of delays and jitter.
     """
 
     delay_forward: Annotated[float, Field(ge=0, le=2)] = 0.0
     delay_back: Annotated[float, Field(ge=0, le=2)] = 0.0
+    jitter: Annotated[float, Field(ge=0, le=1)] = 0.0
+    trace: str | None = None
     lost: Annotated[float, Field(ge=0, le=1)] = 0.0
     lost_from: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.trace and (self.delay_forward or self.delay_back or self.jitter):
+            raise ValueError("trace has the delays; leave delay_forward, delay_back, jitter out")
+        return self
 
 
 class Safety(Facts):
@@ -305,16 +318,29 @@ class TeleopPilot(Facts):
     the contact force comes from: the pressures with the static or the dynamic model, through a
     filter of a `bandwidth` [rad/s] (`bandwidth_hz`), or the simulator's own (`true`).
 
-    What structures can do: stiffness feedback is stable with every task and delay. Direct force
-    bounces where `ratio` times the task's stiffness (and `scale`) is more than hand and joystick
-    hold. Coordinating force tells of the machine's lag; a stiff servo hides the task from it, and
-    under rate control it needs less coupling with delay. Four channels under position control give
-    hand = ratio x force and place = scale x handle in the mean; on a valve-controlled machine they
-    bounce unless ratio x scale x task stiffness is below the coupling, some 400 N/m. Four channels
-    under rate control leave a constant contact force unfelt, by design (F_h = s/k_v F_e); they have
-    no dead band. `impedance` adds ratio x gain of the coordinate (its scale, or under rate control
-    its rate per displacement, for one second) x the task's identified stiffness to the joystick's,
-    within its bounds, and its damping, at most as much as the joystick's own.
+    What structures can do: stiffness feedback is proven stable with every task and delay where
+    `B^2 > 4 M K_max` and `K_min > 0`, hand included (Zhu 1994, theorem 4-2); the published gains do
+    not meet that, and are stable by the bound on the worst switching (`hydrotele analyse teleop`).
+    Direct force bounces where `ratio` times the task's stiffness (and `scale`) is more than hand
+    and joystick hold. Coordinating force tells of the machine's lag; a stiff servo hides the task
+    from it, and under rate control it needs less coupling with delay. It compares the machine's
+    place with that of the handle (`coordinating: handle`, Zhu 1994, 3.52 and 3.53), or with the
+    machine's own reference (`reference`), which a late line makes later. Four channels under
+    position control give hand = ratio x force and place = scale x handle in the mean; on a
+    valve-controlled machine they bounce unless ratio x scale x task stiffness is below the
+    coupling, some 400 N/m. Four channels under rate control leave a constant contact force unfelt,
+    by design (F_h = s/k_v F_e); they have no dead band. `impedance` adds ratio x gain of the
+    coordinate (its scale, or under rate control its rate per displacement, for one second) x the
+    task's identified stiffness to the joystick's, within its bounds, its damping, at most as much
+    as the joystick's own, and its mass, at most half of the flotor's.
+
+    `wave_variables` (impedance `wave` [N s/m]) and `passivity_control` make the line passive with
+    any delay and jitter, under position control: a virtual mass follows the handle through the
+    coupling, which comes back, and the task's force moves it. What the line cannot make passive is
+    a late estimate of that force.
+
+    `compliance: springs` makes the joystick's axes springs at the handle, `decoupled` gives each
+    its own second-order system whatever the flotor's inertia couples (Zhu 1994, 5.9-5.11).
     """
 
     kind: Literal["teleop"]
@@ -328,6 +354,9 @@ class TeleopPilot(Facts):
     force_limit: Positive | None = None
     coupling: NonNegative | None = None
     coupling_damping: NonNegative | None = None
+    coordinating: Literal["handle", "reference"] = "handle"
+    compliance: Literal["springs", "decoupled"] = "springs"
+    wave: Positive | None = None
     virtual_mass: Positive = 2.0
     force: Literal["static", "dynamic", "true"] = "dynamic"
     bandwidth: Annotated[float, Field(gt=0, le=10.0 * math.pi)] = 3.0 * math.pi
@@ -341,3 +370,12 @@ class TeleopPilot(Facts):
     tip_over: TipOver | None = None
     buttons: list[Button] = []
     faults: list[Fault] = []
+
+    @model_validator(mode="after")
+    def _passive_line(self):
+        if self.reflection in ("wave_variables", "passivity_control") and self.mode == "rate":
+            raise ValueError(
+                f"reflection {self.reflection} needs mode position: force times the rate that the"
+                " handle asks for is no power that a line could keep"
+            )
+        return self

@@ -310,7 +310,7 @@ def _figures(found: Findings) -> list[tuple[str, str, str]]:
     passive = sum(one.passive for one in found.analyses)
     cards = [
         ("after", f"{good} of {many}", "structures stable, with the task and free"),
-        ("", f"{passive} of {many}", "passive two-ports, safe with any task"),
+        ("", f"{passive} of {many}", "passive two-ports, safe with any passive hand and task"),
     ]
     if found.agreements:
         worst = min(one.share for one in found.agreements)

@@ -49,6 +49,7 @@ class Case:
         gains: of the channels.
         delay_forward: from the master to the slave [s].
         delay_back: from the slave to the master [s].
+        wave: impedance b of wave variables [N s/m]; 0 for the slave controller's damping.
     """
 
     master: Impedance
@@ -60,6 +61,7 @@ class Case:
     gains: Gains = field(default_factory=Gains)
     delay_forward: float = 0.0
     delay_back: float = 0.0
+    wave: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse controllers that hold a mass: they would need accelerations."""
@@ -204,6 +206,20 @@ class MapRange(Facts):
         return self
 
 
+class SideRange(Facts):
+    """Impedances that are drawn, every number log-uniform between least and most."""
+
+    least: Side
+    most: Side
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        for name in ("mass", "damping", "stiffness"):
+            if not getattr(self.least, name) <= getattr(self.most, name):
+                raise ValueError(f"{name}: least must not be above most")
+        return self
+
+
 class TeleopCase(Facts):
     """Everything that an analysis needs; one axis, all in one scale of lengths and forces."""
 
@@ -218,6 +234,9 @@ class TeleopCase(Facts):
     delays: Delays = Field(default_factory=Delays)
     structures: Annotated[tuple[str, ...], Field(min_length=1)] = STRUCTURES
     stiffness: VaryingSpring | None = None
+    wave: NonNegative = 0.0
+    hands: SideRange | None = None
+    tasks: SideRange | None = None
     map: MapRange = Field(default_factory=MapRange)
 
     @field_validator("structures")
@@ -231,19 +250,21 @@ class TeleopCase(Facts):
         return Case(
             self.master.impedance(), self.slave.impedance(), self.master_control.impedance(),
             self.slave_control.impedance(), self.hand.impedance(), self.task.impedance(), gains,
-            self.delays.forward, self.delays.back,
+            self.delays.forward, self.delays.back, self.wave,
         )  # fmt: skip
 
 
-def known_structures(names: tuple[str, ...]) -> tuple[str, ...]:
+def known_structures(
+    names: tuple[str, ...], known: tuple[str, ...] = STRUCTURES
+) -> tuple[str, ...]:
     """The same names, once each.
 
     Raises:
         ValueError: one is not known.
     """
     for name in names:
-        if name not in STRUCTURES:
-            raise ValueError(f"no structure {name!r}; {suggest(name, STRUCTURES)}")
+        if name not in known:
+            raise ValueError(f"no structure {name!r}; {suggest(name, known)}")
     return tuple(dict.fromkeys(names))
 
 
@@ -270,8 +291,9 @@ _FREE = Impedance()
 _PASSIVE = 1.0 + 1e-6  # rounding in the inverse of a lossless port's matrix stays below
 _STEPS = 61  # tried before a margin is refined
 _REFINED = 1e-3  # of a margin
-_REACH = 1e3  # factors on the loop's gain that are tried, up and down
-_DELAYS = (1e-4, 10.0)  # s each way
+LONGEST_TRIED = 10.0  # s each way
+MOST_TRIED = 1e3  # factor on the loop's gain
+_DELAYS = (1e-4, LONGEST_TRIED)
 
 
 class Loop(Protocol):
@@ -311,9 +333,12 @@ class Analysis:
         loop_free: (n,) the same without a task [1].
         unstable_poles: with the task; None where poles lie on the axis.
         unstable_free: the same without a task.
+        unstable_let_go: with the task and no hand on the handle.
+        unstable_let_go_free: with neither.
         gain_margin: factor on what comes back up to which the loop stays stable; below 1 where the
             case is unstable, 0 where no factor helps, infinite where none was found that hurts.
-        largest_delay: each way, up to which it stays stable [s]; 0 where it is unstable without.
+        largest_delay: each way, up to which it stays stable [s]; 0 where it is unstable without,
+            infinite where it is stable with 10 s, the longest that is tried.
         passive: whether the two-port is, so that no passive hand and task make it unstable.
     """
 
@@ -327,14 +352,21 @@ class Analysis:
     loop_free: np.ndarray
     unstable_poles: int | None
     unstable_free: int | None
+    unstable_let_go: int | None
+    unstable_let_go_free: int | None
     gain_margin: float
     largest_delay: float
     passive: bool
 
     @property
     def stable(self) -> bool:
-        """Whether it is stable with the task and without."""
+        """Whether it is stable with the task and without, a hand on the handle."""
         return self.unstable_poles == 0 and self.unstable_free == 0
+
+    @property
+    def stable_let_go(self) -> bool:
+        """Whether it is stable with the task and without, the handle let go."""
+        return self.unstable_let_go == 0 and self.unstable_let_go_free == 0
 
 
 def analyse(case: Case, structure: str, frequencies: np.ndarray = FREQUENCIES) -> Analysis:
@@ -359,7 +391,8 @@ def analyse(case: Case, structure: str, frequencies: np.ndarray = FREQUENCIES) -
         structure, frequencies, hybrid(port, s), transmitted(port, s, case.task), case.task(s),
         scattering_norm(port, s, unit), loop_gain(port, s, case.hand, case.task),
         loop_gain(port, s, case.hand, _FREE), _counted(port, case.hand, case.task),
-        _counted(port, case.hand, _FREE), gain_margin(case, structure),
+        _counted(port, case.hand, _FREE), _counted(port, _FREE, case.task),
+        _counted(port, _FREE, _FREE), gain_margin(case, structure),
         largest_delay(case, structure), is_passive(port, unit),
     )  # fmt: skip
 
@@ -437,9 +470,9 @@ def gain_margin(case: Loop, structure: str) -> float:
         return holds(case.port(structure, factor), case.hand, case.task)
 
     if right(1.0):
-        found = _change(right, np.geomspace(1.0, _REACH, _STEPS))
+        found = first_change(right, np.geomspace(1.0, MOST_TRIED, _STEPS))
         return math.inf if found is None else found
-    found = _change(right, np.geomspace(1.0, 1.0 / _REACH, _STEPS))
+    found = first_change(right, np.geomspace(1.0, 1.0 / MOST_TRIED, _STEPS))
     return 0.0 if found is None else found
 
 
@@ -453,12 +486,20 @@ def largest_delay(case: Loop, structure: str) -> float:
         return 0.0
     if not right(_DELAYS[0]):
         return 0.0
-    found = _change(right, np.geomspace(*_DELAYS, _STEPS))
+    found = first_change(right, np.geomspace(*_DELAYS, _STEPS))
     return math.inf if found is None else found
 
 
-def _change(right: Callable[[float], bool], points: np.ndarray) -> float | None:
-    """Where an answer first differs from that at the first point; None if it never does."""
+def first_change(right: Callable[[float], bool], points: np.ndarray) -> float | None:
+    """Where an answer first differs from that at the first point; None if it never does.
+
+    Args:
+        right: the question.
+        points: (n,) positive ones, in order, which are tried before the place is refined.
+
+    Returns:
+        The last place where the answer is yes, refined to 0.1 %.
+    """
     first, last = right(float(points[0])), float(points[0])
     for point in map(float, points[1:]):
         if right(point) != first:

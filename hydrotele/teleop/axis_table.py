@@ -17,10 +17,10 @@ from hydrotele.machine.joystick import AXES, AxisGains, Joystick
 from hydrotele.scenario.teleoperation import Coupling, Regulate, Steer, TeleopPilot, Track
 
 # columns, SI; GAIN is the rate of a coordinate per displacement beyond the dead band [1/s], or its
-# place per displacement
+# place per displacement; WAVE is the impedance b of wave variables
 (NOMINAL, LEAST, MOST, SLOPE, DAMPING, LIMIT, DEADBAND, DROP, OUTSIDE, REACH, COORDINATE, SIGN,
- GAIN, RATIO, COUPLING, COUPLING_DAMPING, REFLECTED_MOST) = range(17)  # fmt: skip
-COLUMNS = REFLECTED_MOST + 1
+ GAIN, RATIO, COUPLING, COUPLING_DAMPING, REFLECTED_MOST, WAVE) = range(18)  # fmt: skip
+COLUMNS = WAVE + 1
 LEVER = 0.1  # m, a hand's: makes rotational gains of translational ones
 _SOFT = {"rate": 40.0, "position": 400.0}  # N/m, N per metre of machine or of handle
 _DAMPED = 0.1  # s, of that coupling
@@ -35,7 +35,7 @@ def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, .
         coordinates: task coordinates of the arm.
 
     Returns:
-        (6, 17), columns above.
+        (6, 18), columns above.
 
     Raises:
         InputError: gains that make no sense, a coordinate that the arm has not, one joystick axis
@@ -60,7 +60,7 @@ def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, .
         lever = 1.0 if number < 3 else LEVER
         table[number, RATIO:] = (
             lever * pilot.ratio, lever**2 * soft, lever**2 * damped,
-            pilot.force_limit or law.force_limit,
+            pilot.force_limit or law.force_limit, lever**2 * (pilot.wave or damped),
         )  # fmt: skip
     _place_coordinates(pilot, table, coordinates)
     _check_goals(pilot, table, coordinates)

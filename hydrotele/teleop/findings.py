@@ -13,6 +13,8 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import (
+    LONGEST_TRIED,
+    MOST_TRIED,
     Analysis,
     Case,
     analyse,
@@ -23,6 +25,7 @@ from hydrotele.teleop.analysis import (
 )
 from hydrotele.teleop.confirm import Agreement, SineSweep, agreement, sweep
 from hydrotele.teleop.linear_case import STRUCTURES, LinearCase, local_ratio
+from hydrotele.teleop.robust import Robustness
 from hydrotele.teleop.switching import Spring
 from hydrotele.teleop.two_port import OnTheAxis, unstable_poles
 
@@ -44,6 +47,8 @@ class Findings:
         spring: the joystick axis with stiffness feedback, None without.
         sweeps: measured in simulation, empty where not asked for.
         agreements: the maps, simulated; empty where not asked for.
+        robust: what every structure withstands, sampled; empty where not asked for.
+        period: of that sampling [s].
     """
 
     name: str
@@ -55,6 +60,8 @@ class Findings:
     spring: Spring | None = None
     sweeps: tuple[SineSweep, ...] = ()
     agreements: tuple[Agreement, ...] = ()
+    robust: tuple[Robustness, ...] = ()
+    period: float = 0.0
 
 
 def find(
@@ -97,40 +104,53 @@ def find(
     )
 
 
-def why_unstable(one: Analysis) -> str:
-    """What makes a structure unstable, in a few words."""
-    free = "" if one.unstable_poles != 0 else " when free"
-    many = one.unstable_poles if not free else one.unstable_free
+def why_unstable(one: Analysis, let_go: bool = False) -> str:
+    """What makes a structure unstable, in a few words.
+
+    Args:
+        one: the analysis.
+        let_go: of the handle let go, not in a hand.
+
+    Returns:
+        Such as `no, 2 poles`, `yes` where it is stable.
+    """
+    both = (one.unstable_poles, one.unstable_free)
+    if let_go:
+        both = (one.unstable_let_go, one.unstable_let_go_free)
+    if both == (0, 0):
+        return "yes"
+    free = "" if both[0] != 0 else " when free"
+    many = both[0] if not free else both[1]
     if many is None:
         return f"no, poles on the axis{free}"
     return f"no, {many} pole{'s' * (many != 1)}{free}"
 
 
 def format_factor(margin: float) -> str:
-    """A gain margin.
+    """A gain margin; where none was found, the largest factor that was tried.
 
     >>> format_factor(0.17), format_factor(math.inf)
-    ('x 0.17', 'any')
+    ('x 0.17', '> x 1000')
     """
-    return "any" if math.isinf(margin) else f"x {margin:.3g}"
+    return f"> x {MOST_TRIED:g}" if math.isinf(margin) else f"x {margin:.3g}"
 
 
 def format_delay(delay: float) -> str:
-    """A delay.
+    """A delay; where none was found, the longest that was tried.
 
-    >>> format_delay(0.12345)
-    '123 ms'
+    >>> format_delay(0.12345), format_delay(math.inf)
+    ('123 ms', '> 10 s')
     """
-    return "any" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
+    return f"> {LONGEST_TRIED:g} s" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
 
 
 def format_number(value: float) -> str:
-    """A number with four digits, without an exponent.
+    """A number with five digits, without an exponent.
 
     >>> format_number(-20026.0), format_number(0.0123456)
-    ('-20030', '0.01235')
+    ('-20026', '0.012346')
     """
-    return np.format_float_positional(value, precision=4, fractional=False, trim="-")
+    return np.format_float_positional(value, precision=5, fractional=False, trim="-")
 
 
 def format_error(error: float | None) -> str:
@@ -166,6 +186,11 @@ def findings_document(found: Findings) -> dict:
     if found.spring:
         pair = {"held": found.spring.held(case.hand), "let_go": found.spring}
         document["stiffness_feedback"] = {name: _spring(one) for name, one in pair.items()}
+    if found.robust:
+        document["robust"] = {
+            "period": found.period,
+            "structures": {one.structure: _robust(one) for one in found.robust},
+        }
     if found.agreements:
         document["confirmed"] = {
             "sweeps": [_sweep(one) for one in found.sweeps],
@@ -181,6 +206,9 @@ def _analysis(one: Analysis) -> dict:
         "stable": one.stable,
         "unstable_poles": one.unstable_poles,
         "unstable_poles_free": one.unstable_free,
+        "stable_let_go": one.stable_let_go,
+        "unstable_poles_let_go": one.unstable_let_go,
+        "unstable_poles_let_go_free": one.unstable_let_go_free,
         "gain_margin": one.gain_margin,
         "largest_delay": one.largest_delay,
         "passive": one.passive,
@@ -195,6 +223,34 @@ def _analysis(one: Analysis) -> dict:
     }
 
 
+def _robust(one: Robustness) -> dict:
+    names = ("held_task", "held_free", "let_go_task", "let_go_free")
+    document = {
+        "absolutely_stable": one.absolutely_stable,
+        "llewellyn": one.llewellyn,
+        "sampled": {
+            name: {"stable": told.stable, "reason": told.reason}
+            for name, told in zip(names, one.sampled, strict=True)
+        },
+        "drawn": {
+            "pairs": one.worst.pairs, "unstable": one.worst.unstable,
+            "unstable_let_go": one.worst.unstable_let_go, "worst_growth_rate": one.worst.rate,
+            "worst_hand": vars(one.worst.hand), "worst_task": vars(one.worst.task),
+        },
+    }  # fmt: skip
+    if one.width:
+        document["z_width"] = {
+            "decades": one.width.decades, "stiffest_task_held": one.width.stiffest_held,
+            "stiffest_task_let_go": one.width.stiffest_let_go,
+            "stiffest_tried": one.width.most_tried,
+        }  # fmt: skip
+    if one.released:
+        document["master_let_go"] = {
+            "coefficients": one.released.coefficients, "unstable_poles": one.released.unstable,
+        }  # fmt: skip
+    return document
+
+
 def _pairs(values: np.ndarray) -> list:
     return np.stack([np.real(values), np.imag(values)], axis=-1).tolist()
 
@@ -203,6 +259,7 @@ def _spring(one: Spring) -> dict:
     return {
         "mass": one.mass, "damping": one.damping, "least": one.least, "most": one.most,
         "margin": one.margin, "damping_asked": one.enough_damping, "worst_growth": one.growth,
+        "least_damping": one.least_damping, "stable_by": one.stable_by,
     }  # fmt: skip
 
 
@@ -324,7 +381,7 @@ def find_loop(name: str, case: LinearCase, task_source: str) -> ScenarioFindings
     Source: Zhu 1994, chapters 3 and 4.
     """
     reflection, mode = case.pilot.reflection, case.pilot.mode
-    if reflection in ("four_channel", "impedance"):
+    if reflection in ("four_channel", "impedance", "wave_variables", "passivity_control"):
         message = f"{reflection!r} has no linear case of a scenario; write a case file"
         raise InputError("pilot.reflection", message)
     own = (reflection, mode) in _NAMES
@@ -417,7 +474,8 @@ def loop_document(found: ScenarioFindings) -> dict:
                 name: {
                     "mass": one.mass, "damping": one.damping, "most": one.most,
                     "margin": one.margin, "damping_asked": one.enough_damping,
-                    "worst_growth": one.growth,
+                    "worst_growth": one.growth, "least_damping": one.least_damping,
+                    "stable_by": one.stable_by,
                 }
                 for name, one in springs.items()
             },

@@ -341,9 +341,16 @@ class LinearCase:
             return -reflected * self._coupling(rate, s)
 
         def own(s: np.ndarray) -> np.ndarray:
-            line = np.exp(-s * (self.delay_forward + self.delay_back)) * self._asked(rate, s)
-            linked = 0.0 if feels_force else reflected * self._coupling(rate, s) * line
-            return self._centred(rate, s) + linked
+            if feels_force:
+                return self._centred(rate, s)
+            if self.pilot.coordinating == "handle":
+                asked = self.row[GAIN] / s if rate else self.row[GAIN]
+                linked = self._coupling(rate, s, self.clocks.control) * asked
+            else:
+                late = self.delay_forward + self.delay_back
+                asked = np.exp(-s * late) * self._asked(rate, s)
+                linked = self._coupling(rate, s) * asked
+            return self._centred(rate, s) + reflected * linked
 
         return TwoPort(
             self.master, slave, own, control, forward, back if feels_force else nothing, nothing,
@@ -361,10 +368,14 @@ class LinearCase:
         held = np.exp(-0.5 * self.clocks.control * s)
         return held * ((self.row[NOMINAL] if rate else 0.0) / s + self.row[DAMPING] * held)
 
-    def _coupling(self, rate: bool, s: np.ndarray) -> np.ndarray:
-        """Force on the hand per velocity of the machine that is missing, of coordinating force."""
+    def _coupling(self, rate: bool, s: np.ndarray, period: float | None = None) -> np.ndarray:
+        """Force on the hand per velocity of the machine that is missing, of coordinating force.
+
+        It is held for a period, that of the machine's samples after that of the control if none is
+        given.
+        """
         scale = 1.0 if rate else 1.0 / self.row[GAIN]
-        held = np.exp(-0.5 * (self.clocks.control + self.clocks.samples) * s)
+        held = np.exp(-0.5 * (period or self.clocks.control + self.clocks.samples) * s)
         return scale * held * (self.row[COUPLING] / s + self.row[COUPLING_DAMPING])
 
     def _felt(self, s: np.ndarray) -> np.ndarray:

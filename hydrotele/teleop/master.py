@@ -29,24 +29,34 @@ from hydrotele.teleop.axis_table import (
     NOMINAL,
     OUTSIDE,
     RATIO,
+    REACH,
     REFLECTED_MOST,
     SIGN,
     SLOPE,
+    WAVE,
     axis_table,
     flat_state,
     flattened,
     split,
 )
 from hydrotele.teleop.coils import three_stations
-from hydrotele.teleop.compliance import GRAVITY, holding_wrench, turn_matrix
+from hydrotele.teleop.compliance import GRAVITY, driving_wrench, holding_wrench, turn_matrix
+from hydrotele.teleop.passive_line import END, GONE_IN, controlled_master, wave_master
 
-NONE, STIFFNESS, DIRECT, COORDINATING, FOUR_CHANNEL, IMPEDANCE = range(6)
-KINDS = ("none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance")
+NONE, STIFFNESS, DIRECT, COORDINATING, FOUR_CHANNEL, IMPEDANCE, WAVES, CONTROLLED = range(8)
+KINDS = (
+    "none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance",
+    "wave_variables", "passivity_control",
+)  # fmt: skip
 RATE, POSITION = range(2)
 # rows of `Packet`
-FORCE, PLACE, SPEED, WANTED, WANTED_SPEED, TASK_STIFFNESS, TASK_DAMPING = range(7)
+FORCE, PLACE, SPEED, WANTED, WANTED_SPEED, TASK_STIFFNESS, TASK_DAMPING, TASK_MASS = range(8)
+# the same of a passive line: sum of waves or force of the slave's controller, and its energy
+TOTAL, BUDGET = WANTED, WANTED_SPEED
 _OBSERVER = 60.0  # rad/s of the hand force's estimate: a third of what 200 Hz samples
-_CHANGE = 20.0  # rad/s up to which a force is differentiated: sensors are slower than the joystick
+_CHANGE = 20.0  # rad/s up to which a force or a speed is differentiated
+_HEAVIER = 0.5  # of the flotor's mass by which it may be made to feel heavier: late by _CHANGE
+SENT = END  # of a row of `MasterState.line`: what the next packet carries, and its energy
 WINDUP = 0.1  # m or rad at the machine by which four channels under rate control may be apart
 
 
@@ -54,7 +64,7 @@ class Master(NamedTuple):
     """Numbers of the master's control.
 
     Attributes:
-        axis: (6, 17) of every joystick axis, columns above; SI. GAIN is the coordinate's rate per
+        axis: (6, 18) of every joystick axis, columns above; SI. GAIN is the coordinate's rate per
             displacement beyond the dead band [1/s], or its place per displacement.
         mass: (1,) of the flotor [kg].
         turning: (3,) its moments about the handle [kg m^2].
@@ -64,7 +74,8 @@ class Master(NamedTuple):
         to_currents: (6, 6) inverse of the coils' map [A/N], [A/(N m)].
         most: (1,) largest current [A].
         step: (6,) resolution of the sensing [m], [rad].
-        kind: (2,) structure and mode.
+        kind: (4,) structure, mode, whether coordinating force compares with the handle, whether
+            the axes are decoupled.
     """
 
     axis: np.ndarray
@@ -90,12 +101,14 @@ class MasterState(NamedTuple):
         hand: (6,) estimated force of the hand [N], [N m].
         momentum: (6,) of the estimate.
         integral: (6,) of the rate asked for, for four channels under rate control [m], [rad].
-        before: (6,) slow force from the machine, for its rate of change [N], [N m].
+        before: (6,) slow force from the machine, for its rate of change [N], [N m]; slow speed of
+            the handle where a task's mass is felt [m/s], [rad/s].
         currents: (6,) [A].
         extra: (6,) further force on the handle, such as that of tip-over protection [N], [N m].
         limited: (1,) share by which the currents had to be made smaller; 1 if not, 0 where they
             are off because the reading is no number.
         energy: (2,) gone into the handle from the hand [J]: now, and its least so far.
+        line: (6, 10) of a passive line's end: `passive_line`, and TOTAL, BUDGET to send.
     """
 
     handle: np.ndarray
@@ -110,6 +123,7 @@ class MasterState(NamedTuple):
     extra: np.ndarray
     limited: np.ndarray
     energy: np.ndarray
+    line: np.ndarray
 
 
 def master(
@@ -144,9 +158,12 @@ def master(
         to_currents=np.linalg.inv(lorentz.wrench_map),
         most=np.array([coils.max_current]),
         step=np.array([joystick.sensing.translation] * 3 + [joystick.sensing.rotation] * 3),
-        kind=np.array([KINDS.index(pilot.reflection), RATE if pilot.mode == "rate" else POSITION]),
-    )
-    state = flat_state(MasterState, [(6,)] * 10 + [(1,), (2,)])
+        kind=np.array([
+            KINDS.index(pilot.reflection), RATE if pilot.mode == "rate" else POSITION,
+            pilot.coordinating == "handle", pilot.compliance == "decoupled",
+        ]),
+    )  # fmt: skip
+    state = flat_state(MasterState, [(6,)] * 10 + [(1,), (2,), (6, SENT + 2)])
     state.limited[:] = 1.0
     return flattened(numbers), state
 
@@ -156,7 +173,7 @@ def unpack_master(flat):
     """The parts of `flat_view(Master)`.
 
     Args:
-        flat: (160,) array.
+        flat: (168,) array.
 
     Returns:
         Master, views of it.
@@ -183,7 +200,7 @@ def unpack_master_state(flat):
     """The parts of `flat_view(MasterState)`.
 
     Args:
-        flat: (63,) array.
+        flat: (123,) array.
 
     Returns:
         MasterState, views of it.
@@ -200,10 +217,11 @@ def unpack_master_state(flat):
     before, rest = split(rest, 6)
     currents, rest = split(rest, 6)
     extra, rest = split(rest, 6)
-    limited, energy = split(rest, 1)
+    limited, rest = split(rest, 1)
+    energy, line = split(rest, 2)
     return MasterState(
         handle, speed, push, stiffness, hand, momentum, integral, before, currents, extra, limited,
-        energy,
+        energy, line.reshape(6, SENT + 2),
     )  # fmt: skip
 
 
@@ -258,16 +276,16 @@ def reflect(numbers, packet, fresh, period, s):
 
     Args:
         numbers: Master.
-        packet: (7, k) what came from the machine: force on its tip, its place and speed, those of
-            its reference, stiffness and damping of its task; task units.
+        packet: (8, k) what came from the machine: force on its tip, its place and speed, those of
+            its reference, stiffness, damping and mass of its task; task units.
         fresh: share of the packet that counts, scalar: 1, falling to 0 when the line is silent.
         period: scalar [s].
-        s: MasterState; `push`, `stiffness`, `integral` and `before` are written.
+        s: MasterState; `push`, `stiffness`, `integral`, `before` and `line` are written.
 
     Returns:
         Nothing.
 
-    Source: Zhu 1994, 3.14, 3.59-3.62, 3.75, 4.1, Fig. 6.51.
+    Source: Zhu 1994, 3.52-3.53, 3.59-3.62, 3.75, 4.1, Fig. 6.51; `teleop.passive_line`.
     """
     kind, mode = numbers.kind[0], numbers.kind[1]
     for i in range(6):
@@ -287,6 +305,8 @@ def reflect(numbers, packet, fresh, period, s):
                 stiff = min(row[MOST], max(row[LEAST], stiff - row[SLOPE] * kept * way))
             elif kind == DIRECT:
                 push += row[RATIO] * kept
+            elif kind == COORDINATING and numbers.kind[2] > 0.0:
+                push -= fresh * _coordinating(row, mode, packet, period, s, i)
             elif kind == COORDINATING:
                 share = sign / gain if mode == POSITION else sign
                 behind = share * (packet[WANTED, c] - packet[PLACE, c])
@@ -298,6 +318,12 @@ def reflect(numbers, packet, fresh, period, s):
                 felt = fresh * row[RATIO] * gain
                 stiff = min(row[MOST], max(row[LEAST], stiff + felt * packet[TASK_STIFFNESS, c]))
                 rub += min(rub, felt * packet[TASK_DAMPING, c])  # more makes a sampled flotor shake
+                own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
+                change = _CHANGE * (v - s.before[i])
+                s.before[i] += period * change
+                push -= min(_HEAVIER * own, felt * packet[TASK_MASS, c]) * change
+            elif kind == WAVES or kind == CONTROLLED:
+                push -= fresh * _passive_line(numbers, row, packet, period, s, i)
         s.stiffness[i] = stiff
         beyond = abs(x) - row[DEADBAND]
         if row[OUTSIDE] >= 0.0 and beyond > 0.0:
@@ -309,6 +335,36 @@ def reflect(numbers, packet, fresh, period, s):
         s.push[i] = (
             total if np.isfinite(total) else -row[NOMINAL] * x - row[DAMPING] * v
         )  # the plain spring
+
+
+@compiled
+def _coordinating(row, mode, packet, period, s, i):
+    """Spring and damper between the machine and where the handle asks it to be."""
+    gain, x, v, c, sign = row[GAIN], s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
+    place, speed = sign * packet[PLACE, c], sign * packet[SPEED, c]
+    if mode == POSITION:
+        return row[COUPLING] * (x - place / gain) + row[COUPLING_DAMPING] * (v - speed / gain)
+    beyond = max(0.0, min(row[REACH], abs(x)) - row[DEADBAND])
+    rate = gain * beyond if x > 0.0 else -gain * beyond
+    asked = s.integral[i] + period * rate
+    s.integral[i] = min(place + WINDUP, max(place - WINDUP, asked))
+    return row[COUPLING] * (s.integral[i] - place) + row[COUPLING_DAMPING] * (rate - speed)
+
+
+@compiled
+def _passive_line(numbers, row, packet, period, s, i):
+    """Force of a passive line against the handle; what goes into the next packet is written."""
+    c, sign, v, end = int(row[COORDINATE]), row[SIGN], s.speed[i], s.line[i]
+    total, budget = sign * packet[TOTAL, c], packet[BUDGET, c]
+    if numbers.kind[0] == WAVES:
+        pushed, wave = wave_master(v, total, budget, row[WAVE], period, end)
+        end[SENT] += period * wave
+        end[SENT + 1] += period * wave * wave
+        return pushed
+    own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
+    pushed = controlled_master(v, total, budget, own, period, end)
+    end[SENT], end[SENT + 1] = s.handle[i], end[GONE_IN]
+    return pushed
 
 
 @compiled
@@ -332,6 +388,20 @@ def _four_channels(row, mode, force, packet, fresh, period, s, i):
 
 
 @compiled
+def _decoupled(numbers, turn, s, wrench):
+    """Wrench with which every axis is a mass of its own under its push, about the handle."""
+    mass, arm = numbers.mass[0], numbers.below - numbers.handle
+    inertia, wanted, about = np.zeros((3, 3)), np.empty(3), np.empty(3)
+    square = arm[0] ** 2 + arm[1] ** 2 + arm[2] ** 2
+    for j in range(3):
+        inertia[j, j] = numbers.turning[j] - mass * (square - arm[j] ** 2)
+        wanted[j], about[j] = s.push[j] / mass, s.push[3 + j] / numbers.turning[j]
+    driving_wrench(
+        mass, arm, inertia, numbers.below, wanted, about, turn, s.speed[3:], numbers.gravity, wrench
+    )
+
+
+@compiled
 def drive_coils(numbers, quaternion, period, s):
     """Coil currents that put `push` on the handle, the flotor's weight taken off; hand's force.
 
@@ -350,9 +420,12 @@ def drive_coils(numbers, quaternion, period, s):
     """
     turn, wrench = np.empty((3, 3)), np.empty(6)
     turn_matrix(quaternion, turn)
-    holding_wrench(
-        numbers.mass[0], numbers.below, numbers.handle, s.push, turn, numbers.gravity, wrench
-    )
+    if numbers.kind[3] > 0.0:
+        _decoupled(numbers, turn, s, wrench)
+    else:
+        holding_wrench(
+            numbers.mass[0], numbers.below, numbers.handle, s.push, turn, numbers.gravity, wrench
+        )
     largest = numbers.most[0]
     for i in range(6):
         s.currents[i] = 0.0
@@ -387,7 +460,7 @@ def master_step(numbers, qpos, packet, fresh, period, first, s):
     Args:
         numbers: Master.
         qpos: (7,) of the flotor: position [m] and quaternion.
-        packet: (7, k) see `reflect`.
+        packet: (8, k) see `reflect`.
         fresh: see `reflect`, scalar.
         period: scalar [s].
         first: whether it is the first one, scalar.
@@ -444,7 +517,7 @@ def push_back(
     Args:
         facts: of the machine.
         numbers: of the master.
-        packet: (7, k) what came from the machine.
+        packet: (8, k) what came from the machine.
         start: (5,) pose at the start.
         handle: (6,) measured displacement [m], [rad].
         speed: (6,) its rate [m/s], [rad/s].

@@ -2,8 +2,8 @@
 
 Under rate control the handle beyond its dead band asks for a rate of the task coordinates, under
 position control for their place; bounds of speed and acceleration keep the references continuous.
-With four channels a virtual mass stands between, which the hand's and the task's force move,
-because a valve-controlled machine does not yield by itself.
+With four channels or a passive line a virtual mass stands between, which the hand's or the line's
+force and the task's move, because a valve-controlled machine does not yield by itself.
 
 The slave's side of teleoperation as arrays: its numbers, its state, and how they lie flat.
 """
@@ -28,29 +28,38 @@ from hydrotele.teleop.axis_table import (
     REACH,
     REFLECTED_MOST,
     SIGN,
+    WAVE,
     flat_state,
     flattened,
     split,
 )
 from hydrotele.teleop.master import (
+    BUDGET,
+    CONTROLLED,
     FORCE,
     FOUR_CHANNEL,
     PLACE,
     POSITION,
     RATE,
+    SENT,
     SPEED,
+    TOTAL,
     WANTED,
     WANTED_SPEED,
+    WAVES,
     WINDUP,
     Master,
 )
+from hydrotele.teleop.passive_line import GONE_IN, controlled_slave, wave_slave
 
 BLOCKED, SILENT, TRIPPED, AGE = range(4)  # of `SlaveState.flags`
 # columns of `Slave.table`
-AXIS, WAY, SCALE, EDGE, STOP, SPRING, DAMPER, SHARE, LEVERAGE, FASTEST, STRONGEST = range(11)
+(AXIS, WAY, SCALE, EDGE, STOP, SPRING, DAMPER, SHARE, LEVERAGE, FASTEST, STRONGEST,
+ WAVE_IMPEDANCE) = range(12)  # fmt: skip
+WIDTH = WAVE_IMPEDANCE + 1
 SILENCE, FOLLOWING, ACCELERATION, VIRTUAL_MASS, LEAD = range(5)  # of `Slave.limits`
 # rows of a command packet
-HANDLE, HANDLE_SPEED, HAND = range(3)
+HANDLE, HANDLE_SPEED, HAND = range(3)  # of a passive line: handle, sum or place, energy
 
 
 class Slave(NamedTuple):
@@ -60,9 +69,10 @@ class Slave(NamedTuple):
         arm: (9,) of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         start: (5,) pose at the start: r [m], theta [rad], z [m], attitude [rad], head [rad].
-        table: (k, 11) of every coordinate: joystick axis (-1 without), sign, gain, dead band,
+        table: (k, 12) of every coordinate: joystick axis (-1 without), sign, gain, dead band,
             reach, coupling, its damping, hand per machine force, lever of the virtual mass [1] or
-            [m^2], largest speed [m/s] or [rad/s], largest force that counts [N] or [N m].
+            [m^2], largest speed [m/s] or [rad/s], largest force that counts [N] or [N m], wave
+            impedance [N s/m].
         limits: (5,) silence [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
             mass [kg], lead of the drives [s].
         kind: (2,) structure and mode.
@@ -91,6 +101,7 @@ class SlaveState(NamedTuple):
         asked: (5,) integral of the rate that the handle asks for, for the same [m], [rad].
         flags: (4,) whether it is held at the edge, the line silent, the valves closed for good; age
             of the last packet [s].
+        line: (5, 10) as of `master.MasterState.line`, in the scale of the handle.
     """
 
     pose: np.ndarray
@@ -103,6 +114,7 @@ class SlaveState(NamedTuple):
     force_integral: np.ndarray
     asked: np.ndarray
     flags: np.ndarray
+    line: np.ndarray
 
 
 @compiled
@@ -110,7 +122,7 @@ def unpack_slave(flat, k):
     """The parts of `flat_view(Slave)`.
 
     Args:
-        flat: (21 + 13 k,) array.
+        flat: (23 + 14 k,) array.
         k: number of joints, scalar.
 
     Returns:
@@ -121,9 +133,9 @@ def unpack_slave(flat, k):
     arm, rest = split(flat, 9)
     ranges, rest = split(rest, 2 * k)
     start, rest = split(rest, 5)
-    table, rest = split(rest, 11 * k)
+    table, rest = split(rest, WIDTH * k)
     limits, kind = split(rest, 5)
-    return Slave(arm, ranges.reshape(k, 2), start, table.reshape(k, 11), limits, kind)
+    return Slave(arm, ranges.reshape(k, 2), start, table.reshape(k, WIDTH), limits, kind)
 
 
 @compiled
@@ -131,7 +143,7 @@ def unpack_slave_state(flat, k):
     """The parts of `flat_view(SlaveState)`.
 
     Args:
-        flat: (52 + 3 k,) array.
+        flat: (102 + 3 k,) array.
         k: number of joints, scalar.
 
     Returns:
@@ -147,14 +159,16 @@ def unpack_slave_state(flat, k):
     measured, rest = split(rest, 10)
     command, rest = split(rest, 18)
     force_integral, rest = split(rest, 5)
-    asked, flags = split(rest, 5)
+    asked, rest = split(rest, 5)
+    flags, line = split(rest, 4)
     return SlaveState(
         pose, rate, joint, joint_rate, ahead, measured.reshape(2, 5), command.reshape(3, 6),
-        force_integral, asked, flags,
+        force_integral, asked, flags, line.reshape(5, SENT + 2),
     )  # fmt: skip
 
 
 SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
+_TRICKLE = 1e-3  # W, what a hand does not notice: of passivity control
 _BRAKE = 0.8  # of the acceleration: the rest makes up for the filter's lag
 AHEAD = 0.02  # s over which the change of a rate is averaged before it is looked ahead
 _BLEND = 30.0  # rad/s, of measured task rates from held angles
@@ -181,7 +195,7 @@ def slave(
     arm, _, ranges = arm_facts(machine)
     k, pose = len(joints), np.zeros(5)
     task_forward(arm, joints, pose)
-    table = np.zeros((k, 11))
+    table = np.zeros((k, WIDTH))
     table[:, 0] = -1.0
     for axis, row in enumerate(numbers.axis):
         if row[COORDINATE] >= 0.0:
@@ -190,13 +204,15 @@ def slave(
             speed = pilot.coordinates.get(name, Coupling()).speed  # pyright: ignore - a Coordinate
             table[int(row[COORDINATE])] = (
                 axis, row[SIGN], row[GAIN], row[DEADBAND], row[REACH], row[COUPLING],
-                row[COUPLING_DAMPING], row[RATIO], lever, speed, row[REFLECTED_MOST],
+                row[COUPLING_DAMPING], row[RATIO], lever, speed, row[REFLECTED_MOST], row[WAVE],
             )  # fmt: skip
     safety = pilot.safety
     limits = np.array(
         [safety.silence, safety.following_error, pilot.acceleration, pilot.virtual_mass, lead]
     )
-    state = flat_state(SlaveState, [(5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,)])
+    state = flat_state(SlaveState, [
+        (5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,), (5, SENT + 2),
+    ])  # fmt: skip
     state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
     return flattened(Slave(arm, ranges, pose, table, limits, numbers.kind)), state
 
@@ -305,6 +321,8 @@ def _wanted_rate(numbers, row, c, x, v, hand, force, period, s):
     """Rate that the handle asks a coordinate for."""
     if numbers.kind[0] == FOUR_CHANNEL:
         return _virtual_rate(numbers, row, c, x, v, hand, force, period, s)
+    if numbers.kind[0] == WAVES or numbers.kind[0] == CONTROLLED:
+        return _pulled_rate(numbers, row, c, v, hand, force, period, s)
     if numbers.kind[1] == POSITION:
         return _placed_rate(numbers, row, c, x, period, s)
     beyond = min(row[STOP], abs(x)) - row[EDGE]
@@ -357,6 +375,27 @@ def _virtual_rate(numbers, row, c, x, v, hand, force, period, s):
 
 
 @compiled
+def _pulled_rate(numbers, row, c, total, budget, force, period, s):
+    """Rate of the virtual slave at a passive line, `M z'' = pull + ratio F`; z = y / scale."""
+    gain, spring, damper, end = row[SCALE], row[SPRING], row[DAMPER], s.line[c]
+    speed, mass = s.rate[c] / gain, numbers.limits[VIRTUAL_MASS] * row[LEVERAGE]
+    if numbers.kind[0] == WAVES:
+        pull, wave = wave_slave(
+            speed, total, row[WAY] * budget, spring, damper, row[WAVE_IMPEDANCE], period, end
+        )
+        end[SENT] += period * wave
+        end[SENT + 1] += period * wave * wave
+    else:
+        budget = row[WAY] * budget
+        pull = controlled_slave(speed, total, budget, spring, damper, _TRICKLE, period, end)
+        end[SENT], end[SENT + 1] = pull, end[GONE_IN]
+    push = pull
+    if np.isfinite(force):
+        push += row[SHARE] * min(row[STRONGEST], max(-row[STRONGEST], force))
+    return gain * (speed + period * push / mass)
+
+
+@compiled
 def watch(numbers, joint, s):
     """Close the valves for good where a joint does not follow its reference.
 
@@ -383,7 +422,7 @@ def report(numbers, force, s, packet):
         numbers: Slave.
         force: (k,) at the tip, task coordinates [N], [N m].
         s: SlaveState.
-        packet: (7, k) written, all but the last two rows.
+        packet: (8, k) written, all but the last three rows.
 
     Returns:
         Nothing.
@@ -396,6 +435,9 @@ def report(numbers, force, s, packet):
         packet[SPEED, c] = s.measured[1, c]
         packet[WANTED, c] = s.pose[c] - numbers.start[c]
         packet[WANTED_SPEED, c] = s.rate[c]
+    if numbers.kind[0] == WAVES or numbers.kind[0] == CONTROLLED:
+        for c in range(len(force)):
+            packet[TOTAL, c], packet[BUDGET, c] = s.line[c, SENT], s.line[c, SENT + 1]
     if numbers.kind[0] == FOUR_CHANNEL:
         for c in range(len(force)):
             packet[PLACE, c], packet[SPEED, c] = packet[WANTED, c], packet[WANTED_SPEED, c]

@@ -31,15 +31,19 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import sensor_set
 from hydrotele.machine.sensors import SensorSet
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.scenario.teleoperation import Fault, TeleopPilot
+from hydrotele.scenario.teleoperation import Channel, Fault, TeleopPilot
 from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import contact_force, surrounding_bodies
 from hydrotele.teleop.axis_table import DAMPING, DEADBAND, REACH, flat_view
 from hydrotele.teleop.master import (
+    CONTROLLED,
+    SENT,
     TASK_DAMPING,
+    TASK_MASS,
     TASK_STIFFNESS,
+    WAVES,
     MasterState,
     master,
     master_step,
@@ -47,6 +51,7 @@ from hydrotele.teleop.master import (
     unpack_master,
     unpack_master_state,
 )
+from hydrotele.teleop.network import arrivals, in_periods, load_delays
 from hydrotele.teleop.operator_model import Hand, OperatorModel, pull, unpack_muscles
 from hydrotele.teleop.operator_parameters import held_joystick
 from hydrotele.teleop.slave import (
@@ -75,8 +80,8 @@ class SlaveSide(NamedTuple):
         joint: (nu,) measured [rad] or [m].
         force: (k,) at the tip, task coordinates [N], [N m].
         columns: (k,) places of the arm's joints among the axes.
-        slave: (21 + 13 k,) Slave.
-        state: (52 + 3 k,) SlaveState, written.
+        slave: (23 + 14 k,) Slave.
+        state: (102 + 3 k,) SlaveState, written.
     """
 
     joint: np.ndarray
@@ -92,17 +97,18 @@ class Line(NamedTuple):
     Attributes:
         forward: (n, 3, 6) packets of the master on their way, written: displacement and rate of
             the handle, what is left of the hand's force beyond the joystick's own spring and
-            damper.
-        back: (n, 7, k) packets of the machine on their way, written.
-        packet: (7, k) the last one that the master got, written.
-        lost: (ticks, 2) whether the packet that arrives then is lost: forward, back.
+            damper; of a passive line the sum of waves or the place, and energy, in their place.
+        back: (n, 8, k) packets of the machine on their way, written.
+        packet: (8, k) the last one that the master got, written.
+        age: (ticks, 2) age of the packet that arrives then, forward and back, in ticks; below 0
+            where none arrives that is newer than the last.
         state: (5,) QUIET, SHARE, written, PERIOD, SILENCE, FADING [s].
     """
 
     forward: np.ndarray
     back: np.ndarray
     packet: np.ndarray
-    lost: np.ndarray
+    age: np.ndarray
     state: np.ndarray
 
 
@@ -110,8 +116,8 @@ class MasterSide(NamedTuple):
     """Joystick and operator.
 
     Attributes:
-        master: (160,) Master.
-        state: (63,) MasterState, written.
+        master: (168,) Master.
+        state: (123,) MasterState, written.
         qpos: (7,) of the flotor: position [m] and quaternion.
         muscles: (79,) Muscles, written.
         past: (reflex + 1, 6) see `pull`.
@@ -145,7 +151,7 @@ def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
     Source: `teleop.master`, `teleop.slave`, `teleop.operator_model`.
     """
     joint, force, columns, slave_flat, state_flat = machine
-    forward, back, packet, lost, state = line
+    forward, back, packet, age, state = line
     master_flat, master_state, qpos, hand_flat, past, tremor = operator
     k = len(columns)
     slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
@@ -156,14 +162,16 @@ def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
         arm[i] = joint[columns[i]]
     measure_task(slave, arm, fresh, elapsed, s)
     report(slave, force, s, back[tick % rows])
-    if lost[tick % len(lost), 1]:
+    late = age[tick % len(age), 1]
+    if late < 0:
         state[QUIET] += period
     else:
         state[QUIET] = 0.0
-        for row in range(7):
+        come = back[(tick - late) % rows]
+        for row in range(len(come)):
             for i in range(k):  # a number that is none does not count
-                if np.isfinite(back[(tick + 1) % rows, row, i]):
-                    packet[row, i] = back[(tick + 1) % rows, row, i]
+                if np.isfinite(come[row, i]):
+                    packet[row, i] = come[row, i]
     goal = 0.0 if tripped or state[QUIET] > state[SILENCE] else 1.0
     state[SHARE] += (goal - state[SHARE]) * min(1.0, period / state[FADING])
     numbers = unpack_master(master_flat)
@@ -174,6 +182,8 @@ def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
         own = m.stiffness[i] * m.handle[i] + numbers.axis[i, DAMPING] * m.speed[i]
         ahead[HANDLE, i], ahead[HANDLE_SPEED, i] = m.handle[i], m.speed[i]
         ahead[HAND, i] = m.hand[i] - own
+        if numbers.kind[0] == WAVES or numbers.kind[0] == CONTROLLED:
+            ahead[HANDLE_SPEED, i], ahead[HAND, i] = m.line[i, SENT], m.line[i, SENT + 1]
 
 
 @compiled
@@ -197,15 +207,16 @@ def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, dri
     Source: `teleop.slave`, `control.servo`.
     """
     joint, force, columns, slave_flat, state_flat = machine
-    forward, _, _, lost, state = line
+    forward, _, _, age, state = line
     velocity, arm, volume_head, volume_rod = drive
     k, rows = len(columns), len(forward)
     slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
     measured = np.empty(k)
     for i in range(k):
         measured[i] = joint[columns[i]]
-    coming = tick >= rows - 1 and lost[tick % len(lost), 0]
-    slave_step(slave, forward[(tick + 1) % rows], not coming, force, measured, state[PERIOD], s)
+    late = age[tick % len(age), 0]
+    come = forward[(tick - max(late, 0)) % rows]
+    slave_step(slave, come, late >= 0, force, measured, state[PERIOD], s)
     for i in range(k):
         reference[columns[i]], rate[columns[i]] = s.joint[i], s.joint_rate[i]
     drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod)
@@ -435,6 +446,7 @@ class Station:
                 self._task.update(self._force, self._pose[: len(self._force)])
             self._line.back[:, TASK_STIFFNESS] = self._task.stiffness
             self._line.back[:, TASK_DAMPING] = self._task.damping
+            self._line.back[:, TASK_MASS] = self._task.mass
 
     def _move_flotor(self, data: mujoco.MjData) -> None:
         """One period of the joystick, shaken by the cab if it stands there."""
@@ -576,13 +588,31 @@ def _line(pilot: TeleopPilot, scenario: Scenario, k: int) -> Line:
         if (delay := getattr(channel, name)) >= scenario.duration:
             message = f"{delay:g} s is as long as the run ({scenario.duration:g} s)"
             raise InputError(f"pilot.channel.{name}", message)
+    delays = _delays(scenario, channel, period)
     rng = np.random.default_rng([scenario.seed, 404])
     lost = rng.random((scenario.ticks, 2)) < channel.lost
     lost[: round(channel.lost_from / period)] = False
+    age = np.stack([arrivals(delays[:, side]) for side in range(2)], axis=1)
+    age[lost] = -1
+    longest = np.maximum(delays.max(axis=0), 0)
     return Line(
-        np.zeros((1 + round(channel.delay_forward / period), 3, 6)),
-        np.zeros((1 + round(channel.delay_back / period), 7, k)),
-        np.zeros((7, k)),
-        lost,
+        np.zeros((1 + longest[0], 3, 6)), np.zeros((1 + longest[1], 8, k)), np.zeros((8, k)), age,
         np.array([0.0, 1.0, period, pilot.safety.silence, _FADE]),
-    )
+    )  # fmt: skip
+
+
+def _delays(scenario: Scenario, channel: Channel, period: float) -> np.ndarray:
+    """Delays of all packets in ticks (ticks, 2), forward and back; -1 for those that get lost."""
+    ticks = scenario.ticks
+    if channel.trace:
+        path = Path(scenario.folder, channel.trace)
+        measured = np.stack(load_delays(path), axis=1)
+        found = in_periods(measured, period)
+        if np.any(found.max(axis=0) < 0):
+            raise InputError(path, "all packets of one way are lost; nothing can be steered so")
+        return np.resize(found, (ticks, 2))
+    steady = np.array([channel.delay_forward, channel.delay_back])
+    if not channel.jitter:
+        return np.broadcast_to(np.round(steady / period).astype(int), (ticks, 2))
+    rng = np.random.default_rng([scenario.seed, 405])
+    return in_periods(steady + rng.exponential(channel.jitter, (ticks, 2)), period)

@@ -2,13 +2,15 @@
 
 Where a spring's stiffness may change at any time between two bounds, no change feeds the motion
 more than this one, because at every point of the phase plane it turns the path outwards most. A
-joystick that survives it survives every contact, delay and operator.
+joystick that survives it survives every contact and delay that keep to the bounds, with the hand's
+mass, damper and spring as they are stated; for hands that differ it has to be asked again.
 """
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
@@ -57,8 +59,34 @@ class Spring:
 
     @property
     def margin(self) -> float:
-        """`B^2 - 4 M K_max` [(N s/m)^2]; stable whatever happens, if positive (Zhu 1994, 4.14)."""
+        """`B^2 - 4 M K_max` [(N s/m)^2]; enough if positive, and K_min too (Zhu 1994, 4.14)."""
         return stiffness_margin(self.mass, self.damping, self.most)
+
+    @property
+    def stable_by(self) -> str:
+        """What makes it stable: `theorem`, `switching bound`, or `nothing`.
+
+        Theorem 4-2 asks for `B > 0`, `K_min > 0` and `B^2 > 4 M K_max`. The switching bound asks
+        that the worst switching dies out, which is necessary as well as sufficient.
+        """
+        if self.least > 0.0 and self.damping > 0.0 and self.margin > 0.0:
+            return "theorem"
+        return "switching bound" if self.least > 0.0 and self.growth < 1.0 else "nothing"
+
+    @property
+    def least_damping(self) -> float:
+        """Damping at which the worst switching neither grows nor dies out [N s/m]."""
+        if self.least <= 0.0:
+            return math.inf
+        if self.least == self.most:
+            return 0.0
+
+        def growth(damping: float) -> float:
+            return worst_growth(self.mass, damping, self.least, self.most) - 1.0
+
+        most = self.enough_damping
+        found: float = brentq(growth, 0.0, most, xtol=1e-3 * most)  # pyright: ignore - not full
+        return found
 
     @property
     def growth(self) -> float:

@@ -16,9 +16,9 @@ import numpy as np
 from hydrotele.core.errors import InputError
 
 Block = Callable[[np.ndarray], np.ndarray]  # transfer function of the complex frequency [rad/s]
-_RATE = ("rate_position", "rate_force", "four_channel_rate")
+RATE_STRUCTURES = ("rate_position", "rate_force", "four_channel_rate")
 _DIRECT = ("position_position", "position_force", "four_channel_position")
-STRUCTURES = (*_DIRECT, *_RATE)
+STRUCTURES = (*_DIRECT, *RATE_STRUCTURES)
 _WHERE = "two-port"
 
 
@@ -133,7 +133,7 @@ def two_port(
         raise InputError(_WHERE, f"{structure!r} is not known: {', '.join(STRUCTURES)}")
     if min(delay_forward, delay_back) < 0.0:
         raise InputError(_WHERE, f"delays must not be negative: {delay_forward}, {delay_back} s")
-    if structure in _RATE and not gains.velocity > 0.0:
+    if structure in RATE_STRUCTURES and not gains.velocity > 0.0:
         raise InputError(_WHERE, f"the velocity gain must be positive, got {gains.velocity} 1/s")
     k = gains.velocity
 
@@ -248,10 +248,11 @@ def characteristic(
 
 
 def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
-    """Margin of the theorem of stiffness feedback, `B^2 - 4 M K_max`; stable if positive.
+    """Margin of the theorem of stiffness feedback, `B^2 - 4 M K_max`.
 
-    `M x'' + B x' + K(t) x = 0` with a stiffness that stays between bounds is then uniformly
-    asymptotically stable, however fast it changes, and whatever delay or task changes it.
+    `M x'' + B x' + K(t) x = 0` with a stiffness that stays between `K_min > 0` and K_max is
+    uniformly asymptotically stable if the margin and B are positive, however fast the stiffness
+    changes, and whatever delay or task changes it. With `K_min = 0` the theorem says nothing.
 
     Args:
         mass: of joystick and hand, M [kg] or [kg m^2].
@@ -261,7 +262,7 @@ def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
     Returns:
         The margin.
 
-    Source: Zhu 1994, 4.2.
+    Source: Zhu 1994, theorem 4-2, 4.11-4.14.
 
     >>> stiffness_margin(1.0, 30.0, 200.0)
     100.0

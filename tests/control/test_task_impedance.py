@@ -32,6 +32,31 @@ def test_planted_task_is_recovered(late):
     assert task.stiffness[1] == pytest.approx(STIFFNESS, rel=5e-3)
     assert task.damping[1] == pytest.approx(DAMPING, rel=5e-3)
     assert task.stiffness[0] == 0.0
+    assert task.mass[1] < 0.01 * STIFFNESS  # there is none; 1 % of the force at 1 rad/s
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_planted_mass_is_recovered(late):
+    """Zhu 1994, 3.73-3.74: M, B and K from force, place, rate and acceleration.
+
+    1 %: rate and acceleration are planted by differences of 20 ms.
+    """
+    mass, time = 4.0e4, PERIOD * np.arange(600)
+    turns = 2.0 * np.pi * np.array([[0.3], [0.7], [1.1]])
+    size = np.array([[0.01], [0.004], [0.002]])
+    place = -0.04 - (size * np.sin(turns * time)).sum(axis=0)
+    rate = -(size * turns * np.cos(turns * time)).sum(axis=0)
+    change = (size * turns**2 * np.sin(turns * time)).sum(axis=0)
+    force = -(STIFFNESS * place + DAMPING * rate + mass * change)
+    if late:
+        for band in BANDS:
+            force = filtered(filter_table(band, PERIOD), force)[:, 0]
+    task = TaskImpedance(1, PERIOD, BANDS, late=late)
+    for row in range(600):
+        task.update(force[[row]], place[[row]])
+    assert task.mass[0] == pytest.approx(mass, rel=1e-2)
+    assert task.damping[0] == pytest.approx(DAMPING, rel=1e-2)
+    assert task.stiffness[0] == pytest.approx(STIFFNESS, rel=1e-2)
 
 
 def test_no_task_without_contact_and_no_harm_from_nonsense():

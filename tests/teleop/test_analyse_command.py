@@ -110,3 +110,43 @@ def test_the_shipped_case_has_its_joystick_from_the_thesis():
     assert facts.stiffness and facts.master_control.stiffness == facts.stiffness.nominal
     assert facts.structures == STRUCTURES
     assert facts.stiffness.mass == facts.master.mass
+
+
+def test_robust_has_waves_and_passivity_control(case, tmp_path):
+    """A trace of delays with jitter; the joystick's released handle with rate_position."""
+    trace = tmp_path / "delays.csv"
+    rows = "".join(f"0.0{1 + n % 3},0.02\n" for n in range(300))
+    trace.write_text("forward,back\n" + rows, "utf-8")
+    code, out, _ = invoke(
+        case, "--json", "--robust", "--delays", trace, "--operators", 2, "--period", 0.005,
+        "--structure", "rate_position", "--structure", "passivity_control",
+    )  # fmt: skip
+    document = json.loads(out)
+    assert code == 0 and set(document["structures"]) == {"rate_position"}
+    assert not document["structures"]["rate_position"]["stable_let_go"]
+    assert document["structures"]["rate_position"]["unstable_poles_let_go"] == 2
+    robust = document["robust"]["structures"]
+    assert set(robust) == {"rate_position", "passivity_control"}
+    assert robust["rate_position"]["master_let_go"]["unstable_poles"] == 2
+    assert not robust["rate_position"]["sampled"]["let_go_task"]["stable"]
+    assert robust["passivity_control"]["sampled"]["let_go_task"]["stable"]
+    assert document["stiffness_feedback"]["held"]["stable_by"] == "switching bound"
+
+
+def test_limits_are_numbers(case):
+    code, out, _ = invoke(case, "--out", case.parent / "out", "--structure", "position_position")
+    assert code == 0 and "any" not in out.split("stable:")[0] and "> 10 s" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--structure", "wave_variables"], "--structure: no structure 'wave_variables'"),
+        (["--robust", "--period", "9"], "--period: must be from 0.0001 to 0.1 s"),
+        (["--robust", "--operators", "0"], "--operators: must be from 1"),
+        (["--robust", "--delays", "none.csv"], "none.csv: cannot be read"),
+    ],
+)
+def test_wrong_words_of_robust(case, words, message):
+    code, out, err = invoke(case, *words, "--json", "--structure", "rate_force")
+    assert code == 2 and out == "" and re.search(message, err)

@@ -36,7 +36,7 @@ def built(**changed):
 
 
 def pushed(numbers, s, packet=None, fresh=1.0):
-    reflect(numbers, np.zeros((7, 4)) if packet is None else packet, fresh, PERIOD, s)
+    reflect(numbers, np.zeros((8, 4)) if packet is None else packet, fresh, PERIOD, s)
     return s.push
 
 
@@ -55,7 +55,7 @@ def test_stiffness_feedback_is_the_plain_law(number, x, v, force):
         (gains.most - gains.nominal) / gains.force_limit, gains.damping, gains.force_limit,
         gains.deadband,
     )  # fmt: skip
-    packet = np.zeros((7, 4))
+    packet = np.zeros((8, 4))
     packet[0, int(row[COORDINATE])] = force
     s.handle[number], s.speed[number] = x, v
     contact = -row[SIGN] * force  # against a positive command
@@ -77,7 +77,7 @@ def test_detent_is_the_plain_law(number, x):
 def test_detent_never_pushes_outwards_and_needs_rate_control():
     """A task that softens the spring below what the drop takes leaves no force, not a push out."""
     numbers, s = built(gains="feller", detent=True, stiffness={"z": {"least": 0.0}})
-    packet = np.zeros((7, 4))
+    packet = np.zeros((8, 4))
     packet[0, 2] = 1e6
     s.handle[2] = 1.6e-3
     assert pushed(numbers, s, packet)[2] <= 0.0
@@ -127,7 +127,7 @@ def test_currents_are_limited_as_a_whole():
 def levitated(push, seconds=1.5, **changed):
     """The joystick in a hand, its control, and what muscles (6,) do beyond carrying the hand."""
     numbers, s = built(**changed)
-    flotor, packet = SimulatedFlotor(STICK), np.zeros((7, 4))
+    flotor, packet = SimulatedFlotor(STICK), np.zeros((8, 4))
     muscles = np.asarray(push, float) + np.array([0, 0, 9.81 * STICK.hand.mass, 0, 0, 0])
     for tick in range(round(seconds / PERIOD)):
         master_step(numbers, flotor.data.qpos, packet, 1.0, PERIOD, tick == 0, s)
@@ -197,7 +197,7 @@ def test_a_huge_force_and_none_at_all_leave_the_push_bounded(kind, mode):
 def test_identified_damping_stays_below_what_a_sampled_flotor_bears():
     """At most the joystick's own once more: the handle comes to rest instead of shaking."""
     numbers, s = built(reflection="impedance")
-    packet = np.zeros((7, 4))
+    packet = np.zeros((8, 4))
     packet[5:] = 1e9
     flotor = SimulatedFlotor(STICK)
     muscles = np.array([0, 0, 9.81 * STICK.hand.mass, 0, 0, 0])

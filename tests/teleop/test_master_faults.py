@@ -13,7 +13,7 @@ from tools.handle_laws import Detent
 
 JOYSTICK = load_joystick()
 COORDINATES = ("r", "theta", "z")
-PERIOD, QUIET = 5e-3, np.zeros((7, 3))
+PERIOD, QUIET = 5e-3, np.zeros((8, 3))
 
 
 def at(x=0.0, y=0.0, z=0.0):

@@ -42,9 +42,9 @@ class RoundTrip:
                                       *(np.zeros(6) for _ in range(5)), np.zeros(1),
                                       *(np.zeros(6) for _ in range(3))))  # fmt: skip
         self.forward = np.zeros((1 + forward, 3, 6))
-        self.back, self.packet = np.zeros((1 + back, 7, 4)), np.zeros((7, 4))
-        self.lost = np.zeros((ticks, 2), bool)
-        self.lost[list(lost)] = True
+        self.back, self.packet = np.zeros((1 + back, 8, 4)), np.zeros((8, 4))
+        self.age = np.tile([forward, back], (ticks, 1))
+        self.age[list(lost)] = -1
         self.state = np.array([0.0, 1.0, PERIOD, pilot.safety.silence, FADE])
         self.qpos, self.force = np.array([0.0, 0, 0, 1, 0, 0, 0]), np.zeros(4)
         self.joint = HOME.copy()
@@ -54,7 +54,7 @@ class RoundTrip:
     def step(self, tripped=False):
         flat, k = flat_view, len(AXES)
         machine = SlaveSide(self.joint, self.force, COLUMNS, flat(self.s), flat(self.ss))
-        line = Line(self.forward, self.back, self.packet, self.lost, self.state)
+        line = Line(self.forward, self.back, self.packet, self.age, self.state)
         operator = MasterSide(
             flat(self.m), flat(self.ms), self.qpos, flat(self.hand), np.zeros((2, 6)),
             np.zeros((8, 6)),

@@ -13,13 +13,22 @@ from hydrotele.machine.joystick import load_joystick
 from hydrotele.run.replay import replay_log
 from hydrotele.run.run import begin, run_scenario
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.teleop.axis_table import COUPLING, COUPLING_DAMPING, DAMPING, REFLECTED_MOST
+from hydrotele.teleop.axis_table import (
+    COUPLING,
+    COUPLING_DAMPING,
+    DAMPING,
+    DEADBAND,
+    GAIN,
+    REFLECTED_MOST,
+)
 from hydrotele.teleop.master import master
 
 PERIOD = 0.005
 REFLECTIONS = (
-    "none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance"
+    "none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance",
+    "wave_variables", "passivity_control",
 )  # fmt: skip
+PASSIVE_LINES = REFLECTIONS[-2:]
 PLATE = {"kind": "plate", "position": [6.0, -0.11, 0.3], "size": [0.8, 0.9]}
 DOWN = {"kind": "follow", "time": [0.0, 0.3, 0.6, 4.0], "path": {"z": [0, 0, -0.0025, -0.0025]}}
 SPEEDS = {"r": 0.3, "theta": 0.1, "z": 0.3, "attitude": 0.3}
@@ -62,6 +71,10 @@ def check_sound(run, speeds=SPEEDS):
 @pytest.mark.parametrize("reflection", REFLECTIONS)
 def test_every_structure_goes_down_and_presses(reflection, mode, delay):
     """From free motion into the plate: it touches, and nothing leaves its bounds."""
+    if reflection in PASSIVE_LINES and mode == "rate":
+        with pytest.raises(ValueError, match="needs mode position"):
+            scenario(reflection=reflection, mode=mode)
+        return
     channel = {"delay_forward": delay, "delay_back": delay}
     run = run_scenario(scenario(
         3.0, plate={}, z=0.36, reflection=reflection, mode=mode, channel=channel, force="dynamic"
@@ -83,8 +96,10 @@ def test_direct_force_is_ratio_times_force():
     assert log.force[-100:, 2].mean() > 1e3  # the environment pushes up
 
 
-def test_coordinating_force_is_the_coupling_times_what_the_machine_lags():
-    run = run_scenario(scenario(plate={}, reflection="coordinating_force"))
+def test_coordinating_force_against_the_reference_is_what_the_machine_lags():
+    run = run_scenario(
+        scenario(plate={}, reflection="coordinating_force", coordinating="reference")
+    )
     log, row = run.station.log, numbers_of(run).axis[2]
     start = log.slave("pose")[0, 2]
     pose, seen = log.slave("pose")[:, 2] - start, log.slave("measured")[:, :, 2]
@@ -93,6 +108,91 @@ def test_coordinating_force_is_the_coupling_times_what_the_machine_lags():
     wanted -= row[0] * log.master("handle")[:, 2] + row[DAMPING] * log.master("speed")[:, 2]
     np.testing.assert_allclose(log.master("push")[:, 2], wanted, atol=1e-9)
     assert -(row[COUPLING] * behind)[-1] > 0.0  # reference below the machine: the hand is lifted
+
+
+@pytest.mark.parametrize("mode", ["rate", "position"])
+def test_coordinating_force_of_the_document_compares_with_the_handle(mode):
+    """Zhu 1994, 3.52: C_m (x_h - x_e); 3.53 under rate control: of the integral of the handle."""
+    run = run_scenario(scenario(plate={}, reflection="coordinating_force", mode=mode))
+    log, row = run.station.log, numbers_of(run).axis[2]
+    start, handle, speed = log.slave("pose")[0, 2], log.master("handle"), log.master("speed")
+    seen = log.slave("measured")[:, :, 2] - [start, 0.0]
+    x, v = handle[:, 2], speed[:, 2]
+    if mode == "position":
+        behind, slower = x - seen[:, 0] / row[GAIN], v - seen[:, 1] / row[GAIN]
+    else:
+        rate = row[GAIN] * np.sign(x) * np.maximum(np.abs(x) - row[DEADBAND], 0.0)
+        behind, slower = log.master("integral")[:, 2] - seen[:, 0], rate - seen[:, 1]
+        np.testing.assert_allclose(  # the machine follows within the limit of 0.1 m
+            log.master("integral")[-1, 2], PERIOD * rate.sum(), atol=0.1
+        )
+    wanted = -row[COUPLING] * behind - row[COUPLING_DAMPING] * slower
+    wanted -= row[DAMPING] * v + (row[0] * x if mode == "rate" else 0.0)
+    np.testing.assert_allclose(log.master("push")[:, 2], wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("reflection", PASSIVE_LINES)
+def test_passive_lines_bring_place_and_force_over_a_bad_network(reflection):
+    """100 ms each way, 20 ms of jitter, 2 % lost: the tip follows; the handle gives no energy.
+
+    10 mm of 200 mm: two steps of the handle's tremor of 50 um, times 100, as for four channels.
+    """
+    hand = {"kind": "follow", "time": [0.0, 0.5, 3.5, 12.0],
+            "path": {"z": [0, 0, -0.002, -0.002]}}  # fmt: skip
+    channel = {"delay_forward": 0.1, "delay_back": 0.1, "jitter": 0.02, "lost": 0.02}
+    keys = {"reflection": reflection, "mode": "position", "ratio": 2e-5, "channel": channel}
+    run = run_scenario(scenario(12.0, z=0.9, operator=hand, **keys))
+    pose = run.station.log.slave("pose")[:, 2]
+    handle = run.station.log.master("handle")[:, 2]
+    assert pose[-200:].mean() - pose[0] == pytest.approx(100.0 * handle[-200:].mean(), abs=0.01)
+    run = run_scenario(scenario(
+        12.0, plate={"stiffness": 1e5, "damping": 3e4}, z=0.4, operator=hand, **keys
+    ))  # fmt: skip
+    log, late = run.station.log, slice(-600, None)
+    assert log.force[late, 2].mean() > 500.0  # it bounces: the plate's force is felt late
+    assert run.summary["teleoperation"]["handle_least_energy_J"] > -1e-3
+    # without delay the hand holds the ratio times the machine's force in the mean; 15 %: it swings
+    # by a fifth, and the estimate of the hand's force is a tenth off
+    down = hand | {"path": {"z": [0, 0, -0.003, -0.003]}}
+    keys |= {"operator": down, "channel": {}}
+    run = run_scenario(scenario(12.0, plate={"stiffness": 1e5, "damping": 3e4}, z=0.5, **keys))
+    log = run.station.log
+    force = log.force[late, 2].mean()
+    assert force > 5e3
+    assert log.master("hand")[late, 2].mean() == pytest.approx(-2e-5 * force, rel=0.15)
+
+
+def test_a_trace_of_measured_delays(tmp_path):
+    """A trace of one constant delay is that delay."""
+    (tmp_path / "delays.csv").write_text("forward,back\n0.05,0.1\n", "utf-8")
+    steady = run_scenario(scenario(2.0, channel={"delay_forward": 0.05, "delay_back": 0.1}))
+    case = scenario(2.0, channel={"trace": str(tmp_path / "delays.csv")})
+    traced = run_scenario(case)
+    np.testing.assert_array_equal(
+        steady.station.log.slave("pose"), traced.station.log.slave("pose")
+    )
+    (tmp_path / "delays.csv").write_text("forward,back\n,0.1\n", "utf-8")
+    with pytest.raises(InputError, match="all packets of one way are lost"):
+        run_scenario(case)
+    with pytest.raises(ValueError, match="trace has the delays"):
+        scenario(channel={"trace": "delays.csv", "jitter": 0.1})
+
+
+def test_decoupled_axes_in_the_loop():
+    """Decoupled axes turn the flotor that a hand pushes: the coils then act at its centre of mass.
+
+    The torque of 2.4 N at 0.1 m turns it by degrees until the operator corrects it; with springs at
+    the handle, which is what scenarios use, there is next to none.
+    """
+    hand = {"kind": "follow", "time": [0.0, 0.2, 0.4, 2.0], "path": {"x": [0, 0, 0.004, 0.004]}}
+    turns = {}
+    for kind in ("springs", "decoupled"):
+        run = run_scenario(scenario(2.0, operator=hand, reflection="none", compliance=kind))
+        check_sound(run)
+        turns[kind] = np.abs(run.station.log.master("handle")[:, 3:5]).max()
+        place = run.station.log.master("handle")[-50:, 0].mean()
+        assert place == pytest.approx(0.004, abs=2e-4)  # tremor of 50 um
+    assert turns["springs"] < 0.1 * turns["decoupled"]
 
 
 def test_four_channels_under_position_control_are_transparent_at_rest():

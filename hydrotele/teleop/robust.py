@@ -1,0 +1,371 @@
+"""What a teleoperator withstands: passive hands, drawn operators, stiff tasks, a released handle.
+
+Passivity asks that a two-port gives no energy; absolute stability asks less, that no passive hand
+and no passive task make it unstable (Llewellyn). Between both and the one operator of a case lie
+operators drawn from a spread. Z-width says between which impedances what is felt can lie, and how
+stiff a task may become.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hydrotele.core.errors import InputError
+from hydrotele.teleop.analysis import Case, TeleopCase, first_change, holds
+from hydrotele.teleop.sampled import (
+    SAMPLED_STRUCTURES,
+    PacketAges,
+    Prediction,
+    growth_rate,
+    predict,
+)
+from hydrotele.teleop.two_port import (
+    RATE_STRUCTURES,
+    STRUCTURES,
+    Impedance,
+    OnTheAxis,
+    TwoPort,
+    hybrid,
+    unstable_held,
+)
+
+_FREE = Impedance()
+_SEARCHED = 2.0 * np.pi * np.geomspace(1e-3, 500.0, 3000)  # rad/s
+_FELT = 2.0 * np.pi * np.geomspace(0.1, 5.0, 200)  # rad/s, what a hand moves
+_ROUNDING = 1e-6
+_STIFFER = np.geomspace(1e-3, 1e4, 57)  # times the task's stiffness that are tried
+
+
+def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
+    """Llewellyn's stability parameter; absolutely stable where it is nowhere below 1.
+
+    Args:
+        port: the two-port.
+        s: (...) points of the imaginary axis [rad/s].
+
+    Returns:
+        (...) `(2 Re h11 Re h22 - Re h12 h21) / |h12 h21|` [1]; minus infinity where `Re h11` or
+        `Re h22` is negative, infinity where one way transmits nothing.
+
+    Source: Llewellyn 1952; Haykin 1970, Active network theory; with `[F_h, -V_e] = H [V_h, F_e]`.
+
+    >>> from hydrotele.teleop.two_port import two_port
+    >>> body, firm = Impedance(1.0), Impedance(0.0, 40.0, 400.0)
+    >>> float(llewellyn(two_port("four_channel_position", body, body, firm, firm), 3j).round(6))
+    1.0
+    """
+    h = hybrid(port, np.asarray(s, complex))
+    across = h[..., 0, 1] * h[..., 1, 0]
+    first, second = np.real(h[..., 0, 0]), np.real(h[..., 1, 1])
+    slack = _ROUNDING * np.abs(h)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = (2.0 * first * second - np.real(across)) / np.abs(across)
+    found = np.where(np.abs(across) > 0.0, found, np.inf)
+    return np.where((first < -slack[..., 0, 0]) | (second < -slack[..., 1, 1]), -np.inf, found)
+
+
+def absolutely_stable(port: TwoPort) -> bool:
+    """Whether no passive hand and task make a two-port unstable.
+
+    Args:
+        port: the two-port.
+
+    Returns:
+        True if its hybrid matrix has no pole right of the axis and Llewellyn's parameter is nowhere
+        below 1.
+    """
+    if np.any(llewellyn(port, 1j * _SEARCHED) < 1.0 - _ROUNDING):
+        return False
+    try:
+        return unstable_held(port, _FREE) == 0
+    except OnTheAxis:
+        return False
+
+
+@dataclass(frozen=True)
+class ZWidth:
+    """Between which impedances what is felt can lie, and how stiff the task may be.
+
+    Attributes:
+        frequencies: (n,) [rad/s].
+        free: (n,) felt without a task [N s/m].
+        clamped: (n,) felt with a slave that is held fast [N s/m].
+        stiffest_held: task stiffness up to which it is stable with the hand on [N/m]; infinite if
+            none of those tried is too stiff, 0 if the softest is.
+        stiffest_let_go: the same without a hand.
+        most_tried: largest stiffness tried [N/m].
+    """
+
+    frequencies: np.ndarray
+    free: np.ndarray
+    clamped: np.ndarray
+    stiffest_held: float
+    stiffest_let_go: float
+    most_tried: float
+
+    @property
+    def decades(self) -> float:
+        """Mean of `log10 |clamped| / |free|` over the frequencies that a hand moves [1]."""
+        return float(np.mean(np.log10(np.abs(self.clamped) / np.abs(self.free))))
+
+
+def z_width(case: Case, structure: str, frequencies: np.ndarray = _FELT) -> ZWidth:
+    """Z-width of a structure.
+
+    Args:
+        case: the teleoperator; the task's stiffness is varied, its mass and damping kept.
+        structure: one of `two_port.STRUCTURES`.
+        frequencies: (n,) [rad/s].
+
+    Returns:
+        The widths.
+
+    Raises:
+        InputError: the structure is not known.
+
+    Source: Colgate and Brown 1994 (Z-width); Zhu 1994, 3.4 for what is felt.
+    """
+    port = case.port(structure)
+    h = hybrid(port, 1j * frequencies)
+    clamped = h[:, 0, 0] - h[:, 0, 1] * h[:, 1, 0] / h[:, 1, 1]
+    unit = case.task.stiffness or case.slave_control.stiffness or 1.0
+
+    def stiffest(hand: Impedance) -> float:
+        def right(factor: float) -> bool:
+            task = replace(case.task, stiffness=factor * unit)
+            return holds(port_for(case, structure, task), hand, task)
+
+        if not right(float(_STIFFER[0])):
+            return 0.0
+        found = first_change(right, _STIFFER)
+        return math.inf if found is None else found * unit
+
+    most = float(_STIFFER[-1]) * unit
+    return ZWidth(frequencies, h[:, 0, 0], clamped, stiffest(case.hand), stiffest(_FREE), most)
+
+
+def port_for(case: Case, structure: str, task: Impedance) -> TwoPort:
+    """The structure's two-port with another task."""
+    return replace(case, task=task).port(structure)
+
+
+@dataclass(frozen=True)
+class ReleasedMaster:
+    """The master by itself, as its characteristic polynomial.
+
+    Attributes:
+        coefficients: of falling powers of s.
+        unstable: number of zeros right of the axis.
+    """
+
+    coefficients: np.ndarray
+    unstable: int
+
+
+def released_master(case: Case, structure: str, hand: Impedance = _FREE) -> ReleasedMaster:
+    """The master subsystem without what comes back, in an operator's hand or let go.
+
+    Under position control and rate control with direct force it is `Z_m + C_m + Z_h = 0`. Where the
+    master's own controller acts on the integral, it is `Z_m + C_m / (K_v s) + Z_h = 0` and, let go,
+    `K_v M s^3 + K_v B s^2 + (K_v K + B_mc) s + K_mc = 0` with the master's own M, B and K: without
+    damping B of its own it cannot be stable. K_v of the source is one over the velocity gain here.
+
+    Args:
+        case: the teleoperator.
+        structure: one of `two_port.STRUCTURES`.
+        hand: on the handle; none by default.
+
+    Returns:
+        The polynomial.
+
+    Raises:
+        InputError: the structure is not known.
+
+    Source: Zhu 1994, 3.70-3.72.
+    """
+    if structure not in STRUCTURES:
+        raise InputError("structure", f"{structure!r}; known: {', '.join(STRUCTURES)}")
+    own, control = case.master, case.master_control
+    mass, damping = own.mass + hand.mass, own.damping + hand.damping
+    stiffness = own.stiffness + hand.stiffness
+    if structure in RATE_STRUCTURES and structure != "rate_force":
+        kv = 1.0 / case.gains.velocity
+        found = [kv * mass, kv * damping, kv * stiffness + control.damping, control.stiffness]
+    else:
+        found = [mass, damping + control.damping, stiffness + control.stiffness]
+    roots = np.roots(found)
+    slack = 1e-9 * np.abs(roots).max()
+    return ReleasedMaster(np.array(found), int(np.sum(roots.real > slack)))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Hands and tasks that are drawn: each number log-uniform between two impedances.
+
+    Attributes:
+        hand: least and most [kg], [N s/m], [N/m].
+        task: the same of the task.
+    """
+
+    hand: tuple[Impedance, Impedance]
+    task: tuple[Impedance, Impedance]
+
+    def draw(self, rng: np.random.Generator) -> tuple[Impedance, Impedance]:
+        """One hand and one task; a number that is 0 in either of its bounds is drawn evenly."""
+        hand, task = (_between(least, most, rng) for least, most in (self.hand, self.task))
+        return hand, task
+
+
+# a hand that holds loosely and one that holds firmly, near and far; orders of magnitude after
+# Mussa-Ivaldi, Hogan and Bizzi 1985 and Tsuji et al. 1995, the numbers are assumptions
+HANDS = (Impedance(0.4, 4.0, 80.0), Impedance(0.8, 17.0, 780.0))
+_TASKS = 3.0  # times softer and stiffer than the case's task
+
+
+def spread_of(facts: TeleopCase) -> Spread:
+    """Hands and tasks of a case file, or the usual hands and three times softer or stiffer tasks.
+
+    Args:
+        facts: the case.
+
+    Returns:
+        The spread.
+    """
+    task = facts.task.impedance()
+    hands, tasks = (
+        HANDS,
+        tuple(
+            Impedance(task.mass, k * task.damping, k * task.stiffness)
+            for k in (1.0 / _TASKS, _TASKS)
+        ),
+    )
+    if facts.hands:
+        hands = facts.hands.least.impedance(), facts.hands.most.impedance()
+    if facts.tasks:
+        tasks = facts.tasks.least.impedance(), facts.tasks.most.impedance()
+    return Spread(hands, (tasks[0], tasks[1]))
+
+
+def _between(least: Impedance, most: Impedance, rng: np.random.Generator) -> Impedance:
+    found = []
+    for name in ("mass", "damping", "stiffness"):
+        low, high = getattr(least, name), getattr(most, name)
+        if low > 0.0:
+            found.append(low * (high / low) ** rng.random())
+        else:
+            found.append(low + (high - low) * rng.random())
+    return Impedance(*found)
+
+
+@dataclass(frozen=True)
+class WorstCase:
+    """A structure with many hands and tasks.
+
+    Attributes:
+        pairs: number of hands and tasks drawn.
+        unstable: of them unstable with the hand on.
+        unstable_let_go: the same tasks, handle let go.
+        rate: growth rate of the worst pair with the hand on [1/s].
+        hand: of that pair.
+        task: of that pair.
+    """
+
+    pairs: int
+    unstable: int
+    unstable_let_go: int
+    rate: float
+    hand: Impedance
+    task: Impedance
+
+
+def worst_case(
+    case: Case, structure: str, line: PacketAges, spread: Spread, pairs: int, seed: int = 0
+) -> WorstCase:
+    """Stability over drawn hands and tasks, sampled and with the line's jitter.
+
+    Args:
+        case: the teleoperator.
+        structure: one of `sampled.SAMPLED_STRUCTURES`.
+        line: period and ages of packets.
+        spread: of hands and tasks.
+        pairs: to draw; the same for every structure.
+        seed: of the draw.
+
+    Returns:
+        The worst.
+
+    Raises:
+        InputError: the structure is not known.
+    """
+    rng = np.random.default_rng([seed, 21])
+    unstable, free, worst = 0, 0, (-math.inf, _FREE, _FREE)
+    for _ in range(pairs):
+        hand, task = spread.draw(rng)
+        one = replace(case, hand=hand, task=task)
+        unstable += not predict(one, structure, line).stable
+        free += not predict(replace(one, hand=_FREE), structure, line).stable
+        rate = growth_rate(one, structure, line)
+        if rate > worst[0]:
+            worst = rate, hand, task
+    return WorstCase(pairs, unstable, free, *worst)
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """What one structure withstands.
+
+    Attributes:
+        structure: its name.
+        absolutely_stable: as of Llewellyn; None where there is no linear two-port.
+        llewellyn: least stability parameter [1]; NaN where there is none.
+        width: Z-width, None where there is no linear two-port.
+        released: the master by itself, let go; None for waves and passivity control.
+        sampled: hand on (with the task, free), let go (with the task, free).
+        worst: over drawn hands and tasks.
+    """
+
+    structure: str
+    absolutely_stable: bool | None
+    llewellyn: float
+    width: ZWidth | None
+    released: ReleasedMaster | None
+    sampled: tuple[Prediction, Prediction, Prediction, Prediction]
+    worst: WorstCase
+
+
+def robustness(
+    case: Case, structure: str, line: PacketAges, spread: Spread, pairs: int = 20
+) -> Robustness:
+    """Find what a structure withstands.
+
+    Args:
+        case: the teleoperator.
+        structure: one of `sampled.SAMPLED_STRUCTURES`.
+        line: period and ages of packets.
+        spread: of hands and tasks.
+        pairs: hands and tasks to draw.
+
+    Returns:
+        What was found.
+
+    Raises:
+        InputError: the structure is not known.
+    """
+    if structure not in SAMPLED_STRUCTURES:
+        raise InputError("structure", f"{structure!r}; known: {', '.join(SAMPLED_STRUCTURES)}")
+    linear = structure in STRUCTURES
+    port = case.port(structure) if linear else None
+    four = [
+        predict(replace(case, hand=hand, task=task), structure, line)
+        for hand in (case.hand, _FREE) for task in (case.task, _FREE)
+    ]  # fmt: skip
+    return Robustness(
+        structure,
+        absolutely_stable(port) if port else None,
+        float(llewellyn(port, 1j * _SEARCHED).min()) if port else math.nan,
+        z_width(case, structure) if linear else None,
+        released_master(case, structure) if linear else None,
+        (four[0], four[1], four[2], four[3]),
+        worst_case(case, structure, line, spread, pairs),
+    )

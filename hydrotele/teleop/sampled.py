@@ -1,0 +1,470 @@
+"""Stability of a sampled teleoperator whose packets arrive late and irregularly.
+
+Both sides run at the same period T: coils and servo hold their force over a period, rates are
+backward differences, integrals are sums. Between samples master with hand, and slave with task, are
+masses, dampers and springs, so that one period is an exact map. A packet that is n periods old when
+it is used is the factor `q^n`, `q = 1/z`. With jitter the age changes from period to period; in the
+mean the line is then `E(q) = sum of P(age = n) q^n`. All signals are polynomials of q, and so is
+what is 0 at the poles of the whole loop: its zeros inside `|q| < exp(-sigma T)` are the motions
+that grow faster than sigma, counted by the turns of its phase along that circle. What jitter does
+beyond the mean is `jitter_gain`.
+
+Two structures beyond those of `two_port`, both with the slave's own controller, whose force comes
+back:
+
+- `wave_variables`: `u = (b v + F) / sqrt(2 b)` goes forward, `w = (b v - F) / sqrt(2 b)` comes
+  back, which makes a late line lossless (Niemeyer and Slotine 1991).
+- `passivity_control`: velocity forward, force back, and at either end a controller that lets no
+  more energy out than came in at the other end (Hannaford and Ryu 2002; with delay Ryu, Artigas and
+  Preusche 2010). Nonlinear: it is predicted stable where the line needs no control, or where the
+  slave's end by itself is stable.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from hydrotele.core.errors import InputError
+from hydrotele.teleop.analysis import Case
+from hydrotele.teleop.network import ages_of, in_periods
+from hydrotele.teleop.two_port import RATE_STRUCTURES, STRUCTURES, Impedance
+
+WAVE, PASSIVITY = "wave_variables", "passivity_control"
+SAMPLED_STRUCTURES = (*STRUCTURES, WAVE, PASSIVITY)
+_WHERE = "sampled teleoperator"
+_TURN = 0.5  # rad by which the phase may turn from one point of the circle to the next
+_FIRST = 400
+_MOST = 400_000
+_NEUTRAL = 1e-3  # 1/s: slower than this is drift, as of a free handle, not growth
+_FASTEST = 2e3  # 1/s of growth and decay that are told apart
+# jitter gain at which single runs grow: their power grows as the mean of its logarithm, which for
+# noise of many parts (exponentially distributed power) is the mean's logarithm less Euler's gamma
+_PATHS = math.exp(np.euler_gamma)
+_REFINED = 1e-3  # 1/s, and of the rate
+
+
+@dataclass(frozen=True)
+class PacketAges:
+    """How old packets are when they are used.
+
+    Attributes:
+        period: T of both sides [s].
+        forward: (n,) share of the periods in which the packet from the master is 0 .. n - 1 periods
+            old [1].
+        back: (m,) the same of those from the slave.
+    """
+
+    period: float
+    forward: np.ndarray
+    back: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Refuse what is no distribution."""
+        if not self.period > 0.0:
+            raise InputError(_WHERE, f"the period must be positive, got {self.period:g} s")
+        for name in ("forward", "back"):
+            share = getattr(self, name)
+            if len(share) < 1 or np.any(share < 0.0) or abs(share.sum() - 1.0) > 1e-9:
+                raise InputError(_WHERE, f"the shares of ages {name} must sum to 1")
+
+    @property
+    def mean(self) -> tuple[float, float]:
+        """Mean age of the packets in use, forward and back [s]."""
+        ages = (self.period * np.arange(len(p)) @ p for p in (self.forward, self.back))
+        forward, back = map(float, ages)
+        return forward, back
+
+
+def steady_line(period: float, delay_forward: float, delay_back: float) -> PacketAges:
+    """A line with constant delays, rounded to periods.
+
+    Args:
+        period: T [s].
+        delay_forward: from the master to the slave [s].
+        delay_back: back [s].
+
+    Returns:
+        The line.
+
+    >>> steady_line(0.005, 0.01, 0.0).forward
+    array([0., 0., 1.])
+    """
+    share = [np.eye(1 + round(d / period))[-1] for d in (delay_forward, delay_back)]
+    return PacketAges(period, *share)
+
+
+def jittering_line(
+    period: float, delays_forward: np.ndarray, delays_back: np.ndarray
+) -> PacketAges:
+    """A line with the delays of packets sent one after the other, once a period.
+
+    Args:
+        period: T [s].
+        delays_forward: (n,) [s]; NaN for a packet that is lost.
+        delays_back: (m,) [s].
+
+    Returns:
+        The line; delays are rounded to periods.
+    """
+    return PacketAges(
+        period, *(_shares(in_periods(d, period)) for d in (delays_forward, delays_back))
+    )
+
+
+def _shares(delays: np.ndarray) -> np.ndarray:
+    ages = ages_of(delays)
+    started = np.flatnonzero(ages <= np.arange(len(ages)))
+    if not len(started):
+        raise InputError(_WHERE, "no packet arrives within the delays that are given")
+    ages = ages[started[0] :]
+    return np.bincount(ages) / len(ages)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A mass with damper and spring under a held force; numerators over `below`, at points q."""
+
+    below: np.ndarray
+    place: np.ndarray
+    speed: np.ndarray  # true one
+    change: np.ndarray  # acceleration just before the force steps
+    period: float
+    q: np.ndarray
+
+    @property
+    def rate(self) -> np.ndarray:
+        """Backward difference of the place."""
+        return self.place * (1.0 - self.q) / self.period
+
+    def digital(self, z: Impedance) -> np.ndarray:
+        """Force of a controller made of samples: acceleration, differences and places."""
+        return z.mass * self.change + z.damping * self.rate + z.stiffness * self.place
+
+    def physical(self, z: Impedance) -> np.ndarray:
+        """Force of a body that moves along, as a sensor measures it."""
+        return z.mass * self.change + z.damping * self.speed + z.stiffness * self.place
+
+
+def _side(own: Impedance, held: Impedance, period: float, q: np.ndarray) -> _Side:
+    mass, damping = own.mass + held.mass, own.damping + held.damping
+    stiffness = own.stiffness + held.stiffness
+    block = np.zeros((3, 3))
+    block[0, 1], block[1] = 1.0, (-stiffness / mass, -damping / mass, 1.0 / mass)
+    step = expm(block * period)
+    a, b = step[:2, :2], step[:2, 2]
+    left, det = np.eye(2) - a, float(np.linalg.det(a))
+    e = 1.0 - q  # small where motions are slow: what nearly cancels there is written in it
+    below = np.linalg.det(left) + e * (np.trace(a) - 2.0 * det) + det * e**2
+    place = q * ((1.0 - q * a[1, 1]) * b[0] + q * a[0, 1] * b[1])
+    speed = q * (q * a[1, 0] * b[0] + (1.0 - q * a[0, 0]) * b[1])
+    change = (q * below - damping * speed - stiffness * place) / mass
+    return _Side(below, place, speed, change, period, q)
+
+
+def wave_impedance(case: Case) -> float:
+    """Impedance b of waves [N s/m]; the damping of the slave's controller if none is given."""
+    return case.wave or case.slave_control.damping or 1.0
+
+
+def sampled_characteristic(
+    case: Case, structure: str, line: PacketAges, q: np.ndarray, reflected: float = 1.0
+) -> np.ndarray:
+    """What is 0 at the poles `z = 1/q` of the whole loop, without poles of its own.
+
+    Args:
+        case: the teleoperator with hand and task; its delays are not used, the line has them.
+        structure: one of `SAMPLED_STRUCTURES`; `passivity_control` without its controllers.
+        line: period and ages.
+        q: (...) points.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        (...).
+
+    Raises:
+        InputError: the structure is not known.
+
+    Source: this module's docstring; `two_port.two_port` for the laws.
+    """
+    if structure not in SAMPLED_STRUCTURES:
+        message = f"{structure!r} is not known: {', '.join(SAMPLED_STRUCTURES)}"
+        raise InputError(_WHERE, message)
+    q = np.asarray(q, complex)
+    ahead, home = _late(line.forward, q), reflected * _late(line.back, q)
+    near = _side(case.master, case.hand, line.period, q)
+    far = _side(case.slave, case.task, line.period, q)
+    if structure in (WAVE, PASSIVITY):
+        home = reflected * _after_slave(line, q)
+        return _serial(case, structure == WAVE, near, far, ahead, home)
+    own, forward = _master_laws(case, structure, near)
+    own_slave = far.digital(case.slave_control)
+    back = _slave_law(case, structure, far)
+    free = near.below * ((1.0 - q) if structure in RATE_STRUCTURES else 1.0)
+    return (free + own) * (far.below + own_slave) - ahead * home * forward * back
+
+
+def _late(share: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """E(q), by Horner's rule."""
+    total = np.zeros_like(q)
+    for part in share[::-1]:
+        total = total * q + part
+    return total
+
+
+def _after_slave(line: PacketAges, q: np.ndarray) -> np.ndarray:
+    """E(q) back where the slave answers packets of the same period, after the master has acted."""
+    return _late(line.back, q) - line.back[0] * (1.0 - q)
+
+
+def _master_laws(case: Case, structure: str, near: _Side) -> tuple[np.ndarray, np.ndarray]:
+    """The master's own force, and that on the slave; under rate control times `1 - q`."""
+    firm, own, gains = case.slave_control, case.master_control, case.gains
+    if structure not in RATE_STRUCTURES:
+        forward = gains.position * near.digital(firm)
+        if structure == "four_channel_position":
+            forward = near.digital(firm) + near.digital(case.slave) - near.physical(case.hand)
+        return near.digital(own), forward
+    step = 1.0 - near.q
+
+    def rated(z: Impedance) -> np.ndarray:
+        return gains.velocity * near.place * (z.damping * step + z.stiffness * near.period)
+
+    forward = rated(firm)
+    if structure == "rate_force":
+        return step * near.digital(own), forward
+    if structure == "four_channel_rate":
+        forward = forward - gains.velocity * near.period * near.physical(case.hand)
+    return rated(own), forward
+
+
+def _slave_law(case: Case, structure: str, far: _Side) -> np.ndarray:
+    """Force on the master of the slave's signals."""
+    if structure in ("position_force", "rate_force"):
+        return -case.gains.force * far.physical(case.task)
+    back = far.digital(case.master_control)
+    if structure == "four_channel_position":
+        back = back + far.digital(case.master) - far.physical(case.task)
+    if structure == "four_channel_rate":
+        change = far.physical(case.task) * (1.0 - far.q) / far.period
+        back = back - change / case.gains.velocity
+    return back
+
+
+def _serial(
+    case: Case, waves: bool, near: _Side, far: _Side, ahead: np.ndarray, home: np.ndarray
+) -> np.ndarray:
+    """Line and slave's controller in series: waves, or velocity forward and force back."""
+    step, firm = 1.0 - near.q, case.slave_control
+    held = firm.damping * step + firm.stiffness * near.period  # C = held / step
+    if not waves:
+        alone = step * far.below + held * far.rate
+        return near.below * alone + ahead * home * held * near.rate * far.below
+    b = wave_impedance(case)
+    share = b * step + held  # F_s = b held / share (sqrt(2 / b) U - v_s)
+    slave = share * far.below + b * held * far.rate
+    master = near.below + b * near.rate
+    # determinant of [master, -a home, 2 home D], [-a ahead n, 1 + ahead home, -c ahead home D],
+    # [0, -b c held, slave] with a = sqrt(2 b), c = sqrt(2 / b)
+    first = (1.0 + ahead * home) * slave - ahead * home * 2.0 * held * far.below
+    second = 2.0 * b * near.rate * ahead * home * (slave - 2.0 * held * far.below)
+    return master * first - second
+
+
+def growth_rate(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
+    """Rate of the motion that grows fastest, below 0 where all decay; drift does not count.
+
+    Args:
+        case: as of `sampled_characteristic`.
+        structure: the same.
+        line: period and ages.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        sigma of `exp(sigma t)` [1/s].
+
+    Raises:
+        InputError: the structure is not known, or the phase cannot be followed.
+    """
+    return _fastest(lambda q: sampled_characteristic(case, structure, line, q, reflected), line)
+
+
+def _fastest(function, line: PacketAges) -> float:
+    still = _inside(function, 0.5 * _NEUTRAL * line.period, centre=1.0)
+
+    def grows(rate: float) -> bool:
+        many = _inside(function, math.exp(-rate * line.period))
+        return many > (still if rate < 0.0 else 0)
+
+    least, most = (0.0, _FASTEST) if grows(_NEUTRAL) else (-_FASTEST, 0.0)
+    least, most = (_NEUTRAL, most) if most else (least, -_NEUTRAL)
+    if grows(most):
+        return most
+    while most - least > _REFINED * (1.0 + abs(most)):
+        middle = 0.5 * (least + most)
+        least, most = (middle, most) if grows(middle) else (least, middle)
+    return 0.5 * (least + most)
+
+
+def _inside(function, radius: float, centre: float = 0.0) -> int:
+    """Zeros of a function without poles inside a circle about a real centre."""
+    angle = np.concatenate([[0.0], np.geomspace(1e-7, math.pi, _FIRST)])
+    values = function(centre + radius * np.exp(1j * angle))
+    while True:
+        wide = np.flatnonzero(np.abs(np.angle(values[1:] / values[:-1])) > _TURN)
+        if not len(wide):
+            break
+        between = 0.5 * (angle[wide] + angle[wide + 1])
+        if len(angle) + len(wide) > _MOST or np.any(between == angle[wide]):
+            raise InputError(_WHERE, "the phase cannot be followed: a pole lies on the circle")
+        angle = np.insert(angle, wide + 1, between)
+        values = np.insert(values, wide + 1, function(centre + radius * np.exp(1j * between)))
+    return round(float(np.angle(values[1:] / values[:-1]).sum()) / math.pi)
+
+
+def _angles() -> np.ndarray:
+    """Points of the unit circle up to half the sampling rate."""
+    return np.exp(-1j * np.geomspace(1e-6, math.pi, 4000))
+
+
+def passive_end(case: Case, line: PacketAges) -> bool:
+    """Whether what the line meets at the slave is passive as it is sampled.
+
+    The slave's controller on its mass and task, `C / (1 + C v_s)` from the velocity that is asked
+    for to the force, must have no negative real part up to half the sampling rate, and be stable.
+    Where it is, a line that gives no energy cannot make the loop unstable.
+
+    Args:
+        case: the teleoperator with its task.
+        line: of which the period counts.
+
+    Returns:
+        Whether it is.
+
+    Source: Colgate and Schenkel 1997 (passivity of sampled walls); passivity theorem.
+    """
+    q = _angles()
+    far, firm = _side(case.slave, case.task, line.period, q), case.slave_control
+    held = firm.damping * (1.0 - q) + firm.stiffness * line.period
+    port = held * far.below / ((1.0 - q) * far.below + held * far.rate)
+    grows = _inside(lambda p: slave_characteristic(case, line, p), math.exp(_NEUTRAL * line.period))
+    return bool(np.all(port.real > -1e-6 * np.abs(port))) and not grows
+
+
+def _answers(case: Case, structure: str, line: PacketAges, q: np.ndarray, reflected: float):
+    """What master and slave send per what they receive, at points q."""
+    near = _side(case.master, case.hand, line.period, q)
+    far = _side(case.slave, case.task, line.period, q)
+    if structure == WAVE:
+        b, firm = wave_impedance(case), case.slave_control
+        held = firm.damping * (1.0 - q) + firm.stiffness * line.period
+        master = (b * near.rate - near.below) / (b * near.rate + near.below)
+        share = b * (1.0 - q) + held
+        return master, 1.0 - 2.0 * held * far.below / (share * far.below + b * held * far.rate)
+    own, forward = _master_laws(case, structure, near)
+    free = near.below * ((1.0 - q) if structure in RATE_STRUCTURES else 1.0)
+    back = reflected * _slave_law(case, structure, far)
+    return forward / (free + own), back / (far.below + far.digital(case.slave_control))
+
+
+def jitter_gain(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
+    """How much of the noise that jitter makes comes back as noise; in the mean square.
+
+    A signal of frequency w through a line of random age leaves `E(q)` of it, and noise with the
+    share `1 - |E(q)|^2` of its power, white if the ages of successive packets are independent. The
+    noise goes round the loop, at either end through the closed loop's transfer functions, and makes
+    new noise: the spectral radius of that map of powers.
+
+    Args:
+        case: the teleoperator with hand and task.
+        structure: a linear one.
+        line: period and ages.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        The radius [1], which means something only where the loop is stable in the mean. Below 1 the
+        mean square dies out; single runs do so up to `exp(0.577)`, about 1.78.
+
+    Source: mean-square small gain, Elia 2005 (Remote stabilization over fading channels).
+    """
+    angle = np.geomspace(1e-4, math.pi, 6000)
+    q = np.exp(-1j * angle)
+    master, slave = _answers(case, structure, line, q, reflected)
+    ahead = _late(line.forward, q)
+    home = _after_slave(line, q) if structure == WAVE else _late(line.back, q)
+    left = 1.0 - master * slave * ahead * home
+    powers = np.array([
+        [master * home * slave / left, master / left],
+        [slave / left, slave * ahead * master / left],
+    ])  # fmt: skip
+    share = 1.0 - np.abs(np.array([ahead, home])[:, None]) ** 2
+    table = np.trapezoid(np.abs(powers) ** 2 * share, angle, axis=-1) / math.pi
+    return float(np.abs(np.linalg.eigvals(table)).max())
+
+
+def slave_characteristic(case: Case, line: PacketAges, q: np.ndarray) -> np.ndarray:
+    """What is 0 at the poles of the slave on its controller and task, with a held reference.
+
+    Args:
+        case: the teleoperator with its task.
+        line: of which the period counts.
+        q: (...) points.
+
+    Returns:
+        (...).
+    """
+    far = _side(case.slave, case.task, line.period, np.asarray(q, complex))
+    return far.below + far.digital(case.slave_control)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What is predicted of a sampled structure.
+
+    Attributes:
+        stable: whether a disturbance dies out; under passivity control, whether it stays bounded.
+        reason: `poles`, `jitter` (noise that jitter makes grows, though the mean does not), or of
+            passivity control `slave alone` (its own controller is unstable), `no control needed`,
+            `passive ends`, `bounded` (the slave's end is stable and not passive).
+    """
+
+    stable: bool
+    reason: str
+
+
+def predict(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> Prediction:
+    """Predict whether a sampled structure is stable.
+
+    Args:
+        case: the teleoperator with hand and task.
+        structure: one of `SAMPLED_STRUCTURES`.
+        line: period and ages.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        The prediction.
+
+    Raises:
+        InputError: the structure is not known, or the phase cannot be followed.
+    """
+
+    def whole(q: np.ndarray) -> np.ndarray:
+        return sampled_characteristic(case, structure, line, q, reflected)
+
+    def alone(q: np.ndarray) -> np.ndarray:
+        return slave_characteristic(case, line, q)
+
+    slowest = math.exp(-_NEUTRAL * line.period)
+    steady = _inside(whole, slowest) == 0
+    if structure != PASSIVITY:
+        if not steady:
+            return Prediction(False, "poles")
+        if jitter_gain(case, structure, line, reflected) >= _PATHS:
+            return Prediction(False, "jitter")
+        return Prediction(True, "poles")
+    if steady:
+        return Prediction(True, "no control needed")
+    if _inside(alone, slowest):
+        return Prediction(False, "slave alone")
+    return Prediction(True, "passive ends" if passive_end(case, line) else "bounded")

@@ -1,0 +1,293 @@
+"""A sampled teleoperator in time, packet by packet: confirms what `sampled` predicts.
+
+Master with hand and slave with task are integrated with many steps a period. Every period each
+side measures, sends a packet and uses the newest one that has arrived; packets have their own
+delays, may overtake each other and get lost. Independent of `sampled`: nothing here is a
+polynomial, a mean or a prediction, and waves and passivity control are the nonlinear laws that
+teleoperated scenarios use (`passive_line`).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.core.compiled import compiled
+from hydrotele.teleop.analysis import Case
+from hydrotele.teleop.network import ages_of, in_periods
+from hydrotele.teleop.passive_line import (
+    END,
+    ENERGY,
+    GONE_IN,
+    controlled_master,
+    controlled_slave,
+    wave_master,
+    wave_slave,
+)
+from hydrotele.teleop.sampled import PASSIVITY, WAVE, wave_impedance
+from hydrotele.teleop.two_port import RATE_STRUCTURES, Impedance
+
+# what a side measures: sum, place, difference, acceleration, sum and difference of the force on
+# hand or task, that force
+SUM, X, V, A, IMPULSE, CHANGE, FORCE = range(7)
+_SIGNALS = 7
+_PER_RATE = 0.1  # integration steps over the time constant of the fastest rate
+_TRICKLE = 1e-5  # W of passivity control: in a run less than a tenth of the kick's energy
+_KICK = np.array([0.1, 0.03])  # m/s, of master and slave
+_BLOCKS = 40
+_GROWN, _GONE = 1e8, 1e-8  # times the kick
+_LINEAR, _WAVES, _CONTROLLED = range(3)
+
+
+class Motion(NamedTuple):
+    """What a kick did.
+
+    Attributes:
+        largest: (40,) of both speeds in fortieths of the run [m/s]; 0 after it was ended.
+        grows: whether late motion is larger than early one; under passivity control, which bounds
+            motions and need not end them, whether it has more kinetic energy than the kick gave.
+        line_energy: (periods,) energy that the line has taken in, of both ends [J]; 0 of the six
+            structures without waves or passivity control.
+    """
+
+    largest: np.ndarray
+    grows: bool
+    line_energy: np.ndarray
+
+    @property
+    def dies_out(self) -> bool:
+        """Whether less than a thousandth of the kick is left in the end."""
+        return bool(self.largest[self.largest > 0.0][-1] < 1e-3 * _KICK.max())
+
+
+def laws(case: Case, structure: str, reflected: float = 1.0) -> np.ndarray:
+    """Coefficients on what a side measures.
+
+    Args:
+        case: the teleoperator.
+        structure: one of `two_port.STRUCTURES`.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        (4, 7): own force of the master, force on the slave from the master's packet, own force of
+        the slave, force on the master from the slave's packet.
+
+    Source: Zhu 1994, 3.9-3.62.
+    """
+    made, gains, rate = np.zeros((4, _SIGNALS)), case.gains, structure in RATE_STRUCTURES
+    own, forward, slave, back = made
+
+    def add(row: np.ndarray, z: Impedance, place: int, factor: float = 1.0) -> None:
+        row[place : place + 2] += factor * np.array([z.stiffness, z.damping])
+        if place == X:
+            row[A] += factor * z.mass
+
+    add(slave, case.slave_control, X)
+    ahead = gains.velocity if rate else gains.position
+    if structure == "four_channel_position":
+        ahead = 1.0
+    add(forward, case.slave_control, SUM if rate else X, ahead)
+    shared = structure in ("rate_position", "four_channel_rate")
+    add(own, case.master_control, SUM if shared else X, gains.velocity if shared else 1.0)
+    if structure in ("position_force", "rate_force"):
+        back[FORCE] = -gains.force
+    else:
+        add(back, case.master_control, X)
+    if structure == "four_channel_position":
+        add(forward, case.slave, X)
+        add(back, case.master, X)
+        forward[FORCE], back[FORCE] = -1.0, -1.0
+    if structure == "four_channel_rate":
+        forward[IMPULSE], back[CHANGE] = -gains.velocity, -1.0 / gains.velocity
+    back *= reflected
+    return made
+
+
+def kick(
+    case: Case, structure: str, period: float, delays_forward: np.ndarray, delays_back: np.ndarray,
+    reflected: float = 1.0,
+) -> Motion:  # fmt: skip
+    """Simulate a kick of master and slave.
+
+    Args:
+        case: the teleoperator with hand and task; the delays are those given here.
+        structure: one of `sampled.SAMPLED_STRUCTURES`.
+        period: T of both sides [s].
+        delays_forward: (n,) of the packets sent in every period, which tells the length of the run
+            [s]; NaN where lost.
+        delays_back: (n,) the same from the slave.
+        reflected: factor on what comes back [1].
+
+    Returns:
+        What happened.
+
+    Source: this module's docstring.
+    """
+    way = _LINEAR
+    table = np.zeros((4, _SIGNALS))
+    if structure in (WAVE, PASSIVITY):
+        way = _WAVES if structure == WAVE else _CONTROLLED
+    else:
+        table = laws(case, structure, reflected)
+    ages = [ages_of(in_periods(d, period)) for d in (delays_forward, delays_back)]
+    firm = case.slave_control
+    bodies = np.array([
+        [a.mass, a.damping, a.stiffness, b.mass, b.damping, b.stiffness]
+        for a, b in ((case.master, case.hand), (case.slave, case.task))
+    ])  # fmt: skip
+    steps = max(1, math.ceil(period * _fastest_rate(bodies) / _PER_RATE))
+    numbers = np.array([period, firm.stiffness, firm.damping, wave_impedance(case)])
+    largest, moving, energy = _march(way, table, bodies, numbers, steps, ages[0], ages[1], _KICK)
+    given = 0.5 * float((bodies[:, 0] + bodies[:, 3]) @ _KICK**2)
+    grows = _beyond(moving, given) if way == _CONTROLLED else _grows(largest)
+    return Motion(largest, grows, energy)
+
+
+def _fastest_rate(bodies: np.ndarray) -> float:
+    mass, damping, stiffness = bodies[:, :3].T + bodies[:, 3:].T
+    return float(max((damping / mass).max(), np.sqrt(stiffness / mass).max()))
+
+
+_GROWTH = 1.05  # of what moved before, that a drift stays below
+
+
+def _grows(largest: np.ndarray) -> bool:
+    """Whether the last quarter of the run moves more than the second one."""
+    reached = int(np.count_nonzero(largest > 0.0))
+    if reached < _BLOCKS:
+        return bool(largest[reached - 1] > _KICK.max())
+    quarter = _BLOCKS // 4
+    return bool(largest[-quarter:].max() > _GROWTH * largest[quarter : 2 * quarter].max())
+
+
+def _beyond(largest: np.ndarray, given: float) -> bool:
+    """Whether late motion has more energy than the kick gave."""
+    late = largest[largest > 0.0][-_BLOCKS // 4 :]
+    return bool(late.max() > _GROWTH * given)
+
+
+@compiled
+def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
+    """Largest speeds (40,) and kinetic energies (40,), and energy in the line (n,)."""
+    count = len(age_forward)
+    period = numbers[0]
+    largest, moving, energy = np.zeros(_BLOCKS), np.zeros(_BLOCKS), np.zeros(count)
+    sent = np.zeros((2, count, _SIGNALS))
+    state = np.zeros((2, 2))  # place, speed
+    state[0, 1], state[1, 1] = first[0], first[1]
+    seen, force = np.zeros((2, _SIGNALS)), np.zeros(2)
+    ends, come = np.zeros((2, END)), np.zeros((2, _SIGNALS))
+    for n in range(count):
+        for side in range(2):
+            _measure(bodies[side], state[side], force[side], period, seen[side])
+        newest = n - age_forward[n], n - age_back[n]
+        if way == _LINEAR:
+            sent[0, n], sent[1, n] = seen[0], seen[1]
+            for side in range(2):
+                if newest[side] >= 0:  # else none has come yet
+                    come[side] = sent[side, newest[side]]
+            for side in range(2):
+                force[side] = 0.0
+                for j in range(_SIGNALS):
+                    force[side] -= table[2 * side, j] * seen[side, j]
+                    force[side] += table[3 - 2 * side, j] * come[1 - side, j]
+        elif way == _WAVES:
+            _waves(n, newest[0], newest[1], numbers, seen, sent, ends, force)
+        else:
+            _controlled(n, newest[0], newest[1], numbers, bodies[0, 0], seen, sent, ends, force)
+        energy[n] = ends[0, ENERGY] + ends[1, ENERGY]
+        for side in range(2):
+            _integrate(bodies[side], state[side], force[side], period, steps)
+        block = n * _BLOCKS // count
+        speed = abs(state[0, 1]) + abs(state[1, 1])
+        largest[block] = max(largest[block], speed)
+        kinetic = 0.0
+        for side in range(2):
+            kinetic += 0.5 * (bodies[side, 0] + bodies[side, 3]) * state[side, 1] ** 2
+        moving[block] = max(moving[block], kinetic)
+        if (n + 1) * _BLOCKS % count < _BLOCKS:
+            if largest[block] < _GONE * first[0] or not largest[block] < _GROWN * first[0]:
+                break
+    return largest, moving, energy
+
+
+@compiled
+def _measure(body, state, force, period, seen):
+    """Sensors of a side, just before its force changes."""
+    x, v = state[0], state[1]
+    mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
+    a = (force - damping * v - stiffness * x) / mass
+    held = body[3] * a + body[4] * v + body[5] * x
+    seen[SUM] += period * x
+    seen[V] = (x - seen[X]) / period
+    seen[X], seen[A] = x, a
+    seen[IMPULSE] += period * held
+    seen[CHANGE] = (held - seen[FORCE]) / period
+    seen[FORCE] = held
+
+
+# of packets: sum of all waves, place of the master or force of the slave; their energy
+TOTAL, BUDGET = range(2)
+
+
+@compiled
+def _newest(sent, row, n):
+    """Sum or signal, and energy, of a packet; zeros before any has come."""
+    if row < 0:
+        return 0.0, 0.0
+    return sent[min(row, n), TOTAL], sent[min(row, n), BUDGET]
+
+
+@compiled
+def _waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force):
+    """Both ends of waves; the master acts first, so that it knows of the slave's last period."""
+    period, stiffness, damping, b = numbers[0], numbers[1], numbers[2], numbers[3]
+    total, budget = _newest(sent[1], newest_back, n - 1)
+    pushed, wave = wave_master(seen[0, V], total, budget, b, period, ends[0])
+    _send(sent[0], n, wave, period)
+    total, budget = _newest(sent[0], newest_forward, n)
+    pull, wave = wave_slave(seen[1, V], total, budget, stiffness, damping, b, period, ends[1])
+    _send(sent[1], n, wave, period)
+    force[0], force[1] = -pushed, pull
+
+
+@compiled
+def _send(sent, n, wave, period):
+    before, energy = 0.0, 0.0
+    if n > 0:
+        before, energy = sent[n - 1, TOTAL], sent[n - 1, BUDGET]
+    sent[n, TOTAL] = before + period * wave
+    sent[n, BUDGET] = energy + period * wave * wave
+
+
+@compiled
+def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends, force):
+    """Both ends of passivity control; the master acts first, as for waves."""
+    period, stiffness, damping = numbers[0], numbers[1], numbers[2]
+    total, budget = _newest(sent[1], newest_back, n - 1)
+    force[0] = -controlled_master(seen[0, V], total, budget, mass, period, ends[0])
+    sent[0, n, TOTAL], sent[0, n, BUDGET] = seen[0, X], ends[0, GONE_IN]
+    total, budget = _newest(sent[0], newest_forward, n)
+    force[1] = controlled_slave(
+        seen[1, V], total, budget, stiffness, damping, _TRICKLE, period, ends[1]
+    )
+    sent[1, n, TOTAL], sent[1, n, BUDGET] = force[1], ends[1, GONE_IN]
+
+
+@compiled
+def _integrate(body, state, force, period, steps):
+    """Runge and Kutta's method of fourth order over a period with a held force."""
+    mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
+    h = period / steps
+    x, v = state[0], state[1]
+    for _ in range(steps):
+        a = (force - damping * v - stiffness * x) / mass
+        x2, v2 = x + 0.5 * h * v, v + 0.5 * h * a
+        a2 = (force - damping * v2 - stiffness * x2) / mass
+        x3, v3 = x + 0.5 * h * v2, v + 0.5 * h * a2
+        a3 = (force - damping * v3 - stiffness * x3) / mass
+        x4, v4 = x + h * v3, v + h * a3
+        a4 = (force - damping * v4 - stiffness * x4) / mass
+        x += h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+        v += h / 6.0 * (a + 2.0 * a2 + 2.0 * a3 + a4)
+    state[0], state[1] = x, v
