@@ -109,6 +109,7 @@ def compare(
 DRIVE_EPILOG = """\b
 Examples:  hydrotele drive   |   hydrotele drive fell_tree --device gamepad
            hydrotele drive --device scripted:moves.csv --no-viewer --speed 0
+           hydrotele drive --device haptic:127.0.0.1:5610   |   hydrotele drive --latency
 
 \b
 Keyboard: every press moves an axis on by a quarter of its way, where it stays; space centres all.
@@ -120,6 +121,11 @@ Keyboard: every press moves an axis on by a quarter of its way, where it stays; 
 Gamepad: left stick out/in and swing, right stick raise/lower and tool, shoulders head, cross pad
 further axes, B all off, Start ends. SpaceMouse: push the way the tip shall go; its buttons switch
 the first two further axes, both together all off.
+
+\b
+haptic:HOST:PORT: a device with force output whose server (hydrotele haptic-device) runs there. The
+reflection answers it at its own rate, 1 kHz, beside the machine. --latency shows delays and missed
+deadlines; without --device it starts a simulated device in a process of its own, for 60 s.
 """
 
 
@@ -132,7 +138,7 @@ def drive(
     ] = None,
     tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")] = None,
     device: Annotated[
-        str, typer.Option("--device", "-d", help="keyboard, gamepad, spacemouse or scripted:FILE.")
+        str, typer.Option("--device", "-d", help="keyboard, gamepad, spacemouse, haptic:HOST:PORT, scripted:FILE.")
     ] = "keyboard",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder to write; default runs/SCENARIO.")
@@ -149,6 +155,9 @@ def drive(
     ] = 1.0,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
     effects: EffectFiles = None,
+    latency: Annotated[
+        bool, typer.Option("--latency", help="Show latency, jitter and missed deadlines.")
+    ] = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
@@ -169,8 +178,46 @@ def drive(
             speed,
             review,
             json,
+            latency,
         )  # fmt: skip
     )
+
+
+HAPTIC_EPILOG = """\b
+Examples:  hydrotele haptic-device                       # a simulated one, for hydrotele drive --device haptic
+           hydrotele haptic-device --kind force-dimension --host 0.0.0.0   # for a machine elsewhere
+
+\b
+The server reads the handle and writes forces at 1 kHz and speaks UDP (hydrotele.haptics.packets). It
+gives no force while no machine answers, and never more than the device may give. Whoever can send
+packets to it moves the device: listen on other addresses than this computer's own only in a network
+of your own.
+"""
+
+
+def haptic_device(
+    kind: Annotated[
+        str, typer.Option("--kind", help="simulated or force-dimension.")
+    ] = "simulated",
+    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: a free one.")] = 5610,
+    rate: Annotated[float, typer.Option("--rate", min=50, max=4000, help="Periods per s.")] = 1000,
+    duration: Annotated[
+        float | None, typer.Option("--duration", help="Seconds; default until Ctrl-C.")
+    ] = None,
+    until_eof: Annotated[
+        bool, typer.Option("--until-eof", help="End when the input is closed.", hidden=True)
+    ] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
+    ] = False,
+) -> None:
+    """Serve a haptic device to a machine: poses out, wrenches in, with a watchdog."""
+    from hydrotele.cli.haptic import HapticOptions, serve_device
+
+    pass
+
+    serve_device(HapticOptions(kind, host, port, rate, duration, until_eof, json))
 
 
 SWEEP_EPILOG = """\b
@@ -290,6 +337,7 @@ def run(
 
 
 app.command(epilog=DRIVE_EPILOG)(drive)
+app.command("haptic-device", epilog=HAPTIC_EPILOG)(haptic_device)
 app.command(epilog=SWEEP_EPILOG)(sweep)
 app.command(epilog=COMPARE_EPILOG)(compare)
 

@@ -12,6 +12,7 @@ Delay lines are rings: what is written at a tick is read as many ticks later as 
 """
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,6 +41,7 @@ from hydrotele.teleop.axis_table import DAMPING, DEADBAND, REACH, flat_view
 from hydrotele.teleop.master import (
     TASK_DAMPING,
     TASK_STIFFNESS,
+    Master,
     MasterState,
     master,
     master_step,
@@ -65,6 +67,11 @@ from hydrotele.teleop.slave import (
 )
 
 QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
+
+Exchange = Callable[[np.ndarray, np.ndarray, float, np.ndarray], None]
+"""What a device does once per control tick: writes where its handle is, (7,) as the flotor's [m]
+and quaternion, not a number without one; and takes the machine's packet (7, k), the share of it that
+counts, and the further force on the handle (6,) [N], [N m]."""
 
 
 class SlaveSide(NamedTuple):
@@ -375,6 +382,27 @@ class Station:
         self._said: set[str] = set()
         self.tripped = False
         self._faults = [_Fault(fault, plan.axes) for fault in pilot.faults]
+        self._exchange: Exchange | None = None
+
+    def attach(self, exchange: Exchange) -> None:
+        """Let a device in a person's hand take the place of the simulated joystick.
+
+        Its own loop reflects what comes back; here the same law runs once more, for the logs.
+
+        Args:
+            exchange: called once per control tick, see `Exchange`.
+        """
+        self._exchange = exchange
+
+    @property
+    def numbers(self) -> Master:
+        """Numbers of the master's control."""
+        return self._master
+
+    @property
+    def packet(self) -> np.ndarray:
+        """(7, k) the last packet that came from the machine, see `teleop.master`."""
+        return self._line.packet
 
     @property
     def span(self) -> np.ndarray:
@@ -401,6 +429,9 @@ class Station:
                 self._pilot.tip_over, self._master, self._line.packet, self._slave.start,
                 self._m.handle, self._m.speed, self._m.extra,
             )  # fmt: skip
+        if self._exchange:
+            share = float(self._line.state[SHARE])
+            self._exchange(self._qpos, self._line.packet, share, self._m.extra)
         if tick % self.operator.every == 0:
             self.operator.decide(tick)
         operator = self.operator
@@ -436,6 +467,8 @@ class Station:
 
     def _move_flotor(self, data: mujoco.MjData) -> None:
         """One period of the joystick, shaken by the cab if it stands there."""
+        if self._exchange:
+            return
         currents, muscles = self._m.currents, self.operator.muscles.force
         if self._swing < 0:
             self._flotor.step(currents, muscles)

@@ -1,0 +1,94 @@
+"""A haptic device at the place of the joystick: what it asks for, and what the line has seen."""
+
+from hydrotele.core.errors import InputError
+from hydrotele.haptics.link import Link
+from hydrotele.haptics.server import PORT
+from hydrotele.run.devices import Reading, Switches
+from hydrotele.run.session import Session
+
+HAPTIC = "haptic"
+LOCAL = "127.0.0.1"
+RATE = 1000.0  # Hz of the machine's control beside a device; one physics step per tick
+
+
+def haptic_address(device: str) -> tuple[str, int]:
+    """Host and port of `haptic`, `haptic:HOST` or `haptic:HOST:PORT`.
+
+    Args:
+        device: as the command line has it.
+
+    Returns:
+        Host and port; this computer and the usual port where they are left out.
+
+    Raises:
+        InputError: it is none of these.
+
+    >>> haptic_address("haptic:10.0.0.7")
+    ('10.0.0.7', 5610)
+    """
+    parts = device.split(":")
+    host = parts[1] if len(parts) > 1 else LOCAL
+    port = parts[2] if len(parts) > 2 else str(PORT)
+    right = parts[0] == HAPTIC and len(parts) <= 3 and host and port.isdecimal()
+    if not right or not 0 < int(port) < 65536:
+        raise InputError(f"--device {device}", "must be haptic, haptic:HOST or haptic:HOST:PORT")
+    return host, int(port)
+
+
+class HapticHandle:
+    """The handle of a haptic device whose server runs elsewhere.
+
+    Its buttons switch the axes that the joystick does not move, as those of a SpaceMouse do.
+
+    Attributes:
+        link: the line to the server.
+    """
+
+    def __init__(self, host: str, port: int, further: int) -> None:
+        """Open the line.
+
+        Args:
+            host: of the server.
+            port: of the server.
+            further: number of axes that the joystick does not move.
+
+        Raises:
+            InputError: there is no such host.
+        """
+        self.link, self._switches = Link(host, port), Switches(further)
+        self._held, self._there, self._engaged = 0, None, False
+        self._count = further
+
+    def attach(self, session: Session) -> None:
+        """Take the place of the simulated joystick of a session."""
+        assert session.station
+        station = session.station
+        self.link.start(station.numbers, station.packet.shape)
+        station.attach(self.link.exchange)
+
+    def read(self, time: float) -> Reading:
+        """What the buttons ask for, and whether the device has come or gone."""
+        pose, said = self.link.pose(), ""
+        there = pose is not None
+        if there != self._there:
+            if there:
+                said = "the haptic device is there: centre the handle to take over"
+            elif self._there:
+                said = "the haptic device is silent: the machine has no command"
+                self._switches.off()
+            else:
+                said = "no haptic device answers yet; start hydrotele haptic-device there"
+            self._there = there
+        elif self.link.engaged and not self._engaged:
+            said = "the handle moves the machine"
+        self._engaged = self.link.engaged
+        if pose:
+            pressed, self._held = pose.buttons & ~self._held, pose.buttons
+            for number in range(self._count):
+                if pressed >> number & 1:
+                    self._switches.turn(number)
+        return Reading(commands=tuple(self._switches.commands), said=said)
+
+    def close(self) -> None:
+        """Close the line; the device then goes limp."""
+        self.link.close()
