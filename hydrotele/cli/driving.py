@@ -1,17 +1,16 @@
 """`hydrotele drive`: a person drives a machine, into a folder like a run's."""
 
 import contextlib
-import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from hydrotele.cli.console import notes, out, print_json
+from hydrotele.cli.console import first_interrupt, notes, out, print_json
 from hydrotele.cli.haptic import own_device, print_latency
 from hydrotele.cli.running import print_summary, write_run
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
-from hydrotele.haptics.timing import Deadlines, load_of_machine, steady, summary_of
+from hydrotele.haptics.timing import Deadlines, load_of_machine, summary_of
 from hydrotele.run.devices import Device, Keyboard, open_device
 from hydrotele.run.haptic import HAPTIC, RATE, HapticHandle, haptic_address
 from hydrotele.run.live import Pacer, Status, Watch, drive, further_axes
@@ -75,23 +74,20 @@ def _driven(wishes: DriveOptions) -> Path:
     haptic = _is_haptic(wishes)
     if haptic:
         device = HapticHandle(*haptic_address(wishes.device), len(further))
-        pacer = Deadlines(scenario.ticks)
+        pacer = Deadlines(scenario.ticks, _PRIORITY)
     else:
         device, pacer = open_device(wishes.device, further), Pacer(wishes.speed)
-    calm = steady(_PRIORITY) if haptic else contextlib.nullcontext(False)
     try:
-        with (
-            first_interrupt() as interrupted,
-            _watching(wishes, device, interrupted) as watch,
-            calm as priority,
-        ):
+        with first_interrupt() as interrupted, _watching(wishes, device, interrupted) as watch:
             result = drive(scenario, machine, device, pacer, watch, _say)
     finally:
+        pacer.close()
         device.close()
     if isinstance(pacer, Deadlines):
         machine_side = {
             "control_rate": scenario.control_rate, "ticks": pacer.ticks, "missed": pacer.missed,
-            "late": summary_of(pacer.lateness()), "priority": priority, "load": load_of_machine(),
+            "late": summary_of(pacer.lateness()), "priority": pacer.priority,
+            "load": load_of_machine(),
         }  # fmt: skip
         result.summary["haptic"] = {"machine": machine_side, "line": result.summary["haptic"]}
     _write(result, target, wishes)
@@ -166,27 +162,6 @@ def _say(sentence: str) -> None:
     if notes.is_terminal:
         notes.file.write("\r\x1b[K")  # the status line gives way
     notes.print(f"[yellow]{sentence}[/]", soft_wrap=True)
-
-
-@contextlib.contextmanager
-def first_interrupt() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C only sets what this yields; the second one interrupts as usual."""
-    seen: list[bool] = []
-
-    def note(number, frame) -> None:
-        if seen:
-            raise KeyboardInterrupt
-        seen.append(True)
-
-    try:
-        before = signal.signal(signal.SIGINT, note)
-    except ValueError:  # not in the main thread, where no signals come
-        yield lambda: False
-        return
-    try:
-        yield lambda: bool(seen)
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

@@ -9,10 +9,9 @@ import time as clock
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from hydrotele.cli.console import notes, out, print_json, table
+from hydrotele.cli.console import first_interrupt, notes, out, print_json, table
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.device import open_haptic
-from hydrotele.haptics.server import announce, serve
+from hydrotele.haptics.server import announce, open_haptic, serve
 
 _PATIENCE = 60.0  # s until a device server of our own must listen
 _ROWS = {
@@ -40,8 +39,6 @@ def serve_device(wishes: HapticOptions) -> None:
     Raises:
         InputError: there is no such device, or the address cannot be used.
     """
-    from hydrotele.cli.driving import first_interrupt
-
     period = 1.0 / wishes.rate
     device = open_haptic(wishes.kind, period)
     ended = threading.Event()
@@ -68,8 +65,8 @@ def serve_device(wishes: HapticOptions) -> None:
         return
     refused = ", ".join(f"{count} {why}" for why, count in seen.refused.items() if count)
     out.print(
-        f"{seen.periods} periods, {seen.missed} missed, {seen.unanswered} without an answer in time,"
-        f" {seen.limp} times limp; refused: {refused or 'none'}"
+        f"{seen.periods} periods, {seen.missed} missed, {seen.unanswered} without an answer in"
+        f" time, {seen.limp} times limp; refused: {refused or 'none'}"
     )
 
 
@@ -106,6 +103,7 @@ def own_device() -> Iterator[tuple[str, int]]:
         timer.cancel()
         process.stdin.close()
         process.stdout.read()
+        process.stdout.close()
         process.wait()
 
 

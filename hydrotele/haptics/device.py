@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.core.errors import InputError
 
+_HESITATION = 1.0  # s from when a machine is in control until the simulated person moves
 _FINE = 4  # steps of the simulated handle per period: its stops turn over in 6 ms
 
 
@@ -61,8 +61,12 @@ class HapticDevice(Protocol):
         """
         ...
 
-    def write(self, wrench: np.ndarray) -> None:
+    def write(self, wrench: np.ndarray, on: bool) -> None:
         """Put a wrench (6,) on the handle [N], [N m] until the next one.
+
+        Args:
+            wrench: zero while no machine is in control.
+            on: whether one is.
 
         Raises:
             OSError: the device does not answer.
@@ -141,7 +145,7 @@ class SimulatedDevice:
         self._numbers = np.array([*both, self._stop])
         self._amplitude = np.array(f.motion) * self._stop
         self._omega = 2.0 * np.pi * np.array(f.frequency)
-        self._time, self._state, self._wrench = 0.0, np.zeros((2, 6)), np.zeros(6)
+        self._time, self._state, self._wrench = -_HESITATION, np.zeros((2, 6)), np.zeros(6)
 
     @property
     def abilities(self) -> Abilities:
@@ -155,18 +159,18 @@ class SimulatedDevice:
 
     def read(self) -> HandlePose:
         """Where the handle is after one period more."""
-        wanted = self._amplitude * np.sin(self._omega * self._time)
+        wanted = self._amplitude * np.sin(self._omega * max(0.0, self._time))
         _move(self._numbers, wanted, self._wrench, self._period, self._state)
-        self._time += self._period
         x = self._state[0]
         angle = float(np.sqrt(x[3:] @ x[3:]))
         quaternion = np.array([np.cos(0.5 * angle), 0.0, 0.0, 0.0])
         quaternion[1:] = x[3:] * (np.sin(0.5 * angle) / angle if angle > 0.0 else 0.5)
         return HandlePose(x[:3].copy(), quaternion, 0)
 
-    def write(self, wrench: np.ndarray) -> None:
-        """Put a wrench on the handle."""
+    def write(self, wrench: np.ndarray, on: bool) -> None:
+        """Put a wrench on the handle; a second after a machine is there, the person moves it."""
         self._wrench[:] = wrench
+        self._time = self._time + self._period if on else -_HESITATION
 
     def close(self) -> None:
         """Take the force off."""
@@ -191,28 +195,3 @@ def _move(numbers, wanted, wrench, period, state):
             v += step * force / own
             state[1, i] = v
             state[0, i] = x + step * v
-
-
-KINDS = ("simulated", "force-dimension")
-
-
-def open_haptic(kind: str, period: float) -> HapticDevice:
-    """Open a device for its server.
-
-    Args:
-        kind: one of KINDS.
-        period: of the server [s].
-
-    Returns:
-        The device.
-
-    Raises:
-        InputError: no such kind, what it needs is not installed, or it is not connected.
-    """
-    if kind == "simulated":
-        return SimulatedDevice(period)
-    if kind == "force-dimension":
-        from hydrotele.haptics.force_dimension import ForceDimension
-
-        return ForceDimension()
-    raise InputError(f"--kind {kind}", f"is no haptic device; valid: {', '.join(KINDS)}")

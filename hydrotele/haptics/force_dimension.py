@@ -65,7 +65,7 @@ class ForceDimension:
         buttons = int(self._dhd.getButtonMask())
         return HandlePose(_FROM_DEVICE @ np.array(self._place), _quaternion(turn), buttons)
 
-    def write(self, wrench: np.ndarray) -> None:
+    def write(self, wrench: np.ndarray, on: bool) -> None:
         """Put a wrench on the handle.
 
         Raises:

@@ -207,7 +207,8 @@ def answer_pose(line, box, now, two):
         line.intervals[count[INTERVALS] % len(line.intervals)] = now - count[CAME_AT]
         count[INTERVALS] += 1
     nominal = real[PERIOD]
-    period = min(20.0 * nominal, max(0.25 * nominal, 1e-9 * (pose[SENT] - count[SENT_AT])))
+    period = 1e-9 * (pose[SENT] - count[SENT_AT])
+    period = nominal if first else min(20.0 * nominal, max(0.25 * nominal, period))
     count[LAST], count[SENT_AT], count[CAME_AT] = pose[SEQUENCE], pose[SENT], now
     count[RECEIVED] += 1
     if pose[TAKEN] > count[TAKEN_LAST]:
@@ -271,7 +272,7 @@ def _reflected(line, box, now, two, first, period):
 def _answer_all(handle, line, box):
     """Answer poses until `count[STOP]` is set."""
     two, count = np.zeros(2, np.int64), line.count
-    size = np.uint64(8 * POSE_WORDS)
+    size, answer = np.uint64(8 * POSE_WORDS), np.uint64(8 * WRENCH_WORDS)
     while count[STOP] == 0:
         got = _recv(np.int32(handle), line.pose.ctypes.data, size, np.int32(0))
         now = _now(two)
@@ -279,7 +280,7 @@ def _answer_all(handle, line, box):
             line.reply[:] = 0
             line.reply[MAGIC], line.reply[SENT] = WRENCH_MAGIC, now
             count[ASKED] = now
-            _send(np.int32(handle), line.reply.ctypes.data, np.uint64(8 * WRENCH_WORDS), np.int32(0))
+            _send(np.int32(handle), line.reply.ctypes.data, answer, np.int32(0))
         if got < 0:
             continue
         if got != 8 * POSE_WORDS:
@@ -287,7 +288,7 @@ def _answer_all(handle, line, box):
         elif answer_pose(line, box, now, two):
             line.reply[SENT] = _now(two)
             line.sent[line.reply[SEQUENCE] % _SENT_KEPT] = line.reply[SENT]
-            _send(np.int32(handle), line.reply.ctypes.data, np.uint64(8 * WRENCH_WORDS), np.int32(0))
+            _send(np.int32(handle), line.reply.ctypes.data, answer, np.int32(0))
             line.answers[count[ANSWERS] % len(line.answers)] = _now(two) - now
             count[ANSWERS] += 1
 
@@ -322,7 +323,7 @@ class Link:
         self.box: Mailbox | None = None
         self._thread: threading.Thread | None = None
         self.priority, self.engaged = False, False
-        self._two = np.zeros(2, np.int64)
+        self._before = np.zeros(2, np.int64)
 
     def start(self, numbers: Master, rows: tuple[int, ...]) -> None:
         """Begin to answer poses.
@@ -404,6 +405,12 @@ class Link:
         turn = 2.0 * pose.quaternion[1:] * (1.0 if pose.quaternion[0] >= 0.0 else -1.0)
         return bool((np.abs([*pose.place, *turn]) <= self._dead).all())
 
+    def restart_figures(self) -> None:
+        """Forget what the line has seen so far, such as a device that waited for the machine."""
+        line = self.line
+        line.count[[ANSWERS, ROUNDS, INTERVALS, RECEIVED, LOST, LATE, MALFORMED]] = 0
+        self._before = line.pose[[MISSED, UNANSWERED]]
+
     def figures(self) -> dict[str, Any]:
         """What the line has seen: counts, and times as of `timing.summary_of`."""
         line, count = self.line, self.line.count
@@ -413,8 +420,8 @@ class Link:
             "late": int(count[LATE]),
             "malformed": int(count[MALFORMED]),
             "device_starts": int(count[STARTS]),
-            "device_missed": int(line.pose[MISSED]),
-            "device_unanswered": int(line.pose[UNANSWERED]),
+            "device_missed": int(line.pose[MISSED] - self._before[0]),
+            "device_unanswered": int(line.pose[UNANSWERED] - self._before[1]),
             "priority": self.priority,
             "answer": summary_of(line.answers[: count[ANSWERS]]),
             "loop": summary_of(line.rounds[: count[ROUNDS]]),

@@ -56,7 +56,7 @@ class Packet(NamedTuple):
     @property
     def raw(self) -> memoryview:
         """The bytes, to send or to receive into."""
-        return memoryview(self.whole).cast("B")
+        return self.whole.data.cast("B")
 
 
 def packet(words: int) -> Packet:

@@ -19,14 +19,13 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.device import HapticDevice, within_limits
+from hydrotele.haptics.device import HapticDevice, SimulatedDevice, within_limits
 from hydrotele.haptics.packets import (
     ABLE,
     ANSWERED,
     BUTTONS,
     MAGIC,
     MISSED,
-    MOST,
     ON,
     PERIOD,
     PLACE,
@@ -52,6 +51,8 @@ STALE = 0.02  # s: a wrench that answers an older pose is not taken
 FORGET = 1.0  # s of silence after which another machine may come
 _PRIORITY = 40
 _SAMPLES = 700_000  # times that are kept: 11 minutes of 1 kHz
+
+_REFUSALS = ("malformed", "stranger", "session", "late", "stale")
 
 Address = tuple[str, int]
 
@@ -111,7 +112,7 @@ class Exchange:
         self.pose.real[TRAVEL : PERIOD + 1] = *self._a, period
         self.wrench = np.zeros(6)
         self.client: Address | None = None
-        self.refused = dict.fromkeys(("malformed", "stranger", "session", "late", "stale"), 0)
+        self.refused: dict[str, int] = {why: 0 for why in _REFUSALS}
         self.limp, self.unanswered, self.missed = 0, 0, 0
         self._last, self._heard, self._stale = -1, 0, max(1, round(STALE / period))
         self._on, self.answered = False, -1
@@ -134,7 +135,7 @@ class Exchange:
         if self.client and now - self._heard > 1e9 * FORGET:
             self.client = None
         try:
-            self._device.write(self.wrench)
+            self._device.write(self.wrench, self._on)
             place, quaternion, buttons = self._device.read()
             real[PLACE:QUATERNION], real[QUATERNION:TRAVEL] = place, quaternion
             whole[BUTTONS], real[ABLE] = buttons, 1.0
@@ -222,7 +223,7 @@ def serve(
     opened(line.getsockname())
     with line, steady(_PRIORITY) as priority:
         wake, trips, periods = _periods(line, exchange, period, over)
-        device.write(np.zeros(6))
+        device.write(np.zeros(6), False)
     return ServerSummary(
         periods, exchange.missed, exchange.unanswered, exchange.refused, exchange.limp,
         summary_of(wake), summary_of(trips), priority, load_of_machine(),
@@ -279,3 +280,28 @@ def announce(where: Address) -> None:
     """Tell the process that waits for it, in one line of JSON, where a server listens."""
     sys.stdout.write(json.dumps({"host": where[0], "port": where[1]}) + "\n")
     sys.stdout.flush()
+
+
+KINDS = ("simulated", "force-dimension")
+
+
+def open_haptic(kind: str, period: float) -> HapticDevice:
+    """Open a device for its server.
+
+    Args:
+        kind: one of KINDS.
+        period: of the server [s].
+
+    Returns:
+        The device.
+
+    Raises:
+        InputError: no such kind, what it needs is not installed, or it is not connected.
+    """
+    if kind == "simulated":
+        return SimulatedDevice(period)
+    if kind == "force-dimension":
+        from hydrotele.haptics.force_dimension import ForceDimension
+
+        return ForceDimension()
+    raise InputError(f"--kind {kind}", f"is no haptic device; valid: {', '.join(KINDS)}")

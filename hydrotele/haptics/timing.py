@@ -55,22 +55,25 @@ class Deadlines:
         late: seconds for which it stood still, in all.
         missed: ticks that were not done in time.
         ticks: ticks in all.
+        priority: whether the system gave it.
     """
 
     def __init__(
-        self, most: int, patience: float = 0.25, now: Callable[[], int] = clock.monotonic_ns,
-        sleep: Callable[[float], None] = clock.sleep,
+        self, most: int, level: int = 0, patience: float = 0.25,
+        now: Callable[[], int] = clock.monotonic_ns, sleep: Callable[[float], None] = clock.sleep,
     ) -> None:  # fmt: skip
-        """Begin when `wait` is called first.
+        """Begin when `wait` is called first: what is compiled and opened before is in no hurry.
 
         Args:
             most: number of ticks for which there is room.
+            level: of priority from then on, see `steady`; 0 asks for none.
             patience: by which simulated time may be late before it is stopped [s].
             now: a clock [ns].
             sleep: waits for a time [s].
         """
         self._now, self._sleep, self._patience = now, sleep, patience
         self._begin: int | None = None
+        self._level, self._steady, self.priority = level, contextlib.ExitStack(), False
         self._lateness = np.zeros(most, np.int64)
         self.pauses, self.late, self.missed, self.ticks = 0, 0.0, 0, 0
 
@@ -89,6 +92,9 @@ class Deadlines:
         """
         due, now = round(simulated * 1e9), self._now()
         if self._begin is None:
+            if self._level:
+                self.priority = self._steady.enter_context(steady(self._level))
+                now = self._now()
             self._begin = now - due
         early = self._begin + due - now
         if self.ticks < len(self._lateness):
@@ -107,6 +113,10 @@ class Deadlines:
         while self._now() < self._begin + due:
             pass
         return 0.0
+
+    def close(self) -> None:
+        """Give the priority back."""
+        self._steady.close()
 
     def lateness(self) -> np.ndarray:
         """(n,) by how much the ticks that missed their deadline were late [ns]."""

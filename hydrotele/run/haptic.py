@@ -7,6 +7,7 @@ from hydrotele.run.devices import Reading, Switches
 from hydrotele.run.session import Session
 
 HAPTIC = "haptic"
+_ENGAGED = "the haptic device moves the machine"
 LOCAL = "127.0.0.1"
 RATE = 1000.0  # Hz of the machine's control beside a device; one physics step per tick
 
@@ -56,8 +57,7 @@ class HapticHandle:
             InputError: there is no such host.
         """
         self.link, self._switches = Link(host, port), Switches(further)
-        self._held, self._there, self._engaged = 0, None, False
-        self._count = further
+        self._count, self._held, self._state = further, 0, "new"
 
     def attach(self, session: Session) -> None:
         """Take the place of the simulated joystick of a session."""
@@ -68,26 +68,26 @@ class HapticHandle:
 
     def read(self, time: float) -> Reading:
         """What the buttons ask for, and whether the device has come or gone."""
-        pose, said = self.link.pose(), ""
-        there = pose is not None
-        if there != self._there:
-            if there:
-                said = "the haptic device is there: centre the handle to take over"
-            elif self._there:
-                said = "the haptic device is silent: the machine has no command"
-                self._switches.off()
-            else:
-                said = "no haptic device answers yet; start hydrotele haptic-device there"
-            self._there = there
-        elif self.link.engaged and not self._engaged:
-            said = "the handle moves the machine"
-        self._engaged = self.link.engaged
+        pose = self.link.pose()
+        said = self._news(pose is not None, self.link.engaged)
         if pose:
             pressed, self._held = pose.buttons & ~self._held, pose.buttons
             for number in range(self._count):
                 if pressed >> number & 1:
                     self._switches.turn(number)
         return Reading(commands=tuple(self._switches.commands), said=said)
+
+    def _news(self, there: bool, engaged: bool) -> str:
+        """What has changed, in a sentence; nothing where nothing has."""
+        before, self._state = self._state, "gone" if not there else "moves" if engaged else "waits"
+        if self._state == before:
+            return ""
+        if there:
+            return _ENGAGED if engaged else "a haptic device is there: centre its handle to begin"
+        if before == "new":
+            return "no haptic device answers yet: start hydrotele haptic-device"
+        self._switches.off()
+        return "the haptic device is silent: the machine has no command"
 
     def close(self) -> None:
         """Close the line; the device then goes limp."""

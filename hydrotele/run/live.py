@@ -42,6 +42,10 @@ class TimeKeeper(Protocol):
         """Wait until it is time; by how much simulated time was just set back [s]."""
         ...
 
+    def close(self) -> None:
+        """No time is kept any more."""
+        ...
+
 
 class Pacer:
     """Keeps simulated time to the wall clock; where it falls behind, simulated time stands still.
@@ -89,6 +93,9 @@ class Pacer:
         self.pauses += 1
         self.late -= early
         return -early
+
+    def close(self) -> None:
+        """Nothing was taken that has to be given back."""
 
 
 class LiveHand:
@@ -272,14 +279,17 @@ def drive(
         told.news()
         if not watch(session, status, pacer.now()):
             break
+        if haptic and session.tick == 1:
+            haptic.link.restart_figures()
         if pacer.wait(session.time):  # begins after the first tick has compiled and shown
             told.late(pacer)
+    seen = haptic.link.figures() if haptic else {}
     while session.tick % session.every:  # the logs hold whole rows
         session.advance()
     run = finished(session, hand.written_down(session.scenario, session.time))
     run.summary.update(late_seconds=round(pacer.late, 3), pauses=pacer.pauses)
     if haptic:
-        run.summary["haptic"] = haptic.link.figures()
+        run.summary["haptic"] = seen
     return run
 
 

@@ -70,8 +70,8 @@ QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
 
 Exchange = Callable[[np.ndarray, np.ndarray, float, np.ndarray], None]
 """What a device does once per control tick: writes where its handle is, (7,) as the flotor's [m]
-and quaternion, not a number without one; and takes the machine's packet (7, k), the share of it that
-counts, and the further force on the handle (6,) [N], [N m]."""
+and quaternion, not a number without one; and takes the machine's packet (7, k), the share of it
+that counts, and the further force on the handle (6,) [N], [N m]."""
 
 
 class SlaveSide(NamedTuple):
