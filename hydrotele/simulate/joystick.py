@@ -64,17 +64,18 @@ class SimulatedFlotor:
         self._inertia = turn @ np.diag(body.inertia) @ turn.T
         self._inertia += self._mass * (self._com @ self._com * np.eye(3))
         self._inertia -= self._mass * np.outer(self._com, self._com)
-        self.model.opt.gravity[:] = (0.0, 0.0, GRAVITY)
+        self._gravity = self.model.opt.gravity  # views, which cost time to ask for
+        self._gravity[:] = (0.0, 0.0, GRAVITY)
+        self._ctrl, self._applied = self.data.ctrl, self.data.qfrc_applied
 
     def step(self, currents: np.ndarray, muscles: np.ndarray) -> None:
         """Go on by one control period with held currents (6,) [A] and muscle forces (6,) [N, N m].
 
         Muscles act on the handle: force along the stator's axes, torque about them.
         """
-        data = self.data
-        data.ctrl[:] = currents
-        data.qfrc_applied[:] = muscles
-        mujoco.mj_step(self.model, data, nstep=self.steps)
+        self._ctrl[:] = currents
+        self._applied[:] = muscles
+        mujoco.mj_step(self.model, self.data, nstep=self.steps)
 
     def shaken_step(
         self, currents: np.ndarray, muscles: np.ndarray, mount: np.ndarray, spin: float,
@@ -91,9 +92,9 @@ class SimulatedFlotor:
         """
         _shake(
             self._mass, self._com, self._inertia, mount, spin, spin_rate, muscles,
-            self.model.opt.gravity, self.data.qfrc_applied,
+            self._gravity, self._applied,
         )  # fmt: skip
-        self.data.ctrl[:] = currents
+        self._ctrl[:] = currents
         mujoco.mj_step(self.model, self.data, nstep=self.steps)
 
     def place(self, pose: np.ndarray) -> None:
