@@ -49,11 +49,18 @@ class FlotorFacts(Facts):
 
 
 class CoilFacts(Facts):
-    """Three stations on a radius [m], each with two coils: [N/A], [A]."""
+    """Three stations on a radius [m], each with two coils: [N/A], [A].
+
+    `continuous_current` [A] is what a coil bears for ever, with the time constant `thermal_time`
+    [s] of its winding; `edge_loss` [1] the share of its force that is lost at the end of its gap.
+    """
 
     radius: Positive
     force_per_ampere: Positive
     max_current: Positive
+    continuous_current: Positive = 2.0
+    thermal_time: Positive = 60.0
+    edge_loss: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
 
 
 class DiodeFacts(Facts):
