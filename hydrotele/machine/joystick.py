@@ -3,6 +3,7 @@
 `models/joystick/joystick.yaml` holds the shipped one; a user's is a file of the same form.
 """
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +27,10 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class Workspace(Facts):
-    """How far the handle goes from its centre, either way: translation [m], rotation [rad]."""
+    """Way of the coils' centre in its gap, either way [m], and turning of the flotor [rad].
+
+    The handle, which stands off the coils, turns less about itself: see `Joystick.reach`.
+    """
 
     translation: Positive
     rotation: Positive
@@ -141,6 +145,20 @@ class Joystick(Facts):
     hand: HandFacts
     mount: Vector
     gains: dict[Name, dict[Name, AxisGains]] = Field(min_length=1)
+
+    @property
+    def reach(self) -> tuple[float, ...]:
+        """How far the handle alone goes along and about each axis, (6,) [m], [rad].
+
+        Turned about the handle's centre, the coils move aside by the handle's distance from the
+        axis through it, until they are at the end of their gap.
+        """
+        far, most, handle = self.workspace.translation, self.workspace.rotation, self.flotor.handle
+        turns = []
+        for i in range(3):
+            lever = math.hypot(*(handle[k] for k in range(3) if k != i))
+            turns.append(2.0 * math.asin(min(1.0, 0.5 * far / lever)) if lever > 0.0 else most)
+        return (far,) * 3 + tuple(min(most, turn) for turn in turns)
 
     @model_validator(mode="after")
     def _check(self):

@@ -52,9 +52,7 @@ class SimulatedFlotor:
         spec.compiler.fusestatic = True
         spec.option.timestep = self.period / self.steps
         self.model = spec.compile()
-        self.model.opt.disableflags |= int(
-            mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_EQUALITY
-        )
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
         self.data = mujoco.MjData(self.model)
         body = self.model.body("flotor")
         self._mass, self._com = float(body.mass[0]), body.ipos.copy()
@@ -150,9 +148,7 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     flotor.ipos = np.subtract(facts_flotor.com, facts_flotor.handle)
     coils.pos = np.negative(facts_flotor.handle)
     degrees = 180.0 / math.pi if spec.compiler.degree else 1.0
-    far = facts.workspace.translation
-    for name in ("x", "y", "z"):
-        joints[name].range = (-far, far)
+    _place_stops(spec, facts, path)
     joints["turn"].range = (0.0, degrees * facts.workspace.rotation)
     for actuator in spec.actuators:
         actuator.ctrlrange = (-facts.coils.max_current, facts.coils.max_current)
@@ -167,6 +163,20 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     if hand:
         _hold(joints, facts)
     return spec
+
+
+def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
+    """Put the six walls where the ball at the coils' centre has gone through the gap."""
+    ball, far = spec.geom("gap"), facts.workspace.translation
+    walls = {f"gap_{axis}_{side}": (i, way) for i, axis in enumerate("xyz")
+              for side, way in (("low", -1.0), ("high", 1.0))}  # fmt: skip
+    missing = [name for name in walls if spec.geom(name) is None]
+    if ball is None or missing:
+        names = ", ".join(["gap"] * (ball is None) + missing)
+        raise InputError(path, f"has no geoms {names}, which are the stops at the coils")
+    for name, (axis, way) in walls.items():
+        spec.geom(name).pos = np.negative(facts.flotor.handle)
+        spec.geom(name).pos[axis] += way * (far + ball.size[0] + spec.geom(name).size[axis])
 
 
 def _hold(joints, facts: Joystick) -> None:
