@@ -1,8 +1,7 @@
 """Lorentz coils of a magnetically levitated joystick: currents to wrench, and back within limits.
 
 A coil in its magnets' field pushes the flotor in a fixed direction, as hard as its current. Six of
-them make any force and torque: `[f; tau] = M I`. Where the field falls off towards the ends of the
-gap, a coil that has moved there pushes less.
+them make any force and torque: `[f; tau] = M I`.
 
 Currents heat the coils, which is what limits them over minutes, and what detents are for: Zhu 1994,
 6.3, "a stiff joystick could easily cause heating problem".
@@ -13,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 
 _WHERE = "coils"
@@ -124,30 +122,6 @@ def three_stations(radius: float, force_per_ampere: float, max_current: float) -
     )
 
 
-@compiled
-def heat_step(heat, currents, continuous, time_constant, period):
-    """Heat the coils over a period of held currents.
-
-    `heat' = ((I / I_c)^2 - heat) / T`, by its exact exponential: a first-order winding whose copper
-    loss is I^2 R, at 1 where the continuous current leaves it in the end.
-
-    Args:
-        heat: (6,) temperature rise over that of the continuous current [1], written.
-        currents: (6,) [A].
-        continuous: I_c, scalar [A].
-        time_constant: T of the winding, scalar [s].
-        period: scalar [s].
-
-    Returns:
-        Nothing.
-
-    Source: copper loss and one thermal capacity (I^2 t rating of motors).
-    """
-    share = -np.expm1(-period / time_constant)
-    for i in range(len(heat)):
-        heat[i] += share * ((currents[i] / continuous) ** 2 - heat[i])
-
-
 def heating(currents: np.ndarray, continuous: float) -> float:
     """Rise of the hottest coil's temperature in the end, over what it may have for ever.
 
@@ -175,33 +149,10 @@ def seconds_until_hot(currents: np.ndarray, continuous: float, time_constant: fl
     Returns:
         [s]; infinite if they bear them for ever.
 
-    Source: `heat_step`.
+    Source: `simulate.joystick.heat_step`.
 
     >>> round(seconds_until_hot(np.full(6, 4.0), 2.0, 60.0), 3)
     17.261
     """
     end = heating(currents, continuous)
     return float(-time_constant * np.log1p(-1.0 / end)) if end > 1.0 else float("inf")
-
-
-def field_shares(
-    coils: Coils, place: np.ndarray, turn: np.ndarray, gap: float, edge_loss: float
-) -> np.ndarray:
-    """Share of its force per ampere that every coil has in a pose of the flotor.
-
-    `1 - edge_loss (d / gap)^2`, with the displacement d of the coil's centre from its nominal
-    place: even about the middle of the gap, as symmetric magnets make it.
-
-    Args:
-        coils: the coils.
-        place: (3,) of the coils' frame from its nominal place [m].
-        turn: (3, 3) flotor to stator.
-        gap: displacement at which a coil has lost `edge_loss` [m].
-        edge_loss: share of the force that is lost there [1].
-
-    Returns:
-        (6,), at least 0.
-    """
-    spots = np.asarray(coils.position, float)
-    moved = place + spots @ np.asarray(turn, float).T - spots
-    return np.maximum(0.0, 1.0 - edge_loss * np.sum(moved**2, axis=1) / gap**2)

@@ -471,8 +471,10 @@ class Station:
             return
         currents, muscles = self._m.currents, self.operator.muscles.force
         if self._swing < 0:
+            self._master.most[0] = self._flotor.allowed
             self._flotor.step(currents, muscles)
             return
+        self._master.most[0] = self._flotor.allowed
         w, a = float(data.qvel[self._swing]), float(data.qacc[self._swing])
         self._flotor.shaken_step(currents, muscles, self._mount, w, a)
 
@@ -499,6 +501,7 @@ class Station:
             "largest_handle_displacement_m": float(handle[:, :3].max()),
             "largest_handle_rotation_rad": float(handle[:, 3:].max()),
             "largest_coil_current_A": float(np.abs(self.log.master("currents")).max()),
+            "largest_coil_heat": self._flotor.hottest,
             "periods_with_limited_currents": int((self.log.master("limited") < 1.0).sum()),
             "largest_tip_force_N": float(np.abs(self.log.force[:, [0, 2]]).max()),
             "tripped": self.tripped,

@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
+from hydrotele.simulate.joystick import SimulatedFlotor, field_shares, heat_step
 from hydrotele.teleop.coils import (
     Coils,
-    field_shares,
-    heat_step,
     heating,
     seconds_until_hot,
     three_stations,
@@ -107,7 +106,7 @@ def test_a_detent_keeps_the_coils_cool_where_one_slope_would_not():
 
 
 def test_the_field_is_that_of_the_middle_there_and_even_about_it():
-    coils = three_stations(0.05, 8.0, 4.0)
+    coils = three_stations(0.05, 8.0, 4.0).position
     assert field_shares(coils, np.zeros(3), np.eye(3), 5e-3, 0.2).tolist() == [1.0] * 6
     moved = field_shares(coils, np.array([3e-3, 0.0, 4e-3]), np.eye(3), 5e-3, 0.2)
     assert moved == pytest.approx(np.full(6, 0.8))
@@ -118,3 +117,29 @@ def test_the_field_is_that_of_the_middle_there_and_even_about_it():
         coils, np.zeros(3), np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), 5e-3, 0.2
     )
     assert turned == pytest.approx(np.full(6, 1.0 - 0.2 * (2 * 0.05 * np.sin(0.01) / 5e-3) ** 2))
+
+
+def test_hot_coils_get_less_until_they_have_cooled():
+    flotor, full = SimulatedFlotor(load_joystick(), hand=False), np.full(6, 4.0)
+    c = flotor.facts.coils
+    steps = 0
+    while flotor.allowed == c.max_current:
+        flotor.step(full, np.zeros(6))
+        steps += 1
+    expected = seconds_until_hot(full, c.continuous_current, c.thermal_time)
+    assert steps * flotor.period == pytest.approx(expected, abs=flotor.period)
+    assert flotor.allowed == c.continuous_current and flotor.hottest >= 1.0
+    steps = 0
+    while flotor.allowed < c.max_current:
+        flotor.step(np.zeros(6), np.zeros(6))
+        steps += 1
+    assert steps * flotor.period == pytest.approx(-c.thermal_time * np.log(0.9), abs=0.02)
+
+
+def test_a_coil_that_leaves_its_field_pushes_less():
+    joystick = load_joystick()
+    coils = joystick.coils.model_copy(update={"edge_loss": 0.2})
+    flotor = SimulatedFlotor(joystick.model_copy(update={"coils": coils}), hand=False)
+    flotor.place(np.array([5e-3, 0, 0, 0, 0, 0]))
+    flotor.step(np.zeros(6), np.zeros(6))
+    assert np.abs(flotor.model.actuator_gear).max(axis=1) == pytest.approx(np.full(6, 6.4))

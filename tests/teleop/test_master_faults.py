@@ -60,7 +60,8 @@ def test_a_frozen_reading_pushes_as_before_and_no_harder():
     """Frozen at 3 mm: the coils keep the 1.8 N of there; a hand of 250 N/m is held at 7 mm of it.
 
     So the coils stay within their gap and the currents as they were; the handle tilts about the
-    stop. The master cannot know: a hand may rest. What stands alone knows by its noise (`teleop.levitate`).
+    stop. The master cannot know: a hand may rest. What stands alone knows by its noise
+    (`teleop.levitation`).
     """
     numbers, s = seated()
     flotor, muscles = SimulatedFlotor(JOYSTICK), np.zeros(6)
