@@ -325,7 +325,8 @@ def damping() -> list[str]:
         "Half: if the damper acts on the rate of the Euler vector of 5.1.3, which is half of the"
         " angle's. Unit 1: if the damping's unit were 1 and not 100 N m/rad/s.", "",
         f"At 200 Hz the printed damping of rz needs {1e3 * needed[0]:.1f} and"
-        f" {1e3 * needed[1]:.1f} g m^2 (excavator, feller-buncher): radii of gyration of {radii[0]:.0f} and {radii[1]:.0f} mm"
+        f" {1e3 * needed[1]:.1f} g m^2 (excavator, feller-buncher): radii of gyration of"
+        f" {radii[0]:.0f} and {radii[1]:.0f} mm"
         f" of {f.mass:g} kg, where the coils are at {1e3 * JOYSTICK.coils.radius:g} mm. Ours has"
         f" {1e3 * f.inertia[0]:g} and {1e3 * f.inertia[2]:g} g m^2. So no assumed inertia of this"
         " size holds it, about z in particular, where the handle's height does not help; at 1 kHz"

@@ -48,6 +48,7 @@ from hydrotele.haptics.packets import (
 from hydrotele.haptics.timing import ask_for_priority, summary_of
 from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, REACH, flat_state, flat_view
 from hydrotele.teleop.master import (
+    KINDS,
     Master,
     MasterState,
     master_step,
@@ -59,6 +60,9 @@ SILENT = 0.05  # s without a pose after which the machine gets no command
 FADED = 0.05  # s without the machine after which nothing of it is reflected
 OFF = 0.15  # s without the machine after which there is no force
 RAMP = 0.3  # s over which forces come back
+# Others estimate the hand's force from the mass of the joystick's own flotor, or keep what is on
+# the line in the state of one master.
+REFLECTIONS = ("none", "stiffness", "direct_force", "coordinating_force", "impedance")
 _ASK = 100_000_000  # ns between two requests to be served
 _WAIT = 0.005  # s that the thread waits for a pose before it looks whether it is over
 _CENTRED = 0.1  # of its reach: where an axis without a dead band counts as centred
@@ -325,14 +329,22 @@ class Link:
         self.priority, self.engaged = False, False
         self._before = np.zeros(2, np.int64)
 
-    def start(self, numbers: Master, rows: tuple[int, ...]) -> None:
+    def start(self, numbers: Master, like: MasterState, rows: tuple[int, ...]) -> None:
         """Begin to answer poses.
 
         Args:
             numbers: of the master's control.
+            like: a state of it, which the thread's own is like.
             rows: shape of the machine's packets.
+
+        Raises:
+            InputError: the structure needs more than a pose and the machine's packet.
         """
-        state = flat_state(MasterState, [(6,)] * 10 + [(1,), (2,)])
+        kind = KINDS[int(numbers.kind[0])]
+        if kind not in REFLECTIONS:
+            message = f"{kind!r} does not go with a haptic device; valid: {', '.join(REFLECTIONS)}"
+            raise InputError("pilot.reflection", message)
+        state = flat_state(MasterState, [part.shape for part in like])
         state.limited[:] = 1.0
         self.box = Mailbox(
             np.zeros(2, np.int64), np.zeros(2, np.int64), np.full(8, np.nan), np.zeros(rows),

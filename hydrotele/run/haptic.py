@@ -63,7 +63,7 @@ class HapticHandle:
         """Take the place of the simulated joystick of a session."""
         assert session.station
         station = session.station
-        self.link.start(station.numbers, station.packet.shape)
+        self.link.start(station.numbers, station.master_state, station.packet.shape)
         station.attach(self.link.exchange)
 
     def read(self, time: float) -> Reading:

@@ -70,7 +70,7 @@ QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
 
 Exchange = Callable[[np.ndarray, np.ndarray, float, np.ndarray], None]
 """What a device does once per control tick: writes where its handle is, (7,) as the flotor's [m]
-and quaternion, not a number without one; and takes the machine's packet (7, k), the share of it
+and quaternion, not a number without one; and takes the machine's packet (rows, k), the share of it
 that counts, and the further force on the handle (6,) [N], [N m]."""
 
 
@@ -400,8 +400,13 @@ class Station:
         return self._master
 
     @property
+    def master_state(self) -> MasterState:
+        """State of the master's control, rewritten every tick."""
+        return self._m
+
+    @property
     def packet(self) -> np.ndarray:
-        """(7, k) the last packet that came from the machine, see `teleop.master`."""
+        """(rows, k) the last packet that came from the machine, see `teleop.master`."""
         return self._line.packet
 
     @property

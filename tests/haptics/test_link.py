@@ -42,13 +42,14 @@ from hydrotele.teleop.master import master
 
 STEP = 1e-3
 MS = 1_000_000
+PACKET = (8, 4)
 COORDINATES = ("r", "theta", "z", "attitude")
 
 
 @pytest.fixture(scope="module")
 def numbers():
     pilot = load_scenario("press_stiffness").pilot
-    return master(load_joystick(), pilot, COORDINATES)[0]
+    return master(load_joystick(), pilot, COORDINATES)
 
 
 @pytest.fixture
@@ -57,7 +58,7 @@ def link(numbers, monkeypatch):
     made = Link("127.0.0.1", 9)
     monkeypatch.setattr("threading.Thread.start", lambda self: None)
     monkeypatch.setattr("threading.Thread.join", lambda self, timeout=None: None)
-    made.start(numbers, (7, 4))
+    made.start(*numbers, PACKET)
     yield made
     made.close()
 
@@ -99,7 +100,7 @@ def test_the_spring_of_the_joystick_acts_on_the_scale_of_the_device(stand, numbe
     for _ in range(2000):
         stand.machine()
         assert stand.pose(x=0.01)
-    axis, line = numbers.axis[0], stand.link.line
+    axis, line = numbers[0].axis[0], stand.link.line
     expected = -axis[NOMINAL] * 0.01 * axis[REACH] / 0.05
     assert stand.force == pytest.approx([expected, 0, 0, 0, 0, 0], abs=1e-9)
     assert line.reply[ON] == 1 and line.reply[ANSWERED] == stand.sequence - 1
@@ -186,7 +187,7 @@ def test_the_machine_has_no_command_until_the_handle_was_centred(link, monkeypat
     def exchange(x, age=0):
         link.box.handle[:] = x, 0, 0, 1, 0, 0, 0, 0
         link.box.stamp[0] = now - age
-        link.exchange(qpos, np.zeros((7, 4)), 1.0, np.zeros(6))
+        link.exchange(qpos, np.zeros(PACKET), 1.0, np.zeros(6))
         return qpos[0]
 
     assert np.isnan(exchange(0.004))  # out of the dead band of 1.5 mm when it comes
@@ -194,6 +195,14 @@ def test_the_machine_has_no_command_until_the_handle_was_centred(link, monkeypat
     assert np.isnan(exchange(0.004, age=10**8))  # silent
     assert np.isnan(exchange(0.004))
     assert exchange(0.0) == 0.0 and exchange(0.004) == 0.004
+
+
+def test_a_structure_that_needs_more_than_a_packet_is_refused():
+    pilot = load_scenario("press_stiffness", {"pilot.reflection": "four_channel"}).pilot
+    made = Link("127.0.0.1", 9)
+    with pytest.raises(InputError, match="'four_channel' does not go with a haptic device; valid"):
+        made.start(*master(load_joystick(), pilot, COORDINATES), PACKET)
+    made.close()
 
 
 def test_no_such_host():
@@ -224,11 +233,11 @@ def test_device_and_machine_on_the_loopback(numbers):
     until(lambda: where)
     link, qpos = Link(*where[0]), np.zeros(7)
     try:
-        link.start(numbers, (7, 4))
+        link.start(*numbers, PACKET)
         seen = []
 
         def moved():
-            link.exchange(qpos, np.zeros((7, 4)), 1.0, np.zeros(6))
+            link.exchange(qpos, np.zeros(PACKET), 1.0, np.zeros(6))
             seen.append((qpos[0], device.wrench[0]))
             return qpos[0] > 1e-3  # 10 mm of the device
 
@@ -240,7 +249,7 @@ def test_device_and_machine_on_the_loopback(numbers):
         over.set()  # and the device's server, too
         server.join(20.0)
         until(lambda: link.pose() is None)
-        link.exchange(qpos, np.zeros((7, 4)), 1.0, np.zeros(6))
+        link.exchange(qpos, np.zeros(PACKET), 1.0, np.zeros(6))
         assert np.isnan(qpos).all() and not link.engaged
     finally:
         over.set()
