@@ -25,6 +25,7 @@ FLOORS = (
     ("simulate",),
     ("control",),
     ("teleop",),
+    ("haptics",),
     ("run",),
     ("calibrate", "gap"),
     ("experiments",),

@@ -1,4 +1,4 @@
-"""The joystick alone: steps, hovering, identification, detent, stops, a cab that shakes it.
+"""The joystick alone: steps, identification, detent, travel, damping, heat, a cab that shakes it.
 
     python tools/joystick_study.py [--trials 20] [--seed 1] [--jobs 2]
         [--out docs/results/joystick.md]
@@ -14,8 +14,9 @@ from hydrotele.machine.joystick import AXES, load_joystick
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.simulate.joystick import SimulatedFlotor
-from hydrotele.teleop.compliance import Flotor
+from hydrotele.simulate.joystick import SimulatedFlotor, field_shares
+from hydrotele.teleop.coils import heating, seconds_until_hot, three_stations
+from hydrotele.teleop.compliance import Flotor, turn_matrix
 from hydrotele.teleop.flotor import FlotorFit, identify_flotor
 from hydrotele.teleop.levitation import (
     LevitationRun,
@@ -27,11 +28,18 @@ from hydrotele.teleop.levitation import (
     simulate_levitation,
 )
 from hydrotele.teleop.master import master, master_step
+from hydrotele.teleop.sampled_handle import (
+    largest_damping,
+    least_inertia,
+    slowest_decay,
+    spinning_body,
+    tilting_body,
+)
 from tools.handle_laws import Detent
 from tools.study import options, publish, side_by_side
 
 JOYSTICK = load_joystick()
-SIZES = np.array([2e-3] * 3 + [np.deg2rad(3.0)] * 3)
+SIZES = np.array([2e-3] * 3 + [np.deg2rad(2.0)] * 3)
 PERIOD = 1.0 / JOYSTICK.control_rate
 COM = (0.002, -0.001, 0.020)  # m: off its axis, so that all three are told
 GUESS = Flotor(0.90, np.zeros(3), 2e-3 * np.eye(3))
@@ -218,28 +226,181 @@ def detent() -> list[str]:
     return [*lines, "", f"Largest difference {1e3 * worst:.1f} mN.", ""]
 
 
-def stops() -> list[str]:
-    """How far 20 N push the handle into its stops."""
+def coils_moved(qpos: np.ndarray) -> np.ndarray:
+    """Displacement (3,) of the coils' centre in its gap [m]."""
+    turn, handle = np.empty((3, 3)), np.array(JOYSTICK.flotor.handle)
+    turn_matrix(qpos[3:7], turn)
+    return qpos[:3] + handle - turn @ handle
+
+
+def travel() -> list[str]:
+    """Where the stops are, how far the handle goes, and how deep 20 N go into a stop."""
+    reach, limits = JOYSTICK.reach, JOYSTICK.workspace
+    deg = np.rad2deg(reach[3:])
+    bound = limits.translation / JOYSTICK.gains["feller"]["ry"].deadband
     lines = [
-        "## Stops", "",
-        "At rest under 20 N (2 N m about an axis), beyond 5 mm (7 deg); no hand, weight carried.",
-        "", "| axis | beyond the stop |", "| --- | ---: |",
+        "## Travel and stops", "",
+        'Zhu 1994, 5.1.2: "The joystick workspace is limited by the size of the magnetic gap [...]'
+        " approximately + 5 mm translational motion and + 7 deg rotational motion from the nominal"
+        ' center." The stops are therefore at the coils: their centre moves by'
+        f" {1e3 * limits.translation:g} mm along each axis, the flotor turns by"
+        f" {np.rad2deg(limits.rotation):g} deg. Turned about the handle, whose centre is"
+        f" {1e3 * JOYSTICK.flotor.handle[2]:g} mm above (A), the coils move aside: the handle"
+        f" alone turns by {deg[0]:.2f} deg about x and y and by {deg[2]:.2f} deg about z. The"
+        " feller-buncher's printed dead band of 0.035 rad (Table 6.9) could not be left with a"
+        f" handle higher than {1e3 * bound:.0f} mm.", "",
+        "At rest under 20 N at the height of the coils (2 N m about an axis); no hand, weight"
+        " carried. Last row: 20 N at the handle, which tilt the flotor about its stop.", "",
+        "| axis | beyond the stop |", "| --- | ---: |",
     ]  # fmt: skip
     lift = levitation(JOYSTICK).coils.currents(
         np.array([0.0, 0.0, 9.81 * JOYSTICK.flotor.mass, 0.0, 0.0, 0.0])
     ).value  # fmt: skip
-    for axis, name in enumerate(AXES):
-        flotor, push = SimulatedFlotor(JOYSTICK, hand=False), np.zeros(6)
-        push[axis] = 20.0 if axis < 3 else 2.0
+
+    def pushed(push: np.ndarray) -> np.ndarray:
+        flotor = SimulatedFlotor(JOYSTICK, hand=False)
         flotor.model.dof_damping[:] = [20.0] * 3 + [0.2] * 3
         for _ in range(600):
             flotor.step(lift, push)
-        pose = np.concatenate([flotor.data.qpos[:3], rotation_vector(flotor.data.qpos[3:7])])
-        reach = JOYSTICK.workspace
-        deep = pose[axis] - (reach.translation if axis < 3 else reach.rotation)
-        shown = f"{1e3 * deep:.3f} mm" if axis < 3 else f"{np.rad2deg(deep):.3f} deg"
+        return flotor.data.qpos.copy()
+
+    for axis, name in enumerate(AXES):
+        push = np.zeros(6)
+        push[axis] = 20.0 if axis < 3 else 2.0
+        if axis < 2:
+            push[4 - axis] = 20.0 * JOYSTICK.flotor.handle[2] * (2 * axis - 1.0)
+        qpos = pushed(push)
+        if axis < 3:
+            shown = f"{1e3 * (coils_moved(qpos)[axis] - limits.translation):.3f} mm"
+        else:
+            deep = rotation_vector(qpos[3:7])[axis - 3] - limits.rotation
+            shown = f"{np.rad2deg(deep):.3f} deg"
         lines.append(f"| {name} | {shown} |")
+    qpos = pushed(np.array([20.0, 0, 0, 0, 0, 0]))
+    lines.append(
+        f"| x, at the handle | {1e3 * (coils_moved(qpos)[0] - limits.translation):.3f} mm,"
+        f" handle at {1e3 * qpos[0]:.1f} mm |"
+    )
     return [*lines, ""]
+
+
+HAND = JOYSTICK.hand
+HELD = (HAND.mass, HAND.damping, HAND.stiffness, HAND.rotation_damping, HAND.rotation_stiffness)
+
+
+def damping() -> list[str]:
+    """Whether the printed rotational damping can be held, and with which inertia it could."""
+    f = JOYSTICK.flotor
+    arm = f.com[2] - f.handle[2]
+    printed = {"excavator": (600.0, 6.0, 6.0, 3.0), "feller": (4000.0, 45.0, 25.0, 4.0)}
+    lines = [
+        "## Rotational damping", "",
+        "Tables 6.7 and 6.9 print 0.03 and 0.04 in 100 N m/rad/s, so 3 and 4 N m s/rad, under a"
+        " control of 200 Hz (5.3). Largest eigenvalue of the sampled loop: below 1 the handle comes"
+        " to rest. x and ry together with the springs of x (60 N s/m) at the handle, free and in"
+        " the hand; rz alone, without a hand.", "",
+        "| gains | damping [N m s/rad] | rate [Hz] | free | in the hand | rz |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+    ]  # fmt: skip
+    for name, (stiff, turn, about, rub) in printed.items():
+        for damped, what in ((rub, "printed"), (rub / 2, "half"), (rub / 100, "unit 1"),
+                             (0.25, "ours, A")):  # fmt: skip
+            for rate in (200.0, 1000.0):
+                springs, dampers = np.array([stiff, turn]), np.array([60.0, damped])
+                decays = [
+                    slowest_decay(
+                        tilting_body(f.mass, arm, f.inertia[0], held), springs, dampers, 1 / rate
+                    )
+                    for held in ((0.0,) * 5, HELD)
+                ]
+                spin = spinning_body(f.inertia[2])
+                decays.append(slowest_decay(spin, np.array([about]), dampers[1:], 1 / rate))
+                cells = " | ".join(f"{d:.3f}" for d in decays)
+                lines.append(f"| {name} | {damped:g} ({what}) | {rate:g} | {cells} |")
+    needed = [least_inertia(rub, about, PERIOD) for _, _, about, rub in printed.values()]
+    radii = [1e3 * np.sqrt(i / f.mass) for i in needed]
+    fast = [least_inertia(rub, about, 1e-3) for _, _, about, rub in printed.values()]
+    return [
+        *lines, "",
+        "Half: if the damper acts on the rate of the Euler vector of 5.1.3, which is half of the"
+        " angle's. Unit 1: if the damping's unit were 1 and not 100 N m/rad/s.", "",
+        f"At 200 Hz the printed damping of rz needs {1e3 * needed[0]:.1f} and"
+        f" {1e3 * needed[1]:.1f} g m^2 (excavator, feller-buncher): radii of gyration of"
+        f" {radii[0]:.0f} and {radii[1]:.0f} mm"
+        f" of {f.mass:g} kg, where the coils are at {1e3 * JOYSTICK.coils.radius:g} mm. Ours has"
+        f" {1e3 * f.inertia[0]:g} and {1e3 * f.inertia[2]:g} g m^2. So no assumed inertia of this"
+        " size holds it, about z in particular, where the handle's height does not help; at 1 kHz"
+        f" {1e3 * fast[0]:.1f} and {1e3 * fast[1]:.1f} g m^2 would. Either the printed unit of"
+        " damping is not that of stiffness, or the loop of the coils ran faster than the 200 Hz of"
+        " 5.3. The largest damping that rz of this flotor holds at 200 Hz with 6 N m/rad is"
+        f" {largest_damping(f.inertia[2], 6.0, PERIOD):.2f} N m s/rad. Without a hand x and ry grow"
+        " with every one of these springs at 200 Hz, since a push at the handle tilts a free"
+        " flotor; a handle that stands alone is therefore held by the law of 5.1.3 instead.", "",
+    ]  # fmt: skip
+
+
+def heat() -> list[str]:
+    """Currents and temperatures of a handle that is held out, with and without a detent."""
+    c = JOYSTICK.coils
+    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
+    handle, weight = JOYSTICK.flotor.handle[2], 9.81 * JOYSTICK.flotor.mass
+    lines = [
+        "## Heat", "",
+        'Zhu 1994, 6.3: "a stiff joystick could easily cause heating problem", which detents are to'
+        f" solve. Coils that bear {c.continuous_current:g} A for ever and warm up with"
+        f" {c.thermal_time:g} s (both A); a hand holds one axis of the feller-buncher's gains at"
+        " nine tenths of its reach. Heat: temperature rise in the end, over what is allowed; time"
+        " until cold coils are there.", "",
+        "| axis | one slope: force [N], [N m] | current [A] | heat | time [s] | detent: force |"
+        " current [A] | heat | time [s] |", "| --- |" + " ---: |" * 8,
+    ]  # fmt: skip
+    for axis in (0, 2, 4):
+        gains = JOYSTICK.gains["feller"][AXES[axis]]
+        assert gains.detent
+        x = 0.9 * JOYSTICK.reach[axis]
+        law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
+        cells = []
+        for force in (gains.nominal * x, -law.force(x)):
+            wrench = np.array([0.0, 0.0, weight, 0.0, 0.0, 0.0])
+            wrench[axis] += force
+            wrench[4] += force * handle if axis == 0 else 0.0
+            asked = np.linalg.solve(coils.wrench_map, wrench)
+            left = seconds_until_hot(asked, c.continuous_current, c.thermal_time)
+            current = f"{np.abs(asked).max():.2f}"
+            current += " (cut to 4)" if np.abs(asked).max() > c.max_current else ""
+            cells += [f"{force:.2f}", current, f"{heating(asked, c.continuous_current):.2f}",
+                      "for ever" if np.isinf(left) else f"{left:.0f}"]  # fmt: skip
+        lines.append(f"| {AXES[axis]} | {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def force_over_the_gap() -> list[str]:
+    """What a field that falls off towards the ends of the gap does to the force that is felt."""
+    c, limits = JOYSTICK.coils, JOYSTICK.workspace
+    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
+    weight, handle = 9.81 * JOYSTICK.flotor.mass, JOYSTICK.flotor.handle[2]
+    lines = [
+        "## Force over the gap", "",
+        'Zhu 1994, 5.1.2: "Due to the small motion range" M is "approximately" constant; how much a'
+        " coil loses is not told. If it lost a share of its force quadratically towards the end of"
+        " its gap, with a control that knows of none:", "",
+        "| lost at 5 mm [%] | error of 4.8 N at the handle at 4.5 mm of x [N] | sinking of the"
+        " hovering flotor there [um] | error with 2 mm [N] |", "| ---: | ---: | ---: | ---: |",
+    ]  # fmt: skip
+    stiff = JOYSTICK.gains["feller"]["z"].nominal
+    for loss in (0.0, 0.05, 0.1, 0.2):
+        errors = []
+        for x in (4.5e-3, 2e-3):
+            wrench = np.array([4.8, 0.0, weight, 0.0, 4.8 * handle, 0.0])
+            shares = field_shares(
+                coils.position, np.array([x, 0.0, 0.0]), np.eye(3), limits.translation, loss
+            )
+            errors.append(coils.wrench_map @ (shares * coils.currents(wrench).value) - wrench)
+        lines.append(
+            f"| {100 * loss:g} | {errors[0][0]:.2f} | {-1e6 * errors[0][2] / stiff:.0f} |"
+            f" {errors[1][0]:.2f} |"
+        )
+    return [*lines, "", "The shipped joystick loses nothing (`coils.edge_loss: 0`).", ""]
 
 
 def swing() -> tuple[np.ndarray, np.ndarray]:
@@ -330,8 +491,8 @@ def report(results) -> str:
     """The whole result in Markdown."""
     picture = ["![Steps of the six axes; other axes in grey](joystick.png)", ""]
     return "\n".join([
-        *coils_and_eyes(), *steps(), *picture, *identification(results), *detent(), *stops(),
-        *shaking(),
+        *coils_and_eyes(), *steps(), *picture, *identification(results), *detent(), *travel(),
+        *damping(), *heat(), *force_over_the_gap(), *shaking(),
     ])  # fmt: skip
 
 

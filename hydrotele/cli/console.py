@@ -3,6 +3,7 @@
 import contextlib
 import json
 import re
+import signal
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -101,3 +102,24 @@ def stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | N
             bar.update(task, completed=fraction, description=said)
 
         yield update
+
+
+@contextlib.contextmanager
+def first_interrupt() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C only sets what this yields; the second one interrupts as usual."""
+    seen: list[bool] = []
+
+    def note(number, frame) -> None:
+        if seen:
+            raise KeyboardInterrupt
+        seen.append(True)
+
+    try:
+        before = signal.signal(signal.SIGINT, note)
+    except ValueError:  # not in the main thread, where no signals come
+        yield lambda: False
+        return
+    try:
+        yield lambda: bool(seen)
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,16 +1,18 @@
 """`hydrotele drive`: a person drives a machine, into a folder like a run's."""
 
 import contextlib
-import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from hydrotele.cli.console import notes, out, print_json
+from hydrotele.cli.console import first_interrupt, notes, out, print_json
+from hydrotele.cli.haptic import own_device, print_latency
 from hydrotele.cli.running import print_summary, write_run
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
+from hydrotele.haptics.timing import Deadlines, load_of_machine, summary_of
 from hydrotele.run.devices import Device, Keyboard, open_device
+from hydrotele.run.haptic import HAPTIC, RATE, HapticHandle, haptic_address
 from hydrotele.run.live import Pacer, Status, Watch, drive, further_axes
 from hydrotele.run.run import Run, scenario_machine
 from hydrotele.run.session import Session
@@ -19,6 +21,8 @@ from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.native import stop_profiling_clock
 
 LONGEST = 600.0  # s of a drive without --duration
+LATENCY = 60.0  # s of one that only measures latency
+_PRIORITY = 20  # of the machine, below the line's and the device's
 _FRAMES, _LINES = 30.0, 5.0  # Hz of window and status line
 
 
@@ -34,6 +38,7 @@ class DriveOptions(NamedTuple):
     speed: float
     review: bool
     json: bool
+    latency: bool = False
 
 
 def drive_to_folder(wishes: DriveOptions) -> Path:
@@ -47,24 +52,63 @@ def drive_to_folder(wishes: DriveOptions) -> Path:
         SimulationFailed: the simulation left the finite numbers.
     """
     stop_profiling_clock()
+    if _is_haptic(wishes) and wishes.speed != 1.0:
+        raise InputError("--speed", "must be 1 with a haptic device: a hand is in real time")
     if not wishes.speed >= 0.0:
         raise InputError("--speed", "must be 0 (as fast as it goes) or more; 1 is real time")
-    if wishes.device == "keyboard" and not wishes.viewer:
+    if wishes.device == "keyboard" and not wishes.viewer and not wishes.latency:
         message = "reads the keys of the viewer's window; leave out --no-viewer, or choose another"
         raise InputError("--device keyboard", message)
+    if wishes.latency:
+        return _measured_latency(wishes)
+    return _driven(wishes)
+
+
+def _driven(wishes: DriveOptions) -> Path:
+    """One drive."""
     scenario = _scenario(wishes)
     target = wishes.target or Path("runs", scenario.name)
     check_target(target, "run")
     machine = scenario_machine(scenario)
-    device = open_device(wishes.device, tuple(further_axes(machine)))
-    pacer = Pacer(wishes.speed)
+    further = tuple(further_axes(machine))
+    haptic = _is_haptic(wishes)
+    if haptic:
+        device = HapticHandle(*haptic_address(wishes.device), len(further))
+        pacer = Deadlines(scenario.ticks, _PRIORITY)
+    else:
+        device, pacer = open_device(wishes.device, further), Pacer(wishes.speed)
     try:
         with first_interrupt() as interrupted, _watching(wishes, device, interrupted) as watch:
             result = drive(scenario, machine, device, pacer, watch, _say)
     finally:
+        pacer.close()
         device.close()
+    if isinstance(pacer, Deadlines):
+        machine_side = {
+            "control_rate": scenario.control_rate, "ticks": pacer.ticks, "missed": pacer.missed,
+            "late": summary_of(pacer.lateness()), "priority": pacer.priority,
+            "load": load_of_machine(),
+        }  # fmt: skip
+        result.summary["haptic"] = {"machine": machine_side, "line": result.summary["haptic"]}
     _write(result, target, wishes)
     return target
+
+
+def _measured_latency(wishes: DriveOptions) -> Path:
+    """A drive whose latency is shown; beside a simulated device of its own if none is named."""
+    if _is_haptic(wishes):
+        return _driven(wishes)
+    if wishes.device != "keyboard":
+        message = "has no force output to measure: leave --device out, or name haptic:HOST:PORT"
+        raise InputError(f"--latency with --device {wishes.device}", message)
+    with own_device() as (host, port):
+        duration = LATENCY if wishes.duration is None else wishes.duration
+        own = {"device": f"{HAPTIC}:{host}:{port}", "duration": duration}
+        return _driven(wishes._replace(viewer=False, review=False, **own))
+
+
+def _is_haptic(wishes: DriveOptions) -> bool:
+    return wishes.device.split(":")[0] == HAPTIC
 
 
 def _write(result: Run, target: Path, wishes: DriveOptions) -> None:
@@ -74,10 +118,13 @@ def _write(result: Run, target: Path, wishes: DriveOptions) -> None:
         print_json({**result.summary, "folder": str(target)})
         return
     print_summary(result.summary)
+    if "haptic" in result.summary:
+        print_latency(result.summary["haptic"])
     if result.summary["pauses"]:
         said = f"{result.summary['late_seconds']:.2f} s in {result.summary['pauses']} pauses"
         out.print(f"[yellow]note[/] it could not keep up with real time: {said}")
-    out.print(f"written to [bold]{target}[/]; its scenario.yaml repeats it in hydrotele run")
+    alike = "a run like it" if "haptic" in result.summary else "it in hydrotele run"
+    out.print(f"written to [bold]{target}[/]; its scenario.yaml repeats {alike}")
 
 
 def _scenario(wishes: DriveOptions) -> Scenario:
@@ -90,6 +137,8 @@ def _scenario(wishes: DriveOptions) -> Scenario:
         if own is None:  # a machine of the user's: what is known of none but cat215 is left out
             overrides = {"tool": "null", "sensors": "ideal", "servo": "{}"} | overrides
     overrides["duration"] = repr(duration)
+    if _is_haptic(wishes):
+        overrides = {"control_rate": repr(RATE)} | overrides
     scenario = load_scenario(name, overrides)
     if wishes.scenario is None and "pilot.force" not in overrides and _loose(scenario):
         overrides |= {"pilot.force": '"true"', "sensors": "ideal"}
@@ -113,27 +162,6 @@ def _say(sentence: str) -> None:
     if notes.is_terminal:
         notes.file.write("\r\x1b[K")  # the status line gives way
     notes.print(f"[yellow]{sentence}[/]", soft_wrap=True)
-
-
-@contextlib.contextmanager
-def first_interrupt() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C only sets what this yields; the second one interrupts as usual."""
-    seen: list[bool] = []
-
-    def note(number, frame) -> None:
-        if seen:
-            raise KeyboardInterrupt
-        seen.append(True)
-
-    try:
-        before = signal.signal(signal.SIGINT, note)
-    except ValueError:  # not in the main thread, where no signals come
-        yield lambda: False
-        return
-    try:
-        yield lambda: bool(seen)
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

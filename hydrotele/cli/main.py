@@ -23,6 +23,7 @@ import typer
 
 from hydrotele.cli.calibrating import app as calibrate_app
 from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
+from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
 from hydrotele.core.errors import InputError
 
 
@@ -111,6 +112,7 @@ def compare(
 DRIVE_EPILOG = """\b
 Examples:  hydrotele drive   |   hydrotele drive fell_tree --device gamepad
            hydrotele drive --device scripted:moves.csv --no-viewer --speed 0
+           hydrotele drive --device haptic:127.0.0.1:5610   |   hydrotele drive --latency
 
 \b
 Keyboard: every press moves an axis on by a quarter of its way, where it stays; space centres all.
@@ -122,6 +124,11 @@ Keyboard: every press moves an axis on by a quarter of its way, where it stays; 
 Gamepad: left stick out/in and swing, right stick raise/lower and tool, shoulders head, cross pad
 further axes, B all off, Start ends. SpaceMouse: push the way the tip shall go; its buttons switch
 the first two further axes, both together all off.
+
+\b
+haptic:HOST:PORT: a device with force output whose server (hydrotele haptic-device) runs there. The
+reflection answers it at its own rate, 1 kHz, beside the machine. --latency shows delays and missed
+deadlines; without --device it starts a simulated device in a process of its own, for 60 s.
 """
 
 
@@ -134,7 +141,10 @@ def drive(
     ] = None,
     tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")] = None,
     device: Annotated[
-        str, typer.Option("--device", "-d", help="keyboard, gamepad, spacemouse or scripted:FILE.")
+        str,
+        typer.Option(
+            "--device", "-d", help="keyboard, gamepad, spacemouse, haptic, scripted:FILE."
+        ),
     ] = "keyboard",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder to write; default runs/SCENARIO.")
@@ -151,6 +161,9 @@ def drive(
     ] = 1.0,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
     effects: EffectFiles = None,
+    latency: Annotated[
+        bool, typer.Option("--latency", help="Show latency, jitter and missed deadlines.")
+    ] = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
@@ -171,6 +184,7 @@ def drive(
             speed,
             review,
             json,
+            latency,
         )  # fmt: skip
     )
 
@@ -292,6 +306,7 @@ def run(
 
 
 app.command(epilog=DRIVE_EPILOG)(drive)
+app.command("haptic-device", epilog=HAPTIC_EPILOG)(haptic_device)
 app.command(epilog=SWEEP_EPILOG)(sweep)
 app.command(epilog=COMPARE_EPILOG)(compare)
 app.command("identify-operator", epilog=IDENTIFY_OPERATOR_EPILOG)(identify_operator)

@@ -3,6 +3,7 @@
 `models/joystick/joystick.yaml` holds the shipped one; a user's is a file of the same form.
 """
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +27,10 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class Workspace(Facts):
-    """How far the handle goes from its centre, either way: translation [m], rotation [rad]."""
+    """Way of the coils' centre in its gap, either way [m], and turning of the flotor [rad].
+
+    The handle, which stands off the coils, turns less about itself: see `Joystick.reach`.
+    """
 
     translation: Positive
     rotation: Positive
@@ -49,11 +53,18 @@ class FlotorFacts(Facts):
 
 
 class CoilFacts(Facts):
-    """Three stations on a radius [m], each with two coils: [N/A], [A]."""
+    """Three stations on a radius [m], each with two coils: [N/A], [A].
+
+    `continuous_current` [A] is what a coil bears for ever, with the time constant `thermal_time`
+    [s] of its winding; `edge_loss` [1] the share of its force that is lost at the end of its gap.
+    """
 
     radius: Positive
     force_per_ampere: Positive
     max_current: Positive
+    continuous_current: Positive = 2.0
+    thermal_time: Positive = 60.0
+    edge_loss: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
 
 
 class DiodeFacts(Facts):
@@ -134,6 +145,20 @@ class Joystick(Facts):
     hand: HandFacts
     mount: Vector
     gains: dict[Name, dict[Name, AxisGains]] = Field(min_length=1)
+
+    @property
+    def reach(self) -> tuple[float, ...]:
+        """How far the handle alone goes along and about each axis, (6,) [m], [rad].
+
+        Turned about the handle's centre, the coils move aside by the handle's distance from the
+        axis through it, until they are at the end of their gap.
+        """
+        far, most, handle = self.workspace.translation, self.workspace.rotation, self.flotor.handle
+        turns = []
+        for i in range(3):
+            lever = math.hypot(*(handle[k] for k in range(3) if k != i))
+            turns.append(2.0 * math.asin(min(1.0, 0.5 * far / lever)) if lever > 0.0 else most)
+        return (far,) * 3 + tuple(min(most, turn) for turn in turns)
 
     @model_validator(mode="after")
     def _check(self):

@@ -499,7 +499,7 @@ def _check_time(time: list[float], where: str) -> None:
 
 
 SCRIPTED = "scripted:"
-NAMES = ("keyboard", *LAYOUTS, f"{SCRIPTED}FILE")
+NAMES = ("keyboard", *LAYOUTS, f"{SCRIPTED}FILE", "haptic:HOST:PORT")
 
 
 def open_device(name: str, further: tuple[str, ...]) -> Device:

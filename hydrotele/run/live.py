@@ -6,7 +6,7 @@ What the device asked for is written down, so that the run's own scenario repeat
 import math
 import time as clock
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import AXES
 from hydrotele.machine.machine import Machine
 from hydrotele.run.devices import Device, Reading
+from hydrotele.run.haptic import HapticHandle
 from hydrotele.run.run import Run, begin, finished
 from hydrotele.run.session import Session
 from hydrotele.scenario.scenario import Scenario
@@ -23,7 +24,27 @@ from hydrotele.simulate.record import contact_force, surrounding_bodies
 
 PATIENCE = 0.25  # s that simulated time may be late before it is stopped
 _TELL = 2.0  # s between two sentences that it cannot keep up
+_LED = 5  # decimals of a handle's place that is written down
 _SLOW_CLOCK = 0.002  # s: shorter sleeps cost more than they give
+
+
+class TimeKeeper(Protocol):
+    """Keeps simulated time to the wall clock: a `Pacer`, or the deadlines of a haptic device."""
+
+    pauses: int
+    late: float
+
+    def now(self) -> float:
+        """The clock [s]."""
+        ...
+
+    def wait(self, simulated: float) -> float:
+        """Wait until it is time; by how much simulated time was just set back [s]."""
+        ...
+
+    def close(self) -> None:
+        """No time is kept any more."""
+        ...
 
 
 class Pacer:
@@ -73,6 +94,9 @@ class Pacer:
         self.late -= early
         return -early
 
+    def close(self) -> None:
+        """Nothing was taken that has to be given back."""
+
 
 class LiveHand:
     """Where the device wants the handle, and what it has asked for so far.
@@ -111,6 +135,17 @@ class LiveHand:
                 session.set_command(name, most * new)
                 self._buttons.append(Button(at=session.time, axis=name, command=most * new))
         self._before = reading
+
+    def led(self, handle: np.ndarray, time: float) -> None:
+        """Write down where a device's handle was, (6,) [m], [rad], at a time of the run [s].
+
+        What is written down is where a simulated hand is to hold the joystick. It follows with its
+        own arm, so that a repetition is alike, not the same bit for bit.
+        """
+        wanted = np.round(handle, _LED)
+        if not np.array_equal(wanted, self._wanted):
+            self._wanted = wanted
+            self._note(time, wanted)
 
     def _note(self, time: float, wanted: np.ndarray) -> None:
         if time == self._time[-1]:
@@ -199,7 +234,7 @@ def live(scenario: Scenario, further: Iterable[str]) -> Scenario:
 
 
 def drive(
-    scenario: Scenario, machine: Machine, device: Device, pacer: Pacer,
+    scenario: Scenario, machine: Machine, device: Device, pacer: TimeKeeper,
     watch: Watch, say: Callable[[str], None],
 ) -> Run:  # fmt: skip
     """Let a person drive a scenario.
@@ -225,6 +260,10 @@ def drive(
     station = session.station
     assert station
     hand.span = station.span
+    haptic = device if isinstance(device, HapticHandle) else None
+    if haptic:
+        haptic.attach(session)
+    handle = station.log.master("handle")
     status, told = _status_of(session, further), _Told(session, say)
     while session.tick < session.scenario.ticks:
         if session.tick % station.operator.every == 0:
@@ -234,16 +273,23 @@ def drive(
             if reading.quit:
                 break
             hand.take(reading, session)
+            if haptic:
+                hand.led(handle[max(0, session.tick - 1)], session.time)
         session.advance()
         told.news()
         if not watch(session, status, pacer.now()):
             break
+        if haptic and session.tick == 1:
+            haptic.link.restart_figures()
         if pacer.wait(session.time):  # begins after the first tick has compiled and shown
             told.late(pacer)
+    seen = haptic.link.figures() if haptic else {}
     while session.tick % session.every:  # the logs hold whole rows
         session.advance()
     run = finished(session, hand.written_down(session.scenario, session.time))
     run.summary.update(late_seconds=round(pacer.late, 3), pauses=pacer.pauses)
+    if haptic:
+        run.summary["haptic"] = seen
     return run
 
 
@@ -256,7 +302,7 @@ class _Told:
         self._say, self._count = say, [0, 0]
         self._due = -math.inf
 
-    def late(self, pacer: Pacer) -> None:
+    def late(self, pacer: TimeKeeper) -> None:
         """Tell that simulated time was stopped, now and then."""
         if pacer.now() >= self._due:
             self._due = pacer.now() + _TELL

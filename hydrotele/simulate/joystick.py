@@ -1,7 +1,8 @@
 """The joystick's flotor in MuJoCo: coils push it, stops hold it, a hand or a cab may shake it.
 
 The cab's frame is not inertial: its acceleration counts against gravity, and its turning acts on
-the flotor as force and torque.
+the flotor as force and torque. Coils are warmed by their currents, and push less where the field of
+their magnets falls off towards the ends of the gap.
 """
 
 import math
@@ -16,6 +17,7 @@ from hydrotele.core.files import read_xml
 from hydrotele.machine.joystick import Joystick
 
 GRAVITY = -9.81
+_COOL = 0.9  # heat below which hot coils may have their largest current again
 _STEPS = 2  # physics steps per control period of 5 ms: its stiffest spring turns over in 30 ms
 
 
@@ -27,6 +29,10 @@ class SimulatedFlotor:
         data: its state; `qpos` (7,) handle [m] and quaternion, `qvel` (6,) [m/s] in the stator's
             axes and [rad/s] in the flotor's.
         hand: whether a hand holds the handle.
+        heat: (6,) of the coils, see `heat_step`.
+        hottest: the most that any of them has had.
+        allowed: current that the coils may have now [A]: the largest, or, once one of them is hot
+            and until it has cooled down, the one that they bear for ever.
     """
 
     def __init__(
@@ -52,9 +58,7 @@ class SimulatedFlotor:
         spec.compiler.fusestatic = True
         spec.option.timestep = self.period / self.steps
         self.model = spec.compile()
-        self.model.opt.disableflags |= int(
-            mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_EQUALITY
-        )
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
         self.data = mujoco.MjData(self.model)
         body = self.model.body("flotor")
         self._mass, self._com = float(body.mass[0]), body.ipos.copy()
@@ -64,17 +68,24 @@ class SimulatedFlotor:
         self._inertia = turn @ np.diag(body.inertia) @ turn.T
         self._inertia += self._mass * (self._com @ self._com * np.eye(3))
         self._inertia -= self._mass * np.outer(self._com, self._com)
-        self.model.opt.gravity[:] = (0.0, 0.0, GRAVITY)
+        self._gravity = self.model.opt.gravity  # views, which cost time to ask for
+        self._gravity[:] = (0.0, 0.0, GRAVITY)
+        self._ctrl, self._applied = self.data.ctrl, self.data.qfrc_applied
+        self.heat, self.hottest, self.allowed = np.zeros(6), 0.0, facts.coils.max_current
+        self._gear, self._full = self.model.actuator_gear, self.model.actuator_gear.copy()
+        places = self.model.site_pos[self.model.actuator_trnid[:, 0]]
+        self._spots = places + np.array(
+            facts.flotor.handle
+        )  # from the flotor's to the coils' frame
 
     def step(self, currents: np.ndarray, muscles: np.ndarray) -> None:
         """Go on by one control period with held currents (6,) [A] and muscle forces (6,) [N, N m].
 
         Muscles act on the handle: force along the stator's axes, torque about them.
         """
-        data = self.data
-        data.ctrl[:] = currents
-        data.qfrc_applied[:] = muscles
-        mujoco.mj_step(self.model, data, nstep=self.steps)
+        self._load_coils(currents)
+        self._applied[:] = muscles
+        mujoco.mj_step(self.model, self.data, nstep=self.steps)
 
     def shaken_step(
         self, currents: np.ndarray, muscles: np.ndarray, mount: np.ndarray, spin: float,
@@ -91,10 +102,29 @@ class SimulatedFlotor:
         """
         _shake(
             self._mass, self._com, self._inertia, mount, spin, spin_rate, muscles,
-            self.model.opt.gravity, self.data.qfrc_applied,
+            self._gravity, self._applied,
         )  # fmt: skip
-        self.data.ctrl[:] = currents
+        self._load_coils(currents)
         mujoco.mj_step(self.model, self.data, nstep=self.steps)
+
+    def _load_coils(self, currents: np.ndarray) -> None:
+        """Put currents on the coils, warm them, and weaken those that leave their field."""
+        self._ctrl[:] = currents
+        c = self.facts.coils
+        hot = heat_step(self.heat, currents, c.continuous_current, c.thermal_time, self.period)
+        self.hottest = max(self.hottest, hot)
+        if hot >= 1.0:
+            self.allowed = min(c.max_current, c.continuous_current)
+        elif hot < _COOL:
+            self.allowed = c.max_current
+        if c.edge_loss > 0.0:
+            turn, handle = np.empty(9), np.array(self.facts.flotor.handle)
+            mujoco.mju_quat2Mat(turn, self.data.qpos[3:7])
+            turn = turn.reshape(3, 3)
+            place = self.data.qpos[:3] + handle - turn @ handle
+            gap = self.facts.workspace.translation
+            shares = field_shares(self._spots, place, turn, gap, c.edge_loss)
+            self._gear[:] = self._full * shares[:, None]
 
     def place(self, pose: np.ndarray) -> None:
         """Put the handle to a pose at rest, (6,) displacement [m] and rotation vector [rad]."""
@@ -103,6 +133,54 @@ class SimulatedFlotor:
         angle = float(np.linalg.norm(pose[3:]))
         way = pose[3:] / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
         mujoco.mju_axisAngle2Quat(self.data.qpos[3:7], way, angle)
+
+
+@compiled
+def heat_step(heat, currents, continuous, time_constant, period):
+    """Warm coils over a period of held currents.
+
+    `heat' = ((I / I_c)^2 - heat) / T`, by its exact exponential: one thermal capacity that the
+    copper loss I^2 R warms, at 1 where the continuous current leaves it in the end.
+
+    Args:
+        heat: (6,) temperature rise over that of the continuous current [1], written.
+        currents: (6,) [A].
+        continuous: I_c, scalar [A].
+        time_constant: T of the winding, scalar [s].
+        period: scalar [s].
+
+    Returns:
+        The largest heat, scalar [1].
+
+    Source: copper loss and one thermal capacity (I^2 t rating of motors).
+    """
+    share, hot = -np.expm1(-period / time_constant), 0.0
+    for i in range(len(heat)):
+        heat[i] += share * ((currents[i] / continuous) ** 2 - heat[i])
+        hot = max(hot, heat[i])
+    return hot
+
+
+def field_shares(
+    spots: np.ndarray, place: np.ndarray, turn: np.ndarray, gap: float, edge_loss: float
+) -> np.ndarray:
+    """Share of its force per ampere that every coil has in a pose of the flotor.
+
+    `1 - edge_loss (d / gap)^2`, with the displacement d of the coil's centre from its nominal
+    place: even about the middle of the gap, as symmetric magnets make it.
+
+    Args:
+        spots: (6, 3) centres of the coils in their frame [m].
+        place: (3,) of the coils' frame from its nominal place [m].
+        turn: (3, 3) flotor to stator.
+        gap: displacement at which a coil has lost `edge_loss` [m].
+        edge_loss: share of the force that is lost there [1].
+
+    Returns:
+        (6,), at least 0.
+    """
+    moved = place + spots @ turn.T - spots
+    return np.maximum(0.0, 1.0 - edge_loss * np.sum(moved**2, axis=1) / gap**2)
 
 
 @compiled
@@ -149,9 +227,7 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     flotor.ipos = np.subtract(facts_flotor.com, facts_flotor.handle)
     coils.pos = np.negative(facts_flotor.handle)
     degrees = 180.0 / math.pi if spec.compiler.degree else 1.0
-    far = facts.workspace.translation
-    for name in ("x", "y", "z"):
-        joints[name].range = (-far, far)
+    _place_stops(spec, facts, path)
     joints["turn"].range = (0.0, degrees * facts.workspace.rotation)
     for actuator in spec.actuators:
         actuator.ctrlrange = (-facts.coils.max_current, facts.coils.max_current)
@@ -166,6 +242,20 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     if hand:
         _hold(joints, facts)
     return spec
+
+
+def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
+    """Put the six walls where the ball at the coils' centre has gone through the gap."""
+    ball, far = spec.geom("gap"), facts.workspace.translation
+    walls = {f"gap_{axis}_{side}": (i, way) for i, axis in enumerate("xyz")
+              for side, way in (("low", -1.0), ("high", 1.0))}  # fmt: skip
+    missing = [name for name in walls if spec.geom(name) is None]
+    if ball is None or missing:
+        names = ", ".join(["gap"] * (ball is None) + missing)
+        raise InputError(path, f"has no geoms {names}, which are the stops at the coils")
+    for name, (axis, way) in walls.items():
+        spec.geom(name).pos = np.negative(facts.flotor.handle)
+        spec.geom(name).pos[axis] += way * (far + ball.size[0] + spec.geom(name).size[axis])
 
 
 def _hold(joints, facts: Joystick) -> None:

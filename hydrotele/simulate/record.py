@@ -92,11 +92,22 @@ def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -
     """Staggered positions (..., nq) a step back along velocities (..., nv); see `Record`."""
     if model.nq == model.nv:
         return qpos - model.opt.timestep * qvel
-    turning = (mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE)
-    plain = int(np.argmax(np.isin(model.jnt_type, turning)))
+    plain = _plain_joints(model.jnt_type)
     positions = qpos.copy()
     positions[..., :plain] -= model.opt.timestep * qvel[..., :plain]
     return positions
+
+
+_BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
+
+
+@compiled
+def _plain_joints(kinds):
+    """Number of joints of one degree of freedom before the first ball or free joint."""
+    for k in range(len(kinds)):
+        if kinds[k] == _BALL or kinds[k] == _FREE:
+            return k
+    return 0
 
 
 def sensed_channels(plant: Plant) -> tuple[str, ...]:
@@ -128,7 +139,7 @@ class Recorder:
     def __init__(self, plant: Plant, rows: int) -> None:
         """Make room for all rows."""
         model = plant.model
-        self.model = model
+        self.model, self._step = model, model.opt.timestep
         self.tip_site = model.site(TIP_SITE).id if plant.machine.arm else -1
         self.around = surrounding_bodies(plant)
         self.time = np.zeros(rows)
@@ -153,11 +164,10 @@ class Recorder:
         Raises:
             SimulationFailed: the state is not finite, or MuJoCo warns.
         """
-        h = self.model.opt.timestep
-        self.time[row] = time
+        self.time[row], qacc = time, data.qacc
         self.qpos[row] = aligned_positions(self.model, data)
-        self.qvel[row] = data.qvel - 0.5 * h * data.qacc
-        self.qacc[row] = data.qacc
+        self.qvel[row] = data.qvel - 0.5 * self._step * qacc
+        self.qacc[row] = qacc
         self.act[row] = data.act
         if shown is not None and self.late.shape[1]:
             self.late[row] = shown
@@ -165,7 +175,7 @@ class Recorder:
             self.tip[row] = data.site_xpos[self.tip_site]
         if data.ncon:
             self.contact[row] = contact_force(self.model, data, self.around)
-        if not np.isfinite(self.qacc[row]).all() or data.warning.number.any():
+        if not np.isfinite(qacc).all() or data.warning.number.any():
             raise SimulationFailed(self._story(row))
 
     def _story(self, row: int) -> str:
@@ -199,15 +209,27 @@ def contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray
         data: with contacts and their forces.
         around: (nbody,) of `surrounding_bodies`.
     """
-    total, wrench = np.zeros(3), np.zeros(6)
-    for k in range(data.ncon):
-        contact = data.contact[k]
+    total, count = np.zeros(3), data.ncon
+    if not count:
+        return total
+    contacts, wrenches = data.contact, np.empty((count, 6))
+    for k, wrench in enumerate(wrenches):
         mujoco.mj_contactForce(model, data, k, wrench)
-        force = contact.frame.reshape(3, 3).T @ wrench[:3]
-        grounded = around[model.geom_bodyid[contact.geom]]
-        if grounded[0] != grounded[1]:  # the machine touching itself is no ground force
-            total += force if grounded[0] else -force
+    _add_forces(contacts.frame, contacts.geom, wrenches, model.geom_bodyid, around, total)
     return total
+
+
+@compiled
+def _add_forces(frames, geoms, wrenches, bodies, around, total):
+    """Add the forces of contacts, turned into the world, on bodies that are not around."""
+    for k in range(len(wrenches)):
+        first = around[bodies[geoms[k, 0]]]
+        if first == around[bodies[geoms[k, 1]]]:
+            continue  # the machine touching itself is no ground force
+        sign = 1.0 if first else -1.0
+        for i in range(3):
+            force = frames[k, i] * wrenches[k, 0] + frames[k, 3 + i] * wrenches[k, 1]
+            total[i] += sign * (force + frames[k, 6 + i] * wrenches[k, 2])
 
 
 _BRISTLE, _STIFFNESS = int(Slot.BRISTLE), int(Slot.BRISTLE_STIFFNESS)

@@ -50,7 +50,7 @@ def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, .
     damped = _DAMPED * soft if pilot.coupling_damping is None else pilot.coupling_damping
     for number, name in enumerate(AXES):
         law = _gains(joystick, pilot, name)
-        reach = joystick.workspace.translation if number < 3 else joystick.workspace.rotation
+        reach = joystick.reach[number]
         detent = law.detent if pilot.detent and pilot.mode == "rate" else None  # no dead band else
         table[number, : COORDINATE] = (
             law.nominal, law.least, law.most, (law.most - law.nominal) / law.force_limit,

@@ -2,6 +2,9 @@
 
 A coil in its magnets' field pushes the flotor in a fixed direction, as hard as its current. Six of
 them make any force and torque: `[f; tau] = M I`.
+
+Currents heat the coils, which is what limits them over minutes, and what detents are for: Zhu 1994,
+6.3, "a stiff joystick could easily cause heating problem".
 """
 
 from dataclasses import dataclass
@@ -117,3 +120,39 @@ def three_stations(radius: float, force_per_ampere: float, max_current: float) -
     return Coils(
         np.vstack([places, places]), np.vstack([up, around]), force_per_ampere, max_current
     )
+
+
+def heating(currents: np.ndarray, continuous: float) -> float:
+    """Rise of the hottest coil's temperature in the end, over what it may have for ever.
+
+    Args:
+        currents: (6,) held, or root mean squares [A].
+        continuous: largest current for ever [A].
+
+    Returns:
+        [1]; beyond 1 the coils must be let cool.
+
+    >>> heating(np.array([0.0, 3.0, -4.0, 0.0, 0.0, 0.0]), 2.0)
+    4.0
+    """
+    return float(np.max(np.square(np.asarray(currents, float) / continuous)))
+
+
+def seconds_until_hot(currents: np.ndarray, continuous: float, time_constant: float) -> float:
+    """Time that cold coils bear currents.
+
+    Args:
+        currents: (6,) held [A].
+        continuous: largest current for ever [A].
+        time_constant: of the winding [s].
+
+    Returns:
+        [s]; infinite if they bear them for ever.
+
+    Source: `simulate.joystick.heat_step`.
+
+    >>> round(seconds_until_hot(np.full(6, 4.0), 2.0, 60.0), 3)
+    17.261
+    """
+    end = heating(currents, continuous)
+    return float(-time_constant * np.log1p(-1.0 / end)) if end > 1.0 else float("inf")

@@ -424,8 +424,8 @@ def excitation_path(
         angles = 2.0 * np.pi * np.outer(time, tones[axis::6]) + rng.uniform(0, 2 * np.pi, _TONES)
         path[:, axis] = np.sin(angles).sum(axis=1)
     path *= np.clip(time, 0.0, 1.0)[:, None]  # rises from rest in a second
-    for rows, far in ((slice(0, 3), joystick.workspace.translation),
-                      (slice(3, 6), joystick.workspace.rotation)):  # fmt: skip
+    for rows, far in ((slice(0, 3), min(joystick.reach[:3])),
+                      (slice(3, 6), min(joystick.reach[3:]))):  # fmt: skip
         path[:, rows] *= share * far / np.linalg.norm(path[:, rows], axis=1).max()
     return path
 

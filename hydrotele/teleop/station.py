@@ -12,6 +12,7 @@ Delay lines are rings: what is written at a tick is read as many ticks later as 
 """
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,6 +45,7 @@ from hydrotele.teleop.master import (
     TASK_MASS,
     TASK_STIFFNESS,
     WAVES,
+    Master,
     MasterState,
     master,
     master_step,
@@ -71,6 +73,11 @@ from hydrotele.teleop.slave import (
 )
 
 QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
+
+Exchange = Callable[[np.ndarray, np.ndarray, float, np.ndarray], None]
+"""What a device does once per control tick: writes where its handle is, (7,) as the flotor's [m]
+and quaternion, not a number without one; and takes the machine's packet (rows, k), the share of it
+that counts, and the further force on the handle (6,) [N], [N m]."""
 
 
 class SlaveSide(NamedTuple):
@@ -388,6 +395,32 @@ class Station:
         self._said: set[str] = set()
         self.tripped = False
         self._faults = [_Fault(fault, plan.axes) for fault in pilot.faults]
+        self._exchange: Exchange | None = None
+
+    def attach(self, exchange: Exchange) -> None:
+        """Let a device in a person's hand take the place of the simulated joystick.
+
+        Its own loop reflects what comes back; here the same law runs once more, for the logs.
+
+        Args:
+            exchange: called once per control tick, see `Exchange`.
+        """
+        self._exchange = exchange
+
+    @property
+    def numbers(self) -> Master:
+        """Numbers of the master's control."""
+        return self._master
+
+    @property
+    def master_state(self) -> MasterState:
+        """State of the master's control, rewritten every tick."""
+        return self._m
+
+    @property
+    def packet(self) -> np.ndarray:
+        """(rows, k) the last packet that came from the machine, see `teleop.master`."""
+        return self._line.packet
 
     @property
     def span(self) -> np.ndarray:
@@ -414,6 +447,9 @@ class Station:
                 self._pilot.tip_over, self._master, self._line.packet, self._slave.start,
                 self._m.handle, self._m.speed, self._m.extra,
             )  # fmt: skip
+        if self._exchange:
+            share = float(self._line.state[SHARE])
+            self._exchange(self._qpos, self._line.packet, share, self._m.extra)
         if tick % self.operator.every == 0:
             self.operator.decide(tick)
         operator = self.operator
@@ -450,10 +486,14 @@ class Station:
 
     def _move_flotor(self, data: mujoco.MjData) -> None:
         """One period of the joystick, shaken by the cab if it stands there."""
+        if self._exchange:
+            return
         currents, muscles = self._m.currents, self.operator.muscles.force
         if self._swing < 0:
+            self._master.most[0] = self._flotor.allowed
             self._flotor.step(currents, muscles)
             return
+        self._master.most[0] = self._flotor.allowed
         w, a = float(data.qvel[self._swing]), float(data.qacc[self._swing])
         self._flotor.shaken_step(currents, muscles, self._mount, w, a)
 
@@ -480,6 +520,7 @@ class Station:
             "largest_handle_displacement_m": float(handle[:, :3].max()),
             "largest_handle_rotation_rad": float(handle[:, 3:].max()),
             "largest_coil_current_A": float(np.abs(self.log.master("currents")).max()),
+            "largest_coil_heat": self._flotor.hottest,
             "periods_with_limited_currents": int((self.log.master("limited") < 1.0).sum()),
             "largest_tip_force_N": float(np.abs(self.log.force[:, [0, 2]]).max()),
             "tripped": self.tripped,

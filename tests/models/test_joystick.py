@@ -54,7 +54,7 @@ def test_the_mjcf_alone_has_the_numbers_of_the_yaml():
     folder = models_folder() / "joystick"
     alone = mujoco.MjModel.from_xml_path(str(folder / "joystick.xml"))
     made = joystick_spec(JOYSTICK).compile()
-    for name in ("body_mass", "body_ipos", "jnt_range", "actuator_gear", "site_pos"):
+    for name in ("body_mass", "body_ipos", "jnt_range", "geom_pos", "actuator_gear", "site_pos"):
         np.testing.assert_allclose(
             getattr(alone, name), getattr(made, name), atol=1e-9, err_msg=name
         )
@@ -69,8 +69,33 @@ def test_the_mjcf_alone_has_the_numbers_of_the_yaml():
 
 def test_nothing_of_its_looks_has_mass_or_touches():
     model = joystick_spec(JOYSTICK, hand=False).compile()
-    assert not model.geom_contype.any() and not model.geom_conaffinity.any()
+    stops = [name for name in map(lambda g: model.geom(g).name, range(model.ngeom)) if name]
+    assert sorted(stops) == ["gap", *(f"gap_{a}_{s}" for a in "xyz" for s in ("high", "low"))]
+    for g in range(model.ngeom):
+        touches = model.geom_contype[g] or model.geom_conaffinity[g]
+        assert bool(touches) == bool(model.geom(g).name)
     assert model.body_mass.sum() == pytest.approx(JOYSTICK.flotor.mass)
+
+
+def test_the_handle_turns_about_itself_until_the_coils_are_at_the_end_of_their_gap():
+    """Zhu 1994, 5.1.2: the workspace is limited by the magnetic gap, +-5 mm and +-7 deg."""
+    reach = JOYSTICK.reach
+    assert reach[:3] == (5e-3,) * 3 and reach[5] == pytest.approx(np.deg2rad(7.0))
+    assert reach[3] == reach[4] == pytest.approx(2.0 * np.arcsin(2.5e-3 / 0.12))  # 2.39 deg
+    # The published dead band of the feller-buncher's rotations, 0.035 rad, has to be left: a
+    # handle higher than 143 mm above the coils could not.
+    assert max(JOYSTICK.gains["feller"][axis].deadband for axis in ("rx", "ry")) < reach[4]
+    assert 5e-3 / 0.035 == pytest.approx(0.143, abs=1e-3)
+
+
+def test_a_joystick_without_the_stops_at_its_coils_is_refused(tmp_path):
+    for name in ("joystick.yaml", "joystick.xml"):
+        shutil.copy(models_folder() / "joystick" / name, tmp_path / name)
+    text = (tmp_path / "joystick.xml").read_text()
+    lines = [line for line in text.splitlines() if 'name="gap_x_low"' not in line]
+    (tmp_path / "joystick.xml").write_text("\n".join(lines))
+    with pytest.raises(InputError, match="has no geoms gap_x_low, which are the stops"):
+        joystick_spec(load_joystick(tmp_path))
 
 
 def test_a_users_joystick_is_a_file_or_a_folder(tmp_path):

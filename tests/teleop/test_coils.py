@@ -7,7 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.coils import Coils, three_stations
+from hydrotele.machine.joystick import load_joystick
+from hydrotele.simulate.joystick import SimulatedFlotor, field_shares, heat_step
+from hydrotele.teleop.coils import (
+    Coils,
+    heating,
+    seconds_until_hot,
+    three_stations,
+)
 
 COILS = three_stations(0.05, 8.0, 4.0)
 WRENCH = st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6)
@@ -61,3 +68,78 @@ def test_coils_that_cannot_make_every_wrench_are_refused():
         Coils(place[:3], up[:3], 8.0, 4.0)
     with pytest.raises(InputError, match="positive"):
         three_stations(0.05, 0.0, 4.0)
+
+
+def test_coils_heat_as_the_exact_solution_does():
+    heat, currents = np.zeros(6), np.array([0.0, 1.0, 2.0, 3.0, -4.0, 4.0])
+    for _ in range(1200):
+        heat_step(heat, currents, 2.0, 60.0, 0.025)
+    # 30 s of held currents; the steps are exact, so only rounding of 1200 sums is left
+    assert heat == pytest.approx((currents / 2.0) ** 2 * -np.expm1(-0.5), rel=1e-10)
+
+
+def test_heating_and_the_time_that_is_left():
+    currents = np.full(6, 3.0)
+    assert heating(currents, 2.0) == pytest.approx(2.25)
+    assert seconds_until_hot(np.full(6, 2.0), 2.0, 60.0) == np.inf
+    left, heat = seconds_until_hot(currents, 2.0, 60.0), np.zeros(6)
+    heat_step(heat, currents, 2.0, 60.0, left)
+    assert heat == pytest.approx(np.ones(6))
+
+
+def test_a_detent_keeps_the_coils_cool_where_one_slope_would_not():
+    """Zhu 1994, 6.3: a stiff joystick heats; Table 6.11's detent of the feller-buncher's x."""
+    joystick = load_joystick()
+    c, x = joystick.coils, 4.5e-3
+    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
+    gains = joystick.gains["feller"]["x"]
+    assert gains.detent
+    slope = gains.nominal * x
+    notch = gains.nominal * gains.deadband - gains.detent.drop
+    notch += gains.detent.outside * (x - gains.deadband)
+    hot = []
+    for force in (slope, notch):
+        wrench = np.array([force, 0.0, 9.81 * joystick.flotor.mass, 0.0, 0.0, 0.0])
+        wrench[4] = force * joystick.flotor.handle[2]
+        hot.append(heating(coils.currents(wrench).value, c.continuous_current))
+    assert hot[0] > 2.0 and hot[1] < 1.0
+
+
+def test_the_field_is_that_of_the_middle_there_and_even_about_it():
+    coils = three_stations(0.05, 8.0, 4.0).position
+    assert field_shares(coils, np.zeros(3), np.eye(3), 5e-3, 0.2).tolist() == [1.0] * 6
+    moved = field_shares(coils, np.array([3e-3, 0.0, 4e-3]), np.eye(3), 5e-3, 0.2)
+    assert moved == pytest.approx(np.full(6, 0.8))
+    back = field_shares(coils, np.array([-3e-3, 0.0, -4e-3]), np.eye(3), 5e-3, 0.2)
+    assert back == pytest.approx(moved)
+    c, s = np.cos(0.02), np.sin(0.02)
+    turned = field_shares(
+        coils, np.zeros(3), np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), 5e-3, 0.2
+    )
+    assert turned == pytest.approx(np.full(6, 1.0 - 0.2 * (2 * 0.05 * np.sin(0.01) / 5e-3) ** 2))
+
+
+def test_hot_coils_get_less_until_they_have_cooled():
+    flotor, full = SimulatedFlotor(load_joystick(), hand=False), np.full(6, 4.0)
+    c = flotor.facts.coils
+    steps = 0
+    while flotor.allowed == c.max_current:
+        flotor.step(full, np.zeros(6))
+        steps += 1
+    expected = seconds_until_hot(full, c.continuous_current, c.thermal_time)
+    assert steps * flotor.period == pytest.approx(expected, abs=flotor.period)
+    assert flotor.allowed == c.continuous_current and flotor.hottest >= 1.0
+    steps = 0
+    while flotor.allowed < c.max_current:
+        flotor.step(np.zeros(6), np.zeros(6))
+        steps += 1
+    assert steps * flotor.period == pytest.approx(-c.thermal_time * np.log(0.9), abs=0.02)
+
+
+def test_a_coil_that_leaves_its_field_pushes_less():
+    joystick = load_joystick()
+    coils = joystick.coils.model_copy(update={"edge_loss": 0.2})
+    flotor = SimulatedFlotor(joystick.model_copy(update={"coils": coils}), hand=False)
+    flotor.place(np.array([5e-3, 0, 0, 0, 0, 0]))
+    flotor.step(np.zeros(6), np.zeros(6))
+    assert np.abs(flotor.model.actuator_gear).max(axis=1) == pytest.approx(np.full(6, 6.4))

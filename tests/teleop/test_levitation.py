@@ -10,7 +10,7 @@ from hydrotele.teleop.compliance import Flotor
 from hydrotele.teleop.levitation import FROZEN, designed_step, levitation, simulate_levitation
 
 JOYSTICK = load_joystick()
-STEPS = np.array([2e-3] * 3 + [np.deg2rad(3.0)] * 3)
+STEPS = np.array([2e-3] * 3 + [np.deg2rad(2.0)] * 3)
 
 
 @pytest.mark.parametrize("diodes", [False, True])

@@ -1,0 +1,178 @@
+"""Keeping a period of a millisecond: absolute deadlines, priority, and what was missed.
+
+A process that has a deadline every millisecond sleeps until shortly before it and spins over the
+rest, since a sleeping process wakes some 50 us late. Python's garbage collector is off meanwhile.
+"""
+
+import contextlib
+import ctypes
+import gc
+import os
+import time as clock
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+SPIN = 120e-6  # s before a deadline in which a process stays awake
+PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
+EDGES = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # us, of histograms
+_SLACK = 29  # PR_SET_TIMERSLACK of prctl
+
+
+def summary_of(nanoseconds: np.ndarray) -> dict:
+    """Percentiles and histogram of times.
+
+    Args:
+        nanoseconds: (n,) [ns].
+
+    Returns:
+        count, percentiles [us] by name, and a histogram: [us] of the upper edges, and the counts,
+        one more for what is beyond.
+
+    >>> summary_of(np.array([5_000, 15_000, 9_000_000]))["histogram"]["count"]
+    [1, 1, 0, 0, 0, 0, 0, 0, 0, 1]
+    """
+    micro = np.asarray(nanoseconds, float) / 1e3
+    if not len(micro):
+        return {"count": 0, "percentiles_us": {}, "histogram": {"edges_us": EDGES, "count": []}}
+    values = np.percentile(micro, PERCENTILES)
+    names = [f"p{p:g}" if p < 100.0 else "largest" for p in PERCENTILES]
+    counts = np.histogram(micro, [-np.inf, *EDGES, np.inf])[0]
+    return {
+        "count": len(micro),
+        "percentiles_us": {n: round(float(v), 1) for n, v in zip(names, values, strict=True)},
+        "histogram": {"edges_us": list(EDGES), "count": counts.tolist()},
+    }
+
+
+class Deadlines:
+    """Keeps simulated time to the wall clock with a deadline for every tick.
+
+    What is late is made up for; where that is more than `patience`, simulated time stands still.
+
+    Attributes:
+        pauses: how often simulated time was stopped.
+        late: seconds for which it stood still, in all.
+        missed: ticks that were not done in time.
+        ticks: ticks in all.
+        priority: whether the system gave it.
+    """
+
+    def __init__(
+        self, most: int, level: int = 0, patience: float = 0.25,
+        now: Callable[[], int] = clock.monotonic_ns, sleep: Callable[[float], None] = clock.sleep,
+    ) -> None:  # fmt: skip
+        """Begin when `wait` is called first: what is compiled and opened before is in no hurry.
+
+        Args:
+            most: number of ticks for which there is room.
+            level: of priority from then on, see `steady`; 0 asks for none.
+            patience: by which simulated time may be late before it is stopped [s].
+            now: a clock [ns].
+            sleep: waits for a time [s].
+        """
+        self._now, self._sleep, self._patience = now, sleep, patience
+        self._begin: int | None = None
+        self._level, self._steady, self.priority = level, contextlib.ExitStack(), False
+        self._lateness = np.zeros(most, np.int64)
+        self.pauses, self.late, self.missed, self.ticks = 0, 0.0, 0, 0
+
+    def now(self) -> float:
+        """The clock [s]."""
+        return self._now() * 1e-9
+
+    def wait(self, simulated: float) -> float:
+        """Wait for the deadline of a tick whose work is done.
+
+        Args:
+            simulated: time that has been simulated [s].
+
+        Returns:
+            By how much simulated time was just set back [s]; 0 if it keeps up.
+        """
+        due, now = round(simulated * 1e9), self._now()
+        if self._begin is None:
+            if self._level:
+                self.priority = self._steady.enter_context(steady(self._level))
+                now = self._now()
+            self._begin = now - due
+        early = self._begin + due - now
+        if self.ticks < len(self._lateness):
+            self._lateness[self.ticks] = max(0, -early)
+        self.ticks += 1
+        if early < 0:
+            self.missed += 1
+            if early < -1e9 * self._patience:
+                self._begin -= early
+                self.pauses += 1
+                self.late -= 1e-9 * early
+                return -1e-9 * early
+            return 0.0
+        if early > 1e9 * SPIN:
+            self._sleep(1e-9 * early - SPIN)
+        while self._now() < self._begin + due:
+            pass
+        return 0.0
+
+    def close(self) -> None:
+        """Give the priority back."""
+        self._steady.close()
+
+    def lateness(self) -> np.ndarray:
+        """(n,) by how much the ticks that missed their deadline were late [ns]."""
+        late = self._lateness[: self.ticks]
+        return late[late > 0]
+
+
+def load_of_machine() -> list[float] | None:
+    """Mean number of processes that want a core, over 1, 5 and 15 minutes; None where unknown."""
+    try:
+        return [round(v, 2) for v in os.getloadavg()]
+    except OSError:
+        return None
+
+
+def ask_for_priority(level: int) -> bool:
+    """Run the calling thread before all ordinary ones, where the system permits it.
+
+    Args:
+        level: of the first-in first-out scheduler, 1 to 99.
+
+    Returns:
+        Whether it does.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(level))
+    except (AttributeError, OSError):  # no such scheduler, or not permitted
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def steady(level: int) -> Iterator[bool]:
+    """No garbage collection, exact sleeps and, where permitted, priority.
+
+    Args:
+        level: see `ask_for_priority`; 0 asks for none.
+
+    Yields:
+        Whether there is priority.
+    """
+    _sleep_exactly()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    given = level > 0 and ask_for_priority(level)
+    try:
+        yield given
+    finally:
+        if given:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        gc.enable()
+        gc.unfreeze()
+
+
+def _sleep_exactly() -> None:
+    """Let the system wake this thread when it is time, not 50 us later (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_SLACK, 1000, 0, 0, 0)

@@ -1,0 +1,82 @@
+"""Deadlines on a clock that the test moves, and what is said of times."""
+
+import gc
+
+import numpy as np
+import pytest
+
+from hydrotele.haptics.timing import EDGES, Deadlines, steady, summary_of
+
+MS = 1_000_000
+
+
+class Clock:
+    """A clock that moves when somebody works, sleeps or looks at it."""
+
+    def __init__(self):
+        self.time, self.slept = 10**12, []
+
+    def now(self):
+        self.time += 100  # looking takes 0.1 us
+        return self.time
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.time += round(1e9 * seconds)
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+def test_ticks_end_at_absolute_times(clock):
+    pacer = Deadlines(1000, now=clock.now, sleep=clock.sleep)
+    pacer.wait(0.0)
+    begin = clock.time
+    for tick in range(1, 501):
+        clock.time += 300_000 if tick % 2 else 600_000
+        assert pacer.wait(1e-3 * tick) == 0.0
+    # Every wait ends within two looks at the clock of its time, and errors do not add up.
+    assert clock.time - begin == pytest.approx(500 * MS, abs=1000)
+    assert pacer.missed == 0 and max(clock.slept) < 1e-3
+
+
+def test_a_missed_deadline_is_counted_and_made_up_for(clock):
+    pacer = Deadlines(1000, now=clock.now, sleep=clock.sleep)
+    pacer.wait(0.0)
+    clock.time += 3 * MS + MS // 2  # of work for the first tick
+    for tick in range(1, 8):
+        pacer.wait(1e-3 * tick)
+        clock.time += MS // 2
+    # Ticks 1 to 6 end at 3.5, 4, 4.5, 5, 5.5, 6 ms or a little more; only the seventh is in time.
+    assert pacer.missed == 6 and pacer.ticks == 8 and pacer.pauses == 0
+    late = pacer.lateness()
+    assert len(late) == 6 and late[0] == pytest.approx(2.5 * MS, abs=2000)
+    assert np.all(np.diff(late) < 0)
+
+
+def test_simulated_time_stands_still_after_a_long_stop(clock):
+    pacer = Deadlines(1000, patience=0.1, now=clock.now, sleep=clock.sleep)
+    pacer.wait(0.0)
+    clock.time += 1000 * MS
+    assert pacer.wait(1e-3) == pytest.approx(0.999, abs=1e-5)
+    assert pacer.pauses == 1 and pacer.late == pytest.approx(0.999, abs=1e-5)
+    clock.time += MS // 2
+    assert pacer.wait(2e-3) == 0.0 and pacer.missed == 1
+
+
+def test_garbage_is_collected_again_afterwards():
+    assert gc.isenabled()
+    with steady(0) as priority:
+        assert not gc.isenabled() and not priority
+    assert gc.isenabled() and gc.get_freeze_count() == 0
+
+
+def test_summary_of_times():
+    found = summary_of(1000 * np.arange(1, 1001))  # 1 us to 1 ms
+    assert found["percentiles_us"]["p50"] == pytest.approx(500.5)
+    assert found["percentiles_us"]["largest"] == 1000.0
+    assert sum(found["histogram"]["count"]) == found["count"] == 1000
+    assert len(found["histogram"]["count"]) == len(EDGES) + 1
+    assert summary_of(np.zeros(0))["count"] == 0
