@@ -1,0 +1,308 @@
+"""How well effects explain the gap of a mechanism, given noise that is found in the data.
+
+Everything is linear in the columns, so all that is needed are sums of squares of the columns and
+the gap, whitened by the noise: its autoregression drive by drive, and its covariance between them.
+Numbers of the model that may be off are integrated out; effects are judged by their marginal
+likelihood (Laplace's approximation where they are not linear).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.signal import lfilter
+
+from hydrotele.gap.mechanism_columns import Columns
+from hydrotele.gap.mechanism_effects import TYPICAL, MechanismEffect, strengths
+from hydrotele.identify.estimation import autoregression
+
+_ROUNDS, _STEPS = 3, 40
+_DOUBTED = 1e-3  # of doubt, above which a row counts as one near a reversal
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the equations of k drives.
+
+    Attributes:
+        follow: (q, k) weights of the rows before.
+        white: (k, k) that makes what is new in a row white and of size 1.
+        weight: (n, k) of the rows, lower where the sign of dry friction is in doubt.
+        std: (k,) of the forces' noise [N] or [N m].
+        rest: (n, k) what even all columns together do not explain [N] or [N m].
+    """
+
+    follow: np.ndarray
+    white: np.ndarray
+    weight: np.ndarray
+    std: np.ndarray
+    rest: np.ndarray
+
+
+def whitened(values: np.ndarray, noise: Noise, starts: Sequence[int]) -> np.ndarray:
+    """Values (n, k, ...) freed of the noise's memory and covariance.
+
+    Args:
+        values: one row per equation.
+        noise: of the equations.
+        starts: first rows of the runs, and the number of rows.
+
+    Returns:
+        Fewer rows, (n', k, ...): the first ones of every run have no past.
+    """
+    order, parts = len(noise.follow), []
+    flat = values.reshape(*values.shape[:2], -1) * noise.weight[:, :, None]
+    for first, last in zip(starts[:-1], starts[1:], strict=True):
+        own = np.empty((max(last - first - order, 0), *flat.shape[1:]))
+        for k in range(flat.shape[1]):
+            weights = np.concatenate([[1.0], -noise.follow[:, k]])
+            own[:, k] = lfilter(weights, 1.0, flat[first:last, k], axis=0)[order:]
+        parts.append(np.einsum("ij,njm->nim", noise.white, own))
+    return np.concatenate(parts).reshape(-1, *values.shape[1:])
+
+
+def find_noise(columns: Columns) -> Noise:
+    """Noise of the equations: what is left by a model in which everything may differ.
+
+    Args:
+        columns: of the runs.
+
+    Returns:
+        The noise. What repeats with the motion but has no column counts as noise, too.
+
+    Source: generalised least squares, feasible (Aitken 1935; Cochrane and Orcutt 1949).
+    """
+    n, k, _ = columns.matrix.shape
+    wide = TYPICAL / np.maximum(strengths(columns), 1e-300)
+    used = np.isfinite(wide) & (wide < 1e200)
+    matrix, gap = columns.matrix[:, :, used] * wide[used], columns.gap
+    std = np.maximum(np.std(gap, axis=0), 1e-12)
+    noise = Noise(np.zeros((0, k)), np.diag(1.0 / std), np.ones((n, k)), std, gap)
+    for _ in range(_ROUNDS):
+        x = whitened(matrix, noise, columns.starts).reshape(-1, matrix.shape[2])
+        y = whitened(gap, noise, columns.starts).ravel()
+        square = x.T @ x
+        factor = cho_factor(square + np.eye(len(square)))
+        value = cho_solve(factor, x.T @ y)
+        free = max(1.0 - float(np.trace(cho_solve(factor, square))) / len(y), 0.1)
+        rest = gap - matrix @ value
+        weight = _weights(rest, columns.doubt)
+        left = rest * weight
+        follow = _follow(left, columns.starts)
+        plain = Noise(follow, np.eye(k), weight, noise.std, rest)
+        new = whitened(rest, plain, columns.starts)
+        between = new.T @ new / len(new) / free
+        between += 1e-12 * np.trace(between) / k * np.eye(k)
+        white = np.linalg.inv(np.linalg.cholesky(between))
+        std = np.sqrt(np.mean(left**2, axis=0) / np.mean(weight**2, axis=0) / free)
+        noise = Noise(follow, white, weight, std, rest)
+    return noise
+
+
+def _follow(rest: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+    """Autoregression (q, k) of the longest run, long enough for all."""
+    longest = int(np.argmax(np.diff(starts)))
+    found = [autoregression(rest[a:b]) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    order = len(found[longest])
+    fixed = [autoregression(rest[a:b], order) for a, b in zip(starts[:-1], starts[1:], strict=True)
+             if b - a > 4 * order]  # fmt: skip
+    return np.mean(fixed, axis=0)
+
+
+def _weights(rest: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+    """(n, k), 1 where the sign of dry friction is certain."""
+    out = np.ones_like(rest)
+    for k in range(rest.shape[1]):
+        calm = doubt[:, k] < _DOUBTED
+        if calm.sum() < 0.2 * len(calm) or calm.all():
+            continue
+        base = np.mean(rest[calm, k] ** 2)
+        more = np.sum((rest[~calm, k] ** 2 - base) * doubt[~calm, k] ** 2)
+        grows = max(more / np.sum(doubt[~calm, k] ** 4), 0.0)
+        out[:, k] = np.sqrt(base / (base + grows * doubt[:, k] ** 2))
+    return out
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Effects fitted together.
+
+    Attributes:
+        effects: the effects.
+        values: their parameters, each (p,).
+        covariance: of all parameters, one after the other.
+        score: twice the logarithm of the marginal likelihood over that of no effect.
+        gain: the fall of the squared errors alone.
+    """
+
+    effects: tuple[MechanismEffect, ...]
+    values: tuple[np.ndarray, ...]
+    covariance: np.ndarray
+    score: float
+    gain: float
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Sums of squares of m columns and the gap, numbers of the model integrated out.
+
+    Attributes:
+        names: of the m columns.
+        square: (m, m) of the columns.
+        cross: (m,) of the columns and the gap.
+        places: name -> its place.
+        calibrate: names of the columns that are integrated out.
+        towards: (t, m) how the calibrated numbers follow from the columns' coefficients.
+        posterior: (t,) calibrated deviations without any effect.
+        known: (t, t) covariance of these.
+        evidence: twice the log evidence of the calibration over numbers as given.
+    """
+
+    names: tuple[str, ...]
+    square: np.ndarray
+    cross: np.ndarray
+    calibrate: tuple[str, ...]
+    towards: np.ndarray
+    posterior: np.ndarray
+    known: np.ndarray
+    evidence: float
+    places: dict[str, int] = field(default_factory=dict)
+
+    def fit(
+        self, effects: Sequence[MechanismEffect], start: Sequence[np.ndarray] | None = None
+    ) -> Fitted:
+        """Fit effects together.
+
+        Args:
+            effects: any number, also none.
+            start: parameters to start from; the priors' means by default.
+
+        Returns:
+            The most probable parameters, and what they are worth.
+        """
+        if not effects:
+            return Fitted((), (), np.zeros((0, 0)), 0.0, 0.0)
+        picked = [np.array([self.places[c] for c in one.columns]) for one in effects]
+        union = np.unique(np.concatenate(picked))
+        square, cross = self.square[np.ix_(union, union)], self.cross[union]
+        slots = [np.searchsorted(union, one) for one in picked]
+        mean = np.concatenate([one.start for one in effects])
+        scale = np.concatenate([one.scale for one in effects])
+        low = np.concatenate([one.low for one in effects])
+        high = np.concatenate([one.high for one in effects])
+        ends = np.cumsum([0, *(len(one.start) for one in effects)])
+
+        def along(p: np.ndarray) -> np.ndarray:
+            out = np.zeros(len(union))
+            for e, one in enumerate(effects):
+                np.add.at(out, slots[e], one.coefficients(p[ends[e] : ends[e + 1]]))
+            return out
+
+        def worth(p: np.ndarray) -> float:
+            c = along(p)
+            return float(2.0 * c @ cross - c @ square @ c - np.sum(((p - mean) / scale) ** 2))
+
+        best, most = mean, -np.inf
+        for first in self._starts(effects, start, mean, scale, low, high, ends):
+            p, value = _climb(first, worth, along, square, cross, mean, scale, low, high)
+            if value > most:
+                best, most = p, value
+        slope = _slope(along, best, scale)
+        held = slope.T @ square @ slope + np.diag(1.0 / scale**2)
+        size = scale[:, None] * held * scale
+        score = most - float(np.linalg.slogdet(size)[1])
+        c = along(best)
+        values = tuple(best[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True))
+        return Fitted(
+            tuple(effects), values, np.linalg.inv(held), score,
+            float(2.0 * c @ cross - c @ square @ c),
+        )  # fmt: skip
+
+    def _starts(self, effects, start, mean, scale, low, high, ends):
+        """Where to climb from: what is known, and both sides of an effect that is a product."""
+        first = mean.copy() if start is None else np.concatenate(start)
+        yield np.clip(first, low, high)
+        last = effects[-1]
+        if last.name in ("payload", "joint_spring"):
+            for sign in (1.0, -1.0):
+                other = first.copy()
+                other[ends[-2]] += sign * 0.3 * scale[ends[-2]]
+                yield np.clip(other, low, high)
+
+    def calibrated(self, found: Fitted) -> tuple[np.ndarray, np.ndarray]:
+        """Deviations (t,) of the model's numbers beside some effects, and their covariance."""
+        c = np.zeros(len(self.names))
+        for one, value in zip(found.effects, found.values, strict=True):
+            np.add.at(c, [self.places[name] for name in one.columns], one.coefficients(value))
+        return self.posterior - self.towards @ c, self.known
+
+
+def _climb(first, worth, along, square, cross, mean, scale, low, high):
+    """Gauss-Newton steps with halving; parameters and what they are worth."""
+    p, value = first, worth(first)
+    for _ in range(_STEPS):
+        slope = _slope(along, p, scale)
+        uphill = slope.T @ (cross - square @ along(p)) - (p - mean) / scale**2
+        held = slope.T @ square @ slope + np.diag(1.0 / scale**2)
+        fixed = ((p <= low) & (uphill < 0.0)) | ((p >= high) & (uphill > 0.0))
+        step, free = np.zeros(len(p)), ~fixed
+        if free.any():
+            step[free] = np.linalg.solve(held[np.ix_(free, free)], uphill[free])
+        for _ in range(12):
+            there = np.clip(p + step, low, high)
+            gained = worth(there) - value
+            if gained >= 0.0:
+                break
+            step = 0.5 * step
+        else:
+            break
+        p, value = there, value + gained
+        if gained < 1e-6:
+            break
+    return p, value
+
+
+def _slope(along, p: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """(c, p) by central differences: coefficients are polynomials of the second degree at most."""
+    out = []
+    for k, step in enumerate(1e-4 * scale):
+        away = np.zeros(len(p))
+        away[k] = step
+        out.append((along(p + away) - along(p - away)) / (2.0 * step))
+    return np.stack(out, axis=1)
+
+
+def gather_evidence(columns: Columns, noise: Noise, off: dict[str, float]) -> Evidence:
+    """Evidence of some runs.
+
+    Args:
+        columns: of the runs.
+        noise: of their equations.
+        off: column -> standard deviation by which a number of the model may be off.
+
+    Returns:
+        The evidence.
+    """
+    whole = np.concatenate([columns.matrix, columns.gap[:, :, None]], axis=2)
+    x = whitened(whole, noise, columns.starts).reshape(-1, whole.shape[2])
+    gram = x.T @ x
+    square, cross = gram[:-1, :-1], gram[:-1, -1]
+    names = columns.names
+    free = tuple(name for name in names if off.get(name, 0.0) > 0.0)
+    places = {name: k for k, name in enumerate(names)}
+    if not free:
+        empty = np.zeros((0, len(names)))
+        return Evidence(names, square, cross, (), empty, np.zeros(0), np.zeros((0, 0)), 0.0, places)
+    at = np.array([places[name] for name in free])
+    std = np.array([off[name] for name in free])
+    inner = std[:, None] * square[np.ix_(at, at)] * std + np.eye(len(at))
+    factor = cho_factor(inner)
+    towards = std[:, None] * cho_solve(factor, std[:, None] * square[at])
+    posterior = std * cho_solve(factor, std * cross[at])
+    known = std[:, None] * cho_solve(factor, np.diag(std))
+    worth = float(cross[at] @ posterior - np.linalg.slogdet(inner)[1])
+    return Evidence(
+        names, square - square[:, at] @ towards, cross - towards.T @ cross[at], free, towards,
+        posterior, known, worth, places,
+    )  # fmt: skip
