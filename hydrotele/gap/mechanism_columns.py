@@ -26,7 +26,11 @@ from hydrotele.identify.setup import RegressorSetup
 from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.inverse_dynamics import project
 
-STRIBECK = (0.03, 0.1, 0.3)  # of a joint's RMS rate: velocities of the Stribeck effect that are tried
+STRIBECK = (
+    0.03,
+    0.1,
+    0.3,
+)  # of a joint's RMS rate: Stribeck velocities that are tried
 _ROWS = 10.0  # rows per period of the band that columns of small differences need
 _LATE, _AWAY, _TILT = 1e-3, 1e-3, 0.01  # s, of a joint's travel, rad: the small differences
 _WIDEST = 25.0  # Hz: what is faster tells of drives and sensors, not of a mechanism
@@ -50,6 +54,7 @@ class Columns:
         sizes: joint -> (mean, travel, RMS rate) of its motion [rad] or [m], and per s.
         band: of the low-pass [Hz].
         spacing: between rows [s].
+        row: between the readings that they are made of [s].
         runs: names.
     """
 
@@ -64,6 +69,7 @@ class Columns:
     sizes: Mapping[str, tuple[float, float, float]]
     band: float
     spacing: float
+    row: float
     runs: tuple[str, ...]
 
     @property
@@ -182,7 +188,7 @@ def build_columns(
     }
     return Columns(
         names, stacked(1), stacked(2), stacked(3), stacked(4), tuple(map(int, starts)), stacked(5),
-        states, sizes, band, parts[0][7], tuple(r.name for r in records),
+        states, sizes, band, parts[0][7], records[0].period, tuple(r.name for r in records),
     )  # fmt: skip
 
 
@@ -319,5 +325,3 @@ def tilted(gravity: np.ndarray, turn: np.ndarray) -> np.ndarray:
         gravity * np.cos(angle) + np.cross(axis, gravity) * np.sin(angle)
         + axis * (axis @ gravity) * (1.0 - np.cos(angle))
     )  # fmt: skip
-
-

@@ -22,7 +22,7 @@ SENTENCES = {
     "com_offset": "a body's centre of mass lies elsewhere",
     "inertia_error": "a body's moments of inertia about its centre of mass are others",
     "base_tilt": "the base does not stand level",
-    "force_offset": "a constant in a drive's measured force: its sensor's offset or a constant load",
+    "force_offset": "a constant in a drive's force: an offset of its sensor, or a constant load",
     "force_scale": "a force sensor with another scale",
     "force_delay": "a force sensor that reads late",
     "angle_offset": "a position sensor that is mounted askew",

@@ -15,10 +15,9 @@ from scipy.signal import lfilter
 
 from hydrotele.gap.mechanism_columns import Columns
 from hydrotele.gap.mechanism_effects import TYPICAL, MechanismEffect, strengths
-from hydrotele.identify.estimation import autoregression
+from hydrotele.identify.estimation import autoregression, find_doubtful, weights
 
 _ROUNDS, _STEPS = 3, 40
-_DOUBTED = 1e-3  # of doubt, above which a row counts as one near a reversal
 
 
 @dataclass(frozen=True)
@@ -31,6 +30,7 @@ class Noise:
         weight: (n, k) of the rows, lower where the sign of dry friction is in doubt.
         std: (k,) of the forces' noise [N] or [N m].
         rest: (n, k) what even all columns together do not explain [N] or [N m].
+        doubtful: (k, 2) how the weights follow from the doubt; see `identify.estimation.weights`.
     """
 
     follow: np.ndarray
@@ -38,6 +38,7 @@ class Noise:
     weight: np.ndarray
     std: np.ndarray
     rest: np.ndarray
+    doubtful: np.ndarray
 
 
 def whitened(values: np.ndarray, noise: Noise, starts: Sequence[int]) -> np.ndarray:
@@ -56,8 +57,8 @@ def whitened(values: np.ndarray, noise: Noise, starts: Sequence[int]) -> np.ndar
     for first, last in zip(starts[:-1], starts[1:], strict=True):
         own = np.empty((max(last - first - order, 0), *flat.shape[1:]))
         for k in range(flat.shape[1]):
-            weights = np.concatenate([[1.0], -noise.follow[:, k]])
-            own[:, k] = lfilter(weights, 1.0, flat[first:last, k], axis=0)[order:]
+            fresh = np.concatenate([[1.0], -noise.follow[:, k]])
+            own[:, k] = lfilter(fresh, 1.0, flat[first:last, k], axis=0)[order:]
         parts.append(np.einsum("ij,njm->nim", noise.white, own))
     return np.concatenate(parts).reshape(-1, *values.shape[1:])
 
@@ -78,7 +79,7 @@ def find_noise(columns: Columns) -> Noise:
     used = np.isfinite(wide) & (wide < 1e200)
     matrix, gap = columns.matrix[:, :, used] * wide[used], columns.gap
     std = np.maximum(np.std(gap, axis=0), 1e-12)
-    noise = Noise(np.zeros((0, k)), np.diag(1.0 / std), np.ones((n, k)), std, gap)
+    noise = Noise(np.zeros((0, k)), np.diag(1.0 / std), np.ones((n, k)), std, gap, np.zeros((k, 2)))
     for _ in range(_ROUNDS):
         x = whitened(matrix, noise, columns.starts).reshape(-1, matrix.shape[2])
         y = whitened(gap, noise, columns.starts).ravel()
@@ -87,16 +88,17 @@ def find_noise(columns: Columns) -> Noise:
         value = cho_solve(factor, x.T @ y)
         free = max(1.0 - float(np.trace(cho_solve(factor, square))) / len(y), 0.1)
         rest = gap - matrix @ value
-        weight = _weights(rest, columns.doubt)
+        doubtful = find_doubtful(rest, columns.doubt)
+        weight = weights(doubtful, columns.doubt)
         left = rest * weight
         follow = _follow(left, columns.starts)
-        plain = Noise(follow, np.eye(k), weight, noise.std, rest)
+        plain = Noise(follow, np.eye(k), weight, noise.std, rest, doubtful)
         new = whitened(rest, plain, columns.starts)
         between = new.T @ new / len(new) / free
         between += 1e-12 * np.trace(between) / k * np.eye(k)
         white = np.linalg.inv(np.linalg.cholesky(between))
         std = np.sqrt(np.mean(left**2, axis=0) / np.mean(weight**2, axis=0) / free)
-        noise = Noise(follow, white, weight, std, rest)
+        noise = Noise(follow, white, weight, std, rest, doubtful)
     return noise
 
 
@@ -108,20 +110,6 @@ def _follow(rest: np.ndarray, starts: Sequence[int]) -> np.ndarray:
     fixed = [autoregression(rest[a:b], order) for a, b in zip(starts[:-1], starts[1:], strict=True)
              if b - a > 4 * order]  # fmt: skip
     return np.mean(fixed, axis=0)
-
-
-def _weights(rest: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-    """(n, k), 1 where the sign of dry friction is certain."""
-    out = np.ones_like(rest)
-    for k in range(rest.shape[1]):
-        calm = doubt[:, k] < _DOUBTED
-        if calm.sum() < 0.2 * len(calm) or calm.all():
-            continue
-        base = np.mean(rest[calm, k] ** 2)
-        more = np.sum((rest[~calm, k] ** 2 - base) * doubt[~calm, k] ** 2)
-        grows = max(more / np.sum(doubt[~calm, k] ** 4), 0.0)
-        out[:, k] = np.sqrt(base / (base + grows * doubt[:, k] ** 2))
-    return out
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,8 @@ class Equations:
         name: the run's.
         band: of the low-pass [Hz].
         matrix: (n, k, m).
-        force: (n, k) less what the joints' stated damping and springs take [N] or [N m]; NaN where unknown.
+        force: (n, k) less what the joints' stated damping and springs take [N] or [N m]; NaN where
+            unknown.
         time: (n,) [s] from the run's start.
         spacing: between equations [s]; a whole part of a repeated motion's period.
         doubt: (n, k) how uncertain the sign of the drives' dry friction is, 0 .. 1.

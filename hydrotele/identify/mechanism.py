@@ -52,7 +52,7 @@ class ColumnMapping(Facts):
         absent: parameters that are known to be 0, such as `moment_x.stator_*`.
         offsets: whether drives may have constant forces.
         friction: joint -> friction that an MJCF cannot state, such as `stribeck`, `quadratic`,
-            `viscous_asymmetry`; see `FrictionTerm`.
+            `viscous_asymmetry`; see `FrictionTerm`. `stribeck_velocity` is that of `stribeck`.
         sensor_errors: `position.JOINT` or `force.DRIVE` -> known defect of its sensor, which is
             taken off the readings (after signs that the mapping turns).
         uncertainty: share by which masses, inertias and friction of the MJCF may be off; a gap
@@ -143,7 +143,7 @@ def load_mechanism(
     given = _named(chain.joints, facts.coordinates, source, "joint") or measured
     _named([*passive, *chain.drives], facts.friction, source, "joint with friction")
     for numbers in facts.friction.values():
-        _named(FRICTION_TERMS, numbers, source, "parameter of friction")
+        _named((*FRICTION_TERMS, "stribeck_velocity"), numbers, source, "parameter of friction")
     _named(
         [*(f"position.{j}" for j in measured), *(f"force.{d}" for d in chain.drives)],
         facts.sensor_errors, source, "sensor",

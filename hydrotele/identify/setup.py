@@ -190,7 +190,7 @@ def mechanism_setup(
         alike: as of `Setup`.
         absent: as of `Setup`.
         friction: joint -> further parameters of its friction, which an MJCF cannot state; see
-            `FRICTION_TERMS`.
+            `FRICTION_TERMS`, and `stribeck_velocity`.
 
     Returns:
         The setup. Bodies that no joint moves have no columns; joints with an `armature` have one.
@@ -203,7 +203,9 @@ def mechanism_setup(
             j = chain.index(place)
             numbers = {"coulomb": float(chain.frictionloss[j]), "viscous": float(damping[j])}
             damping[j] = 0.0  # it has a column
-        rubbing.append(FrictionTerm(place, numbers | dict((friction or {}).get(place, {}))))
+        more = dict((friction or {}).get(place, {}))
+        slow = more.pop("stribeck_velocity", FrictionTerm.stribeck)
+        rubbing.append(FrictionTerm(place, numbers | more, stribeck=slow))
     return RegressorSetup(
         chain=replace(chain, damping=damping),
         given=tuple(chain.drives if given is None else given),

@@ -196,7 +196,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         joints=names,
         closures=tuple(one.name for one in closures),
         start=np.array([joint.start for joint in joints]),
-        inertia=np.array([_inertia(model, b) for b in range(1, model.nbody)]).reshape(-1, 10),
+        inertia=np.array([body_inertia(model, b) for b in range(1, model.nbody)]).reshape(-1, 10),
         armature=np.array([joint.armature for joint in joints]),
         damping=np.array([joint.damping for joint in joints]),
         frictionloss=np.array([joint.frictionloss for joint in joints]),
@@ -316,8 +316,16 @@ def _turn(quaternion: np.ndarray) -> np.ndarray:
     return matrix.reshape(3, 3)
 
 
-def _inertia(model: mujoco.MjModel, body: int) -> list[float]:
-    """Mass, mass times centre of mass, and inertia about the frame's origin, of a body."""
+def body_inertia(model: mujoco.MjModel, body: int) -> list[float]:
+    """Mass, mass times centre of mass, and inertia about the frame's origin, of a body.
+
+    Args:
+        model: compiled.
+        body: its number.
+
+    Returns:
+        The ten inertial parameters in the order of `BODY_PARAMETERS`.
+    """
     mass, com, turn = model.body_mass[body], model.body_ipos[body], _turn(model.body_iquat[body])
     about = turn @ np.diag(model.body_inertia[body]) @ turn.T
     about += mass * (com @ com * np.eye(3) - np.outer(com, com))

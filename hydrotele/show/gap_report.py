@@ -60,7 +60,8 @@ def write_report(gap: Gap, path: str | Path) -> None:
         path: file to write.
     """
     patched, runs = has_patch(gap), ", ".join(p.run for p in gap.before[1:])
-    over = f"GAP REPORT  ·  machine {gap.machine.name}, tool {gap.machine.tool}"
+    over = f"GAP REPORT  ·  machine {gap.machine.name}"
+    over += f", tool {gap.machine.tool}" if gap.machine.tool else ""
     if gap.before:
         over += f"  ·  judged on {gap.before[0].run}" + (f", fitted on {runs}" if runs else "")
     report_html.write_report(
@@ -227,10 +228,10 @@ def _ranking(gap: Gap) -> list[dict[str, Any]]:
 def _value(gap: Gap, candidate: Candidate, name: str) -> str:
     value, label = candidate.parameters[name], name.replace("_", " ")
     effect = EFFECTS.get(candidate.name)
-    facts = effect.parameters(gap.machine, candidate.location) if effect else {}
-    if name not in facts:
-        return f"{label} {value:.3g}"
-    return f"{label} {amount(value, facts[name].unit, name)}"
+    known = effect is not None and not candidate.units
+    facts = effect.parameters(gap.machine, candidate.location) if known else {}
+    unit = candidate.units.get(name) or (facts[name].unit if name in facts else None)
+    return f"{label} {amount(value, unit, name) if unit else f'{value:.3g}'}"
 
 
 def _tests(gap: Gap) -> list[tuple[str, str, str, bool]]:

@@ -192,9 +192,15 @@ def plant(
         case "clock_offset":
             return sensors._replace(force_delay=np.full(6, numbers["delay"])), None
         case "stribeck_friction":
-            return sensors, lambda q, v, f, t: -legs * numbers["stribeck"] * np.exp(
-                -((v / numbers["velocity"]) ** 2)
-            ) * np.tanh(v / 0.001)
+            return (
+                sensors,
+                lambda q, v, f, t: (
+                    -legs
+                    * numbers["stribeck"]
+                    * np.exp(-((v / numbers["velocity"]) ** 2))
+                    * np.tanh(v / 0.001)
+                ),
+            )
         case "friction_asymmetry":
             return sensors, lambda q, v, f, t: -legs * numbers["viscous_asymmetry"] * abs(v)
         case "speed_dependent_force":
