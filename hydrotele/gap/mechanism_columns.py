@@ -32,6 +32,7 @@ STRIBECK = (
     0.3,
 )  # of a joint's RMS rate: Stribeck velocities that are tried
 _ROWS = 10.0  # rows per period of the band that columns of small differences need
+_READINGS = 20.0  # rows per period of the band that all else needs; more are averaged
 _LATE, _AWAY, _TILT = 1e-3, 1e-3, 0.01  # s, of a joint's travel, rad: the small differences
 _WIDEST = 25.0  # Hz: what is faster tells of drives and sensors, not of a mechanism
 _SLOWEST = 8.0  # rows of one run that a band leaves at least
@@ -76,6 +77,12 @@ class Columns:
     def gap(self) -> np.ndarray:
         """(n, k) measured less modelled."""
         return self.measured - self.modelled
+
+    def moved(self, value: Mapping[str, float]) -> "Columns":
+        """Columns whose model has some coefficients, column -> value, added."""
+        at = [self.names.index(name) for name in value]
+        added = self.matrix[:, :, at] @ np.array(list(value.values())) if value else 0.0
+        return replace(self, modelled=self.modelled + added)
 
 
 Errors = Mapping[str, SensorError]
@@ -168,8 +175,8 @@ def build_columns(
     Raises:
         InputError: a run cannot be followed by the chain, or no run has all forces.
     """
-    setup, parts = separate_setup(mechanism.setup), []
-    records = [corrected(r, setup.chain.drives, errors or {}) for r in records]
+    setup, parts, row = separate_setup(mechanism.setup), [], records[0].period
+    records = [_averaged(corrected(r, setup.chain.drives, errors or {}), band) for r in records]
     sizes = _sizes(records)
     for record in records:
         parts.append(_run_columns(record, setup, band, sizes))
@@ -188,7 +195,24 @@ def build_columns(
     }
     return Columns(
         names, stacked(1), stacked(2), stacked(3), stacked(4), tuple(map(int, starts)), stacked(5),
-        states, sizes, band, parts[0][7], records[0].period, tuple(r.name for r in records),
+        states, sizes, band, parts[0][7], row, tuple(r.name for r in records),
+    )  # fmt: skip
+
+
+def _averaged(record: IdentificationRecord, band: float) -> IdentificationRecord:
+    """Means of a few rows each, positions and forces alike."""
+    many = max(1, int(1.0 / (_READINGS * band * record.period)))
+    count = len(record.force) // many
+    if many == 1 or count < 10:
+        return record
+    position, force = (
+        values[: count * many].reshape(count, many, -1).mean(axis=1)
+        for values in (record.position, record.force)
+    )
+    small = many**-0.5
+    return replace(
+        record, period=many * record.period, position=position, force=force,
+        position_noise=small * record.position_noise, force_noise=small * record.force_noise,
     )  # fmt: skip
 
 

@@ -48,8 +48,7 @@ class MechanismEffect:
         location: a joint, a drive, a body, `force` or `base`.
         parameters: name -> number, with its prior (`scale` about `start`) and its bounds.
         columns: those that it acts through.
-        coefficients: (p,) parameters -> (c,) what they add along the columns, beside the given
-            model and the errors that are taken off already.
+        coefficients: (p,) parameters -> (c,) what they add to the given model along the columns.
         start: (p,) mean of the prior.
         variant: number of the form, where there are several.
     """
@@ -100,7 +99,7 @@ def mechanism_effects(
         chain: the given mechanism.
         columns: of the runs.
         nominal: parameter of the regressor -> its given value.
-        applied: sensor effect -> the numbers that are taken off the readings already.
+        applied: sensor effect -> its numbers, where they are taken off the readings.
 
     Returns:
         The effects. Those that move no drive's force are left out.
@@ -108,6 +107,28 @@ def mechanism_effects(
     build = _Builder(chain, columns, nominal, applied)
     out = [*build.joints(), *build.bodies(), *build.sensors()]
     return [one for one in out if one is not None]
+
+
+def undone(columns: Columns, applied: Mapping[Key, np.ndarray], name_of: Mapping[Key, str]):
+    """Columns whose readings have the sensors' defects again, to the first order.
+
+    What is taken off the readings thus stays a question: columns are those about the numbers found
+    so far, and the gap is that of the readings as they are.
+
+    Args:
+        columns: of readings from which defects are taken off.
+        applied: effect -> its numbers.
+        name_of: effect -> its column.
+
+    Returns:
+        The columns.
+    """
+    value = {}
+    for key, numbers in applied.items():
+        known = float(numbers[0])
+        back = known if key[0] != "force_scale" else 1.0 - 1.0 / known
+        value[name_of[key]] = -back
+    return columns.moved(value)
 
 
 class _Builder:
@@ -136,9 +157,8 @@ class _Builder:
         facts = self.number(column, unit, nominal, low)
         if facts is None:
             return None
-        known = float(self.applied.get((name, place), [nominal])[0])
         return MechanismEffect(
-            name, place, {parameter: facts}, (column,), lambda p: p - known, np.array([nominal]),
+            name, place, {parameter: facts}, (column,), lambda p: p - nominal, np.array([nominal]),
             variant,
         )  # fmt: skip
 
@@ -276,11 +296,8 @@ class _Builder:
         facts = self.number(column, "s")
         if facts is None:
             return None
-        known = float(self.applied.get((name, place), [0.0])[0])
         facts = Parameter("s", 0.0, low, _SECOND, min(facts.scale, 0.02), facts.least)
-        return MechanismEffect(
-            name, place, {"delay": facts}, (column,), lambda p: p - known, np.zeros(1)
-        )
+        return MechanismEffect(name, place, {"delay": facts}, (column,), lambda p: p, np.zeros(1))
 
     def scale(self, drive: str) -> MechanismEffect | None:
         column = f"scale.force.{drive}"
@@ -289,7 +306,12 @@ class _Builder:
         known = float(self.applied.get(("force_scale", drive), [1.0])[0])
         facts = Parameter("1", 1.0, 0.2, 5.0, 0.2, LEAST)
         return MechanismEffect(
-            "force_scale", drive, {"scale": facts}, (column,), lambda p: p / known - 1.0, np.ones(1)
+            "force_scale",
+            drive,
+            {"scale": facts},
+            (column,),
+            lambda p: (p - 1.0) / known,
+            np.ones(1),
         )
 
     def tilt(self) -> MechanismEffect | None:

@@ -7,7 +7,7 @@ likelihood (Laplace's approximation where they are not linear).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -218,11 +218,45 @@ class Evidence:
                 other[ends[-2]] += sign * 0.3 * scale[ends[-2]]
                 yield np.clip(other, low, high)
 
+    def beside(self, found: Fitted) -> "Evidence":
+        """Evidence of what is left beside some effects, whose numbers stay free.
+
+        A fit of one more effect to it tells what that adds to the score of these, exactly so where
+        they are linear.
+
+        Args:
+            found: the effects, fitted.
+
+        Returns:
+            The evidence.
+        """
+        if not found.effects:
+            return self
+        value, slope = self._whole(found)
+        inner = slope.T @ self.square @ slope + np.diag(
+            1.0 / np.concatenate([one.scale for one in found.effects]) ** 2
+        )
+        across = self.square @ slope
+        cross = self.cross - self.square @ value
+        step = np.linalg.solve(inner, np.column_stack([across.T, slope.T @ cross]))
+        return replace(
+            self, square=self.square - across @ step[:, :-1], cross=cross - across @ step[:, -1]
+        )
+
+    def _whole(self, found: Fitted) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients (m,) of effects, and their slopes (m, p) over the parameters."""
+        value, slopes = np.zeros(len(self.names)), []
+        for one, numbers in zip(found.effects, found.values, strict=True):
+            at = [self.places[name] for name in one.columns]
+            np.add.at(value, at, one.coefficients(numbers))
+            own = np.zeros((len(self.names), len(numbers)))
+            own[at] = _slope(one.coefficients, numbers, one.scale)
+            slopes.append(own)
+        return value, np.concatenate(slopes, axis=1)
+
     def calibrated(self, found: Fitted) -> tuple[np.ndarray, np.ndarray]:
         """Deviations (t,) of the model's numbers beside some effects, and their covariance."""
-        c = np.zeros(len(self.names))
-        for one, value in zip(found.effects, found.values, strict=True):
-            np.add.at(c, [self.places[name] for name in one.columns], one.coefficients(value))
+        c = self._whole(found)[0] if found.effects else np.zeros(len(self.names))
         return self.posterior - self.towards @ c, self.known
 
 

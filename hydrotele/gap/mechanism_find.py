@@ -17,7 +17,13 @@ from hydrotele.core.errors import InputError
 from hydrotele.gap.description import channel_words, lack_words
 from hydrotele.gap.find import Progress, detail_words, verdict_of
 from hydrotele.gap.mechanism_columns import Columns, build_columns, common_band, separate_setup
-from hydrotele.gap.mechanism_effects import SENTENCES, Key, MechanismEffect, mechanism_effects
+from hydrotele.gap.mechanism_effects import (
+    SENTENCES,
+    Key,
+    MechanismEffect,
+    mechanism_effects,
+    undone,
+)
 from hydrotele.gap.mechanism_evidence import (
     Evidence,
     Fitted,
@@ -56,11 +62,17 @@ _ODDS = 6.0  # twice the log odds by which naming an effect must beat not naming
 _MOST = 20  # effects
 _ROUNDS = 4  # of taking sensors' defects off the readings
 _SAME = 0.02  # of a prior's width, within which a round has changed nothing
+_BETTER = 1e-3  # by which an exchange must be better
 _WORTH_TELLING = 0.005
 _CALIBRATED = 10.0  # twice the log odds from which numbers of the model count as off
 _TOLD = 3.0  # standard deviations from which a calibrated number is told
 _SLOW = 0.1  # share of a drive's Coulomb friction by which its form near rest may differ
 _NORMAL95 = 1.96
+_WORSE = 1.02  # times the given model's errors on the held-out run: no patch may do more
+_REJECTED = (
+    "What the fitted runs asked for makes the held-out run worse; it was taken back, and nothing is"
+    " named."
+)
 METRIC = "RMS of the errors of the drives' forces over their noise, all drives, held-out run"
 
 
@@ -92,6 +104,11 @@ class _Found:
     fitted: Fitted
     weak: tuple[Fitted, ...]
     singles: list[Fitted]
+
+    def emptied(self) -> "_Found":
+        """Without what was chosen, and with the numbers of the model as given."""
+        evidence = gather_evidence(self.columns, self.noise, {})
+        return replace(self, evidence=evidence, fitted=evidence.fit([]))
 
 
 def find_mechanism_gap(
@@ -150,6 +167,11 @@ def find_mechanism_gap(
     if patched is not given:
         now = build_columns([heldout], better, band, patch.errors)
     judged = _judged(mechanism, found, nominal, then, now)
+    if not _rms(judged.after[0]) <= _WORSE * _rms(judged.before[0]):
+        notes = (*notes, _REJECTED)
+        found, patched = found.emptied(), given
+        calibration, now = {}, then
+        judged = _judged(mechanism, found, nominal, then, now)
     named = _named(found, judged.shares)
     named, details = _believable(named, judged)
     left = judged.left
@@ -245,6 +267,7 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
         tell(f"columns of all effects, round {turn + 1}", 0.2 * turn)
         errors = sensor_errors(known, mechanism.setup.chain, mechanism.measured)
         columns = build_columns(fit, mechanism, band, errors)
+        columns = undone(columns, applied, {one.key: one.columns[0] for one, _ in known})
         noise = find_noise(columns)
         evidence = gather_evidence(columns, noise, possible_errors(mechanism, columns))
         effects = mechanism_effects(mechanism.setup.chain, columns, nominal, applied)
@@ -280,26 +303,19 @@ def _search(columns, noise, evidence: Evidence, effects: list[MechanismEffect], 
             chosen.append(max(same, key=lambda pair: pair[0])[1])
     now, weak, refused = evidence.fit(chosen), [], set()
     while len(chosen) < _MOST:
-        trial = singles if not chosen else [
-            evidence.fit([*chosen, one], [*now.values, one.start])
-            if one.key not in {e.key for e in chosen} and one.key not in refused else None
-            for one in effects
-        ]  # fmt: skip
-        options = [(f.score, k) for k, f in enumerate(trial)
-                   if f is not None and effects[k].key not in refused]  # fmt: skip
-        if not options:
+        left, taken = evidence.beside(now), {one.key for one in chosen} | refused
+        options = [(left.fit([one]).score, k) for k, one in enumerate(effects)
+                   if one.key not in taken]  # fmt: skip
+        if not options or max(options)[0] < need:
             break
-        score, k = max(options)
-        if score - now.score < need:
-            break
-        better = trial[k]
-        assert better is not None
-        if _slight(effects[k], better.values[-1]):
-            refused.add(effects[k].key)
-            weak.append(better)
+        one = effects[max(options)[1]]
+        better = evidence.fit([*chosen, one], [*now.values, one.start])
+        if better.score - now.score < need or _slight(one, better.values[-1]):
+            refused.add(one.key)
+            if better.score - now.score >= need:
+                weak.append(better)
             continue
-        chosen, now = [*chosen, effects[k]], better
-        chosen, now = _improved(evidence, effects, chosen, now, need, refused)
+        chosen, now = _improved(evidence, effects, [*chosen, one], better, need, refused)
     chosen, now = _improved(evidence, effects, chosen, now, need, refused)
     return _Found(columns, noise, evidence, effects, now, tuple(weak), singles)
 
@@ -314,26 +330,26 @@ def _slight(effect: MechanismEffect, value: np.ndarray) -> bool:
 
 def _improved(evidence, effects, chosen, now: Fitted, need: float, refused):
     """Without what is not needed, and with what explains the same better."""
-    changed = True
-    while changed:
-        changed = False
+    for _ in range(_MOST):
         for k in range(len(chosen)):
             rest = [*chosen[:k], *chosen[k + 1 :]]
             without = evidence.fit(rest, [*now.values[:k], *now.values[k + 1 :]] if rest else None)
             if now.score - without.score < need or _slight(chosen[k], now.values[k]):
-                chosen, now, changed = rest, without, True
+                chosen, now = rest, without
                 break
-            keys = {one.key for one in rest} | refused
-            for one in effects:
-                if one.key in keys or one is chosen[k]:
-                    continue
-                start = [*without.values, one.start]
-                other = evidence.fit([*rest, one], start)
-                if other.score > now.score + 1e-3 and not _slight(one, other.values[-1]):
-                    chosen, now, changed = [*rest, one], other, True
-                    break
-            if changed:
+            keys, left = {one.key for one in rest} | refused, evidence.beside(without)
+            score, place = max(
+                (left.fit([one]).score, n) for n, one in enumerate(effects) if one.key not in keys
+            )
+            one = effects[place]
+            if one is chosen[k] or without.score + score < now.score + _BETTER:
+                continue
+            other = evidence.fit([*rest, one], [*without.values, one.start])
+            if other.score > now.score + _BETTER and not _slight(one, other.values[-1]):
+                chosen, now = [*rest, one], other
                 break
+        else:
+            break
     return chosen, now
 
 
@@ -349,17 +365,19 @@ def _named(found: _Found, shares: Mapping[Key, float]) -> list[NamedEffect]:
         first += len(value)
         rest = [*now.effects[:k], *now.effects[k + 1 :]]
         values = [*now.values[:k], *now.values[k + 1 :]]
+        without = evidence.fit(rest, values if rest else None)
+        left, others = evidence.beside(without), {e.key for e in rest}
         scores: dict[Key, float] = {}
         for one in found.effects:
-            if one.key in {e.key for e in rest}:
+            if one.key in others:
                 continue
-            other = now if one is effect else evidence.fit([*rest, one], [*values, one.start])
-            scores[one.key] = np.logaddexp(scores.get(one.key, -np.inf), 0.5 * other.score)
-        none = 0.5 * evidence.fit(rest, values if rest else None).score + many
+            score = now.score if one is effect else without.score + left.fit([one]).score
+            scores[one.key] = float(np.logaddexp(scores.get(one.key, -np.inf), 0.5 * score))
+        none = 0.5 * without.score + many
         top = max(*scores.values(), none)
         weights = {key: float(np.exp(s - top)) for key, s in scores.items()}
         total = sum(weights.values()) + float(np.exp(none - top))
-        others = sorted(
+        rivals = sorted(
             (Alternative(*key, w / total) for key, w in weights.items()
              if key != effect.key and w / total >= _WORTH_TELLING),
             key=lambda a: -a.probability,
@@ -372,7 +390,7 @@ def _named(found: _Found, shares: Mapping[Key, float]) -> list[NamedEffect]:
             for (name, p), v, s in zip(effect.parameters.items(), value, own, strict=True)
         }  # fmt: skip
         out.append(NamedEffect(
-            effect.name, effect.location, weights[effect.key] / total, numbers, tuple(others),
+            effect.name, effect.location, weights[effect.key] / total, numbers, tuple(rivals),
             shares[effect.key],
         ))  # fmt: skip
     return sorted(out, key=lambda e: (-round(e.probability, 3), -e.share))

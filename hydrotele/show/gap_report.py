@@ -34,6 +34,7 @@ from hydrotele.gap.description import (
 )
 from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Candidate, Estimate, Gap, LearnedLaw, Prediction, finite
+from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import usual_unit
 from hydrotele.show import report_html
 from hydrotele.show.channels import padded_range
@@ -59,6 +60,7 @@ def write_report(gap: Gap, path: str | Path) -> None:
         gap: what the search yields.
         path: file to write.
     """
+    mechanism = not isinstance(gap.machine, Machine)
     patched, runs = has_patch(gap), ", ".join(p.run for p in gap.before[1:])
     over = f"GAP REPORT  ·  machine {gap.machine.name}"
     over += f", tool {gap.machine.tool}" if gap.machine.tool else ""
@@ -73,9 +75,41 @@ def write_report(gap: Gap, path: str | Path) -> None:
         laws=_laws(gap, patched) if gap.laws else None,
         heat_map=draw_heat_map(gap.before[0], gap.after[0], patched) if gap.before else None,
         ranking=_ranking(gap), unlisted=len(gap.ranking) - _CANDIDATES, tests=_tests(gap),
+        proof_words=_PROOF[mechanism].format(gap.before[0].run if gap.before else ""),
+        commands=_COMMANDS[mechanism], open_loop=_open_loop(gap),
         noise=_noise(gap), rivals=_rivals(gap), experiment=_experiment(gap), notes=gap.notes,
         version=hydrotele.__version__, seconds=f"{gap.seconds:.0f}",
     )  # fmt: skip
+
+
+_PROOF = {
+    False: "One-step prediction errors on {}: from its readings so far, the model says what the"
+    " sensors will read next. A perfect model is off by the sensors' noise alone, 1.0.",
+    True: "Forces of the drives on {} by inverse dynamics of its measured motion, against those"
+    " measured. A perfect model is off by noise alone, 1.0.",
+}  # fmt: skip
+_COMMANDS = {
+    False: "hydrotele replay LOG --machine patched/\nhydrotele run SCENARIO --machine patched/",
+    True: "hydrotele gap --mjcf patched/robot.xml --columns patched/columns.yaml --data LOGS\n"
+    "hydrotele identify --mjcf patched/robot.xml --columns patched/columns.yaml --data LOGS",
+}  # fmt: skip
+
+
+def _open_loop(gap: Gap) -> dict[str, Any] | None:
+    """How far the models of a mechanism run away when the measured forces drive them."""
+    if not gap.open_loop:
+        return None
+    horizon, models = gap.open_loop["horizon"], [gap.open_loop["before"]]
+    models += [gap.open_loop["after"]] if "after" in gap.open_loop else []
+    rows = []
+    for drive in models[0]:
+        unit = "m" if gap.law_units["force"] == "N" else "rad"
+        rows.append((drive, *(amount(model[drive], unit) for model in models)))
+    words = (
+        "The MJCF in MuJoCo without any controller, from measured states: RMS difference of a"
+        f" drive's position after {horizon:g} s."
+    )
+    return {"words": words, "rows": rows}
 
 
 def _figures(gap: Gap) -> list[tuple[str, str, str]]:
