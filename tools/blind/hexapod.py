@@ -1,16 +1,25 @@
 """The hexapod as a world of its own: MuJoCo, a controller, sensors, and what may be hidden in it.
 
+    python -m tools.blind.hexapod FOLDER_OF_THE_SERIES TRIAL
+
 Nothing of the search is imported here, and no regressor: the model's MJCF is changed, simulated and
 measured. Effects that an MJCF cannot state act as forces on the struts at every step.
 """
 
+import argparse
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 
 from hydrotele.core.files import models_folder
+from tools.blind.generate import key_hash
+from tools.blind.trials import Place, Series, load_series, write_json
 
 RATE = 1000.0  # Hz, of controller and log
 LEGS = range(6)
@@ -99,7 +108,7 @@ def draw_outside(turn: int, rng: np.random.Generator) -> tuple[Planted, Added]:
     """A law that no library knows, on one strut, and the force that it makes."""
     leg = int(rng.integers(6))
     size = float(rng.uniform(25.0, 60.0))
-    name = ("cogging", "hysteresis", "coupling", "random_law", "gated", "backlash_spring")[turn % 6]
+    name = ("cogging", "hysteresis", "coupling", "random_law", "gated", "pulse")[turn % 6]
     number = rng.uniform(0.0, 1.0, 20)
     weight = rng.normal(size=(_WAVES, 3))
     memory = {"z": 0.0}
@@ -120,9 +129,9 @@ def draw_outside(turn: int, rng: np.random.Generator) -> tuple[Planted, Added]:
             value = np.sin(weight @ at + 6.0 * number[5 : 5 + _WAVES]).sum() * np.sqrt(2.0 / _WAVES)
         elif name == "gated":
             value = np.sin((q - 0.79) / 0.03) if q > 0.79 + 0.03 * (number[2] - 0.5) else 0.0
-        else:  # a spring that a play takes up, softening
-            past = abs(q - 0.79) - 0.04 * number[2] - 0.01
-            value = -np.sign(q - 0.79) * np.sqrt(max(past, 0.0) / 0.05)
+        else:  # for a while only
+            start = 2.0 + 6.0 * number[2]
+            value = float(start < time < start + 1.0 + 2.0 * number[3])
         out[:] = 0.0
         out[leg] = size * value
         return out
@@ -315,7 +324,7 @@ def simulate(
         for _ in range(steps):
             if added is not None:
                 data.qfrc_applied[dofs] = added(data.qpos[slides], data.qvel[dofs], drive,
-                                                row / RATE)  # fmt: skip
+                                                (row - settle) / RATE)  # fmt: skip
             mujoco.mj_step(model, data)
     if any(w.number for w in data.warning) or not np.isfinite(length).all():
         raise ValueError("the simulation failed")
@@ -354,9 +363,68 @@ def make(
         runs[name] = np.column_stack([time, length, force])
     key = {
         "class": kind,
-        "effects": [planted._asdict()] if planted else [],
+        "effects": [_told(planted, spec)] if planted else [],
         "off": off,
         "noise": {"length": sensors.length_noise, "force": sensors.force_noise.tolist(),
                   "correlation": sensors.correlation},
     }  # fmt: skip
     return key, runs
+
+
+def _told(planted: Planted, spec: mujoco.MjSpec) -> dict[str, Any]:
+    """An effect as the key has it, with the numbers that the robot has in all."""
+    numbers = dict(planted.parameters)
+    if "added" in numbers:
+        joint = spec.joint(planted.location)
+        del numbers["added"]
+        if planted.name == "coulomb_friction":
+            numbers["coulomb"] = joint.frictionloss
+        else:
+            numbers["viscous"] = float(np.ravel(joint.damping)[0])
+    if planted.name == "drive_inertia":
+        numbers = {"drive_inertia": numbers["inertia"]}
+    numbers.pop("velocity", None)
+    return {
+        "name": planted.name, "location": planted.location,
+        "parameters": {k: {"value": float(v)} for k, v in numbers.items()},
+        "visibility": {"total_fit_runs": None},
+    }  # fmt: skip
+
+
+def make_trial(place: Place, series: Series) -> None:
+    """Write logs, key and seal of a trial.
+
+    Args:
+        place: where its files lie.
+        series: the series that it is part of.
+    """
+    classes, number = series.classes(), series.names().index(place.trial)
+    rng = np.random.default_rng([series.seed, 20, number])
+    turn = series.seed + classes[:number].count("outside")
+    key, runs = make(classes[number], turn, rng, series.duration)
+    key |= {"trial": place.trial, "nonce": rng.bytes(16).hex()}
+    write_json(place.key, key)
+    place.key.chmod(0o600)
+    place.folder.mkdir(parents=True, exist_ok=True)
+    place.seal.write_text(key_hash(place) + "\n")
+    part = place.folder / f".data.{os.getpid()}.part"
+    part.mkdir()
+    names = ["time", *(f"position.slide_{k + 1}" for k in LEGS),
+             *(f"force.slide_{k + 1}" for k in LEGS)]  # fmt: skip
+    for name, table in runs.items():
+        columns = dict(zip(names, table.T.copy(), strict=True))
+        pyarrow.parquet.write_table(pyarrow.table(columns), part / f"{name}.parquet")
+    part.rename(place.data)
+
+
+def main() -> None:
+    """Parse the arguments and make the trial."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("trial")
+    args = parser.parse_args()
+    make_trial(Place(args.out, args.trial), load_series(args.out))
+
+
+if __name__ == "__main__":
+    main()
