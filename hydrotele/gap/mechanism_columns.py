@@ -31,9 +31,10 @@ STRIBECK = (
     0.1,
     0.3,
 )  # of a joint's RMS rate: Stribeck velocities that are tried
-_ROWS = 10.0  # rows per period of the band that columns of small differences need
+_ROWS = 5.0  # rows per period of the band that columns of small differences need
 _READINGS = 20.0  # rows per period of the band that all else needs; more are averaged
 _LATE, _AWAY, _TILT = 1e-3, 1e-3, 0.01  # s, of a joint's travel, rad: the small differences
+_RESOLVED = 5e-3  # s, over which positions are averaged before it is asked what they resolve
 _WIDEST = 25.0  # Hz: what is faster tells of drives and sensors, not of a mechanism
 _SLOWEST = 8.0  # rows of one run that a band leaves at least
 _WHERE = "gap"
@@ -146,8 +147,9 @@ def common_band(records: Sequence[IdentificationRecord], mechanism: Mechanism) -
         InputError: nothing moves in any run.
     """
     bands, moves = [], []
-    for record in records:
-        record = in_coordinates(record, mechanism.setup)
+    for whole in records:
+        many = max(1, int(_RESOLVED / whole.period))
+        record = in_coordinates(_averaged(whole, many), mechanism.setup)
         found = resolution(record.position, record.period, record.position_noise)
         bands.append(min(0.5 * found.bandwidth, _WIDEST, 0.2 / record.period))
         bands[-1] = max(bands[-1], _SLOWEST / (len(record.force) * record.period))
@@ -176,7 +178,8 @@ def build_columns(
         InputError: a run cannot be followed by the chain, or no run has all forces.
     """
     setup, parts, row = separate_setup(mechanism.setup), [], records[0].period
-    records = [_averaged(corrected(r, setup.chain.drives, errors or {}), band) for r in records]
+    records = [corrected(r, setup.chain.drives, errors or {}) for r in records]
+    records = [_averaged(r, max(1, int(1.0 / (_READINGS * band * r.period)))) for r in records]
     sizes = _sizes(records)
     for record in records:
         parts.append(_run_columns(record, setup, band, sizes))
@@ -199,9 +202,8 @@ def build_columns(
     )  # fmt: skip
 
 
-def _averaged(record: IdentificationRecord, band: float) -> IdentificationRecord:
-    """Means of a few rows each, positions and forces alike."""
-    many = max(1, int(1.0 / (_READINGS * band * record.period)))
+def _averaged(record: IdentificationRecord, many: int) -> IdentificationRecord:
+    """Means of some rows each, positions and forces alike."""
     count = len(record.force) // many
     if many == 1 or count < 10:
         return record
@@ -249,6 +251,10 @@ def _run_columns(
     late = _Differences(setup, whole, measured, raw.axes, record.period * stride, table.nominal)
     names, slow = late.columns(sizes)
     extra = _onto(slow, band, record.period * stride, own.time)
+    fine = np.stack([motion.value, motion.rate, motion.acceleration])
+    more, quick = _drive_columns(setup, fine, sizes)
+    names = [*names, *more]
+    extra = np.concatenate([extra, _onto(quick, band, record.period, own.time)], axis=2)
     low, thin = low_pass(band, record.period)
     force = low_passed_forces(record.force, record.period, low, thin)
     matrix = np.concatenate([own.matrix, extra], axis=2)
@@ -268,6 +274,25 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
     passed = low_passed(slow, low, 1)
     own = (np.arange(len(passed)) + (len(low) - 1) / 2) * period
     return CubicSpline(own, passed, axis=0)(np.clip(time, own[0], own[-1]))
+
+
+def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes):
+    """Springs, and friction near rest, of the drives: names, and (n, k, m)."""
+    chain = setup.chain
+    found = project(chain, setup.given, *motion)
+    names, out = [], []
+    for drive in chain.drives:
+        j = chain.index(drive)
+        share, rate = found.share[:, :, j], found.rate[:, j]
+        middle = float(found.position[:, j].mean()) if drive not in sizes else sizes[drive][0]
+        names.append(f"spring.{drive}")
+        out.append(share * (found.position[:, j, None] - middle))
+        speed = sizes[drive][2] if drive in sizes else float(np.sqrt(np.mean(rate**2)))
+        for number, part in enumerate(STRIBECK):
+            shape = np.exp(-((rate / (part * speed)) ** 2)) * np.sign(rate)
+            names.append(f"stribeck{number}.{drive}")
+            out.append(share * shape[:, None])
+    return names, np.stack(out, axis=2)
 
 
 @dataclass(frozen=True)
@@ -309,14 +334,6 @@ class _Differences:
             own = np.arange(len(chain.drives)) == k
             add(f"scale.force.{drive}", base * own)
             add(f"delay.force.{drive}", -change * own)
-            j = chain.index(drive)
-            share, rate = found.share[:, :, j], found.rate[:, j]
-            middle = float(found.position[:, j].mean()) if drive not in sizes else sizes[drive][0]
-            add(f"spring.{drive}", share * (found.position[:, j, None] - middle))
-            speed = sizes[drive][2] if drive in sizes else float(np.sqrt(np.mean(rate**2)))
-            for number, part in enumerate(STRIBECK):
-                shape = np.exp(-((rate / (part * speed)) ** 2)) * np.sign(rate)
-                add(f"stribeck{number}.{drive}", share * shape[:, None])
         return names, np.stack(out, axis=2)
 
     def _moved(self, change: np.ndarray, base: np.ndarray) -> np.ndarray:

@@ -327,8 +327,8 @@ class _Builder:
 
 def _point(place: np.ndarray) -> np.ndarray:
     """Inertia (6,) of a unit mass at a place, about the origin."""
-    full = place @ place * np.eye(3) - np.outer(place, place)
-    return full[np.triu_indices(3)]
+    x, y, z = place
+    return np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
 
 
 def _matrix(upper: np.ndarray) -> np.ndarray:

@@ -171,6 +171,8 @@ class Evidence:
         """
         if not effects:
             return Fitted((), (), np.zeros((0, 0)), 0.0, 0.0)
+        if len(effects) == 1 and len(effects[0].columns) == len(effects[0].start) == 1:
+            return self._fit_one(effects[0])
         picked = [np.array([self.places[c] for c in one.columns]) for one in effects]
         union = np.unique(np.concatenate(picked))
         square, cross = self.square[np.ix_(union, union)], self.cross[union]
@@ -206,6 +208,17 @@ class Evidence:
             tuple(effects), values, np.linalg.inv(held), score,
             float(2.0 * c @ cross - c @ square @ c),
         )  # fmt: skip
+
+    def _fit_one(self, one: MechanismEffect) -> Fitted:
+        """A single effect that is linear in one number."""
+        k, step, low, high = self.places[one.columns[0]], one.scale[0], one.low[0], one.high[0]
+        slope = float(one.coefficients(one.start + step)[0] - one.coefficients(one.start)[0]) / step
+        held = slope**2 * self.square[k, k] + step**-2
+        p = float(np.clip(one.start[0] + slope * self.cross[k] / held, low, high))
+        c = slope * (p - one.start[0])
+        gain = float(2.0 * c * self.cross[k] - c * self.square[k, k] * c)
+        score = gain - ((p - one.start[0]) / step) ** 2 - float(np.log(step**2 * held))
+        return Fitted((one,), (np.array([p]),), np.array([[1.0 / held]]), score, gain)
 
     def _starts(self, effects, start, mean, scale, low, high, ends):
         """Where to climb from: what is known, and both sides of an effect that is a product."""

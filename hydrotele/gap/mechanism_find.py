@@ -15,7 +15,7 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.gap.description import channel_words, lack_words
-from hydrotele.gap.find import Progress, detail_words, verdict_of
+from hydrotele.gap.find import Progress, detail_words, verdict_of, without_details
 from hydrotele.gap.mechanism_columns import Columns, build_columns, common_band, separate_setup
 from hydrotele.gap.mechanism_effects import (
     SENTENCES,
@@ -105,10 +105,15 @@ class _Found:
     weak: tuple[Fitted, ...]
     singles: list[Fitted]
 
-    def emptied(self) -> "_Found":
-        """Without what was chosen, and with the numbers of the model as given."""
-        evidence = gather_evidence(self.columns, self.noise, {})
-        return replace(self, evidence=evidence, fitted=evidence.fit([]))
+
+def _emptied(fit, mechanism: Mechanism, band: float, found: _Found) -> _Found:
+    """A search's result without what was chosen: readings and model as they are given."""
+    columns = build_columns(fit, mechanism, band)
+    noise = find_noise(columns)
+    evidence = gather_evidence(columns, noise, {})
+    return replace(
+        found, columns=columns, noise=noise, evidence=evidence, fitted=evidence.fit([]), weak=()
+    )
 
 
 def find_mechanism_gap(
@@ -169,7 +174,7 @@ def find_mechanism_gap(
     judged = _judged(mechanism, found, nominal, then, now)
     if not _rms(judged.after[0]) <= _WORSE * _rms(judged.before[0]):
         notes = (*notes, _REJECTED)
-        found, patched = found.emptied(), given
+        found, patched = _emptied(fit, mechanism, band, found), given
         calibration, now = {}, then
         judged = _judged(mechanism, found, nominal, then, now)
     named = _named(found, judged.shares)
@@ -530,7 +535,8 @@ def _unexplained(found: _Found) -> np.ndarray:
 
 def _believable(named: Sequence[NamedEffect], judged: _Judged):
     """Effects, and those that may only make up for what is lacking on the drive they move most."""
-    kept, details = [], []
+    named, small = without_details(named, bool(judged.left.lacking.any()))
+    kept, details = [], list(small)
     for effect in named:
         moved = judged.moved[effect.name, effect.location]
         own = int(np.argmax(moved / judged.std))

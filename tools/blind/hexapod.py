@@ -77,7 +77,7 @@ def draw_single(rng: np.random.Generator) -> Planted:
         "hinge": lambda: (str(rng.choice([f"alpha_{leg}", f"beta_{leg}"])),
                           {"added": between(1.5, 6.0)}),
         "payload": lambda: ("platform", {
-            "mass": between(0.3, 3.0), "x": float(rng.uniform(-0.08, 0.08)),
+            "mass": between(0.8, 3.0), "x": float(rng.uniform(-0.08, 0.08)),
             "y": float(rng.uniform(-0.08, 0.08)), "z": float(rng.uniform(-0.05, 0.15))}),
         "com_offset": lambda: ("platform", dict(zip("xyz", (
             between(0.015, 0.06) * _direction(rng)).tolist(), strict=True))),
