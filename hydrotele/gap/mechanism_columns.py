@@ -252,7 +252,7 @@ def _run_columns(
     names, slow = late.columns(sizes)
     extra = _onto(slow, band, record.period * stride, own.time)
     fine = np.stack([motion.value, motion.rate, motion.acceleration])
-    more, quick = _drive_columns(setup, fine, sizes)
+    more, quick = _drive_columns(setup, fine, sizes, table.nominal, record.period)
     names = [*names, *more]
     extra = np.concatenate([extra, _onto(quick, band, record.period, own.time)], axis=2)
     low, thin = low_pass(band, record.period)
@@ -276,12 +276,18 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
     return CubicSpline(own, passed, axis=0)(np.clip(time, own[0], own[-1]))
 
 
-def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes):
-    """Springs, and friction near rest, of the drives: names, and (n, k, m)."""
+def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, nominal, period: float):
+    """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m)."""
     chain = setup.chain
     found = project(chain, setup.given, *motion)
-    names, out = [], []
-    for drive in chain.drives:
+    passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.rest)
+    base = setup.table(found).matrix @ nominal + np.einsum("nkv,nv->nk", found.share, passive)
+    change = np.gradient(base, period, axis=0)
+    names, out = ["delay.force"], [-change]
+    for k, drive in enumerate(chain.drives):
+        own = np.arange(len(chain.drives)) == k
+        names += [f"scale.force.{drive}", f"delay.force.{drive}"]
+        out += [base * own, -change * own]
         j = chain.index(drive)
         share, rate = found.share[:, :, j], found.rate[:, j]
         middle = float(found.position[:, j].mean()) if drive not in sizes else sizes[drive][0]
@@ -328,18 +334,16 @@ class _Differences:
             add(f"delay.position.{joint}", -self._moved(lag, base) / _LATE)
         for axis, letter in ((0, "x"), (1, "y")):
             add(f"tilt.{letter}", self._tilted(axis, base) / _TILT)
-        change = np.gradient(base, self.period, axis=0)
-        add("delay.force", -change)
-        for k, drive in enumerate(chain.drives):
-            own = np.arange(len(chain.drives)) == k
-            add(f"scale.force.{drive}", base * own)
-            add(f"delay.force.{drive}", -change * own)
         return names, np.stack(out, axis=2)
+
+    def _rate(self, values: np.ndarray, order: int = 1) -> np.ndarray:
+        """Derivatives of rows by a cubic spline: differences of so few rows are too small."""
+        time = np.arange(len(values)) * self.period
+        return CubicSpline(time, values, axis=0)(time, order)
 
     def _moved(self, change: np.ndarray, base: np.ndarray) -> np.ndarray:
         """What the model's forces gain where the given joints are elsewhere by (n, k)."""
-        rate = np.gradient(change, self.period, axis=0)
-        away = np.stack([change, rate, np.gradient(rate, self.period, axis=0)])
+        away = np.stack([change, self._rate(change), self._rate(change, 2)])
         return -(base - row_forces(self.setup, self.motion + away, self.nominal))
 
     def _tilted(self, axis: int, base: np.ndarray) -> np.ndarray:

@@ -34,6 +34,7 @@ SENTENCES = {
 TYPICAL, LEAST = 0.3, 0.01  # share of a drive's force RMS that an effect moves, typically; at least
 _MOST = 20.0  # times the typical size, where a search ends
 _NONE = 1e-9  # share that has no effect
+_ASIDE = 0.3  # of its radius of gyration that a body's centre of mass is aside, typically
 _SECOND = 0.1  # s, beyond which no sensor is late
 
 Key = tuple[str, str]
@@ -254,7 +255,7 @@ class _Builder:
         share = mass * max(self.strength[n] for n in names[:3])
         if share < _NONE:
             return None
-        scale = min(TYPICAL / share, size)
+        scale = min(TYPICAL / share, _ASIDE * size)
         way = Parameter("m", 0.0, -2.0 * size, 2.0 * size, scale, LEAST / share)
 
         def coefficients(p: np.ndarray) -> np.ndarray:

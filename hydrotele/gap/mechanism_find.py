@@ -60,8 +60,9 @@ from hydrotele.multibody.regressor import BODY_PARAMETERS
 _ODDS = 6.0  # twice the log odds by which naming an effect must beat not naming it, beside the
 # number of effects that are tried
 _MOST = 20  # effects
+_FEW = 3  # effects up to which exchanges are tried after every new one
 _ROUNDS = 4  # of taking sensors' defects off the readings
-_SAME = 0.02  # of a prior's width, within which a round has changed nothing
+_SAME = 0.01  # of a prior's width, within which a round has changed nothing
 _BETTER = 1e-3  # by which an exchange must be better
 _WORTH_TELLING = 0.005
 _CALIBRATED = 10.0  # twice the log odds from which numbers of the model count as off
@@ -256,7 +257,7 @@ def possible_errors(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
             out[f"{kind}.{one.place}"] = off * abs(value)
         if one.place in chain.drives:
             dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
-            out[f"stribeck0.{one.place}"] = out[f"stribeck1.{one.place}"] = _SLOW * dry
+            out[f"stribeck0.{one.place}"] = out[f"stribeck2.{one.place}"] = _SLOW * dry
     for joint in mechanism.setup.drive_inertia:
         out[f"drive_inertia.{joint}"] = off * abs(float(chain.armature[chain.index(joint)]))
     out["delay.force"] = 0.5 * columns.row
@@ -320,7 +321,9 @@ def _search(columns, noise, evidence: Evidence, effects: list[MechanismEffect], 
             if better.score - now.score >= need:
                 weak.append(better)
             continue
-        chosen, now = _improved(evidence, effects, [*chosen, one], better, need, refused)
+        chosen, now = [*chosen, one], better
+        if len(chosen) <= _FEW:
+            chosen, now = _improved(evidence, effects, chosen, now, need, refused)
     chosen, now = _improved(evidence, effects, chosen, now, need, refused)
     return _Found(columns, noise, evidence, effects, now, tuple(weak), singles)
 
@@ -335,7 +338,7 @@ def _slight(effect: MechanismEffect, value: np.ndarray) -> bool:
 
 def _improved(evidence, effects, chosen, now: Fitted, need: float, refused):
     """Without what is not needed, and with what explains the same better."""
-    for _ in range(_MOST):
+    for _ in range(_FEW + len(chosen)):
         for k in range(len(chosen)):
             rest = [*chosen[:k], *chosen[k + 1 :]]
             without = evidence.fit(rest, [*now.values[:k], *now.values[k + 1 :]] if rest else None)

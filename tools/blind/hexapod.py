@@ -43,6 +43,13 @@ class Planted(NamedTuple):
     parameters: dict[str, float]
 
 
+class Stribeck(NamedTuple):
+    """Dry friction of the struts (6,) [N] that fades with the speed, on the scale of a velocity."""
+
+    size: np.ndarray
+    velocity: float
+
+
 class Sensors(NamedTuple):
     """Noise and defects of the six lengths and the six forces."""
 
@@ -80,7 +87,7 @@ def draw_single(rng: np.random.Generator) -> Planted:
             "mass": between(0.8, 3.0), "x": float(rng.uniform(-0.08, 0.08)),
             "y": float(rng.uniform(-0.08, 0.08)), "z": float(rng.uniform(-0.05, 0.15))}),
         "com_offset": lambda: ("platform", dict(zip("xyz", (
-            between(0.015, 0.06) * _direction(rng)).tolist(), strict=True))),
+            between(0.025, 0.07) * _direction(rng)).tolist(), strict=True))),
         "inertia_error": lambda: ("platform", {"ratio": between(1.4, 3.0)}),
         "force_offset": lambda: (slide, {"offset": either() * between(8.0, 60.0)}),
         "force_scale": lambda: (slide, {"scale": 1.0 + either() * between(0.05, 0.2)}),
@@ -154,7 +161,7 @@ def draw_sensors(rng: np.random.Generator) -> Sensors:
 
 def plant(
     spec: mujoco.MjSpec, sensors: Sensors, one: Planted
-) -> tuple[Sensors, Added | None]:  # fmt: skip
+) -> tuple[Sensors, Added | Stribeck | None]:  # fmt: skip
     """Put an effect into the MJCF, the sensors, or the forces of every step."""
     numbers = one.parameters
     legs = np.array([one.location == f"slide_{k + 1}" for k in LEGS], float)
@@ -285,7 +292,7 @@ def motion(seconds: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def simulate(
-    model: mujoco.MjModel, pose: np.ndarray, sensors: Sensors, added: Added | None,
+    model: mujoco.MjModel, pose: np.ndarray, sensors: Sensors, added: Added | Stribeck | None,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Drive a motion by a linear controller per strut; time (n,), lengths and forces (n, 6)."""
@@ -298,6 +305,7 @@ def simulate(
         mujoco.mj_resetDataKeyframe(model, data, 0)
     slides = [model.joint(f"slide_{k + 1}").qposadr[0] for k in LEGS]
     dofs = [model.joint(f"slide_{k + 1}").dofadr[0] for k in LEGS]
+    dry = model.dof_frictionloss[dofs].copy()
     steps = round(1.0 / RATE / model.opt.timestep)
     settle = round(1.5 * RATE)  # from the model's home to where the motion starts
     home = data.qpos[slides].copy()
@@ -322,10 +330,14 @@ def simulate(
         before = drive
         data.ctrl[:] = drive
         for _ in range(steps):
-            if added is not None:
+            if isinstance(added, Stribeck):  # the solver's own dry friction, so that it can stick
+                fades = np.exp(-((data.qvel[dofs] / added.velocity) ** 2))
+                model.dof_frictionloss[dofs] = dry + added.size * fades
+            elif added is not None:
                 data.qfrc_applied[dofs] = added(data.qpos[slides], data.qvel[dofs], drive,
                                                 (row - settle) / RATE)  # fmt: skip
             mujoco.mj_step(model, data)
+    model.dof_frictionloss[dofs] = dry
     if any(w.number for w in data.warning) or not np.isfinite(length).all():
         raise ValueError("the simulation failed")
     mixed = sensors.correlation * np.ones((6, 6)) + (1.0 - sensors.correlation) * np.eye(6)
