@@ -152,7 +152,10 @@ def gap_mjcf_to_folder(
         gap = find_mechanism_gap(mjcf, columns, fit, judge, progress, effects, said)
         if progress:
             progress("drive the models by the measured forces", 0.95)
-        gap = dataclasses.replace(gap, open_loop=_open_loop(gap, data, mechanism, heldout))
+        try:
+            gap = dataclasses.replace(gap, open_loop=_open_loop(gap, data, mechanism, heldout))
+        except InputError as error:
+            gap = dataclasses.replace(gap, notes=(*gap.notes, f"No open loop: {error}."))
     with whole_folder(target, "gap") as folder:
         document = json.dumps(gap_document(gap), indent=2, allow_nan=False)
         (folder / "gap.json").write_text(document + "\n", encoding="utf-8")
@@ -200,7 +203,7 @@ def _open_loop(
         whole = np.stack([motion.value, motion.rate, motion.acceleration])
         known = np.isfinite(judge.force).all(axis=1)
         if not known.all():
-            return {}
+            raise InputError(judge.name, "lacks forces for a while")
         out[which] = open_loop_errors(
             mujoco.MjModel.from_xml_string(model.mjcf), one.setup.chain, one.setup.given, whole,
             judge.force, judge.period, _HORIZON,

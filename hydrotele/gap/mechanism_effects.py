@@ -177,7 +177,7 @@ class _Builder:
                 ("viscous_friction", "viscous", f"{force} s/{length}", 0.0),
                 ("friction_asymmetry", "viscous_asymmetry", f"{force} s/{length}", -np.inf),
                 ("speed_dependent_force", "quadratic", f"{force} s^2/{length}^2", 0.0),
-                ("drive_inertia", "drive_inertia", inertia, -np.inf),
+                ("drive_inertia", "drive_inertia", inertia, 0.0),
             ):
                 if kind == "drive_inertia" and place not in self.chain.drives:
                     continue
