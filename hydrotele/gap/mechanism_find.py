@@ -96,7 +96,10 @@ class MechanismModel:
 
 @dataclass(frozen=True)
 class _Found:
-    """Result of a search: evidence, all candidates, and the chosen ones fitted together."""
+    """Result of a search: evidence, all candidates, and the chosen ones fitted together.
+
+    `weak` would be chosen but for their size, and are `refused` with others that are not needed.
+    """
 
     columns: Columns
     noise: Noise
@@ -105,6 +108,7 @@ class _Found:
     fitted: Fitted
     weak: tuple[Fitted, ...]
     singles: list[Fitted]
+    refused: frozenset[Key]
 
 
 def _emptied(fit, mechanism: Mechanism, band: float, found: _Found) -> _Found:
@@ -325,7 +329,7 @@ def _search(columns, noise, evidence: Evidence, effects: list[MechanismEffect], 
         if len(chosen) <= _FEW:
             chosen, now = _improved(evidence, effects, chosen, now, need, refused)
     chosen, now = _improved(evidence, effects, chosen, now, need, refused)
-    return _Found(columns, noise, evidence, effects, now, tuple(weak), singles)
+    return _Found(columns, noise, evidence, effects, now, tuple(weak), singles, frozenset(refused))
 
 
 def _slight(effect: MechanismEffect, value: np.ndarray) -> bool:
@@ -377,7 +381,7 @@ def _named(found: _Found, shares: Mapping[Key, float]) -> list[NamedEffect]:
         left, others = evidence.beside(without), {e.key for e in rest}
         scores: dict[Key, float] = {}
         for one in found.effects:
-            if one.key in others:
+            if one.key in others or (one is not effect and one.key in found.refused):
                 continue
             score = now.score if one is effect else without.score + left.fit([one]).score
             scores[one.key] = float(np.logaddexp(scores.get(one.key, -np.inf), 0.5 * score))

@@ -316,6 +316,7 @@ _ADDED = {"force": "force", "command": "command"} | dict.fromkeys(
     ("flow_head", "flow_rod", "flow_through", "flow_supply"), "flow"
 )
 _ZOOM = 2.0  # s
+_LITTLE = 0.5  # of an axis' usual unit, below which SI is shown, such as N instead of kN
 _LOUDEST = 6.0  # times noise, where the colours of the heat map end at the latest
 
 
@@ -372,6 +373,8 @@ def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: b
     """
     column = before.channels.index(channel)
     unit, factor = axis_unit(usual_unit(channel))
+    if np.nanmax(np.abs(before.measured[:, column]), initial=0.0) * factor < _LITTLE:
+        unit, factor = usual_unit(channel), 1.0
     measured = factor * before.measured[:, column]
     lines = [("model as given", NOMINAL, factor * before.predicted[:, column])]
     if changed:

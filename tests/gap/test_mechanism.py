@@ -12,14 +12,14 @@ from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
-from hydrotele.gap.mechanism_evidence import find_noise, gather_evidence
 from hydrotele.gap.mechanism_effects import mechanism_effects
+from hydrotele.gap.mechanism_evidence import find_noise, gather_evidence
 from hydrotele.gap.mechanism_find import (
     find_mechanism_gap,
     nominal_parameters,
     possible_errors,
 )
-from hydrotele.gap.mechanism_patch import patched_mjcf, Patch
+from hydrotele.gap.mechanism_patch import Patch, patched_mjcf
 from hydrotele.identify.mechanism import ColumnMapping, load_mechanism, mechanism_records
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.inverse_dynamics import project
