@@ -161,7 +161,7 @@ def common_band(records: Sequence[IdentificationRecord], mechanism: Mechanism) -
 
 def build_columns(
     records: Sequence[IdentificationRecord], mechanism: Mechanism, band: float,
-    errors: Errors | None = None,
+    errors: Errors | None = None, about: Mapping[str, float] | None = None,
 ) -> Columns:  # fmt: skip
     """Columns of some runs.
 
@@ -170,6 +170,8 @@ def build_columns(
         mechanism: the given model.
         band: in which forces are compared [Hz].
         errors: of sensors, known so far; they are taken off the readings.
+        about: parameter -> how much it differs from the given one, as far as is known: defects of
+            sensors have columns about that model's forces, the gap stays that of the given one.
 
     Returns:
         The columns. Rows in which a drive's force is not known are left out.
@@ -182,7 +184,7 @@ def build_columns(
     records = [_averaged(r, max(1, int(1.0 / (_READINGS * band * r.period)))) for r in records]
     sizes = _sizes(records)
     for record in records:
-        parts.append(_run_columns(record, setup, band, sizes))
+        parts.append(_run_columns(record, setup, band, sizes, about or {}))
     names = parts[0][0]
     keep = [np.isfinite(p[2]).all(axis=1) for p in parts]
     if not any(rows.any() for rows in keep):
@@ -234,7 +236,7 @@ def _sizes(records: Sequence[IdentificationRecord]) -> dict[str, tuple[float, fl
 
 def _run_columns(
     raw: IdentificationRecord, setup: RegressorSetup, band: float,
-    sizes: Mapping[str, tuple[float, float, float]],
+    sizes: Mapping[str, tuple[float, float, float]], about: Mapping[str, float],
 ):  # fmt: skip
     """Names, matrix, measured, modelled, time, doubt, states, spacing of one run."""
     how = Processing("zero_phase", band=band)
@@ -248,11 +250,12 @@ def _run_columns(
     rows = slice(None, None, stride)
     whole = np.stack([motion.value, motion.rate, motion.acceleration])[:, rows]
     measured = np.stack([lengths.value, lengths.rate])[:, rows]
-    late = _Differences(setup, whole, measured, raw.axes, record.period * stride, table.nominal)
+    value = table.nominal + [about.get(name, 0.0) for name in table.names]
+    late = _Differences(setup, whole, measured, raw.axes, record.period * stride, value)
     names, slow = late.columns(sizes)
     extra = _onto(slow, band, record.period * stride, own.time)
     fine = np.stack([motion.value, motion.rate, motion.acceleration])
-    more, quick = _drive_columns(setup, fine, sizes, table.nominal, record.period)
+    more, quick = _drive_columns(setup, fine, sizes, value, record.period)
     names = [*names, *more]
     extra = np.concatenate([extra, _onto(quick, band, record.period, own.time)], axis=2)
     low, thin = low_pass(band, record.period)
@@ -276,12 +279,12 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
     return CubicSpline(own, passed, axis=0)(np.clip(time, own[0], own[-1]))
 
 
-def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, nominal, period: float):
+def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, period: float):
     """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m)."""
     chain = setup.chain
     found = project(chain, setup.given, *motion)
     passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.rest)
-    base = setup.table(found).matrix @ nominal + np.einsum("nkv,nv->nk", found.share, passive)
+    base = setup.table(found).matrix @ value + np.einsum("nkv,nv->nk", found.share, passive)
     change = np.gradient(base, period, axis=0)
     names, out = ["delay.force"], [-change]
     for k, drive in enumerate(chain.drives):
@@ -310,7 +313,7 @@ class _Differences:
     measured: np.ndarray
     axes: tuple[str, ...]
     period: float
-    nominal: np.ndarray
+    value: np.ndarray
 
     def columns(self, sizes) -> tuple[list[str], np.ndarray]:
         """Names, and (n, k, m)."""
@@ -319,7 +322,7 @@ class _Differences:
         here = [chain.index(name) for name in self.axes]
         moves = np.linalg.solve(found.share[:, :, here], found.share)  # q_v per measured joint
         given = [chain.index(name) for name in self.setup.given]
-        base = row_forces(self.setup, self.motion, self.nominal)
+        base = row_forces(self.setup, self.motion, self.value)
         names, out = [], []
 
         def add(name: str, column: np.ndarray) -> None:
@@ -344,7 +347,7 @@ class _Differences:
     def _moved(self, change: np.ndarray, base: np.ndarray) -> np.ndarray:
         """What the model's forces gain where the given joints are elsewhere by (n, k)."""
         away = np.stack([change, self._rate(change), self._rate(change, 2)])
-        return -(base - row_forces(self.setup, self.motion + away, self.nominal))
+        return -(base - row_forces(self.setup, self.motion + away, self.value))
 
     def _tilted(self, axis: int, base: np.ndarray) -> np.ndarray:
         """What they gain where the base is turned about x or y of the world by the step."""
@@ -353,7 +356,7 @@ class _Differences:
         turn[axis] = _TILT
         down = tilted(chain.tree.gravity, turn)
         moved = replace(self.setup, chain=replace(chain, tree=chain.tree._replace(gravity=down)))
-        return row_forces(moved, self.motion, self.nominal) - base
+        return row_forces(moved, self.motion, self.value) - base
 
 
 def tilted(gravity: np.ndarray, turn: np.ndarray) -> np.ndarray:

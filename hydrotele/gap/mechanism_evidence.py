@@ -267,9 +267,13 @@ class Evidence:
             slopes.append(own)
         return value, np.concatenate(slopes, axis=1)
 
+    def coefficients(self, found: Fitted) -> np.ndarray:
+        """What some effects add along all columns (m,)."""
+        return self._whole(found)[0] if found.effects else np.zeros(len(self.names))
+
     def calibrated(self, found: Fitted) -> tuple[np.ndarray, np.ndarray]:
         """Deviations (t,) of the model's numbers beside some effects, and their covariance."""
-        c = self._whole(found)[0] if found.effects else np.zeros(len(self.names))
+        c = self.coefficients(found)
         return self.posterior - self.towards @ c, self.known
 
 

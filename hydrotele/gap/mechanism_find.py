@@ -272,11 +272,11 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
     """Search; take sensors' defects off the readings and search again until nothing changes."""
     applied: dict[Key, np.ndarray] = {}
     known: Sequence[tuple[MechanismEffect, np.ndarray]] = ()
-    found = None
+    found, about = None, {}
     for turn in range(_ROUNDS):
         tell(f"columns of all effects, round {turn + 1}", 0.2 * turn)
         errors = sensor_errors(known, mechanism.setup.chain, mechanism.measured)
-        columns = build_columns(fit, mechanism, band, errors)
+        columns = build_columns(fit, mechanism, band, errors, about)
         columns = undone(columns, applied, {one.key: one.columns[0] for one, _ in known})
         noise = find_noise(columns)
         evidence = gather_evidence(columns, noise, possible_errors(mechanism, columns))
@@ -290,6 +290,8 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
             for one, value in zip(found.fitted.effects, found.fitted.values, strict=True)
             if sensor_errors([(one, value)], mechanism.setup.chain, mechanism.measured)
         ]
+        value = evidence.coefficients(found.fitted)
+        about = {name: value[k] for k, name in enumerate(columns.names) if name in nominal}
         steps = [
             np.abs(value - applied.get(one.key, one.start)) / one.scale for one, value in known
         ]
@@ -531,10 +533,7 @@ def _judged(
 def _unexplained(found: _Found) -> np.ndarray:
     """(n, k) of the fitted runs, after effects and calibrated numbers [N] or [N m]."""
     evidence, columns = found.evidence, found.columns
-    value = np.zeros(len(columns.names))
-    for effect, numbers in zip(found.fitted.effects, found.fitted.values, strict=True):
-        at = [evidence.places[name] for name in effect.columns]
-        np.add.at(value, at, effect.coefficients(numbers))
+    value = evidence.coefficients(found.fitted)
     deviation, _ = evidence.calibrated(found.fitted)
     value[[evidence.places[name] for name in evidence.calibrate]] += deviation
     return columns.gap - columns.matrix @ value
