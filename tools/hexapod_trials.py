@@ -4,44 +4,76 @@
     python tools/hexapod_trials.py --out runs/hexapod            # goes on after a kill
     python tools/hexapod_trials.py --out runs/hexapod --score-only
 
-Every trial is made by a process of its own (`tools.blind.hexapod`: MuJoCo, no regressor), which
-writes four logs, seals the key and ends; another process runs the command on a copy of the logs,
-with the model as it is shipped. Noise is drawn anew and not told; in three of four trials the
+One process makes the trials (`tools.blind.hexapod`: MuJoCo, no regressor): it writes four logs per
+trial, seals the key and ends. Another one, which sees nothing but copies of the logs and the model
+as it is shipped, answers what `hydrotele gap --machine palida --data LOGS` answers. Noise is drawn anew and not told; in three of four trials the
 numbers of the robot are off by 0.5, 1 or 2 % everywhere.
 """
 
 import argparse
 import json
+import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from hydrotele.core.errors import InputError
 from tools.blind.generate import key_hash
 from tools.blind.judge import Verdict, judge
-from tools.blind.run_trial import ROOT, ask
+from tools.blind.run_trial import PASSED, ROOT
 from tools.blind.trials import Place, Series, begin_series, load_series, write_json
 
 KINDS = ("single", "clean", "outside")
-COMMAND = (sys.executable, "-m", "hydrotele.cli", "gap", "--machine", "palida", "--data", "{data}",
-           "--out", "answer", "--json")  # fmt: skip
-LIMIT = 3000.0  # s
+MODEL = ROOT / "models" / "palida"
 
 
-def run(place: Place) -> None:
-    """Make one trial and let the command answer."""
-    if not (place.data.is_dir() and place.key.is_file() and place.seal.is_file()):
-        words = [sys.executable, "-m", "tools.blind.hexapod", str(place.out), place.trial]
+def make(out: Path, places: Sequence[Place]) -> None:
+    """Make the trials that are not there, in a process of its own, which then ends."""
+    missing = [p.trial for p in places if not (p.data.is_dir() and p.seal.is_file())]
+    if missing:
+        words = [sys.executable, "-m", "tools.blind.hexapod", str(out), *missing]
         done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise InputError(f"trial {place.trial}", f"no data: {done.stderr[-2000:]}")
-    begin = time.perf_counter()
-    answer, error = ask(place.data, COMMAND, LIMIT)
-    write_json(place.result, {
-        "trial": place.trial, "answer": answer, "error": error,
-        "wall_seconds": round(time.perf_counter() - begin, 2),
-    })  # fmt: skip
+            raise InputError(out, f"no data: {done.stderr[-2000:]}")
+
+
+def answer(places: Sequence[Place]) -> None:
+    """Let a process that sees nothing but the model and copies of the logs answer all trials."""
+    with tempfile.TemporaryDirectory(prefix="logs_") as folder:
+        copies = []
+        for number, place in enumerate(places):
+            copies.append(Path(folder, f"{number}"))
+            shutil.copytree(place.data, copies[-1])
+        words = [
+            sys.executable,
+            str(ROOT / "tools" / "blind" / "mechanism_workflow.py"),
+            str(MODEL / "palida.xml"),
+            str(MODEL / "columns.yaml"),
+            *map(str, copies),
+        ]
+        environment = {name: os.environ[name] for name in PASSED if name in os.environ}
+        environment["PYTHONPATH"] = str(ROOT)
+        with subprocess.Popen(
+            words, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            text=True,
+        ) as process:  # fmt: skip
+            assert process.stdout
+            begin = time.perf_counter()
+            for place, line in zip(places, process.stdout, strict=False):
+                found = json.loads(line)
+                error = found.get("error")
+                write_json(place.result, {
+                    "trial": place.trial, "answer": None if error else found, "error": error,
+                    "wall_seconds": round(time.perf_counter() - begin, 2),
+                })  # fmt: skip
+                begin = time.perf_counter()
+                print(f"{place.trial} answered", flush=True)
+    if process.returncode:
+        raise InputError("search", f"ended with status {process.returncode}")
 
 
 def score(out: Path) -> str:
@@ -137,10 +169,10 @@ def main() -> int:
             counts = {kind: count or 0 for kind, count in counts.items()} | {"double": 0}
             begin_series(args.out, Series(args.seed, counts, "palida", args.duration))
         places = [Place(args.out.resolve(), n) for n in load_series(args.out).names()]
-        for place in places if not args.score_only else ():
-            if not place.result.is_file():
-                run(place)
-                print(f"{place.trial} answered", flush=True)
+        left = [place for place in places if not place.result.is_file()]
+        if left and not args.score_only:
+            make(args.out.resolve(), left)
+            answer(left)
         print(score(args.out))
     except InputError as error:
         print(error, file=sys.stderr)

@@ -153,7 +153,9 @@ def gap_mjcf_to_folder(
         if progress:
             progress("drive the models by the measured forces", 0.95)
         try:
-            gap = dataclasses.replace(gap, open_loop=_open_loop(gap, data, mechanism, heldout))
+            gap = dataclasses.replace(
+                gap, open_loop=mechanism_open_loop(gap, data, mechanism, heldout)
+            )
         except InputError as error:
             gap = dataclasses.replace(gap, notes=(*gap.notes, f"No open loop: {error}."))
     with whole_folder(target, "gap") as folder:
@@ -183,10 +185,23 @@ def gap_mjcf_to_folder(
 _HORIZON = 0.25  # s: an unstable mechanism that nothing controls soon leaves any motion
 
 
-def _open_loop(
+def mechanism_open_loop(
     gap: Gap, data: Sequence[Path], mechanism: Mechanism, heldout: str | None
 ) -> dict[str, Any]:  # fmt: skip
-    """How far the given and the patched model run away when the measured forces drive them."""
+    """How far the given and the patched model run away when the measured forces drive them.
+
+    Args:
+        gap: of a mechanism.
+        data: log files, folders of logs.
+        mechanism: the given model.
+        heldout: name of the run to judge on, None to choose.
+
+    Returns:
+        As `Gap.open_loop`.
+
+    Raises:
+        InputError: a force is not known for a while, or a simulation fails.
+    """
     from hydrotele.gap.mechanism_patch import COLUMNS_FILE, MJCF_FILE, write_mechanism
 
     models = {"before": mechanism}

@@ -262,8 +262,9 @@ def _ranking(gap: Gap) -> list[dict[str, Any]]:
 def _value(gap: Gap, candidate: Candidate, name: str) -> str:
     value, label = candidate.parameters[name], name.replace("_", " ")
     effect = EFFECTS.get(candidate.name)
-    known = effect is not None and not candidate.units
-    facts = effect.parameters(gap.machine, candidate.location) if known else {}
+    facts = {}
+    if effect is not None and not candidate.units:
+        facts = effect.parameters(gap.machine, candidate.location)
     unit = candidate.units.get(name) or (facts[name].unit if name in facts else None)
     return f"{label} {amount(value, unit, name) if unit else f'{value:.3g}'}"
 

@@ -1,6 +1,6 @@
 """The hexapod as a world of its own: MuJoCo, a controller, sensors, and what may be hidden in it.
 
-    python -m tools.blind.hexapod FOLDER_OF_THE_SERIES TRIAL
+    python -m tools.blind.hexapod FOLDER_OF_THE_SERIES TRIAL...
 
 Nothing of the search is imported here, and no regressor: the model's MJCF is changed, simulated and
 measured. Effects that an MJCF cannot state act as forces on the struts at every step.
@@ -430,12 +430,13 @@ def make_trial(place: Place, series: Series) -> None:
 
 
 def main() -> None:
-    """Parse the arguments and make the trial."""
+    """Parse the arguments and make the trials."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("trial")
+    parser.add_argument("trial", nargs="+")
     args = parser.parse_args()
-    make_trial(Place(args.out, args.trial), load_series(args.out))
+    for trial in args.trial:
+        make_trial(Place(args.out, trial), load_series(args.out))
 
 
 if __name__ == "__main__":
