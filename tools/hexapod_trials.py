@@ -6,8 +6,9 @@
 
 One process makes the trials (`tools.blind.hexapod`: MuJoCo, no regressor): it writes four logs per
 trial, seals the key and ends. Another one, which sees nothing but copies of the logs and the model
-as it is shipped, answers what `hydrotele gap --machine palida --data LOGS` answers. Noise is drawn anew and not told; in three of four trials the
-numbers of the robot are off by 0.5, 1 or 2 % everywhere.
+as it is shipped, answers what `hydrotele gap --machine palida --data LOGS` answers. Noise is drawn
+anew and not told; in three of four trials the numbers of the robot are off by 0.5, 1 or 2 %
+everywhere.
 """
 
 import argparse
