@@ -87,19 +87,32 @@ def find_noise(columns: Columns) -> Noise:
         factor = cho_factor(square + np.eye(len(square)))
         value = cho_solve(factor, x.T @ y)
         free = max(1.0 - float(np.trace(cho_solve(factor, square))) / len(y), 0.1)
-        rest = gap - matrix @ value
-        doubtful = find_doubtful(rest, columns.doubt)
-        weight = weights(doubtful, columns.doubt)
-        left = rest * weight
-        follow = _follow(left, columns.starts)
-        plain = Noise(follow, np.eye(k), weight, noise.std, rest, doubtful)
-        new = whitened(rest, plain, columns.starts)
-        between = new.T @ new / len(new) / free
-        between += 1e-12 * np.trace(between) / k * np.eye(k)
-        white = np.linalg.inv(np.linalg.cholesky(between))
-        std = np.sqrt(np.mean(left**2, axis=0) / np.mean(weight**2, axis=0) / free)
-        noise = Noise(follow, white, weight, std, rest, doubtful)
+        noise = noise_of(gap - matrix @ value, columns, free)
     return noise
+
+
+def noise_of(rest: np.ndarray, columns: Columns, free: float = 1.0) -> Noise:
+    """Noise of the equations, from what a model leaves.
+
+    Args:
+        rest: (n, k) [N] or [N m].
+        columns: of the runs.
+        free: share of the equations that the model's numbers have not used up.
+
+    Returns:
+        The noise.
+    """
+    drives = rest.shape[1]
+    doubtful = find_doubtful(rest, columns.doubt)
+    weight = weights(doubtful, columns.doubt)
+    left = rest * weight
+    follow = _follow(left, columns.starts)
+    std = np.sqrt(np.mean(left**2, axis=0) / np.mean(weight**2, axis=0) / free)
+    plain = Noise(follow, np.eye(drives), weight, std, rest, doubtful)
+    new = whitened(rest, plain, columns.starts)
+    between = new.T @ new / len(new) / free
+    between += 1e-12 * np.trace(between) / drives * np.eye(drives)
+    return replace(plain, white=np.linalg.inv(np.linalg.cholesky(between)))
 
 
 def _follow(rest: np.ndarray, starts: Sequence[int]) -> np.ndarray:

@@ -30,6 +30,7 @@ from hydrotele.gap.mechanism_evidence import (
     Noise,
     find_noise,
     gather_evidence,
+    noise_of,
 )
 from hydrotele.gap.mechanism_lack import Left, find_left, loud_windows
 from hydrotele.gap.mechanism_patch import (
@@ -60,6 +61,7 @@ from hydrotele.multibody.regressor import BODY_PARAMETERS
 _ODDS = 6.0  # twice the log odds by which naming an effect must beat not naming it, beside the
 # number of effects that are tried
 _MOST = 20  # effects
+_SCARCE = 5.0  # equations per column, below which all columns together tell noise too small
 _FEW = 3  # effects up to which exchanges are tried after every new one
 _ROUNDS = 4  # of taking sensors' defects off the readings
 _SAME = 0.01  # of a prior's width, within which a round has changed nothing
@@ -285,6 +287,10 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
             effects = [one for one in effects if one.name in names]
         tell(f"{len(effects)} effects, round {turn + 1}", 0.2 * turn + 0.15)
         found = _search(columns, noise, evidence, effects, found)
+        if columns.gap.size < _SCARCE * len(columns.names):
+            noise = noise_of(_unexplained(found), columns)
+            evidence = gather_evidence(columns, noise, possible_errors(mechanism, columns))
+            found = _search(columns, noise, evidence, effects, found)
         known = [
             (one, value)
             for one, value in zip(found.fitted.effects, found.fitted.values, strict=True)
