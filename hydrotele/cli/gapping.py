@@ -1,9 +1,14 @@
 """`hydrotele gap`: where model and measured logs disagree, and the machine that agrees better."""
 
+import dataclasses
 import json
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import mujoco
+import numpy as np
 import yaml
 
 import hydrotele
@@ -15,9 +20,12 @@ from hydrotele.core.output import check_target, whole_folder
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.customary import in_customary_units
 from hydrotele.gap.description import effect_title, headline, verdict_words
-from hydrotele.gap.patched import has_patch, write_patch
+from hydrotele.gap.patched import add_head, has_patch, write_effects, write_patch
 from hydrotele.gap.result import Gap, finite, gap_document
+from hydrotele.identify.mechanism import Mechanism, load_mechanism, mechanism_records
+from hydrotele.identify.motion import Processing, joint_motion, resolution
 from hydrotele.logs.dataset import Dataset, load_dataset
+from hydrotele.simulate.driven_chain import open_loop_errors
 from hydrotele.simulate.native import stop_profiling_clock
 
 _COLOURS = {
@@ -109,6 +117,113 @@ def write_gap(
         "hydrotele": hydrotele.__version__,
     }
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def gap_mjcf_to_folder(
+    data: Sequence[Path], mjcf: Path, columns: Path | None, heldout: str | None,
+    target: Path | None, as_json: bool, effects: Sequence[str] = (),
+) -> Path:  # fmt: skip
+    """Find the gap between the model of a mechanism without hydraulics and its logs.
+
+    Args:
+        data: log files, folders of logs.
+        mjcf: the mechanism, with `connect` and `weld` closures.
+        columns: YAML file that says which column is which; None for columns with usual names.
+        heldout: name of the run to judge on, None to choose.
+        target: folder, default `gap_<data>`.
+        as_json: print `gap.json` instead of words.
+        effects: names of the effects to try; none means all.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: data, mechanism, mapping, effects or target are not usable.
+    """
+    from hydrotele.gap.mechanism_find import find_mechanism_gap
+    from hydrotele.gap.mechanism_patch import COLUMNS_FILE, write_mechanism
+    from hydrotele.show.gap_report import write_report
+
+    target = target or Path(f"gap_{data_name(data)}")
+    check_target(target, "gap")
+    mechanism = load_mechanism(mjcf, columns)
+    fit, judge, said = mechanism_records(data, mechanism, heldout, as_measured=True)
+    with stages(f"gap {mechanism.setup.chain.name}", as_json) as progress:
+        gap = find_mechanism_gap(mjcf, columns, fit, judge, progress, effects, said)
+        if progress:
+            progress("drive the models by the measured forces", 0.95)
+        try:
+            gap = dataclasses.replace(
+                gap, open_loop=mechanism_open_loop(gap, data, mechanism, heldout)
+            )
+        except InputError as error:
+            gap = dataclasses.replace(gap, notes=(*gap.notes, f"No open loop: {error}."))
+    with whole_folder(target, "gap") as folder:
+        document = json.dumps(gap_document(gap), indent=2, allow_nan=False)
+        (folder / "gap.json").write_text(document + "\n", encoding="utf-8")
+        if gap.patched is not gap.machine:
+            patched = folder / "patched"
+            patched.mkdir()
+            write_mechanism(patched, gap.patched.mjcf, gap.patched.mapping)
+            add_head(gap, patched / COLUMNS_FILE)
+            write_effects(gap, patched)
+        write_report(gap, folder / "report.html")
+        summary = {
+            "kind": "gap", "machine": gap.machine.name, "mjcf": str(mjcf),
+            "columns": str(columns) if columns else None, "data": [str(path) for path in data],
+            "heldout": judge.name, "verdict": gap.verdict, "hydrotele": hydrotele.__version__,
+        }  # fmt: skip
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    if as_json:
+        print_json(gap_document(gap))
+    else:
+        _print(gap)
+        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    return target
+
+
+_HORIZON = 0.25  # s: an unstable mechanism that nothing controls soon leaves any motion
+
+
+def mechanism_open_loop(
+    gap: Gap, data: Sequence[Path], mechanism: Mechanism, heldout: str | None
+) -> dict[str, Any]:  # fmt: skip
+    """How far the given and the patched model run away when the measured forces drive them.
+
+    Args:
+        gap: of a mechanism.
+        data: log files, folders of logs.
+        mechanism: the given model.
+        heldout: name of the run to judge on, None to choose.
+
+    Returns:
+        As `Gap.open_loop`.
+
+    Raises:
+        InputError: a force is not known for a while, or a simulation fails.
+    """
+    from hydrotele.gap.mechanism_patch import COLUMNS_FILE, MJCF_FILE, write_mechanism
+
+    models = {"before": mechanism}
+    if gap.patched is not gap.machine:
+        with tempfile.TemporaryDirectory() as folder:
+            write_mechanism(Path(folder), gap.patched.mjcf, gap.patched.mapping)
+            models["after"] = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
+    out: dict[str, Any] = {"horizon": _HORIZON}
+    for which, one in models.items():
+        _, judge, _ = mechanism_records(data, one, heldout)
+        found = resolution(judge.position, judge.period, judge.position_noise)
+        motion = joint_motion(judge.position, judge.period, found, Processing())
+        model = gap.machine if which == "before" else gap.patched
+        whole = np.stack([motion.value, motion.rate, motion.acceleration])
+        known = np.isfinite(judge.force).all(axis=1)
+        if not known.all():
+            raise InputError(judge.name, "lacks forces for a while")
+        out[which] = open_loop_errors(
+            mujoco.MjModel.from_xml_string(model.mjcf), one.setup.chain, one.setup.given, whole,
+            judge.force, judge.period, _HORIZON,
+        )  # fmt: skip
+    return out
 
 
 def _search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool) -> Gap:

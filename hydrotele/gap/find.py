@@ -136,7 +136,7 @@ def find_gap(
         left = left_over(before[0], after[0], data.channels, floor)
         named = believed(named, learned, left, _lost(tests, learned))
     named, details = without_details(named, failed)
-    verdict = _verdict(named, failed, None if judge.ripple else floor)
+    verdict = verdict_of(named, failed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
     lacks = _lacks(data.machine, discovery.judged)
@@ -172,7 +172,7 @@ def find_gap(
         learned=learned,
         lacks=lacks,
         noise=_noise(data, judge.levels),
-        notes=(*data.notes, *notes, *map(_detail, details),
+        notes=(*data.notes, *notes, *map(detail_words, details),
                *_notes(found, data, judge.levels, floor)),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
@@ -266,7 +266,19 @@ def _lost(tests: Mapping[str, dict], laws: Sequence[LearnedLaw]) -> set[str]:
     return axes | {law.axis for law in laws if law.share > _MINOR}
 
 
-def _verdict(named: Sequence[NamedEffect], failed: bool, floor: float | None) -> Verdict:
+def verdict_of(named: Sequence[NamedEffect], failed: bool, floor: float | None) -> Verdict:
+    """The verdict.
+
+    Args:
+        named: the effects.
+        failed: whether what is left is more than noise.
+        floor: what a perfect model would leave; None where it cannot be told.
+
+    Returns:
+        `no_gap` or `unknown` without effects; `named` where all are sure and nothing is left,
+        `ambiguous` where some are not; `partly` where something is left but the effects close a
+        third of the gap.
+    """
     sure = [effect for effect in named if effect.mechanism_probability >= SURE]
     if not named:
         return "unknown" if failed or floor is None else "no_gap"
@@ -334,7 +346,8 @@ def without_details(
     return tuple(effect for effect in named if effect not in details), details
 
 
-def _detail(effect: NamedEffect) -> str:
+def detail_words(effect: NamedEffect) -> str:
+    """Why an effect is not named although the patched model has it."""
     told = ", ".join(
         f"{key} {e.value:.4g} {e.unit} ({e.low:.4g} to {e.high:.4g})"
         for key, e in effect.parameters.items()

@@ -30,8 +30,28 @@ def write_patch(gap: Gap, folder: Path) -> None:
     """
     file = folder / MACHINE_FILE
     save_machine(gap.patched, file)
+    add_head(gap, file)
+    write_effects(gap, folder)
+
+
+def add_head(gap: Gap, file: Path) -> None:
+    """Say in comments at the head of a YAML file what the effects are.
+
+    Args:
+        gap: what the search yields.
+        file: of the patched model.
+    """
     head = "".join(f"# {line}\n" for line in _head(gap))
     file.write_text(head + file.read_text(encoding="utf-8"), encoding="utf-8")
+
+
+def write_effects(gap: Gap, folder: Path) -> None:
+    """Write `effects.yaml`: effects, calibrated numbers and learned laws, with the given values.
+
+    Args:
+        gap: what the search yields.
+        folder: an existing folder.
+    """
     record = {
         "machine": gap.machine.name,
         "tool": gap.machine.tool,

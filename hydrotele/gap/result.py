@@ -7,12 +7,11 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.machine.machine import Machine
 
 SURE = 0.95
 """Probability of a mechanism below which it is called ambiguous."""
@@ -184,6 +183,7 @@ class Candidate:
         gain: fall of -2 log likelihood over the fit runs.
         charge: what its parameters cost (Occam factor), in the same unit.
         parameters: parameter -> value.
+        units: parameter -> its SI unit, where the library does not state it.
     """
 
     name: str
@@ -191,6 +191,7 @@ class Candidate:
     gain: float
     charge: float
     parameters: Mapping[str, float]
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -215,12 +216,15 @@ class Prediction:
     whitened: np.ndarray
 
 
+Model = TypeVar("Model")
+
+
 @dataclass(frozen=True)
-class Gap:
+class Gap(Generic[Model]):
     """Everything the search yields.
 
     Attributes:
-        machine: the model that was given.
+        machine: the model that was given: a Machine, or the model of a mechanism.
         patched: the model with the named effects; the same object if nothing was named.
         verdict: named, partly, ambiguous, unknown or no_gap.
         effects: the named effects, the surest first.
@@ -241,10 +245,12 @@ class Gap:
         noise: channel -> (found, stated) standard deviation of a reading [SI]; NaN if not stated.
         notes: what was left out or mended in the data, one sentence each.
         seconds: wall time of the search.
+        open_loop: how far the models run away from the measured motion when the measured forces
+            drive them: `horizon` [s], `before` and `after` (joint -> RMS [rad] or [m]); or None.
     """
 
-    machine: Machine
-    patched: Machine
+    machine: Model
+    patched: Model
     verdict: Verdict
     effects: tuple[NamedEffect, ...]
     unknown: Unknown | None
@@ -262,6 +268,7 @@ class Gap:
     noise: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
+    open_loop: Mapping[str, Any] | None = None
 
 
 def gap_document(gap: Gap) -> dict[str, Any]:
@@ -289,6 +296,8 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         `tests`: residual test -> `value`, `limit`, `passed`.
         `laws`: balance -> `unit` and `places`, place -> RMS `before`, `after` and `noise`.
         `next_experiment`: `reason` and `scenario`, or null. `notes`: on the data. `seconds`.
+        Of a mechanism also `open_loop`: `horizon` [s], `before` and `after` (joint -> RMS [rad] or
+        [m] by which a model runs away within it when the measured forces drive it), or null.
     """
     unknown = gap.unknown and {
         "law": gap.unknown.law,
@@ -302,7 +311,8 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         law: {"unit": gap.law_units.get(law, "1"), "places": places}
         for law, places in gap.laws.items()
     }
-    return finite({
+    open_loop = {} if gap.open_loop is None else {"open_loop": gap.open_loop}
+    return finite(open_loop | {
         "verdict": gap.verdict,
         "effects": [effect_document(effect) for effect in gap.effects],
         "calibration": {

@@ -42,7 +42,8 @@ class Equations:
         name: the run's.
         band: of the low-pass [Hz].
         matrix: (n, k, m).
-        force: (n, k) less what the joints' stated damping takes [N] or [N m]; NaN where unknown.
+        force: (n, k) less what the joints' stated damping and springs take [N] or [N m]; NaN where
+            unknown.
         time: (n,) [s] from the run's start.
         spacing: between equations [s]; a whole part of a repeated motion's period.
         doubt: (n, k) how uncertain the sign of the drives' dry friction is, 0 .. 1.
@@ -110,9 +111,9 @@ def build_equations(
         some = min(per_chunk, count - first)
         rows = slice(first * thin, (first + some - 1) * thin + len(low))
         last, doubt, damping, pose = _rows(setup, motions[:, rows], motion.rate_std[rows], start)
-        damped.append(_thinned(damping, low, thin))
-        parts.append(_thinned(last.matrix, low, thin))
-        doubts.append(_thinned(doubt, weights, thin))
+        damped.append(low_passed(damping, low, thin))
+        parts.append(low_passed(last.matrix, low, thin))
+        doubts.append(low_passed(doubt, weights, thin))
         start = pose
     assert last is not None
     noise = np.sqrt(np.sum(low**2)) * record.force_noise
@@ -122,7 +123,7 @@ def build_equations(
     time = (np.arange(count) * thin + (len(low) - 1) / 2) * record.period
     made = Equations(
         record.name, band, np.concatenate(parts), 
-        _forces(record.force, record.period, low, thin) - np.concatenate(damped), time,
+        low_passed_forces(record.force, record.period, low, thin) - np.concatenate(damped), time,
         thin * record.period, np.concatenate(doubts), noise, spread,
     )  # fmt: skip
     empty = Regressor(last.matrix[:0], last.drives, last.names, last.units, last.nominal)
@@ -162,7 +163,7 @@ def _motion_noise(
     taken = _rows(setup, motions[:, rows], rate_std[rows], None)[0].matrix
     total = np.zeros((taken.shape[1], taken.shape[2], taken.shape[2]))
     for draw in error_draws(smoothed, _DRAWS):
-        error = _thinned(taken - _rows(setup, likely - draw, None, None)[0].matrix, low, thin)
+        error = low_passed(taken - _rows(setup, likely - draw, None, None)[0].matrix, low, thin)
         total += np.einsum("nkm,nkl->kml", error, error)
     return total / (len(error) * _DRAWS)
 
@@ -182,7 +183,7 @@ def row_forces(
         rate_std: (n, k) of the rates [rad/s] or [m/s]; None if they are certain.
 
     Returns:
-        (n, k) [N] or [N m].
+        (n, k) [N] or [N m], with the joints' stated damping and springs.
     """
     out, start = [], None
     for first in range(0, motions.shape[1], _CHUNK):
@@ -199,7 +200,7 @@ def _rows(
     rate_std: np.ndarray | None,
     start: np.ndarray | None,
 ):
-    """Some rows (3, n, k): regressor, doubt of the signs, forces of damping, and the last pose."""
+    """Some rows (3, n, k): regressor, doubt of the signs, damping and springs, the last pose."""
     chain = setup.chain
     found = project(chain, setup.given, *motions, start=start)
     given = [chain.index(name) for name in setup.given]
@@ -210,8 +211,8 @@ def _rows(
     doubt = np.zeros((len(found.rate), len(table.drives)))
     if spread is not None:
         doubt = sign_uncertainty(chain, found, table.drives, setup.rubbing, spread)
-    damping = np.einsum("nkv,nv->nk", found.share, chain.damping * found.rate)
-    return table, doubt, damping, found.position[-1]
+    passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.rest)
+    return table, doubt, np.einsum("nkv,nv->nk", found.share, passive), found.position[-1]
 
 
 def low_pass(band: float, period: float, cycle: float | None = None) -> tuple[np.ndarray, int]:
@@ -237,8 +238,17 @@ def low_pass(band: float, period: float, cycle: float | None = None) -> tuple[np
     return weights / weights.sum(), (parts or [thin])[0]
 
 
-def _thinned(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
-    """Low-passed rows, as far as all of the weights lie on rows, every `thin`-th."""
+def low_passed(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
+    """Rows after a low-pass, as far as all of its weights lie on rows.
+
+    Args:
+        values: (n, ...).
+        low: weights, their number odd.
+        thin: every which row is kept.
+
+    Returns:
+        (rows, ...).
+    """
     count = (len(values) - len(low)) // thin + 1
     flat = values.reshape(len(values), -1)
     # upfirdn puts out a row for every input; the first whole one ends at row len(low) - 1
@@ -249,8 +259,18 @@ def _thinned(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
     return out[first : first + count].reshape(count, *values.shape[1:])
 
 
-def _forces(force: np.ndarray, period: float, low: np.ndarray, thin: int) -> np.ndarray:
-    """Low-passed forces (n, k); short gaps are bridged, long ones leave NaN."""
+def low_passed_forces(force: np.ndarray, period: float, low: np.ndarray, thin: int) -> np.ndarray:
+    """Forces after a low-pass; short gaps are bridged, long ones leave NaN.
+
+    Args:
+        force: (n, k), NaN where unknown.
+        period: between rows [s].
+        low: weights, their number odd.
+        thin: every which row is kept.
+
+    Returns:
+        (rows, k).
+    """
     known = np.isfinite(force)
     far = np.zeros_like(known)
     filled, rows = np.zeros_like(force), np.arange(len(force))
@@ -264,8 +284,8 @@ def _forces(force: np.ndarray, period: float, low: np.ndarray, thin: int) -> np.
             near = np.minimum(np.abs(places[after] - rows), np.abs(places[before] - rows))
             far[:, k] = near * period > 0.5 * GAP
             filled[:, k] = np.interp(rows, rows[known[:, k]], force[known[:, k], k])
-    out = _thinned(filled, low, thin)
-    missing = _thinned(far.astype(float), np.abs(low) / np.abs(low).sum(), thin)
+    out = low_passed(filled, low, thin)
+    missing = low_passed(far.astype(float), np.abs(low) / np.abs(low).sum(), thin)
     out[missing > _MISSING] = np.nan
     return out
 

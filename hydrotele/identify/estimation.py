@@ -370,7 +370,7 @@ def weighted(
     if method == "least_squares":
         return Weighted(data.table, ones, alike, data.matrix, data.force, np.eye(drives))
     plain = Weighted(data.table, ones, alike, data.matrix, data.force)
-    doubtful = _doubtful(plain.fitted(structure, order=0).residual, data.doubt)
+    doubtful = find_doubtful(plain.fitted(structure, order=0).residual, data.doubt)
     weight = weights(doubtful, data.doubt)
     matrix, force = weight[:, :, None] * data.matrix, weight * data.force
     found = Weighted(data.table, weight, doubtful, matrix, force)
@@ -436,8 +436,16 @@ def weights(doubtful: np.ndarray, doubt: np.ndarray) -> np.ndarray:
     return np.sqrt(doubtful[:, 0] / (doubtful[:, 0] + doubtful[:, 1] * doubt**2))
 
 
-def _doubtful(residual: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-    """How much larger doubtful errors are (k, 2), read off the residuals of a first estimate."""
+def find_doubtful(residual: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+    """How much larger doubtful errors are, read off the residuals of a first estimate.
+
+    Args:
+        residual: (n, k).
+        doubt: (n, k) of the signs of dry friction.
+
+    Returns:
+        (k, 2) as of `Weighted`.
+    """
     out = np.tile([1.0, 0.0], (doubt.shape[1], 1))
     for k in range(doubt.shape[1]):
         square = residual[:, k] ** 2

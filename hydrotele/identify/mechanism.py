@@ -8,20 +8,22 @@ import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from hydrotele.core.datafile import Facts, parse, read_yaml, suggest
 from hydrotele.core.errors import InputError
 from hydrotele.identify.motion import GAP
-from hydrotele.identify.record import IdentificationRecord
+from hydrotele.identify.record import IdentificationRecord, trimmed, without_error
 from hydrotele.identify.setup import RegressorSetup, mechanism_setup
 from hydrotele.logs.log import LEFT_OUT, Log, load_log, read_table
 from hydrotele.logs.rows import fit_clock
+from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.poses import joint_positions
-from hydrotele.multibody.regressor import BODY_PARAMETERS
+from hydrotele.multibody.regressor import BODY_PARAMETERS, FRICTION_TERMS
 
 _FITTED = 2.0 / 3.0  # of a single run; the rest judges
 _POSITIONS = ("position.{joint}", "angle.{joint}", "{joint}")
@@ -49,6 +51,12 @@ class ColumnMapping(Facts):
         alike: groups of bodies or joints that have the same parameters.
         absent: parameters that are known to be 0, such as `moment_x.stator_*`.
         offsets: whether drives may have constant forces.
+        friction: joint -> friction that an MJCF cannot state, such as `stribeck`, `quadratic`,
+            `viscous_asymmetry`; see `FrictionTerm`. `stribeck_velocity` is that of `stribeck`.
+        sensor_errors: `position.JOINT` or `force.DRIVE` -> known defect of its sensor, which is
+            taken off the readings (after signs that the mapping turns).
+        uncertainty: share by which masses, inertias and friction of the MJCF may be off; a gap
+            search calibrates them within it before it names anything.
     """
 
     time: str = "time"
@@ -61,6 +69,9 @@ class ColumnMapping(Facts):
     alike: tuple[tuple[str, ...], ...] = ()
     absent: tuple[str, ...] = ()
     offsets: bool = True
+    friction: dict[str, dict[str, float]] = Field(default_factory=dict)
+    sensor_errors: dict[str, SensorError] = Field(default_factory=dict)
+    uncertainty: Annotated[float, Field(ge=0.0, le=0.5)] = 0.03
 
 
 @dataclass(frozen=True)
@@ -130,9 +141,17 @@ def load_mechanism(
         if firsts.get(name.partition(".")[2], name.partition(".")[2]) == name.partition(".")[2]
     ]
     given = _named(chain.joints, facts.coordinates, source, "joint") or measured
+    _named([*passive, *chain.drives], facts.friction, source, "joint with friction")
+    for numbers in facts.friction.values():
+        _named((*FRICTION_TERMS, "stribeck_velocity"), numbers, source, "parameter of friction")
+    _named(
+        [*(f"position.{j}" for j in measured), *(f"force.{d}" for d in chain.drives)],
+        facts.sensor_errors, source, "sensor",
+    )  # fmt: skip
     setup = mechanism_setup(
-        chain, given, passive=passive, offsets=facts.offsets, alike=alike, absent=absent
-    )
+        chain, given, passive=passive, offsets=facts.offsets, alike=alike, absent=absent,
+        friction=facts.friction,
+    )  # fmt: skip
     return Mechanism(setup, measured, facts, source)
 
 
@@ -149,7 +168,7 @@ def _named(known: Sequence[str], patterns, source: str, what: str) -> list[str]:
 
 def mechanism_records(
     paths: Sequence[str | Path], mechanism: Mechanism, heldout: str | None = None,
-    period: float | None = None,
+    period: float | None = None, as_measured: bool = False,
 ) -> tuple[tuple[IdentificationRecord, ...], IdentificationRecord, tuple[str, ...]]:  # fmt: skip
     """Read logs of a mechanism.
 
@@ -159,6 +178,7 @@ def mechanism_records(
         heldout: name of the run to judge on; by default one that begins with `test`, else the last;
             a single run is split in time.
         period: of a repeated motion [s]; a single run is then split at a whole period.
+        as_measured: whether to leave positions in the measured joints.
 
     Returns:
         Records of the runs to fit, of the run to judge on, and notes.
@@ -171,7 +191,8 @@ def mechanism_records(
         log, columns = _load(path, mechanism)
         if log.name in runs:
             raise InputError(log.source, f"run {log.name!r} is there twice: rename one")
-        runs[log.name], said = _record(log, columns, mechanism)
+        run, said = _record(log, columns, mechanism)
+        runs[log.name] = run if as_measured else in_coordinates(run, mechanism.setup)
         notes += said
     if heldout is not None and heldout not in runs:
         raise InputError("--heldout", f"there is no run {heldout!r}; {suggest(heldout, runs)}")
@@ -277,7 +298,10 @@ def _record(
 
     def values_of(what: str, joint: str) -> np.ndarray | None:
         column = columns.get((what, joint))
-        return None if column is None else column.sign * log[column.channel]
+        if column is None:
+            return None
+        known = mechanism.mapping.sensor_errors.get(f"{what}.{joint}", SensorError())
+        return without_error(column.sign * log[column.channel], known, period)
 
     position = []
     for joint in mechanism.measured:
@@ -299,7 +323,7 @@ def _record(
         _noise(mapping.position_noise, mechanism.measured), np.array(force).T,
         _noise(mapping.force_noise, chain.drives),
     )  # fmt: skip
-    return in_coordinates(record, mechanism.setup), notes
+    return trimmed(record), notes
 
 
 def _noise(stated: float | dict[str, float] | None, joints: Sequence[str]) -> np.ndarray:

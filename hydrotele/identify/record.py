@@ -302,9 +302,25 @@ def _reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, 
     """Readings (n,) freed of the sensor defects that the machine states, and their noise."""
     column = dataset.channels.index(channel)
     error = dataset.machine.sensor_errors.get(channel, SensorError())
-    values = (run.reading[:, column] - error.offset) / error.scale
-    if error.late:
-        late = error.delay + error.time_constant  # of motions slower than the lag
-        rows = np.arange(len(values), dtype=float)
-        values = np.interp(rows + late / run.period, rows, values, right=np.nan)
+    values = without_error(run.reading[:, column], error, run.period)
     return values, float(dataset.noise_of(run)[column]) / error.scale
+
+
+def without_error(values: np.ndarray, error: SensorError, period: float) -> np.ndarray:
+    """What a sensor would read without its defect.
+
+    Args:
+        values: (n,) readings, NaN where missing.
+        error: offset, scale, delay and lag; the lag counts as a delay, which it is of motions that
+            are slower.
+        period: between rows [s].
+
+    Returns:
+        (n,), NaN where nothing is known: at the end, where the sensor is late.
+    """
+    values = (values - error.offset) / error.scale
+    if error.late:
+        rows = np.arange(len(values), dtype=float)
+        late = (error.delay + error.time_constant) / period
+        values = np.interp(rows + late, rows, values, right=np.nan)
+    return values

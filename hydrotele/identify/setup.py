@@ -175,6 +175,7 @@ def cylinder_bars(machine: Machine) -> dict[str, tuple[str, str]]:
 def mechanism_setup(
     chain: Chain, given: Sequence[str] | None = None, *, passive: Sequence[str] = (),
     offsets: bool = True, alike: Sequence[Sequence[str]] = (), absent: Sequence[str] = (),
+    friction: Mapping[str, Mapping[str, float]] | None = None,
 ) -> RegressorSetup:  # fmt: skip
     """Setup for any mechanism, without a machine.
 
@@ -188,6 +189,8 @@ def mechanism_setup(
         offsets: whether the drives may have constant forces.
         alike: as of `Setup`.
         absent: as of `Setup`.
+        friction: joint -> further parameters of its friction, which an MJCF cannot state; see
+            `FRICTION_TERMS`, and `stribeck_velocity`.
 
     Returns:
         The setup. Bodies that no joint moves have no columns; joints with an `armature` have one.
@@ -200,7 +203,9 @@ def mechanism_setup(
             j = chain.index(place)
             numbers = {"coulomb": float(chain.frictionloss[j]), "viscous": float(damping[j])}
             damping[j] = 0.0  # it has a column
-        rubbing.append(FrictionTerm(place, numbers))
+        more = dict((friction or {}).get(place, {}))
+        slow = more.pop("stribeck_velocity", FrictionTerm.stribeck)
+        rubbing.append(FrictionTerm(place, numbers | more, stribeck=slow))
     return RegressorSetup(
         chain=replace(chain, damping=damping),
         given=tuple(chain.drives if given is None else given),

@@ -73,6 +73,8 @@ class Chain:
         armature: (v,) inertia of a joint's drive [kg] or [kg m^2].
         damping: (v,) [N s/m] or [N m s/rad].
         frictionloss: (v,) dry friction [N] or [N m].
+        stiffness: (v,) of a joint's spring [N/m] or [N m/rad].
+        rest: (v,) position at which it is slack [rad] or [m].
         drives: joints that an actuator moves, in the actuators' order.
         places: (v,) place of a joint in MuJoCo's `qpos`, -1 for those of ball and free joints.
         dofs: (v,) place of a joint in MuJoCo's `qvel`, -1 likewise.
@@ -88,6 +90,8 @@ class Chain:
     armature: np.ndarray
     damping: np.ndarray
     frictionloss: np.ndarray
+    stiffness: np.ndarray
+    rest: np.ndarray
     drives: tuple[str, ...]
     places: np.ndarray
     dofs: np.ndarray
@@ -116,6 +120,8 @@ class _Joint(NamedTuple):
     armature: float
     damping: float
     frictionloss: float
+    stiffness: float
+    rest: float
     place: int
     dof: int
 
@@ -133,8 +139,8 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         The chain. Actuators that move a joint name the drives; without any, all joints are.
 
     Raises:
-        InputError: no such file, an actuator on a ball or free joint, such a joint with damping or
-            armature or friction, or an active constraint other than `connect` and `weld`.
+        InputError: no such file, an actuator on a ball or free joint, such a joint with damping,
+            armature, friction or a spring, or an active constraint other than `connect` and `weld`.
 
     Source: MuJoCo manual, `mj_kinematics` and `mjData`.
     """
@@ -190,10 +196,12 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         joints=names,
         closures=tuple(one.name for one in closures),
         start=np.array([joint.start for joint in joints]),
-        inertia=np.array([_inertia(model, b) for b in range(1, model.nbody)]).reshape(-1, 10),
+        inertia=np.array([body_inertia(model, b) for b in range(1, model.nbody)]).reshape(-1, 10),
         armature=np.array([joint.armature for joint in joints]),
         damping=np.array([joint.damping for joint in joints]),
         frictionloss=np.array([joint.frictionloss for joint in joints]),
+        stiffness=np.array([joint.stiffness for joint in joints]),
+        rest=np.array([joint.rest for joint in joints]),
         drives=tuple(dict.fromkeys(whole[int(model.jnt_qposadr[j])] for j in moved)) or names,
         places=np.array([joint.place for joint in joints], np.int64),
         dofs=np.array([joint.dof for joint in joints], np.int64),
@@ -220,14 +228,16 @@ def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joi
             _Joint(
                 name, body, kind == _SLIDE, tuple(model.jnt_axis[j]), anchor,
                 float(model.qpos0[place]), float(pose[place]), float(model.dof_armature[dof]),
-                float(model.dof_damping[dof]), float(model.dof_frictionloss[dof]), place, dof,
+                float(model.dof_damping[dof]), float(model.dof_frictionloss[dof]),
+                float(model.jnt_stiffness[j]), float(model.qpos_spring[place]), place, dof,
             )
         ]  # fmt: skip
     last = dof + (3 if kind == _BALL else 6)
     stated = (model.dof_damping, model.dof_armature, model.dof_frictionloss)
-    if any(values[dof:last].any() for values in stated):
+    if any(values[dof:last].any() for values in stated) or model.jnt_stiffness[j]:
         raise InputError(
-            _WHERE, f"joint {name}: only hinges and slides may have damping, armature or friction"
+            _WHERE,
+            f"joint {name}: only hinges and slides may have damping, armature, friction or springs",
         )
     out, unit = [], np.eye(3)
     if kind == _FREE:
@@ -235,14 +245,14 @@ def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joi
         for k, letter in _AXES:
             out.append(
                 _Joint(f"{name}_{letter}", body, True, tuple(unit[k]), anchor, 0.0,
-                       float(ground[k]), 0.0, 0.0, 0.0, -1, -1)
+                       float(ground[k]), 0.0, 0.0, 0.0, 0.0, 0.0, -1, -1)
             )  # fmt: skip
         place += 3
     angles = cardan_angles(_turn(pose[place : place + 4]))
     for k, letter in _AXES:
         out.append(
             _Joint(f"{name}_r{letter}", body, False, tuple(unit[k]), anchor, 0.0,
-                   float(angles[k]), 0.0, 0.0, 0.0, -1, -1)
+                   float(angles[k]), 0.0, 0.0, 0.0, 0.0, 0.0, -1, -1)
         )  # fmt: skip
     return out
 
@@ -306,8 +316,16 @@ def _turn(quaternion: np.ndarray) -> np.ndarray:
     return matrix.reshape(3, 3)
 
 
-def _inertia(model: mujoco.MjModel, body: int) -> list[float]:
-    """Mass, mass times centre of mass, and inertia about the frame's origin, of a body."""
+def body_inertia(model: mujoco.MjModel, body: int) -> list[float]:
+    """Mass, mass times centre of mass, and inertia about the frame's origin, of a body.
+
+    Args:
+        model: compiled.
+        body: its number.
+
+    Returns:
+        The ten inertial parameters in the order of `BODY_PARAMETERS`.
+    """
     mass, com, turn = model.body_mass[body], model.body_ipos[body], _turn(model.body_iquat[body])
     about = turn @ np.diag(model.body_inertia[body]) @ turn.T
     about += mass * (com @ com * np.eye(3) - np.outer(com, com))

@@ -29,7 +29,8 @@ class FrictionTerm:
     """Friction at one place, linear in its parameters.
 
     `(coulomb + stribeck exp(-(v/v_s)^2)) way + viscous v`, plus a part of each in which `way` or
-    `v` is replaced by `way^2` or `v way` (asymmetry), with `way = tanh(v/v_0)`.
+    `v` is replaced by `way^2` or `v way` (asymmetry), plus `quadratic v^2 way`, with
+    `way = tanh(v/v_0)`.
 
     Attributes:
         place: a joint, or a closure, whose bodies turn against each other.
@@ -46,7 +47,7 @@ class FrictionTerm:
 
 FRICTION_TERMS = (
     "coulomb", "stribeck", "coulomb_asymmetry", "stribeck_asymmetry", "viscous",
-    "viscous_asymmetry",
+    "viscous_asymmetry", "quadratic",
 )  # fmt: skip
 
 
@@ -181,10 +182,9 @@ def _friction_terms(
         weights = _WEIGHTS / _WEIGHTS.sum()
         shapes = {kind: _shape(one, kind, maybe) @ weights for kind in one.nominal}
     dry, wet = ("N", "N s/m") if chain.tree.slides[j] else ("N m", "N m s/rad")
-    return {
-        kind: (share * shapes[kind][:, None], wet if kind in _SLOPES else dry)
-        for kind in one.nominal
-    }
+    units = dict.fromkeys(FRICTION_TERMS, dry) | dict.fromkeys(_SLOPES, wet)
+    units["quadratic"] = "N s^2/m^2" if chain.tree.slides[j] else "N m s^2/rad^2"
+    return {kind: (share * shapes[kind][:, None], units[kind]) for kind in one.nominal}
 
 
 def _shape(one: FrictionTerm, kind: str, velocity: np.ndarray) -> np.ndarray:
@@ -194,6 +194,8 @@ def _shape(one: FrictionTerm, kind: str, velocity: np.ndarray) -> np.ndarray:
     way = np.tanh(velocity / one.smoothing) if one.smoothing else np.sign(velocity)
     if kind == "viscous_asymmetry":
         return velocity * way
+    if kind == "quadratic":
+        return velocity**2 * way
     side = way**2 if kind.endswith("_asymmetry") else way
     if kind.startswith("stribeck"):
         return np.exp(-((velocity / one.stribeck) ** 2)) * side

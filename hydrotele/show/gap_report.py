@@ -34,6 +34,7 @@ from hydrotele.gap.description import (
 )
 from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Candidate, Estimate, Gap, LearnedLaw, Prediction, finite
+from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import usual_unit
 from hydrotele.show import report_html
 from hydrotele.show.channels import padded_range
@@ -59,8 +60,10 @@ def write_report(gap: Gap, path: str | Path) -> None:
         gap: what the search yields.
         path: file to write.
     """
+    mechanism = not isinstance(gap.machine, Machine)
     patched, runs = has_patch(gap), ", ".join(p.run for p in gap.before[1:])
-    over = f"GAP REPORT  ·  machine {gap.machine.name}, tool {gap.machine.tool}"
+    over = f"GAP REPORT  ·  machine {gap.machine.name}"
+    over += f", tool {gap.machine.tool}" if gap.machine.tool else ""
     if gap.before:
         over += f"  ·  judged on {gap.before[0].run}" + (f", fitted on {runs}" if runs else "")
     report_html.write_report(
@@ -72,9 +75,41 @@ def write_report(gap: Gap, path: str | Path) -> None:
         laws=_laws(gap, patched) if gap.laws else None,
         heat_map=draw_heat_map(gap.before[0], gap.after[0], patched) if gap.before else None,
         ranking=_ranking(gap), unlisted=len(gap.ranking) - _CANDIDATES, tests=_tests(gap),
+        proof_words=_PROOF[mechanism].format(gap.before[0].run if gap.before else ""),
+        commands=_COMMANDS[mechanism], open_loop=_open_loop(gap),
         noise=_noise(gap), rivals=_rivals(gap), experiment=_experiment(gap), notes=gap.notes,
         version=hydrotele.__version__, seconds=f"{gap.seconds:.0f}",
     )  # fmt: skip
+
+
+_PROOF = {
+    False: "One-step prediction errors on {}: from its readings so far, the model says what the"
+    " sensors will read next. A perfect model is off by the sensors' noise alone, 1.0.",
+    True: "Forces of the drives on {} by inverse dynamics of its measured motion, against those"
+    " measured. A perfect model is off by noise alone, 1.0.",
+}  # fmt: skip
+_COMMANDS = {
+    False: "hydrotele replay LOG --machine patched/\nhydrotele run SCENARIO --machine patched/",
+    True: "hydrotele gap --mjcf patched/robot.xml --columns patched/columns.yaml --data LOGS\n"
+    "hydrotele identify --mjcf patched/robot.xml --columns patched/columns.yaml --data LOGS",
+}  # fmt: skip
+
+
+def _open_loop(gap: Gap) -> dict[str, Any] | None:
+    """How far the models of a mechanism run away when the measured forces drive them."""
+    if not gap.open_loop:
+        return None
+    horizon, models = gap.open_loop["horizon"], [gap.open_loop["before"]]
+    models += [gap.open_loop["after"]] if "after" in gap.open_loop else []
+    rows = []
+    for drive in models[0]:
+        unit = "m" if gap.law_units["force"] == "N" else "rad"
+        rows.append((drive, *(amount(model[drive], unit) for model in models)))
+    words = (
+        "The MJCF in MuJoCo without any controller, from measured states: RMS difference of a"
+        f" drive's position after {horizon:g} s."
+    )
+    return {"words": words, "rows": rows}
 
 
 def _figures(gap: Gap) -> list[tuple[str, str, str]]:
@@ -227,10 +262,11 @@ def _ranking(gap: Gap) -> list[dict[str, Any]]:
 def _value(gap: Gap, candidate: Candidate, name: str) -> str:
     value, label = candidate.parameters[name], name.replace("_", " ")
     effect = EFFECTS.get(candidate.name)
-    facts = effect.parameters(gap.machine, candidate.location) if effect else {}
-    if name not in facts:
-        return f"{label} {value:.3g}"
-    return f"{label} {amount(value, facts[name].unit, name)}"
+    facts = {}
+    if effect is not None and not candidate.units:
+        facts = effect.parameters(gap.machine, candidate.location)
+    unit = candidate.units.get(name) or (facts[name].unit if name in facts else None)
+    return f"{label} {amount(value, unit, name) if unit else f'{value:.3g}'}"
 
 
 def _tests(gap: Gap) -> list[tuple[str, str, str, bool]]:
@@ -281,6 +317,7 @@ _ADDED = {"force": "force", "command": "command"} | dict.fromkeys(
     ("flow_head", "flow_rod", "flow_through", "flow_supply"), "flow"
 )
 _ZOOM = 2.0  # s
+_LITTLE = 0.5  # of an axis' usual unit, below which SI is shown, such as N instead of kN
 _LOUDEST = 6.0  # times noise, where the colours of the heat map end at the latest
 
 
@@ -337,6 +374,8 @@ def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: b
     """
     column = before.channels.index(channel)
     unit, factor = axis_unit(usual_unit(channel))
+    if np.nanmax(np.abs(before.measured[:, column]), initial=0.0) * factor < _LITTLE:
+        unit, factor = usual_unit(channel), 1.0
     measured = factor * before.measured[:, column]
     lines = [("model as given", NOMINAL, factor * before.predicted[:, column])]
     if changed:

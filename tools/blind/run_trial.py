@@ -17,7 +17,7 @@ from tools.blind.trials import Place, write_json
 ROOT = Path(__file__).resolve().parents[2]
 _SCRIPT = ROOT / "tools" / "blind" / "workflow.py"
 WORKFLOW = (sys.executable, str(_SCRIPT), "{data}", "{machine}", "{threads}")
-_PASSED = (  # all of the environment that the workflow sees
+PASSED = (  # all of the environment that the workflow sees
     "PATH", "HOME", "LANG", "LC_ALL", "TMPDIR", "NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS",
     "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "MPLCONFIGDIR",
 )  # fmt: skip
@@ -86,7 +86,7 @@ def ask(
             target.write_bytes(log.read_bytes())
             target.chmod(0o444)
         command = [part.replace("{data}", str(copy)) for part in workflow]
-        environment = {name: os.environ[name] for name in _PASSED if name in os.environ}
+        environment = {name: os.environ[name] for name in PASSED if name in os.environ}
         environment["PYTHONPATH"] = str(ROOT)  # the search is this checkout's, as its stamp says
         try:
             done = subprocess.run(

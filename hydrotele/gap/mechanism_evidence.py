@@ -1,0 +1,360 @@
+"""How well effects explain the gap of a mechanism, given noise that is found in the data.
+
+Everything is linear in the columns, so all that is needed are sums of squares of the columns and
+the gap, whitened by the noise: its autoregression drive by drive, and its covariance between them.
+Numbers of the model that may be off are integrated out; effects are judged by their marginal
+likelihood (Laplace's approximation where they are not linear).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.signal import lfilter
+
+from hydrotele.gap.mechanism_columns import Columns
+from hydrotele.gap.mechanism_effects import TYPICAL, MechanismEffect, strengths
+from hydrotele.identify.estimation import autoregression, find_doubtful, weights
+
+_ROUNDS, _STEPS = 3, 40
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the equations of k drives.
+
+    Attributes:
+        follow: (q, k) weights of the rows before.
+        white: (k, k) that makes what is new in a row white and of size 1.
+        weight: (n, k) of the rows, lower where the sign of dry friction is in doubt.
+        std: (k,) of the forces' noise [N] or [N m].
+        rest: (n, k) what even all columns together do not explain [N] or [N m].
+        doubtful: (k, 2) how the weights follow from the doubt; see `identify.estimation.weights`.
+    """
+
+    follow: np.ndarray
+    white: np.ndarray
+    weight: np.ndarray
+    std: np.ndarray
+    rest: np.ndarray
+    doubtful: np.ndarray
+
+
+def whitened(values: np.ndarray, noise: Noise, starts: Sequence[int]) -> np.ndarray:
+    """Values (n, k, ...) freed of the noise's memory and covariance.
+
+    Args:
+        values: one row per equation.
+        noise: of the equations.
+        starts: first rows of the runs, and the number of rows.
+
+    Returns:
+        Fewer rows, (n', k, ...): the first ones of every run have no past.
+    """
+    order, parts = len(noise.follow), []
+    flat = values.reshape(*values.shape[:2], -1) * noise.weight[:, :, None]
+    for first, last in zip(starts[:-1], starts[1:], strict=True):
+        own = np.empty((max(last - first - order, 0), *flat.shape[1:]))
+        for k in range(flat.shape[1]):
+            fresh = np.concatenate([[1.0], -noise.follow[:, k]])
+            own[:, k] = lfilter(fresh, 1.0, flat[first:last, k], axis=0)[order:]
+        parts.append(np.einsum("ij,njm->nim", noise.white, own))
+    return np.concatenate(parts).reshape(-1, *values.shape[1:])
+
+
+def find_noise(columns: Columns) -> Noise:
+    """Noise of the equations: what is left by a model in which everything may differ.
+
+    Args:
+        columns: of the runs.
+
+    Returns:
+        The noise. What repeats with the motion but has no column counts as noise, too.
+
+    Source: generalised least squares, feasible (Aitken 1935; Cochrane and Orcutt 1949).
+    """
+    n, k, _ = columns.matrix.shape
+    wide = TYPICAL / np.maximum(strengths(columns), 1e-300)
+    used = np.isfinite(wide) & (wide < 1e200)
+    matrix, gap = columns.matrix[:, :, used] * wide[used], columns.gap
+    std = np.maximum(np.std(gap, axis=0), 1e-12)
+    noise = Noise(np.zeros((0, k)), np.diag(1.0 / std), np.ones((n, k)), std, gap, np.zeros((k, 2)))
+    for _ in range(_ROUNDS):
+        x = whitened(matrix, noise, columns.starts).reshape(-1, matrix.shape[2])
+        y = whitened(gap, noise, columns.starts).ravel()
+        square = x.T @ x
+        factor = cho_factor(square + np.eye(len(square)))
+        value = cho_solve(factor, x.T @ y)
+        free = max(1.0 - float(np.trace(cho_solve(factor, square))) / len(y), 0.1)
+        noise = noise_of(gap - matrix @ value, columns, free)
+    return noise
+
+
+def noise_of(rest: np.ndarray, columns: Columns, free: float = 1.0) -> Noise:
+    """Noise of the equations, from what a model leaves.
+
+    Args:
+        rest: (n, k) [N] or [N m].
+        columns: of the runs.
+        free: share of the equations that the model's numbers have not used up.
+
+    Returns:
+        The noise.
+    """
+    drives = rest.shape[1]
+    doubtful = find_doubtful(rest, columns.doubt)
+    weight = weights(doubtful, columns.doubt)
+    left = rest * weight
+    follow = _follow(left, columns.starts)
+    std = np.sqrt(np.mean(left**2, axis=0) / np.mean(weight**2, axis=0) / free)
+    plain = Noise(follow, np.eye(drives), weight, std, rest, doubtful)
+    new = whitened(rest, plain, columns.starts)
+    between = new.T @ new / len(new) / free
+    between += 1e-12 * np.trace(between) / drives * np.eye(drives)
+    return replace(plain, white=np.linalg.inv(np.linalg.cholesky(between)))
+
+
+def _follow(rest: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+    """Autoregression (q, k) of the longest run, long enough for all."""
+    longest = int(np.argmax(np.diff(starts)))
+    found = [autoregression(rest[a:b]) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    order = len(found[longest])
+    fixed = [autoregression(rest[a:b], order) for a, b in zip(starts[:-1], starts[1:], strict=True)
+             if b - a > 4 * order]  # fmt: skip
+    return np.mean(fixed, axis=0)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Effects fitted together.
+
+    Attributes:
+        effects: the effects.
+        values: their parameters, each (p,).
+        covariance: of all parameters, one after the other.
+        score: twice the logarithm of the marginal likelihood over that of no effect.
+        gain: the fall of the squared errors alone.
+    """
+
+    effects: tuple[MechanismEffect, ...]
+    values: tuple[np.ndarray, ...]
+    covariance: np.ndarray
+    score: float
+    gain: float
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Sums of squares of m columns and the gap, numbers of the model integrated out.
+
+    Attributes:
+        names: of the m columns.
+        square: (m, m) of the columns.
+        cross: (m,) of the columns and the gap.
+        places: name -> its place.
+        calibrate: names of the columns that are integrated out.
+        towards: (t, m) how the calibrated numbers follow from the columns' coefficients.
+        posterior: (t,) calibrated deviations without any effect.
+        known: (t, t) covariance of these.
+        evidence: twice the log evidence of the calibration over numbers as given.
+    """
+
+    names: tuple[str, ...]
+    square: np.ndarray
+    cross: np.ndarray
+    calibrate: tuple[str, ...]
+    towards: np.ndarray
+    posterior: np.ndarray
+    known: np.ndarray
+    evidence: float
+    places: dict[str, int] = field(default_factory=dict)
+
+    def fit(
+        self, effects: Sequence[MechanismEffect], start: Sequence[np.ndarray] | None = None
+    ) -> Fitted:
+        """Fit effects together.
+
+        Args:
+            effects: any number, also none.
+            start: parameters to start from; the priors' means by default.
+
+        Returns:
+            The most probable parameters, and what they are worth.
+        """
+        if not effects:
+            return Fitted((), (), np.zeros((0, 0)), 0.0, 0.0)
+        if len(effects) == 1 and len(effects[0].columns) == len(effects[0].start) == 1:
+            return self._fit_one(effects[0])
+        picked = [np.array([self.places[c] for c in one.columns]) for one in effects]
+        union = np.unique(np.concatenate(picked))
+        square, cross = self.square[np.ix_(union, union)], self.cross[union]
+        slots = [np.searchsorted(union, one) for one in picked]
+        mean = np.concatenate([one.start for one in effects])
+        scale = np.concatenate([one.scale for one in effects])
+        low = np.concatenate([one.low for one in effects])
+        high = np.concatenate([one.high for one in effects])
+        ends = np.cumsum([0, *(len(one.start) for one in effects)])
+
+        def along(p: np.ndarray) -> np.ndarray:
+            out = np.zeros(len(union))
+            for e, one in enumerate(effects):
+                np.add.at(out, slots[e], one.coefficients(p[ends[e] : ends[e + 1]]))
+            return out
+
+        def worth(p: np.ndarray) -> float:
+            c = along(p)
+            return float(2.0 * c @ cross - c @ square @ c - np.sum(((p - mean) / scale) ** 2))
+
+        best, most = mean, -np.inf
+        for first in self._starts(effects, start, mean, scale, low, high, ends):
+            p, value = _climb(first, worth, along, square, cross, mean, scale, low, high)
+            if value > most:
+                best, most = p, value
+        slope = _slope(along, best, scale)
+        held = slope.T @ square @ slope + np.diag(1.0 / scale**2)
+        size = scale[:, None] * held * scale
+        score = most - float(np.linalg.slogdet(size)[1])
+        c = along(best)
+        values = tuple(best[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True))
+        return Fitted(
+            tuple(effects), values, np.linalg.inv(held), score,
+            float(2.0 * c @ cross - c @ square @ c),
+        )  # fmt: skip
+
+    def _fit_one(self, one: MechanismEffect) -> Fitted:
+        """A single effect that is linear in one number."""
+        k, step, low, high = self.places[one.columns[0]], one.scale[0], one.low[0], one.high[0]
+        slope = float(one.coefficients(one.start + step)[0] - one.coefficients(one.start)[0]) / step
+        held = slope**2 * self.square[k, k] + step**-2
+        p = float(np.clip(one.start[0] + slope * self.cross[k] / held, low, high))
+        c = slope * (p - one.start[0])
+        gain = float(2.0 * c * self.cross[k] - c * self.square[k, k] * c)
+        score = gain - ((p - one.start[0]) / step) ** 2 - float(np.log(step**2 * held))
+        return Fitted((one,), (np.array([p]),), np.array([[1.0 / held]]), score, gain)
+
+    def _starts(self, effects, start, mean, scale, low, high, ends):
+        """Where to climb from: what is known, and both sides of an effect that is a product."""
+        first = mean.copy() if start is None else np.concatenate(start)
+        yield np.clip(first, low, high)
+        last = effects[-1]
+        if last.name in ("payload", "joint_spring"):
+            for sign in (1.0, -1.0):
+                other = first.copy()
+                other[ends[-2]] += sign * 0.3 * scale[ends[-2]]
+                yield np.clip(other, low, high)
+
+    def beside(self, found: Fitted) -> "Evidence":
+        """Evidence of what is left beside some effects, whose numbers stay free.
+
+        A fit of one more effect to it tells what that adds to the score of these, exactly so where
+        they are linear.
+
+        Args:
+            found: the effects, fitted.
+
+        Returns:
+            The evidence.
+        """
+        if not found.effects:
+            return self
+        value, slope = self._whole(found)
+        inner = slope.T @ self.square @ slope + np.diag(
+            1.0 / np.concatenate([one.scale for one in found.effects]) ** 2
+        )
+        across = self.square @ slope
+        cross = self.cross - self.square @ value
+        step = np.linalg.solve(inner, np.column_stack([across.T, slope.T @ cross]))
+        return replace(
+            self, square=self.square - across @ step[:, :-1], cross=cross - across @ step[:, -1]
+        )
+
+    def _whole(self, found: Fitted) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients (m,) of effects, and their slopes (m, p) over the parameters."""
+        value, slopes = np.zeros(len(self.names)), []
+        for one, numbers in zip(found.effects, found.values, strict=True):
+            at = [self.places[name] for name in one.columns]
+            np.add.at(value, at, one.coefficients(numbers))
+            own = np.zeros((len(self.names), len(numbers)))
+            own[at] = _slope(one.coefficients, numbers, one.scale)
+            slopes.append(own)
+        return value, np.concatenate(slopes, axis=1)
+
+    def coefficients(self, found: Fitted) -> np.ndarray:
+        """What some effects add along all columns (m,)."""
+        return self._whole(found)[0] if found.effects else np.zeros(len(self.names))
+
+    def calibrated(self, found: Fitted) -> tuple[np.ndarray, np.ndarray]:
+        """Deviations (t,) of the model's numbers beside some effects, and their covariance."""
+        c = self.coefficients(found)
+        return self.posterior - self.towards @ c, self.known
+
+
+def _climb(first, worth, along, square, cross, mean, scale, low, high):
+    """Gauss-Newton steps with halving; parameters and what they are worth."""
+    p, value = first, worth(first)
+    for _ in range(_STEPS):
+        slope = _slope(along, p, scale)
+        uphill = slope.T @ (cross - square @ along(p)) - (p - mean) / scale**2
+        held = slope.T @ square @ slope + np.diag(1.0 / scale**2)
+        fixed = ((p <= low) & (uphill < 0.0)) | ((p >= high) & (uphill > 0.0))
+        step, free = np.zeros(len(p)), ~fixed
+        if free.any():
+            step[free] = np.linalg.solve(held[np.ix_(free, free)], uphill[free])
+        for _ in range(12):
+            there = np.clip(p + step, low, high)
+            gained = worth(there) - value
+            if gained >= 0.0:
+                break
+            step = 0.5 * step
+        else:
+            break
+        p, value = there, value + gained
+        if gained < 1e-6:
+            break
+    return p, value
+
+
+def _slope(along, p: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """(c, p) by central differences: coefficients are polynomials of the second degree at most."""
+    out = []
+    for k, step in enumerate(1e-4 * scale):
+        away = np.zeros(len(p))
+        away[k] = step
+        out.append((along(p + away) - along(p - away)) / (2.0 * step))
+    return np.stack(out, axis=1)
+
+
+def gather_evidence(columns: Columns, noise: Noise, off: dict[str, float]) -> Evidence:
+    """Evidence of some runs.
+
+    Args:
+        columns: of the runs.
+        noise: of their equations.
+        off: column -> standard deviation by which a number of the model may be off.
+
+    Returns:
+        The evidence.
+    """
+    whole = np.concatenate([columns.matrix, columns.gap[:, :, None]], axis=2)
+    x = whitened(whole, noise, columns.starts).reshape(-1, whole.shape[2])
+    gram = x.T @ x
+    square, cross = gram[:-1, :-1], gram[:-1, -1]
+    names = columns.names
+    free = tuple(name for name in names if off.get(name, 0.0) > 0.0)
+    places = {name: k for k, name in enumerate(names)}
+    if not free:
+        empty = np.zeros((0, len(names)))
+        return Evidence(names, square, cross, (), empty, np.zeros(0), np.zeros((0, 0)), 0.0, places)
+    at = np.array([places[name] for name in free])
+    std = np.array([off[name] for name in free])
+    inner = std[:, None] * square[np.ix_(at, at)] * std + np.eye(len(at))
+    factor = cho_factor(inner)
+    towards = std[:, None] * cho_solve(factor, std[:, None] * square[at])
+    posterior = std * cho_solve(factor, std * cross[at])
+    known = std[:, None] * cho_solve(factor, np.diag(std))
+    worth = float(cross[at] @ posterior - np.linalg.slogdet(inner)[1])
+    return Evidence(
+        names, square - square[:, at] @ towards, cross - towards.T @ cross[at], free, towards,
+        posterior, known, worth, places,
+    )  # fmt: skip

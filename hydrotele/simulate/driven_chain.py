@@ -1,0 +1,104 @@
+"""An MJCF driven by measured forces from measured states: how far it runs away from the motion."""
+
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+from hydrotele.core.errors import InputError
+from hydrotele.multibody.chain import Chain
+from hydrotele.multibody.inverse_dynamics import project
+
+_WHERE = "open loop"
+
+
+def set_state(
+    model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, position: np.ndarray, rate: np.ndarray
+) -> None:
+    """Put a mechanism into a state.
+
+    Args:
+        model: compiled.
+        data: that is changed.
+        chain: the same mechanism.
+        position: (v,) of all joints of the chain [rad] or [m].
+        rate: (v,) [rad/s] or [m/s].
+
+    Source: MuJoCo manual, `mjtJoint`: a free joint's linear velocity is the world's, angular
+    velocities are the body's.
+    """
+    mujoco.mj_resetData(model, data)
+    where = {name: k for k, name in enumerate(chain.joints)}
+    for j in range(model.njnt):
+        name = model.joint(j).name or f"joint{j}"
+        at, dof = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+        if name in where:
+            data.qpos[at], data.qvel[dof] = position[where[name]], rate[where[name]]
+            continue
+        if f"{name}_rx" not in where:  # an object beside the mechanism
+            continue
+        if f"{name}_x" in where:
+            places = [where[f"{name}_{letter}"] for letter in "xyz"]
+            data.qpos[at : at + 3], data.qvel[dof : dof + 3] = position[places], rate[places]
+            at, dof = at + 3, dof + 3
+        turns = [where[f"{name}_r{letter}"] for letter in "xyz"]
+        mujoco.mju_euler2Quat(data.qpos[at : at + 4], position[turns], "xyz")
+        data.qvel[dof : dof + 3] = _spin(position[turns]) @ rate[turns]
+
+
+def _spin(angles: np.ndarray) -> np.ndarray:
+    """Angular velocity in the body's frame per rate of Cardan angles about x, y and z (3, 3)."""
+    _, b, c = angles
+    sb, cb, sc, cc = np.sin(b), np.cos(b), np.sin(c), np.cos(c)
+    return np.array([[cb * cc, sc, 0.0], [-cb * sc, cc, 0.0], [sb, 0.0, 1.0]])
+
+
+def open_loop_errors(
+    model: mujoco.MjModel, chain: Chain, given: Sequence[str], motion: np.ndarray,
+    force: np.ndarray, period: float, horizon: float = 0.25, starts: int = 30,
+) -> Mapping[str, float]:  # fmt: skip
+    """How far a model runs away from a measured motion when the measured forces drive it.
+
+    Actuators are put aside; forces act on the drives' joints as they were measured.
+
+    Args:
+        model: compiled.
+        chain: the same mechanism.
+        given: the k joints whose motion is known.
+        motion: (3, n, k) positions, rates and accelerations of these.
+        force: (n, k) of the drives [N] or [N m].
+        period: between rows [s].
+        horizon: after which the difference counts [s].
+        starts: instants from which the model starts, spread over the motion.
+
+    Returns:
+        Drive -> RMS difference of its position after the horizon [rad] or [m].
+
+    Raises:
+        InputError: the motion is shorter than the horizon, or the simulation fails.
+    """
+    steps = round(horizon / model.opt.timestep)
+    rows = round(horizon / period)
+    if motion.shape[1] <= rows:
+        raise InputError(_WHERE, f"the run is shorter than {horizon:g} s")
+    firsts = np.unique(np.linspace(0, motion.shape[1] - rows - 1, starts).astype(int))
+    found = project(chain, tuple(given), *motion)
+    flags = model.opt.disableflags
+    model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    data, drives = mujoco.MjData(model), [chain.index(name) for name in chain.drives]
+    dofs = [int(chain.dofs[j]) for j in drives]
+    places = [int(chain.places[j]) for j in drives]
+    times = np.arange(motion.shape[1]) * period
+    total = np.zeros(len(drives))
+    for first in firsts:
+        set_state(model, data, chain, found.position[first], found.rate[first])
+        at = times[first] + (np.arange(steps) + 0.5) * model.opt.timestep
+        driving = np.column_stack([np.interp(at, times, column) for column in force.T])
+        for row in driving:
+            data.qfrc_applied[dofs] = row
+            mujoco.mj_step(model, data)
+        if not np.isfinite(data.qpos).all() or data.warning.number.any():
+            raise InputError(_WHERE, "the simulation of the mechanism fails")
+        total += (data.qpos[places] - found.position[first + rows, drives]) ** 2
+    model.opt.disableflags = flags
+    return dict(zip(chain.drives, np.sqrt(total / len(firsts)).tolist(), strict=True))
