@@ -153,11 +153,15 @@ class Regulate(Facts):
 
 
 class Track(Facts):
-    """The operator tracks a force trajectory that is displayed to him, seeing it late and rough."""
+    """The operator tracks a force trajectory that is displayed to him, seeing it late and rough.
+
+    With `shown: target_and_force` the screen shows the estimated contact force beside the target.
+    """
 
     kind: Literal["track"]
     target: ForceTarget
     approach: Positive = 0.35
+    shown: Literal["target", "target_and_force"] = "target"
 
 
 class Steer(Facts):

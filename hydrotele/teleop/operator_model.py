@@ -1,7 +1,8 @@
 """The simulated operator: what he sees and feels, and what he wants the handle to do.
 
 He never knows the contact force: he feels what the handle does, sees the tip and whether it
-touches, and in `track` a graph of the force that he is to make. He decides fifty times a second;
+touches, and in `track` a graph of the force that he is to make, beside it the estimated force where
+the screen shows it. He decides fifty times a second;
 `teleop.operator_model` does the rest.
 
 Muscles of the simulated operator: from a wanted displacement to forces on the handle.
@@ -155,6 +156,7 @@ class Perceived(Protocol):
     """What there was to see and feel, by tick (`StationLog`)."""
 
     touching: np.ndarray
+    force: np.ndarray
 
     def master(self, name: str) -> np.ndarray:
         """(n, ...) of a field of MasterState."""
@@ -221,6 +223,7 @@ class OperatorModel:
         self._imagined, self._errors = 0.0, []
         self._handle, self._hand = seen.master("handle"), seen.master("hand")
         self._pose, self._touching = seen.slave("measured"), seen.touching
+        self._screen = seen.force
         if isinstance(pilot.operator, Regulate | Track):
             time = self._step * np.arange(count)
             self._target = _prepared(pilot.operator, pilot, numbers, time, self._sight)
@@ -256,6 +259,9 @@ class OperatorModel:
         felt, looked = max(0, tick - self._touch), max(0, tick - self._look)
         touching = bool(self._touching[looked])
         believed = self._judge(tick, axis, press.way, felt, touching)
+        if press.force_shown:
+            shown = press.side * self._screen[looked, int(press.row[COORDINATE])]
+            believed = max(0.0, self._seen_and_felt(believed, shown, tick))
         self.believed[number] = press.side * believed
         if not touching and believed < press.noticed:
             reach = row[DEADBAND] + approach * (row[REACH] - row[DEADBAND])
@@ -309,6 +315,15 @@ class OperatorModel:
             return self._imagined
         return max(0.0, (way * force - row[NOMINAL] * way * x) / max(row[RATIO], 1e-12))
 
+    def _seen_and_felt(self, felt: float, shown: float, tick: int) -> float:
+        """Contact force from screen and hand, each by its variance; Ernst and Banks 2002 [N]."""
+        seen = shown + self._target.largest * self._sight[tick // self.every]
+        if self._pilot.reflection == "none":
+            return seen
+        by_eye = (self._habits.sight_noise * self._target.largest) ** 2
+        by_hand = (self._habits.force_noise * max(felt, self._target.close)) ** 2
+        return seen if by_eye <= 0.0 else (seen * by_hand + felt * by_eye) / (by_hand + by_eye)
+
     def _lean(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
         """Push with the force that the target would push back with, and let the handle go."""
         share = 1.0 - math.exp(-self._step / _LEANING)
@@ -324,13 +339,13 @@ class OperatorModel:
             axis = _axis_of(self._numbers, c)
             row, wanted = self._numbers.axis[axis], self.muscles.wanted
             error = row[SIGN] * (goals[tick // self.every] - pose[c])
+            close = abs(error) < self._habits.sight
             if self._pilot.mode == "position":
-                step = self._habits.skill * self._step * error / row[GAIN]
+                step = 0.0 if close else self._habits.skill * self._step * error / row[GAIN]
                 wanted[axis] = min(row[REACH], max(-row[REACH], wanted[axis] + step))
                 continue
             most = 0.95 * (row[REACH] - row[DEADBAND])
             step = min(most, max(-most, self._habits.skill * error / row[GAIN]))
-            close = abs(error) < self._habits.sight
             wanted[axis] = 0.0 if close else math.copysign(row[DEADBAND], step) + step
 
 
@@ -346,6 +361,8 @@ class _Target(NamedTuple):
         displayed: (decisions,) what he is shown [N]; NaN without.
         close: error that he leaves alone at the largest target [N].
         noticed: force from which he believes in a contact that he does not see [N].
+        largest: of the targets [N].
+        force_shown: whether the screen shows the contact force, too.
     """
 
     axis: int
@@ -356,6 +373,8 @@ class _Target(NamedTuple):
     displayed: np.ndarray
     close: float
     noticed: float
+    largest: float
+    force_shown: bool
 
 
 def _prepared(
@@ -373,7 +392,10 @@ def _prepared(
     direct = pilot.reflection == "direct_force"
     noticed = max(close, _NOTICED / max(row[RATIO], 1e-12)) if direct else close
     way = -side * row[SIGN]
-    return _Target(axis, row, side, way, goal.tolist(), displayed, close, noticed)
+    force_shown = isinstance(pressing, Track) and pressing.shown == "target_and_force"
+    return _Target(
+        axis, row, side, way, goal.tolist(), displayed, close, noticed, largest, force_shown
+    )
 
 
 def _axis_of(numbers: Master, coordinate: int) -> int:
