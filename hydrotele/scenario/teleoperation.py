@@ -5,9 +5,10 @@ attitude and head [rad]. All SI, frozen; keys may carry units as suffixes.
 """
 
 import math
+import warnings
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from hydrotele.core.datafile import Facts, Name, NonNegative, Positive
 
@@ -155,13 +156,14 @@ class Regulate(Facts):
 class Track(Facts):
     """The operator tracks a force trajectory that is displayed to him, seeing it late and rough.
 
-    With `shown: target_and_force` the screen shows the estimated contact force beside the target.
+    `display: both` shows the contact force (as the machine's sensors tell it) beside the target;
+    `target` the target alone, so that he has to feel or to imagine the force.
     """
 
     kind: Literal["track"]
     target: ForceTarget
     approach: Positive = 0.35
-    shown: Literal["target", "target_and_force"] = "target"
+    display: Literal["target", "both"] = "target"
 
 
 class Steer(Facts):
@@ -191,32 +193,103 @@ class Live(Facts):
     kind: Literal["live"]
 
 
-class Perception(Facts):
-    """What a person's senses and muscles can do; sources in models/joystick/README.md.
+class Recorded(Facts):
+    """The handle moves as a person moved it: `recorded` is a CSV or Parquet file of his hand.
 
-    reaction: from seeing to acting [s]; touch: from feeling to acting [s]; force_noise: of felt
-    forces, as a share; sight_noise: of a displayed force, as a share of its largest; tremor: of the
-    muscles' force [N]; skill: gain of the outer loop [1/s]; muscle: of the handle's position [1/s];
-    imagination: spread of what he believes a command does without feeling it, as a share;
-    task_stiffness: what he is used to [N/m]; dwell: between correcting pushes [s];
-    sight: how well a place is seen [m] or [rad].
+    It has `time` and `handle.x` ... `handle.rz` (or `x` ... `rz`), as displacements [m] or [rad];
+    a unit may stand in the column's name (`handle.z [mm]`). Axes without a column stay centred.
     """
 
-    reaction: NonNegative = 0.25
-    touch: NonNegative = 0.12
-    force_noise: NonNegative = 0.03
-    sight_noise: NonNegative = 0.02
-    tremor: NonNegative = 0.05
-    skill: Positive = 1.5
-    muscle: Positive = 6.0
-    imagination: NonNegative = 0.3
-    task_stiffness: Positive = 1.0e6
-    dwell: Positive = 1.5
-    sight: NonNegative = 0.02
-    largest_force: Positive = 30.0
+    kind: Literal["recorded"] = "recorded"
+    recorded: str
 
 
-Behaviour = Annotated[Follow | Regulate | Track | Steer | Live, Field(discriminator="kind")]
+class Perception(Facts):
+    """Who the simulated operator is, and what his senses and muscles can do.
+
+    `file` has other parameters than `hydrotele/teleop/operator.yaml`, which tells what is known of
+    each; `drawn` takes the operator of that number from the spread given there. `grip` (relaxed,
+    normal, firm) and `posture` (near, mid, far) replace the joystick file's hand. Every parameter
+    that is set here counts instead of the file's:
+
+    visual_delay: from seeing to acting [s]; touch: from feeling to acting [s]; crossover: of the
+    loops that he closes by sight, at most [rad/s]; force_weber, position_weber, integration_weber:
+    of felt forces, displacements and stiffnesses, as a share; remnant: of his observation noise;
+    sight: how well a place is seen [m] or [rad]; sight_noise: of a displayed force, as a share of
+    its largest; tremor: of the muscles' force [N]; muscle: of the handle's position [1/s];
+    cocontraction: share of the largest; imagination: spread of what he believes a command does
+    without feeling it, as a share; task_stiffness: what he is used to [N/m]; dwell: between
+    correcting pushes [s]; `Operator` in `hydrotele.teleop.operator_parameters` has all of them.
+    """
+
+    file: str | None = None
+    drawn: Annotated[int, Field(ge=0)] | None = None
+    grip: Name | None = None
+    posture: Name | None = None
+    visual_delay: NonNegative | None = None
+    crossover: Positive | None = None
+    tracking_margin: Positive | None = None
+    placing_margin: Positive | None = None
+    gain_margin: Annotated[float, Field(gt=0, lt=1)] | None = None
+    neuromuscular_frequency: Positive | None = None
+    neuromuscular_damping: Positive | None = None
+    remnant: NonNegative | None = None
+    sight: NonNegative | None = None
+    sight_noise: NonNegative | None = None
+    touch: NonNegative | None = None
+    force_weber: NonNegative | None = None
+    position_weber: NonNegative | None = None
+    integration_weber: NonNegative | None = None
+    tremor: NonNegative | None = None
+    muscle: Positive | None = None
+    largest_force: Positive | None = None
+    cocontraction: Annotated[float, Field(ge=0, le=1)] | None = None
+    usual_speed: Positive | None = None
+    usual_scale: Positive | None = None
+    task_stiffness: Positive | None = None
+    surprise: Positive | None = None
+    memory: Positive | None = None
+    imagination: NonNegative | None = None
+    dwell: Positive | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _rename(cls, data):
+        """Read keys by their former names."""
+        if not isinstance(data, dict):
+            return data
+        for old, new in _FORMER.items():
+            if old in data:
+                if new in data:
+                    raise ValueError(f"{old} is the former name of {new}; give one of them")
+                message = f"pilot.perception: {old} is now called {new}; it was read as that"
+                warnings.warn(message, FutureWarning, stacklevel=2)
+                data = {new if key == old else key: value for key, value in data.items()}
+        return data
+
+
+_FORMER = {"reaction": "visual_delay", "force_noise": "force_weber", "skill": "crossover"}
+
+
+def _kind_of(value: object) -> object:
+    """The kind of an operator; one with a record needs no other word."""
+    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    return "recorded" if kind is None and isinstance(value, dict) and "recorded" in value else kind
+
+
+Behaviour = Annotated[
+    Annotated[Follow, Tag("follow")]
+    | Annotated[Regulate, Tag("regulate")]
+    | Annotated[Track, Tag("track")]
+    | Annotated[Steer, Tag("steer")]
+    | Annotated[Live, Tag("live")]
+    | Annotated[Recorded, Tag("recorded")],
+    Discriminator(
+        _kind_of,
+        custom_error_type="operator_kind",
+        custom_error_message="needs kind: follow, regulate, track, steer, live; or recorded: FILE",
+    ),
+]
 
 
 class TeleopPilot(Facts):

@@ -1,15 +1,18 @@
 """The simulated operator: what he sees and feels, and what he wants the handle to do.
 
-He never knows the contact force: he feels what the handle does, sees the tip and whether it
-touches, and in `track` a graph of the force that he is to make, beside it the estimated force where
-the screen shows it. He decides fifty times a second;
-`teleop.operator_model` does the rest.
+He never knows the contact force nor the machine's gains: he feels what the handle does, sees the
+tip and whether it touches, in `track` a graph of the force that he is to make, and learns from his
+own pushes what they do. The joystick's own springs and the scale of what it reflects are told to
+him. He decides fifty times a second; by sight he steers as `teleop.manual_control` says, who he is
+stands in `teleop.operator_parameters`.
 
 Muscles of the simulated operator: from a wanted displacement to forces on the handle.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -17,13 +20,21 @@ import numpy as np
 from hydrotele.control.resolved_motion import COORDINATES
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
+from hydrotele.logs.log import load_log
 from hydrotele.machine.joystick import AXES, Joystick
-from hydrotele.scenario.teleoperation import Follow, Live, Regulate, Steer, TeleopPilot, Track
+from hydrotele.scenario.teleoperation import (
+    Follow,
+    Live,
+    Recorded,
+    Regulate,
+    Steer,
+    TeleopPilot,
+    Track,
+)
 from hydrotele.teleop.axis_table import (
     COORDINATE,
     DEADBAND,
     DROP,
-    GAIN,
     LEAST,
     LIMIT,
     NOMINAL,
@@ -35,7 +46,18 @@ from hydrotele.teleop.axis_table import (
     flattened,
     split,
 )
+from hydrotele.teleop.manual_control import (
+    BELIEVED_GAIN,
+    GAIN,
+    INTEGRATOR,
+    NOTICED,
+    Loop,
+    look_and_act,
+    neuromuscular_matrix,
+    visual_loop,
+)
 from hydrotele.teleop.master import Master
+from hydrotele.teleop.operator_parameters import Operator, perceiving
 
 _THROUGH = 1.15  # times the force at a notch's edge, to get over it
 _FINE, _FINE_TURN = 4e-4, 4e-3  # m, rad: a larger gap is a way to go, nothing to learn from
@@ -55,6 +77,9 @@ class Muscles(NamedTuple):
         most: (6,) largest force [N], [N m].
         weight: (6,) of the hand, which they carry [N], [N m].
         gain: (1,) of the correction [1/s].
+        rest: (6,) where the neuromuscular lag has moved the arm's rest [m], [rad].
+        rate: (6,) its rate.
+        lag: (6,) of `neuromuscular_matrix`, for one control period.
     """
 
     wanted: np.ndarray
@@ -66,6 +91,9 @@ class Muscles(NamedTuple):
     most: np.ndarray
     weight: np.ndarray
     gain: np.ndarray
+    rest: np.ndarray
+    rate: np.ndarray
+    lag: np.ndarray
 
 
 @compiled
@@ -73,7 +101,7 @@ def unpack_muscles(flat):
     """The parts of `flat_view(Muscles)`.
 
     Args:
-        flat: (61,) array.
+        flat: (79,) array.
 
     Returns:
         Muscles, views of it.
@@ -87,9 +115,13 @@ def unpack_muscles(flat):
     force, rest = split(rest, 6)
     arm, rest = split(rest, 6)
     most, rest = split(rest, 6)
-    weight, gain = split(rest, 6)
+    weight, rest = split(rest, 6)
+    gain, rest = split(rest, 1)
+    place, rest = split(rest, 6)
+    rate, lag = split(rest, 6)
     return Muscles(
-        wanted, spring, notch.reshape(3, 6), correction, force, arm, most, weight, gain
+        wanted, spring, notch.reshape(3, 6), correction, force, arm, most, weight, gain, place,
+        rate, lag,
     )  # fmt: skip
 
 
@@ -98,7 +130,7 @@ def pull(muscles, past, tremor, handle, tick, period):
     """Forces of one period: the arm's rest moves with what is wanted, the rest is corrected late.
 
     Args:
-        muscles: Muscles; `correction` and `force` are written.
+        muscles: Muscles; `correction`, `force`, `rest` and `rate` are written.
         past: (reflex + 1, 6) displacements of the last periods, written [m], [rad].
         tremor: (n, 6) of the run [N], [N m].
         handle: (6,) displacement of now [m], [rad].
@@ -108,14 +140,19 @@ def pull(muscles, past, tremor, handle, tick, period):
     Returns:
         Nothing.
 
-    Source: equilibrium-point control with a late integral; Feldman 1986.
+    Source: equilibrium-point control with a late integral; Feldman 1986. The rest follows what is
+        wanted through the neuromuscular lag; McRuer and Jex 1967.
     """
-    rows = len(past)
+    rows, lag = len(past), muscles.lag
     noise = tick % len(tremor)
     for i in range(6):
         past[tick % rows, i] = handle[i]
         late = past[(tick + 1) % rows, i]
-        wanted, spring, most = muscles.wanted[i], muscles.spring[i], muscles.most[i]
+        spring, most = muscles.spring[i], muscles.most[i]
+        place, rate = muscles.rest[i], muscles.rate[i]
+        wanted = lag[0] * place + lag[1] * rate + lag[2] * muscles.wanted[i]
+        muscles.rate[i] = lag[3] * place + lag[4] * rate + lag[5] * muscles.wanted[i]
+        muscles.rest[i] = wanted
         firm = muscles.arm[i] + spring
         known = firm * wanted
         beyond = abs(wanted) - muscles.notch[0, i]
@@ -140,12 +177,15 @@ _CLOSE = 0.05  # of the target: a force error that a person leaves alone
 _LEAST_CLOSE = 0.2  # of the largest target's: for targets near nothing
 _NOTICED = 0.2  # N: a force on the hand that stands out from its own tremor and the spring's
 _PUSH = 0.3  # s of a correcting push
+_CORRECTED = 0.45  # of an error, by one push
 _LEAST_WAY = 3e-4  # m: a stiffness cannot be felt from a smaller displacement
 _LEANING = 0.3  # s in which a hand builds up a force
 _TREMOR_BAND = 2.0 * math.pi * 8.0  # rad/s of a physiological tremor
 _SLOW = 2.0 * math.pi * 0.5  # rad/s of drifting judgement
 _LEVERS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m: forces of the hand into torques
 _ROUND = 2**14  # periods of tremor before it comes again
+_LOOKING = 0.67  # of the time between pushes by feel: a display is read sooner
+_FURTHEST = 20.0  # times what he expected of a push: more or less is not learnt
 
 
 Hand = Callable[[], np.ndarray]
@@ -177,61 +217,96 @@ class OperatorModel:
         every: control ticks per decision.
         believed: (decisions,) contact force that he believes to have [N]; NaN where he does not
             care.
+        loops: coordinate -> what he closes by sight, and has learnt of it.
     """
 
     def __init__(
         self, pilot: TeleopPilot, joystick: Joystick, numbers: Master, seen: Perceived, ticks: int,
-        period: float, seed: int, hand: Hand | None = None,
+        period: float, seed: int, hand: Hand | None = None, folder: str = "",
     ) -> None:  # fmt: skip
         """Sit down.
 
         Args:
             pilot: the scenario's.
-            joystick: the joystick, with the hand's numbers.
-            numbers: of the master's control, which he has learnt.
+            joystick: the joystick, with his hand's numbers.
+            numbers: of the master's control; of them he knows the joystick's springs, dead bands,
+                detents and what it reflects, not how the machine answers.
             seen: what there will be to see and feel, filled tick by tick.
             ticks: number of control periods.
             period: of the control [s].
             seed: of the run.
             hand: of a live operator.
+            folder: of the scenario, from which files are counted.
 
         Raises:
-            InputError: a live operator without a hand.
+            InputError: a live operator without a hand, a file that is not usable.
         """
         if isinstance(pilot.operator, Live) and hand is None:
             message = "a live operator has to be there: hydrotele drive SCENARIO"
             raise InputError("pilot.operator", message)
         self._live = hand
-        self._pilot, self._behaviour, self._habits = pilot, pilot.operator, pilot.perception
+        self._pilot, self._behaviour = pilot, pilot.operator
+        self.him = him = perceiving(pilot.perception, folder)
         self._numbers, self._period = numbers, period
         self.every = max(1, round(1.0 / (DECISIONS * period)))
         self._step = self.every * period
-        p, rng = pilot.perception, np.random.default_rng([seed, 1994])
-        self.muscles = _muscles(pilot, joystick, numbers)
+        rng = np.random.default_rng([seed, 1994])
+        self.muscles = _muscles(pilot, joystick, numbers, him, period)
         white = rng.standard_normal((_ROUND, 6)) * _LEVERS
-        self.tremor = p.tremor * _coloured(white, _TREMOR_BAND, period)
+        self.tremor = him.tremor * _coloured(white, _TREMOR_BAND, period)
         self.past = np.zeros((1 + max(1, round(REFLEX / period)), 6))
         count = ticks // self.every + 1
-        self._judgement = p.force_noise * _coloured(rng.standard_normal(count), _SLOW, self._step)
+        drift = _coloured(rng.standard_normal((count, 2)), _SLOW, self._step)
+        self._force_error = 1.0 + him.force_weber * drift[:, 0]
+        self._place_error = 1.0 + him.position_weber * drift[:, 1]
+        impression = rng.standard_normal(count)[
+            (self._step * np.arange(count) / him.dwell).astype(int)
+        ]
+        self._impression = np.exp(him.integration_weber * impression)
         sight = _coloured(rng.standard_normal(count), 4.0 * _SLOW, self._step)
-        self._sight = p.sight_noise * sight
-        self._imagined_gain = math.exp(p.imagination * rng.standard_normal())
-        self._look = max(1, round(p.reaction / period))
-        self._touch = max(1, round(p.touch / period))
+        self._sight = him.sight_noise * sight
+        self._imagined_gain = math.exp(him.imagination * rng.standard_normal())
+        self._look = max(1, round(him.visual_delay / period))
+        self._touch = max(1, round(him.touch / period))
         self._reflex = max(1, round(REFLEX / period))
         self.believed = np.full(count, np.nan)
-        self._imagined, self._errors = 0.0, []
+        self._imagined, self._belief = 0.0, None
+        self._met = 0.0
         self._handle, self._hand = seen.master("handle"), seen.master("hand")
         self._pose, self._touching = seen.slave("measured"), seen.touching
-        self._screen = seen.force
+        self._seen = seen
+        self.loops: dict[int, Loop] = {}
         if isinstance(pilot.operator, Regulate | Track):
             time = self._step * np.arange(count)
-            self._target = _prepared(pilot.operator, pilot, numbers, time, self._sight)
-        self._pushing, self._until = True, 0.0
+            self._target = _prepared(pilot.operator, pilot, numbers, time, self._sight, him)
+            self._look_at(COORDINATES.index(pilot.operator.target.coordinate), rng, count)
+            self._met = self._target.row[NOMINAL]
+        self._pushing, self._until, self._errors = True, 0.0, []
         if isinstance(pilot.operator, Follow):
             self._path = _followed(pilot.operator, count, self._step)
+        if isinstance(pilot.operator, Recorded):
+            path = Path(folder, pilot.operator.recorded)
+            self._path = recorded_hand(path, self._step * np.arange(count))
         if isinstance(pilot.operator, Steer):
             self._goals = _steered(pilot.operator, count, self._step)
+            for c in self._goals:
+                self._look_at(c, rng, count)
+
+    def _look_at(self, c: int, rng: np.random.Generator, count: int) -> None:
+        """Prepare to move a coordinate by sight."""
+        axis = _axis_of(self._numbers, c)
+        row, rate, him = self._numbers.axis[axis], self._pilot.mode == "rate", self.him
+        turns = COORDINATES[c] not in ("r", "z")
+        way = row[REACH] - row[DEADBAND]
+        expected = him.usual_speed * (0.5 if turns else 1.0) / way
+        if not rate:
+            way = row[REACH]
+            expected = him.usual_scale * (1.0 if not turns else 0.2 if axis < 3 else 0.1)
+        self.loops[c] = visual_loop(
+            him, self._step, expected, rng, form=INTEGRATOR if rate else GAIN,
+            margin=him.placing_margin, threshold=him.sight, most=(0.95 if rate else 1.0) * way,
+            steps=count,
+        )  # fmt: skip
 
     def decide(self, tick: int) -> None:
         """Choose what the handle should do until the next decision; `muscles` is written.
@@ -239,7 +314,7 @@ class OperatorModel:
         Args:
             tick: the control tick, a multiple of `every`.
         """
-        if isinstance(self._behaviour, Follow):
+        if isinstance(self._behaviour, Follow | Recorded):
             self.muscles.wanted[:] = self._path[tick // self.every]
         if self._live:
             self.muscles.wanted[:] = self._live()
@@ -252,77 +327,112 @@ class OperatorModel:
                 self._steer(tick)
 
     def _press(self, tick: int, approach: float) -> None:
-        """Bring a contact force to its target, by feel if there is any, else by imagination."""
+        """Bring a contact force to its target, by display or by feel, else by imagination."""
         press, number = self._target, tick // self.every
         axis, row, wanted = press.axis, press.row, self.muscles.wanted
         goal = press.goal[number]
         felt, looked = max(0, tick - self._touch), max(0, tick - self._look)
         touching = bool(self._touching[looked])
-        believed = self._judge(tick, axis, press.way, felt, touching)
-        if press.force_shown:
-            shown = press.side * self._screen[looked, int(press.row[COORDINATE])]
-            believed = max(0.0, self._seen_and_felt(believed, shown, tick))
-        self.believed[number] = press.side * believed
-        if not touching and believed < press.noticed:
+        if not touching:
+            c = int(row[COORDINATE])
+            seen = float(self._pose[tick - 1, 0, c])
+            look_and_act(self.loops[c], number - 1, seen, seen, self._acting(axis, tick - 1))
+        judged = self._judge(tick, axis, press.way, felt, looked, touching)
+        belief = judged if self._belief is None else self._belief.force
+        self.believed[number] = press.side * belief
+        if not touching and judged < press.noticed:
+            self._belief = None
             reach = row[DEADBAND] + approach * (row[REACH] - row[DEADBAND])
             wanted[axis] = press.way * reach
-        elif self._pilot.reflection == "direct_force":
+        elif self._pilot.reflection == "direct_force" and not press.shown:
             self._lean(axis, press.way, row, abs(goal), max(0, tick - self._reflex))
         else:
-            error = press.side * goal - believed
-            close = max(_CLOSE * abs(goal), _LEAST_CLOSE * press.close)
-            self._pulse_or_feel(tick, axis, press.way, error, close)
+            self._pulse_or_feel(tick, axis, press.way, press.side * goal, judged)
 
-    def _pulse_or_feel(self, tick: int, axis: int, way: float, error: float, close: float) -> None:
+    def _pulse_or_feel(
+        self, tick: int, axis: int, way: float, goal: float, judged: float
+    ) -> None:  # fmt: skip
         """Rest inside the dead band where contact is felt; correct by short pushes beyond it."""
         row, now, wanted = self._target.row, tick * self._period, self.muscles.wanted
-        self._errors.append(error)
+        if self._belief is None:
+            push = self.loops[int(row[COORDINATE])].state[BELIEVED_GAIN] * self.him.task_stiffness
+            self._belief = _Belief(judged, math.inf, push, (self.him.surprise * push) ** 2)
+        self._errors.append(judged)
+        pause = self.him.dwell * (_LOOKING if self._target.shown else 1.0)
         if now >= self._until:
             late = self._errors[len(self._errors) // 2 :]
-            mean = sum(late) / len(late)
             self._errors.clear()
             if self._pushing:
-                self._pushing, self._until = False, now + self._habits.dwell
-                wanted[axis] = way * _HOLD * row[DEADBAND]
-            elif abs(mean) < close:
-                self._until = now + 0.5 * self._habits.dwell
+                self._pushing, self._until = False, now + pause
+                rest = 0.0 if self._target.shown else _HOLD * row[DEADBAND]
+                wanted[axis] = way * rest
             else:
-                speed = self._habits.skill * mean / (self._habits.task_stiffness * row[GAIN])
-                most = 0.5 * (row[REACH] - row[DEADBAND])
-                step = min(most, max(-most, speed))
-                wanted[axis] = way * (math.copysign(row[DEADBAND], step) + step)
-                self._pushing, self._until = True, now + _PUSH
-        if self._pilot.reflection == "stiffness":
-            stiff = row[NOMINAL] + row[SLOPE] * self._imagined
+                felt = self._pilot.reflection != "none" or self._target.shown
+                mean = sum(late) / len(late)
+                self._belief.judge(mean, self._doubt(row, mean) if felt else 0.0)
+                error = goal - self._belief.force
+                close = max(_CLOSE * abs(goal), _LEAST_CLOSE * self._target.close)
+                if abs(error) < close:
+                    self._until = now + 0.5 * pause
+                else:
+                    speed = _CORRECTED * error / (self._belief.push * _PUSH)
+                    most = 0.5 * (row[REACH] - row[DEADBAND])
+                    step = min(most, max(-most, speed))
+                    wanted[axis] = way * (math.copysign(row[DEADBAND], step) + step)
+                    self._belief.pushed = step * _PUSH if felt else 0.0
+                    self._pushing, self._until = True, now + _PUSH
+        if self._pilot.reflection in ("stiffness", "impedance"):
+            stiff = self._load(axis, way, max(0, tick - self._reflex))
             self.muscles.spring[axis] = stiff if way * wanted[axis] >= 0.0 else row[LEAST]
 
-    def _judge(self, tick: int, axis: int, way: float, felt: int, touching: bool) -> float:
-        """Contact force that he believes to have, at least 0 [N]."""
-        row, reflection = self._target.row, self._pilot.reflection
+    def _load(self, axis: int, way: float, felt: int) -> float:
+        """Stiffness that his muscles work against, as they last met it [N/m].
+
+        Reflexes need no judgement; how muscles scatter is in the tremor.
+        """
+        row, x = self._target.row, float(self._handle[felt, axis])
+        if way * x > _LEAST_WAY:
+            force = float(self._hand[felt, axis])
+            most = row[NOMINAL] + row[SLOPE] * row[LIMIT]
+            self._met = min(most, max(row[NOMINAL], force / x))
+        return self._met
+
+    def _doubt(self, row: list[float], force: float) -> float:
+        """Variance of a judged contact force as he knows it from himself [N^2]."""
+        him, largest = self.him, self._target.close / _CLOSE
+        if self._target.shown:
+            return (him.sight_noise * largest) ** 2
+        if self._pilot.reflection in ("stiffness", "impedance"):
+            share = math.hypot(him.force_weber, him.position_weber, him.integration_weber)
+            return (share * (row[NOMINAL] / row[SLOPE] + force)) ** 2
+        return (him.force_weber * max(force, _LEAST_CLOSE * largest)) ** 2
+
+    def _judge(
+        self, tick: int, axis: int, way: float, felt: int, looked: int, touching: bool
+    ) -> float:  # fmt: skip
+        """Contact force that he now judges to have, at least 0 [N]."""
+        row, reflection, number = self._target.row, self._pilot.reflection, tick // self.every
+        if self._target.shown:
+            shown = self._target.side * float(self._seen.force[looked, int(row[COORDINATE])])
+            largest = self._target.close / _CLOSE
+            self._imagined = max(0.0, shown + largest * self._sight[number])
+            return self._imagined
         if reflection == "none":
-            wanted = self.muscles.wanted[axis]
-            beyond = math.copysign(max(0.0, abs(wanted) - row[DEADBAND]), way * wanted)
+            beyond = way * row[SIGN] * self._acting(axis, felt)
             if touching:
-                change = beyond * row[GAIN] * self._habits.task_stiffness * self._imagined_gain
+                rate = self.loops[int(row[COORDINATE])].state[BELIEVED_GAIN]
+                change = beyond * rate * self.him.task_stiffness * self._imagined_gain
                 self._imagined = max(0.0, self._imagined + self._step * change)
             return self._imagined
-        x = float(self._handle[felt, axis])
-        force = float(self._hand[felt, axis]) * (1.0 + self._judgement[tick // self.every])
+        x = float(self._handle[felt, axis]) * self._place_error[number]
+        force = float(self._hand[felt, axis]) * self._force_error[number]
         if reflection in ("stiffness", "impedance"):
             if way * x > _LEAST_WAY:
-                stiffer = max(0.0, force / x - row[NOMINAL])
+                felt_stiffness = felt_as_stiffness(force, x, self._impression[number])
+                stiffer = max(0.0, felt_stiffness - row[NOMINAL])
                 self._imagined = min(row[LIMIT], stiffer / row[SLOPE])
             return self._imagined
         return max(0.0, (way * force - row[NOMINAL] * way * x) / max(row[RATIO], 1e-12))
-
-    def _seen_and_felt(self, felt: float, shown: float, tick: int) -> float:
-        """Contact force from screen and hand, each by its variance; Ernst and Banks 2002 [N]."""
-        seen = shown + self._target.largest * self._sight[tick // self.every]
-        if self._pilot.reflection == "none":
-            return seen
-        by_eye = (self._habits.sight_noise * self._target.largest) ** 2
-        by_hand = (self._habits.force_noise * max(felt, self._target.close)) ** 2
-        return seen if by_eye <= 0.0 else (seen * by_hand + felt * by_eye) / (by_hand + by_eye)
 
     def _lean(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
         """Push with the force that the target would push back with, and let the handle go."""
@@ -332,21 +442,86 @@ class OperatorModel:
         self.muscles.spring[axis] = 0.0
         self.muscles.wanted[axis] = self._handle[reflex, axis]  # a force, not a place
 
+    def _acting(self, axis: int, tick: int) -> float:
+        """Displacement of the handle that moves the machine, along the coordinate."""
+        row, x = self._numbers.axis[axis], float(self._handle[tick, axis])
+        if self._pilot.mode == "rate":
+            x = math.copysign(max(0.0, abs(x) - row[DEADBAND]), x)
+        return float(row[SIGN]) * x
+
     def _steer(self, tick: int) -> None:
         """Move the tip to where it should be, by sight."""
-        pose = self._pose[max(0, tick - self._look), 0]
+        before, number = tick - 1, tick // self.every
         for c, goals in self._goals.items():
-            axis = _axis_of(self._numbers, c)
+            axis, loop = _axis_of(self._numbers, c), self.loops[c]
             row, wanted = self._numbers.axis[axis], self.muscles.wanted
-            error = row[SIGN] * (goals[tick // self.every] - pose[c])
-            close = abs(error) < self._habits.sight
+            seen, acting = float(self._pose[before, 0, c]), self._acting(axis, before)
+            step = row[SIGN] * look_and_act(loop, number - 1, goals[number], seen, acting)
             if self._pilot.mode == "position":
-                step = 0.0 if close else self._habits.skill * self._step * error / row[GAIN]
-                wanted[axis] = min(row[REACH], max(-row[REACH], wanted[axis] + step))
+                wanted[axis] = step
                 continue
-            most = 0.95 * (row[REACH] - row[DEADBAND])
-            step = min(most, max(-most, self._habits.skill * error / row[GAIN]))
-            wanted[axis] = 0.0 if close else math.copysign(row[DEADBAND], step) + step
+            way = row[SIGN] * loop.state[NOTICED]
+            wanted[axis] = 0.0 if way == 0.0 else math.copysign(row[DEADBAND], way) + step
+
+
+@dataclass
+class _Belief:
+    """A contact force and what a push does to it, as he believes.
+
+    Attributes:
+        force: mean [N].
+        variance: of the force [N^2].
+        push: change of the force by a push, per displacement and time [N/(m s)].
+        doubt: variance of the same.
+        pushed: displacement times time of the last push [m s].
+        before: what was judged before it [N].
+    """
+
+    force: float
+    variance: float
+    push: float
+    doubt: float
+    pushed: float = 0.0
+    before: float = math.nan
+
+    def __post_init__(self) -> None:
+        self._expected = self.push
+
+    def judge(self, judged: float, variance: float) -> None:
+        """Take in a judgement [N] and its variance [N^2], and what the last push did."""
+        if self.pushed and math.isfinite(self.before):
+            own = self.pushed**2 * self.doubt
+            share = self.pushed * self.doubt / (own + 2.0 * variance)
+            self.push += share * (judged - self.before - self.pushed * self.push)
+            self.doubt *= 1.0 - share * self.pushed
+            low, high = self._expected / _FURTHEST, self._expected * _FURTHEST
+            self.push = min(high, max(low, self.push))
+        change = self.pushed * self.push
+        self.force = max(0.0, self.force + change)
+        self.variance += self.pushed**2 * self.doubt + (_FADES * self.force) ** 2
+        share = 1.0 if math.isinf(self.variance) or not variance else (
+            self.variance / (self.variance + variance)
+        )  # fmt: skip
+        self.force += share * (judged - self.force)
+        self.variance = variance if share == 1.0 else (1.0 - share) * self.variance
+        self.before, self.pushed = judged, 0.0
+
+
+_FADES = 0.05  # of a force, by which it may change between two judgements without him
+
+
+def felt_as_stiffness(force: float, displacement: float, impression: float) -> float:
+    """Stiffness that a hand feels in a spring.
+
+    Args:
+        force: felt [N].
+        displacement: felt [m].
+        impression: factor by which putting both together is off [1].
+
+    Returns:
+        The stiffness [N/m].
+    """
+    return force / displacement * impression
 
 
 class _Target(NamedTuple):
@@ -361,8 +536,7 @@ class _Target(NamedTuple):
         displayed: (decisions,) what he is shown [N]; NaN without.
         close: error that he leaves alone at the largest target [N].
         noticed: force from which he believes in a contact that he does not see [N].
-        largest: of the targets [N].
-        force_shown: whether the screen shows the contact force, too.
+        shown: whether the contact force is displayed beside it.
     """
 
     axis: int
@@ -373,15 +547,14 @@ class _Target(NamedTuple):
     displayed: np.ndarray
     close: float
     noticed: float
-    largest: float
-    force_shown: bool
+    shown: bool
 
 
 def _prepared(
     pressing: Regulate | Track, pilot: TeleopPilot, numbers: Master, time: np.ndarray,
-    sight: np.ndarray,
+    sight: np.ndarray, him: Operator,
 ) -> _Target:  # fmt: skip
-    target, shown, late = pressing.target, isinstance(pressing, Track), pilot.perception.reaction
+    target, shown, late = pressing.target, isinstance(pressing, Track), him.visual_delay
     axis = _axis_of(numbers, COORDINATES.index(target.coordinate))
     largest = max(abs(f) for f in target.force) or 1.0
     side = math.copysign(1.0, next((f for f in target.force if f), 1.0))
@@ -392,19 +565,28 @@ def _prepared(
     direct = pilot.reflection == "direct_force"
     noticed = max(close, _NOTICED / max(row[RATIO], 1e-12)) if direct else close
     way = -side * row[SIGN]
-    force_shown = isinstance(pressing, Track) and pressing.shown == "target_and_force"
-    return _Target(
-        axis, row, side, way, goal.tolist(), displayed, close, noticed, largest, force_shown
-    )
+    both = isinstance(pressing, Track) and pressing.display == "both"
+    return _Target(axis, row, side, way, goal.tolist(), displayed, close, noticed, both)
 
 
 def _axis_of(numbers: Master, coordinate: int) -> int:
     return int(np.flatnonzero(numbers.axis[:, COORDINATE] == coordinate)[0])
 
 
-def _muscles(pilot: TeleopPilot, joystick: Joystick, numbers: Master) -> Muscles:
-    """His arm at rest."""
-    hand, p = joystick.hand, pilot.perception
+def _muscles(
+    pilot: TeleopPilot, joystick: Joystick, numbers: Master, him: Operator, period: float
+) -> Muscles:
+    """His arm at rest.
+
+    A path that is given is that of the hand, behind the neuromuscular lag. A hand that leans on the
+    handle with a force follows it by its compliance, which is part of the arm.
+    """
+    hand, lagging = joystick.hand, isinstance(pilot.operator, Regulate | Track | Steer)
+    if not isinstance(pilot.operator, Steer) and pilot.reflection == "direct_force":
+        lagging = False
+    frequency = him.neuromuscular_frequency if lagging else 0.0
+    tracking = isinstance(pilot.operator, Steer)
+    damping = him.neuromuscular_damping if tracking else 1.0  # single pushes do not overshoot
     free = pilot.mode == "position" and pilot.reflection not in ("none", "stiffness", "impedance")
     at_rest = Muscles(
         wanted=np.zeros(6),
@@ -413,9 +595,12 @@ def _muscles(pilot: TeleopPilot, joystick: Joystick, numbers: Master) -> Muscles
         correction=np.zeros(6),
         force=np.zeros(6),
         arm=np.array([hand.stiffness] * 3 + [hand.rotation_stiffness] * 3),
-        most=p.largest_force * _LEVERS,
+        most=him.largest_force * _LEVERS,
         weight=np.array([0.0, 0.0, 9.81 * hand.mass, 0.0, 0.0, 0.0]),
-        gain=np.array([p.muscle]),
+        gain=np.array([him.muscle]),
+        rest=np.zeros(6),
+        rate=np.zeros(6),
+        lag=neuromuscular_matrix(frequency, damping, period),
     )
     return flattened(at_rest)
 
@@ -435,6 +620,34 @@ def _followed(behaviour: Follow, count: int, step: float) -> np.ndarray:
     for name, values in behaviour.path.items():
         path[:, AXES.index(name)] = _at(time, behaviour.time, values, behaviour.interpolate)
     return path
+
+
+def recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
+    """Displacements of a handle that a person has moved.
+
+    Args:
+        path: CSV or Parquet file with `time` and columns `handle.<axis>` or `<axis>`.
+        time: (n,) since the record's first row, at which they are asked for [s].
+
+    Returns:
+        (n, 6) displacements [m], [rad]; what the record does not reach is held.
+
+    Raises:
+        InputError: the file cannot be read or has no such column.
+    """
+    log = load_log(path, minimum_rows=2, maximum_dropped=1.0)
+    made, found = np.zeros((len(time), 6)), False
+    for i, axis in enumerate(AXES):
+        for name in (f"handle.{axis}", axis):
+            if name in log.columns:
+                made[:, i] = np.interp(time, log.time - log.time[0], log[name])
+                found = True
+                break
+    if not found:
+        has = ", ".join(log.columns)
+        wanted = ", ".join(f"handle.{axis}" for axis in AXES)
+        raise InputError(path, f"has no displacement of the handle ({wanted}); it has {has}")
+    return made
 
 
 def _steered(behaviour: Steer, count: int, step: float) -> dict[int, np.ndarray]:

@@ -48,6 +48,7 @@ from hydrotele.teleop.master import (
     unpack_master_state,
 )
 from hydrotele.teleop.operator_model import Hand, OperatorModel, pull, unpack_muscles
+from hydrotele.teleop.operator_parameters import held_joystick
 from hydrotele.teleop.slave import (
     BLOCKED,
     HAND,
@@ -112,7 +113,7 @@ class MasterSide(NamedTuple):
         master: (160,) Master.
         state: (63,) MasterState, written.
         qpos: (7,) of the flotor: position [m] and quaternion.
-        muscles: (61,) Muscles, written.
+        muscles: (79,) Muscles, written.
         past: (reflex + 1, 6) see `pull`.
         tremor: (n, 6) see `pull`.
     """
@@ -345,6 +346,7 @@ class Station:
         self._plant, self._pilot, self._plan, self._drives = plant, pilot, plan, drives
         self._scale, self._period = scenario.servo.feedforward, 1.0 / scenario.control_rate
         joystick = load_joystick(_beside(scenario, pilot.joystick))
+        joystick = held_joystick(joystick, pilot.perception, scenario.folder)
         _, axes, _ = arm_facts(machine)
         self.columns = np.array([plan.axes.index(a) for a in axes])
         self.coordinates = COORDINATES[: len(axes)]
@@ -366,7 +368,7 @@ class Station:
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
         self.operator = OperatorModel(
             pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed,
-            hand,
+            hand, scenario.folder,
         )  # fmt: skip
         self._master_flat, self._m_flat = flat_view(self._master), flat_view(self._m)
         self._slave_flat, self._s_flat = flat_view(self._slave), flat_view(self._s)

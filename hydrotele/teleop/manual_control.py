@@ -1,0 +1,461 @@
+"""Manual control by sight: the crossover model of the human operator, and what he learns by doing.
+
+Around the crossover frequency operator and controlled element together are
+`Yp Yc = omega_c e^(-tau s) / s`: he integrates where the element is a gain, acts in proportion
+where it integrates, and leads where it integrates twice. Gain, form and lag of the element are
+known to him only from what he has done and seen; the phase margin that he keeps then gives the
+crossover frequency. His error is seen late and through noise in proportion to its size (remnant),
+and his limb is a second-order lag.
+
+Source: McRuer and Jex 1967, IEEE Trans. Human Factors in Electronics 8; Levison, Baron and Kleinman
+1969, IEEE Trans. Man-Machine Systems 10 (observation noise).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.core.compiled import compiled
+from hydrotele.teleop.operator_parameters import Operator
+
+GAIN, INTEGRATOR, DOUBLE_INTEGRATOR = range(3)
+FORMS = ("K", "K/s", "K/s^2")
+_LAGS = (0.0, 0.15, 0.3, 0.6, 1.0)  # s, first-order lags of an element that he tells apart
+_DELAYS = (0.0, 0.1, 0.2, 0.3, 0.45)  # s, and dead times
+LEAD = 2.5  # s, of what he generates for a double integrator
+_WASHOUT = 1.5  # rad/s: slower motion is drift, not an effect of his hand
+_SCATTER = 0.5  # s between errors of prediction that are independent of each other
+_VARIANCE = 5.0  # s over which he feels how large his errors are
+_FLOOR = 1e-24  # of a sum of squares: nothing has moved
+# of `Loop.facts`
+STEP, DELAY, REMNANT, THRESHOLD, MEMORY, SURPRISE, MOST, FORM, PRIOR = range(9)
+ERROR_POWER, RATE_POWER, INTEGRAL, CHOSEN, BELIEVED_GAIN, NOTICED = range(6)  # of `Loop.state`
+
+
+class Loop(NamedTuple):
+    """Facts and state of a loop that an operator closes by sight, with n candidate elements.
+
+    Attributes:
+        facts: (9,) step [s], visual delay [s], remnant [1], threshold of the error, memory [s],
+            surprise [1], largest output, number of integrations, expected gain.
+        lag: (n,) first-order lag of each candidate [s].
+        dead: (n,) dead time of each [s].
+        action: (n,) his gain with each, for an element of unit gain.
+        past: (rows, 3) error, seen output and own hand of the last steps, a ring.
+        noise: (m, 2) standard normal, of error and rate.
+        hand: (n, 4) hand behind each lag, and its three low-passes.
+        seen: (3,) low-passes of the seen output.
+        sums: (n, 4) faded sums of effect^2, effect times output, output^2, and of steps.
+        state: (6,) mean square of error and rate, integral of the output, chosen candidate, its
+            gain, error of now as he sees it without noise, 0 below the threshold.
+    """
+
+    facts: np.ndarray
+    lag: np.ndarray
+    dead: np.ndarray
+    action: np.ndarray
+    past: np.ndarray
+    noise: np.ndarray
+    hand: np.ndarray
+    seen: np.ndarray
+    sums: np.ndarray
+    state: np.ndarray
+
+
+def visual_loop(
+    him: Operator, step: float, prior: float, rng: np.random.Generator, *,
+    form: int, margin: float | None = None, threshold: float = 0.0, most: float = math.inf,
+    steps: int = 2**12,
+) -> Loop:  # fmt: skip
+    """A loop before anything has happened.
+
+    Args:
+        him: the operator.
+        step: between his decisions [s].
+        prior: gain that he expects.
+        rng: of his observation noise, and of how far his expectation is off.
+        form: of the element, which he has been told: a place, a rate or an acceleration.
+        margin: phase margin that he keeps [rad]; that of tracking by default.
+        threshold: error that he does not see.
+        most: largest displacement of the hand.
+        steps: of noise before it comes again.
+
+    Returns:
+        The loop.
+    """
+    off = math.exp(him.surprise * rng.standard_normal())
+    late = him.visual_delay + (him.lead_delay if form == DOUBLE_INTEGRATOR else 0.0)
+    rows = 4 + math.ceil((late + max(_DELAYS)) / step)
+    places = [(lag, dead) for lag in _LAGS for dead in _DELAYS]
+    margin = him.tracking_margin if margin is None else margin
+    n = len(places)
+    return Loop(
+        facts=np.array([
+            step, late - 0.5 * step, him.remnant, threshold, him.memory, him.surprise, most, form,
+            off * prior,
+        ]),
+        lag=np.array([lag for lag, _ in places]),
+        dead=np.array([dead for _, dead in places]),
+        action=np.array([_action(him, form, lag, late + dead, margin) for lag, dead in places]),
+        past=np.zeros((rows, 3)),
+        noise=rng.standard_normal((steps, 2)),
+        hand=np.zeros((n, 4)),
+        seen=np.zeros(3),
+        sums=np.zeros((n, 4)),
+        state=np.array([0.0, 0.0, 0.0, 0.0, off * prior, 0.0]),
+    )  # fmt: skip
+
+
+@compiled
+def learn(loop, tick, late, seen):
+    """Compare what the hand did with what came of it, for every candidate element.
+
+    Both go through a third-order wash-out, so that each candidate's effect is a finite filter of
+    the hand: `s^(3-n) / (s + a)^3 / (T s + 1)`.
+
+    Args:
+        loop: Loop; `hand`, `seen`, `sums` and `state` are written.
+        tick: number of the decision, scalar.
+        late: steps by which what he sees is old, scalar.
+        seen: output of the element then, scalar.
+
+    Returns:
+        Nothing.
+
+    Source: recursive least squares with forgetting, over a bank of models.
+    """
+    step, a, rows = loop.facts[STEP], _WASHOUT, len(loop.past)
+    share = 1.0 - np.exp(-a * step)
+    keep = np.exp(-step / loop.facts[MEMORY])
+    low = loop.seen
+    low[0] += share * (seen - low[0])
+    low[1] += share * (low[0] - low[1])
+    low[2] += share * (low[1] - low[2])
+    output = seen - 3.0 * low[0] + 3.0 * low[1] - low[2]
+    best, least = 0, np.inf
+    for i in range(len(loop.lag)):
+        row, lag = loop.hand[i], loop.lag[i]
+        back = late + loop.dead[i] / step
+        whole = int(back)
+        hand = 0.0
+        if tick > whole:
+            part = back - whole
+            hand = (1.0 - part) * loop.past[(tick - whole) % rows, 2]
+            hand += part * loop.past[(tick - whole - 1) % rows, 2]
+        row[0] += (1.0 - np.exp(-step / lag) if lag > 0.0 else 1.0) * (hand - row[0])
+        row[1] += share * (row[0] - row[1])
+        row[2] += share * (row[1] - row[2])
+        row[3] += share * (row[2] - row[3])
+        if loop.facts[FORM] == 0.0:
+            effect = row[0] - 3.0 * row[1] + 3.0 * row[2] - row[3]
+        elif loop.facts[FORM] == 1.0:
+            effect = (row[1] - 2.0 * row[2] + row[3]) / a
+        else:
+            effect = (row[2] - row[3]) / (a * a)
+        sums = loop.sums[i]
+        sums[0] = keep * sums[0] + effect * effect
+        sums[1] = keep * sums[1] + effect * output
+        sums[2] = keep * sums[2] + output * output
+        sums[3] = keep * sums[3] + 1.0
+        if sums[0] > _FLOOR and sums[1] > 0.0:
+            cost = (sums[2] - sums[1] * sums[1] / sums[0]) / max(sums[2], _FLOOR)
+            if cost < least:
+                best, least = i, cost
+    loop.state[CHOSEN] = best
+
+
+@compiled
+def believe(loop):
+    """Gain of the element that he believes in now: experience, weighed against his expectation.
+
+    Args:
+        loop: Loop; the believed gain in `state` is written.
+
+    Returns:
+        The gain, scalar, in units of output per hand (and second, second^2).
+
+    Source: normal posterior of the gain's logarithm.
+    """
+    best = int(loop.state[CHOSEN])
+    sums, prior = loop.sums[best], loop.facts[PRIOR]
+    gain = prior
+    if sums[0] > _FLOOR and sums[1] > 0.0:
+        fitted = sums[1] / sums[0]
+        scatter = max(0.0, sums[2] - fitted * sums[1]) / sums[3]
+        doubt = scatter / (fitted * fitted * sums[0]) * (_SCATTER / loop.facts[STEP]) + 1e-4
+        surprise = loop.facts[SURPRISE] ** 2
+        weight = surprise / (surprise + doubt)
+        gain = np.exp(weight * np.log(fitted) + (1.0 - weight) * np.log(prior))
+    loop.state[BELIEVED_GAIN] = gain
+    return gain
+
+
+@compiled
+def look_and_act(loop, tick, target, seen, hand):
+    """One decision: learn from what was seen, and choose where the hand should be.
+
+    Args:
+        loop: Loop, written.
+        tick: number of the decision, scalar.
+        target: where the output should be now, scalar.
+        seen: the output now, scalar.
+        hand: displacement of the hand now, scalar.
+
+    Returns:
+        Displacement of the hand that he wants, scalar; in front of the neuromuscular lag.
+
+    Source: McRuer and Jex 1967; Levison, Baron and Kleinman 1969.
+    """
+    facts, past, state = loop.facts, loop.past, loop.state
+    step, rows = facts[STEP], len(past)
+    here = past[tick % rows]
+    here[0], here[1], here[2] = target - seen, seen, hand
+    late = max(0.0, facts[DELAY] / step)
+    whole = int(late)
+    part = late - whole
+    if tick < whole + 2:
+        return 0.0
+    one, two = past[(tick - whole) % rows], past[(tick - whole - 1) % rows]
+    error = (1.0 - part) * one[0] + part * two[0]
+    three = past[(tick - whole - 2) % rows]
+    rate = (error - (1.0 - part) * two[0] - part * three[0]) / step
+    learn(loop, tick, late, (1.0 - part) * one[1] + part * two[1])
+    best = int(state[CHOSEN])
+    gain = believe(loop)
+    share = 1.0 - np.exp(-step / _VARIANCE)
+    state[ERROR_POWER] += share * (error * error - state[ERROR_POWER])
+    state[RATE_POWER] += share * (rate * rate - state[RATE_POWER])
+    density = np.sqrt(facts[REMNANT] * np.pi / step)
+    noise = loop.noise[tick % len(loop.noise)]
+    state[NOTICED] = error if abs(error) >= facts[THRESHOLD] else 0.0
+    if state[NOTICED] == 0.0 and facts[THRESHOLD] > 0.0:
+        return state[INTEGRAL]  # he leaves alone what he does not see
+    error += density * np.sqrt(state[ERROR_POWER]) * noise[0]
+    action = loop.action[best] / gain
+    if facts[FORM] == 0.0:
+        state[INTEGRAL] += step * action * error
+        state[INTEGRAL] = min(facts[MOST], max(-facts[MOST], state[INTEGRAL]))
+        return state[INTEGRAL]
+    if facts[FORM] == 2.0:
+        rate += density * np.sqrt(state[RATE_POWER]) * noise[1]
+        error += LEAD * rate
+    return min(facts[MOST], max(-facts[MOST], action * error))
+
+
+def operator_response(
+    him: Operator, form: int, frequencies: np.ndarray, late: float | None = None
+) -> np.ndarray:
+    """Describing function of the operator with unit gain: equalisation, delay, neuromuscular lag.
+
+    Args:
+        him: the operator.
+        form: of the controlled element.
+        frequencies: (m,) [rad/s].
+        late: delay, with what lead adds to it [s]; his own by default.
+
+    Returns:
+        (m,) complex hand per error.
+    """
+    s = 1j * frequencies
+    if late is None:
+        late = him.visual_delay + (him.lead_delay if form == DOUBLE_INTEGRATOR else 0.0)
+    equal = (1.0 / s, np.ones_like(s), 1.0 + LEAD * s)[form]
+    w, z = him.neuromuscular_frequency, him.neuromuscular_damping
+    return equal * np.exp(-late * s) * w**2 / (s**2 + 2.0 * z * w * s + w**2)
+
+
+def _action(him: Operator, form: int, lag: float, late: float, margin: float) -> float:
+    """Largest gain of his with which both margins are kept, for an element of unit gain."""
+    w = np.geomspace(0.02, 60.0, 4000)
+    loop = operator_response(him, form, w, late) / (1j * w) ** form / (1.0 + lag * 1j * w)
+    size, phase = np.abs(loop), np.unwrap(np.angle(loop))
+    phase -= 2.0 * math.pi * round((phase[0] + math.pi * (1.0 if form == 2 else 0.5)) / math.tau)
+    close = np.flatnonzero(phase >= margin - math.pi)
+    turn = np.flatnonzero(phase >= -math.pi)
+    at = min(w[close[-1]] if len(close) else w[turn[-1]] / 3.0, him.crossover)
+    beyond = size[turn[-1] :].max()  # the neuromuscular peak counts, too
+    return float(min(1.0 / np.interp(at, w, size), him.gain_margin / beyond))
+
+
+def neuromuscular_matrix(frequency: float, damping: float, step: float) -> np.ndarray:
+    """Exact step of the neuromuscular lag `omega^2 / (s^2 + 2 zeta omega s + omega^2)`.
+
+    Args:
+        frequency: natural frequency [rad/s]; 0 for none.
+        damping: ratio [1].
+        step: during which the input is held [s].
+
+    Returns:
+        (6,) a11, a12, b1, a21, a22, b2 of place and rate.
+    """
+    if frequency <= 0.0:
+        return np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    from scipy.linalg import expm
+
+    w2 = frequency**2
+    whole = expm(step * np.array([[0.0, 1.0, 0.0], [-w2, -2.0 * damping * frequency, w2],
+                                  [0.0, 0.0, 0.0]]))  # fmt: skip
+    return whole[:2].reshape(6)
+
+
+class TrackingRecord(NamedTuple):
+    """A record of tracking.
+
+    Attributes:
+        time: (n,) [s].
+        target: (n,) where the output should be.
+        response: (n,) output of the controlled element.
+        hand: (n,) displacement (or force) of the hand.
+    """
+
+    time: np.ndarray
+    target: np.ndarray
+    response: np.ndarray
+    hand: np.ndarray
+
+
+def sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float = 120.0, seed: int = 0
+                 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """A target of ten sines, with amplitudes that fall to a tenth beyond its bandwidth.
+
+    Args:
+        time: (n,) [s].
+        bandwidth: of the large sines [rad/s].
+        duration: after which it comes again [s].
+        seed: of the phases.
+
+    Returns:
+        (n,) target of unit standard deviation, and the (10,) frequencies [rad/s].
+
+    Source: form of the forcing functions of McRuer et al. 1965, AFFDL-TR-65-15.
+    """
+    base = 2.0 * math.pi / duration
+    wanted = np.geomspace(0.26, 14.0, 10) / base
+    primes = [n for n in range(3, 400) if all(n % k for k in range(2, int(n**0.5) + 1))]
+    count = [min(primes, key=lambda n: abs(n - w)) for w in wanted]
+    frequencies = base * np.array(sorted(set(count)))
+    size = np.where(frequencies <= bandwidth, 1.0, 0.1)
+    phase = np.random.default_rng([seed, 65]).uniform(0.0, 2.0 * math.pi, len(frequencies))
+    target = (size * np.sin(np.outer(time, frequencies) + phase)).sum(axis=1)
+    return target / math.sqrt(0.5 * (size**2).sum()), frequencies
+
+
+@compiled
+def _simulate(loop, lag, form, gain, target, fine, hand, response):
+    """Closed loop of `track`; `hand` and `response` are written."""
+    place, speed, output, rate = 0.0, 0.0, 0.0, 0.0
+    step = loop.facts[STEP] / fine
+    wanted = 0.0
+    for k in range(len(target)):
+        hand[k], response[k] = place, output
+        if k % fine == 0:
+            wanted = look_and_act(loop, k // fine, target[k], output, place)
+        before = place
+        place, speed = (
+            lag[0] * place + lag[1] * speed + lag[2] * wanted,
+            lag[3] * place + lag[4] * speed + lag[5] * wanted,
+        )
+        middle = 0.5 * (before + place)
+        if form == 0:
+            output = gain * place
+        elif form == 1:
+            output += step * gain * middle
+        else:
+            output += step * rate + 0.5 * step * step * gain * middle
+            rate += step * gain * middle
+
+
+def track(
+    him: Operator, form: int, gain: float, target: np.ndarray, *, step: float = 0.01, fine: int = 2,
+    seed: int = 0, surprised: bool = True,
+) -> TrackingRecord:  # fmt: skip
+    """Tracking of a displayed target by this operator, with a controlled element of no machine.
+
+    Args:
+        him: the operator.
+        form: GAIN, INTEGRATOR or DOUBLE_INTEGRATOR.
+        gain: of the element, which he does not know.
+        target: (n,) at steps of `step`.
+        step: of the record [s].
+        fine: steps per decision.
+        seed: of his noise and of his expectation.
+        surprised: whether his expectation is off as far as `surprise` says; else it is exact.
+
+    Returns:
+        The record.
+    """
+    rng = np.random.default_rng([seed, 1967])
+    loop = visual_loop(him, fine * step, gain, rng, form=form, steps=len(target) // fine + 1)
+    if not surprised:
+        loop.facts[PRIOR] = loop.state[BELIEVED_GAIN] = gain
+    lag = neuromuscular_matrix(him.neuromuscular_frequency, him.neuromuscular_damping, step)
+    hand, response = np.zeros((2, len(target)))
+    _simulate(loop, lag, form, gain, np.asarray(target, float), fine, hand, response)
+    return TrackingRecord(step * np.arange(len(target)), np.asarray(target), response, hand)
+
+
+class Crossover(NamedTuple):
+    """What an open loop `Yp Yc` looks like around its crossover frequency.
+
+    Attributes:
+        frequency: where its gain is 1 [rad/s].
+        margin: phase margin [rad].
+        slope: of its gain around there [dB per decade].
+    """
+
+    frequency: float
+    margin: float
+    slope: float
+
+
+def describing_function(
+    record: TrackingRecord, frequencies: np.ndarray, skip: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Describing functions at the frequencies of a sum of sines, measured from a record.
+
+    Args:
+        record: with a target of these frequencies.
+        frequencies: (m,) [rad/s], whole multiples of one over the record's length after `skip`.
+        skip: time at the beginning that is left out [s].
+
+    Returns:
+        (m,) complex response per error (Yp Yc) and hand per error (Yp).
+
+    Source: McRuer et al. 1965, AFFDL-TR-65-15: ratio of Fourier coefficients.
+    """
+    kept = record.time >= skip - 1e-9
+    time = record.time[kept]
+    basis = np.exp(-1j * np.outer(frequencies, time))
+    target, response, hand = (
+        basis @ values[kept] for values in (record.target, record.response, record.hand)
+    )
+    return response / (target - response), hand / (target - response)
+
+
+def crossover_of(frequencies: np.ndarray, open_loop: np.ndarray) -> Crossover:
+    """Crossover frequency, phase margin and slope of a measured open loop.
+
+    The slope is that of a line through the points from half to twice the crossover frequency.
+
+    Args:
+        frequencies: (m,) rising [rad/s].
+        open_loop: (m,) complex.
+
+    Returns:
+        They; NaN where the gain does not fall through 1.
+    """
+    decades, size = np.log10(frequencies), 20.0 * np.log10(np.abs(open_loop))
+    phase = np.unwrap(np.angle(open_loop))
+    phase -= 2.0 * math.pi * np.round((phase[0] + 0.5 * math.pi) / (2.0 * math.pi))
+    falls = np.flatnonzero((size[:-1] >= 0.0) & (size[1:] < 0.0))
+    if not len(falls):
+        return Crossover(math.nan, math.nan, math.nan)
+    k = falls[0]
+    share = size[k] / (size[k] - size[k + 1])
+    place = decades[k] + share * (decades[k + 1] - decades[k])
+    near = np.abs(decades - place) <= math.log10(2.0)
+    near[k] = near[k + 1] = True
+    slope = float(np.polyfit(decades[near], size[near], 1)[0])
+    angle = phase[k] + share * (phase[k + 1] - phase[k])
+    return Crossover(float(10.0**place), float(math.pi + angle), slope)

@@ -1,0 +1,260 @@
+"""Parameters of the simulated operator: the file with their sources, drawn operators, the hand.
+
+`hydrotele/teleop/operator.yaml` is the one that is shipped. A scenario may name a file of its own
+(`perception: {file: my_operator.yaml}`, as `hydrotele identify-operator` writes it), which needs
+only the parameters that differ, may draw an operator from the spread (`drawn: 3`), and may set
+single parameters.
+"""
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hydrotele.core.datafile import Facts, Name, Number, Positive, parse, read_yaml
+from hydrotele.core.datafile import suggest as suggest_name
+from hydrotele.core.errors import InputError
+from hydrotele.machine.joystick import HandFacts, Joystick
+from hydrotele.scenario.teleoperation import Perception
+
+SHIPPED = Path(__file__).resolve().with_name("operator.yaml")
+
+
+class OperatorParameter(Facts):
+    """A parameter of the operator: nominal value, spread from `low` to `high`, and its source.
+
+    `basis` says whether a study measured it (`published`), whether a published figure is quoted
+    from memory (`recalled`), whether it was fitted to a record (`identified`), or none of these.
+    """
+
+    value: Number
+    low: Number
+    high: Number
+    unit: str = "1"
+    basis: Literal["published", "recalled", "identified", "assumption"]
+    source: str
+
+    @model_validator(mode="after")
+    def _check(self):
+        if not 0.0 <= self.low <= self.value <= self.high:
+            raise ValueError(
+                f"must be ordered, 0 <= low {self.low:g} <= value {self.value:g}"
+                f" <= high {self.high:g}"
+            )
+        return self
+
+
+class OperatorFile(Facts):
+    """A file of operator parameters; `grips` of the hand, `postures` as factors on stiffness."""
+
+    name: Name
+    description: str = ""
+    parameters: dict[Name, OperatorParameter] = Field(min_length=1)
+    grips: dict[Name, HandFacts] = {}
+    postures: dict[Name, Positive] = {}
+
+    @model_validator(mode="after")
+    def _check(self):
+        if strange := set(self.parameters) - set(_NAMES):
+            name = min(strange)
+            raise ValueError(f"parameters.{name}: {suggest_name(name, _NAMES)}")
+        return self
+
+
+@dataclasses.dataclass(frozen=True)
+class Operator:
+    """One operator.
+
+    Attributes:
+        visual_delay: from seeing to moving, without the neuromuscular lag [s].
+        lead_delay: what generating lead adds to it [s].
+        crossover: largest crossover frequency that he closes a loop with [rad/s].
+        tracking_margin: phase margin that he keeps in tracking [rad].
+        placing_margin: the same when he brings the tip to a place [rad].
+        gain_margin: largest loop gain where the phase is -180 degrees [1].
+        neuromuscular_frequency: natural frequency of limb and reflexes [rad/s].
+        neuromuscular_damping: damping ratio of the same.
+        remnant: power density of his observation noise over pi times the variance of what he
+            observes.
+        sight: how well a place is seen [m] or [rad].
+        sight_noise: of a display, as a share of its largest value.
+        touch: from feeling to acting [s].
+        force_weber: standard deviation of a felt force, as a share.
+        position_weber: of a felt displacement, as a share.
+        integration_weber: of putting both together to a stiffness, as a share.
+        tremor: of the muscles' force [N].
+        muscle: gain of the handle's position [1/s].
+        largest_force: [N].
+        cocontraction: share of the largest.
+        stiffening: arm stiffness with full co-contraction, times.
+        usual_speed: that he expects at the handle's stop [m/s], [rad/s].
+        usual_scale: that he expects under position control [m/m], [rad/rad].
+        task_stiffness: of the ground that he is used to [N/m].
+        surprise: standard deviation of the logarithm of a gain not yet experienced.
+        memory: time over which experience fades [s].
+        imagination: spread of what he believes an unfelt push to do, as a share.
+        dwell: between correcting pushes by feel [s].
+    """
+
+    visual_delay: float
+    lead_delay: float
+    crossover: float
+    tracking_margin: float
+    placing_margin: float
+    gain_margin: float
+    neuromuscular_frequency: float
+    neuromuscular_damping: float
+    remnant: float
+    sight: float
+    sight_noise: float
+    touch: float
+    force_weber: float
+    position_weber: float
+    integration_weber: float
+    tremor: float
+    muscle: float
+    largest_force: float
+    cocontraction: float
+    stiffening: float
+    usual_speed: float
+    usual_scale: float
+    task_stiffness: float
+    surprise: float
+    memory: float
+    imagination: float
+    dwell: float
+
+    @property
+    def neuromuscular_delay(self) -> float:
+        """Delay of the neuromuscular lag at low frequencies, 2 zeta / omega [s]."""
+        return 2.0 * self.neuromuscular_damping / self.neuromuscular_frequency
+
+
+_NAMES = tuple(field.name for field in dataclasses.fields(Operator))
+
+
+@functools.cache
+def load_operator_file(path: Path = SHIPPED) -> OperatorFile:
+    """Read a file of operator parameters.
+
+    Args:
+        path: of the file; without one the shipped file is read.
+
+    Returns:
+        The validated file, completed by what only the shipped one has.
+
+    Raises:
+        InputError: names file, line and key of what is wrong.
+    """
+    data, lines = read_yaml(path)
+    found = parse(OperatorFile, data, str(path), lines)
+    if path == SHIPPED:
+        if lacking := [name for name in _NAMES if name not in found.parameters]:
+            raise InputError(path, f"lacks the parameters {', '.join(lacking)}")
+        return found
+    usual = load_operator_file()
+    return found.model_copy(update={
+        "parameters": usual.parameters | found.parameters,
+        "grips": usual.grips | found.grips, "postures": usual.postures | found.postures,
+    })  # fmt: skip
+
+
+def drawn_operator(file: OperatorFile, number: int | None, **known: float) -> Operator:
+    """An operator of a file.
+
+    Args:
+        file: of `load_operator_file`.
+        number: which one to draw from the spread, the same every time; None for the nominal one.
+        known: parameters that are not drawn.
+
+    Returns:
+        The operator.
+    """
+    values = {}
+    for place, name in enumerate(_NAMES):
+        p = file.parameters[name]
+        values[name] = p.value
+        if number is not None and p.low < p.high:
+            rng = np.random.default_rng([number, place, 1967])
+            values[name] = float(rng.triangular(p.low, p.value, p.high))
+    return Operator(**values | known)
+
+
+def perceiving(perception: Perception, folder: str = "") -> Operator:
+    """The operator that a scenario asks for.
+
+    Args:
+        perception: the scenario's.
+        folder: of the scenario, from which its file is counted.
+
+    Returns:
+        The operator.
+
+    Raises:
+        InputError: the file is not usable.
+    """
+    known = {name: getattr(perception, name) for name in _NAMES if hasattr(perception, name)}
+    known = {name: value for name, value in known.items() if value is not None}
+    return drawn_operator(_file_of(perception, folder), perception.drawn, **known)
+
+
+def held_joystick(joystick: Joystick, perception: Perception, folder: str = "") -> Joystick:
+    """The joystick with this operator's hand on it.
+
+    Without `grip`, `posture` and co-contraction the hand is the joystick file's own.
+
+    Args:
+        joystick: the joystick.
+        perception: the scenario's.
+        folder: of the scenario, from which its file is counted.
+
+    Returns:
+        The joystick with another hand.
+
+    Raises:
+        InputError: there is no such grip or posture, or the file is not usable.
+    """
+    file, him = _file_of(perception, folder), perceiving(perception, folder)
+    hand = joystick.hand
+    if perception.grip:
+        if perception.grip not in file.grips:
+            message = f"{perception.grip!r}; {suggest_name(perception.grip, file.grips)}"
+            raise InputError("pilot.perception.grip", message)
+        hand = file.grips[perception.grip]
+    factor = 1.0 + (him.stiffening - 1.0) * min(1.0, him.cocontraction)
+    if perception.posture:
+        if perception.posture not in file.postures:
+            message = f"{perception.posture!r}; {suggest_name(perception.posture, file.postures)}"
+            raise InputError("pilot.perception.posture", message)
+        factor *= file.postures[perception.posture]
+    return joystick.model_copy(update={"hand": stiffened(hand, factor)})
+
+
+def stiffened(hand: HandFacts, factor: float) -> HandFacts:
+    """A hand whose stiffness is `factor` times as large, with the same damping ratio.
+
+    Muscles that work against each other add stiffness and damping but no force (Hogan 1984).
+
+    Args:
+        hand: mass [kg], damping [N s/m] and stiffness [N/m].
+        factor: on the stiffness.
+
+    Returns:
+        The hand.
+    """
+    root = math.sqrt(factor)
+    return hand.model_copy(update={
+        "stiffness": factor * hand.stiffness, "damping": root * hand.damping,
+        "rotation_stiffness": factor * hand.rotation_stiffness,
+        "rotation_damping": root * hand.rotation_damping,
+    })  # fmt: skip
+
+
+def _file_of(perception: Perception, folder: str) -> OperatorFile:
+    if perception.file is None:
+        return load_operator_file()
+    return load_operator_file(Path(folder, perception.file).resolve())
