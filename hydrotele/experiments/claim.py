@@ -98,6 +98,11 @@ class Experiment:
         return self.times or min(asked, self.most)
 
 
+def drawn(seed: int) -> dict[str, str]:
+    """Changes of a scenario: an operator drawn from the published spread, and a seed for noise."""
+    return {"seed": str(seed), "pilot.perception.drawn": str(seed)}
+
+
 def spread(samples: Sequence[Sample], name: str, scale: float = 1.0, digits: int = 1) -> str:
     """Mean of a figure over the samples with its least and largest, as text.
 

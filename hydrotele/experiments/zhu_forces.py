@@ -19,6 +19,7 @@ from hydrotele.experiments.claim import (
     Experiment,
     Sample,
     Verdict,
+    drawn,
     largest,
     least,
     mean,
@@ -70,7 +71,7 @@ def _off_line(x: np.ndarray, force: np.ndarray, slope: np.ndarray | float) -> fl
 
 def by_feel(seed: int, changes: Changes) -> Sample:
     """20 kN, then 35 kN, held by what the joystick's stiffness tells alone."""
-    keys = {"seed": str(seed)} | _UNFILTERED | dict(changes)
+    keys = drawn(seed) | _UNFILTERED | dict(changes)
     scenario, run = perform("press_stiffness", keys)
     m, values = run.measured, {}
     facts = target_of(scenario).target
@@ -113,8 +114,8 @@ def _figures(run: Run, duration: float) -> dict[str, float]:
 def direct(ratio: float, seed: int, changes: Changes) -> Sample:
     """The reflected force on the hand itself, as large as 4.5 N for 25 kN or another ratio."""
     keys = {
-        "pilot.ratio": str(ratio), "pilot.operator.target.force": f"[{_TASK}]", "seed": str(seed)
-    } | _UNFILTERED | dict(changes)  # fmt: skip
+        "pilot.ratio": str(ratio), "pilot.operator.target.force": f"[{_TASK}]"
+    } | drawn(seed) | _UNFILTERED | dict(changes)  # fmt: skip
     scenario, run = perform("press_direct", keys)
     return Sample(_figures(run, scenario.duration), _panels(scenario, run))
 
@@ -281,8 +282,8 @@ def track(seed: int, changes: Changes) -> Sample:
     for detent in ("true", "false"):
         for reflection in ("stiffness", "none"):
             keys = {
-                "pilot.reflection": reflection, "pilot.detent": detent, "seed": str(seed)
-            } | dict(changes)  # fmt: skip
+                "pilot.reflection": reflection, "pilot.detent": detent
+            } | drawn(seed) | dict(changes)  # fmt: skip
             scenario, run = perform("track_rock", keys)
             m, facts = run.measured, target_of(scenario).target
             late = m.time > _LATER

@@ -15,6 +15,7 @@ from hydrotele.experiments.claim import (
     Experiment,
     Sample,
     Verdict,
+    drawn,
     largest,
     least,
     mean,
@@ -47,7 +48,7 @@ def line(way: str, seed: int, changes: Changes) -> Sample:
     _, axis, sign, held, start = _WAYS[way]
     push = 0.004 * sign
     keys = {f"start.pose.{k}": v for k, v in start.items()}
-    keys |= {"pilot.operator.path": f"{{{axis}: [0, 0, {push}, {push}, 0, 0]}}", "seed": str(seed)}
+    keys |= {"pilot.operator.path": f"{{{axis}: [0, 0, {push}, {push}, 0, 0]}}"} | drawn(seed)
     _, run = perform("joystick_up", keys | dict(changes))
     pose, time = cylindrical(run), run.truth.time
     gone = pose["z" if axis == "z" else "r"]
@@ -133,7 +134,7 @@ def steering(seed: int, changes: Changes) -> Sample:
     }
     values, panels = {}, []
     for name, keys in cases.items():
-        keys = {"pilot.mount": "table", "seed": str(seed)} | keys | dict(changes)
+        keys = {"pilot.mount": "table"} | drawn(seed) | keys | dict(changes)
         _, run = perform("steer", keys)
         over, count = swings(run)
         values |= {f"{name}_over": over, f"{name}_swings": float(count)}
@@ -178,7 +179,7 @@ _EDGE = 1.5  # mm: dead band of Table 6.9
 
 def handle_ramp(detent: str, seed: int, changes: Changes) -> Sample:
     """Force of the hand while it moves the handle slowly from its centre to near its stop."""
-    keys = {"pilot.detent": detent, "seed": str(seed)} | dict(changes)
+    keys = {"pilot.detent": detent} | drawn(seed) | dict(changes)
     _, run = perform("handle_ramp", keys)
     m, values, panels = run.measured, {}, []
     for axis, (begin, end, *_) in _RAMPS.items():
@@ -300,7 +301,7 @@ _CROSS = 0.1  # of a step
 
 def resolved_steps(seed: int, changes: Changes) -> Sample:
     """Steps of the joystick in all five task coordinates, judged on the measured pose."""
-    _, run = perform("feller_steps", {"seed": str(seed)} | dict(changes))
+    _, run = perform("feller_steps", drawn(seed) | dict(changes))
     m, values, panels = run.measured, {}, []
     for name, begin in _COORDINATES.items():
         inside = (m.time >= begin) & (m.time < begin + 4.9)
