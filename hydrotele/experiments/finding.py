@@ -81,6 +81,20 @@ class Finding(NamedTuple):
         }  # fmt: skip
 
 
+def tally(findings: Sequence[Finding]) -> str:
+    """How many findings agree, those of the document and ours apart, as a sentence.
+
+    >>> tally([Finding("a", "p. 1", "", "", True), Finding("b", "p. 2", "", "", False)])
+    '1 of 2 as published'
+    """
+    ours = [one for one in findings if one.basis == "ours"]
+    published = [one for one in findings if one.basis != "ours"]
+    words = f"{sum(one.ok for one in published)} of {len(published)} as published"
+    if ours:
+        words += f"; beyond the document {sum(one.ok for one in ours)} of {len(ours)} hold"
+    return words
+
+
 def perform(name: str, overrides: Mapping[str, str] | None = None) -> tuple[Scenario, Run]:
     """Run a shipped scenario with some of its values changed."""
     scenario = load_scenario(name, dict(overrides or {}))

@@ -266,7 +266,9 @@ def _unstable_verdict(samples: Sequence[Sample]) -> Verdict:
         f" {spread(samples, 'ripple', 100.0, 0)} % of the mean, handle up to"
         f" {spread(samples, 'farthest', 1e3)} mm"
     )
-    return Verdict(ripple > _BOUNCING, told, "unstable: ripple above 50 % of the mean, in every run")
+    return Verdict(
+        ripple > _BOUNCING, told, "unstable: ripple above 50 % of the mean, in every run"
+    )
 
 
 _LATER = 12.0  # s: until then the head is on its way
