@@ -274,7 +274,7 @@ EXPERIMENTS = (
     Experiment("hand that goes on pushing", pushing, (
         Claim(
             "tip-over: the stick pushed back",
-            "the most effective way is via a force reflection which automatically pushes the"
+            "the most effective way is via force reflection which automatically pushes the"
             " joystick back into its position deadband",
             "p. 99",
             "document",

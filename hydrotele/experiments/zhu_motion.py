@@ -321,7 +321,8 @@ def _following_verdict(samples: Sequence[Sample]) -> Verdict:
         why += (
             "; with half the position gain (2 /s) the boom overshoots by"
             f" {100 * v['boom_over_slower']:.0f} % and swings by"
-            f" +-{v['boom_ringing_slower']:.1f} %: the servo's gain is too high for the oil under the whole arm's weight"
+            f" +-{v['boom_ringing_slower']:.1f} %: the servo's gain is too high"
+            " for the oil under the whole arm's weight"
         )
     return Verdict(not bad, "; ".join(told), why)
 
