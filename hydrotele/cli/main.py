@@ -14,6 +14,7 @@ Words of the command line into overrides of a scenario.
 import os
 import signal
 import sys
+import warnings
 from json import dumps as json_text
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +22,7 @@ from typing import Annotated
 import typer
 
 from hydrotele.cli.calibrating import app as calibrate_app
+from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
 from hydrotele.core.errors import InputError
 
 
@@ -292,6 +294,7 @@ def run(
 app.command(epilog=DRIVE_EPILOG)(drive)
 app.command(epilog=SWEEP_EPILOG)(sweep)
 app.command(epilog=COMPARE_EPILOG)(compare)
+app.command("identify-operator", epilog=IDENTIFY_OPERATOR_EPILOG)(identify_operator)
 
 
 @app.command(
@@ -656,6 +659,7 @@ def main() -> None:
         sys.exit(ended[0])  # so that everything is cleaned up
 
     signal.signal(signal.SIGTERM, end)
+    warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning {message}", err=True)
     try:
         _run()
     finally:

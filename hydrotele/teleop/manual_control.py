@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import compiled
+from hydrotele.core.compiled import compiled, inlined
 from hydrotele.teleop.operator_parameters import Operator
 
 GAIN, INTEGRATOR, DOUBLE_INTEGRATOR = range(3)
@@ -107,6 +107,17 @@ def visual_loop(
     )  # fmt: skip
 
 
+@inlined
+def _past(past, tick, back, column):
+    """What was so many steps ago, between decisions by interpolation; 0 before the first."""
+    whole = int(back)
+    if tick < whole + 1:
+        return 0.0
+    part, rows = back - whole, len(past)
+    one, two = past[(tick - whole) % rows, column], past[(tick - whole - 1) % rows, column]
+    return (1.0 - part) * one + part * two
+
+
 @compiled
 def learn(loop, tick, late, seen):
     """Compare what the hand did with what came of it, for every candidate element.
@@ -125,7 +136,7 @@ def learn(loop, tick, late, seen):
 
     Source: recursive least squares with forgetting, over a bank of models.
     """
-    step, a, rows = loop.facts[STEP], _WASHOUT, len(loop.past)
+    step, a = loop.facts[STEP], _WASHOUT
     share = 1.0 - np.exp(-a * step)
     keep = np.exp(-step / loop.facts[MEMORY])
     low = loop.seen
@@ -136,13 +147,7 @@ def learn(loop, tick, late, seen):
     best, least = 0, np.inf
     for i in range(len(loop.lag)):
         row, lag = loop.hand[i], loop.lag[i]
-        back = late + loop.dead[i] / step
-        whole = int(back)
-        hand = 0.0
-        if tick > whole:
-            part = back - whole
-            hand = (1.0 - part) * loop.past[(tick - whole) % rows, 2]
-            hand += part * loop.past[(tick - whole - 1) % rows, 2]
+        hand = _past(loop.past, tick, late + loop.dead[i] / step, 2)
         row[0] += (1.0 - np.exp(-step / lag) if lag > 0.0 else 1.0) * (hand - row[0])
         row[1] += share * (row[0] - row[1])
         row[2] += share * (row[1] - row[2])
@@ -211,16 +216,12 @@ def look_and_act(loop, tick, target, seen, hand):
     step, rows = facts[STEP], len(past)
     here = past[tick % rows]
     here[0], here[1], here[2] = target - seen, seen, hand
-    late = max(0.0, facts[DELAY] / step)
-    whole = int(late)
-    part = late - whole
-    if tick < whole + 2:
+    late = max(0.5, facts[DELAY] / step)
+    if tick < int(late) + 3:
         return 0.0
-    one, two = past[(tick - whole) % rows], past[(tick - whole - 1) % rows]
-    error = (1.0 - part) * one[0] + part * two[0]
-    three = past[(tick - whole - 2) % rows]
-    rate = (error - (1.0 - part) * two[0] - part * three[0]) / step
-    learn(loop, tick, late, (1.0 - part) * one[1] + part * two[1])
+    error = _past(past, tick, late, 0)
+    rate = (_past(past, tick, late - 0.5, 0) - _past(past, tick, late + 0.5, 0)) / step
+    learn(loop, tick, late, _past(past, tick, late, 1))
     best = int(state[CHOSEN])
     gain = believe(loop)
     share = 1.0 - np.exp(-step / _VARIANCE)

@@ -46,6 +46,7 @@ from hydrotele.teleop.axis_table import (
     flattened,
     split,
 )
+from hydrotele.teleop.haptic_perception import feeling, felt_stiffness
 from hydrotele.teleop.manual_control import (
     BELIEVED_GAIN,
     GAIN,
@@ -256,13 +257,7 @@ class OperatorModel:
         self.tremor = him.tremor * _coloured(white, _TREMOR_BAND, period)
         self.past = np.zeros((1 + max(1, round(REFLEX / period)), 6))
         count = ticks // self.every + 1
-        drift = _coloured(rng.standard_normal((count, 2)), _SLOW, self._step)
-        self._force_error = 1.0 + him.force_weber * drift[:, 0]
-        self._place_error = 1.0 + him.position_weber * drift[:, 1]
-        impression = rng.standard_normal(count)[
-            (self._step * np.arange(count) / him.dwell).astype(int)
-        ]
-        self._impression = np.exp(him.integration_weber * impression)
+        self._feeling = feeling(him, rng, count, self._step)
         sight = _coloured(rng.standard_normal(count), 4.0 * _SLOW, self._step)
         self._sight = him.sight_noise * sight
         self._imagined_gain = math.exp(him.imagination * rng.standard_normal())
@@ -403,8 +398,7 @@ class OperatorModel:
         if self._target.shown:
             return (him.sight_noise * largest) ** 2
         if self._pilot.reflection in ("stiffness", "impedance"):
-            share = math.hypot(him.force_weber, him.position_weber, him.integration_weber)
-            return (share * (row[NOMINAL] / row[SLOPE] + force)) ** 2
+            return (self._feeling.share * (row[NOMINAL] / row[SLOPE] + force)) ** 2
         return (him.force_weber * max(force, _LEAST_CLOSE * largest)) ** 2
 
     def _judge(
@@ -424,14 +418,13 @@ class OperatorModel:
                 change = beyond * rate * self.him.task_stiffness * self._imagined_gain
                 self._imagined = max(0.0, self._imagined + self._step * change)
             return self._imagined
-        x = float(self._handle[felt, axis]) * self._place_error[number]
-        force = float(self._hand[felt, axis]) * self._force_error[number]
+        x, force = float(self._handle[felt, axis]), float(self._hand[felt, axis])
         if reflection in ("stiffness", "impedance"):
             if way * x > _LEAST_WAY:
-                felt_stiffness = felt_as_stiffness(force, x, self._impression[number])
-                stiffer = max(0.0, felt_stiffness - row[NOMINAL])
+                stiffer = max(0.0, felt_stiffness(force, x, self._feeling, number) - row[NOMINAL])
                 self._imagined = min(row[LIMIT], stiffer / row[SLOPE])
             return self._imagined
+        x, force = x * self._feeling.displacement[number], force * self._feeling.force[number]
         return max(0.0, (way * force - row[NOMINAL] * way * x) / max(row[RATIO], 1e-12))
 
     def _lean(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
@@ -508,20 +501,6 @@ class _Belief:
 
 
 _FADES = 0.05  # of a force, by which it may change between two judgements without him
-
-
-def felt_as_stiffness(force: float, displacement: float, impression: float) -> float:
-    """Stiffness that a hand feels in a spring.
-
-    Args:
-        force: felt [N].
-        displacement: felt [m].
-        impression: factor by which putting both together is off [1].
-
-    Returns:
-        The stiffness [N/m].
-    """
-    return force / displacement * impression
 
 
 class _Target(NamedTuple):

@@ -1,0 +1,563 @@
+"""Identification of the operator model's parameters from a record of compensatory tracking.
+
+The operator sees the error between target and response and moves his hand; his describing function
+`Yp = K (equalisation) e^(-tau s) omega^2 / (s^2 + 2 zeta omega s + omega^2)` is fitted to error and
+hand. His own noise goes round the loop, so that it is part of the error: an ordinary fit is biased.
+The part of the error that comes from the target is therefore the instrument (refined instrumental
+variables): the equations `sum dYp/dtheta e_target * W (hand - Yp error) = 0` hold at the true
+parameters whatever the remnant, and their covariance gives the standard errors. W whitens the
+remnant.
+
+Source: Van den Hof and Schrama 1993 (two-stage method); Soderstrom and Stoica 1983 (instrumental
+variables); form of Yp: McRuer and Jex 1967.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+
+from hydrotele.core.errors import InputError
+from hydrotele.core.units import to_si
+from hydrotele.logs.log import read_table
+from hydrotele.teleop.manual_control import FORMS, TrackingRecord
+from hydrotele.teleop.operator_parameters import load_operator_file
+
+EQUALISATIONS = ("integral", "lag", "gain", "lead")
+_SLOWEST, _FASTEST = 10.0, 25.0  # Hz of the samples that are used
+_SHORTEST = 20.0  # s
+_MISSING = 0.05  # share of the samples that may be interpolated
+_HIGHPASS = 0.15  # rad/s: slower motion of the hand is drift
+_SETTLES = 6.0  # s until filters have forgotten what was before the record
+_MEMORY, _TAP = 3.0, 0.06  # s of the response of the error to the target, and between its taps
+_PARTS, _RANK = 6, 3e-3  # of the record; smallest singular value that counts, to the largest
+_WHITENER = 0.6  # s of the autoregression of the remnant
+_BOUNDS = {
+    "gain": (1e-9, 1e9), "delay": (0.02, 1.0), "time_constant": (0.02, 50.0),
+    "neuromuscular_frequency": (3.0, 60.0), "neuromuscular_damping": (0.03, 2.0),
+}  # fmt: skip
+_UNITS = {"delay": "s", "time_constant": "s", "neuromuscular_frequency": "rad/s",
+          "neuromuscular_damping": "1", "remnant": "1", "crossover": "rad/s",
+          "phase_margin": "rad", "gain_margin": "1"}  # fmt: skip
+_CERTAIN = 0.5  # standard error of a logarithm beyond which a parameter is not identified
+_QUANTILE = 2.1  # of Student's t with the degrees of freedom that the blocks leave
+_BLOCK = 4.0  # s, longer than what the operator remembers of an error
+_DRAWS = 400
+_UNSETTLED = 20.0  # of the criterion, for a fit whose iterations did not settle
+
+
+class Estimate(NamedTuple):
+    """An estimated parameter.
+
+    Attributes:
+        value: estimate.
+        low: lower end of its 95 % interval.
+        high: upper end.
+        unit: of them.
+        identified: whether the record tells it to better than a factor of about 2.7.
+    """
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    identified: bool
+
+
+class OperatorFit(NamedTuple):
+    """An operator identified from a record.
+
+    Attributes:
+        equalisation: `gain`, `lead`, `lag` or `integral`.
+        estimates: name -> estimate: gain (hand per error), delay, time_constant of lead or lag,
+            neuromuscular_frequency, neuromuscular_damping, remnant; crossover, phase_margin and
+            gain_margin where the controlled element is one of the known forms.
+        element: form of the controlled element, as `K/s`, empty where it is none of them.
+        explained: share of the hand's variance that the model predicts from the target [1].
+        rate: of the samples that were used [Hz].
+        duration: that was used [s].
+        notes: what the user should know.
+        frequencies: (m,) at which the describing function is given [rad/s].
+        response: (m,) complex describing function Yp of the model.
+    """
+
+    equalisation: str
+    estimates: Mapping[str, Estimate]
+    element: str
+    explained: float
+    rate: float
+    duration: float
+    notes: tuple[str, ...]
+    frequencies: np.ndarray
+    response: np.ndarray
+
+
+def read_tracking(
+    path: Path, names: Mapping[str, str] | None = None
+) -> tuple[TrackingRecord, list[str]]:
+    """Read a record of tracking from a CSV or Parquet file.
+
+    Columns are `time`, `target`, `response` and `hand`, or what `names` calls them; without a
+    `hand` a column `force` is what the operator does (a stick that does not move). A unit in the
+    header (`time [ms]`) is converted. Samples need not be equidistant; single missing values are
+    interpolated.
+
+    Args:
+        path: of the file.
+        names: `time`, `target`, `response`, `hand` -> column.
+
+    Returns:
+        The record as it was sampled, and notes.
+
+    Raises:
+        InputError: names file, column and row, and what to do.
+    """
+    table = read_table(path, missing=True)
+    given, notes = dict(names or {}), []
+    lower = {name.lower(): name for name in table.names}
+    columns: dict[str, np.ndarray] = {}
+    for key in ("time", "target", "response", "hand"):
+        name = given.get(key) or lower.get(key)
+        if key == "hand" and name is None and "force" in lower:
+            name = lower["force"]
+            notes.append("no hand: the force is taken as what the operator does")
+        if name not in table.names:
+            has = ", ".join(table.names)
+            message = f"has no column {name or key!r}; it has {has}; name it with --{key} COLUMN"
+            raise InputError(path, message)
+        place = table.names.index(name)
+        unit, values = table.units[place], np.array(table.values[place], float)
+        if unit is not None:
+            values *= to_si(unit)[1]
+        if np.isinf(values).any():
+            row = int(np.flatnonzero(np.isinf(values))[0])
+            raise InputError(table.where(str(name), row), "is infinite: remove the row")
+        columns[key] = values
+    time = columns.pop("time")
+    if len(time) < 10:
+        raise InputError(path, f"has {len(time)} rows: a record of tracking needs {_SHORTEST:g} s")
+    bad = np.flatnonzero(~(np.diff(time) > 0.0))
+    if len(bad):
+        message = "does not rise here: sort the rows, and keep each time once"
+        raise InputError(table.where("time", int(bad[0]) + 1), message)
+    for key, values in columns.items():
+        missing = np.isnan(values)
+        if missing.mean() > _MISSING:
+            share = 100.0 * missing.mean()
+            row = int(np.flatnonzero(missing)[0])
+            message = f"misses {share:.0f} % of its values, {100 * _MISSING:g} % may be missing"
+            raise InputError(table.where(given.get(key, key), row), message)
+        if missing.any():
+            notes.append(f"{int(missing.sum())} missing values of {key} were interpolated")
+            columns[key] = np.interp(time, time[~missing], values[~missing])
+        if np.ptp(columns[key]) == 0.0:
+            raise InputError(f"{path}, column {given.get(key, key)}", "never changes")
+    return TrackingRecord(time, *(columns[k] for k in ("target", "response", "hand"))), notes
+
+
+def identify_operator(
+    record: TrackingRecord, equalisation: str | None = None, source: str = "record"
+) -> OperatorFit:
+    """Fit the operator model to a record of compensatory tracking.
+
+    Args:
+        record: as it was sampled.
+        equalisation: `gain`, `lead`, `lag` or `integral`; chosen by the record without one.
+        source: what messages call the record.
+
+    Returns:
+        The fit.
+
+    Raises:
+        InputError: the record is too short or too slow, or shows no answer to its target.
+    """
+    if equalisation is not None and equalisation not in EQUALISATIONS:
+        message = f"{equalisation!r}; valid: {', '.join(EQUALISATIONS)}"
+        raise InputError("--equalisation", message)
+    step, signals, notes = _uniform(record, source)
+    filtered = {name: _filter(values, step, _highpass) for name, values in signals.items()}
+    target, seen, hand = filtered["target"], filtered["error"], filtered["hand"]
+    from_target = _instrument(target, seen, step)
+    data = _Data(step, seen, from_target, hand)
+    kinds = (equalisation,) if equalisation else EQUALISATIONS
+    fits = [fit for kind in kinds if (fit := _fit(data, kind)) is not None]
+    if not fits:
+        raise InputError(source, "shows no answer of the hand to the target: check the columns")
+    best = min(fits, key=lambda fit: fit.criterion + _UNSETTLED * (not fit.settled))
+    if not best.settled:
+        notes.append("the fit did not settle: record longer, or with more motion of the target")
+    return _finished(best, data, signals, record, notes)
+
+
+class _Data(NamedTuple):
+    step: float
+    error: np.ndarray
+    from_target: np.ndarray
+    hand: np.ndarray
+
+
+class _Fit(NamedTuple):
+    kind: str
+    names: tuple[str, ...]
+    sign: float
+    logs: np.ndarray
+    covariance: np.ndarray
+    noise: np.ndarray
+    criterion: float
+    settled: bool
+
+
+def _uniform(record: TrackingRecord, source: str) -> tuple[float, dict[str, np.ndarray], list[str]]:
+    """Equidistant signals without mean, and notes."""
+    time, notes = record.time, []
+    spacing = float(np.median(np.diff(time)))
+    if time[-1] - time[0] < _SHORTEST:
+        message = f"is {time[-1] - time[0]:.1f} s long: at least {_SHORTEST:g} s are needed"
+        raise InputError(source, message)
+    if 1.0 / spacing < _SLOWEST:
+        message = f"has {1.0 / spacing:.2g} samples per second: at least {_SLOWEST:g} are needed"
+        raise InputError(source, message)
+    if (gap := float(np.diff(time).max())) > 0.5:
+        at = float(time[int(np.argmax(np.diff(time)))])
+        message = f"has a gap of {gap:.2f} s at {at:.2f} s: cut it there, and use the longer part"
+        raise InputError(source, message)
+    if np.abs(np.diff(time) / spacing - 1.0).max() > 0.5:
+        notes.append("samples are not equidistant: they were interpolated")
+    error = record.target - record.response
+    every = max(1, math.ceil(1.0 / spacing / _FASTEST - 0.01))
+    grid = np.arange(time[0], time[-1], spacing)
+    made = {}
+    for name, values in (("target", record.target), ("error", error), ("hand", record.hand),
+                         ("response", record.response)):  # fmt: skip
+        even = np.interp(grid, time, values)
+        if every > 1:
+            from scipy.signal import decimate
+
+            even = decimate(even, every, ftype="fir", zero_phase=True)
+        made[name] = even - even.mean()
+    return spacing * every, made, notes
+
+
+def _highpass(s: np.ndarray) -> np.ndarray:
+    return s / (s + _HIGHPASS)
+
+
+def _filter(values: np.ndarray, step: float, response) -> np.ndarray:
+    """A signal through a transfer function of s, from rest."""
+    pad = len(values) + round(4.0 * _SETTLES / step)
+    s = 2j * np.pi * np.fft.rfftfreq(pad, step)
+    return np.fft.irfft(np.fft.rfft(values, pad) * response(s), pad)[: len(values)]
+
+
+def _instrument(target: np.ndarray, seen: np.ndarray, step: float) -> np.ndarray:
+    """Part of the error that comes from the target: its response by least squares.
+
+    Each part of the record gets the response that the others have, so that the remnant of a part
+    is not in its own instrument (jackknife instrumental variables, Angrist et al. 1999).
+    """
+    apart = max(1, round(_TAP / step))
+    lags = np.arange(0, round(_MEMORY / step), apart)
+    table = np.zeros((len(target), len(lags)))
+    for column, lag in enumerate(lags):
+        table[lag:, column] = target[: len(target) - lag]
+    made = np.zeros(len(target))
+    rows = np.arange(len(target))
+    usable = rows >= round(_SETTLES / step)
+    for part in np.array_split(rows, _PARTS):
+        others = usable & ((rows < part[0]) | (rows > part[-1]))
+        taps = np.linalg.lstsq(table[others], seen[others], rcond=_RANK)[0]
+        made[part] = table[part] @ taps
+    return made
+
+
+def _names(kind: str) -> tuple[str, ...]:
+    timed = ("time_constant",) if kind in ("lead", "lag") else ()
+    return ("gain", "delay", *timed, "neuromuscular_frequency", "neuromuscular_damping")
+
+
+def _response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Describing function of the operator."""
+    p = dict(zip(_names(kind), np.exp(logs), strict=True))
+    w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
+    made = p["gain"] * np.exp(-p["delay"] * s) * w**2 / (s**2 + 2.0 * z * w * s + w**2)
+    if kind == "lead":
+        made = made * (1.0 + p["time_constant"] * s)
+    elif kind == "lag":
+        made = made / (1.0 + p["time_constant"] * s)
+    elif kind == "integral":
+        made = made / np.where(s == 0.0, np.inf, s)
+    return made
+
+
+def _slopes(kind: str, logs: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
+    """Its derivatives with respect to the logarithms."""
+    p = dict(zip(_names(kind), np.exp(logs), strict=True))
+    w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
+    whole = _response(kind, logs, s)
+    lag = s**2 + 2.0 * z * w * s + w**2
+    factor = {
+        "gain": np.ones_like(s), "delay": -p["delay"] * s,
+        "neuromuscular_frequency": 2.0 - (2.0 * z * w * s + 2.0 * w**2) / lag,
+        "neuromuscular_damping": -2.0 * z * w * s / lag,
+    }  # fmt: skip
+    if kind in ("lead", "lag"):
+        t = p["time_constant"] * s
+        factor["time_constant"] = (1.0 if kind == "lead" else -1.0) * t / (1.0 + t)
+    return [whole * factor[name] for name in _names(kind)]
+
+
+def _predicted(data: _Data, kind: str, logs: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return _filter(values, data.step, lambda s: _response(kind, logs, s))
+
+
+def _autoregression(noise: np.ndarray, step: float) -> np.ndarray:
+    """Whitening filter of a noise: 1 and the negative coefficients of its autoregression."""
+    from scipy.linalg import solve_toeplitz
+
+    order = max(4, round(_WHITENER / step))
+    noise = noise - noise.mean()
+    size = len(noise)
+    spectrum = np.abs(np.fft.rfft(noise, 2 * size)) ** 2
+    r = np.fft.irfft(spectrum)[: order + 1] / size
+    r[0] *= 1.0 + 1e-6
+    return np.concatenate([[1.0], -solve_toeplitz(r[:order], r[1 : order + 1])])
+
+
+def _fit(data: _Data, kind: str) -> _Fit | None:
+    """Refined instrumental variables from several delays; None where nothing fits."""
+    from scipy.optimize import least_squares
+    from scipy.signal import lfilter
+
+    names, first = _names(kind), round(_SETTLES / data.step)
+    low, high = (np.log([_BOUNDS[n][side] for n in names]) for side in (0, 1))
+    starts = []
+    for delay in (0.1, 0.2, 0.35, 0.5):
+        for constant in (0.3, 2.0) if "time_constant" in names else (1.0,):
+            usual = {"gain": 1.0, "delay": delay, "time_constant": constant,
+                     "neuromuscular_frequency": 12.0, "neuromuscular_damping": 0.4}  # fmt: skip
+            logs = np.log([usual[n] for n in names])
+            one = _predicted(data, kind, logs, data.from_target)[first:]
+            gain = float(one @ data.hand[first:] / max(one @ one, 1e-300))
+            rest = float(np.sum((data.hand[first:] - gain * one) ** 2))
+            starts.append((rest, gain, logs))
+    _, gain, logs = min(starts, key=lambda start: start[0])
+    if gain == 0.0 or not math.isfinite(gain):
+        return None
+    sign, logs = math.copysign(1.0, gain), logs.copy()
+    logs[0] = math.log(abs(gain))
+    hand = sign * data.hand
+    logs = np.clip(logs, low + 1e-6, high - 1e-6)
+
+    def miss(x: np.ndarray) -> np.ndarray:
+        return (hand - _predicted(data, kind, x, data.from_target))[first:]
+
+    logs = least_squares(miss, logs, bounds=(low, high), x_scale=0.3).x
+    noise, covariance, settled = hand, np.eye(len(logs)), False
+    for turn in range(30):
+        noise = (hand - _predicted(data, kind, logs, data.error))[first:]
+        white = _autoregression(noise, data.step)
+
+        def whitened(values: np.ndarray, white=white) -> np.ndarray:
+            return np.asarray(lfilter(white, [1.0], values[first:]))[len(white) :]
+
+        rest = np.asarray(lfilter(white, [1.0], noise))[len(white) :]
+        count = len(logs)
+        z = np.empty((len(rest), count))
+        d = np.empty((len(rest), count))
+        for k in range(count):
+            z[:, k] = whitened(_slope_of(data, kind, logs, k, data.from_target))
+            d[:, k] = whitened(_slope_of(data, kind, logs, k, data.error))
+        scale = np.linalg.norm(z, axis=0) + 1e-300
+        matrix = (z / scale).T @ (d / scale)
+        move = np.linalg.lstsq(matrix, (z / scale).T @ rest, rcond=1e-10)[0] / scale
+        logs = np.clip(logs + np.clip(move, -0.3, 0.3) * (1.0 if turn < 20 else 0.5), low, high)
+        inverse = np.linalg.pinv(matrix) / scale[:, None]
+        covariance = inverse @ _moment_covariance(z / scale, rest, data.step) @ inverse.T
+        settled = bool(np.abs(move).max() < 1e-3)
+        if np.abs(move).max() < 1e-4:
+            break
+    rest = miss(logs)
+    white = _autoregression(rest, data.step)
+    power = float(np.var(np.asarray(lfilter(white, [1.0], rest))[len(white) :]))
+    size = len(rest)
+    criterion = size * math.log(max(power, 1e-300)) + len(logs) * math.log(size)
+    return _Fit(kind, names, sign, logs, covariance, noise, criterion, settled)
+
+
+def _moment_covariance(z: np.ndarray, rest: np.ndarray, step: float) -> np.ndarray:
+    """Covariance of `z^T rest` by blocks: the remnant grows and shrinks with the error."""
+    length = round(_BLOCK / step)
+    blocks = len(rest) // length
+    used = blocks * length
+    products = (z[:used] * rest[:used, None]).reshape(blocks, length, -1).sum(axis=1)
+    return len(rest) / used * blocks / (blocks - 1) * products.T @ products
+
+
+def _slope_of(
+    data: _Data, kind: str, logs: np.ndarray, k: int, values: np.ndarray
+) -> np.ndarray:  # fmt: skip
+    return _filter(values, data.step, lambda s: _slopes(kind, logs, s)[k])
+
+
+def _finished(
+    fit: _Fit, data: _Data, signals: Mapping[str, np.ndarray], record: TrackingRecord,
+    notes: list[str],
+) -> OperatorFit:  # fmt: skip
+    """Estimates with intervals, remnant, and where the loop crosses over."""
+    errors = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    estimates: dict[str, Estimate] = {}
+    for name, log, error in zip(fit.names, fit.logs, errors, strict=True):
+        at_bound = min(abs(log - math.log(b)) for b in _BOUNDS[name]) < 1e-3
+        estimates[name] = _estimate(log, error, _UNITS.get(name, "hand per error"), not at_bound)
+        if at_bound or error > _CERTAIN:
+            notes.append(f"{name} cannot be told from this record")
+    estimates["remnant"] = _remnant(fit, data, errors[0])
+    if fit.sign < 0.0:
+        notes.append("the hand's sign is turned round: a positive error moves it the negative way")
+    first = round(_SETTLES / data.step)
+    hand = fit.sign * data.hand[first:]
+    rest = hand - _predicted(data, fit.kind, fit.logs, data.from_target)[first:]
+    explained = 1.0 - float(np.var(rest) / np.var(hand))
+    if explained < 0.3:
+        notes.append(f"only {100 * explained:.0f} % of the hand's motion come from the target")
+    w = np.geomspace(0.1, 30.0, 600)
+    element = _close(fit, data, signals, w, estimates, notes)
+    return OperatorFit(
+        fit.kind, estimates, element, explained, 1.0 / data.step,
+        float(record.time[-1] - record.time[0]), tuple(dict.fromkeys(notes)), w,
+        _response(fit.kind, fit.logs, 1j * w),
+    )  # fmt: skip
+
+
+def _estimate(log: float, error: float, unit: str, inside: bool = True) -> Estimate:
+    reach = min(_QUANTILE * error, 20.0)
+    low, high = math.exp(log - reach), math.exp(log + reach)
+    return Estimate(math.exp(log), low, high, unit, bool(inside and error <= _CERTAIN))
+
+
+def _remnant(fit: _Fit, data: _Data, gain_error: float) -> Estimate:
+    """Power density of the observation noise over pi times the variance of what is observed."""
+    from scipy.signal import welch
+
+    length = min(len(fit.noise), round(15.0 / data.step))
+    f, density = welch(fit.noise, 1.0 / data.step, nperseg=length, detrend="linear")
+    w = 2.0 * np.pi * f
+    p = dict(zip(fit.names, np.exp(fit.logs), strict=True))
+    band = (w >= 1.0) & (w <= min(8.0, 0.8 * p["neuromuscular_frequency"]))
+    s = 1j * w[band]
+    bare = np.abs(_response(fit.kind, fit.logs, s)) * np.abs(_highpass(s))
+    first = round(_SETTLES / data.step)
+    seen = data.error[first:]
+    power = np.full(len(s), float(np.var(seen)))
+    if fit.kind == "lead":  # error and rate are both observed
+        lead = p["time_constant"]
+        rate = float(np.var(np.gradient(seen, data.step)))
+        power = (power + lead**2 * rate) / (1.0 + (lead * w[band]) ** 2)
+    share = density[band] / 2.0 / bare**2 / (np.pi * power)  # two-sided
+    count = max(1.0, 1.8 * len(fit.noise) / length * band.sum() * 0.6)
+    error = math.hypot(math.sqrt(1.0 / count), 2.0 * gain_error)
+    return _estimate(math.log(float(share.mean())), error, "1")
+
+
+def _close(
+    fit: _Fit, data: _Data, signals: Mapping[str, np.ndarray], w: np.ndarray,
+    estimates: dict[str, Estimate], notes: list[str],
+) -> str:  # fmt: skip
+    """Controlled element; crossover frequency and margins of the open loop with intervals."""
+    first, hand = round(_SETTLES / data.step), signals["hand"]
+    best = (math.inf, 0, 1.0, 0.0)
+
+    def apart(s: np.ndarray) -> np.ndarray:
+        return (s / (s + 1.0)) ** 2
+
+    output = _filter(signals["response"], data.step, apart)[first:]
+    for form in range(len(FORMS)):
+        for late in np.arange(0.0, 0.61, 0.02):
+
+            def made(s: np.ndarray, form=form, late=late) -> np.ndarray:
+                return s ** (2 - form) / (s + 1.0) ** 2 * np.exp(-late * s)
+
+            effect = _filter(hand, data.step, made)[first:]
+            gain = float(effect @ output / max(effect @ effect, 1e-300))
+            rest = float(np.sum((output - gain * effect) ** 2) / np.sum(output**2))
+            best = min(best, (rest, form, gain, float(late)))
+    rest, form, gain, late = best
+    if rest > 0.2:
+        notes.append("the controlled element is none of K, K/s and K/s^2: no crossover is given")
+        return ""
+    rng = np.random.default_rng(1967)
+    draws = rng.multivariate_normal(fit.logs, fit.covariance, _DRAWS, check_valid="ignore")
+    low, high = (np.log([_BOUNDS[n][side] for n in fit.names]) for side in (0, 1))
+    draws = np.clip(draws, low, high)
+    s = 1j * w
+    element = abs(gain) * np.exp(-late * s) / s**form
+    found = [_margins(w, _response(fit.kind, x, s) * element, form) for x in (fit.logs, *draws)]
+    for k, name in enumerate(("crossover", "phase_margin", "gain_margin")):
+        values = np.array([one[k] for one in found[1:]])
+        values = values[np.isfinite(values)]
+        if not math.isfinite(found[0][k]) or len(values) < _DRAWS // 2:
+            continue
+        low, high = np.percentile(values, [2.5, 97.5])
+        low, high = min(low, found[0][k]), max(high, found[0][k])
+        known = bool(low > 0.0 and high / low < math.exp(2.0 * _QUANTILE * _CERTAIN))
+        estimates[name] = Estimate(found[0][k], float(low), float(high), _UNITS[name], known)
+    return FORMS[form]
+
+
+def _margins(w: np.ndarray, loop: np.ndarray, form: int) -> tuple[float, float, float]:
+    """Crossover frequency, phase margin, and gain where the phase is -180 degrees."""
+    size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
+    phase -= 2.0 * math.pi * round((phase[0] + math.pi * (1.0 if form == 2 else 0.5)) / math.tau)
+    falls = np.flatnonzero((size[:-1] >= 0.0) & (size[1:] < 0.0))
+    turns = np.flatnonzero((phase[:-1] >= -math.pi) & (phase[1:] < -math.pi))
+    crossover = margin = math.nan
+    if len(falls):
+        k = falls[0]
+        share = size[k] / (size[k] - size[k + 1])
+        crossover = float(w[k] * (w[k + 1] / w[k]) ** share)
+        margin = float(math.pi + phase[k] + share * (phase[k + 1] - phase[k]))
+    beyond = float(math.exp(size[turns[-1]])) if len(turns) else math.nan
+    return crossover, margin, beyond
+
+
+def operator_file_of(fit: OperatorFit, name: str, source: str) -> str:
+    """The fit as a file of operator parameters, for `perception: {file: ...}` of a scenario.
+
+    Only what the record tells is in it; the rest stays that of the shipped file.
+
+    Args:
+        fit: of `identify_operator`.
+        name: of the operator.
+        source: of the record.
+
+    Returns:
+        The YAML text.
+
+    Raises:
+        InputError: the record tells none of the parameters.
+    """
+    usual = load_operator_file().parameters
+    lead = usual["lead_delay"].value if fit.equalisation == "lead" else 0.0
+    known = {"visual_delay": "delay", "neuromuscular_frequency": "neuromuscular_frequency",
+             "neuromuscular_damping": "neuromuscular_damping", "remnant": "remnant",
+             "tracking_margin": "phase_margin", "gain_margin": "gain_margin"}  # fmt: skip
+    parameters = {}
+    for key, found in known.items():
+        one = fit.estimates.get(found)
+        if one is None or not one.identified:
+            continue
+        off = lead if key == "visual_delay" else 0.0
+        value, low, high = (max(0.0, x - off) for x in (one.value, one.low, one.high))
+        if key == "gain_margin" and not 0.0 < value < 1.0:
+            continue
+        parameters[key] = {
+            "value": round(value, 5), "low": round(low, 5), "high": round(high, 5),
+            "unit": one.unit, "basis": "identified", "source": source,
+        }  # fmt: skip
+    if not parameters:
+        raise InputError(source, "tells none of the operator's parameters: record longer")
+    document = {"name": name, "description": f"identified from {source}", "parameters": parameters}
+    return yaml.safe_dump(document, sort_keys=False)

@@ -1,0 +1,194 @@
+"""Psychophysical experiments with the simulated operator: how well he tells springs and forces.
+
+Method of constant stimuli, two intervals: on every trial the handle is a reference and a comparison
+in either order; he moves each to a displacement that roves from trial to trial, so that neither
+terminal force nor work tells him, holds it, and says which was stiffer (or stronger). A cumulative
+normal through his answers gives the just noticeable difference. His muscles, tremor and perception
+are those of the runs; the experiment knows only his answers.
+
+Source: Tan et al. 1995, Perception & Psychophysics 57 (roving displacement).
+"""
+
+import math
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from hydrotele.core.compiled import compiled
+from hydrotele.machine.joystick import HandFacts
+from hydrotele.teleop.axis_table import flattened
+from hydrotele.teleop.haptic_perception import Feeling, feeling, felt_stiffness
+from hydrotele.teleop.manual_control import neuromuscular_matrix
+from hydrotele.teleop.operator_model import REFLEX, Muscles, pull
+from hydrotele.teleop.operator_parameters import Operator
+
+_LEVELS = {
+    "stiffness": (-0.6, -0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45, 0.6),
+    "force": (-0.2, -0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2),
+}
+ROVING = (2.0e-3, 4.5e-3)  # m, displacements of the handle
+_PERIOD, _FINE = 0.005, 10  # s of the control, steps of the handle in it
+_MASS, _DAMPING = 0.85, 60.0  # kg, N s/m of the joystick's handle
+_DECISION = 0.02  # s
+
+Sense = Literal["stiffness", "force"]
+
+
+class Discrimination(NamedTuple):
+    """A psychometric function.
+
+    Attributes:
+        levels: (n,) comparison over reference, less 1.
+        greater: (n,) share of the trials in which the comparison was said to be greater.
+        trials: of every level.
+        jnd: difference that one interval tells with d' = 1, as a share of the reference.
+        error: standard error of the same.
+        bias: level that is felt like the reference.
+    """
+
+    levels: np.ndarray
+    greater: np.ndarray
+    trials: int
+    jnd: float
+    error: float
+    bias: float
+
+
+@compiled
+def _explore(muscles, past, tremor, spring, load, first, felt):
+    """Handle with `spring` and `load` for len(felt) periods; force and place there are written."""
+    mass, x, v = _MASS + muscles.weight[0], 0.0, 0.0
+    step = _PERIOD / _FINE
+    handle = np.zeros(6)
+    for k in range(len(felt)):
+        handle[0] = x
+        before = v
+        pull(muscles, past, tremor, handle, first + k, _PERIOD)
+        for _ in range(_FINE):
+            push = muscles.force[0] - muscles.weight[0] - muscles.arm[0] * x
+            push -= (_DAMPING + muscles.weight[1]) * v + spring * x + load
+            v += step * push / mass
+            x += step * v
+        felt[k, 0] = spring * x + load + _DAMPING * v + _MASS * (v - before) / _PERIOD
+        felt[k, 1] = x
+
+
+def _arm(him: Operator, hand: HandFacts, expected: float) -> Muscles:
+    """His arm on axis 0 of a handle whose stiffness he expects to be so large [N/m]."""
+    zero = np.zeros(6)
+    return flattened(Muscles(
+        wanted=zero, spring=zero + expected, notch=np.full((3, 6), -1.0), correction=zero,
+        force=zero, arm=zero + hand.stiffness, most=zero + him.largest_force,
+        weight=np.array([hand.mass, hand.damping, 0.0, 0.0, 0.0, 0.0]),
+        gain=np.array([him.muscle]), rest=zero, rate=zero,
+        lag=neuromuscular_matrix(him.neuromuscular_frequency, 1.0, _PERIOD),
+    ))  # fmt: skip
+
+
+def discriminate(
+    him: Operator, hand: HandFacts, sense: Sense = "stiffness", reference: float = 1000.0,
+    trials: int = 40, seed: int = 0,
+) -> Discrimination:  # fmt: skip
+    """Just noticeable difference of an operator.
+
+    Args:
+        him: the operator.
+        hand: his hand on the handle.
+        sense: what he compares: the handle's stiffness, or a constant force against him.
+        reference: of it [N/m] or [N].
+        trials: of every level.
+        seed: of the trials.
+
+    Returns:
+        The psychometric function.
+    """
+    rng = np.random.default_rng([seed, 1995])
+    ticks = round(him.dwell / _PERIOD)
+    tremor = him.tremor * _shaking(rng, 2**12)
+    every, levels = round(_DECISION / _PERIOD), np.array(_LEVELS[sense])
+    decisions = ticks // every
+
+    def feels(value: float) -> float:
+        errors = feeling(him, rng, decisions, _DECISION)
+        spring, load = (value, 0.0) if sense == "stiffness" else (0.0, value)
+        muscles = _arm(him, hand, reference if sense == "stiffness" else 0.0)
+        muscles.wanted[0] = rng.uniform(*ROVING)
+        past, handle = np.zeros((1 + round(REFLEX / _PERIOD), 6)), np.zeros((ticks, 2))
+        _explore(muscles, past, tremor, spring, load, int(rng.integers(2**11)), handle)
+        return _judged(handle[::every], errors, sense)
+
+    greater = np.zeros(len(levels))
+    for k, level in enumerate(levels):
+        for _ in range(trials):
+            pair = [reference, reference * (1.0 + level)]
+            if swapped := rng.random() < 0.5:
+                pair.reverse()
+            felt = [feels(value) for value in pair]
+            greater[k] += (felt[0] > felt[1]) == swapped
+    bias, spread, error = fit_psychometric(levels, greater, trials)
+    root = math.sqrt(2.0)  # both intervals scatter
+    return Discrimination(levels, greater / trials, trials, spread / root, error / root, bias)
+
+
+def _judged(handle: np.ndarray, errors: Feeling, sense: Sense) -> float:
+    """What he feels in the late half of the exploration, by the decisions of a run."""
+    felt = []
+    for number in range(len(errors.force) // 2, len(errors.force)):
+        force, x = (float(value) for value in handle[number])
+        if sense == "stiffness":
+            felt.append(felt_stiffness(force, x, errors, number))
+        else:
+            felt.append(force * errors.force[number])
+    return float(np.mean(felt))
+
+
+def _shaking(rng: np.random.Generator, count: int) -> np.ndarray:
+    from scipy.signal import lfilter
+
+    share = 1.0 - math.exp(-2.0 * math.pi * 8.0 * _PERIOD)
+    white = rng.standard_normal((count, 6)) * math.sqrt((2.0 - share) / share)
+    return np.asarray(lfilter([share], [1.0, share - 1.0], white, axis=0))
+
+
+def fit_psychometric(
+    levels: np.ndarray, greater: np.ndarray, trials: int, lapse: float = 0.01
+) -> tuple[float, float, float]:  # fmt: skip
+    """Cumulative normal through the answers, by maximum likelihood.
+
+    Args:
+        levels: (n,) of the comparison.
+        greater: (n,) number of trials in which it was said to be greater.
+        trials: of every level.
+        lapse: share of answers by mistake.
+
+    Returns:
+        Mean, standard deviation, and standard error of the deviation.
+    """
+    from scipy.optimize import minimize
+    from scipy.special import ndtr
+
+    def share(x: np.ndarray) -> np.ndarray:
+        return lapse + (1.0 - 2.0 * lapse) * ndtr((levels - x[0]) / math.exp(x[1]))
+
+    def likelihood(x: np.ndarray) -> float:
+        p = share(x)
+        return -float(np.sum(greater * np.log(p) + (trials - greater) * np.log(1.0 - p)))
+
+    found = minimize(
+        likelihood, np.array([0.0, math.log(0.3 * np.ptp(levels))]), method="Nelder-Mead"
+    ).x
+    step = 1e-3
+    slopes = [_slope(share, found, k, step) for k in range(2)]
+    p = share(found)
+    information = np.array([
+        [np.sum(trials * a * b / (p * (1.0 - p))) for a in slopes] for b in slopes
+    ])  # fmt: skip
+    spread = math.exp(found[1])
+    return float(found[0]), spread, spread * math.sqrt(np.linalg.pinv(information)[1, 1])
+
+
+def _slope(share: Callable, x: np.ndarray, k: int, step: float) -> np.ndarray:
+    moved = np.zeros(2)
+    moved[k] = step
+    return (share(x + moved) - share(x - moved)) / (2.0 * step)
