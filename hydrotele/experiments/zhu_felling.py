@@ -23,7 +23,7 @@ from hydrotele.teleop.master import tipping_share
 _JND = 0.23  # of a compliance: what a hand tells apart without other cues; Tan 1995
 _RAPIDLY = 1.0  # s, from 10 to 90 % of the first force; Fig. 6.55 shows nine seconds
 _HIT = 2.0  # s after the contact
-_NEVER = 1.0e9  # s
+_NEVER = np.inf  # s
 
 
 def tree(seed: int, changes: Changes) -> Sample:

@@ -117,7 +117,9 @@ def direct(ratio: float, seed: int, changes: Changes) -> Sample:
         "pilot.ratio": str(ratio), "pilot.operator.target.force": f"[{_TASK}]"
     } | drawn(seed) | _UNFILTERED | dict(changes)  # fmt: skip
     scenario, run = perform("press_direct", keys)
-    return Sample(_figures(run, scenario.duration), _panels(scenario, run))
+    assert isinstance(scenario.pilot, TeleopPilot)
+    values = {"ratio": scenario.pilot.ratio} | _figures(run, scenario.duration)
+    return Sample(values, _panels(scenario, run))
 
 
 def _held_verdict(samples: Sequence[Sample]) -> Verdict:
@@ -127,14 +129,25 @@ def _held_verdict(samples: Sequence[Sample]) -> Verdict:
         f" 35; largest error {100 * worst:.0f} %, of the true force"
         f" {100 * largest(samples, 'truly'):.0f} %"
     )
-    why = f"reasonably good: within the {100 * _JND:.0f} % of compliance that a hand tells apart"
-    return Verdict(worst < _JND, told, f"{why} (Tan 1995), a limit of ours")
+    within = sum(sample.values["worst"] < _JND for sample in samples)
+    why = (
+        f"reasonably good: within the {100 * _JND:.0f} % of compliance that a hand tells apart (Tan"
+        f" 1995), a limit of ours; {within} of {len(samples)} operators are within it"
+    )
+    if worst >= _JND:
+        why += (
+            ". A stiffness felt wrongly by that share, K_nom with it, is a force wrong by 33 % at"
+            " 20 kN and 29 % at 35 kN (4.1, Tables 6.7 and 6.8); the operator of the thesis had"
+            " learnt the feel with the force on a screen, ours knows K_nom and K_r only"
+        )
+    return Verdict(worst < _JND, told, why)
 
 
 def _targets_verdict(samples: Sequence[Sample]) -> Verdict:
     verdict = _held_verdict(samples)
-    ok = largest(samples, "worst") < 0.1
-    return Verdict(ok, verdict.simulated, "ours: within 10 %; the text of the thesis has no target")
+    within = sum(sample.values["worst"] < 0.1 for sample in samples)
+    why = f"{within} of {len(samples)} operators; see the row of the same force above"
+    return Verdict(within == len(samples), verdict.simulated, why)
 
 
 def _proportional_verdict(samples: Sequence[Sample]) -> Verdict:
@@ -154,7 +167,8 @@ def _point_verdict(samples: Sequence[Sample]) -> Verdict:
     hand = mean(samples, "hand")
     ok = steady and small and abs(hand / -_PUBLISHED - 1.0) < 0.1
     told = (
-        f"at {_RATIO:.1e} N/N {hand:.1f} N hold against {spread(samples, 'held', 1e-3)} kN,"
+        f"at {samples[0].values['ratio']:.1e} N/N {hand:.1f} N hold against"
+        f" {spread(samples, 'held', 1e-3)} kN,"
         f" {spread(samples, 'place', 1e3)} mm from the centre, ripple"
         f" {spread(samples, 'ripple', 100.0, 0)} %"
     )
@@ -169,10 +183,10 @@ def _point_verdict(samples: Sequence[Sample]) -> Verdict:
 _SOFT = "[{kind: plate, position: [6.0, -0.11, 0.3], size: [0.8, 0.9], stiffness: 3.0e+5, damping: 3.0e+4}]"  # noqa: E501
 _HARD = "[{kind: plate, position: [6.0, -0.11, 0.3], size: [0.8, 0.9], stiffness: 3.0e+6, damping: 9.0e+4}]"  # noqa: E501
 CONDITIONS: tuple[tuple[str, Changes, dict[str, float]], ...] = (
-    ("as it stands (force late by 0.09 s, 1 MN/m, 0.3 m/s at the stop, 200 Hz)", {}, {}),
+    ("as it stands (force late by 0.10 s, 1 MN/m, 0.3 m/s at the stop, 200 Hz)", {}, {}),
     ("force without lag, as only a simulation knows it", {"pilot.force": "'true'"}, {}),
-    ("force late by 0.29 s (1.5 Hz)", {"pilot.bandwidth_hz": "1.5"}, {}),
-    ("force late by 0.6 s (0.7 Hz)", {"pilot.bandwidth_hz": "0.7"}, {}),
+    ("force late by 0.32 s (1.5 Hz)", {"pilot.bandwidth_hz": "1.5"}, {}),
+    ("force late by 0.68 s (0.7 Hz)", {"pilot.bandwidth_hz": "0.7"}, {}),
     ("line late by 0.1 s each way",
      {"pilot.channel": "{delay_forward: 0.1, delay_back: 0.1}"}, {}),
     ("ground of 0.3 MN/m", {"surroundings": _SOFT}, {}),
@@ -260,9 +274,9 @@ def _force(limit: float) -> str:
 
 
 def _unstable_verdict(samples: Sequence[Sample]) -> Verdict:
-    ripple = least(samples, "ripple")
+    ripple, ratio = least(samples, "ripple"), samples[0].values["ratio"]
     told = (
-        f"at 4.0e-4 N/N, 20 N for 50 kN, the machine bounces: ripple"
+        f"at {ratio:.1e} N/N, {5e4 * ratio:.0f} N for 50 kN: ripple"
         f" {spread(samples, 'ripple', 100.0, 0)} % of the mean, handle up to"
         f" {spread(samples, 'farthest', 1e3)} mm"
     )

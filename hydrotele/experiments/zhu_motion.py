@@ -162,6 +162,14 @@ def _steering_verdict(samples: Sequence[Sample]) -> Verdict:
         f" {spread(samples, f'{key}_swings', 1.0, 0)} reversals"
         for name, key in (("rate", "rate"), ("position", "position"))
     ]
+    calm = sum(
+        s.values["rate_over"] < _SMOOTH and s.values["rate_swings"] < _SWINGS for s in samples
+    )
+    restless = sum(s.values["position_swings"] >= _SWINGS for s in samples)
+    told.append(
+        f"smooth under rate control: {calm} of {len(samples)} operators, swinging under position"
+        f" control: {restless}"
+    )
     few = [sample for sample in samples if "calm_swings" in sample.values]
 
     def case(key: str) -> str:

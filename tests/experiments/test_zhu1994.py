@@ -1,4 +1,4 @@
-"""Zhu's experiments: quotations are verbatim, criteria can fail, a `no` is told and is no success."""
+"""Zhu's experiments: quotations are verbatim, criteria can fail, a `no` is no success."""
 
 import json
 import re
@@ -83,14 +83,14 @@ def test_a_force_of_no_effect_is_no_improvement():
 
 def test_one_bad_repetition_is_enough():
     claim = CLAIMS["direct feedback: held with 4.5 N"]
-    good = {"ripple": 0.05, "place": 5e-4, "hand": -4.5, "held": 2.4e4}
+    good = {"ripple": 0.05, "place": 5e-4, "hand": -4.5, "held": 2.4e4, "ratio": 1.8e-4}
     assert claim.finding([Sample(good)] * 3).ok
     assert not claim.finding([Sample(good), Sample(good | {"ripple": 0.9})]).ok
 
 
 def test_a_row_tells_whose_statement_it_is():
-    found = [Finding("a", "p. 1", "as is", "so", True, basis="document"),
-             Finding("b", "beyond p. 1", "as ours", "so", False, basis="ours", explanation="why")]  # fmt: skip
+    ours = Finding("b", "beyond p. 1", "as ours", "so", False, basis="ours", explanation="why")
+    found = [Finding("a", "p. 1", "as is", "so", True, basis="document"), ours]
     assert set(found[0].row()) == COLUMNS
     assert tally(found) == "1 of 1 as published; beyond the document 0 of 1 hold"
     lines = experimenting.markdown_table(found).splitlines()
