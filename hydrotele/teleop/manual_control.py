@@ -12,6 +12,7 @@ Source: McRuer and Jex 1967, IEEE Trans. Human Factors in Electronics 8; Levison
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -411,27 +412,29 @@ class Crossover(NamedTuple):
 
 
 def describing_function(
-    record: TrackingRecord, frequencies: np.ndarray, skip: float = 0.0
+    records: Sequence[TrackingRecord], frequencies: np.ndarray, skip: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Describing functions at the frequencies of a sum of sines, measured from a record.
+    """Describing functions at the frequencies of a sum of sines, measured from records.
 
     Args:
-        record: with a target of these frequencies.
+        records: with targets of these frequencies, of one length.
         frequencies: (m,) [rad/s], whole multiples of one over the record's length after `skip`.
         skip: time at the beginning that is left out [s].
 
     Returns:
         (m,) complex response per error (Yp Yc) and hand per error (Yp).
 
-    Source: McRuer et al. 1965, AFFDL-TR-65-15: ratio of Fourier coefficients.
+    Source: McRuer et al. 1965, AFFDL-TR-65-15: ratio of cross spectra with the target.
     """
-    kept = record.time >= skip - 1e-9
-    time = record.time[kept]
-    basis = np.exp(-1j * np.outer(frequencies, time))
-    target, response, hand = (
-        basis @ values[kept] for values in (record.target, record.response, record.hand)
-    )
-    return response / (target - response), hand / (target - response)
+    error, output, acted = np.zeros((3, len(frequencies)), complex)
+    for record in records:
+        kept = record.time >= skip - 1e-9
+        basis = np.exp(-1j * np.outer(frequencies, record.time[kept]))
+        target, response, hand = (basis @ values[kept] for values in record[1:])
+        error += (target - response) * target.conj()
+        output += response * target.conj()
+        acted += hand * target.conj()
+    return output / error, acted / error
 
 
 def crossover_of(frequencies: np.ndarray, open_loop: np.ndarray) -> Crossover:
