@@ -8,7 +8,7 @@ from hydrotele.cli.console import notes, out, print_json, stages
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.experiments.abdellatif2008 import abdellatif2008
-from hydrotele.experiments.finding import Finding
+from hydrotele.experiments.finding import Finding, tally
 from hydrotele.experiments.khoshzaban1992 import khoshzaban1992
 from hydrotele.experiments.wang2012 import wang2012
 from hydrotele.experiments.zhu1994 import zhu1994
@@ -64,7 +64,7 @@ def _write(folder: Path, name: str, seeds: int, findings: list[Finding]) -> None
     from hydrotele.show.experiment_report import write_experiment_report
 
     notes.print("writing report.html ...", style="dim")
-    rows = [finding.row() | {"source": finding.source} for finding in findings]
+    rows = [finding.row() for finding in findings]
     text = json.dumps(rows, indent=2, allow_nan=False)
     (folder / "experiments.json").write_text(text + "\n", encoding="utf-8")
     write_experiment_report(name, findings, folder / "report.html")
@@ -75,11 +75,26 @@ def _write(folder: Path, name: str, seeds: int, findings: list[Finding]) -> None
 
 
 def markdown_table(findings: list[Finding]) -> str:
-    """The findings as a Markdown table."""
+    """The findings as a Markdown table, with whose statement each is where that is told."""
+    if any(one.basis for one in findings):
+        return _long_table(findings)
     lines = ["| experiment | published | simulated | same |", "| --- | --- | --- | --- |"]
     for one in findings:
         name = f"{one.name} ({one.source})"
         lines.append(f"| {name} | {one.published} | {one.simulated} | {_word(one)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _long_table(findings: list[Finding]) -> str:
+    lines = [
+        "| experiment | where | whose | stated | simulated | same | explanation |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for one in findings:
+        stated = f'"{one.published}"' if one.basis == "document" else one.published
+        cells = (one.name, one.source, one.basis, stated, one.simulated, _word(one),
+                 one.explanation)  # fmt: skip
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -91,7 +106,10 @@ def _print(findings: list[Finding]) -> None:
     for one in findings:
         mark = "[green]same[/]" if one.ok else "[red]differs[/]"
         out.print(f"{mark} [bold]{one.name}[/] ({one.source})")
-        out.print(f"  published: {one.published}")
-        out.print(f"  simulated: {one.simulated}")
-    same = sum(one.ok for one in findings)
-    out.print(f"{same} of {len(findings)} as published")
+        out.print(
+            f"  {'ours' if one.basis == 'ours' else 'published'}: {one.published}", markup=False
+        )
+        out.print(f"  simulated: {one.simulated}", markup=False)
+        if one.explanation:
+            out.print(f"  explanation: {one.explanation}", markup=False)
+    out.print(tally(findings))

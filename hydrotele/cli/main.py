@@ -664,10 +664,15 @@ def experiments(
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
     json: Json = False,
 ) -> None:
-    """Repeat published experiments in simulation, beside what was published."""
+    """Repeat published experiments in simulation, beside what was published.
+
+    The exit status is 1 where a row says no.
+    """
     from hydrotele.cli.experimenting import experiments_to_folder
 
-    experiments_to_folder(name, out, seeds, jobs, json)
+    findings = experiments_to_folder(name, out, seeds, jobs, json)
+    if not all(finding.ok for finding in findings):
+        raise typer.Exit(1)
 
 
 @app.command(

@@ -57,6 +57,9 @@ class Finding(NamedTuple):
         ok: whether that is the same.
         panels: curves to look at.
         marginals: a posterior to look at.
+        basis: `document` where the source states it, `ours` where it goes beyond the source; empty
+            where the series does not tell them apart.
+        explanation: why it differs, or what the agreement hangs on.
     """
 
     name: str
@@ -66,11 +69,30 @@ class Finding(NamedTuple):
     ok: bool
     panels: tuple[Panel, ...] = ()
     marginals: Marginals | None = None
+    basis: str = ""
+    explanation: str = ""
 
     def row(self) -> dict[str, str | bool]:
-        """Name, published, simulated and ok, as `--json` prints them."""
-        return {"name": self.name, "published": self.published, "simulated": self.simulated,
-                "ok": bool(self.ok)}  # fmt: skip
+        """One row as `--json` prints it; `ours_or_document` is empty where it is not told."""
+        return {
+            "name": self.name, "published": self.published, "where": self.source,
+            "ours_or_document": self.basis, "simulated": self.simulated, "ok": bool(self.ok),
+            "explanation": self.explanation,
+        }  # fmt: skip
+
+
+def tally(findings: Sequence[Finding]) -> str:
+    """How many findings agree, those of the document and ours apart, as a sentence.
+
+    >>> tally([Finding("a", "p. 1", "", "", True), Finding("b", "p. 2", "", "", False)])
+    '1 of 2 as published'
+    """
+    ours = [one for one in findings if one.basis == "ours"]
+    published = [one for one in findings if one.basis != "ours"]
+    words = f"{sum(one.ok for one in published)} of {len(published)} as published"
+    if ours:
+        words += f"; beyond the document {sum(one.ok for one in ours)} of {len(ours)} hold"
+    return words
 
 
 def perform(name: str, overrides: Mapping[str, str] | None = None) -> tuple[Scenario, Run]:

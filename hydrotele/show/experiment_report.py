@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hydrotele
-from hydrotele.experiments.finding import Finding, Panel
+from hydrotele.experiments.finding import Finding, Panel, tally
 from hydrotele.show import report_html
 from hydrotele.show.calibration_figures import corner
 from hydrotele.show.report_html import drawing, png
@@ -23,7 +23,7 @@ def write_experiment_report(name: str, findings: Sequence[Finding], path: Path) 
     """
     report_html.write_report(
         "experiments", path, title=f"experiments {name}", version=hydrotele.__version__, name=name,
-        same=sum(one.ok for one in findings), findings=findings,
+        tally=tally(findings), findings=findings,
         curves=[(one, draw_panels(one.panels)) for one in findings if one.panels],
         posteriors=[(one, _corner(one)) for one in findings if one.marginals],
     )  # fmt: skip
