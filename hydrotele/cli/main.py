@@ -15,7 +15,6 @@ import os
 import signal
 import sys
 import warnings
-from json import dumps as json_text
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +22,7 @@ import typer
 
 from hydrotele.cli.calibrating import app as calibrate_app
 from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
+from hydrotele.cli.option_values import chosen, numbers_of, overrides_of
 from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
@@ -300,8 +300,6 @@ def run(
 ) -> None:
     """Simulate a scenario; write both logs, the rerun recording, the summary and the MJCF."""
     from hydrotele.cli.running import run_to_folder
-
-    pass
 
     run_to_folder(scenario, out, overrides_of(set_ or []) | chosen(machine, tool), review, json)
 
@@ -743,49 +741,3 @@ def _run() -> None:
             raise
         typer.echo(f"simulation failed: {error}", err=True)
         sys.exit(3)
-
-
-def overrides_of(items: list[str]) -> dict[str, str]:
-    """Key path -> YAML text of every `key=value`.
-
-    Raises:
-        InputError: it is none.
-    """
-    pairs = {}
-    for item in items:
-        key, sign, value = item.partition("=")
-        if not sign or not key:
-            raise InputError(f"--set {item}", "must be key=value, for example servo.lead=0.04")
-        pairs[key] = value
-    return pairs
-
-
-def chosen(machine: str | None, tool: str | None) -> dict[str, str]:
-    """Overrides of a scenario's machine; a path counts from here, not from the scenario's file."""
-    from hydrotele.machine.machine_file import shipped_machines
-
-    pairs = {}
-    if machine is not None:
-        named = machine in shipped_machines()
-        pairs["machine"] = json_text(machine if named else str(Path(machine).resolve()))
-    if tool is not None:
-        pairs["tool"] = json_text(tool)
-    return pairs
-
-
-def numbers_of(option: str, text: str) -> list[float]:
-    """Positive numbers of an option, separated by commas.
-
-    Raises:
-        InputError: there is none, or one is no positive number.
-
-    >>> numbers_of("--horizons", "1, 5,30")
-    [1.0, 5.0, 30.0]
-    """
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        numbers = []
-    if not numbers or not all(0.0 < number < float("inf") for number in numbers):
-        raise InputError(f"{option} {text}", "must be positive numbers, for example 1,5,30")
-    return numbers

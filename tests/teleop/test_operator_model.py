@@ -47,7 +47,9 @@ def test_he_acts_on_what_he_saw_a_reaction_time_ago(mode):
         views = Views()
         views.values["measured"][:, 0, 2] = 0.6
         views.values["measured"][200:, 0, 2] += jump
-        him, _ = person(STEER, views=views, mode=mode, perception={"visual_delay": 0.25, "remnant": 0.0})
+        him, _ = person(
+            STEER, views=views, mode=mode, perception={"visual_delay": 0.25, "remnant": 0.0}
+        )
         wanted.append([])
         for tick in range(0, TICKS, him.every):
             him.decide(tick)
