@@ -42,7 +42,7 @@ from hydrotele.gap.result import (
     Prediction,
     Verdict,
 )
-from hydrotele.gap.rivals import effect_probabilities
+from hydrotele.gap.rivals import TOLD, effect_probabilities
 from hydrotele.gap.search import Found, lacking, search
 from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
@@ -64,7 +64,7 @@ _MINOR = 0.02  # share of the gap up to which something is a detail; laws are ra
 # machine than 15 % of what they do
 _TRACE_OF_FORM = 0.005  # share up to which an effect only mends the form of one beside it
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
-_SAME_READINGS = 1.0  # squares, in standard deviations: less than chance makes of one reading
+_ALIKE = 1.0e-4  # of the squares of what an effect changes: readings that are alike to 1 %
 _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
 _OFF = 0.05  # by which noise must differ from the stated to be noted
@@ -373,10 +373,11 @@ def _chances(found: Found, index: int, rest: Judged) -> tuple[float, tuple[Alter
     """Probability of an effect against its rivals and against none, and those of the rivals."""
     rivals = [r for r in found.rivals[index] if np.isfinite(r.judged.loss)]
     table = effect_probabilities(found.judged, found.charges[index], rest, rivals)
+    alike = min(TOLD, _ALIKE * apart(found.judged, rest))
     others = [
         Alternative(
             r.hypothesis.name, r.hypothesis.location, float(chance),
-            apart(found.judged, r.judged) < _SAME_READINGS,
+            apart(found.judged, r.judged) < alike,
         )
         for r, chance in zip(rivals, table[2:], strict=True) if chance >= _WORTH_TELLING
     ]  # fmt: skip

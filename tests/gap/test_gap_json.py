@@ -37,7 +37,9 @@ def test_an_effect_in_full(gap_of):
         "mechanism_probability": 0.62,
         "share": None,
         "parameters": {"offset": {"value": -0.0061, "unit": "m", "ci95": [-0.0066, -0.0056]}},
-        "alternatives": [{"name": "pin_offset", "location": "boom", "probability": 0.37}],
+        "alternatives": [
+            {"name": "pin_offset", "location": "boom", "probability": 0.37, "same": False}
+        ],
     }
 
 

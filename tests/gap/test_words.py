@@ -63,6 +63,9 @@ def test_a_mechanism_of_open_form_is_named_with_both_forms(gap_of):
         "length_offset", "boom", 0.61, {}, (Alternative("pin_offset", "boom", 0.3),)
     )
     assert unlike.other_forms == () and unlike.mechanism_probability == 0.61
+    same = Alternative("com_offset", "swing", 0.54, same=True)  # about a vertical axis
+    inertia = NamedEffect("inertia_error", "swing", 0.45, {}, (same,))
+    assert inertia.mechanism_probability == pytest.approx(0.99)
 
 
 def test_a_partly_named_gap_says_what_is_named_learned_and_left(gap_of):
