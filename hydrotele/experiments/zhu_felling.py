@@ -292,7 +292,7 @@ EXPERIMENTS = (
             {"pilot.reflection": "none"},
             "no reflection in both",
         ),
-    ), most=10),
+    ), most=5),
     Experiment("added spring", protected, (
         Claim(
             "tip-over: an added spring",
@@ -304,5 +304,5 @@ EXPERIMENTS = (
             {"pilot.tip_over": "null"},
             "without the spring in both",
         ),
-    ), most=10),
+    ), most=5),
 )  # fmt: skip
