@@ -137,10 +137,12 @@ CONFIGURATIONS = {
 
 def scenario_results(number: int) -> list[float]:
     """All configurations with one drawn operator."""
-    return [
+    found = [
         factor * function(more | person(number, 100 + number))
         for function, more, factor in CONFIGURATIONS.values()
     ]
+    say(f"operator {number}: {', '.join(f'{x:.3g}' for x in found)}")
+    return found
 
 
 def sensitivity(name: str, value: float, seeds: int, records: int, trials: int) -> list[float]:
@@ -248,8 +250,6 @@ def identification_part(asked, pool) -> str:
 def scenario_part(asked, pool) -> str:
     found = np.array(list(pool.map(scenario_results, range(asked.operators))))
     rows = [(name, span(found[:, k])) for k, name in enumerate(CONFIGURATIONS)]
-    names = list(CONFIGURATIONS)
-
     def survives(words: str, better: int, worse: int) -> tuple[str, str]:
         wins = int((found[:, better] < found[:, worse]).sum())
         ratio = np.median(found[:, worse] / found[:, better])
@@ -263,7 +263,6 @@ def scenario_part(asked, pool) -> str:
         survives("rate control rests more quietly than position control", 5, 6),
         survives("so it does with the joystick off the cab", 5, 7),
     ]
-    assert names
     say("scenarios done")
     return table(("result", f"median (range) over {asked.operators} operators"), rows)
 

@@ -1,0 +1,159 @@
+"""Crossover model: measured from simulated tracking, learnt gains, remnant, and drawn operators."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hydrotele.core.errors import InputError
+from hydrotele.machine.joystick import load_joystick
+from hydrotele.scenario.teleoperation import Perception, TeleopPilot
+from hydrotele.teleop.manual_control import (
+    BELIEVED_GAIN,
+    DOUBLE_INTEGRATOR,
+    FORMS,
+    GAIN,
+    INTEGRATOR,
+    crossover_of,
+    describing_function,
+    look_and_act,
+    neuromuscular_matrix,
+    sum_of_sines,
+    track,
+    visual_loop,
+)
+from hydrotele.teleop.operator_model import recorded_hand
+from hydrotele.teleop.operator_parameters import (
+    drawn_operator,
+    held_joystick,
+    load_operator_file,
+    perceiving,
+)
+
+HIM = drawn_operator(load_operator_file(), None)
+TIME = np.arange(0.0, 150.0, 0.01)
+
+
+def measured(form, records=4, him=HIM):
+    done = []
+    for seed in range(records):
+        target, frequencies = sum_of_sines(TIME, 2.5, 120.0, seed)
+        done.append(track(him, form, 2.0, target, seed=seed))
+    return crossover_of(frequencies, describing_function(done, frequencies, 30.0)[0])
+
+
+@pytest.mark.parametrize(
+    ("form", "frequency", "margin"),
+    [(GAIN, (2.5, 6.0), (25, 70)), (INTEGRATOR, (2.5, 5.5), (20, 60)),
+     (DOUBLE_INTEGRATOR, (1.8, 4.0), (15, 50))],
+    ids=FORMS,
+)  # fmt: skip
+def test_the_open_loop_falls_by_20_db_per_decade_around_a_published_crossover(
+    form, frequency, margin
+):
+    """Ranges: McRuer and Jex 1967, and side sticks; 5 dB for the neuromuscular peak above."""
+    found = measured(form)
+    assert frequency[0] < found.frequency < frequency[1]
+    assert margin[0] < math.degrees(found.margin) < margin[1]
+    assert found.slope == pytest.approx(-20.0, abs=5.0)
+
+
+def test_an_operator_with_twice_the_delay_crosses_over_at_a_lower_frequency():
+    slow = drawn_operator(load_operator_file(), None, visual_delay=0.32)
+    assert measured(INTEGRATOR, him=slow).frequency < 0.8 * measured(INTEGRATOR).frequency
+
+
+@pytest.mark.parametrize("form", [GAIN, INTEGRATOR, DOUBLE_INTEGRATOR])
+def test_he_learns_a_gain_that_he_did_not_expect(form):
+    """A tenth: he weighs what he expected, and the rest of his own noise."""
+    rng, step, gain = np.random.default_rng(5), 0.02, 7.0
+    loop = visual_loop(HIM, step, 1.0, rng, form=form)
+    output = rate = hand = 0.0
+    assert loop.state[BELIEVED_GAIN] < 0.5 * gain
+    for tick in range(2000):
+        target = math.sin(0.8 * tick * step) + 0.5 * math.sin(2.1 * tick * step)
+        hand += 0.2 * (look_and_act(loop, tick, target, output, hand) - hand)
+        if form == GAIN:
+            output = gain * hand
+        elif form == INTEGRATOR:
+            output += step * gain * hand
+        else:
+            rate += step * gain * hand
+            output += step * rate
+    assert loop.state[BELIEVED_GAIN] == pytest.approx(gain, rel=0.1)
+
+
+def test_the_neuromuscular_step_is_exact():
+    """A held input for one second, in one step and in a hundred."""
+    one = neuromuscular_matrix(12.0, 0.3, 1.0)
+    many = neuromuscular_matrix(12.0, 0.3, 0.01)
+    place, rate = 0.0, 0.0
+    for _ in range(100):
+        place, rate = (
+            many[0] * place + many[1] * rate + many[2], many[3] * place + many[4] * rate + many[5]
+        )  # fmt: skip
+    assert (place, rate) == pytest.approx((one[2], one[5]), abs=1e-12)
+    assert neuromuscular_matrix(0.0, 0.3, 0.01).tolist() == [0, 0, 1, 0, 0, 0]
+
+
+def test_the_same_number_draws_the_same_operator_within_the_spread():
+    file = load_operator_file()
+    for number in range(5):
+        one = drawn_operator(file, number)
+        assert one == drawn_operator(file, number) != drawn_operator(file, number + 1)
+        for name, p in file.parameters.items():
+            assert p.low <= getattr(one, name) <= p.high, name
+
+
+def test_every_number_has_a_source():
+    for name, p in load_operator_file().parameters.items():
+        assert len(p.source) > 20, name
+
+
+def test_former_keys_are_read_with_a_warning():
+    with pytest.warns(FutureWarning, match="skill is now called crossover"):
+        assert Perception.model_validate({"skill": 0.8}).crossover == 0.8
+    with pytest.raises(ValueError, match="give one of them"):
+        Perception.model_validate({"skill": 0.8, "crossover": 1.0})
+
+
+def test_an_own_file_changes_what_it_names(tmp_path):
+    (tmp_path / "me.yaml").write_text(
+        "name: me\nparameters:\n  tremor: {value: 0.2, low: 0.1, high: 0.3, unit: N,"
+        " basis: identified, source: a record of mine}\n"
+    )
+    him = perceiving(Perception(file="me.yaml", touch=0.2), str(tmp_path))
+    assert (him.tremor, him.touch, him.remnant) == (0.2, 0.2, HIM.remnant)
+    (tmp_path / "bad.yaml").write_text("name: me\nparameters: {tremors: {value: 1}}\n")
+    with pytest.raises(InputError, match="bad.yaml"):
+        perceiving(Perception(file="bad.yaml"), str(tmp_path))
+
+
+def test_grip_posture_and_cocontraction_make_the_hand():
+    """Full co-contraction: stiffness times `stiffening`, the damping ratio stays."""
+    stick = load_joystick()
+    assert held_joystick(stick, Perception()).hand == stick.hand
+    firm = held_joystick(stick, Perception(grip="firm")).hand
+    assert firm.stiffness > stick.hand.stiffness
+    tense = held_joystick(stick, Perception(cocontraction=1.0)).hand
+    assert tense.stiffness == pytest.approx(HIM.stiffening * stick.hand.stiffness)
+    ratio = [h.damping / math.sqrt(h.mass * h.stiffness) for h in (tense, stick.hand)]
+    assert ratio[0] == pytest.approx(ratio[1])
+    assert held_joystick(stick, Perception(posture="far")).hand.stiffness < stick.hand.stiffness
+    with pytest.raises(InputError, match="did you mean 'firm'"):
+        held_joystick(stick, Perception(grip="frm"))
+
+
+def test_a_recorded_hand_replaces_the_model(tmp_path):
+    path = tmp_path / "hand.csv"
+    path.write_text("time,handle.z [mm]\n10.0,0\n10.5,2\n11.5,-1\n")
+    made = recorded_hand(path, np.array([0.0, 0.25, 1.0, 5.0]))
+    assert made[:, 2] == pytest.approx([0.0, 0.001, 0.0005, -0.001])
+    assert not made[:, [0, 1, 3, 4, 5]].any()
+    path.write_text("time,elbow\n0,1\n1,2\n")
+    with pytest.raises(InputError, match="handle.x"):
+        recorded_hand(path, np.zeros(2))
+    pilot = TeleopPilot.model_validate({"kind": "teleop", "operator": {"recorded": "hand.csv"}})
+    assert pilot.operator.kind == "recorded"
+    with pytest.raises(ValueError, match="recorded: FILE"):
+        TeleopPilot.model_validate({"kind": "teleop", "operator": {"kind": "steers"}})
