@@ -81,8 +81,8 @@ def main() -> None:
     text = "\n".join([
         "The CAT 215 presses on a plate by a handle under rate control, with direct force, as the",
         "whole station simulates it: flotor, operator, packets, valves, oil, arm and contact. Told",
-        "is the linear case with the network's mean delays. Drawn: the plate's stiffness, the speed",
-        "of the handle, the estimate's bandwidth, delays up to 120 ms each way, jitter with a mean",
+        "is the linear case with the network's mean delays. Drawn: the plate's stiffness, the",
+        "speed of the handle, the estimate's bandwidth, delays up to 120 ms each way, jitter with a mean",
         "of up to 30 ms, and the ratio within 1.2 e-folds of the predicted limit.",
         "", f"Right: {right} of {len(found)}; of the {len(far)} further than 20 to 25 % from the"
         f" limit {right_far}.", "", *lines, "",
