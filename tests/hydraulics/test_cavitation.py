@@ -199,3 +199,26 @@ def test_a_balance_of_readings_misses_no_oil_where_a_chamber_gives_off_air(boom)
         boom, np.array([spool]), np.array([20.0e6]), *sides, volumes, np.array([v])
     )
     assert np.abs(lacks).max() < 1e-12 * boom[Slot.AREA_HEAD] * v
+
+
+def test_a_stick_that_is_lowered_faster_than_make_up_oil_comes():
+    """The CAT 325's stick as `fell_tree` lowers it: its head side grows by 180 L/min, valve closed.
+
+    Oil alone would settle where the make-up valve lets that in, 0.3 MPa of tank pressure less
+    A v / k_m: -0.3 MPa above atmosphere, 0.2 MPa below vacuum. Air fills what is missing instead.
+    """
+    user = actuator_parameters(load_machine("cat325", "none"))["stick"].copy()
+    user[[Slot.COUNT, Slot.LEAKAGE]] = 1, 0.0
+    tank, make = user[Slot.TANK_PRESSURE], user[Slot.MAKEUP_GAIN]
+    speed = 0.6e6 * make / user[Slot.AREA_HEAD]
+    assert 0.1 < speed < 0.2
+
+    def lowered(time):
+        return 0.1 + speed * time, speed
+
+    with_air = run(user, lowered, 1e-3, 1.0)[:, 0]
+    assert -ATMOSPHERE < with_air.min() < 0.0
+    user[Slot.AIR_RELEASE] = 0.0
+    alone = run(user, lowered, 1e-3, 1.0)[:, 0]
+    assert alone[-1] == pytest.approx(tank - 0.6e6, rel=1e-3)  # settles with V / (beta k_m)
+    assert alone.min() < -2.0 * ATMOSPHERE
