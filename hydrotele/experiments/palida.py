@@ -18,6 +18,7 @@ from hydrotele.multibody.chain import cardan_angles
 from hydrotele.multibody.inverse_dynamics import project
 from hydrotele.multibody.poses import joint_positions
 
+_CHUNK = 1000  # rows at a time: memory that stays in use is faster than new one
 LEGS = range(1, 7)
 CHI2_95 = 36.42  # of 24 degrees of freedom, as the document prints it
 HOME = np.array([0.0, 0.0, 0.55, 0.0, 0.0, 0.0])
@@ -102,8 +103,13 @@ class Robot:
 
     def matrix(self, motion: np.ndarray) -> np.ndarray:
         """Regressor (n, 6, 24) of Table 2's parameters along a motion (3, n, 6) of the pose."""
-        found = project(self.setup.chain, self.setup.given, *motion)
-        return self.setup.table(found).matrix[:, :, self.told.base[self.order]]
+        out, start = [], None
+        for first in range(0, motion.shape[1], _CHUNK):
+            some = motion[:, first : first + _CHUNK]
+            found = project(self.setup.chain, self.setup.given, *some, start=start)
+            start = found.position[-1]
+            out.append(self.setup.table(found).matrix[:, :, self.told.base[self.order]])
+        return np.concatenate(out)
 
     def lengths(self, motion: np.ndarray) -> np.ndarray:
         """Leg lengths (n, 6) [m] at poses (n, 6)."""
