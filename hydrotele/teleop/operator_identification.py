@@ -43,8 +43,8 @@ _UNITS = {"delay": "s", "time_constant": "s", "neuromuscular_frequency": "rad/s"
           "neuromuscular_damping": "1", "remnant": "1", "crossover": "rad/s",
           "phase_margin": "rad", "gain_margin": "1"}  # fmt: skip
 _CERTAIN = 0.5  # standard error of a logarithm beyond which a parameter is not identified
-_QUANTILE = 2.1  # of Student's t with the degrees of freedom that the blocks leave
-_BLOCK = 4.0  # s, longer than what the operator remembers of an error
+_JACKKNIFE = 8  # parts of the record
+_QUANTILE = 2.36  # of Student's t with the degrees of freedom that they leave, for 95 %
 _DRAWS = 400
 _UNSETTLED = 20.0  # of the criterion, for a fit whose iterations did not settle
 
@@ -374,8 +374,7 @@ def _fit(data: _Data, kind: str) -> _Fit | None:
         matrix = (z / scale).T @ (d / scale)
         move = np.linalg.lstsq(matrix, (z / scale).T @ rest, rcond=1e-10)[0] / scale
         logs = np.clip(logs + np.clip(move, -0.3, 0.3) * (1.0 if turn < 20 else 0.5), low, high)
-        inverse = np.linalg.pinv(matrix) / scale[:, None]
-        covariance = inverse @ _moment_covariance(z / scale, rest, data.step) @ inverse.T
+        covariance = _covariance(z / scale, d / scale, rest) / np.outer(scale, scale)
         settled = bool(np.abs(move).max() < 1e-3)
         if np.abs(move).max() < 1e-4:
             break
@@ -387,13 +386,23 @@ def _fit(data: _Data, kind: str) -> _Fit | None:
     return _Fit(kind, names, sign, logs, covariance, noise, criterion, settled)
 
 
-def _moment_covariance(z: np.ndarray, rest: np.ndarray, step: float) -> np.ndarray:
-    """Covariance of `z^T rest` by blocks: the remnant grows and shrinks with the error."""
-    length = round(_BLOCK / step)
-    blocks = len(rest) // length
-    used = blocks * length
-    products = (z[:used] * rest[:used, None]).reshape(blocks, length, -1).sum(axis=1)
-    return len(rest) / used * blocks / (blocks - 1) * products.T @ products
+def _covariance(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Covariance of the solution of `z^T (rest - d x) = 0`, the larger of two for every element.
+
+    One takes the whitened remnant as equally large throughout, the other leaves out one part of
+    the record after the other (jackknife): the remnant grows and shrinks with the error, and a
+    burst of it may decide.
+    """
+    inverse = np.linalg.pinv(z.T @ d)
+    equal = float(rest @ rest) / (len(rest) - z.shape[1]) * inverse @ (z.T @ z) @ inverse.T
+    moves = []
+    for part in np.array_split(np.arange(len(rest)), _JACKKNIFE):
+        others = np.ones(len(rest), bool)
+        others[part] = False
+        moves.append(np.linalg.pinv(z[others].T @ d[others]) @ (z[others].T @ rest[others]))
+    apart = (_JACKKNIFE - 1) * np.var(moves, axis=0)
+    scale = np.sqrt(np.maximum(1.0, apart / np.maximum(np.diag(equal), 1e-300)))
+    return equal * np.outer(scale, scale)
 
 
 def _slope_of(
@@ -458,7 +467,7 @@ def _remnant(fit: _Fit, data: _Data, gain_error: float) -> Estimate:
         power = (power + lead**2 * rate) / (1.0 + (lead * w[band]) ** 2)
     share = density[band] / 2.0 / bare**2 / (np.pi * power)  # two-sided
     count = max(1.0, 1.8 * len(fit.noise) / length * band.sum() * 0.6)
-    error = math.hypot(math.sqrt(1.0 / count), 2.0 * gain_error)
+    error = math.hypot(math.sqrt(1.5 / count), 2.0 * gain_error)
     return _estimate(math.log(float(share.mean())), error, "1")
 
 

@@ -20,7 +20,8 @@ import numpy as np
 from hydrotele.control.resolved_motion import COORDINATES
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.logs.log import load_log
+from hydrotele.core.units import to_si
+from hydrotele.logs.log import read_table
 from hydrotele.machine.joystick import AXES, Joystick
 from hydrotele.scenario.teleoperation import (
     Follow,
@@ -614,18 +615,22 @@ def recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
     Raises:
         InputError: the file cannot be read or has no such column.
     """
-    log = load_log(path, minimum_rows=2, maximum_dropped=1.0)
-    made, found = np.zeros((len(time), 6)), False
-    for i, axis in enumerate(AXES):
-        for name in (f"handle.{axis}", axis):
-            if name in log.columns:
-                made[:, i] = np.interp(time, log.time - log.time[0], log[name])
-                found = True
-                break
-    if not found:
-        has = ", ".join(log.columns)
+    table = read_table(path)
+    columns = {}
+    for name, values, unit in zip(table.names, table.values, table.units, strict=True):
+        if name == "time" or name.removeprefix("handle.") in AXES:
+            columns[name.removeprefix("handle.")] = values * (to_si(unit)[1] if unit else 1.0)
+    if len(columns) < 2 or "time" not in columns:
         wanted = ", ".join(f"handle.{axis}" for axis in AXES)
-        raise InputError(path, f"has no displacement of the handle ({wanted}); it has {has}")
+        has = ", ".join(table.names)
+        raise InputError(path, f"needs time and a displacement ({wanted}); it has {has}")
+    record = columns.pop("time")
+    if len(bad := np.flatnonzero(~(np.diff(record) > 0.0))):
+        message = "does not rise here: sort the rows, and keep each time once"
+        raise InputError(table.where("time", int(bad[0]) + 1), message)
+    made = np.zeros((len(time), 6))
+    for axis, values in columns.items():
+        made[:, AXES.index(axis)] = np.interp(time, record - record[0], values)
     return made
 
 

@@ -150,6 +150,8 @@ def test_a_recorded_hand_replaces_the_model(tmp_path):
     made = recorded_hand(path, np.array([0.0, 0.25, 1.0, 5.0]))
     assert made[:, 2] == pytest.approx([0.0, 0.001, 0.0005, -0.001])
     assert not made[:, [0, 1, 3, 4, 5]].any()
+    path.write_text("time,z,button\n0,0.001,1\n1,0.002,0\n")
+    assert recorded_hand(path, np.array([0.5]))[0, 2] == pytest.approx(0.0015)
     path.write_text("time,elbow\n0,1\n1,2\n")
     with pytest.raises(InputError, match="handle.x"):
         recorded_hand(path, np.zeros(2))

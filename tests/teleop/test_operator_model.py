@@ -42,14 +42,12 @@ def test_he_acts_on_what_he_saw_a_reaction_time_ago(mode):
 
     The hold of a decision is half a step late by itself, which his delay includes.
     """
-    wanted = []
+    wanted, calm = [], {"visual_delay": 0.25, "remnant": 0.0}
     for jump in (0.0, 0.5):
         views = Views()
         views.values["measured"][:, 0, 2] = 0.6
         views.values["measured"][200:, 0, 2] += jump
-        him, _ = person(
-            STEER, views=views, mode=mode, perception={"visual_delay": 0.25, "remnant": 0.0}
-        )
+        him, _ = person(STEER, views=views, mode=mode, perception=calm)
         wanted.append([])
         for tick in range(0, TICKS, him.every):
             him.decide(tick)
