@@ -82,8 +82,8 @@ def main() -> None:
         "The CAT 215 presses on a plate by a handle under rate control, with direct force, as the",
         "whole station simulates it: flotor, operator, packets, valves, oil, arm and contact. Told",
         "is the linear case with the network's mean delays. Drawn: the plate's stiffness, the",
-        "speed of the handle, the estimate's bandwidth, delays up to 120 ms each way, jitter with a",
-        "mean of up to 30 ms, and the ratio within 1.2 e-folds of the predicted limit.",
+        "speed of the handle, the estimate's bandwidth, delays up to 120 ms each way, jitter with",
+        "a mean of up to 30 ms, and the ratio within 1.2 e-folds of the predicted limit.",
         "", f"Right: {right} of {len(found)}; of the {len(far)} further than 20 to 25 % from the"
         f" limit {right_far}.", "", *lines, "",
         "The limit told is low by up to a quarter (force_reflection.md: 1.09 to 1.36), as the",
