@@ -149,23 +149,6 @@ def test_jitter_is_noise_and_a_steady_line_is_none():
     assert jitter_gain(CASE, WAVE, steady) < 1e-9 < jitter_gain(CASE, WAVE, line)
 
 
-def test_jitter_makes_unstable_what_is_stable_in_the_mean():
-    """Cases whose mean decays, in noise that is more than twice as strong as runs withstand."""
-    found = 0
-    for number in range(40):
-        rng = np.random.default_rng([11, number])
-        case, period, factor = stability_study.drawn_case(rng)
-        count = round(40.0 / period)
-        delays = [stability_study.drawn_delays(rng, 2 * count, period) for _ in range(2)]
-        line = jittering_line(period, *(d[:count] for d in delays))
-        for name, k in ((WAVE, 1.0), ("four_channel_position", factor), ("position_force", factor)):
-            told = predict(case, name, line, k)
-            if told.reason == "jitter" and jitter_gain(case, name, line, k) > 4.0:
-                found += 1
-                assert kick(case, name, period, *(d[count:] for d in delays), k).grows
-    assert found > 0
-
-
 def test_lost_and_overtaken_packets():
     delays = np.array([1, 1, -1, 0, 4, 0, 0])
     assert ages_of(delays).tolist() == [1, 1, 1, 0, 1, 0, 0]
