@@ -16,6 +16,7 @@ from hydrotele.cli.console import notes, out, print_json, stages, table
 from hydrotele.cli.opening import data_name, machine_of
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import models_folder
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.customary import in_customary_units
@@ -25,6 +26,7 @@ from hydrotele.gap.result import Gap, finite, gap_document
 from hydrotele.identify.mechanism import Mechanism, load_mechanism, mechanism_records
 from hydrotele.identify.motion import Processing, joint_motion, resolution
 from hydrotele.logs.dataset import Dataset, load_dataset
+from hydrotele.machine.machine_file import MACHINE_FILE
 from hydrotele.simulate.driven_chain import open_loop_errors
 from hydrotele.simulate.native import stop_profiling_clock
 
@@ -180,6 +182,37 @@ def gap_mjcf_to_folder(
         _print(gap)
         out.print(f"written to [bold]{target}[/]; open {target}/report.html")
     return target
+
+
+def mechanism_named(
+    machine: str | None, mjcf: Path | None, columns: Path | None
+) -> tuple[Path | None, Path | None]:
+    """The mechanism that a user names: by its file, or a shipped model that is no machine.
+
+    Args:
+        machine: name of a machine or of such a model.
+        mjcf: file.
+        columns: of the mapping.
+
+    Returns:
+        Its MJCF and its mapping; None, None for a machine.
+
+    Raises:
+        InputError: a mapping without a mechanism, or a mechanism and a machine.
+    """
+    if mjcf is not None:
+        if machine:
+            raise InputError("--machine", "is another model than --mjcf: name one of them")
+        return mjcf, columns
+    path = models_folder() / machine / f"{machine}.xml" if machine else None
+    if path is None or not path.is_file() or (path.parent / MACHINE_FILE).is_file():
+        if columns is not None:
+            raise InputError(
+                "--columns", "says which column is which of --mjcf: name that, too"
+            )  # fmt: skip
+        return None, None
+    beside = path.parent / "columns.yaml"
+    return path, columns or (beside if beside.is_file() else None)
 
 
 _HORIZON = 0.25  # s: an unstable mechanism that nothing controls soon leaves any motion

@@ -25,7 +25,6 @@ from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identif
 from hydrotele.cli.option_values import chosen, numbers_of, overrides_of
 from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import models_folder
 
 
 def _load(files: list[Path] | None) -> list[Path] | None:
@@ -336,14 +335,6 @@ def replay(
     replay_logs(logs, machine, tool, timestep, out, json)
 
 
-def _plain_model(name: str | None) -> Path | None:
-    """MJCF of a shipped model that has no machine file, by its name."""
-    path = models_folder() / name / f"{name}.xml" if name else None
-    if path is None or not path.is_file() or (path.parent / "machine.yaml").is_file():
-        return None
-    return path
-
-
 @app.command(
     epilog="Examples:  hydrotele gap --machine cat215 --data measured/site_a   |   "
     "hydrotele gap --data runs/a runs/b --heldout b   |   "
@@ -383,24 +374,16 @@ def gap(
     With --mjcf, or the name of a model without machine.yaml such as palida: any mechanism without
     hydraulics, from measured positions and drive forces.
     """
-    from hydrotele.cli.gapping import gap_mjcf_to_folder, gap_to_folder
+    from hydrotele.cli.gapping import gap_mjcf_to_folder, gap_to_folder, mechanism_named
 
-    if columns is not None and mjcf is None:
-        raise InputError("--columns", "says which column is which of --mjcf: name that, too")
-    plain = mjcf if mjcf is not None else _plain_model(machine)
-    if plain is not None:
-        given = {
-            "--machine": machine if mjcf else None, "--tool": tool, "--sensors": sensors,
-            "--jobs": jobs, "--mask": mask, "--force": force,
-        }  # fmt: skip
-        if strange := [option for option, value in given.items() if value]:
-            raise InputError(strange[0], "belongs to a machine: leave it out with --mjcf")
-        beside = plain.parent / "columns.yaml"
-        if columns is None and mjcf is None and beside.is_file():
-            columns = beside
-        gap_mjcf_to_folder(
-            [*data, *(more or [])], plain, columns, heldout, out, json, effect or []
-        )  # fmt: skip
+    model, columns = mechanism_named(machine, mjcf, columns)
+    if model is not None:
+        of_machines = {"--tool": tool, "--sensors": sensors, "--jobs": jobs, "--mask": mask,
+                       "--force": force}  # fmt: skip
+        if strange := [option for option, value in of_machines.items() if value]:
+            raise InputError(strange[0], "belongs to a machine: leave it out for a mechanism")
+        every = [*data, *(more or [])]
+        gap_mjcf_to_folder(every, model, columns, heldout, out, json, effect or [])
         return
     gap_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,
