@@ -16,8 +16,8 @@ from hydrotele.haptics.device import Abilities, HandlePose
 
 _WHERE = "--kind force-dimension"
 _FROM_DEVICE = np.diag([-1.0, -1.0, 1.0])  # half a turn about z
-# DHD's name of a device contains: travel [m], rotation [rad], force [N], torque [N m]; the vendor's
-# data sheets give the workspaces as diameters or boxes, half of the least is what is used
+# DHD's name of a device contains: travel [m], rotation [rad], force [N], torque [N m]: assumptions,
+# not checked against the vendor's data sheets
 _KNOWN = {
     "omega.3": Abilities(0.055, 0.0, 12.0, 0.0),
     "omega.6": Abilities(0.055, 0.0, 12.0, 0.0),  # its wrist gives no torque
