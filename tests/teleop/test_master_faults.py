@@ -48,7 +48,7 @@ def test_a_reading_that_is_no_number_switches_the_coils_off():
 def test_a_packet_that_is_no_number_leaves_the_spring(kind):
     numbers, s = seated(reflection=kind)
     for _ in range(3):
-        master_step(numbers, at(3e-3), np.full((7, 3), np.nan), 1.0, PERIOD, False, s)
+        master_step(numbers, at(3e-3), np.full((8, 3), np.nan), 1.0, PERIOD, False, s)
     assert np.isfinite(s.currents).all() and np.abs(s.currents).max() < 4.0
     # 600 N/m; between K_min and K_max where the stiffness itself was no number
     assert -4000.0 * 3e-3 <= s.push[0] <= -300.0 * 3e-3

@@ -77,7 +77,7 @@ def growth(axis: int, stiffness: float, damping: float, joystick) -> float:
     flotor.place(pose)
     turns = []
     for k in range(60):
-        master_step(numbers, flotor.data.qpos, np.zeros((7, 3)), 1.0, PERIOD, k == 0, state)
+        master_step(numbers, flotor.data.qpos, np.zeros((8, 3)), 1.0, PERIOD, k == 0, state)
         turns.append(state.handle[axis])
         flotor.step(state.currents, np.zeros(6))
     late, early = np.abs(turns[40:60]).max(), np.abs(turns[5:25]).max()
