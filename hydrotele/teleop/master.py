@@ -321,7 +321,9 @@ def reflect(numbers, packet, fresh, period, s):
                 own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
                 change = _CHANGE * (v - s.before[i])
                 s.before[i] += period * change
-                push -= min(_HEAVIER * own, felt * packet[TASK_MASS, c]) * change
+                heavier = felt * packet[TASK_MASS, c]
+                if heavier > 0.0:  # not where it is no number
+                    push -= min(_HEAVIER * own, heavier) * change
             elif kind == WAVES or kind == CONTROLLED:
                 push -= fresh * _passive_line(numbers, row, packet, period, s, i)
         s.stiffness[i] = stiff
