@@ -64,7 +64,7 @@ _MINOR = 0.02  # share of the gap up to which something is a detail; laws are ra
 # machine than 15 % of what they do
 _TRACE_OF_FORM = 0.005  # share up to which an effect only mends the form of one beside it
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
-_ALIKE = 1.0e-4  # of the squares of what an effect changes: readings that are alike to 1 %
+_ALIKE = 1.0e-3  # of the squares of what an effect changes: readings that are alike to 3 %
 _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
 _OFF = 0.05  # by which noise must differ from the stated to be noted
