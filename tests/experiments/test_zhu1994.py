@@ -81,6 +81,32 @@ def test_a_force_of_no_effect_is_no_improvement():
     assert claim.finding([Sample(values | {"none_plain": 9e3})]).ok
 
 
+_CASES = ("calm", "fast", "slow_rate", "slow_position")
+GOOD = {
+    "rate against position control": {
+        "rate_over": 0.03, "rate_swings": 0.0, "position_over": 0.4, "position_swings": 6.0,
+        **{f"{case}_over": 0.4 for case in _CASES}, **{f"{case}_swings": 6.0 for case in _CASES},
+    },
+    "feller-buncher: joints follow their steps": {
+        f"{joint}_{key}": value for joint in ("boom", "stick", "tilt")
+        for key, value in (("over", 0.02), ("left", 0.01), ("ringing", 0.5))
+    },
+    "stiffness feedback: a force applied by feel":
+        {"worst": 0.05, "truly": 0.05, "held_20": 2.0e4, "held_35": 3.5e4},
+    "stiffness feedback: 20 and 35 kN":
+        {"worst": 0.05, "truly": 0.05, "held_20": 2.0e4, "held_35": 3.5e4},
+    "tip-over avoided by stiffness feedback alone":
+        {"with_share": 0.5, "soil_share": 0.4, "without_share": 3.0},
+    "tip-over: an added spring":
+        {"protected_share": 0.7, "bare_share": 1.2, "protected_handle": 1.0e-3},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_a_criterion_can_say_yes(name):
+    assert CLAIMS[name].finding([Sample(GOOD[name])] * 2).ok
+
+
 def test_one_bad_repetition_is_enough():
     claim = CLAIMS["direct feedback: held with 4.5 N"]
     good = {"ripple": 0.05, "place": 5e-4, "hand": -4.5, "held": 2.4e4, "ratio": 1.8e-4}
