@@ -1,6 +1,6 @@
 """Operator model: crossover, discrimination, identification, drawn operators, sensitivity.
 
-python tools/operator_study.py --operators 20 --records 10 --trials 60 --seeds 2 --jobs 1
+python tools/operator_study.py --part all --operators 20 --records 10 --trials 60 --seeds 2 --jobs 1
 """
 
 import dataclasses
@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 from study import options, publish
 
+from hydrotele.experiments.finding import cylindrical
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
@@ -102,15 +103,12 @@ def tracked(changes: dict[str, str]) -> float:
 def restless(changes: dict[str, str]) -> float:
     """RMS speed of the tip where it should rest [m/s]."""
     run = run_scenario(load_scenario("steer", changes))
-    log, time = run.station.log, run.station.log
-    pose = log.slave("measured")[:, 0]
-    time = np.arange(len(pose)) / run.scenario.control_rate
+    pose, time = cylindrical(run), run.truth.time
     rest = np.zeros(len(time), bool)
     for begin, end in RESTING:
         rest |= (time > begin) & (time < end)
-    smooth = np.array([np.convolve(pose[:, c], np.full(20, 0.05), "same") for c in (0, 2)])
-    speed = np.gradient(smooth, time, axis=1)[:, rest & (time < time[-1] - 0.2)]
-    return float(np.sqrt(np.mean(speed**2)))
+    speed = [np.gradient(pose[c], time)[rest] for c in ("r", "z")]
+    return float(np.sqrt(np.mean(np.square(speed))))
 
 
 def person(number: int | None, seed: int, **known: float) -> dict[str, str]:
@@ -146,7 +144,7 @@ def scenario_results(number: int) -> list[float]:
 
 
 def sensitivity(name: str, value: float, seeds: int, records: int, trials: int) -> list[float]:
-    """What one parameter changes: bench and machine, with everything else nominal."""
+    """What one parameter changes, with everything else nominal: bench; machine by `seeds` runs."""
     known = {name: value} if name else {}
     one = crossover(None, 1, records, **known)
     him = drawn_operator(FILE, None, **known)
@@ -160,7 +158,8 @@ def sensitivity(name: str, value: float, seeds: int, records: int, trials: int) 
             1e3 * restless(changes),
             1e3 * restless(changes | {"pilot.mode": "position"}),
         ))  # fmt: skip
-    return [one.frequency, math.degrees(one.margin), 100.0 * felt, *np.mean(rows, axis=0).tolist()]
+    machine = np.mean(rows, axis=0).tolist() if rows else [math.nan] * 3
+    return [one.frequency, math.degrees(one.margin), 100.0 * felt, *machine]
 
 
 _BENCH_ONLY = ("lead_delay", "stiffening")  # not keys of a scenario, or without effect alone
@@ -250,6 +249,7 @@ def identification_part(asked, pool) -> str:
 def scenario_part(asked, pool) -> str:
     found = np.array(list(pool.map(scenario_results, range(asked.operators))))
     rows = [(name, span(found[:, k])) for k, name in enumerate(CONFIGURATIONS)]
+
     def survives(words: str, better: int, worse: int) -> tuple[str, str]:
         wins = int((found[:, better] < found[:, worse]).sum())
         ratio = np.median(found[:, worse] / found[:, better])
