@@ -31,6 +31,7 @@ from hydrotele.gap.mechanism_evidence import (
     find_noise,
     gather_evidence,
     noise_of,
+    row_weights,
 )
 from hydrotele.gap.mechanism_lack import Left, find_left, loud_windows
 from hydrotele.gap.mechanism_patch import (
@@ -53,7 +54,6 @@ from hydrotele.gap.result import (
     Prediction,
     Unknown,
 )
-from hydrotele.identify.estimation import weights
 from hydrotele.identify.mechanism import ColumnMapping, Mechanism, load_mechanism
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.multibody.regressor import BODY_PARAMETERS
@@ -491,9 +491,9 @@ def _judged(
 ) -> _Judged:  # fmt: skip
     fit, noise = found.columns, found.noise
     rest = _unexplained(found)
-    weight = weights(noise.doubtful, then.doubt)
+    weight = row_weights(noise.doubtful, then.doubt)
     rows = min(len(then.time), len(now.time))  # a late sensor tells nothing of the last ones
-    later = weights(noise.doubtful, now.doubt)
+    later = row_weights(noise.doubtful, now.doubt)
     left = find_left(fit, now, rest, now.gap, noise.std, noise.weight, later)
     std = noise.std * np.sqrt(np.where(left.lacking, np.clip(1.0 - left.share, 0.05, 1.0), 1.0))
     plain = {(e.key, e.variant): e for e in
