@@ -18,7 +18,7 @@ from hydrotele.gap.mechanism_effects import TYPICAL, MechanismEffect, strengths
 from hydrotele.identify.estimation import autoregression, find_doubtful, weights
 
 _ROUNDS, _STEPS = 3, 40
-_STICKS = 0.5  # doubt of a sign from which a drive counts as sticking
+_STICKS = 0.25  # doubt of a sign from which a drive counts as sticking
 
 
 @dataclass(frozen=True)
