@@ -1,7 +1,7 @@
 """Effects that a mechanism can have and its model can lack: names, places, numbers, columns."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,7 @@ SENTENCES = {
 }
 TYPICAL, LEAST = 0.3, 0.01  # share of a drive's force RMS that an effect moves, typically; at least
 _MOST = 20.0  # times the typical size, where a search ends
+_FORM = 0.3  # of a drive's dry friction, which its form near rest may change
 _NONE = 1e-9  # share that has no effect
 _ASIDE = 0.3  # of its radius of gyration that a body's centre of mass is aside, typically
 _SECOND = 0.1  # s, beyond which no sensor is late
@@ -187,11 +188,21 @@ class _Builder:
             if place not in self.chain.drives:
                 continue
             for variant in range(len(STRIBECK)):
-                yield self.linear(
+                one = self.linear(
                     "stribeck_friction", place, "stribeck", f"stribeck{variant}.{place}", force,
                     0.0, 0.0, variant,
                 )  # fmt: skip
+                yield one and self.sliding(one)
             yield self.spring(place)
+
+    def sliding(self, one: MechanismEffect) -> MechanismEffect:
+        """Stribeck's effect, not worth naming below a part of dry friction.
+
+        The form of that near rest (sticking, presliding) is never known as well as far from it.
+        """
+        (facts,) = one.parameters.values()
+        least = max(facts.least, _FORM * self.nominal.get(f"coulomb.{one.location}", 0.0))
+        return replace(one, parameters={"stribeck": replace(facts, least=least)})
 
     def spring(self, drive: str) -> MechanismEffect | None:
         force, length, _, _ = self.units(drive)

@@ -18,6 +18,7 @@ from hydrotele.gap.mechanism_effects import TYPICAL, MechanismEffect, strengths
 from hydrotele.identify.estimation import autoregression, find_doubtful, weights
 
 _ROUNDS, _STEPS = 3, 40
+_STICKS = 0.25  # doubt of a sign from which a drive counts as sticking
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def noise_of(rest: np.ndarray, columns: Columns, free: float = 1.0) -> Noise:
     """
     drives = rest.shape[1]
     doubtful = find_doubtful(rest, columns.doubt)
-    weight = weights(doubtful, columns.doubt)
+    weight = row_weights(doubtful, columns.doubt)
     left = rest * weight
     follow = _follow(left, columns.starts)
     std = np.sqrt(np.mean(left**2, axis=0) / np.mean(weight**2, axis=0) / free)
@@ -113,6 +114,19 @@ def noise_of(rest: np.ndarray, columns: Columns, free: float = 1.0) -> Noise:
     between = new.T @ new / len(new) / free
     between += 1e-12 * np.trace(between) / drives * np.eye(drives)
     return replace(plain, white=np.linalg.inv(np.linalg.cholesky(between)))
+
+
+def row_weights(doubtful: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+    """Weights of equations: none where a drive sticks, whose dry friction may then be anything.
+
+    Args:
+        doubtful: (k, 2) of `Noise`.
+        doubt: (n, k) how uncertain the sign of the drives' dry friction is.
+
+    Returns:
+        (n, k), 1 at most.
+    """
+    return weights(doubtful, doubt) * (doubt < _STICKS)
 
 
 def _follow(rest: np.ndarray, starts: Sequence[int]) -> np.ndarray:

@@ -31,6 +31,7 @@ from hydrotele.gap.mechanism_evidence import (
     find_noise,
     gather_evidence,
     noise_of,
+    row_weights,
 )
 from hydrotele.gap.mechanism_lack import Left, find_left, loud_windows
 from hydrotele.gap.mechanism_patch import (
@@ -53,7 +54,6 @@ from hydrotele.gap.result import (
     Prediction,
     Unknown,
 )
-from hydrotele.identify.estimation import weights
 from hydrotele.identify.mechanism import ColumnMapping, Mechanism, load_mechanism
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.multibody.regressor import BODY_PARAMETERS
@@ -75,6 +75,9 @@ _WORSE = 1.02  # times the given model's errors on the held-out run: no patch ma
 _REJECTED = (
     "What the fitted runs asked for makes the held-out run worse; it was taken back, and nothing is"
     " named."
+)
+_SPOILS = (
+    "{} at {}, which the fitted runs asked for, makes the held-out run worse; it was taken back."
 )
 METRIC = "RMS of the errors of the drives' forces over their noise, all drives, held-out run"
 
@@ -111,6 +114,39 @@ class _Found:
     weak: tuple[Fitted, ...]
     singles: list[Fitted]
     refused: frozenset[Key]
+
+
+class _Patching(NamedTuple):
+    """What it takes to patch the model and to judge it on the held-out run."""
+
+    mjcf: str | Path
+    mechanism: Mechanism
+    given: MechanismModel
+    nominal: Mapping[str, float]
+    heldout: IdentificationRecord
+    band: float
+    then: Columns
+
+    def of(self, found: _Found) -> tuple[MechanismModel, dict[str, Estimate], "_Judged"]:
+        """The patched model, the calibrated numbers, and what the held-out run says of both."""
+        mechanism = self.mechanism
+        chosen = list(zip(found.fitted.effects, found.fitted.values, strict=True))
+        calibration, numbers = _calibration(mechanism, found, self.nominal)
+        patched, now = self.given, self.then
+        if chosen or numbers:
+            speeds = {joint: size[2] for joint, size in found.columns.sizes.items()}
+            patch = patch_of(
+                chosen, mechanism.setup.chain, mechanism.measured, numbers, self.nominal, speeds
+            )  # fmt: skip
+            patched = replace(
+                self.given, mjcf=patched_mjcf(self.mjcf, patch),
+                mapping=patched_mapping(mechanism.mapping, patch),
+            )  # fmt: skip
+            with tempfile.TemporaryDirectory() as folder:
+                write_mechanism(Path(folder), patched.mjcf, patched.mapping)
+                better = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
+            now = build_columns([self.heldout], better, self.band, patch.errors)
+        return patched, calibration, _judged(mechanism, found, self.nominal, self.then, now)
 
 
 def _emptied(fit, mechanism: Mechanism, band: float, found: _Found) -> _Found:
@@ -157,33 +193,23 @@ def find_mechanism_gap(
     nominal = nominal_parameters(mechanism)
     found = _searched(fit, mechanism, band, nominal, effects, tell)
     tell("patch the model, judge it on the held-out run", 0.8)
-    chosen = list(zip(found.fitted.effects, found.fitted.values, strict=True))
-    calibration, numbers = _calibration(mechanism, found, nominal)
-    speeds = {joint: size[2] for joint, size in found.columns.sizes.items()}
-    patch = patch_of(
-        chosen, mechanism.setup.chain, mechanism.measured, numbers, nominal, speeds
-    )  # fmt: skip
     given = MechanismModel(
         mechanism.setup.chain.name, Path(mjcf).read_text(encoding="utf-8"), mechanism.mapping
     )
-    patched, better = given, mechanism
-    if chosen or numbers:
-        patched = replace(
-            given, mjcf=patched_mjcf(mjcf, patch), mapping=patched_mapping(mechanism.mapping, patch)
-        )  # fmt: skip
-        with tempfile.TemporaryDirectory() as folder:
-            write_mechanism(Path(folder), patched.mjcf, patched.mapping)
-            better = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
     then = build_columns([heldout], mechanism, band)
-    now = then
-    if patched is not given:
-        now = build_columns([heldout], better, band, patch.errors)
-    judged = _judged(mechanism, found, nominal, then, now)
+    patching = _Patching(mjcf, mechanism, given, nominal, heldout, band, then)
+    patched, calibration, judged = patching.of(found)
+    if spoiling := {key for key, gain in judged.gained.items() if gain < 0.0}:
+        kept = [(e, v) for e, v in zip(found.fitted.effects, found.fitted.values, strict=True)
+                if e.key not in spoiling]  # fmt: skip
+        fitted = found.evidence.fit([e for e, _ in kept], [v for _, v in kept] or None)
+        notes = (*notes, *(_SPOILS.format(*key) for key in sorted(spoiling)))
+        found = replace(found, fitted=fitted, refused=found.refused | spoiling)
+        patched, calibration, judged = patching.of(found)
     if not _rms(judged.after[0]) <= _WORSE * _rms(judged.before[0]):
         notes = (*notes, _REJECTED)
-        found, patched = _emptied(fit, mechanism, band, found), given
-        calibration, now = {}, then
-        judged = _judged(mechanism, found, nominal, then, now)
+        found, patched, calibration = _emptied(fit, mechanism, band, found), given, {}
+        judged = _judged(mechanism, found, nominal, then, then)
     named = _named(found, judged.shares)
     named, details = _believable(named, judged)
     left = judged.left
@@ -473,6 +499,8 @@ class _Judged(NamedTuple):
         std: (k,) noise of the drives' forces, without what is lacking [N] or [N m].
         left: what the patched model lacks.
         shares: effect -> share of the gap that comes back without it.
+        gained: effect -> by how much the squared error of the drive that it moves most grows
+            without it, over the noise's.
         moved: effect -> (k,) RMS of what it does to every drive's force [N] or [N m].
         before: predictions of the given model, the held-out run first.
         after: of the patched one.
@@ -481,6 +509,7 @@ class _Judged(NamedTuple):
     std: np.ndarray
     left: Left
     shares: Mapping[Key, float]
+    gained: Mapping[Key, float]
     moved: Mapping[Key, np.ndarray]
     before: tuple[Prediction, ...]
     after: tuple[Prediction, ...]
@@ -491,9 +520,9 @@ def _judged(
 ) -> _Judged:  # fmt: skip
     fit, noise = found.columns, found.noise
     rest = _unexplained(found)
-    weight = weights(noise.doubtful, then.doubt)
+    weight = row_weights(noise.doubtful, then.doubt)
     rows = min(len(then.time), len(now.time))  # a late sensor tells nothing of the last ones
-    later = weights(noise.doubtful, now.doubt)
+    later = row_weights(noise.doubtful, now.doubt)
     left = find_left(fit, now, rest, now.gap, noise.std, noise.weight, later)
     std = noise.std * np.sqrt(np.where(left.lacking, np.clip(1.0 - left.share, 0.05, 1.0), 1.0))
     plain = {(e.key, e.variant): e for e in
@@ -502,7 +531,7 @@ def _judged(
     before = (weight * then.gap / std)[:rows]
     after = (later * now.gap / std)[:rows]
     whole = float(np.mean(before**2)) - 1.0
-    shares, moved = {}, {}
+    shares, moved, gained = {}, {}, {}
     for effect, value in zip(found.fitted.effects, found.fitted.values, strict=True):
         own = plain.get((effect.key, effect.variant))
         if own is None:
@@ -510,9 +539,12 @@ def _judged(
             continue
         at = [places[name] for name in own.columns]
         added = then.matrix[:rows, :, at] @ own.coefficients(value)
-        back = float(np.mean((after + weight[:rows] * added / std) ** 2) - np.mean(after**2))
+        grown = np.mean((after + weight[:rows] * added / std) ** 2, axis=0)
+        grown -= np.mean(after**2, axis=0)
+        back = float(np.mean(grown))
         shares[effect.key] = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
         moved[effect.key] = np.sqrt(np.mean(added**2, axis=0))
+        gained[effect.key] = float(grown[np.argmax(moved[effect.key] / std)])
     channels = tuple(
         f"{'force' if _unit(mechanism, d) == 'N' else 'torque'}.{d}"
         for d in mechanism.setup.chain.drives
@@ -533,7 +565,7 @@ def _judged(
                 run, fit.time[some], fit.measured[some], error[some],
                 (noise.weight * error / std)[some],
             ))  # fmt: skip
-    return _Judged(std, left, shares, moved, tuple(predictions[0]), tuple(predictions[1]))
+    return _Judged(std, left, shares, gained, moved, tuple(predictions[0]), tuple(predictions[1]))
 
 
 def _unexplained(found: _Found) -> np.ndarray:
