@@ -182,7 +182,7 @@ def _friction_terms(
         weights = _WEIGHTS / _WEIGHTS.sum()
         shapes = {kind: _shape(one, kind, maybe) @ weights for kind in one.nominal}
     dry, wet = ("N", "N s/m") if chain.tree.slides[j] else ("N m", "N m s/rad")
-    units = dict.fromkeys(FRICTION_TERMS, dry) | dict.fromkeys(_SLOPES, wet)
+    units: dict[str, str] = {kind: wet if kind in _SLOPES else dry for kind in FRICTION_TERMS}
     units["quadratic"] = "N s^2/m^2" if chain.tree.slides[j] else "N m s^2/rad^2"
     return {kind: (share * shapes[kind][:, None], units[kind]) for kind in one.nominal}
 
