@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.signal import fftconvolve
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.equations import (
@@ -32,8 +33,10 @@ STRIBECK = (
     0.3,
 )  # of a joint's RMS rate: Stribeck velocities that are tried
 _ROWS = 5.0  # rows per period of the band that columns of small differences need
+_SMOOTH = 1.5  # times the band, to which rates of late positions are smoothed before
 _READINGS = 20.0  # rows per period of the band that all else needs; more are averaged
-_LATE, _AWAY, _TILT = 1e-3, 1e-3, 0.01  # s, of a joint's travel, rad: the small differences
+_LATE, _AWAY, _TILT = 0.01, 1e-3, 0.01  # s, of a joint's travel, rad: the small differences; a
+# step of dry friction must move by about a row
 _RESOLVED = 5e-3  # s, over which positions are averaged before it is asked what they resolve
 _WIDEST = 25.0  # Hz: what is faster tells of drives and sensors, not of a mechanism
 _SLOWEST = 8.0  # rows of one run that a band leaves at least
@@ -249,7 +252,9 @@ def _run_columns(
     stride = max(1, int(1.0 / (_ROWS * band * record.period)))
     rows = slice(None, None, stride)
     whole = np.stack([motion.value, motion.rate, motion.acceleration])[:, rows]
-    measured = np.stack([lengths.value, lengths.rate])[:, rows]
+    smooth, _ = low_pass(_SMOOTH * band, record.period)  # what few rows can still tell
+    rate = fftconvolve(lengths.rate, smooth[:, None], mode="same", axes=0)
+    measured = np.stack([lengths.value, rate])[:, rows]
     value = table.nominal + [about.get(name, 0.0) for name in table.names]
     late = _Differences(setup, whole, measured, raw.axes, record.period * stride, value)
     names, slow = late.columns(sizes)
@@ -334,7 +339,7 @@ class _Differences:
             step = _AWAY * sizes[joint][1]
             add(f"offset.position.{joint}", -self._moved(way * step, base) / step)
             lag = self.measured[1][:, k, None] * way * _LATE
-            add(f"delay.position.{joint}", -self._moved(lag, base) / _LATE)
+            add(f"delay.position.{joint}", self._moved(lag, base) / _LATE)
         for axis, letter in ((0, "x"), (1, "y")):
             add(f"tilt.{letter}", self._tilted(axis, base) / _TILT)
         return names, np.stack(out, axis=2)

@@ -1,7 +1,6 @@
 """Gaps of mechanisms without hydraulics: planted effects are named, laws outside are not."""
 
 import json
-from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -10,12 +9,11 @@ from typer.testing import CliRunner
 
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import models_folder
-from hydrotele.experiments.palida import excited, measured
-from hydrotele.gap.mechanism_columns import tilted
+from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
 from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.mechanism_patch import Patch, patched_mjcf
 from hydrotele.identify.mechanism import load_mechanism, mechanism_records
+from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.inverse_dynamics import project
 from hydrotele.simulate.driven_chain import open_loop_errors
@@ -161,12 +159,21 @@ def test_an_arm_driven_by_its_own_forces_follows_its_motion(tmp_path):
     assert max(errors.values()) < 2e-3  # rad: soft friction and steps of 1 ms
 
 
-def test_one_period_of_the_hexapod_is_enough_to_find_nothing_wrong():
-    """Few equations, many columns: noise must not be taken for too small."""
-    record = measured(excited(), 1, np.random.default_rng(0))
-    record = replace(record, position_noise=np.full(6, np.nan), force_noise=np.full(6, np.nan))
-    other = measured(excited(), 1, np.random.default_rng(1))
-    folder = models_folder() / "palida"
-    gap = find_mechanism_gap(folder / "palida.xml", folder / "columns.yaml", [record], other)
-    assert gap.verdict == "no_gap" and not gap.effects
-    assert len(gap.ranking) == 15  # of more than a hundred effects
+def test_columns_are_what_sensors_defects_do(tmp_path):
+    """Each column of a late or displaced sensor against the readings without its defect."""
+    logs(tmp_path, noise=0.0)
+    mechanism = load_mechanism(tmp_path / "robot.xml")
+    fit, _, _ = mechanism_records([tmp_path / "logs"], mechanism, as_measured=True)
+    band = common_band(fit, mechanism)
+    given = build_columns(fit, mechanism, band)
+    for kind, value in (("offset", 0.002), ("delay", 0.012)):
+        for channel in ("position.elbow", "force.shoulder"):
+            name = f"{kind}.{channel}" if kind == "delay" or "position" in channel else ""
+            if not name:
+                continue
+            better = build_columns(fit, mechanism, band, {channel: SensorError(**{kind: value})})
+            many = min(len(given.time), len(better.time)) // 3  # of the first run
+            did = (given.gap - 0.0)[:many] - better.gap[:many]
+            says = value * given.matrix[:many, :, given.names.index(name)]
+            rest = np.linalg.norm(did - says) / np.linalg.norm(did)
+            assert rest < 0.35, (name, rest)  # steps of dry friction move by parts of a row
