@@ -338,8 +338,9 @@ class _Differences:
             way = moves[:, k, given]
             step = _AWAY * sizes[joint][1]
             add(f"offset.position.{joint}", -self._moved(way * step, base) / step)
-            lag = self.measured[1][:, k, None] * way * _LATE
-            add(f"delay.position.{joint}", self._moved(lag, base) / _LATE)
+            late = max(_LATE, self.period)
+            lag = self.measured[1][:, k, None] * way * late
+            add(f"delay.position.{joint}", self._moved(lag, base) / late)
         for axis, letter in ((0, "x"), (1, "y")):
             add(f"tilt.{letter}", self._tilted(axis, base) / _TILT)
         return names, np.stack(out, axis=2)
