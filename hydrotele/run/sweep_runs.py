@@ -48,8 +48,8 @@ _EVERY = (
 )  # fmt: skip
 _STATION = (
     "handle_energy_J", "handle_least_energy_J", "largest_handle_displacement_m",
-    "largest_handle_rotation_rad", "largest_coil_current_A", "periods_with_limited_currents",
-    "largest_tip_force_N", "tripped",
+    "largest_handle_rotation_rad", "largest_coil_current_A", "largest_coil_heat",
+    "periods_with_limited_currents", "largest_tip_force_N", "tripped",
 )  # fmt: skip
 _TIP = ("tip_r", "tip_z", "tip_attitude")
 
