@@ -129,16 +129,15 @@ def test_a_saw_above_the_kerf_does_not_cut():
 
 
 def test_cut_held_lifted_and_let_go():
-    """In this order; lifted with the tip, and on the ground again at the end."""
+    """In this order; lifted by half a metre with the tip, and on the ground again at the end."""
     points = {"r": [7.4, 8.0, 8.0], "z": [0.75, 0.75, 1.2]}
     scenario = fell(17.0, [SAW, CLOSE, OPEN], times=(0.0, 5.5, 11.0), points=points)
     session, way = gone(scenario)
     assert [said for _, said in session.events] == [
         "the tree is cut", "the grab holds the tree", "the grab lets the tree go",
     ]  # fmt: skip
-    at = round(14.4 / 0.005)
-    # 0.45 m are asked for; who steers by sight and learns the machine's lag is still on the way
-    assert 0.25 < way[at, 2] < 0.55
+    held = way[: round(14.4 / 0.005), 2]
+    assert 0.35 < held.max() < 0.55  # 0.45 m by the tip; the foot swings as the stem rocks
     assert way[-1, 2] < 0.1
     model = session.plant.model
     stiff = model.jnt_stiffness[model.joint("tree_0_z").id]
