@@ -69,6 +69,7 @@ from hydrotele.teleop.axis_table import (
 )
 from hydrotele.teleop.master import Master, master
 from hydrotele.teleop.operator_model import DECISIONS, REFLEX
+from hydrotele.teleop.operator_parameters import held_joystick
 from hydrotele.teleop.slave import AHEAD, SMOOTH
 from hydrotele.teleop.switching import Spring
 from hydrotele.teleop.two_port import Impedance, TwoPort
@@ -462,12 +463,12 @@ class Contact(NamedTuple):
 def scenario_case(
     scenario: Scenario, machine: Machine, joystick: Joystick, coordinate: str | None = None
 ) -> tuple[LinearCase, Contact]:
-    """The linear case of a scenario.
+    """The linear case of a scenario, with the hand of its operator as it is simulated.
 
     Args:
         scenario: with a teleoperated pilot.
         machine: its machine.
-        joystick: its joystick.
+        joystick: its joystick; grip, posture and co-contraction of the operator replace its hand.
         coordinate: of the arm; that of the operator's force target by default, else z.
 
     Returns:
@@ -475,7 +476,7 @@ def scenario_case(
 
     Raises:
         InputError: the scenario is not teleoperated, the arm has no such coordinate, nothing comes
-            back.
+            back, the operator's grip or posture is not known.
     """
     pilot = scenario.pilot
     if not isinstance(pilot, TeleopPilot):
@@ -490,6 +491,7 @@ def scenario_case(
     contact = _contact(scenario, machine, wanted)
     sensors, period = sensor_set(machine, scenario.sensors), 1.0 / scenario.control_rate
     clocks = Clocks(period, max(period, 1.0 / sensors.rate) if sensors else period)
+    joystick = held_joystick(joystick, pilot.perception, scenario.folder)
     numbers, _ = master(joystick, pilot, coordinates)
     tip = tip_drive(machine, contact.joints, wanted, scenario.servo)
     case = linear_case(pilot, joystick, numbers, tip, scenario.servo, clocks, contact.task)

@@ -94,6 +94,19 @@ def test_limit_falls_with_speed_stiffness_delay_and_lag():
     assert double.largest_ratio == pytest.approx(0.5 * ratio, rel=2e-3)  # two margins' rounding
 
 
+def test_hand_is_that_of_the_scenarios_operator(case):
+    """Grip and co-contraction of the scenario are in the loop, as the station simulates them."""
+    usual = load_joystick().hand
+    assert case.held == Impedance(usual.mass, usual.damping, usual.stiffness)
+    firm = made(pilot__perception="{grip: firm, cocontraction: 0.4}")[0]
+    assert firm.held.mass == pytest.approx(0.8)  # operator.yaml: firm
+    assert firm.held.stiffness == pytest.approx(600.0 * 1.8)  # stiffening 3: 1 + 2 x 0.4
+    ratios = [structure_findings(c, "rate_force").largest_ratio for c in (case, firm)]
+    assert ratios[1] != pytest.approx(ratios[0], rel=0.02)
+    with pytest.raises(InputError, match="pilot.perception.grip"):
+        made(pilot__perception="{grip: frm}")
+
+
 def test_pole_lies_on_the_axis_at_the_limit(case):
     found = structure_findings(case, "rate_force")
     assert found.unstable_poles == 2 and not found.stable
