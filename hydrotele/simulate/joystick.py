@@ -20,7 +20,7 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_xml
-from hydrotele.machine.joystick import Joystick
+from hydrotele.machine.joystick import Joystick, principal
 
 GRAVITY = -9.81
 _COOL = 0.9  # heat below which hot coils may have their largest current again
@@ -82,11 +82,14 @@ class SimulatedFlotor:
         self._gravity[:] = (0.0, 0.0, GRAVITY)
         self._ctrl, self._applied = self.data.ctrl, self.data.qfrc_applied
         self._leaps, self._started, self._before = not runge_kutta, False, np.zeros((2, _HALVES))
-        self._speed, self._half_damping = self.data.qvel, 0.5 * self.model.dof_damping
+        self._speed, self._half_damping = self.data.qvel, 0.5 * _damping(self.model)
         if runge_kutta:
             self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
         else:  # MuJoCo counts it by the velocity after a step
-            self.model.dof_damping[:] = self._half_damping
+            self.model.dof_damping *= 0.5
+            self.model.tendon_damping *= 0.5
+            if self.model.ntendon:  # its Euler steps do so for joints only
+                self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self.heat, self.hottest, self.allowed = np.zeros(6), 0.0, facts.coils.max_current
         self._gear, self._full = self.model.actuator_gear, self.model.actuator_gear.copy()
         places = self.model.site_pos[self.model.actuator_trnid[:, 0]]
@@ -170,6 +173,16 @@ class SimulatedFlotor:
         mujoco.mju_axisAngle2Quat(self.data.qpos[3:7], way, angle)
 
 
+def _damping(model: mujoco.MjModel) -> np.ndarray:
+    """(nv, nv) of joints and fixed tendons."""
+    found, way = np.diag(model.dof_damping), np.zeros((model.ntendon, model.nv))
+    for k in range(model.ntendon):
+        at, many = model.tendon_adr[k], model.tendon_num[k]
+        dofs = model.jnt_dofadr[model.wrap_objid[at : at + many]]
+        way[k, dofs] = model.wrap_prm[at : at + many]
+    return found + way.T @ np.diag(model.tendon_damping) @ way
+
+
 @compiled
 def _keep(ctrl, applied, gravity, before):
     """Put a period's inputs into the second row of `before` (2, 15), and what was there above."""
@@ -189,7 +202,8 @@ def _load(ctrl, applied, gravity, before, half_damping, speed, share):
             part[i] = share * before[0, at] + (1.0 - share) * before[1, at]
             at += 1
     for i in range(len(applied)):
-        applied[i] -= half_damping[i] * speed[i]
+        for k in range(len(speed)):
+            applied[i] -= half_damping[i, k] * speed[k]
 
 
 @compiled
@@ -293,11 +307,11 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
         place, turn = spec.site(f"coil_{k + 1}"), 2.0 * math.pi * (k % 3) / 3.0
         place.pos = facts.coils.radius * np.array([math.cos(turn), math.sin(turn), 0.0])
     if hand and facts.hand.mass > 0.0:
-        grip.mass = facts.hand.mass
+        grip.mass = facts.hand.carried
     else:
         spec.delete(grip)
     if hand:
-        _hold(joints, facts)
+        _hold(spec, joints, facts)
     return spec
 
 
@@ -315,9 +329,30 @@ def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
         spec.geom(name).pos[axis] += way * (far + ball.size[0] + spec.geom(name).size[axis])
 
 
-def _hold(joints, facts: Joystick) -> None:
+def _hold(spec: mujoco.MjSpec, joints, facts: Joystick) -> None:
+    """Springs and dampers of the arm, and its mass beyond what hangs on the handle.
+
+    In the horizontal plane the short axes of its ellipses are on the slides; what the long axes
+    have more is on tendons along them, which add their stiffness, damping and armature.
+    """
+    hand = facts.hand
     for name in ("x", "y", "z", "turn"):
         turns = name == "turn"
-        stiffness = facts.hand.rotation_stiffness if turns else facts.hand.stiffness
-        damping = facts.hand.rotation_damping if turns else facts.hand.damping
-        joints[name].stiffness[0], joints[name].damping[0] = stiffness, damping
+        joints[name].stiffness[0] = hand.rotation_stiffness if turns else hand.stiffness
+        joints[name].damping[0] = hand.rotation_damping if turns else hand.damping
+    firm, heavy = principal(hand.stiffness_shape), principal(hand.mass_shape)
+    joints["z"].armature = hand.mass - hand.carried
+    for name in ("x", "y"):
+        joints[name].stiffness[0] *= firm.least
+        joints[name].damping[0] *= firm.least
+        joints[name].armature = heavy.least * hand.mass - hand.carried
+    for name, axis in (("stiff", firm), ("heavy", heavy)):
+        if axis.greatest <= axis.least * (1.0 + 1e-9):
+            continue
+        more, arm = axis.greatest - axis.least, spec.add_tendon(name=f"arm_{name}")
+        arm.wrap_joint("x", math.cos(axis.angle))
+        arm.wrap_joint("y", math.sin(axis.angle))
+        if name == "stiff":
+            arm.stiffness[0], arm.damping[0] = more * hand.stiffness, more * hand.damping
+        else:
+            arm.armature = more * hand.mass

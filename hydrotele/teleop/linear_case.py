@@ -9,7 +9,8 @@ follows `k_v V_h / s` (`teleop.linear_machine`); under position control its plac
 task pushes back; the force at the tip comes back through the estimator's two filters, held for a
 sample of the sensors, through the line with its delay, times the ratio.
 
-Left out: dead bands, stops, limits of force and acceleration, loss of contact, sensor noise.
+Left out: dead bands, stops, limits of force and acceleration, loss of contact, sensor noise; the
+other axes of the handle, which are at rest.
 
 The linear case of a teleoperated scenario: machine in contact, joystick, servo, line, task.
 
@@ -413,12 +414,10 @@ def linear_case(
     place = np.flatnonzero(numbers.axis[:, COORDINATE] == COORDINATES.index(tip.coordinate))
     if not len(place):
         raise InputError(_WHERE, f"no joystick axis moves {tip.coordinate}")
-    axis, hand, channel = int(place[0]), joystick.hand, pilot.channel
+    axis, channel = int(place[0]), pilot.channel
     turns = AXES[axis].startswith("r")
     flotor = float(numbers.turning[axis - 3]) if turns else float(numbers.mass[0])
-    held = Impedance(hand.mass, hand.damping, hand.stiffness)
-    if turns:
-        held = Impedance(0.0, hand.rotation_damping, hand.rotation_stiffness)
+    held = Impedance(*joystick.hand.along(axis))
     return LinearCase(
         pilot, numbers.axis[axis].copy(), Impedance(flotor), held, tip, servo, clocks, task,
         channel.delay_forward, channel.delay_back,

@@ -145,6 +145,54 @@ def test_held_forces_move_a_free_body_exactly():
     assert abs(x) < 4e-3  # no stop was met
 
 
+SLANTED = JOYSTICK.model_copy(update={"hand": JOYSTICK.hand.model_copy(update={
+    "mass_shape": (1.1, 0.5, 1.2), "stiffness_shape": (2.5, 0.4, 0.6)})})  # fmt: skip
+
+
+def test_an_arm_is_as_heavy_and_stiff_as_its_ellipses_say():
+    """The matrices of MuJoCo with the hand less those without; only what hangs on it has weight."""
+    hand, n = SLANTED.hand, 6
+    found = []
+    for held in (True, False):
+        flotor = SimulatedFlotor(SLANTED, hand=held)
+        model, data, mass, stiffness = flotor.model, flotor.data, np.zeros((n, n)), np.zeros((n, 2))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, mass)
+        for k in range(2):
+            data.qpos[:3] = np.eye(3)[k] * 1e-3
+            mujoco.mj_forward(model, data)
+            stiffness[:, k] = -data.qfrc_spring / 1e-3
+        found.append((mass[:3, :3], stiffness[:2], model.body_mass.sum()))
+    (m1, k1, w1), (m0, k0, w0) = found
+    expected = hand.mass * np.array([[1.1, 0.5, 0.0], [0.5, 1.2, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(m1 - m0, expected, atol=1e-9)
+    np.testing.assert_allclose(k1 - k0, hand.stiffness * np.array([[2.5, 0.4], [0.4, 0.6]]))
+    assert w1 - w0 == pytest.approx(hand.carried) and hand.carried < hand.mass
+
+
+def test_steps_of_a_slanted_arm_converge_with_their_second_order():
+    """A push across its ellipses, in the plane, where mass and damping are coupled, too.
+
+    Coils that carry the weight only; the hand alone brings it back.
+    """
+    stocky = JOYSTICK.flotor.model_copy(update={"inertia": (10.0, 10.0, 10.0)})  # hardly turns
+    heavy = SLANTED.model_copy(update={"flotor": stocky})
+
+    def places(**kind):
+        flotor, rng = SimulatedFlotor(heavy, **kind), np.random.default_rng(5)
+        muscles, found, currents = np.zeros(6), [], lifting(flotor)
+        for _ in range(100):
+            muscles[:2], muscles[2] = rng.normal(0.0, 0.3, 2), 9.81 * SLANTED.hand.carried
+            flotor.step(currents, muscles)
+            found.append(flotor.data.qpos[:2].copy())
+        return np.array(found)
+
+    exact = places(fine=16)
+    errors = [np.abs(places(fine=fine) - exact).max() for fine in (1, 2, 4)]
+    assert np.abs(exact).max() < 4e-3 and errors[0] < 2e-3 * np.abs(exact).max(), errors
+    assert (np.array(errors[:-1]) / errors[1:] > 3.5).all(), errors
+
+
 def coils_moved(flotor):
     """Displacement (3,) of the coils' centre from its nominal place [m]."""
     turn, handle = np.empty(9), np.array(JOYSTICK.flotor.handle)

@@ -101,6 +101,8 @@ def test_hand_is_that_of_the_scenarios_operator(case):
     firm = made(pilot__perception="{grip: firm, cocontraction: 0.4}")[0]
     assert firm.held.mass == pytest.approx(0.8)  # operator.yaml: firm
     assert firm.held.stiffness == pytest.approx(600.0 * 1.8)  # stiffening 3: 1 + 2 x 0.4
+    far = made(pilot__perception="{grip: normal, posture: far}", coordinate="r")[0]
+    assert far.held.stiffness > 2.0 * 250.0  # towards the shoulder
     ratios = [structure_findings(c, "rate_force").largest_ratio for c in (case, firm)]
     assert ratios[1] != pytest.approx(ratios[0], rel=0.02)
     with pytest.raises(InputError, match="pilot.perception.grip"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.machine.joystick import load_joystick
+from hydrotele.machine.joystick import load_joystick, principal
 from hydrotele.scenario.teleoperation import Perception, TeleopPilot
 from hydrotele.teleop.manual_control import (
     BELIEVED_GAIN,
@@ -24,6 +24,7 @@ from hydrotele.teleop.manual_control import (
 )
 from hydrotele.teleop.operator_model import recorded_hand
 from hydrotele.teleop.operator_parameters import (
+    arm_impedance,
     drawn_operator,
     held_joystick,
     load_operator_file,
@@ -129,6 +130,34 @@ def test_an_own_file_changes_what_it_names(tmp_path):
         perceiving(Perception(file="bad.yaml"), str(tmp_path))
 
 
+def test_posture_makes_ellipses_of_the_hand():
+    """Mussa-Ivaldi et al. 1985: long axis to the shoulder, longer and turning with the hand.
+
+    Mass stays positive, its ellipse along the forearm; the usual posture keeps the grip's size.
+    """
+    stick, file = load_joystick(), load_operator_file()
+    hands = {p: held_joystick(stick, Perception(grip="normal", posture=p)).hand
+             for p in ("near", "mid", "far")}  # fmt: skip
+    long = [principal(h.stiffness_shape) for h in hands.values()]
+    ratio = [p.greatest / p.least for p in long]
+    assert ratio[0] < 2.0 < ratio[1] < 3.0 < ratio[2]
+    assert abs(long[1].angle) < np.deg2rad(5.0) and abs(long[2].angle) < np.deg2rad(5.0)
+    mid = principal(hands["mid"].stiffness_shape)
+    assert mid.least * mid.greatest == pytest.approx(1.0)  # its geometric mean is the grip's
+    assert hands["mid"].stiffness == file.grips["normal"].stiffness
+    assert hands["far"].along(0)[2] > 1.4 * hands["mid"].along(0)[2] > 1.4 * 250.0
+    assert hands["far"].along(1)[2] < 0.7 * hands["mid"].along(1)[2] < 0.7 * 250.0
+    assert hands["far"].along(2)[2] == 250.0
+    assert file.arm
+    turned = [arm_impedance(file.arm, (0.4 * math.cos(a), 0.4 * math.sin(a))) for a in (0.0, 0.5)]
+    c, s = math.cos(0.5), math.sin(0.5)
+    turn = np.array([[c, -s], [s, c]])
+    for here, there in zip(*turned, strict=True):
+        np.testing.assert_allclose(turn @ here @ turn.T, there, rtol=1e-9)
+    with pytest.raises(InputError, match="out of reach"):
+        arm_impedance(file.arm, (0.7, 0.0))
+
+
 def test_grip_posture_and_cocontraction_make_the_hand():
     """Full co-contraction: stiffness times `stiffening`, the damping ratio stays."""
     stick = load_joystick()
@@ -139,7 +168,6 @@ def test_grip_posture_and_cocontraction_make_the_hand():
     assert tense.stiffness == pytest.approx(HIM.stiffening * stick.hand.stiffness)
     ratio = [h.damping / math.sqrt(h.mass * h.stiffness) for h in (tense, stick.hand)]
     assert ratio[0] == pytest.approx(ratio[1])
-    assert held_joystick(stick, Perception(posture="far")).hand.stiffness < stick.hand.stiffness
     with pytest.raises(InputError, match="did you mean 'firm'"):
         held_joystick(stick, Perception(grip="frm"))
 
