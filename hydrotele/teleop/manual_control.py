@@ -220,7 +220,8 @@ def look_and_act(loop, tick, target, seen, hand):
     late = max(0.5, facts[DELAY] / step)
     if tick < int(late) + 3:
         return 0.0
-    error = _past(past, tick, late, 0)
+    middle = 0.5 if facts[FORM] == 0.0 else 0.0  # of the step over which he integrates
+    error = _past(past, tick, late + middle, 0)
     rate = (_past(past, tick, late - 0.5, 0) - _past(past, tick, late + 0.5, 0)) / step
     learn(loop, tick, late, _past(past, tick, late, 1))
     best = int(state[CHOSEN])

@@ -1,5 +1,6 @@
 """Crossover model: measured from simulated tracking, learnt gains, remnant, and drawn operators."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -18,6 +19,7 @@ from hydrotele.teleop.manual_control import (
     describing_function,
     look_and_act,
     neuromuscular_matrix,
+    operator_response,
     sum_of_sines,
     track,
     visual_loop,
@@ -128,6 +130,21 @@ def test_an_own_file_changes_what_it_names(tmp_path):
     (tmp_path / "bad.yaml").write_text("name: me\nparameters: {tremors: {value: 1}}\n")
     with pytest.raises(InputError, match="bad.yaml"):
         perceiving(Perception(file="bad.yaml"), str(tmp_path))
+
+
+@pytest.mark.parametrize("form", range(3))
+def test_operator_is_as_late_as_his_parameters_say(form):
+    """Without remnant, by the phase of his describing function from 1 to 9 rad/s.
+
+    2 ms at 9 rad/s: he decides every 20 ms, between which what he saw is interpolated.
+    """
+    him, time = dataclasses.replace(HIM, remnant=0.0), np.arange(0.0, 150.0, 0.01)
+    target, w = sum_of_sines(time, 2.5, 120.0, 3)
+    record = track(him, form, 2.0, target, seed=3, surprised=False)
+    found = describing_function([record], w, 30.0)[1] / operator_response(him, form, w)
+    told = (w > 1.0) & (w < 9.0)
+    delay = -np.angle(found[told]) / w[told]
+    assert np.abs(delay).max() < 4e-3 and abs(delay[-1]) < 2e-3, delay
 
 
 def test_posture_makes_ellipses_of_the_hand():
