@@ -142,6 +142,22 @@ def test_every_structure_has_a_margin(reflection, mode):
 
 
 @pytest.mark.parametrize(
+    ("reflection", "mode", "message"),
+    [
+        ("four_channel", "rate", "observed force of the hand.*--structure four_channel_rate"),
+        ("wave_variables", "position", "as far as energy.*--structure wave_variables --robust"),
+        ("passivity_control", "position", "--structure passivity_control --robust"),
+        ("impedance", "rate", "identified and changes; .*direct_force"),
+    ],
+)
+def test_structures_without_a_linear_case_say_why_and_what_to_do(reflection, mode, message):
+    case = made()[0]
+    pilot = case.pilot.model_copy(update={"reflection": reflection, "mode": mode})
+    with pytest.raises(InputError, match=message):
+        find_loop("a", dataclasses.replace(case, pilot=pilot), "")
+
+
+@pytest.mark.parametrize(
     ("overrides", "coordinate", "message"),
     [
         ({}, "head", "no 'head'; the arm has r, theta, z, attitude"),
