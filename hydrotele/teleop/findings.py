@@ -402,10 +402,8 @@ def find_loop(name: str, case: LinearCase, task_source: str) -> ScenarioFindings
     reflection, mode = case.pilot.reflection, case.pilot.mode
     if reflection in _UNLINEAR:
         why, instead = _UNLINEAR[reflection]
-        raise InputError(
-            "pilot.reflection",
-            f"{reflection!r} of a scenario has no linear case, because {why}; {instead.format(mode)}",
-        )
+        message = f"{reflection!r} of a scenario has no linear case, because {why}"
+        raise InputError("pilot.reflection", f"{message}; {instead.format(mode)}")
     own = (reflection, mode) in _NAMES
     structure = _NAMES.get((reflection, mode), f"{mode}_force")
     spring = case.spring

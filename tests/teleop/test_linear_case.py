@@ -167,9 +167,3 @@ def test_structures_without_a_linear_case_say_why_and_what_to_do(reflection, mod
 def test_what_cannot_be_analysed(overrides, coordinate, message):
     with pytest.raises(InputError, match=message):
         made(coordinate=coordinate, **overrides)
-
-
-def test_a_structure_without_a_linear_case_says_so():
-    case = made(pilot__reflection="four_channel")[0]
-    with pytest.raises(InputError, match="four_channel.*write a case file"):
-        find_loop("a", case, "")
