@@ -463,4 +463,5 @@ def crossover_of(frequencies: np.ndarray, open_loop: np.ndarray) -> Crossover:
     near[k] = near[k + 1] = True
     slope = float(np.polyfit(decades[near], size[near], 1)[0])
     angle = phase[k] + share * (phase[k + 1] - phase[k])
-    return Crossover(float(10.0**place), float(math.pi + angle), slope)
+    margin = math.remainder(math.pi + angle, 2.0 * math.pi)  # sparse sines may hide a turn
+    return Crossover(float(10.0**place), margin, slope)

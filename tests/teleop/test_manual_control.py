@@ -61,6 +61,15 @@ def test_the_open_loop_falls_by_20_db_per_decade_around_a_published_crossover(
     assert found.slope == pytest.approx(-20.0, abs=5.0)
 
 
+def test_a_turn_between_two_sines_does_not_count_as_margin():
+    """1 e^(-0.3 s) / s, margin 90 - 17 degrees; far above, sines are more than a turn apart."""
+    w = np.array([0.3, 0.6, 0.9, 1.2, 2.0, 40.0])
+    for turn in (0.0, 2.0 * np.pi):
+        loop = np.exp(-1j * (0.3 * w + turn)) / (1j * w)
+        assert crossover_of(w, loop).margin == pytest.approx(0.5 * np.pi - 0.3, abs=0.01)
+    assert abs(crossover_of(w[::5], np.exp(-0.3j * w[::5]) / (1j * w[::5])).margin) < np.pi
+
+
 def test_an_operator_with_twice_the_delay_crosses_over_at_a_lower_frequency():
     slow = drawn_operator(load_operator_file(), None, visual_delay=0.32)
     assert measured(INTEGRATOR, him=slow).frequency < 0.8 * measured(INTEGRATOR).frequency
