@@ -63,7 +63,7 @@ class Left:
 
 def find_left(
     fit: Columns, judge: Columns, rest: np.ndarray, judged: np.ndarray, std: np.ndarray,
-    weight: np.ndarray, judge_weight: np.ndarray,
+    weight: np.ndarray, judge_weight: np.ndarray, spread: np.ndarray,
 ) -> Left:  # fmt: skip
     """Look for what is left.
 
@@ -75,6 +75,7 @@ def find_left(
         std: (k,) noise of the fitted runs.
         weight: (n, k) of the rows, lower where the sign of friction is in doubt.
         judge_weight: (j, k).
+        spread: (k,) RMS of what the fit's own uncertainty does to the run that was not fitted.
 
     Returns:
         What is left.
@@ -92,7 +93,9 @@ def find_left(
             laws += own
     burst, limit, loud = _bursts([(fit, weight * rest), (judge, judge_weight * judged)], std)
     grown = np.sqrt(np.mean((judge_weight * judged) ** 2, axis=0)
-                    / np.mean(judge_weight**2, axis=0)) / std  # fmt: skip
+                    / np.mean(judge_weight**2, axis=0))  # fmt: skip
+    std = np.hypot(std, spread)
+    grown = grown / std
     excess = std * np.sqrt(np.maximum(grown**2 - 1.0, 0.0))
     by_state = (share > _TOLD) & (size > _SMALL * force)
     by_time = (burst > limit) & (loud > _SMALL * force)
