@@ -75,14 +75,18 @@ def find_noise(columns: Columns) -> Noise:
         columns: of the runs.
 
     Returns:
-        The noise. What repeats with the motion but has no column counts as noise, too.
+        The noise. What repeats with the motion but has no column counts as noise, too; what is
+        constant in a run but differs from run to run does not.
 
     Source: generalised least squares, feasible (Aitken 1935; Cochrane and Orcutt 1949).
     """
     n, k, _ = columns.matrix.shape
     wide = TYPICAL / np.maximum(strengths(columns), 1e-300)
     used = np.isfinite(wide) & (wide < 1e200)
-    matrix, gap = columns.matrix[:, :, used] * wide[used], columns.gap
+    gap = columns.gap
+    matrix = np.concatenate(
+        [columns.matrix[:, :, used] * wide[used], _run_offsets(columns)], axis=2
+    )
     std = np.maximum(np.std(gap, axis=0), 1e-12)
     noise = Noise(np.zeros((0, k)), np.diag(1.0 / std), np.ones((n, k)), std, gap, np.zeros((k, 2)))
     for _ in range(_ROUNDS):
@@ -94,6 +98,17 @@ def find_noise(columns: Columns) -> Noise:
         free = max(1.0 - float(np.trace(cho_solve(factor, square))) / len(y), 0.1)
         noise = noise_of(gap - matrix @ value, columns, free)
     return noise
+
+
+def _run_offsets(columns: Columns) -> np.ndarray:
+    """(n, k, k r) constants of every drive in every one of r runs, of a typical size."""
+    rows, drives = columns.measured.shape
+    size = TYPICAL * np.sqrt(np.mean(columns.measured**2, axis=0))
+    runs = len(columns.starts) - 1
+    out = np.zeros((rows, drives, runs, drives))
+    for run, (a, b) in enumerate(zip(columns.starts[:-1], columns.starts[1:], strict=True)):
+        out[a:b, np.arange(drives), run, np.arange(drives)] = size
+    return out.reshape(rows, drives, -1)
 
 
 def noise_of(rest: np.ndarray, columns: Columns, free: float = 1.0) -> Noise:
@@ -360,14 +375,10 @@ def effects_by_part(
             precisions[k].append(np.linalg.inv(fitted.covariance[block, block]))
     out = []
     for effect, many, weights in zip(found.effects, values, precisions, strict=True):
-        mean = np.linalg.solve(
-            sum(weights), sum(w @ v for w, v in zip(weights, many, strict=True))
-        )
+        mean = np.linalg.solve(sum(weights), sum(w @ v for w, v in zip(weights, many, strict=True)))
         away = np.array(many) - mean
         square = sum(float(d @ w @ d) for d, w in zip(away, weights, strict=True))
-        size = sum(
-            float((mean - effect.start) @ w @ (mean - effect.start)) for w in weights
-        )
+        size = sum(float((mean - effect.start) @ w @ (mean - effect.start)) for w in weights)
         free = len(mean) * (len(many) - 1)
         varies = chi2.sf(square, free) < _CHANCE and square - free > _VARIES**2 * size
         out.append(many if varies else [])

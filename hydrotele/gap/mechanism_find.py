@@ -35,7 +35,7 @@ from hydrotele.gap.mechanism_evidence import (
     row_weights,
     whitened,
 )
-from hydrotele.gap.mechanism_lack import Left, find_left, loud_windows
+from hydrotele.gap.mechanism_lack import Left, find_left, loud_windows, with_variation
 from hydrotele.gap.mechanism_patch import (
     COLUMNS_FILE,
     MJCF_FILE,
@@ -69,7 +69,11 @@ _ROUNDS = 4  # of taking sensors' defects off the readings
 _SAME = 0.01  # of a prior's width, within which a round has changed nothing
 _BETTER = 1e-3  # by which an exchange must be better
 _WORTH_TELLING = 0.005
-_SHARES = (1.0, 0.3, 0.1)  # of the stated uncertainty that are tried: how far the numbers are off is
+_SHARES = (
+    1.0,
+    0.3,
+    0.1,
+)  # of the stated uncertainty that are tried: how far the numbers are off is
 # found, too
 _CALIBRATED = 10.0  # twice the log odds from which numbers of the model count as off
 _TOLD = 3.0  # standard deviations from which a calibrated number is told
@@ -87,6 +91,7 @@ _DIFFERS = (
     "{} at {}, which the fitted runs asked for, is not the same in all parts of them ({} {} {});"
     " it was taken back."
 )
+_LISTED = 3  # notes of that kind
 METRIC = "RMS of the errors of the drives' forces over their noise, all drives, held-out run"
 
 
@@ -222,8 +227,8 @@ def find_mechanism_gap(
     )
     then = build_columns([heldout], mechanism, band)
     patching = _Patching(mjcf, mechanism, given, nominal, heldout, band, then)
-    found, untrue = _constant(found)
-    notes = (*notes, *untrue.values())
+    found, untrue, varies = _constant(found)
+    notes = (*notes, *untrue)
     patched, calibration, judged = patching.of(found)
     if spoiling := {key for key, gain in judged.gained.items() if gain < 0.0}:
         notes = (*notes, *(_SPOILS.format(*key) for key in sorted(spoiling)))
@@ -233,6 +238,7 @@ def find_mechanism_gap(
         notes = (*notes, _REJECTED)
         found, patched, calibration = _emptied(fit, mechanism, band, found), given, {}
         judged = _judged(mechanism, found, nominal, then, then)
+    judged = judged._replace(left=with_variation(judged.left, varies, judged.std))
     named = _named(found, judged.shares)
     named, details = _believable(named, judged)
     left = judged.left
@@ -272,21 +278,31 @@ def _without(found: _Found, dropped: Iterable[Key]) -> _Found:
     return replace(found, fitted=fitted, refused=found.refused | dropped)
 
 
-def _constant(found: _Found) -> tuple[_Found, dict[Key, str]]:
-    """A search's result without effects that differ from run to run; and what is said of these."""
-    told: dict[Key, str] = {}
+def _constant(found: _Found) -> tuple[_Found, list[str], np.ndarray]:
+    """A search's result without effects that differ from run to run.
+
+    Returns:
+        The result, what is said of the effects, and (k,) RMS of the drives' forces that these made.
+    """
+    told: list[str] = []
+    moved = np.zeros(found.columns.measured.shape[1])
     while found.fitted.effects:
         parts = effects_by_part(found.columns, found.noise, found.off, found.fitted)
-        effects = found.fitted.effects
-        differ = {e.key: (e, many) for e, many in zip(effects, parts, strict=True) if many}
+        differ = [k for k, many in enumerate(parts) if many]
         if not differ:
             break
-        for key, (effect, many) in differ.items():
+        for k in differ:
+            effect, value = found.fitted.effects[k], found.fitted.values[k]
             name, facts = next(iter(effect.parameters.items()))
-            values = ", ".join(f"{float(value[0]):.3g}" for value in many)
-            told[key] = _DIFFERS.format(*key, name, values, facts.unit)
-        found = _without(found, differ)
-    return found, told
+            values = ", ".join(f"{float(own[0]):.3g}" for own in parts[k])
+            told.append(_DIFFERS.format(*effect.key, name, values, facts.unit))
+            at = [found.evidence.places[column] for column in effect.columns]
+            force = found.columns.matrix[:, :, at] @ effect.coefficients(value)
+            moved = np.hypot(moved, np.sqrt(np.mean(force**2, axis=0)))
+        found = _without(found, [found.fitted.effects[k].key for k in differ])
+    if len(told) > _LISTED:
+        told = [*told[:_LISTED], f"So were {len(told) - _LISTED} more."]
+    return found, told, moved
 
 
 def nominal_parameters(mechanism: Mechanism) -> dict[str, float]:
@@ -312,9 +328,7 @@ def nominal_parameters(mechanism: Mechanism) -> dict[str, float]:
     return out
 
 
-def possible_errors(
-    mechanism: Mechanism, columns: Columns, share: float = 1.0
-) -> dict[str, float]:
+def possible_errors(mechanism: Mechanism, columns: Columns, share: float = 1.0) -> dict[str, float]:
     """By how much numbers of the model may be off: column -> standard deviation.
 
     Masses, moments and inertias by the mapping's uncertainty of the body's own, friction by that of

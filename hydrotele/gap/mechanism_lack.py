@@ -6,7 +6,7 @@ a law that the model lacks.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -113,6 +113,25 @@ def find_left(
     size = np.maximum(np.where(by_state, size, 0.0), np.where(by_run, excess, 0.0))
     size = np.maximum(size, np.where(by_time, loud, 0.0))
     return Left(tuple(laws), share, size, tests, lacking)
+
+
+def with_variation(left: Left, moved: np.ndarray, std: np.ndarray) -> Left:
+    """What is left, with effects that are not the same in all parts of the fitted runs.
+
+    Args:
+        left: without them.
+        moved: (k,) RMS of what they do to the drives' forces [N] or [N m].
+        std: (k,) of the forces' noise; what is smaller says nothing.
+
+    Returns:
+        What is left.
+    """
+    loud = moved > std
+    tests = {**left.tests, "constant": _test(float((moved / std).max()), 1.0, not loud.any())}
+    return replace(
+        left, tests=tests, lacking=left.lacking | loud,
+        size=np.maximum(left.size, np.where(loud, moved, 0.0)),
+    )  # fmt: skip
 
 
 def _test(value: float, limit: float, passed: bool) -> dict[str, float | bool]:
