@@ -374,11 +374,11 @@ def effects_by_part(
             values[k].append(value)
             precisions[k].append(np.linalg.inv(fitted.covariance[block, block]))
     out = []
-    for effect, many, weights in zip(found.effects, values, precisions, strict=True):
-        mean = np.linalg.solve(sum(weights), sum(w @ v for w, v in zip(weights, many, strict=True)))
+    for effect, many, known in zip(found.effects, values, precisions, strict=True):
+        mean = np.linalg.solve(sum(known), sum(w @ v for w, v in zip(known, many, strict=True)))
         away = np.array(many) - mean
-        square = sum(float(d @ w @ d) for d, w in zip(away, weights, strict=True))
-        size = sum(float((mean - effect.start) @ w @ (mean - effect.start)) for w in weights)
+        square = sum(float(d @ w @ d) for d, w in zip(away, known, strict=True))
+        size = sum(float((mean - effect.start) @ w @ (mean - effect.start)) for w in known)
         free = len(mean) * (len(many) - 1)
         varies = chi2.sf(square, free) < _CHANCE and square - free > _VARIES**2 * size
         out.append(many if varies else [])

@@ -376,20 +376,13 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
         if names:
             effects = [one for one in effects if one.name in names]
         tell(f"{len(effects)} effects, round {turn + 1}", 0.2 * turn + 0.15)
-        noise, before = find_noise(columns), found
-
-        def tried(share, noise=noise, columns=columns, effects=effects, before=before):
-            off = possible_errors(mechanism, columns, share)
-            return _search(
-                columns, noise, gather_evidence(columns, noise, off), effects, before, off
-            )
-
-        all_of = {share: tried(share) for share in shares}
-        best = max(shares, key=lambda share: all_of[share].total)
-        found, shares = all_of[best], (best,)
+        noise = find_noise(columns)
+        tried = [_search(columns, noise, mechanism, one, effects, found) for one in shares]
+        best = int(np.argmax([one.total for one in tried]))
+        found, shares = tried[best], shares[best : best + 1]
         if columns.gap.size < _SCARCE * len(columns.names):
-            before = found
-            found = tried(best, noise_of(_unexplained(found), columns), before=before)
+            noise = noise_of(_unexplained(found), columns)
+            found = _search(columns, noise, mechanism, shares[0], effects, found)
         known = [
             (one, value)
             for one, value in zip(found.fitted.effects, found.fitted.values, strict=True)
@@ -409,9 +402,12 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
 
 
 def _search(
-    columns, noise, evidence: Evidence, effects: list[MechanismEffect], before: _Found | None, off
-) -> _Found:
+    columns: Columns, noise: Noise, mechanism: Mechanism, share: float,
+    effects: list[MechanismEffect], before: _Found | None,
+) -> _Found:  # fmt: skip
     """Add what is most worth adding, drop what is not worth having, exchange what is better."""
+    off = possible_errors(mechanism, columns, share)
+    evidence = gather_evidence(columns, noise, off)
     need = 2.0 * np.log(max(len(effects), 1)) + _ODDS
     singles = [evidence.fit([one]) for one in effects]
     first = [e.key for e in before.fitted.effects] if before else []
@@ -608,10 +604,9 @@ def _judged(
     before = (weight * then.gap / std)[:rows]
     after = (later * now.gap / std)[:rows]
     whole = float(np.mean(before**2)) - 1.0
-    last = replace(noise, weight=later[:rows])
 
     def squares(error: np.ndarray) -> float:
-        return float(np.sum(whitened(error, last, (0, rows)) ** 2))
+        return float(np.sum(whitened(error, replace(noise, weight=later[:rows]), (0, rows)) ** 2))
 
     shares, moved, gained, value_of_all = {}, {}, {}, found.coefficients()
     for effect, value in zip(found.fitted.effects, found.fitted.values, strict=True):
