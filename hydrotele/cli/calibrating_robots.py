@@ -1,6 +1,5 @@
 """`hydrotele calibrate mukca` and `scara`: serial robots."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from hydrotele.calibrate.mukca import (
     parts_to_leave_out,
 )
 from hydrotele.calibrate.sockets import Socket, idle_joints, load_sockets, places_of
-from hydrotele.cli.console import out, plain, print_json, table
+from hydrotele.cli.console import out, plain, print_json, table, write_json
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 from hydrotele.core.output import check_target, whole_folder
@@ -210,8 +209,7 @@ def _write(
 ) -> None:
     from hydrotele.show.robot_calibration_report import draw_sockets, write_robot_report
 
-    text = json.dumps(document, indent=2, allow_nan=False)
-    (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / "calibration.json", document)
     source = f"calibrated by hydrotele {hydrotele.__version__} from {document['data']}"
     (folder / "calibrated.yaml").write_text(robot_yaml(found.robot, source), encoding="utf-8")
     origin = Path(found.nominal.source)
@@ -228,7 +226,7 @@ def _write(
         "heldout": document["heldout"],
         "hydrotele": hydrotele.__version__,
     }
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)
 
 
 def _print(document: dict[str, Any], found: SocketCalibration, left: Sequence[LeftOut]) -> None:

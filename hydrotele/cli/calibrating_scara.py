@@ -1,6 +1,5 @@
 """`hydrotele calibrate scara`: the example by which calibration is explained."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from hydrotele.calibrate.scara import (
     save_scara,
     simulated_scara,
 )
-from hydrotele.cli.console import out, plain, print_json, table
+from hydrotele.cli.console import out, plain, print_json, table, write_json
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 
@@ -91,16 +90,14 @@ def calibrate_scara_folder(
         document["best_poses"] = sorted(k + 1 for k in chosen.chosen)
     if target is not None:
         with whole_folder(target, "robot calibration") as folder:
-            text = json.dumps(document, indent=2, allow_nan=False)
-            (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
+            write_json(folder / "calibration.json", document)
             summary = {
                 "kind": "robot calibration",
                 "data": document["data"],
                 "heldout": document["heldout"],
                 "hydrotele": hydrotele.__version__,
             }
-            text = json.dumps(summary, indent=2) + "\n"
-            (folder / "summary.json").write_text(text, encoding="utf-8")
+            write_json(folder / "summary.json", summary)
     if as_json:
         print_json(document)
     else:
