@@ -9,10 +9,10 @@ from pathlib import Path
 
 import hypothesis
 
-# Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out.
-collect_ignore = []
-if importlib.util.find_spec("stable_baselines3") is None:
-    collect_ignore = ["envs/test_stable_baselines.py", "tools/test_learn.py"]
+# Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out and the last lines of
+# the suite say so. tools/nightly has a check `learn`, which runs them with it.
+_LEARN = ("envs/test_stable_baselines.py", "tools/test_learn.py")
+collect_ignore = [] if importlib.util.find_spec("stable_baselines3") else [*_LEARN]
 
 # Has to be settled before the first import of mujoco or dm_control.
 if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:
@@ -57,6 +57,11 @@ def _inside(path, root):
 
 def pytest_terminal_summary(terminalreporter):
     """Say what tools/test did beside pytest here, so that pytest has the last word."""
+    if collect_ignore:
+        terminalreporter.write_line(
+            f"not run, for they need the extra `learn` (torch, 3 GB): {', '.join(collect_ignore)};"
+            " tools/nightly --only learn runs them"
+        )
     folder = os.environ.get("HYDROTELE_CHECKS")
     if folder and Path(folder, "output").exists():
         done = Path(folder, "done")
