@@ -9,8 +9,8 @@ from pathlib import Path
 
 import hypothesis
 
-# Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out and the last lines of
-# the suite say so. tools/nightly has a check `learn`, which runs them with it.
+# Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out; the last lines of
+# the suite say so, and tools/nightly has a check `learn`, which runs them with it.
 _LEARN = ("envs/test_stable_baselines.py", "tools/test_learn.py")
 collect_ignore = [] if importlib.util.find_spec("stable_baselines3") else [*_LEARN]
 
