@@ -31,12 +31,15 @@ hypothesis.settings.load_profile("hydrotele")
 
 
 # Files that take ten seconds or more, the longest first: two processes then end together. A file
-# that is missing here costs at most its own length at the end.
+# that is missing here costs at most its own length at the end. The first two compile unlike code,
+# so that neither process waits for the other.
 LONG = (
-    "scenario/test_scenario.py", "envs/test_gymnasium.py", "gap/test_find.py",
-    "envs/test_render.py", "cli/test_cli.py", "effects/test_library.py", "gap/test_discover.py",
-    "teleop/test_station.py", "run/test_sweep_processes.py", "experiments/test_zhu1994.py",
-    "models/test_machines.py",
+    "gap/test_find.py", "scenario/test_scenario.py", "envs/test_render.py", "cli/test_cli.py",
+    "effects/test_library.py", "gap/test_discover.py", "teleop/test_station.py",
+    "estimate/test_filter.py", "envs/test_gymnasium.py", "estimate/test_reduced_against_plant.py",
+    "models/test_machines.py", "run/test_sweep_processes.py", "cli/test_untrusted_folder.py",
+    "gap/test_rattling.py", "estimate/test_output_error.py", "gap/test_command.py",
+    "core/test_compiled.py", "calibrate/test_mukca.py", "experiments/test_zhu1994.py",
 )  # fmt: skip
 
 

@@ -51,7 +51,7 @@ def test_a_pressure_offset_below_one_reading_is_named():
 
 
 @pytest.mark.parametrize("effects", [
-    ("valve_deadband", "valve_gain", "command_delay", "leakage"),
+    ("valve_deadband", "valve_gain", "command_delay", "internal_leakage"),
     pytest.param((), marks=pytest.mark.nightly, id="the whole library"),
 ])  # fmt: skip
 def test_missing_channels_and_rows_still_find_the_dead_band(effects, tmp_path):
