@@ -43,10 +43,13 @@ LONG = (
 )  # fmt: skip
 
 
+_REAL = Path(__file__).resolve().parents[2] / "shared" / "real"
+
+
 def pytest_collection_modifyitems(config, items):
     """Leave out what needs absent records; put the files that take long first."""
     root = Path(__file__).parent
-    if not (root.parent.parent / "shared" / "real").is_dir():
+    if not _REAL.is_dir():
         absent = [item for item in items if item.get_closest_marker("real")]
         config.hook.pytest_deselected(items=absent)
         items[:] = [item for item in items if item not in absent]
@@ -65,6 +68,8 @@ def pytest_terminal_summary(terminalreporter):
             f"not run, for they need the extra `learn` (torch, 3 GB): {', '.join(collect_ignore)};"
             " tools/nightly --only learn runs them"
         )
+    if not _REAL.is_dir():
+        terminalreporter.write_line(f"not run: tests of real machines' records, not at {_REAL}")
     folder = os.environ.get("HYDROTELE_CHECKS")
     if folder and Path(folder, "output").exists():
         done = Path(folder, "done")
