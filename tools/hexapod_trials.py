@@ -24,7 +24,7 @@ from pathlib import Path
 
 from hydrotele.core.errors import InputError
 from tools.blind.generate import key_hash
-from tools.blind.judge import Verdict, judge
+from tools.blind.judge import DETECTABLE, Verdict, judge
 from tools.blind.run_trial import PASSED, ROOT
 from tools.blind.trials import Place, Series, begin_series, load_series, write_json
 
@@ -104,6 +104,12 @@ def _summary(verdicts: list[Verdict], answers) -> list[str]:
         if own:
             right = sum(v.right for v in own)
             rows.append(f"| {kind} | {right} of {len(own)} | {100 * right / len(own):.0f} % |")
+        faint = [v for v in own if v.weak]
+        if kind == "single" and faint:
+            quiet = sum(not answers[v.trial].get("effects") for v in faint)
+            clear, right = len(own) - len(faint), sum(v.right for v in own if not v.weak)
+            rows.append(f"| single, not faint | {right} of {clear} | {100 * right / clear:.0f} % |")
+            rows.append(f"| faint, nothing named | {quiet} of {len(faint)} | |")
     named = [v for v in verdicts if v.kind == "clean" and answers[v.trial].get("effects")]
     false = [v for v in verdicts if v.kind == "outside" and any(p > 0.5 for p, _ in v.beliefs)]
     covered = [low <= truth <= high for v in verdicts for _, _, low, high, truth in v.covered]
@@ -113,6 +119,10 @@ def _summary(verdicts: list[Verdict], answers) -> list[str]:
         f" 50 %: {len(false)}. 95 % intervals that hold the truth: {sum(covered)} of"
         f" {len(covered)}.",
     ]
+    rows.append(
+        f"Faint: what the effect changes in the measured forces of the fitted runs, in units of"
+        f" their noise and summed in squares, has a root below {DETECTABLE:g}."
+    )
     loops = []
     for v in verdicts:
         loop = answers[v.trial].get("open_loop") or {}
@@ -132,8 +142,8 @@ def _summary(verdicts: list[Verdict], answers) -> list[str]:
 
 
 def _rows(verdicts: list[Verdict], keys, answers) -> list[str]:
-    rows = ["| trial | off | hidden | verdict | answer | errors / noise, both models | right |",
-            "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    rows = ["| trial | off | hidden | visibility | verdict | answer | errors / noise, both models |"
+            " right |", "| --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
     for v in verdicts:
         hidden = ", ".join(
             f"{e['name']} at {e['location']}: " + ", ".join(
@@ -146,7 +156,9 @@ def _rows(verdicts: list[Verdict], keys, answers) -> list[str]:
             for e in answers[v.trial].get("effects", [])
         ) or "-"  # fmt: skip
         size = f"{v.before:.2f}, {v.after:.2f}" if v.before and v.after else v.error or "-"
-        rows.append(f"| {v.trial} | {100 * keys[v.trial]['off']:.1f} % | {hidden} | {v.verdict} |"
+        seen = "" if v.visible is None else f"{v.visible:.3g}"
+        rows.append(f"| {v.trial} | {100 * keys[v.trial]['off']:.1f} % | {hidden} | {seen} |"
+                    f" {v.verdict} |"
                     f" {told} | {size} | {'yes' if v.right else 'no'} |")  # fmt: skip
     return rows
 

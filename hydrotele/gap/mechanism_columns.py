@@ -14,6 +14,7 @@ from scipy.signal import fftconvolve
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.equations import (
+    RateErrors,
     build_equations,
     low_pass,
     low_passed,
@@ -256,10 +257,11 @@ def _run_columns(
     how = Processing("zero_phase", band=band)
     record = in_coordinates(raw, setup)
     found = resolution(record.position, record.period, record.position_noise)
-    own, table = build_equations(record, setup, how, found)
-    motion = joint_motion(record.position, record.period, found, how)
     plain = resolution(raw.position, raw.period, raw.position_noise)
     lengths = joint_motion(raw.position, raw.period, plain, how)
+    errors = RateErrors(raw.axes, lengths.rate_std)
+    own, table = build_equations(record, setup, how, found, rate_errors=errors)
+    motion = joint_motion(record.position, record.period, found, how)
     stride = max(1, int(1.0 / (_ROWS * band * record.period)))
     rows = slice(None, None, stride)
     whole = np.stack([motion.value, motion.rate, motion.acceleration])[:, rows]
@@ -271,9 +273,14 @@ def _run_columns(
     names, slow = late.columns(sizes)
     extra = _onto(slow, band, record.period * stride, own.time)
     fine = np.stack([motion.value, motion.rate, motion.acceleration])
-    more, quick = _drive_columns(setup, fine, sizes, value, record.period)
+    more, quick = _drive_columns(setup, fine, sizes, value, band, record.period)
+    quick = _onto(quick, band, record.period, own.time)
+    for k, name in enumerate(more):
+        kind, _, drive = name.partition(".")
+        if kind == "sharpness":
+            quick[:, :, k] -= own.matrix[:, :, table.names.index(f"coulomb.{drive}")]
     names = [*names, *more]
-    extra = np.concatenate([extra, _onto(quick, band, record.period, own.time)], axis=2)
+    extra = np.concatenate([extra, quick], axis=2)
     low, thin = low_pass(band, record.period)
     force = low_passed_forces(record.force, record.period, low, thin)
     matrix = np.concatenate([own.matrix, extra], axis=2)
@@ -295,14 +302,20 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
     return CubicSpline(own, passed, axis=0)(np.clip(time, own[0], own[-1]))
 
 
-def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, period: float):
-    """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m)."""
+def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, band, period: float):
+    """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m).
+
+    What dry friction does where it turns may be nearer to the sign of the rate in the band than to
+    the sign expected of the uncertain rate: `sharpness` is the first, of which the second is taken.
+    """
     chain = setup.chain
     found = project(chain, setup.given, *motion)
     passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.rest)
     base = setup.table(found).matrix @ value + np.einsum("nkv,nv->nk", found.share, passive)
     change = np.gradient(base, period, axis=0)
     names, out = ["delay.force"], [-change]
+    rubs = {one.place for one in setup.rubbing if "coulomb" in one.nominal}
+    low, _ = low_pass(band, period)
     for k, drive in enumerate(chain.drives):
         own = np.arange(len(chain.drives)) == k
         names += [f"scale.force.{drive}", f"delay.force.{drive}"]
@@ -313,6 +326,10 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, peri
         names.append(f"spring.{drive}")
         out.append(share * (found.position[:, j, None] - middle))
         speed = sizes[drive][2] if drive in sizes else float(np.sqrt(np.mean(rate**2)))
+        if drive in rubs:
+            calm = fftconvolve(rate, low, mode="same")
+            names.append(f"sharpness.{drive}")
+            out.append(share * np.sign(calm)[:, None])
         for number, part in enumerate(STRIBECK):
             shape = np.exp(-((rate / (part * speed)) ** 2)) * np.sign(rate)
             names.append(f"stribeck{number}.{drive}")

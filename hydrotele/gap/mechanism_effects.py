@@ -33,7 +33,7 @@ SENTENCES = {
 }
 TYPICAL, LEAST = 0.3, 0.01  # share of a drive's force RMS that an effect moves, typically; at least
 _MOST = 20.0  # times the typical size, where a search ends
-_FORM = 0.3  # of a drive's dry friction, which its form near rest may change
+_FORM = 0.2  # of a drive's dry friction, which its form near rest may change
 _NONE = 1e-9  # share that has no effect
 _ASIDE = 0.3  # of its radius of gyration that a body's centre of mass is aside, typically
 _SECOND = 0.1  # s, beyond which no sensor is late

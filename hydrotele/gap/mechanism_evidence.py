@@ -20,8 +20,9 @@ from hydrotele.identify.estimation import autoregression, find_doubtful, weights
 
 _ROUNDS, _STEPS = 3, 40
 _STICKS = 0.25  # doubt of a sign from which a drive counts as sticking
-_PARTS = 3  # of the fitted runs that an effect must be alike in, at least
-_VARIES, _CHANCE = 0.25, 1e-3  # share of an effect by which it differs from part to part, where it
+_PARTS, _LONG = 3, 2.0  # parts of the fitted runs that an effect must be alike in, at least, and
+# how long they are at most [s]
+_VARIES, _CHANCE = 0.6, 1e-3  # share of an effect by which it differs from part to part, where it
 # counts as one that is not constant, and the chance of that by noise
 
 
@@ -348,31 +349,36 @@ def effects_by_part(
     """Parameters of effects in every part of the runs, where they differ from part to part.
 
     Args:
-        columns: of the runs; if these are less than three, each is cut into parts.
+        columns: of the runs, which are cut into parts of some seconds.
         noise: of their equations.
         off: see `gather_evidence`.
         found: effects that are fitted to all runs.
 
     Returns:
         For each effect its parameters in every part; an empty list where they are alike, that is,
-        where noise explains the differences, or these are small.
+        where noise explains the differences, or these are not worth naming.
     """
     runs = list(zip(columns.starts[:-1], columns.starts[1:], strict=True))
     cuts = -(-_PARTS // len(runs))
-    edges = [np.linspace(a, b, cuts + 1).astype(int) for a, b in runs]
+    edges = [
+        np.linspace(a, b, max(cuts, round((b - a) * columns.spacing / _LONG)) + 1).astype(int)
+        for a, b in runs
+    ]
     values: list[list[np.ndarray]] = [[] for _ in found.effects]
     precisions: list[list[np.ndarray]] = [[] for _ in found.effects]
     for first, last in [pair for e in edges for pair in zip(e[:-1], e[1:], strict=True)]:
         if last - first <= 2 * len(noise.follow):
             continue
-        own = replace(noise, weight=noise.weight[first:last])
-        part = gather_evidence(columns.part(first, last), own, off)
+        here = replace(noise, weight=noise.weight[first:last])
+        part = gather_evidence(columns.part(first, last), here, off)
         fitted, begin = part.fit(found.effects, found.values), 0
         for k, value in enumerate(fitted.values):
             block = slice(begin, begin + len(value))
             begin += len(value)
             values[k].append(value)
-            precisions[k].append(np.linalg.inv(fitted.covariance[block, block]))
+            least = [facts.least for facts in found.effects[k].parameters.values()]
+            own = fitted.covariance[block, block] + np.diag(np.square(least))
+            precisions[k].append(np.linalg.inv(own))
     out = []
     for effect, many, known in zip(found.effects, values, precisions, strict=True):
         mean = np.linalg.solve(sum(known), sum(w @ v for w, v in zip(known, many, strict=True)))

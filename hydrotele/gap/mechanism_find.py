@@ -69,16 +69,13 @@ _ROUNDS = 4  # of taking sensors' defects off the readings
 _SAME = 0.01  # of a prior's width, within which a round has changed nothing
 _BETTER = 1e-3  # by which an exchange must be better
 _WORTH_TELLING = 0.005
-_SHARES = (
-    1.0,
-    0.3,
-    0.1,
-)  # of the stated uncertainty that are tried: how far the numbers are off is
-# found, too
+_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the stated uncertainty that are tried: how far the numbers
+# are off is found, too
 _CALIBRATED = 10.0  # twice the log odds from which numbers of the model count as off
 _TOLD = 3.0  # standard deviations from which a calibrated number is told
-_SLOW = 0.2  # share of a drive's Coulomb friction by which its form near rest may differ
+_SLOW = 0.1  # share of a drive's Coulomb friction by which its form near rest may differ
 _NORMAL95 = 1.96
+_SPOILT = -4.0  # standard deviations by which an effect may better the held-out run too little
 _WORSE = 1.02  # times the given model's errors on the held-out run: no patch may do more
 _REJECTED = (
     "What the fitted runs asked for makes the held-out run worse; it was taken back, and nothing is"
@@ -91,6 +88,8 @@ _DIFFERS = (
     "{} at {}, which the fitted runs asked for, is not the same in all parts of them ({} {} {});"
     " it was taken back."
 )
+_SHARP = 0.5  # of the way from the expected sign of an uncertain rate to the sign of a calm one
+_TURNS = 0.05  # doubt of a sign from which what is left may be the form of dry friction near rest
 _LISTED = 3  # notes of that kind
 METRIC = "RMS of the errors of the drives' forces over their noise, all drives, held-out run"
 
@@ -230,9 +229,10 @@ def find_mechanism_gap(
     found, untrue, varies = _constant(found)
     notes = (*notes, *untrue)
     patched, calibration, judged = patching.of(found)
-    if spoiling := {key for key, gain in judged.gained.items() if gain < 0.0}:
-        notes = (*notes, *(_SPOILS.format(*key) for key in sorted(spoiling)))
-        found = _without(found, spoiling)
+    while judged.spoiling:
+        worst = min(judged.spoiling, key=judged.spoiling.__getitem__)
+        notes = (*notes, _SPOILS.format(*worst))
+        found = _without(found, [worst])
         patched, calibration, judged = patching.of(found)
     if not _rms(judged.after[0]) <= _WORSE * _rms(judged.before[0]):
         notes = (*notes, _REJECTED)
@@ -294,7 +294,8 @@ def _constant(found: _Found) -> tuple[_Found, list[str], np.ndarray]:
         for k in differ:
             effect, value = found.fitted.effects[k], found.fitted.values[k]
             name, facts = next(iter(effect.parameters.items()))
-            values = ", ".join(f"{float(own[0]):.3g}" for own in parts[k])
+            own = [float(part[0]) for part in parts[k]]
+            values = f"{min(own):.3g} to {max(own):.3g}"
             told.append(_DIFFERS.format(*effect.key, name, values, facts.unit))
             at = [found.evidence.places[column] for column in effect.columns]
             force = found.columns.matrix[:, :, at] @ effect.coefficients(value)
@@ -332,8 +333,9 @@ def possible_errors(mechanism: Mechanism, columns: Columns, share: float = 1.0) 
     """By how much numbers of the model may be off: column -> standard deviation.
 
     Masses, moments and inertias by the mapping's uncertainty of the body's own, friction by that of
-    its own; forces and positions may be half a row apart in time, and dry friction near rest is
-    never known as well as far from it.
+    its own; forces and positions may be half a row apart in time, dry friction near rest is never
+    known as well as far from it, and where it turns by no more than twice the band resolves: a
+    drive brakes harder than it starts, so that its smoothed rate passes zero late.
 
     Args:
         mechanism: the given model.
@@ -356,6 +358,7 @@ def possible_errors(mechanism: Mechanism, columns: Columns, share: float = 1.0) 
         if one.place in chain.drives:
             dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
             out[f"stribeck0.{one.place}"] = out[f"stribeck2.{one.place}"] = _SLOW * dry
+            out[f"sharpness.{one.place}"] = _SHARP * dry
     for joint in mechanism.setup.drive_inertia:
         out[f"drive_inertia.{joint}"] = off * abs(float(chain.armature[chain.index(joint)]))
     out["delay.force"] = 0.5 * columns.row
@@ -378,7 +381,8 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
         tell(f"{len(effects)} effects, round {turn + 1}", 0.2 * turn + 0.15)
         noise = find_noise(columns)
         tried = [_search(columns, noise, mechanism, one, effects, found) for one in shares]
-        best = int(np.argmax([one.total for one in tried]))
+        many = 2.0 * np.log(max(len(effects), 1))
+        best = int(np.argmax([one.total - many * len(one.fitted.effects) for one in tried]))
         found, shares = tried[best], shares[best : best + 1]
         if columns.gap.size < _SCARCE * len(columns.names):
             noise = noise_of(_unexplained(found), columns)
@@ -408,7 +412,7 @@ def _search(
     """Add what is most worth adding, drop what is not worth having, exchange what is better."""
     off = possible_errors(mechanism, columns, share)
     evidence = gather_evidence(columns, noise, off)
-    need = 2.0 * np.log(max(len(effects), 1)) + _ODDS
+    need = _need(effects)
     singles = [evidence.fit([one]) for one in effects]
     first = [e.key for e in before.fitted.effects] if before else []
     chosen: list[MechanismEffect] = []
@@ -437,6 +441,11 @@ def _search(
     return _Found(
         columns, noise, evidence, effects, now, tuple(weak), singles, frozenset(refused), off
     )
+
+
+def _need(effects: Sequence[MechanismEffect]) -> float:
+    """Twice the log odds that speak against any one of so many effects before data do."""
+    return 2.0 * np.log(max(len(effects), 1)) + _ODDS
 
 
 def _slight(effect: MechanismEffect, value: np.ndarray) -> bool:
@@ -571,8 +580,9 @@ class _Judged(NamedTuple):
         std: (k,) noise of the drives' forces, without what is lacking [N] or [N m].
         left: what the patched model lacks.
         shares: effect -> share of the gap that comes back without it.
-        gained: effect -> by how much the held-out run's squared errors, whitened by the noise,
-            grow without it, all else fitted again.
+        spoiling: effects without which, all else fitted again, the held-out run's squared errors,
+            whitened by the noise, are smaller, and by more than noise explains if these effects are
+            there -> by how much the errors grow without them.
         moved: effect -> (k,) RMS of what it does to every drive's force [N] or [N m].
         before: predictions of the given model, the held-out run first.
         after: of the patched one.
@@ -581,7 +591,7 @@ class _Judged(NamedTuple):
     std: np.ndarray
     left: Left
     shares: Mapping[Key, float]
-    gained: Mapping[Key, float]
+    spoiling: Mapping[Key, float]
     moved: Mapping[Key, np.ndarray]
     before: tuple[Prediction, ...]
     after: tuple[Prediction, ...]
@@ -596,7 +606,10 @@ def _judged(
     rows = min(len(then.time), len(now.time))  # a late sensor tells nothing of the last ones
     later = row_weights(noise.doubtful, now.doubt)
     spread = np.sqrt(found.evidence.predicted_variance(found.fitted, then.matrix).mean(axis=0))
-    left = find_left(fit, now, rest, now.gap, noise.std, noise.weight, later, spread)
+    left = find_left(
+        fit, now, rest, now.gap, noise.std, noise.weight * (fit.doubt < _TURNS),
+        later * (now.doubt < _TURNS), spread,
+    )  # fmt: skip
     std = noise.std * np.sqrt(np.where(left.lacking, np.clip(1.0 - left.share, 0.05, 1.0), 1.0))
     plain = {(e.key, e.variant): e for e in
              mechanism_effects(mechanism.setup.chain, then, nominal, {})}  # fmt: skip
@@ -608,7 +621,7 @@ def _judged(
     def squares(error: np.ndarray) -> float:
         return float(np.sum(whitened(error, replace(noise, weight=later[:rows]), (0, rows)) ** 2))
 
-    shares, moved, gained, value_of_all = {}, {}, {}, found.coefficients()
+    shares, moved, spoiling, value_of_all = {}, {}, {}, found.coefficients()
     for effect, value in zip(found.fitted.effects, found.fitted.values, strict=True):
         own = plain.get((effect.key, effect.variant))
         if own is None:
@@ -620,8 +633,11 @@ def _judged(
         shares[effect.key] = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
         moved[effect.key] = np.sqrt(np.mean(added**2, axis=0))
         change = value_of_all - _without(found, [effect.key]).coefficients()
-        error = now.gap[:rows]
-        gained[effect.key] = squares(error + then.matrix[:rows] @ change) - squares(error)
+        error, change = now.gap[:rows], then.matrix[:rows] @ change
+        expected = squares(change)
+        gain = squares(error + change) - squares(error)
+        if gain < min(0.0, expected + 2.0 * _SPOILT * np.sqrt(expected)):
+            spoiling[effect.key] = gain
     channels = tuple(
         f"{'force' if _unit(mechanism, d) == 'N' else 'torque'}.{d}"
         for d in mechanism.setup.chain.drives
@@ -642,7 +658,7 @@ def _judged(
                 run, fit.time[some], fit.measured[some], error[some],
                 (noise.weight * error / std)[some],
             ))  # fmt: skip
-    return _Judged(std, left, shares, gained, moved, tuple(predictions[0]), tuple(predictions[1]))
+    return _Judged(std, left, shares, spoiling, moved, tuple(predictions[0]), tuple(predictions[1]))
 
 
 def _unexplained(found: _Found) -> np.ndarray:

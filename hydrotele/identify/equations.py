@@ -5,6 +5,7 @@ The equations of all runs to fit, one below the other.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import upfirdn
@@ -70,9 +71,25 @@ class Equations:
         return np.sqrt(self.force_noise**2 + np.maximum(moved, 0.0))
 
 
+class RateErrors(NamedTuple):
+    """Errors of the rates of the joints that were measured, one independent of the other.
+
+    Attributes:
+        axes: names of the k joints.
+        std: (n, k) standard deviations [rad/s] or [m/s].
+    """
+
+    axes: tuple[str, ...]
+    std: np.ndarray
+
+    def part(self, rows: slice) -> "RateErrors":
+        """Those of some rows."""
+        return self._replace(std=self.std[rows])
+
+
 def build_equations(
     record: IdentificationRecord, setup: RegressorSetup, processing: Processing, found: Resolution,
-    with_noise: bool = False,
+    with_noise: bool = False, rate_errors: RateErrors | None = None,
 ) -> tuple[Equations, Regressor]:  # fmt: skip
     """Equations of a run.
 
@@ -82,6 +99,8 @@ def build_equations(
         processing: how positions are differentiated.
         found: what the positions of all runs resolve.
         with_noise: whether to find what the motion's errors leave, and to thin out less.
+        rate_errors: of the joints that were measured, where these are not the record's; by default
+            the record's own, which count as independent.
 
     Returns:
         The equations, and a regressor without rows that has names, units and nominal values.
@@ -105,12 +124,13 @@ def build_equations(
             record.name, f"{len(record.force)} rows are too few for a band of {band:g} Hz, which"
             f" needs {len(low)}",
         )  # fmt: skip
+    errors = rate_errors or RateErrors(record.axes, motion.rate_std)
     start, last, parts, doubts, damped = None, None, [], [], []
     weights = np.abs(low) / np.abs(low).sum()
     for first in range(0, count, per_chunk := max(1, _CHUNK // thin)):
         some = min(per_chunk, count - first)
         rows = slice(first * thin, (first + some - 1) * thin + len(low))
-        last, doubt, damping, pose = _rows(setup, motions[:, rows], motion.rate_std[rows], start)
+        last, doubt, damping, pose = _rows(setup, motions[:, rows], errors.part(rows), start)
         damped.append(low_passed(damping, low, thin))
         parts.append(low_passed(last.matrix, low, thin))
         doubts.append(low_passed(doubt, weights, thin))
@@ -119,7 +139,7 @@ def build_equations(
     noise = np.sqrt(np.sum(low**2)) * record.force_noise
     spread = np.zeros(0)
     if with_noise:
-        spread = _motion_noise(record, setup, found, motions, motion.rate_std, low, thin)
+        spread = _motion_noise(record, setup, found, motions, errors, low, thin)
     time = (np.arange(count) * thin + (len(low) - 1) / 2) * record.period
     made = Equations(
         record.name, band, np.concatenate(parts), 
@@ -150,7 +170,7 @@ def _motion(record: IdentificationRecord, found: Resolution, processing: Process
 
 def _motion_noise(
     record: IdentificationRecord, setup: RegressorSetup, found: Resolution, motions: np.ndarray,
-    rate_std: np.ndarray, low: np.ndarray, thin: int,
+    errors: RateErrors, low: np.ndarray, thin: int,
 ) -> np.ndarray:  # fmt: skip
     """What the motion's errors leave in the drives' forces (k, m, m); see `Equations`.
 
@@ -160,7 +180,7 @@ def _motion_noise(
     rows = slice(0, max(_NOISY, 4 * len(low)))
     smoothed = smooth(record.position[rows], record.period, found.noise)
     likely = np.stack([smoothed.value, smoothed.rate, smoothed.acceleration])
-    taken = _rows(setup, motions[:, rows], rate_std[rows], None)[0].matrix
+    taken = _rows(setup, motions[:, rows], errors.part(rows), None)[0].matrix
     total = np.zeros((taken.shape[1], taken.shape[2], taken.shape[2]))
     for draw in error_draws(smoothed, _DRAWS):
         error = low_passed(taken - _rows(setup, likely - draw, None, None)[0].matrix, low, thin)
@@ -188,8 +208,8 @@ def row_forces(
     out, start = [], None
     for first in range(0, motions.shape[1], _CHUNK):
         rows = slice(first, first + _CHUNK)
-        spread = None if rate_std is None else rate_std[rows]
-        table, _, damping, start = _rows(setup, motions[:, rows], spread, start)
+        errors = None if rate_std is None else RateErrors(setup.given, rate_std[rows])
+        table, _, damping, start = _rows(setup, motions[:, rows], errors, start)
         out.append(table.matrix @ value + damping)
     return np.concatenate(out)
 
@@ -197,16 +217,16 @@ def row_forces(
 def _rows(
     setup: RegressorSetup,
     motions: np.ndarray,
-    rate_std: np.ndarray | None,
+    errors: RateErrors | None,
     start: np.ndarray | None,
 ):
     """Some rows (3, n, k): regressor, doubt of the signs, damping and springs, the last pose."""
     chain = setup.chain
     found = project(chain, setup.given, *motions, start=start)
-    given = [chain.index(name) for name in setup.given]
     spread = None
-    if rate_std is not None and np.isfinite(rate_std).all():
-        spread = rate_deviations(found, given, rate_std)
+    if errors is not None and np.isfinite(errors.std).all():
+        measured = [chain.index(name) for name in errors.axes]
+        spread = rate_deviations(found, measured, errors.std)
     table = setup.table(found, spread)
     doubt = np.zeros((len(found.rate), len(table.drives)))
     if spread is not None:

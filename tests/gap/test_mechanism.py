@@ -9,15 +9,18 @@ from typer.testing import CliRunner
 
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import models_folder
 from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
 from hydrotele.gap.mechanism_evidence import find_noise
 from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.mechanism_patch import Patch, patched_mjcf
 from hydrotele.identify.mechanism import load_mechanism, mechanism_records
+from hydrotele.identify.record import IdentificationRecord
 from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.inverse_dynamics import project
 from hydrotele.simulate.driven_chain import open_loop_errors
+from tools.blind import hexapod
 
 ARM = """\
 <mujoco model="arm"><compiler angle="radian"/><option timestep="0.001"/>
@@ -198,3 +201,26 @@ def test_columns_are_what_sensors_defects_do(tmp_path):
             says = value * given.matrix[:many, :, given.names.index(name)]
             rest = np.linalg.norm(did - says) / np.linalg.norm(did)
             assert rest < 0.35, (name, rest)  # steps of dry friction move by parts of a row
+
+
+def test_where_dry_friction_turns_is_not_taken_for_another_law():
+    """A strut with 20 N of dry friction turns more sharply than its uncertain rate tells."""
+    rng, folder = np.random.default_rng(1), models_folder() / "palida"
+    sensors = hexapod.draw_sensors(rng)._replace(length_noise=2.5e-5, force_noise=np.full(6, 0.01))
+    model, runs = hexapod.hexapod().compile(), []
+    mechanism = load_mechanism(folder / "palida.xml", folder / "columns.yaml")
+    for name in ("first", "second"):
+        pose = hexapod.motion(6.0, rng)
+        _, length, force = hexapod.simulate(model, pose, sensors, None, rng)
+        runs.append(IdentificationRecord(
+            name, 1e-3, tuple(f"slide_{k + 1}" for k in range(6)), length, np.full(6, np.nan),
+            force, np.full(6, np.nan),
+        ))  # fmt: skip
+    columns = build_columns(runs, mechanism, 8.5)
+    rest, turning = columns.gap[:, 2], columns.doubt[:, 2] > 0.02
+    own = columns.matrix[:, 2, columns.names.index("sharpness.slide_3")]
+    part = own[turning] @ rest[turning] / (own[turning] @ own[turning]) / 20.15
+    left = rest - 20.15 * part * own
+    assert 0.2 < part < 1.0, part
+    assert turning.sum() > 20
+    assert np.std(left[turning]) < 0.7 * np.std(rest[turning])

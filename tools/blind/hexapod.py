@@ -7,6 +7,7 @@ measured. Effects that an MJCF cannot state act as forces on the struts at every
 """
 
 import argparse
+import copy
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -359,23 +360,34 @@ def _late(values: np.ndarray, delay: np.ndarray) -> np.ndarray:
 def make(
     kind: str, turn: int, rng: np.random.Generator, seconds: float = 12.0
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """One trial: its key, and run -> table (n, 13) of time, lengths and forces."""
+    """One trial: its key, and run -> table (n, 13) of time, lengths and forces.
+
+    Visibility is what the effect changes in the measured forces of the fitted runs, in units of
+    their noise: a robot without it follows the same motions, both with noiseless lengths.
+    """
     spec, sensors, added, planted = hexapod(), draw_sensors(rng), None, None
     off = float(rng.choice([0.0, 0.005, 0.01, 0.02]))
     disturb(spec, off, rng)
+    plain, good = spec.copy(), sensors
     if kind == "single":
         planted = draw_single(rng)
         sensors, added = plant(spec, sensors, planted)
     elif kind == "outside":
         planted, added = draw_outside(turn, rng)
-    model = spec.compile()
-    runs = {}
+    model, runs, changed = spec.compile(), {}, 0.0
     for name in ("run_1", "run_2", "run_3", "test"):
-        time, length, force = simulate(model, motion(seconds, rng), sensors, added, rng)
+        pose, same = motion(seconds, rng), copy.deepcopy(rng)
+        time, length, force = simulate(model, pose, sensors, added, rng)
         runs[name] = np.column_stack([time, length, force])
+        if planted and name != "test":
+            one, other = (
+                simulate(spec.compile(), pose, s._replace(length_noise=0.0), a, copy.deepcopy(same))
+                for spec, s, a in ((spec, sensors, added), (plain, good, None))
+            )
+            changed += float(np.sum(((one[2] - other[2]) / sensors.force_noise) ** 2))
     key = {
         "class": kind,
-        "effects": [_told(planted, spec)] if planted else [],
+        "effects": [_told(planted, spec, changed**0.5)] if planted else [],
         "off": off,
         "noise": {"length": sensors.length_noise, "force": sensors.force_noise.tolist(),
                   "correlation": sensors.correlation},
@@ -383,7 +395,7 @@ def make(
     return key, runs
 
 
-def _told(planted: Planted, spec: mujoco.MjSpec) -> dict[str, Any]:
+def _told(planted: Planted, spec: mujoco.MjSpec, visible: float) -> dict[str, Any]:
     """An effect as the key has it, with the numbers that the robot has in all."""
     numbers = dict(planted.parameters)
     if "added" in numbers:
@@ -399,7 +411,7 @@ def _told(planted: Planted, spec: mujoco.MjSpec) -> dict[str, Any]:
     return {
         "name": planted.name, "location": planted.location,
         "parameters": {k: {"value": float(v)} for k, v in numbers.items()},
-        "visibility": {"total_fit_runs": None},
+        "visibility": {"total_fit_runs": round(visible, 2)},
     }  # fmt: skip
 
 
