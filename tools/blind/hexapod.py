@@ -180,7 +180,8 @@ def plant(
             body = spec.body(one.location).add_body(
                 name="load", pos=[numbers["x"], numbers["y"], numbers["z"]]
             )
-            body.mass, body.inertia, body.explicitinertial = numbers["mass"], [1e-6] * 3, True
+            body.mass, body.inertia, body.ipos = numbers["mass"], [1e-6] * 3, [0.0] * 3
+            body.explicitinertial = True
         case "com_offset":
             spec.body(one.location).ipos += [numbers[k] for k in "xyz"]
         case "inertia_error":
