@@ -36,6 +36,7 @@ _MOST = 20.0  # times the typical size, where a search ends
 _FORM = 0.2  # of a drive's dry friction, which its form near rest may change
 _NONE = 1e-9  # share that has no effect
 _ASIDE = 0.3  # of its radius of gyration that a body's centre of mass is aside, typically
+_NOTABLE = 0.2  # of a body's moments of inertia that is worth naming, little as forces may change
 _SECOND = 0.1  # s, beyond which no sensor is late
 
 Key = tuple[str, str]
@@ -283,7 +284,8 @@ class _Builder:
         if share < _NONE:
             return None
         scale = min(TYPICAL / share, 1.0)
-        ratio = Parameter("1", 1.0, 0.05, 1.0 + _MOST * scale, scale, LEAST / share)
+        least = min(LEAST / share, _NOTABLE)
+        ratio = Parameter("1", 1.0, 0.05, 1.0 + _MOST * scale, scale, least)
         return MechanismEffect(
             "inertia_error", body, {"ratio": ratio}, names, lambda p: (p[0] - 1.0) * upper,
             np.ones(1),
