@@ -104,12 +104,12 @@ def _summary(verdicts: list[Verdict], answers) -> list[str]:
         if own:
             right = sum(v.right for v in own)
             rows.append(f"| {kind} | {right} of {len(own)} | {100 * right / len(own):.0f} % |")
-        faint = [v for v in own if v.weak]
+        faint = [v for v in own if v.weak and v.visible]  # a length's defect shows in no force
         if kind == "single" and faint:
-            quiet = sum(not answers[v.trial].get("effects") for v in faint)
-            clear, right = len(own) - len(faint), sum(v.right for v in own if not v.weak)
+            fine = sum(v.right or not answers[v.trial].get("effects") for v in faint)
+            clear, right = len(own) - len(faint), sum(v.right for v in own if v not in faint)
             rows.append(f"| single, not faint | {right} of {clear} | {100 * right / clear:.0f} % |")
-            rows.append(f"| faint, nothing named | {quiet} of {len(faint)} | |")
+            rows.append(f"| faint: right, or nothing named | {fine} of {len(faint)} | |")
     named = [v for v in verdicts if v.kind == "clean" and answers[v.trial].get("effects")]
     false = [v for v in verdicts if v.kind == "outside" and any(p > 0.5 for p, _ in v.beliefs)]
     covered = [low <= truth <= high for v in verdicts for _, _, low, high, truth in v.covered]
