@@ -178,8 +178,15 @@ _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an inte
 
 
 def worth_naming(guess: Guess, index: int, score: float) -> bool:
-    """Whether an effect is as large as its least size in any parameter, or beyond doubt."""
+    """Whether an effect is as large as its least size in any parameter, or beyond doubt.
+
+    Optional numbers only shape an effect: with all others below their least sizes it is another's
+    form that it makes up for, such as a gap too small to be one that softens a spring.
+    """
     hypothesis, deviation = guess.parts[index]
+    own = np.array([not p.optional for p in hypothesis.parameters.values()])
+    if not own.all() and not np.any(np.abs(deviation[own]) >= hypothesis.least[own]):
+        return False
     return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
 
 

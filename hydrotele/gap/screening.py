@@ -262,7 +262,7 @@ _SHAKEN = 3.0  # times its floor, of the white noise on a rate; teeth may be hid
 _DAMPING = 0.05  # damping ratio to begin with: hard teeth, hardly oiled
 _STRETCH = 3.0  # s where a run is busiest: some reversals of a motor
 _STRETCHES = 4  # at most, each of another run, that are taken together at last
-_SIMPLEX = (0.15, 0.5, 1.0, 0.3)  # of the logarithms of gap, inertia and damping ratio; of the rest
+_SIMPLEX = (0.15, 0.5, 1.0, 0.4, 0.3)  # of the logarithms of the numbers of teeth; of the rest
 _SIMPLEXES = (1.0, 0.3)  # times that, one after the other
 _STARTS = 2  # gaps from which to search
 _EVALUATIONS = 60  # of a simplex
@@ -295,7 +295,7 @@ def rattling(
             continue
         whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(evidence.data.machine, axis))
         deviation = _likeliest(evidence, whole)
-        if deviation is not None:
+        if deviation is not None and deviation[0] >= whole.least[0]:
             guess = base.guess.plus(whole, deviation)
             found.append(evidence.judged_from(guess, _sensors_only(evidence)))
     return min(found, key=lambda judged: judged.loss, default=None)
@@ -317,17 +317,17 @@ def _likeliest(evidence: Evidence, teeth: Hypothesis) -> np.ndarray | None:
     column = list(data.axes).index(teeth.location)
     parts = sorted((_busiest_part(run, column) for run in evidence.runs), key=lambda p: -p[0])
     stretches = [run for _, run in parts[:_STRETCHES]]
-    nominal = np.array([p.nominal for p in teeth.parameters.values()])
+    nominal, size = np.array([p.nominal for p in teeth.parameters.values()]), teeth.size
     scale = np.array([p.scale for p in teeth.parameters.values()])
 
     def deviation(x: np.ndarray) -> np.ndarray:
-        return np.clip((np.exp(x[:3]) - nominal) / scale, teeth.low, teeth.high)
+        return np.clip((np.exp(x[:size]) - nominal) / scale, teeth.low, teeth.high)
 
     def track(x: np.ndarray | None, run: RunData, rest: np.ndarray | None = None) -> Track:
         machine = data.machine if x is None else teeth.machine(data.machine, deviation(x))
         return track_run(machine, data, run, None, evidence.step, levels, rest=rest)
 
-    starts = [np.log([gap, nominal[1], _DAMPING]) for gap in _GAPS]
+    starts = [np.log([gap, nominal[1], _DAMPING, nominal[3]]) for gap in _GAPS]
     none, *tracks = evidence.map(lambda x: track(x, stretches[0]), [None, *starts])
     order = sorted(range(len(starts)), key=lambda k: tracks[k].loss)
     if not tracks[order[0]].loss < none.loss:
@@ -336,13 +336,13 @@ def _likeliest(evidence: Evidence, teeth: Hypothesis) -> np.ndarray | None:
     def climbed(k: int) -> OptimizeResult:
         """On one stretch, together with where the drive rests as it begins."""
         answer = OptimizeResult(x=np.append(starts[k], tracks[k].rest))
-        for size in _SIMPLEXES:  # the simplex shrinks into a dent: once more from there
+        for width in _SIMPLEXES:  # the simplex shrinks into a dent: once more from there
             answer = _simplex(
-                lambda x: track(x, stretches[0], np.clip(x[3:], -1.0, 1.0)).loss, answer.x, size
+                lambda x: track(x, stretches[0], np.clip(x[size:], -1.0, 1.0)).loss, answer.x, width
             )
         return answer
 
-    best = min(evidence.map(climbed, order[:_STARTS]), key=lambda answer: answer.fun).x[:3]
+    best = min(evidence.map(climbed, order[:_STARTS]), key=lambda answer: answer.fun).x[:size]
     rests = evidence.map(lambda run: track(best, run).rest, stretches)
 
     def loss(x: np.ndarray) -> float:
