@@ -283,7 +283,7 @@ def step_circuit(
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
     coupled = supply_coupling(user, first, count, scratch, p_start, scratch[_FACTORS:])
     if coupled:
-        _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch)
+        _begin_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch)
         _couple(count, act_dot, scratch)
     for i in range(count):
         u, a, k = (first + i) * SLOTS, 4 * i, _FIRST + 2 * i
@@ -378,7 +378,7 @@ def _softening_ahead(user, u, pressure, rate, dt):
 
 
 @allocation_free
-def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
+def _begin_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch):
     """What a supply pressure of 1 Pa more adds to the stage rates of the fed chambers.
 
     Of `(I - gamma h (D + b w^T)) k = r` with D diagonal, b the rates per supply pressure and
@@ -392,8 +392,9 @@ def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
         if scratch[f + 2] == 0.0:
             continue
         head, rod = _chamber_stiffness(
-            user, (first + i) * SLOTS, length[first + i] - dt * velocity[first + i]
-        )
+            user, (first + i) * SLOTS, length[first + i] - dt * velocity[first + i],
+            act[4 * i + 2], act[4 * i + 3],
+        )  # fmt: skip
         own = gamma_h * scratch[f + 2]
         own *= head * scratch[f] if scratch[4 * i + 3] > 0.0 else rod * scratch[f + 1]
         k = _FIRST + 2 * i

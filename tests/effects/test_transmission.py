@@ -113,6 +113,28 @@ def test_a_flexible_cylinder_gives_by_force_times_compliance(compliance):
     assert list(independent_dofs(machine, plant.model)) == sorted(plant.dof)
 
 
+def test_a_spring_may_be_shaped_by_its_drives_inertia_and_damping():
+    """Left out, they are what the library takes; with the compliance none, nothing changes."""
+    plain = apply_effect(MACHINE, "joint_flexibility", "swing", {"compliance": 1e-7})
+    usual = plain.axes["swing"].transmission
+    ratio = usual.damping / (2.0 * math.sqrt(usual.stiffness * usual.inertia))
+    values = {"compliance": 1e-7, "drive_inertia": 0.5 * usual.inertia, "damping_ratio": 3 * ratio}
+    shaped = apply_effect(MACHINE, "joint_flexibility", "swing", values).axes["swing"].transmission
+    assert (shaped.stiffness, shaped.backlash) == (usual.stiffness, 0.0)
+    assert shaped.inertia == pytest.approx(0.5 * usual.inertia)
+    assert shaped.damping == pytest.approx(3 * math.sqrt(0.5) * usual.damping)
+    rigid = apply_effect(MACHINE, "joint_flexibility", "swing", {**values, "compliance": 0.0})
+    assert rigid == MACHINE
+
+
+@pytest.mark.parametrize("frequency", [20.0, 80.0])
+def test_teeth_ring_with_the_frequency_of_their_contact(frequency):
+    teeth = apply_effect(
+        MACHINE, "backlash", "swing", {"gap": GAP, "contact_frequency": frequency}
+    ).axes["swing"].transmission  # fmt: skip
+    assert math.sqrt(teeth.stiffness / teeth.inertia) == pytest.approx(2 * math.pi * frequency)
+
+
 def test_length_reads_the_piston_and_angle_the_load():
     """Half-open valve: length minus what the angle says is the deflection under the load."""
     effect = {"name": "joint_flexibility", "location": "boom", "parameters": {"compliance": 3e-8}}
