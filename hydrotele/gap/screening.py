@@ -333,16 +333,16 @@ def _likeliest(evidence: Evidence, teeth: Hypothesis) -> np.ndarray | None:
     if not tracks[order[0]].loss < none.loss:
         return None
 
-    def climbed(k: int) -> OptimizeResult:
+    def first(x: np.ndarray) -> float:
         """On one stretch, together with where the drive rests as it begins."""
-        answer = OptimizeResult(x=np.append(starts[k], tracks[k].rest))
-        for width in _SIMPLEXES:  # the simplex shrinks into a dent: once more from there
-            answer = _simplex(
-                lambda x: track(x, stretches[0], np.clip(x[size:], -1.0, 1.0)).loss, answer.x, width
-            )
-        return answer
+        return track(x, stretches[0], np.clip(x[size:], -1.0, 1.0)).loss
 
-    best = min(evidence.map(climbed, order[:_STARTS]), key=lambda answer: answer.fun).x[:size]
+    def climbed(k: int) -> OptimizeResult:
+        return _simplex(first, np.append(starts[k], tracks[k].rest), _SIMPLEXES[0])
+
+    best = min(evidence.map(climbed, order[:_STARTS]), key=lambda answer: answer.fun)
+    # the simplex shrinks into a dent: once more from there
+    best = _simplex(first, best.x, _SIMPLEXES[-1]).x[:size]
     rests = evidence.map(lambda run: track(best, run).rest, stretches)
 
     def loss(x: np.ndarray) -> float:
