@@ -26,6 +26,7 @@ from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import noise_prior, rippled_at, smoothed_inputs
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, track_run
 from hydrotele.logs.dataset import RunData
+from hydrotele.machine.machine import Machine
 
 _FEW = 16  # candidates that are tried on all runs
 _GLANCE = 20.0  # s of the run that fits worst on which all are tried
@@ -256,7 +257,7 @@ def _loudest(u: np.ndarray, period: float) -> tuple[float, float, int, int]:
     return best
 
 
-_TEETH = "backlash"
+_TEETH, _SPRING = "backlash", "joint_flexibility"
 _GAPS = (0.002, 0.0035, 0.006, 0.01, 0.018, 0.03)  # rad; further apart, one may be jumped over
 _SHAKEN = 3.0  # times its floor, of the white noise on a rate; teeth may be hidden in other lacks
 _DAMPING = 0.05  # damping ratio to begin with: hard teeth, hardly oiled
@@ -294,7 +295,9 @@ def rattling(
         ):
             continue
         whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(evidence.data.machine, axis))
-        deviation = _likeliest(evidence, whole)
+        springs = (_SPRING, axis) in {h.key for h in ahead.guess.hypotheses}
+        rival = ahead.guess.machine(evidence.data.machine) if springs else None
+        deviation = _likeliest(evidence, whole, rival)
         if deviation is not None and deviation[0] >= whole.least[0]:
             guess = base.guess.plus(whole, deviation)
             found.append(evidence.judged_from(guess, _sensors_only(evidence)))
@@ -311,8 +314,12 @@ def _sensors_only(evidence: Evidence) -> Levels:
     return Levels(noise_prior(evidence.data).noise)
 
 
-def _likeliest(evidence: Evidence, teeth: Hypothesis) -> np.ndarray | None:
-    """Deviations of the likeliest teeth; None where every gap is less likely than none."""
+def _likeliest(evidence: Evidence, teeth: Hypothesis, rival: Machine | None) -> np.ndarray | None:
+    """Deviations of the likeliest teeth; None where every gap is less likely than none.
+
+    Nor are there any where a spring of the same drive, the rival, explains the busiest stretch
+    better than the best of them.
+    """
     data, levels = evidence.data, _sensors_only(evidence)
     column = list(data.axes).index(teeth.location)
     parts = sorted((_busiest_part(run, column) for run in evidence.runs), key=lambda p: -p[0])
@@ -341,6 +348,8 @@ def _likeliest(evidence: Evidence, teeth: Hypothesis) -> np.ndarray | None:
         return _simplex(first, np.append(starts[k], tracks[k].rest), _SIMPLEXES[0])
 
     best = min(evidence.map(climbed, order[:_STARTS]), key=lambda answer: answer.fun)
+    if rival and best.fun > track_run(rival, data, stretches[0], None, evidence.step, levels).loss:
+        return None
     # the simplex shrinks into a dent: once more from there
     best = _simplex(first, best.x, _SIMPLEXES[-1]).x[:size]
     rests = evidence.map(lambda run: track(best, run).rest, stretches)
