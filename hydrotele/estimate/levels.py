@@ -449,10 +449,10 @@ def _between(old: Levels, new: Levels, part: float) -> Levels:
     def mean(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.exp((1.0 - part) * np.log(a) + part * np.log(b))
 
-    drift = {
-        name: float(mean(max(old.drift.get(name, 0.0), DRIFT[name.partition(".")[0]]), value))
-        for name, value in new.drift.items()
-    }  # fmt: skip
+    names = list(new.drift)
+    began = np.array([old.drift.get(name, 0.0) for name in names])
+    drift = mean(np.maximum(began, by_kind(names, DRIFT)), by_kind(names, new.drift))
+    drift = dict(zip(names, drift.tolist(), strict=True))
     return dataclasses.replace(
         new, noise=mean(old.noise, new.noise), sizes=mean(old.sizes, new.sizes), drift=drift
     )
