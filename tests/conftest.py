@@ -9,10 +9,10 @@ from pathlib import Path
 
 import hypothesis
 
-# Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out.
-collect_ignore = []
-if importlib.util.find_spec("stable_baselines3") is None:
-    collect_ignore = ["envs/test_stable_baselines.py", "tools/test_learn.py"]
+# Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out; the last lines of
+# the suite say so, and tools/nightly has a check `learn`, which runs them with it.
+_LEARN = ("envs/test_stable_baselines.py", "tools/test_learn.py")
+collect_ignore = [] if importlib.util.find_spec("stable_baselines3") else [*_LEARN]
 
 # Has to be settled before the first import of mujoco or dm_control.
 if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:
@@ -31,19 +31,25 @@ hypothesis.settings.load_profile("hydrotele")
 
 
 # Files that take ten seconds or more, the longest first: two processes then end together. A file
-# that is missing here costs at most its own length at the end.
+# that is missing here costs at most its own length at the end. The first two compile unlike code,
+# so that neither process waits for the other.
 LONG = (
-    "scenario/test_scenario.py", "envs/test_gymnasium.py", "gap/test_find.py",
-    "envs/test_render.py", "cli/test_cli.py", "effects/test_library.py", "gap/test_discover.py",
-    "teleop/test_station.py", "run/test_sweep_processes.py", "experiments/test_zhu1994.py",
-    "models/test_machines.py",
+    "gap/test_find.py", "scenario/test_scenario.py", "envs/test_render.py", "cli/test_cli.py",
+    "effects/test_library.py", "gap/test_discover.py", "teleop/test_station.py",
+    "estimate/test_filter.py", "envs/test_gymnasium.py", "estimate/test_reduced_against_plant.py",
+    "models/test_machines.py", "run/test_sweep_processes.py", "cli/test_untrusted_folder.py",
+    "gap/test_rattling.py", "estimate/test_output_error.py", "gap/test_command.py",
+    "core/test_compiled.py", "calibrate/test_mukca.py", "experiments/test_zhu1994.py",
 )  # fmt: skip
+
+
+_REAL = Path(__file__).resolve().parents[2] / "shared" / "real"
 
 
 def pytest_collection_modifyitems(config, items):
     """Leave out what needs absent records; put the files that take long first."""
     root = Path(__file__).parent
-    if not (root.parent.parent / "shared" / "real").is_dir():
+    if not _REAL.is_dir():
         absent = [item for item in items if item.get_closest_marker("real")]
         config.hook.pytest_deselected(items=absent)
         items[:] = [item for item in items if item not in absent]
@@ -57,6 +63,13 @@ def _inside(path, root):
 
 def pytest_terminal_summary(terminalreporter):
     """Say what tools/test did beside pytest here, so that pytest has the last word."""
+    if collect_ignore:
+        terminalreporter.write_line(
+            f"not run, for they need the extra `learn` (torch, 3 GB): {', '.join(collect_ignore)};"
+            " tools/nightly --only learn runs them"
+        )
+    if not _REAL.is_dir():
+        terminalreporter.write_line(f"not run: tests of real machines' records, not at {_REAL}")
     folder = os.environ.get("HYDROTELE_CHECKS")
     if folder and Path(folder, "output").exists():
         done = Path(folder, "done")

@@ -17,7 +17,8 @@ import yaml
 
 from hydrotele.identify.excitation import (
     Excitation,
-    design_excitation,
+    MachineLimits,
+    design_motion,
     information,
     informative_base,
 )
@@ -76,9 +77,10 @@ def main() -> None:
     noise = force_noise(machine, SENSORS)
     base = informative_base(machine, setup, noise)
     old = motion_of(load_scenario(OLD))
-    new = design_excitation(
-        machine, setup, noise, base, period=old.period, harmonics=asked.harmonics,
-        starts=asked.starts, seed=asked.seed, progress=lambda said, share: print(said, flush=True),
+    new = design_motion(
+        MachineLimits(machine, setup), setup, noise, base, period=old.period,
+        harmonics=asked.harmonics, starts=asked.starts, seed=asked.seed,
+        progress=lambda said, share: print(said, flush=True),
     )  # fmt: skip
     time = np.arange(0.0, old.period, 0.05)
     logs = [

@@ -3,7 +3,6 @@
 `hydrotele analyse teleop SCENARIO`: the linear loop of a teleoperated scenario.
 """
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,7 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 import hydrotele
-from hydrotele.cli.console import notes, out, plain, print_json, stages, table
+from hydrotele.cli.console import (
+    notes,
+    out,
+    plain,
+    print_json,
+    print_result,
+    stages,
+    table,
+    write_json,
+)
 from hydrotele.core.datafile import read_yaml
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
@@ -94,11 +102,7 @@ def analyse_teleop_to_folder(
     if target:
         with whole_folder(target, "two-port analysis") as folder:
             _write(folder, found, document)
-    if as_json:
-        print_json(document)
-    else:
-        _print(found)
-        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    print_result(document, as_json, lambda: _print(found), target)
     return target
 
 
@@ -163,8 +167,7 @@ def _line(case: Case, robustly: Robustly) -> PacketAges:
 
 
 def _write(folder: Path, found: Findings, document: dict) -> None:
-    text = json.dumps(document, indent=2, allow_nan=False)
-    (folder / "analysis.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / "analysis.json", document)
     from hydrotele.show.teleop_report import draw_maps, write_teleop_report
 
     notes.print("writing report.html ...", style="dim")
@@ -172,7 +175,7 @@ def _write(folder: Path, found: Findings, document: dict) -> None:
     write_teleop_report(found, maps, folder / "report.html")
     (folder / "stability.png").write_bytes(maps)
     summary = {"kind": "two-port analysis", "name": found.name, "hydrotele": hydrotele.__version__}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)
 
 
 def _print(found: Findings) -> None:
@@ -381,10 +384,9 @@ def _print_spring_table(held: Spring, free: Spring) -> None:
 def _write_loop(folder: Path, found: ScenarioFindings, document: dict) -> None:
     from hydrotele.show.teleop_report import draw_loop_map, write_loop_report
 
-    text = json.dumps(document, indent=2, allow_nan=False)
-    (folder / "analysis.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / "analysis.json", document)
     picture = draw_loop_map(found)
     (folder / "stability.png").write_bytes(picture)
     write_loop_report(found, findings_table(found), picture, folder / "report.html")
     summary = {"kind": _KIND, "name": found.name, "hydrotele": hydrotele.__version__}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)

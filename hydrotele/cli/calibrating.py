@@ -154,7 +154,7 @@ def scara(
     json: Json = False,
 ) -> None:
     """Link lengths of a SCARA from measured positions (Wang 2012, section 1.1)."""
-    from hydrotele.cli.calibrating_scara import calibrate_scara_folder, simulate_scara_folder
+    from hydrotele.cli.calibrating_robots import calibrate_scara_folder, simulate_scara_folder
 
     if simulate is not None:
         simulate_scara_folder(simulate, poses, 1e-3 * noise, seed)

@@ -1,6 +1,5 @@
 """`hydrotele calibrate arm`, `linkage` and `design`: from logs to results in words, JSON, files."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from hydrotele.calibrate.linkage import (
     values_of,
 )
 from hydrotele.calibrate.loop import Loop, loop_of, unit_of
-from hydrotele.cli.console import out, plain, print_json, table
+from hydrotele.cli.console import out, plain, print_json, table, write_json
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.logs.log import load_logs
@@ -239,12 +238,11 @@ def _print_target(target: Path | None) -> None:
 
 def _write(target: Path, said: Mapping[str, Any], machine: Machine, report) -> None:
     with whole_folder(target, "arm calibration") as folder:
-        text = json.dumps(said, indent=2, allow_nan=False)
-        (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
+        write_json(folder / "calibration.json", said)
         save_machine(machine, folder / MACHINE_FILE)
         report(folder)
         summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
-        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        write_json(folder / "summary.json", summary)
 
 
 def _arm_report(folder: Path, result: ArmResult) -> None:
@@ -373,10 +371,9 @@ def design_calibrator(
 
         with whole_folder(target, "arm calibration") as folder:
             (folder / "design.png").write_bytes(draw_designs(survey, best))
-            text = json.dumps(said, indent=2, allow_nan=False)
-            (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
+            write_json(folder / "calibration.json", said)
             summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
-            (folder / "summary.json").write_text(json.dumps(summary) + "\n", encoding="utf-8")
+            write_json(folder / "summary.json", summary)
     if as_json:
         print_json(said)
         return

@@ -1,7 +1,6 @@
 """`hydrotele compare`: how well machines and black boxes predict runs on the commands alone."""
 
 import dataclasses
-import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import hydrotele
-from hydrotele.cli.console import notes, out, plain, print_json, stages, table
+from hydrotele.cli.console import notes, out, plain, print_json, stages, table, write_json
 from hydrotele.cli.opening import machine_of
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
@@ -254,8 +253,7 @@ def _write(
 ) -> None:  # fmt: skip
     from hydrotele.show.compare_figures import draw_free_runs
 
-    text = json.dumps(document, indent=2, allow_nan=False)
-    (folder / "compare.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / "compare.json", document)
     notes.print("drawing free_run.png ...", style="dim")
     begin, some = _beginning(run), slice(0, _MOST_PLOTS)
     time = run.start + run.period * np.arange(len(begin.reading))
@@ -274,7 +272,7 @@ def _write(
         "judged": document["judged"],
         "hydrotele": hydrotele.__version__,
     }
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)
 
 
 def _print(

@@ -5,6 +5,7 @@ import json
 import re
 import signal
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,31 @@ notes = _Console(stderr=True, highlight=False, emoji=False)
 def print_json(data: Any) -> None:
     """Print data as JSON; numbers that are not finite become null."""
     print(json.dumps(plain(data), indent=2))
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write data as JSON into a file; numbers that are not finite become null."""
+    text = json.dumps(plain(data), indent=2, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def print_result(
+    document: Any, as_json: bool, show: Callable[[], None], target: Path | None
+) -> None:
+    """Print what a command found: as JSON, or in words with the place of its report.
+
+    Args:
+        document: what the JSON holds.
+        as_json: whether to print that.
+        show: prints the words.
+        target: folder that was written, with a report.html; None where none was.
+    """
+    if as_json:
+        print_json(document)
+        return
+    show()
+    if target:
+        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
 
 
 def plain(data: Any) -> Any:

@@ -1,10 +1,9 @@
 """`hydrotele experiments`: published experiments repeated, beside what was published."""
 
-import json
 from pathlib import Path
 
 import hydrotele
-from hydrotele.cli.console import notes, out, print_json, stages
+from hydrotele.cli.console import notes, out, print_result, stages, write_json
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.experiments.abdellatif2008 import abdellatif2008
@@ -52,11 +51,7 @@ def experiments_to_folder(
     if target:
         with whole_folder(target, "experiments") as folder:
             _write(folder, name, seeds, findings)
-    if as_json:
-        print_json([finding.row() for finding in findings])
-    else:
-        _print(findings)
-        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    print_result([finding.row() for finding in findings], as_json, lambda: _print(findings), target)
     return findings
 
 
@@ -65,13 +60,12 @@ def _write(folder: Path, name: str, seeds: int, findings: list[Finding]) -> None
 
     notes.print("writing report.html ...", style="dim")
     rows = [finding.row() for finding in findings]
-    text = json.dumps(rows, indent=2, allow_nan=False)
-    (folder / "experiments.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / "experiments.json", rows)
     write_experiment_report(name, findings, folder / "report.html")
     head = f"# Experiments of {name}\n\n`hydrotele experiments {name} --seeds {seeds}`\n\n"
     (folder / "table.md").write_text(head + markdown_table(findings), encoding="utf-8")
     summary = {"kind": "experiments", "name": name, "hydrotele": hydrotele.__version__}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)
 
 
 def markdown_table(findings: list[Finding]) -> str:

@@ -1,7 +1,6 @@
 """`hydrotele gap`: where model and measured logs disagree, and the machine that agrees better."""
 
 import dataclasses
-import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import yaml
 
 import hydrotele
-from hydrotele.cli.console import notes, out, print_json, stages, table
+from hydrotele.cli.console import notes, out, print_result, stages, table, write_json
 from hydrotele.cli.opening import data_name, machine_of
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
@@ -76,11 +75,7 @@ def gap_to_folder(
     gap = _search(dataset, effects, jobs, quiet=as_json)
     with whole_folder(target, "gap") as folder:
         write_gap(gap, dataset, folder, recording, data)
-    if as_json:
-        print_json(gap_document(gap))
-    else:
-        _print(gap)
-        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    print_result(gap_document(gap), as_json, lambda: _print(gap), target)
     return target
 
 
@@ -88,8 +83,7 @@ def write_gap(
     gap: Gap, dataset: Dataset, folder: Path, recording: bool = True, data: Sequence[Path] = ()
 ) -> None:
     """Write gap.json, the report, the patched machine, the next experiment and the recording."""
-    document = json.dumps(gap_document(gap), indent=2, allow_nan=False)
-    (folder / "gap.json").write_text(document + "\n", encoding="utf-8")
+    write_json(folder / "gap.json", gap_document(gap))
     if has_patch(gap):
         from hydrotele.simulate.plant import build_plant
 
@@ -118,7 +112,7 @@ def write_gap(
         "verdict": gap.verdict,
         "hydrotele": hydrotele.__version__,
     }
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)
 
 
 def gap_mjcf_to_folder(
@@ -161,8 +155,7 @@ def gap_mjcf_to_folder(
         except InputError as error:
             gap = dataclasses.replace(gap, notes=(*gap.notes, f"No open loop: {error}."))
     with whole_folder(target, "gap") as folder:
-        document = json.dumps(gap_document(gap), indent=2, allow_nan=False)
-        (folder / "gap.json").write_text(document + "\n", encoding="utf-8")
+        write_json(folder / "gap.json", gap_document(gap))
         if gap.patched is not gap.machine:
             patched = folder / "patched"
             patched.mkdir()
@@ -175,12 +168,8 @@ def gap_mjcf_to_folder(
             "columns": str(columns) if columns else None, "data": [str(path) for path in data],
             "heldout": judge.name, "verdict": gap.verdict, "hydrotele": hydrotele.__version__,
         }  # fmt: skip
-        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    if as_json:
-        print_json(gap_document(gap))
-    else:
-        _print(gap)
-        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+        write_json(folder / "summary.json", summary)
+    print_result(gap_document(gap), as_json, lambda: _print(gap), target)
     return target
 
 

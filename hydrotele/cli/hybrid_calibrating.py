@@ -26,7 +26,7 @@ from hydrotele.calibrate.hybrid_data import (
     save_measurement,
 )
 from hydrotele.calibrate.posterior import Evolution, Posterior, evolve, sample_posterior
-from hydrotele.cli.console import notes, out, plain, print_json, table
+from hydrotele.cli.console import notes, out, print_json, table, write_json
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.kinematics.hybrid import Hybrid, forward, load_hybrid, save_hybrid
@@ -197,8 +197,7 @@ def _heldout(count: int, before: Errors, after: Errors) -> dict[str, Any]:
 def _write(folder: Path, result, done: Calibration, heldout, posterior) -> None:
     from hydrotele.show.calibration_figures import corner, error_bars
 
-    text = json.dumps(plain(result), indent=2, allow_nan=False)
-    (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / "calibration.json", result)
     save_hybrid(done.robot, folder / "robot.yaml", "calibrated by hydrotele calibrate hybrid")
     before, after, what = done.before, done.left_out, "poses, each predicted without itself"
     if len(before.position) != len(after.position):
@@ -220,7 +219,7 @@ def _write(folder: Path, result, done: Calibration, heldout, posterior) -> None:
                        truth / sizes, "least squares")  # fmt: skip
         (folder / "posterior.png").write_bytes(image)
     summary = {"kind": KIND, "name": result["robot"], "hydrotele": hydrotele.__version__}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)
 
 
 def _print(result: dict[str, Any]) -> None:
@@ -318,7 +317,7 @@ def simulate_hybrid(
         text = json.dumps(dict(zip(model.names, planted.tolist(), strict=True)), indent=2)
         (folder / "truth" / "errors.json").write_text(text + "\n", encoding="utf-8")
         summary = {"kind": MEASUREMENT, "name": nominal.name, "hydrotele": hydrotele.__version__}
-        (folder / "summary.json").write_text(json.dumps(summary) + "\n", encoding="utf-8")
+        write_json(folder / "summary.json", summary)
     out.print(f"written to [bold]{target}[/]: {poses} poses and {heldout} to judge on")
 
 

@@ -4,7 +4,6 @@
 """
 
 import dataclasses
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,13 +13,22 @@ import numpy as np
 import yaml
 
 import hydrotele
-from hydrotele.cli.console import notes, out, plain, print_json, stages, table
+from hydrotele.cli.console import (
+    notes,
+    out,
+    plain,
+    print_json,
+    print_result,
+    stages,
+    table,
+    write_json,
+)
 from hydrotele.cli.opening import data_name, machine_of
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, replacing, whole_folder
 from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.estimation import Estimator
-from hydrotele.identify.excitation import design_excitation, informative_base
+from hydrotele.identify.excitation import MachineLimits, design_motion, informative_base
 from hydrotele.identify.hydraulic import Hydraulics, identify_hydraulics
 from hydrotele.identify.identification import identify_with_shapes
 from hydrotele.identify.identified_machine import identified_machine, identify_document
@@ -121,11 +129,12 @@ def identify_to_folder(
         raise InputError(target, mechanism.lacking)
     with whole_folder(target, "identify") as folder:
         _write(folder, dataset, mechanism, hydraulics, data, choices)
-    if as_json:
-        print_json(identify_document(mechanism.found, hydraulics, mechanism.best))
-    else:
-        _print(mechanism, hydraulics, dataset)
-        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+    print_result(
+        identify_document(mechanism.found, hydraulics, mechanism.best),
+        as_json,
+        lambda: _print(mechanism, hydraulics, dataset),
+        target,
+    )
     return target
 
 
@@ -166,8 +175,7 @@ def identify_mjcf_to_folder(
         )  # fmt: skip
     with whole_folder(target, "identify") as folder:
         document = plain(identify_document(found))
-        text = json.dumps(document, indent=2, allow_nan=False)
-        (folder / "identify.json").write_text(text + "\n", encoding="utf-8")
+        write_json(folder / "identify.json", document)
         learned = LearnedFrom(name, None, tuple(run.name for run in fit), judge.name)
         write_identify_report(learned, found, None, None, folder / "report.html")
         summary = {
@@ -175,12 +183,10 @@ def identify_mjcf_to_folder(
             "data": [str(path) for path in data], "heldout": judge.name,
             "status": document["status"], "hydrotele": hydrotele.__version__,
         }  # fmt: skip
-        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    if as_json:
-        print_json(identify_document(found))
-    else:
-        _print_mechanism(found, judge.name)
-        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+        write_json(folder / "summary.json", summary)
+    print_result(
+        identify_document(found), as_json, lambda: _print_mechanism(found, judge.name), target
+    )
     return target
 
 
@@ -220,8 +226,7 @@ def _write(
 ) -> None:  # fmt: skip
     found, patched = mechanism.found, hydraulics.machine if hydraulics else mechanism.machine
     document = plain(identify_document(found, hydraulics, mechanism.best))
-    text = json.dumps(document, indent=2, allow_nan=False)
-    (folder / "identify.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / "identify.json", document)
     made = folder / "identified"
     made.mkdir()
     save_machine(patched, made / MACHINE_FILE)
@@ -244,7 +249,7 @@ def _write(
         "status": document["status"],
         "hydrotele": hydrotele.__version__,
     }
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)
 
 
 def _print(mechanism: MechanismResult, hydraulics: Hydraulics | None, dataset: Dataset) -> None:
@@ -332,9 +337,9 @@ def excite_to_file(
     noise = np.maximum(force_noise(model, named), 1e-9)
     base = informative_base(model, setup, noise, period, seed)
     with stages(f"excite {model.name}", as_json) as progress:
-        found = design_excitation(
-            model, setup, noise, base, period=period, harmonics=harmonics, starts=starts,
-            seed=seed, progress=progress,
+        found = design_motion(
+            MachineLimits(model, setup), setup, noise, base, period=period, harmonics=harmonics,
+            starts=starts, seed=seed, progress=progress,
         )  # fmt: skip
     scenario = found.scenario(name, model, cycles, place, sensors=named)
     with replacing(target, ".yaml") as part:

@@ -35,10 +35,8 @@ def identify_operator(
     ] = False,
 ) -> None:
     """Fit the operator model to a person's tracking: delay, margins, neuromuscular lag, remnant."""
-    from json import dumps
-
     import hydrotele
-    from hydrotele.cli.console import notes, plain, print_json
+    from hydrotele.cli.console import notes, plain, print_json, write_json
     from hydrotele.core.output import check_target, whole_folder
     from hydrotele.teleop.operator_identification import (
         identify_operator,
@@ -62,9 +60,9 @@ def identify_operator(
         text = operator_file_of(fit, "identified", file.name)
         with whole_folder(out, _KIND) as folder:
             (folder / "operator.yaml").write_text(text, encoding="utf-8")
-            (folder / "fit.json").write_text(dumps(document, indent=2) + "\n", encoding="utf-8")
+            write_json(folder / "fit.json", document)
             summary = {"kind": _KIND, "name": file.name, "hydrotele": hydrotele.__version__}
-            (folder / "summary.json").write_text(dumps(summary, indent=2) + "\n", encoding="utf-8")
+            write_json(folder / "summary.json", summary)
     if json:
         print_json(document)
         return

@@ -1,10 +1,9 @@
 """`hydrotele replay`: logged commands through the model, differences per channel."""
 
 import dataclasses
-import json
 from pathlib import Path
 
-from hydrotele.cli.console import notes, out, plain, print_json, progress_bar, table
+from hydrotele.cli.console import notes, out, print_json, progress_bar, table, write_json
 from hydrotele.cli.opening import log_path, open_log
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.logs.log import save_log
@@ -59,7 +58,7 @@ def replay_logs(
                 name = prefix + result.measured.name
                 _write(folder, name, the_machine, result)
             data = {"kind": "replay", "replays": [as_data(result) for _, result in results]}
-            (folder / "summary.json").write_text(json.dumps(plain(data), indent=2) + "\n")
+            write_json(folder / "summary.json", data)
         notes.print(f"written to {target}")
     if as_json:
         data = [as_data(result) for _, result in results]

@@ -53,7 +53,8 @@ def _show(recording: Path, serve: bool, port: int, screenshot: Path | None, quie
         from hydrotele.show.viewer import take_screenshot
 
         notes.print("taking a screenshot ...", style="dim")
-        take_screenshot(recording, screenshot)
+        for complaint in take_screenshot(recording, screenshot):
+            notes.print(f"[yellow]viewer[/] {complaint}", soft_wrap=True)
         out.print(f"written to [bold]{screenshot}[/]")
     elif serve:
         from hydrotele.show.viewer import serve_recording

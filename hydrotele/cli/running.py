@@ -1,10 +1,9 @@
 """`hydrotele run`: a scenario into a folder."""
 
-import json
 from pathlib import Path
 from typing import Any
 
-from hydrotele.cli.console import notes, out, plain, print_json, progress_bar, table
+from hydrotele.cli.console import notes, out, print_json, progress_bar, table, write_json
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import save_machine
@@ -64,7 +63,7 @@ def write_run(result: Run, folder: Path, review: bool = True) -> None:
 
         notes.print("writing review.rrd ...", style="dim")
         write_recording(folder / "review.rrd", {"truth": (result.plant.machine, result.truth)})
-    (folder / "summary.json").write_text(json.dumps(plain(result.summary), indent=2) + "\n")
+    write_json(folder / "summary.json", result.summary)
 
 
 def print_summary(summary: dict[str, Any]) -> None:

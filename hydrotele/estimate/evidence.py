@@ -160,11 +160,6 @@ class Evidence:
         return judged
 
     @property
-    def base_loss(self) -> float:
-        """-2 log likelihood of the base with its own gains, without constant."""
-        return sum(track.loss for track in self.tracks)
-
-    @property
     def base_errors(self) -> np.ndarray:
         """(E,) whitened errors of the base, all runs."""
         return np.concatenate([flat(track.whitened) for track in self.tracks])

@@ -486,7 +486,7 @@ def _correct(model, sp, z, own, delta):
         for i in range(model.hydraulic):
             if model.user[i * SLOTS + _KIND] == _PUMPED:
                 _keep_side(z, 2 * (n + t) + 4 * i, delta[2 * (n + t) + 4 * i])
-        if model.memory is not None:
+        if model.memory >= 0:
             _bound_memory(model, z)
         return
     for sign in (-1.0, 1.0):
@@ -501,7 +501,7 @@ def _correct(model, sp, z, own, delta):
         if sign < 0.0:
             for s in range(len(own)):
                 z[own[s]] += delta[s]
-    if model.memory is not None:
+    if model.memory >= 0:
         _bound_memory(model, z)
 
 

@@ -302,9 +302,9 @@ def _shown(model: Model, states: np.ndarray, period: float) -> np.ndarray:
 
 @compiled
 def _read_rows(model, sp, states, period, out):
-    nothing = np.zeros((0, out.shape[1]))
+    nothing, one = np.zeros((0, out.shape[1])), np.int64(1)  # numba compiles anew for a written 1
     for row in range(len(states)):
-        read_channels(model, sp, states[row], row, 1, 1.0, nothing, out[row])
+        read_channels(model, sp, states[row], row, one, 1.0, nothing, out[row])
     follow_trail(model, out, period, out[0].copy())
 
 

@@ -119,9 +119,8 @@ def supply_of(model, sp, z):
     user, count, act = model.user, model.hydraulic, sp.act
     set_activations(model, sp, z)
     open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
-    if model.memory is None:
-        return circuit_supply(user, 0, count, sp.scratch)
-    return circuit_supply(user, 0, count, sp.scratch, delivered_share(user, 0, act))
+    share = 1.0 if model.memory < 0 else delivered_share(user, 0, act)
+    return circuit_supply(user, 0, count, sp.scratch, share)
 
 
 @allocation_free
@@ -356,7 +355,7 @@ def accelerate(model, sp, z, dt):
         if len(model.terms) > 0:
             more, steep = term_force(model, sp, z, i, own)
         slope, plain = 0.0, True
-        if model.memory is not None:
+        if model.memory >= 0:
             if user[u + _BRISTLE_STIFFNESS] > 0.0:
                 plain, moved = False, _inertia(model, sp, i)
                 sp.drive[INERTIA, i] = moved
@@ -525,7 +524,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
         place(model, sp, z)
         for i in range(nu):
             drive[V, i] = (drive[X, i] - drive[V, i]) / h
-        if model.memory is not None:
+        if model.memory >= 0:
             _bend(model.user, act, drive, h, sp.act_dot)
         if count > 0:
             if len(model.terms) > 0:
@@ -538,7 +537,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
             )  # fmt: skip
             for k in range(4 * count):
                 act[k] += h * sp.act_dot[k]
-        if model.memory is not None:
+        if model.memory >= 0:
             for k in range(4 * count, len(sp.act_dot)):
                 act[k] += h * sp.act_dot[k]
         store_activations(model, sp, z)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.hydraulics.circuit import SCRATCH
+from hydrotele.hydraulics.circuit import NO_MEMORY, SCRATCH
 from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters, extra_state_names
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
@@ -45,8 +45,8 @@ class Model(NamedTuple):
         lag: (c,) sensor delays [s].
         terms: (k,) table of the machine's terms, see `terms.table`.
         time_constant: (c,) time constants of the sensors' first-order lags [s].
-        memory: number of states that follow the activations; None, and not 0, where there are none:
-            the compiled functions are then those of a model that knows no memory.
+        memory: number of states that follow the activations; NO_MEMORY, and not 0, where there are
+            none: what needs them is then left out.
     """
 
     mech: ReducedMechanism
@@ -63,7 +63,7 @@ class Model(NamedTuple):
     lag: np.ndarray
     terms: np.ndarray
     time_constant: np.ndarray
-    memory: int | None
+    memory: int
 
 
 class Space(NamedTuple):
@@ -140,13 +140,13 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         lag=np.array([e.delay for e in errors], float),
         terms=terms_table(machine.terms, order),
         time_constant=np.array([e.time_constant for e in errors], float),
-        memory=len(extra_state_names(machine)) or None,
+        memory=len(extra_state_names(machine)) or NO_MEMORY,
     )
 
 
 def model_space(model: Model) -> Space:
     """Fresh work space for a model."""
-    nu, n, acts = len(model.gear), len(model.mech.free), 4 * model.hydraulic + (model.memory or 0)
+    nu, n, acts = len(model.gear), len(model.mech.free), 4 * model.hydraulic + max(model.memory, 0)
     total = n + len(model.transmission)
     return Space(
         motion_space(model.mech), np.zeros((5, nu)), np.zeros((nu, n)), np.zeros((total, total)),
@@ -157,7 +157,7 @@ def model_space(model: Model) -> Space:
 def state_size(model: Model) -> int:
     """Number of states."""
     moving = 2 * (len(model.mech.free) + len(model.transmission))
-    return moving + 4 * model.hydraulic + (model.memory or 0)
+    return moving + 4 * model.hydraulic + max(model.memory, 0)
 
 
 def state_names(machine: Machine) -> list[str]:

@@ -18,14 +18,12 @@ from hydrotele.calibrate.loop import Loop, closure, link_chain, loop_of, unit_of
 from hydrotele.calibrate.sweeps import STILL, SWEEPS, Clean, sweep_poses
 from hydrotele.core.units import PSI
 from hydrotele.experiments.calibrator_poses import RESOLVER, readings, stressed, true_numbers
-from hydrotele.experiments.finding import Finding, Panel, perform
+from hydrotele.experiments.finding import Finding, Panel, Progress, perform
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.kinematics.serial_chain import forward
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-
-Progress = Callable[[str, float], None]
 
 _MOVED = ("stick", "boom", "swing")
 _EXACT = 1.0e-9

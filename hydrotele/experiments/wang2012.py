@@ -23,7 +23,7 @@ from hydrotele.calibrate.hybrid import (
 )
 from hydrotele.calibrate.hybrid_data import Measurement, measurement_of_wires
 from hydrotele.calibrate.posterior import Evolution, Posterior, evolve, sample_posterior
-from hydrotele.experiments.finding import Finding, Marginals, Panel, performed
+from hydrotele.experiments.finding import Finding, Marginals, Panel, Progress, performed
 from hydrotele.kinematics.hybrid import (
     Hybrid,
     Pose,
@@ -580,9 +580,6 @@ def coverage(results: list[tuple[int, int]]) -> Finding:
         " 95 % intervals (criterion: 93 to 97 %)",
         0.93 < share < 0.97,
     )
-
-
-Progress = Callable[[str, float], None]
 
 
 def wang2012(

@@ -82,6 +82,17 @@ class Columns:
         """(n, k) measured less modelled."""
         return self.measured - self.modelled
 
+    def part(self, first: int, last: int) -> "Columns":
+        """Equations `first` to `last`, of one run, as if they were all."""
+        rows = slice(first, last)
+        run = self.runs[int(np.searchsorted(self.starts, first, side="right")) - 1]
+        return replace(
+            self, matrix=self.matrix[rows], measured=self.measured[rows],
+            modelled=self.modelled[rows], time=self.time[rows], starts=(0, last - first),
+            doubt=self.doubt[rows], runs=(run,),
+            states={name: values[rows] for name, values in self.states.items()},
+        )  # fmt: skip
+
     def moved(self, value: Mapping[str, float]) -> "Columns":
         """Columns whose model has some coefficients, column -> value, added."""
         at = [self.names.index(name) for name in value]

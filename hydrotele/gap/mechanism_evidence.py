@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.signal import lfilter
+from scipy.stats import chi2
 
 from hydrotele.gap.mechanism_columns import Columns
 from hydrotele.gap.mechanism_effects import TYPICAL, MechanismEffect, strengths
@@ -19,6 +20,9 @@ from hydrotele.identify.estimation import autoregression, find_doubtful, weights
 
 _ROUNDS, _STEPS = 3, 40
 _STICKS = 0.25  # doubt of a sign from which a drive counts as sticking
+_PARTS = 3  # of the fitted runs that an effect must be alike in, at least
+_VARIES, _CHANCE = 0.25, 1e-3  # share of an effect by which it differs from part to part, where it
+# counts as one that is not constant, and the chance of that by noise
 
 
 @dataclass(frozen=True)
@@ -71,14 +75,18 @@ def find_noise(columns: Columns) -> Noise:
         columns: of the runs.
 
     Returns:
-        The noise. What repeats with the motion but has no column counts as noise, too.
+        The noise. What repeats with the motion but has no column counts as noise, too; what is
+        constant in a run but differs from run to run does not.
 
     Source: generalised least squares, feasible (Aitken 1935; Cochrane and Orcutt 1949).
     """
     n, k, _ = columns.matrix.shape
     wide = TYPICAL / np.maximum(strengths(columns), 1e-300)
     used = np.isfinite(wide) & (wide < 1e200)
-    matrix, gap = columns.matrix[:, :, used] * wide[used], columns.gap
+    gap = columns.gap
+    matrix = np.concatenate(
+        [columns.matrix[:, :, used] * wide[used], _run_offsets(columns)], axis=2
+    )
     std = np.maximum(np.std(gap, axis=0), 1e-12)
     noise = Noise(np.zeros((0, k)), np.diag(1.0 / std), np.ones((n, k)), std, gap, np.zeros((k, 2)))
     for _ in range(_ROUNDS):
@@ -90,6 +98,17 @@ def find_noise(columns: Columns) -> Noise:
         free = max(1.0 - float(np.trace(cho_solve(factor, square))) / len(y), 0.1)
         noise = noise_of(gap - matrix @ value, columns, free)
     return noise
+
+
+def _run_offsets(columns: Columns) -> np.ndarray:
+    """(n, k, k r) constants of every drive in every one of r runs, of a typical size."""
+    rows, drives = columns.measured.shape
+    size = TYPICAL * np.sqrt(np.mean(columns.measured**2, axis=0))
+    runs = len(columns.starts) - 1
+    out = np.zeros((rows, drives, runs, drives))
+    for run, (a, b) in enumerate(zip(columns.starts[:-1], columns.starts[1:], strict=True)):
+        out[a:b, np.arange(drives), run, np.arange(drives)] = size
+    return out.reshape(rows, drives, -1)
 
 
 def noise_of(rest: np.ndarray, columns: Columns, free: float = 1.0) -> Noise:
@@ -298,10 +317,72 @@ class Evidence:
         """What some effects add along all columns (m,)."""
         return self._whole(found)[0] if found.effects else np.zeros(len(self.names))
 
+    def predicted_variance(self, found: Fitted, matrix: np.ndarray) -> np.ndarray:
+        """Variance that the uncertainty of all that is fitted has in predictions.
+
+        Args:
+            found: the effects, fitted.
+            matrix: (n, k, m) columns of what is predicted.
+
+        Returns:
+            (n, k).
+        """
+        at = [self.places[name] for name in self.calibrate]
+        own = matrix[:, :, at]
+        variance = np.einsum("nkt,tu,nku->nk", own, self.known, own)
+        if found.effects:
+            _, slope = self._whole(found)
+            along = (matrix - own @ self.towards) @ slope
+            variance += np.einsum("nkp,pq,nkq->nk", along, found.covariance, along)
+        return variance
+
     def calibrated(self, found: Fitted) -> tuple[np.ndarray, np.ndarray]:
         """Deviations (t,) of the model's numbers beside some effects, and their covariance."""
         c = self.coefficients(found)
         return self.posterior - self.towards @ c, self.known
+
+
+def effects_by_part(
+    columns: Columns, noise: Noise, off: dict[str, float], found: Fitted
+) -> list[list[np.ndarray]]:
+    """Parameters of effects in every part of the runs, where they differ from part to part.
+
+    Args:
+        columns: of the runs; if these are less than three, each is cut into parts.
+        noise: of their equations.
+        off: see `gather_evidence`.
+        found: effects that are fitted to all runs.
+
+    Returns:
+        For each effect its parameters in every part; an empty list where they are alike, that is,
+        where noise explains the differences, or these are small.
+    """
+    runs = list(zip(columns.starts[:-1], columns.starts[1:], strict=True))
+    cuts = -(-_PARTS // len(runs))
+    edges = [np.linspace(a, b, cuts + 1).astype(int) for a, b in runs]
+    values: list[list[np.ndarray]] = [[] for _ in found.effects]
+    precisions: list[list[np.ndarray]] = [[] for _ in found.effects]
+    for first, last in [pair for e in edges for pair in zip(e[:-1], e[1:], strict=True)]:
+        if last - first <= 2 * len(noise.follow):
+            continue
+        own = replace(noise, weight=noise.weight[first:last])
+        part = gather_evidence(columns.part(first, last), own, off)
+        fitted, begin = part.fit(found.effects, found.values), 0
+        for k, value in enumerate(fitted.values):
+            block = slice(begin, begin + len(value))
+            begin += len(value)
+            values[k].append(value)
+            precisions[k].append(np.linalg.inv(fitted.covariance[block, block]))
+    out = []
+    for effect, many, known in zip(found.effects, values, precisions, strict=True):
+        mean = np.linalg.solve(sum(known), sum(w @ v for w, v in zip(known, many, strict=True)))
+        away = np.array(many) - mean
+        square = sum(float(d @ w @ d) for d, w in zip(away, known, strict=True))
+        size = sum(float((mean - effect.start) @ w @ (mean - effect.start)) for w in known)
+        free = len(mean) * (len(many) - 1)
+        varies = chi2.sf(square, free) < _CHANCE and square - free > _VARIES**2 * size
+        out.append(many if varies else [])
+    return out
 
 
 def _climb(first, worth, along, square, cross, mean, scale, low, high):

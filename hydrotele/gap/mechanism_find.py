@@ -6,7 +6,7 @@ was not fitted, and say what is left.
 
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -28,12 +28,14 @@ from hydrotele.gap.mechanism_evidence import (
     Evidence,
     Fitted,
     Noise,
+    effects_by_part,
     find_noise,
     gather_evidence,
     noise_of,
     row_weights,
+    whitened,
 )
-from hydrotele.gap.mechanism_lack import Left, find_left, loud_windows
+from hydrotele.gap.mechanism_lack import Left, find_left, loud_windows, with_variation
 from hydrotele.gap.mechanism_patch import (
     COLUMNS_FILE,
     MJCF_FILE,
@@ -67,6 +69,12 @@ _ROUNDS = 4  # of taking sensors' defects off the readings
 _SAME = 0.01  # of a prior's width, within which a round has changed nothing
 _BETTER = 1e-3  # by which an exchange must be better
 _WORTH_TELLING = 0.005
+_SHARES = (
+    1.0,
+    0.3,
+    0.1,
+)  # of the stated uncertainty that are tried: how far the numbers are off is
+# found, too
 _CALIBRATED = 10.0  # twice the log odds from which numbers of the model count as off
 _TOLD = 3.0  # standard deviations from which a calibrated number is told
 _SLOW = 0.2  # share of a drive's Coulomb friction by which its form near rest may differ
@@ -79,6 +87,11 @@ _REJECTED = (
 _SPOILS = (
     "{} at {}, which the fitted runs asked for, makes the held-out run worse; it was taken back."
 )
+_DIFFERS = (
+    "{} at {}, which the fitted runs asked for, is not the same in all parts of them ({} {} {});"
+    " it was taken back."
+)
+_LISTED = 3  # notes of that kind
 METRIC = "RMS of the errors of the drives' forces over their noise, all drives, held-out run"
 
 
@@ -103,7 +116,8 @@ class MechanismModel:
 class _Found:
     """Result of a search: evidence, all candidates, and the chosen ones fitted together.
 
-    `weak` would be chosen but for their size, and are `refused` with others that are not needed.
+    `off` are the standard deviations of the numbers that `evidence` integrates out. `weak` would be
+    chosen but for their size, and are `refused` with others that are not needed.
     """
 
     columns: Columns
@@ -114,6 +128,20 @@ class _Found:
     weak: tuple[Fitted, ...]
     singles: list[Fitted]
     refused: frozenset[Key]
+    off: dict[str, float]
+
+    @property
+    def total(self) -> float:
+        """Twice the log evidence of the numbers' errors and the effects together."""
+        return self.evidence.evidence + self.fitted.score
+
+    def coefficients(self) -> np.ndarray:
+        """(m,) what effects and calibrated numbers add along all columns."""
+        evidence = self.evidence
+        value = evidence.coefficients(self.fitted)
+        deviation, _ = evidence.calibrated(self.fitted)
+        value[[evidence.places[name] for name in evidence.calibrate]] += deviation
+        return value
 
 
 class _Patching(NamedTuple):
@@ -155,8 +183,9 @@ def _emptied(fit, mechanism: Mechanism, band: float, found: _Found) -> _Found:
     noise = find_noise(columns)
     evidence = gather_evidence(columns, noise, {})
     return replace(
-        found, columns=columns, noise=noise, evidence=evidence, fitted=evidence.fit([]), weak=()
-    )
+        found, columns=columns, noise=noise, evidence=evidence, fitted=evidence.fit([]), weak=(),
+        off={},
+    )  # fmt: skip
 
 
 def find_mechanism_gap(
@@ -198,18 +227,18 @@ def find_mechanism_gap(
     )
     then = build_columns([heldout], mechanism, band)
     patching = _Patching(mjcf, mechanism, given, nominal, heldout, band, then)
+    found, untrue, varies = _constant(found)
+    notes = (*notes, *untrue)
     patched, calibration, judged = patching.of(found)
     if spoiling := {key for key, gain in judged.gained.items() if gain < 0.0}:
-        kept = [(e, v) for e, v in zip(found.fitted.effects, found.fitted.values, strict=True)
-                if e.key not in spoiling]  # fmt: skip
-        fitted = found.evidence.fit([e for e, _ in kept], [v for _, v in kept] or None)
         notes = (*notes, *(_SPOILS.format(*key) for key in sorted(spoiling)))
-        found = replace(found, fitted=fitted, refused=found.refused | spoiling)
+        found = _without(found, spoiling)
         patched, calibration, judged = patching.of(found)
     if not _rms(judged.after[0]) <= _WORSE * _rms(judged.before[0]):
         notes = (*notes, _REJECTED)
         found, patched, calibration = _emptied(fit, mechanism, band, found), given, {}
         judged = _judged(mechanism, found, nominal, then, then)
+    judged = judged._replace(left=with_variation(judged.left, varies, judged.std))
     named = _named(found, judged.shares)
     named, details = _believable(named, judged)
     left = judged.left
@@ -240,6 +269,42 @@ def find_mechanism_gap(
     )  # fmt: skip
 
 
+def _without(found: _Found, dropped: Iterable[Key]) -> _Found:
+    """A search's result without some effects, the others fitted again."""
+    dropped, fitted = frozenset(dropped), found.fitted
+    kept = [(e, v) for e, v in zip(fitted.effects, fitted.values, strict=True)
+            if e.key not in dropped]  # fmt: skip
+    fitted = found.evidence.fit([e for e, _ in kept], [v for _, v in kept] or None)
+    return replace(found, fitted=fitted, refused=found.refused | dropped)
+
+
+def _constant(found: _Found) -> tuple[_Found, list[str], np.ndarray]:
+    """A search's result without effects that differ from run to run.
+
+    Returns:
+        The result, what is said of the effects, and (k,) RMS of the drives' forces that these made.
+    """
+    told: list[str] = []
+    moved = np.zeros(found.columns.measured.shape[1])
+    while found.fitted.effects:
+        parts = effects_by_part(found.columns, found.noise, found.off, found.fitted)
+        differ = [k for k, many in enumerate(parts) if many]
+        if not differ:
+            break
+        for k in differ:
+            effect, value = found.fitted.effects[k], found.fitted.values[k]
+            name, facts = next(iter(effect.parameters.items()))
+            values = ", ".join(f"{float(own[0]):.3g}" for own in parts[k])
+            told.append(_DIFFERS.format(*effect.key, name, values, facts.unit))
+            at = [found.evidence.places[column] for column in effect.columns]
+            force = found.columns.matrix[:, :, at] @ effect.coefficients(value)
+            moved = np.hypot(moved, np.sqrt(np.mean(force**2, axis=0)))
+        found = _without(found, [found.fitted.effects[k].key for k in differ])
+    if len(told) > _LISTED:
+        told = [*told[:_LISTED], f"So were {len(told) - _LISTED} more."]
+    return found, told, moved
+
+
 def nominal_parameters(mechanism: Mechanism) -> dict[str, float]:
     """Regressor's parameter -> its given value, of the setup with a column for everything.
 
@@ -263,7 +328,7 @@ def nominal_parameters(mechanism: Mechanism) -> dict[str, float]:
     return out
 
 
-def possible_errors(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
+def possible_errors(mechanism: Mechanism, columns: Columns, share: float = 1.0) -> dict[str, float]:
     """By how much numbers of the model may be off: column -> standard deviation.
 
     Masses, moments and inertias by the mapping's uncertainty of the body's own, friction by that of
@@ -273,11 +338,12 @@ def possible_errors(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
     Args:
         mechanism: the given model.
         columns: of its runs.
+        share: of the stated uncertainty.
 
     Returns:
         The standard deviations.
     """
-    off, chain, out = mechanism.mapping.uncertainty, mechanism.setup.chain, {}
+    off, chain, out = share * mechanism.mapping.uncertainty, mechanism.setup.chain, {}
     for body, ten in zip(chain.bodies, chain.inertia, strict=True):
         mass, spread = float(ten[0]), float(ten[4] + ten[7] + ten[9]) / 2.0
         reach = np.sqrt(max(spread, 0.0) * max(mass, 0.0))
@@ -300,29 +366,29 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
     """Search; take sensors' defects off the readings and search again until nothing changes."""
     applied: dict[Key, np.ndarray] = {}
     known: Sequence[tuple[MechanismEffect, np.ndarray]] = ()
-    found, about = None, {}
+    found, about, shares = None, {}, _SHARES
     for turn in range(_ROUNDS):
         tell(f"columns of all effects, round {turn + 1}", 0.2 * turn)
         errors = sensor_errors(known, mechanism.setup.chain, mechanism.measured)
         columns = build_columns(fit, mechanism, band, errors, about)
         columns = undone(columns, applied, {one.key: one.columns[0] for one, _ in known})
-        noise = find_noise(columns)
-        evidence = gather_evidence(columns, noise, possible_errors(mechanism, columns))
         effects = mechanism_effects(mechanism.setup.chain, columns, nominal, applied)
         if names:
             effects = [one for one in effects if one.name in names]
         tell(f"{len(effects)} effects, round {turn + 1}", 0.2 * turn + 0.15)
-        found = _search(columns, noise, evidence, effects, found)
+        noise = find_noise(columns)
+        tried = [_search(columns, noise, mechanism, one, effects, found) for one in shares]
+        best = int(np.argmax([one.total for one in tried]))
+        found, shares = tried[best], shares[best : best + 1]
         if columns.gap.size < _SCARCE * len(columns.names):
             noise = noise_of(_unexplained(found), columns)
-            evidence = gather_evidence(columns, noise, possible_errors(mechanism, columns))
-            found = _search(columns, noise, evidence, effects, found)
+            found = _search(columns, noise, mechanism, shares[0], effects, found)
         known = [
             (one, value)
             for one, value in zip(found.fitted.effects, found.fitted.values, strict=True)
             if sensor_errors([(one, value)], mechanism.setup.chain, mechanism.measured)
         ]
-        value = evidence.coefficients(found.fitted)
+        value = found.evidence.coefficients(found.fitted)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in nominal}
         steps = [
             np.abs(value - applied.get(one.key, one.start)) / one.scale for one, value in known
@@ -335,8 +401,13 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
     return found
 
 
-def _search(columns, noise, evidence: Evidence, effects: list[MechanismEffect], before):
+def _search(
+    columns: Columns, noise: Noise, mechanism: Mechanism, share: float,
+    effects: list[MechanismEffect], before: _Found | None,
+) -> _Found:  # fmt: skip
     """Add what is most worth adding, drop what is not worth having, exchange what is better."""
+    off = possible_errors(mechanism, columns, share)
+    evidence = gather_evidence(columns, noise, off)
     need = 2.0 * np.log(max(len(effects), 1)) + _ODDS
     singles = [evidence.fit([one]) for one in effects]
     first = [e.key for e in before.fitted.effects] if before else []
@@ -363,7 +434,9 @@ def _search(columns, noise, evidence: Evidence, effects: list[MechanismEffect], 
         if len(chosen) <= _FEW:
             chosen, now = _improved(evidence, effects, chosen, now, need, refused)
     chosen, now = _improved(evidence, effects, chosen, now, need, refused)
-    return _Found(columns, noise, evidence, effects, now, tuple(weak), singles, frozenset(refused))
+    return _Found(
+        columns, noise, evidence, effects, now, tuple(weak), singles, frozenset(refused), off
+    )
 
 
 def _slight(effect: MechanismEffect, value: np.ndarray) -> bool:
@@ -447,8 +520,7 @@ def _calibration(mechanism: Mechanism, found: _Found, nominal: Mapping[str, floa
 
     Numbers count as off where the data say so with the effects in the model.
     """
-    off = possible_errors(mechanism, found.columns)
-    nuisance = {name: std for name, std in off.items() if name not in nominal}
+    nuisance = {name: std for name, std in found.off.items() if name not in nominal}
     sharp = gather_evidence(found.columns, found.noise, nuisance)
     values = list(found.fitted.values) or None
     as_given = sharp.fit(found.fitted.effects, values)
@@ -499,8 +571,8 @@ class _Judged(NamedTuple):
         std: (k,) noise of the drives' forces, without what is lacking [N] or [N m].
         left: what the patched model lacks.
         shares: effect -> share of the gap that comes back without it.
-        gained: effect -> by how much the squared error of the drive that it moves most grows
-            without it, over the noise's.
+        gained: effect -> by how much the held-out run's squared errors, whitened by the noise,
+            grow without it, all else fitted again.
         moved: effect -> (k,) RMS of what it does to every drive's force [N] or [N m].
         before: predictions of the given model, the held-out run first.
         after: of the patched one.
@@ -523,7 +595,8 @@ def _judged(
     weight = row_weights(noise.doubtful, then.doubt)
     rows = min(len(then.time), len(now.time))  # a late sensor tells nothing of the last ones
     later = row_weights(noise.doubtful, now.doubt)
-    left = find_left(fit, now, rest, now.gap, noise.std, noise.weight, later)
+    spread = np.sqrt(found.evidence.predicted_variance(found.fitted, then.matrix).mean(axis=0))
+    left = find_left(fit, now, rest, now.gap, noise.std, noise.weight, later, spread)
     std = noise.std * np.sqrt(np.where(left.lacking, np.clip(1.0 - left.share, 0.05, 1.0), 1.0))
     plain = {(e.key, e.variant): e for e in
              mechanism_effects(mechanism.setup.chain, then, nominal, {})}  # fmt: skip
@@ -531,7 +604,11 @@ def _judged(
     before = (weight * then.gap / std)[:rows]
     after = (later * now.gap / std)[:rows]
     whole = float(np.mean(before**2)) - 1.0
-    shares, moved, gained = {}, {}, {}
+
+    def squares(error: np.ndarray) -> float:
+        return float(np.sum(whitened(error, replace(noise, weight=later[:rows]), (0, rows)) ** 2))
+
+    shares, moved, gained, value_of_all = {}, {}, {}, found.coefficients()
     for effect, value in zip(found.fitted.effects, found.fitted.values, strict=True):
         own = plain.get((effect.key, effect.variant))
         if own is None:
@@ -539,12 +616,12 @@ def _judged(
             continue
         at = [places[name] for name in own.columns]
         added = then.matrix[:rows, :, at] @ own.coefficients(value)
-        grown = np.mean((after + weight[:rows] * added / std) ** 2, axis=0)
-        grown -= np.mean(after**2, axis=0)
-        back = float(np.mean(grown))
+        back = float(np.mean((after + weight[:rows] * added / std) ** 2) - np.mean(after**2))
         shares[effect.key] = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
         moved[effect.key] = np.sqrt(np.mean(added**2, axis=0))
-        gained[effect.key] = float(grown[np.argmax(moved[effect.key] / std)])
+        change = value_of_all - _without(found, [effect.key]).coefficients()
+        error = now.gap[:rows]
+        gained[effect.key] = squares(error + then.matrix[:rows] @ change) - squares(error)
     channels = tuple(
         f"{'force' if _unit(mechanism, d) == 'N' else 'torque'}.{d}"
         for d in mechanism.setup.chain.drives
@@ -570,11 +647,7 @@ def _judged(
 
 def _unexplained(found: _Found) -> np.ndarray:
     """(n, k) of the fitted runs, after effects and calibrated numbers [N] or [N m]."""
-    evidence, columns = found.evidence, found.columns
-    value = evidence.coefficients(found.fitted)
-    deviation, _ = evidence.calibrated(found.fitted)
-    value[[evidence.places[name] for name in evidence.calibrate]] += deviation
-    return columns.gap - columns.matrix @ value
+    return found.columns.gap - found.columns.matrix @ found.coefficients()
 
 
 def _believable(named: Sequence[NamedEffect], judged: _Judged):

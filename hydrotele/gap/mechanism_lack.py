@@ -6,7 +6,7 @@ a law that the model lacks.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -63,7 +63,7 @@ class Left:
 
 def find_left(
     fit: Columns, judge: Columns, rest: np.ndarray, judged: np.ndarray, std: np.ndarray,
-    weight: np.ndarray, judge_weight: np.ndarray,
+    weight: np.ndarray, judge_weight: np.ndarray, spread: np.ndarray,
 ) -> Left:  # fmt: skip
     """Look for what is left.
 
@@ -75,6 +75,7 @@ def find_left(
         std: (k,) noise of the fitted runs.
         weight: (n, k) of the rows, lower where the sign of friction is in doubt.
         judge_weight: (j, k).
+        spread: (k,) RMS of what the fit's own uncertainty does to the run that was not fitted.
 
     Returns:
         What is left.
@@ -92,7 +93,9 @@ def find_left(
             laws += own
     burst, limit, loud = _bursts([(fit, weight * rest), (judge, judge_weight * judged)], std)
     grown = np.sqrt(np.mean((judge_weight * judged) ** 2, axis=0)
-                    / np.mean(judge_weight**2, axis=0)) / std  # fmt: skip
+                    / np.mean(judge_weight**2, axis=0))  # fmt: skip
+    std = np.hypot(std, spread)
+    grown = grown / std
     excess = std * np.sqrt(np.maximum(grown**2 - 1.0, 0.0))
     by_state = (share > _TOLD) & (size > _SMALL * force)
     by_time = (burst > limit) & (loud > _SMALL * force)
@@ -110,6 +113,25 @@ def find_left(
     size = np.maximum(np.where(by_state, size, 0.0), np.where(by_run, excess, 0.0))
     size = np.maximum(size, np.where(by_time, loud, 0.0))
     return Left(tuple(laws), share, size, tests, lacking)
+
+
+def with_variation(left: Left, moved: np.ndarray, std: np.ndarray) -> Left:
+    """What is left, with effects that are not the same in all parts of the fitted runs.
+
+    Args:
+        left: without them.
+        moved: (k,) RMS of what they do to the drives' forces [N] or [N m].
+        std: (k,) of the forces' noise; what is smaller says nothing.
+
+    Returns:
+        What is left.
+    """
+    loud = moved > std
+    tests = {**left.tests, "constant": _test(float((moved / std).max()), 1.0, not loud.any())}
+    return replace(
+        left, tests=tests, lacking=left.lacking | loud,
+        size=np.maximum(left.size, np.where(loud, moved, 0.0)),
+    )  # fmt: skip
 
 
 def _test(value: float, limit: float, passed: bool) -> dict[str, float | bool]:

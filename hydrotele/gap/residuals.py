@@ -224,7 +224,7 @@ def clean_run(machine: Machine, data: Dataset, run: RunData, start: np.ndarray, 
     rows = len(run.command)
     shown, states = np.empty((rows, len(data.channels))), np.empty((rows, state_size(model)))
     simulate_rows(
-        model, space, start.copy(), run.command, run.period,
+        model, space, start.copy(), run.command.copy(), run.period,
         max(1, round(run.period / (0.5 * STEP))), shown, states,
     )  # fmt: skip
     noise = (

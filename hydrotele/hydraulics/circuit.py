@@ -59,13 +59,14 @@ from hydrotele.terms.law import Drives, DriveState
 from hydrotele.terms.table import COMMAND, FLOW_SUPPLY, added, added_flows
 
 __all__ = [
-    "ACTIVATIONS", "MAX_AXES", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
+    "ACTIVATIONS", "MAX_AXES", "NO_MEMORY", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
     "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_state", "chamber_flows",
     "circuit_scratch", "circuit_supply", "delivered_share", "force_after_friction", "open_ports",
     "pressure_rates", "pumped_force", "step_circuit", "supply_pressure", "demanded_share",
 ]  # fmt: skip
 
 ACTIVATIONS = 4
+NO_MEMORY = -1  # number of further states where none is even asked for
 MAX_AXES = 8
 _FACTORS = 4 * MAX_AXES  # after the ports: of the pressures, and how the supply couples them
 _FIRST = 8 * MAX_AXES  # then both chambers' softening, later their rates in the first stage
@@ -180,25 +181,23 @@ def _delivery_of_terms(user, first, count, terms, act, length, velocity, command
     if at == 0:
         return 0.0
     total, drives = 0.0, Drives(count, act, length, velocity, command)
-    if terms is not None:
-        if len(terms) > 0:
-            for i in range(count):
-                u, a = (first + i) * SLOTS, 4 * i
-                force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
-                s = DriveState(
-                    time, length[first + i] - dt * velocity[first + i], velocity[first + i],
-                    act[a], act[a + 1], act[a + 2], act[a + 3], supply, command[first + i], force,
-                )  # fmt: skip
-                total += added(terms, FLOW_SUPPLY, first + i, s, drives)
+    if len(terms) > 0:
+        for i in range(count):
+            u, a = (first + i) * SLOTS, 4 * i
+            force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
+            s = DriveState(
+                time, length[first + i] - dt * velocity[first + i], velocity[first + i],
+                act[a], act[a + 1], act[a + 2], act[a + 3], supply, command[first + i], force,
+            )  # fmt: skip
+            total += added(terms, FLOW_SUPPLY, first + i, s, drives)
     wanted = total / user[first * SLOTS + _PUMP]
     return wanted + (act[at] - wanted) * math.exp(-dt / ADDED_LAG)
 
 
 @allocation_free
 def step_circuit(
-    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms=None, time=0.0,
-    memory=None,
-):  # fmt: skip
+    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time, memory
+):
     """Advance spools and chamber pressures of all axes that share a supply by one step.
 
     Spools follow their exact exponential; pressures take one step of the L-stable second-order
@@ -224,10 +223,10 @@ def step_circuit(
         act_dot: (>= 4 count,) written: mean rates over the step, in the unit of `act` per [s]; of
             what is remembered, the pump's alone.
         scratch: (SCRATCH,) work space.
-        terms: (n,) table of the machine's terms, None for none [SI].
+        terms: (n,) table of the machine's terms, `NO_TERMS` for none [SI].
         time: at the start of the step, scalar [s]; only terms see it.
-        memory: number of states that follow the activations, scalar [1]; None leaves them out, and
-            the time that it takes to ask for them.
+        memory: number of states that follow the activations, scalar [1]; `NO_MEMORY` leaves them
+            out, and the time that it takes to ask for them.
 
     Returns:
         (supply pressure at the start of the step [Pa], at its end [Pa]).
@@ -249,11 +248,11 @@ def step_circuit(
             act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]
         )
     open_ports(user, act, act, scratch, first, count, 0.0, act_dot)
-    share, begun, more_delivered = 1.0, 0.0, 0.0
-    if memory is None:
-        p_start = circuit_supply(user, first, count, scratch)
-    else:
-        p_start = circuit_supply(user, first, count, scratch, delivered_share(user, first, act))
+    held, share, begun, more_delivered = 1.0, 1.0, 0.0, 0.0
+    if memory >= 0:
+        held = delivered_share(user, first, act)
+    p_start = circuit_supply(user, first, count, scratch, held)
+    if memory >= 0:
         begun = demanded_share(user, first, count, scratch)
         more_delivered = _delivery_of_terms(
             user, first, count, terms, act, length, velocity, command, time, p_start, dt
@@ -266,12 +265,11 @@ def step_circuit(
         if user[u + _KIND] == _PUMPED:
             scratch[a + 3] = switched_speed(act[a], act_dot[a])
         more = _NO_FLOWS
-        if terms is not None:
-            if len(terms) > 0:
-                more = _flows_of_terms(
-                    terms, first + i, user, time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3],
-                    p_start, command, drives,
-                )  # fmt: skip
+        if len(terms) > 0:
+            more = _flows_of_terms(
+                terms, first + i, user, time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3],
+                p_start, command, drives,
+            )  # fmt: skip
         head, rod, j_head, j_rod = pressure_rates(
             user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3], x, v, dt, more,
         )  # fmt: skip
@@ -291,10 +289,8 @@ def step_circuit(
         act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], act_dot[a + 2], dt)
         act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], act_dot[a + 3], dt)
     open_ports(user, act, act_dot, scratch, first, count, dt, act_dot)
-    if memory is None:
-        p_end = circuit_supply(user, first, count, scratch)
-    else:
-        p_end = circuit_supply(user, first, count, scratch, share)
+    p_end = circuit_supply(user, first, count, scratch, share)
+    if memory >= 0:
         if user[first * SLOTS + _LAG] > 0.0:
             at = int(user[first * SLOTS + _DELIVERY])
             wanted = 0.5 * (begun + demanded_share(user, first, count, scratch))
@@ -307,12 +303,11 @@ def step_circuit(
         x, v = length[first + i], velocity[first + i]
         p_head, p_rod = act[a + 2] + dt * act_dot[a + 2], act[a + 3] + dt * act_dot[a + 3]
         more = _NO_FLOWS
-        if terms is not None:
-            if len(terms) > 0:
-                more = _flows_of_terms(
-                    terms, first + i, user, time + dt, x, v, act_dot[a], act_dot[a + 1], p_head,
-                    p_rod, p_end, command, drives,
-                )  # fmt: skip
+        if len(terms) > 0:
+            more = _flows_of_terms(
+                terms, first + i, user, time + dt, x, v, act_dot[a], act_dot[a + 1], p_head,
+                p_rod, p_end, command, drives,
+            )  # fmt: skip
         head, rod, _, _ = pressure_rates(
             user, u, scratch[a + 3], p_end, p_head, p_rod, x, v, 0.0, more,
         )  # fmt: skip

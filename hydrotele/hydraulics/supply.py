@@ -217,7 +217,7 @@ def demanded_share(user, first, count, ports):
 
     Source: nominal model, "Supply"; first-order swash plate: Merritt 1967, sec. 8-6.
     """
-    supply = circuit_supply(user, first, count, ports)
+    supply = circuit_supply(user, first, count, ports, 1.0)
     return min(1.0, drawn_flow(user, first, count, ports, supply) / user[first * SLOTS + _PUMP])
 
 
@@ -273,7 +273,7 @@ def highest_supply(user, first, count, ports):
 
 
 @inlined
-def circuit_supply(user, first, count, ports, share=1.0):
+def circuit_supply(user, first, count, ports, share):
     """Supply pressure of a circuit: what pump and relief give, or what load sensing asks for.
 
     A load-sensing pump holds `max p_i + margin` over the open valves (tank pressure counts as a

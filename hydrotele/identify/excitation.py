@@ -129,7 +129,7 @@ def informative_base(
     Returns:
         (p,) places in the regressor's parameters: worth designing a motion for.
     """
-    limits, rng = _Limits(machine, setup), np.random.default_rng(seed)
+    limits, rng = MachineLimits(machine, setup), np.random.default_rng(seed)
     time = np.arange(0.0, period, _READ)
     phase = rng.uniform(0.0, 2.0 * math.pi, (len(limits.axes), 5))
     wide = 0.15 * limits.half[:, None] / np.arange(1, 6) * 5.0 / np.sqrt(5.0)
@@ -145,48 +145,6 @@ def informative_base(
     return identifiable_in_noise(
         flat, table.names, reference_sizes(table, setup, forces), asked
     ).base
-
-
-def design_excitation(
-    machine: Machine, setup: RegressorSetup, noise: np.ndarray, base: Sequence[int] | np.ndarray, *,
-    period: float = 20.0, harmonics: int = 8, starts: int = 2, iterations: int = 150,
-    seed: int = 0, progress: Callable[[str, float], None] | None = None,
-) -> Excitation:  # fmt: skip
-    """D-optimal Fourier motion within the machine's limits.
-
-    Maximises ln det of the information of the base parameters. Limits: joint ranges, strokes,
-    pump flow shared by all axes, valves' rated flows, and forces at the relief pressure.
-
-    Args:
-        machine: the machine.
-        setup: of the regressor; its given numbers tell the forces.
-        noise: (k,) standard deviation of the drives' force errors [N] or [N m].
-        base: places of the base parameters that count.
-        period: [s].
-        harmonics: number H of them.
-        starts: random motions from which to search.
-        iterations: of each search, per weight of the limits.
-        seed: of these.
-        progress: told what is being done and how far, 0 .. 1.
-
-    Returns:
-        The best motion found.
-
-    Raises:
-        InputError: no start moves within the limits, or the machine has plain drives, whose
-            feedback nobody has tuned.
-
-    Source: Abdellatif 2008, section 4; Swevers et al. 1997.
-    """
-    if plain := [name for name, axis in machine.axes.items() if axis.force]:
-        raise InputError(
-            _WHERE, f"{', '.join(plain)} has a plain drive, whose feedback depends on its use:"
-            " write a scenario with a `fourier` pilot and a `servo` of your own",
-        )  # fmt: skip
-    return design_motion(
-        _Limits(machine, setup), setup, noise, base, period=period, harmonics=harmonics,
-        starts=starts, iterations=iterations, seed=seed, progress=progress,
-    )  # fmt: skip
 
 
 class MotionLimits(Protocol):
@@ -227,8 +185,10 @@ def design_motion(
 ) -> Excitation:  # fmt: skip
     """D-optimal Fourier motion of the setup's given joints within any limits.
 
+    Maximises ln det of the information of the base parameters.
+
     Args:
-        limits: of the motion.
+        limits: of the motion; `MachineLimits` has those of a machine.
         setup: of the regressor.
         noise: of the drives' force errors, as of `information`.
         base: places of the base parameters that count.
@@ -245,7 +205,7 @@ def design_motion(
     Raises:
         InputError: no start moves within the limits.
 
-    Source: Abdellatif 2008, (22)-(26).
+    Source: Abdellatif 2008, section 4 and (22)-(26); Swevers et al. 1997.
     """
     rows = max(60, _ROWS * harmonics)
     time = np.arange(rows) * period / rows
@@ -360,10 +320,25 @@ class DriveLimits:
         )
 
 
-class _Limits:
-    """What the machine allows: ranges, strokes, flows and forces."""
+class MachineLimits:
+    """What a machine allows: joint ranges, strokes, flows, and forces at the relief pressure.
+
+    The pump's flow is shared by all axes. The setup's given numbers tell the forces.
+
+    Args:
+        machine: the machine.
+        setup: of the regressor.
+
+    Raises:
+        InputError: the machine has plain drives, whose feedback nobody has tuned.
+    """
 
     def __init__(self, machine: Machine, setup: RegressorSetup):
+        if plain := [name for name, axis in machine.axes.items() if axis.force]:
+            raise InputError(
+                _WHERE, f"{', '.join(plain)} has a plain drive, whose feedback depends on its use:"
+                " write a scenario with a `fourier` pilot and a `servo` of your own",
+            )  # fmt: skip
         self.machine, self.setup = machine, setup
         self.axes = tuple(actuator_order(machine))
         ranges = []

@@ -10,7 +10,7 @@ import numpy as np
 
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
-from hydrotele.multibody.chain import Chain
+from hydrotele.multibody.chain import Chain, Tree
 from hydrotele.multibody.tree_motion import Frames, move_tree, new_frames, point_column
 from hydrotele.multibody.vectors import (
     add,
@@ -175,45 +175,42 @@ def close_near(tree, q, others, space):
     return False
 
 
-@compiled
-def close_from(tree, q, others, closed, longest):
+def close_from(
+    tree: Tree, q: np.ndarray, others: np.ndarray, closed: float, longest: float
+) -> float:
     """Close the loops from some way off by moving some of the joints.
 
     Args:
-        tree: Tree.
-        q: (v,) positions, changed in place.
+        tree: of the joints.
+        q: (v,) positions, changed in place [rad] or [m].
         others: (m,) joints that may move.
-        closed: opening that counts as closed, scalar [m], [rad].
-        longest: most that a joint moves in one round, scalar [rad], [m].
+        closed: opening that counts as closed [m], [rad].
+        longest: most that a joint moves in one round [rad], [m].
 
     Returns:
-        Opening that is left, scalar [m], [rad].
+        Opening that is left [m], [rad].
 
     Source: Gauss-Newton with a bounded step, minimum norm where the closures leave a choice.
     """
-    v, r, open_by = len(q), tree.row[-1], 0.0
-    frames, gap, slope = new_frames(tree), np.zeros((r, 1)), np.zeros((r, v))
-    still, none = np.zeros(v), np.zeros(3)
-    for _ in range(_ROUNDS if r else 0):
-        move_tree(tree, q, still, still, none, frames)
-        loop_errors(tree, frames, gap, slope)
-        open_by = np.max(np.abs(gap))
-        if open_by < closed:
+    open_by = 0.0
+    for _ in range(_ROUNDS if tree.row[-1] else 0):
+        gap, slope = _openings(tree, q)
+        open_by = float(np.abs(gap).max())
+        if not closed <= open_by < np.inf:
             break
-        step = np.linalg.lstsq(np.ascontiguousarray(slope[:, others]), gap, _SMALL)[0][:, 0]
-        largest = np.max(np.abs(step))
-        q[others] -= step * min(1.0, longest / max(largest, 1e-300))
+        step = np.linalg.lstsq(slope[:, others], gap[:, 0], _SMALL)[0]
+        q[others] -= step * min(1.0, longest / max(float(np.abs(step).max()), 1e-300))
     return open_by
 
 
 @compiled
-def closure_slope(tree, q):
-    """Jacobian (r, v) of the closures' openings at positions (v,)."""
+def _openings(tree, q):
+    """Openings (r, 1) of the closures at positions (v,), and their Jacobian (r, v)."""
     v, r = len(q), tree.row[-1]
     frames, gap, slope, still = new_frames(tree), np.zeros((r, 1)), np.zeros((r, v)), np.zeros(v)
     move_tree(tree, q, still, still, np.zeros(3), frames)
     loop_errors(tree, frames, gap, slope)
-    return slope
+    return gap, slope
 
 
 def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.ndarray:
@@ -233,7 +230,7 @@ def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.nda
     basis = np.zeros((len(q), len(independent)))
     basis[independent, np.arange(len(independent))] = 1.0
     if len(others):
-        slope = closure_slope(chain.tree, np.ascontiguousarray(q, float))
+        slope = _openings(chain.tree, np.ascontiguousarray(q, float))[1]
         basis[others] = -np.linalg.lstsq(slope[:, others], slope[:, independent], rcond=1e-10)[0]
     return basis
 
@@ -250,7 +247,7 @@ def check_determined(chain: Chain, q: np.ndarray, independent: np.ndarray) -> No
         InputError: names them.
     """
     others = np.setdiff1d(np.arange(len(q)), independent)
-    loose = np.linalg.svd(closure_slope(chain.tree, q)[:, others], full_matrices=True)
+    loose = np.linalg.svd(_openings(chain.tree, q)[1][:, others], full_matrices=True)
     hidden = np.linalg.norm(loose[2][np.sum(loose[1] > _SMALL) :], axis=0)
     if (hidden > _SMALL).any():
         names = ", ".join(chain.joints[j] for j in others[hidden > _SMALL])

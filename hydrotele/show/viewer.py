@@ -240,7 +240,7 @@ def take_screenshot(
     size: tuple[int, int] = (1600, 1000),
     at: float | None = None,
     timeout: float = 90.0,
-) -> None:
+) -> tuple[str, ...]:
     """Save what the viewer shows of a recording.
 
     Args:
@@ -249,6 +249,9 @@ def take_screenshot(
         size: width and height [pixel].
         at: time on the timeline `time` [s]; default is the middle of the recording.
         timeout: the longest that all of it may take [s].
+
+    Returns:
+        Warnings and errors that the viewer has for the recording.
 
     Raises:
         InputError: the recording cannot be read, there is no Vulkan driver (says what to install),
@@ -259,21 +262,15 @@ def take_screenshot(
         _hide_top_panel(client)
         client.set_time(TIMELINE, duration=_moment(state, at, rrd), play_state="paused")
         part.write_bytes(_settled_picture(client, deadline))
+        return _complaints(client)
 
 
-def view_reports(rrd: str | os.PathLike, timeout: float = 90.0) -> list[str]:
-    """Return the warnings and errors that the viewer has for a recording; none is good.
-
-    Raises:
-        InputError: as `take_screenshot`.
-    """
-    deadline = time.monotonic() + timeout
-    with _viewing(rrd, (1600, 1000), deadline) as (client, _):
-        _settled_picture(client, deadline)
-        views = client.get_state().views
-        shown = [f"{v.name}: {r.severity}: {r.summary}" for v in views for r in v.reports]
-        entries = [e for e in client.get_logs() if e.level in ("WARN", "ERROR")]
-        return shown + [e.message for e in entries if "rasterizer" not in e.message]
+def _complaints(client: "ViewerClient") -> tuple[str, ...]:
+    """Warnings and errors that the viewer has for what it shows."""
+    views = client.get_state().views
+    shown = [f"{v.name}: {r.severity}: {r.summary}" for v in views for r in v.reports]
+    entries = [e for e in client.get_logs() if e.level in ("WARN", "ERROR")]
+    return (*shown, *(e.message for e in entries if "rasterizer" not in e.message))
 
 
 @contextlib.contextmanager

@@ -27,6 +27,7 @@ from hydrotele.core.compiled import allocation_free, callback, compiled
 from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate, settled_bristle_friction
 from hydrotele.hydraulics.circuit import (
     MAX_AXES,
+    NO_MEMORY,
     SCRATCH,
     SLOTS,
     Kind,
@@ -310,7 +311,7 @@ def _callbacks(remembers):
         if not remembers:
             step_circuit(
                 user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms,
-                time, None,
+                time, np.int64(NO_MEMORY),  # numba compiles anew for a written number
             )  # fmt: skip
         else:
             _advance_with_memory(

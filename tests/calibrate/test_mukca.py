@@ -1,7 +1,6 @@
 """Ball in sockets: planted errors, measured data, models of the joints, outliers, bad input."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,10 +24,11 @@ from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.robot_file import load_robot
 from hydrotele.kinematics.serial_robot import deflection_names
+from tests.measured import REAL, needs_real
 
 PLACES = {"left": (0.4, 0.3, 0.1), "right": (0.45, -0.3, 0.1), "front": (0.55, 0.0, 0.1)}
 UNSEEN = {"unseen": (0.5, 0.1, 0.25)}
-MEASURED = Path(__file__).parents[3] / "shared/real/mukca_panda_3"
+MEASURED = REAL / "mukca_panda_3"
 
 
 def simulated(robot="panda", rows=20, errors=None, seed=3, corrections=None):
@@ -118,9 +118,8 @@ def test_rows_with_the_ball_elsewhere_are_named_and_left_out(noisy):
     assert judge(found.robot, unseen).rms < 0.087e-3
 
 
+@needs_real
 def test_measured_panda_reaches_the_published_accuracy():
-    if not MEASURED.is_dir():
-        pytest.skip("the measured data are not beside this checkout")
     sockets, _ = load_sockets(MEASURED)
     robot, _ = choose_robot(sockets, Options())
     assert robot.name == "panda"

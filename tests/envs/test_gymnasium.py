@@ -52,7 +52,7 @@ def test_the_checker_of_gymnasium_has_nothing_to_say(name, action):
 
 @pytest.mark.parametrize("action", ACTIONS)
 def test_random_actions_leave_no_space_and_raise_no_warning(name, action):
-    env = batched(name, 8, action=action, sensors="real", variants=4, control_rate=20.0)
+    env = batched(name, 4, action=action, sensors="real", variants=4, control_rate=20.0)
     core = env.unwrapped.core
     seen, _ = env.reset(seed=11)
     env.action_space.seed(11)

@@ -7,7 +7,7 @@ import pytest
 
 from hydrotele.effects import Term, changed, with_terms
 from hydrotele.estimate.reduced_dynamics import simulate_rows
-from hydrotele.hydraulics.circuit import circuit_scratch, step_circuit
+from hydrotele.hydraulics.circuit import NO_MEMORY, circuit_scratch, step_circuit
 from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters
 from hydrotele.terms.table import terms_table
 
@@ -96,8 +96,9 @@ def still_circuit(machine, terms, pressures, dt, end):
     x = np.full(count, 0.5)
     for k in range(round(end / dt)):
         step_circuit(
-            user, 0, count, act, zeros, x, zeros, dt, rate, circuit_scratch(), table, k * dt
-        )
+            user, 0, count, act, zeros, x, zeros, dt, rate, circuit_scratch(), table, k * dt,
+            NO_MEMORY,
+        )  # fmt: skip
         act += dt * rate
     return act.reshape(-1, 4)[:, 2:]
 

@@ -41,10 +41,16 @@ def site(tmp_path, monkeypatch, heldout):
 
 @pytest.fixture
 def searching(monkeypatch, gap_of):
-    """Put a search in place that yields a verdict; tells what it was asked."""
+    """Put a search in place that yields a verdict; tells what it was asked.
 
-    def put(verdict):
+    The report has tests of its own and takes seconds, so that it is drawn only where asked for.
+    """
+
+    def put(verdict, report=False):
         asked = {}
+        if not report:
+            written = "hydrotele.show.gap_report.write_report"
+            monkeypatch.setattr(written, lambda gap, path: path.write_text("<html></html>"))
 
         def find_gap(dataset, progress=None, **chosen):
             asked.update(chosen, dataset=dataset)
@@ -59,8 +65,9 @@ def searching(monkeypatch, gap_of):
 
 
 def test_the_folder_is_named_after_the_data_and_complete(site, searching):
-    asked = searching("named")
+    asked = searching("named", report=True)
     code, out, _ = invoke("gap", "--data", "site", "--no-recording")
+    assert "Payload" in (site / "gap_site" / "report.html").read_text()
     assert code == 0 and names(site / "gap_site") == sorted([*_ALWAYS, "patched"])
     assert names(site / "gap_site" / "patched") == ["effects.yaml", "machine.xml", "machine.yaml"]
     said = " ".join(out.split())

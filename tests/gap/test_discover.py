@@ -57,8 +57,12 @@ def data(tmp_path_factory):
     return load_dataset(logs, rig)
 
 
-def test_an_outsider_is_not_named_but_learned(data):
-    gap = find_gap(data)
+@pytest.mark.parametrize("effects", [
+    ("valve_gain", "valve_deadband", "internal_leakage", "bulk_modulus", "viscous_friction"),
+    pytest.param((), marks=pytest.mark.nightly, id="the whole library"),
+])  # fmt: skip
+def test_an_outsider_is_not_named_but_learned(effects, data):
+    gap = find_gap(data, effects=effects)
     assert gap.verdict in ("unknown", "partly")
     assert all(effect.probability <= 0.5 for effect in gap.effects), gap.effects
     assert {law.balance for law in gap.learned} & {"flow_head", "flow_through"}

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
+from hydrotele.gap.mechanism_evidence import find_noise
 from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.mechanism_patch import Patch, patched_mjcf
 from hydrotele.identify.mechanism import load_mechanism, mechanism_records
@@ -127,6 +128,23 @@ def test_a_law_outside_the_library_is_located_but_not_named(tmp_path):
     assert gap.verdict == "unknown" and not gap.effects
     assert gap.unknown and gap.unknown.channel == "torque.shoulder"
     assert "position.shoulder" in gap.unknown.depends_on
+
+
+def test_an_effect_that_differs_from_run_to_run_is_taken_back(tmp_path):
+    turns = iter((0.5, 3.0, 1.5))  # N m s/rad, run by run
+    logs(tmp_path, law=lambda q, v: next(turns) * v[:, 0])
+    gap = found_gap(tmp_path)
+    assert gap.verdict == "unknown" and not gap.effects
+    assert any("not the same in all parts" in note for note in gap.notes), gap.notes
+
+
+def test_constants_that_differ_from_run_to_run_are_not_noise(tmp_path):
+    turns = iter((-1.5, 3.0, 0.5))  # N m, run by run
+    logs(tmp_path, law=lambda q, v: next(turns) + 0.0 * q[:, 0])
+    mechanism = load_mechanism(tmp_path / "robot.xml")
+    fit, _, _ = mechanism_records([tmp_path / "logs"], mechanism, as_measured=True)
+    columns = build_columns(fit, mechanism, common_band(fit, mechanism))
+    assert find_noise(columns).std.max() < 0.2  # N m; 0.15 at 200 Hz is 0.05 below 10 Hz
 
 
 def test_a_tilt_of_the_base_turns_gravity():

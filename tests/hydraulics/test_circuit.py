@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hydrotele.hydraulics.circuit import (
+    NO_MEMORY,
     SLOTS,
     Slot,
     _relieved,
@@ -18,6 +19,7 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.hydraulics.laws import port_flow
 from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.terms.table import NO_TERMS
 
 SWING, BOOM, STICK = range(3)
 RELIEF, TANK, PUMP, BETA = 28.0e6, 0.3e6, 5.0e-3, 0.9e9
@@ -36,7 +38,10 @@ def run(user, act, command, x, v, dt, steps, count=3):
     act, x, v = np.array(act, float), np.array(x, float), np.array(v, float)
     states, rate, scratch = [act.copy()], np.zeros_like(act), circuit_scratch()
     for k in range(steps):
-        step_circuit(user, 0, count, act, command, x + (k + 1) * dt * v, v, dt, rate, scratch)
+        step_circuit(
+            user, 0, count, act, command, x + (k + 1) * dt * v, v, dt, rate, scratch, NO_TERMS, 0.0,
+            NO_MEMORY,
+        )  # fmt: skip
         act = act + dt * rate
         states.append(act)
     return np.array(states)

@@ -25,6 +25,7 @@ from hydrotele.hydraulics.parameters import actuator_parameters, extra_state_nam
 from hydrotele.machine.drives import Axis, Friction
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.terms.table import NO_TERMS
 
 COULOMB, STRIBECK, SLOW, UNEQUAL = 150.0, 50.0, 0.02, 0.2
 STIFFNESS = 4.0e6  # N/m: 200 N break away after some 50 um
@@ -192,7 +193,7 @@ def test_the_pump_follows_by_its_exponential_and_arrives_at_todays_pressure():
     act = np.array([0.6, 0.0, 2e6, 2e6, 0.0])
     open_ports(user, act, act, scratch, 0, 1, 0.0, act)
     wanted = demanded_share(user, 0, 1, scratch)
-    without = circuit_supply(now, 0, 1, scratch)
+    without = circuit_supply(now, 0, 1, scratch, 1.0)
     assert 0.2 < wanted < 1.0
     low = circuit_supply(user, 0, 1, scratch, 0.5 * wanted)
     assert low < without, "a pump that is not there yet falls short"
@@ -202,7 +203,7 @@ def test_the_pump_follows_by_its_exponential_and_arrives_at_todays_pressure():
         act[:4] = 0.6, 0.0, 2e6, 2e6
         step_circuit(
             user, 0, 1, act, np.array([0.62]), np.zeros(1), np.zeros(1), dt, rates, scratch,
-            None, 0.0, 1,
+            NO_TERMS, 0.0, 1,
         )  # fmt: skip
         act[4] += dt * rates[4]
         shares.append(act[4])

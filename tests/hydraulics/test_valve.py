@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hydrotele.hydraulics.circuit import (
+    NO_MEMORY,
     SLOTS,
     circuit_scratch,
     circuit_supply,
@@ -17,6 +18,7 @@ from hydrotele.hydraulics.parameters import Slot, actuator_parameters
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.terms.table import NO_TERMS
 
 CAT = load_machine("cat215", "none")
 CYLINDER = CAT.axes["boom"].cylinder
@@ -144,7 +146,7 @@ def test_a_held_load_comes_down_as_fast_as_the_pilot_allows():
     act, rate = np.array([-0.5, 0.0, p_head, p_rod]), np.zeros(4)
     # both chambers must be in balance: no rate, within rounding of beta / V times the flow
     step_circuit(user, 0, 1, act, np.array([-0.5]), np.array([0.5 + 1e-4 * v]), np.array([v]), 1e-4,
-                 rate, circuit_scratch())  # fmt: skip
+                 rate, circuit_scratch(), NO_TERMS, 0.0, NO_MEMORY)  # fmt: skip
     stiff = user[Slot.BULK_MODULUS] / user[Slot.VOLUME_HEAD] * head * abs(v)
     assert np.abs(rate[2:]).max() < 1e-9 * stiff
 
@@ -189,7 +191,10 @@ def test_the_step_converges_with_second_order_where_everything_is_in_it():
         act, rate, scratch = np.array(start), np.zeros(4), circuit_scratch()
         for n in range(round(0.032 / dt)):
             x = np.array([x0 + (n + 1) * dt * v])
-            step_circuit(user, 0, 1, act, np.array([command]), x, np.array([v]), dt, rate, scratch)
+            step_circuit(
+                user, 0, 1, act, np.array([command]), x, np.array([v]), dt, rate, scratch, NO_TERMS,
+                0.0, NO_MEMORY,
+            )  # fmt: skip
             act = act + dt * rate
         errors.append(np.abs(act - exact)[2:].max())
     # 2 in the limit; a kink of the curve or the compensator inside a step costs some of it
@@ -226,7 +231,7 @@ def supply_of(act, **supply):
     ports = circuit_scratch()
     act = np.array(act, float)
     open_ports(user, act, act, ports, 0, 3, 0.0, act)
-    return circuit_supply(user, 0, 3, ports), user, ports
+    return circuit_supply(user, 0, 3, ports, 1.0), user, ports
 
 
 CALM = [0.0, 0, 9e6, 9e6, 0.1, 0, 8e6, 5e6, -0.08, 0, 6e6, 7e6]
@@ -293,7 +298,7 @@ def test_chambers_keep_their_volume_beyond_the_ends():
         act, rate = np.array([0.0, 0.0, 4e6, 4e6]), np.zeros(4)
         for _ in range(200):
             step_circuit(user, 0, 1, act, np.zeros(1), np.array([x]), np.array([v]), 1e-3, rate,
-                         circuit_scratch())  # fmt: skip
+                         circuit_scratch(), NO_TERMS, 0.0, NO_MEMORY)  # fmt: skip
             act = act + 1e-3 * rate
         assert np.isfinite(act).all()
         squeezed = act[2] if v < 0 else act[3]

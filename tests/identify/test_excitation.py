@@ -6,7 +6,8 @@ import yaml
 
 from hydrotele.identify.excitation import (
     Excitation,
-    design_excitation,
+    MachineLimits,
+    design_motion,
     information,
     informative_base,
 )
@@ -42,8 +43,9 @@ def test_a_cylinder_on_rails_is_driven_within_its_limits_and_tells_more(rig, tmp
     places = informative_base(machine, setup, noise, 6.0)
     assert len(places) >= 3  # mass, Coulomb and viscous friction
     short = dict(period=6.0, harmonics=3, starts=1)
+    limits = MachineLimits(machine, setup)
     rough, good = (
-        design_excitation(machine, setup, noise, places, iterations=n, **short) for n in (1, 40)
+        design_motion(limits, setup, noise, places, iterations=n, **short) for n in (1, 40)
     )
     assert good.criterion > rough.criterion + 0.3
     assert 0.5 < good.worst <= 1.0

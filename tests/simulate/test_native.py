@@ -12,6 +12,7 @@ from mujoco.batch import Batch
 
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS,
+    NO_MEMORY,
     SLOTS,
     Slot,
     actuator_friction,
@@ -21,6 +22,7 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.simulate.plant import build_plant, rest_state
+from hydrotele.terms.table import NO_TERMS
 
 HOLD = 20  # steps of one command
 
@@ -44,7 +46,7 @@ def test_step_is_the_pure_circuit_bit_for_bit(plant_of, tool):
             act, velocity = data.act.copy(), data.actuator_velocity.copy()
             step_circuit(
                 user, 0, plant.hydraulic, act, data.ctrl, data.actuator_length, velocity, dt, rate,
-                scratch,
+                scratch, NO_TERMS, 0.0, NO_MEMORY,
             )  # fmt: skip
             mujoco.mj_step(model, data)
             assert np.array_equal(data.act, act + dt * rate)

@@ -66,8 +66,7 @@ def check_sound(run, speeds=SPEEDS):
         assert np.isfinite(values).all()
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.1])
-@pytest.mark.parametrize("mode", ["rate", "position"])
+@pytest.mark.parametrize(("mode", "delay"), [("rate", 0.1), ("position", 0.0), ("position", 0.1)])
 @pytest.mark.parametrize("reflection", REFLECTIONS)
 def test_every_structure_goes_down_and_presses(reflection, mode, delay):
     """From free motion into the plate: it touches, and nothing leaves its bounds."""
