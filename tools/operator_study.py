@@ -15,6 +15,7 @@ from hydrotele.experiments.finding import cylindrical
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
+from hydrotele.scenario.teleoperation import Perception
 from hydrotele.teleop.manual_control import (
     FORMS,
     TrackingRecord,
@@ -24,7 +25,11 @@ from hydrotele.teleop.manual_control import (
     track,
 )
 from hydrotele.teleop.operator_identification import identify_operator
-from hydrotele.teleop.operator_parameters import drawn_operator, load_operator_file
+from hydrotele.teleop.operator_parameters import (
+    drawn_operator,
+    held_joystick,
+    load_operator_file,
+)
 from hydrotele.teleop.psychophysics import discriminate
 
 FILE, HAND = load_operator_file(), load_joystick().hand
@@ -143,12 +148,19 @@ def scenario_results(number: int) -> list[float]:
     return found
 
 
-def sensitivity(name: str, value: float, seeds: int, records: int, trials: int) -> list[float]:
+def sensitivity(
+    name: str, value: float | str, seeds: int, records: int, trials: int
+) -> list[float]:  # fmt: skip
     """What one parameter changes, with everything else nominal: bench; machine by `seeds` runs."""
-    known = {name: value} if name else {}
-    one = crossover(None, 1, records, **known)
-    him = drawn_operator(FILE, None, **known)
-    felt = discriminate(him, HAND, trials=trials).jnd
+    known, hand = {name: value} if name else {}, HAND
+    bench: dict[str, float] = {}
+    if isinstance(value, str):  # grip or posture
+        hand = held_joystick(load_joystick(), Perception(**{name: value})).hand
+    elif name:
+        bench = {name: value}
+    one = crossover(None, 1, records, **bench)
+    him = drawn_operator(FILE, None, **bench)
+    felt = discriminate(him, hand, trials=trials).jnd
     scenario = {} if name in _BENCH_ONLY else known
     rows = []
     for seed in range(1, seeds + 1):
@@ -268,16 +280,18 @@ def scenario_part(asked, pool) -> str:
 
 
 def sensitivity_part(asked, pool) -> str:
-    cases = [("", 0.0)]
+    cases: list[tuple[str, float | str]] = [("", 0.0)]
     for name, p in FILE.parameters.items():
         cases += [(name, value) for value in (p.low, p.high) if value != p.value]
+    cases += [("grip", name) for name in FILE.grips] + [("posture", name) for name in FILE.postures]
     n = len(cases)
     found = list(pool.map(sensitivity, [c[0] for c in cases], [c[1] for c in cases],
                           [asked.seeds] * n, [asked.records] * n, [asked.trials] * n))  # fmt: skip
     rows = [("nominal", "", *(f"{x:.3g}" for x in found[0]))]
     for (name, value), one in zip(cases[1:], found[1:], strict=True):
-        basis = FILE.parameters[name].basis
-        rows.append((f"{name} ({basis})", f"{value:g}", *(f"{x:.3g}" for x in one)))
+        basis = FILE.parameters[name].basis if name in FILE.parameters else "assumption"
+        at = value if isinstance(value, str) else f"{value:g}"
+        rows.append((f"{name} ({basis})", at, *(f"{x:.3g}" for x in one)))
     say("sensitivity done")
     return table(
         ("parameter", "at", "crossover with K/s [rad/s]", "phase margin [deg]",

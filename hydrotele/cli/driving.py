@@ -1,6 +1,8 @@
 """`hydrotele drive`: a person drives a machine, into a folder like a run's."""
 
 import contextlib
+import os
+import time as clock
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +12,13 @@ from hydrotele.cli.haptic import own_device, print_latency
 from hydrotele.cli.running import print_summary, write_run
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
-from hydrotele.haptics.timing import Deadlines, load_of_machine, summary_of
+from hydrotele.haptics.timing import (
+    Deadlines,
+    computer_alone,
+    load_of_machine,
+    stolen_time,
+    summary_of,
+)
 from hydrotele.run.devices import Device, Keyboard, open_device
 from hydrotele.run.haptic import HAPTIC, RATE, HapticHandle, haptic_address
 from hydrotele.run.live import Pacer, Status, Watch, drive, further_axes
@@ -22,6 +30,7 @@ from hydrotele.simulate.native import stop_profiling_clock
 
 LONGEST = 600.0  # s of a drive without --duration
 LATENCY = 60.0  # s of one that only measures latency
+_ALONE = (1.0, 20.0)  # s, least and most, of a loop without work before it: a third of the drive
 _PRIORITY = 20  # of the machine, below the line's and the device's
 _FRAMES, _LINES = 30.0, 5.0  # Hz of window and status line
 
@@ -71,12 +80,17 @@ def _driven(wishes: DriveOptions) -> Path:
     check_target(target, "run")
     machine = scenario_machine(scenario)
     further = tuple(further_axes(machine))
-    haptic = _is_haptic(wishes)
+    haptic, alone = _is_haptic(wishes), {}
+    if wishes.latency:
+        seconds = min(_ALONE[1], max(_ALONE[0], scenario.duration / 3.0))
+        notes.print(f"a loop without work for {seconds:.0f} s, then the drive", style="dim")
+        alone = computer_alone(seconds, scenario.control_rate, _PRIORITY)
     if haptic:
         device = HapticHandle(*haptic_address(wishes.device), len(further))
         pacer = Deadlines(scenario.ticks, _PRIORITY)
     else:
         device, pacer = open_device(wishes.device, further), Pacer(wishes.speed)
+    stolen, begun = stolen_time(), clock.monotonic()
     try:
         with first_interrupt() as interrupted, _watching(wishes, device, interrupted) as watch:
             result = drive(scenario, machine, device, pacer, watch, _say)
@@ -89,9 +103,22 @@ def _driven(wishes: DriveOptions) -> Path:
             "late": summary_of(pacer.lateness()), "priority": pacer.priority,
             "load": load_of_machine(),
         }  # fmt: skip
-        result.summary["haptic"] = {"machine": machine_side, "line": result.summary["haptic"]}
+        result.summary["haptic"] = {
+            "machine": machine_side, "line": result.summary["haptic"],
+            "computer": alone | _stolen(stolen, clock.monotonic() - begun),
+        }  # fmt: skip
     _write(result, target, wishes)
     return target
+
+
+def _stolen(before: float | None, seconds: float) -> dict[str, float | None]:
+    """Processor time that the host took meanwhile [s], and its share of all processors'."""
+    after = stolen_time()
+    if before is None or after is None:
+        return {"stolen_seconds": None, "stolen_share": None}
+    taken = after - before
+    share = taken / (seconds * (os.cpu_count() or 1)) if seconds > 0.0 else 0.0
+    return {"stolen_seconds": round(taken, 3), "stolen_share": round(share, 6)}
 
 
 def _measured_latency(wishes: DriveOptions) -> Path:

@@ -13,6 +13,7 @@ from hydrotele.cli.console import first_interrupt, notes, out, print_json, table
 from hydrotele.core.errors import InputError
 from hydrotele.haptics.server import announce, open_haptic, serve
 
+HELD = 1e-3  # share of deadlines that may be missed
 _PATIENCE = 60.0  # s until a device server of our own must listen
 _ROWS = {
     "answer": "pose received to wrench sent",
@@ -113,9 +114,14 @@ def print_latency(figures: dict) -> None:
     Args:
         figures: `haptic` of a drive's summary.
     """
-    machine, line = figures["machine"], figures["line"]
+    machine, line, computer = figures["machine"], figures["line"], figures.get("computer", {})
     missed = table("Missed deadlines", "", "of", "missed", "share")
+    rows: list[tuple[str, int, int]] = []
+    if "missed" in computer:
+        alone = f"computer alone, no work for {computer['seconds']:g} s"
+        rows.append((alone, computer["missed"], computer["ticks"]))
     for name, count, of in (
+        *rows,
         (f"machine, {machine['control_rate']:g} Hz", machine["missed"], machine["ticks"]),
         ("device, its own periods", line["device_missed"], line["poses"] + line["lost"]),
         ("device, wrench in time", line["device_unanswered"], line["poses"] + line["lost"]),
@@ -123,15 +129,17 @@ def print_latency(figures: dict) -> None:
     ):
         missed.add_row(name, str(of), str(count), f"{100.0 * count / max(of, 1):.3f} %")
     out.print(missed)
-    rows = {**{said: line[key] for key, said in _ROWS.items()}, "machine late": machine["late"]}
+    spans = {**{said: line[key] for key, said in _ROWS.items()}, "machine late": machine["late"]}
+    if "late" in computer:
+        spans["computer alone late"] = computer["late"]
     names = ("p50", "p90", "p99", "p99.9", "largest")
     times = table("Times [us]", "", *names)
-    for said, found in rows.items():
+    for said, found in spans.items():
         times.add_row(said, *(f"{found['percentiles_us'].get(n, 0.0):g}" for n in names))
     out.print(times)
     edges = line["answer"]["histogram"]["edges_us"]
     histogram = table("Number of times up to [us]", "", *(f"{e}" for e in edges), "more")
-    for said, found in rows.items():
+    for said, found in spans.items():
         histogram.add_row(said, *map(str, found["histogram"]["count"]))
     out.print(histogram)
     load = machine["load"]
@@ -139,3 +147,37 @@ def print_latency(figures: dict) -> None:
         f"priority: machine {machine['priority']}, line {line['priority']}; load of the computer:"
         f" {load[0] if load else 'unknown'}"
     )
+    for sentence in computer_sentences(machine, computer):
+        out.print(sentence)
+
+
+def computer_sentences(machine: dict, computer: dict) -> list[str]:
+    """What the computer alone could hold, and what its host took, in words.
+
+    Args:
+        machine: `haptic.machine` of a drive's summary.
+        computer: `haptic.computer` of it.
+
+    Returns:
+        Sentences.
+    """
+    said = []
+    if (stolen := computer.get("stolen_seconds")) is not None:
+        share = 100.0 * computer["stolen_share"]
+        said.append(f"time stolen by the host meanwhile: {stolen:g} s, {share:.2g} % of all cores")
+    if "missed" not in computer:
+        return said
+    alone, own = (x["missed"] / max(x["ticks"], 1) for x in (computer, machine))
+    largest = computer["late"]["percentiles_us"].get("largest", 0.0)
+    if alone > HELD:
+        said.append(
+            f"[yellow]note[/] the computer alone missed {100.0 * alone:.2g} % of its deadlines, by"
+            f" up to {1e-3 * largest:.2g} ms, without any work: it cannot hold"
+            f" {100.0 * HELD:g} %, whatever runs on it"
+        )
+    elif own > HELD:
+        said.append(
+            f"[yellow]note[/] the computer alone missed {100.0 * alone:.2g} %: the rest of the"
+            f" {100.0 * own:.2g} % is the machine's, or of what ran beside it"
+        )
+    return said

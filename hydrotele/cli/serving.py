@@ -7,6 +7,7 @@ import typer
 HAPTIC_EPILOG = """\b
 Examples:  hydrotele haptic-device    # a simulated one, for hydrotele drive --device haptic
            hydrotele haptic-device --kind force-dimension --host 0.0.0.0   # machine elsewhere
+           hydrotele haptic-device --kind "haption:192.168.0.5#5000"       # device elsewhere
 
 \b
 The server reads the handle and writes forces at 1 kHz and speaks UDP (hydrotele.haptics.packets).
@@ -18,7 +19,7 @@ network of your own.
 
 def haptic_device(
     kind: Annotated[
-        str, typer.Option("--kind", help="simulated or force-dimension.")
+        str, typer.Option("--kind", help="simulated, force-dimension, haption.")
     ] = "simulated",
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: a free one.")] = 5610,

@@ -24,6 +24,7 @@ _JND = 0.23  # of a compliance: what a hand tells apart without other cues; Tan 
 _RAPIDLY = 1.0  # s, from 10 to 90 % of the first force; Fig. 6.55 shows nine seconds
 _HIT = 2.0  # s after the contact
 _NEVER = np.inf  # s
+_LAID = -50.0  # deg of the head: a stem that lies more than it stands
 
 
 def tree(seed: int, changes: Changes) -> Sample:
@@ -122,15 +123,22 @@ def _process_verdict(samples: Sequence[Sample]) -> Verdict:
     for sample in samples:
         v = sample.values
         order = v["cut"] < v["held"] < v["let_go"] < _NEVER
-        ok = bool(ok and order and v["laid"] < -50.0 and v["aside"] > 30.0 and not v["tripped"])
+        ok = bool(ok and order and v["laid"] < _LAID and v["aside"] > 30.0 and not v["tripped"])
     first = samples[0].values
     told = [
         f"{words} at {first[key]:.1f} s" if first[key] < _NEVER else f"not {words}"
         for words, key in (("contact", "touched"), ("cut", "cut"), ("held", "held"),
                            ("let go", "let_go"))
     ]  # fmt: skip
-    told.append(f"laid down at {first['laid']:.0f} deg, {first['aside']:.0f} deg to the side")
-    why = f"the order and the side in {len(samples)} runs, to the side: more than 30 deg of swing"
+    told.append(
+        f"laid down at {spread(samples, 'laid', 1.0, 0)} deg,"
+        f" {spread(samples, 'aside', 1.0, 0)} deg to the side"
+    )
+    lain = sum(s.values["laid"] < _LAID for s in samples)
+    why = (
+        f"the order and the side in {len(samples)} runs, to the side: more than 30 deg of swing;"
+        f" laid: the head beyond {_LAID:.0f} deg, a limit of ours, in {lain}"
+    )
     if any(s.values["touched"] > s.values["cut"] for s in samples):
         why += "; the head bears on the stem after the cut: the simulated disc stands ahead of it"
     return Verdict(ok, ", ".join(told), why)

@@ -177,6 +177,14 @@ def _point_verdict(samples: Sequence[Sample]) -> Verdict:
         " axis; without a filter on the force, which the thesis does not mention: with more lag"
         " this point is not stable, see what the limit hangs on"
     )
+    if not ok:
+        quiet = sum(s.values["ripple"] < _STEADY for s in samples)
+        near = sum(s.values["place"] < _DEADBAND for s in samples)
+        why += (
+            f"; {quiet} of {len(samples)} operators hold it with less than {100 * _STEADY:.0f} % of"
+            f" ripple, {near} within the dead band. The ratio makes {50e3 * _RATIO:.0f} N of 50 kN"
+            " (Table 6.8), which is the limit itself that the row of the limit finds to 20 %"
+        )
     return Verdict(ok, told, why)
 
 

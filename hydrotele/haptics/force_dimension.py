@@ -16,14 +16,15 @@ from hydrotele.haptics.device import Abilities, HandlePose
 
 _WHERE = "--kind force-dimension"
 _FROM_DEVICE = np.diag([-1.0, -1.0, 1.0])  # half a turn about z
-# DHD's name of a device contains: travel [m], rotation [rad], force [N], torque [N m]: assumptions,
-# not checked against the vendor's data sheets
+# DHD's name of a device contains: travel [m], rotation [rad], force [N], torque [N m]. Forces and
+# torques of omega.7 and sigma.7 are those in CHAI3D's driver for them, the rest are assumptions;
+# none was checked against the vendor's data sheets.
 _KNOWN = {
     "omega.3": Abilities(0.055, 0.0, 12.0, 0.0),
     "omega.6": Abilities(0.055, 0.0, 12.0, 0.0),  # its wrist gives no torque
     "omega.7": Abilities(0.055, 0.0, 12.0, 0.0),
     "delta.3": Abilities(0.13, 0.0, 20.0, 0.0),
-    "sigma.7": Abilities(0.065, 0.6, 20.0, 0.4),
+    "sigma.7": Abilities(0.065, 0.6, 12.0, 0.2),
     "lambda.7": Abilities(0.085, 0.6, 20.0, 0.4),
 }
 _LEAST = Abilities(0.05, 0.0, 8.0, 0.0)  # of a device that is none of these

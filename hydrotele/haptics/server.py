@@ -282,14 +282,14 @@ def announce(where: Address) -> None:
     sys.stdout.flush()
 
 
-KINDS = ("simulated", "force-dimension")
+KINDS = ("simulated", "force-dimension", "haption")
 
 
 def open_haptic(kind: str, period: float) -> HapticDevice:
     """Open a device for its server.
 
     Args:
-        kind: one of KINDS.
+        kind: one of KINDS; `haption:HOST#PORT` for a device elsewhere.
         period: of the server [s].
 
     Returns:
@@ -304,4 +304,9 @@ def open_haptic(kind: str, period: float) -> HapticDevice:
         from hydrotele.haptics.force_dimension import ForceDimension
 
         return ForceDimension()
+    name, _, address = kind.partition(":")
+    if name == "haption":
+        from hydrotele.haptics.haption import ADDRESS, Haption
+
+        return Haption(period, address or ADDRESS)
     raise InputError(f"--kind {kind}", f"is no haptic device; valid: {', '.join(KINDS)}")

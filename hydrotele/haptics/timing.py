@@ -2,6 +2,8 @@
 
 A process that has a deadline every millisecond sleeps until shortly before it and spins over the
 rest, since a sleeping process wakes some 50 us late. Python's garbage collector is off meanwhile.
+What a loop without work misses, and the time that a virtual machine's host takes from it, tell what
+the computer can hold at all.
 """
 
 import contextlib
@@ -10,6 +12,7 @@ import gc
 import os
 import time as clock
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -17,6 +20,7 @@ SPIN = 120e-6  # s before a deadline in which a process stays awake
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 EDGES = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # us, of histograms
 _SLACK = 29  # PR_SET_TIMERSLACK of prctl
+_STAT, _STEAL = Path("/proc/stat"), 8  # word of its first line: proc(5)
 
 
 def summary_of(nanoseconds: np.ndarray) -> dict:
@@ -122,6 +126,52 @@ class Deadlines:
         """(n,) by how much the ticks that missed their deadline were late [ns]."""
         late = self._lateness[: self.ticks]
         return late[late > 0]
+
+
+def computer_alone(
+    seconds: float, rate: float, level: int = 0, now: Callable[[], int] = clock.monotonic_ns,
+    sleep: Callable[[float], None] = clock.sleep,
+) -> dict:  # fmt: skip
+    """Deadlines that a loop without work misses: what the computer and its system take.
+
+    Args:
+        seconds: for which it runs [s].
+        rate: of its deadlines [Hz].
+        level: of priority, see `steady`.
+        now: a clock [ns].
+        sleep: waits for a time [s].
+
+    Returns:
+        seconds, ticks, missed, late (see `summary_of`), and priority.
+    """
+    ticks = max(1, round(seconds * rate))
+    pacer = Deadlines(ticks, level, now=now, sleep=sleep)
+    try:
+        for tick in range(ticks):
+            pacer.wait(tick / rate)
+    finally:
+        pacer.close()
+    return {"seconds": seconds, "ticks": pacer.ticks, "missed": pacer.missed,
+            "late": summary_of(pacer.lateness()), "priority": pacer.priority}  # fmt: skip
+
+
+def stolen_time(stat: Path = _STAT) -> float | None:
+    """Processor time that the host of a virtual machine has taken from it since it was started.
+
+    Args:
+        stat: the kernel's figures, in ticks of the system.
+
+    Returns:
+        Sum over all processors [s]; None where the system does not tell.
+
+    Source: proc(5), "steal" of /proc/stat.
+    """
+    try:
+        with stat.open(encoding="ascii") as file:
+            words = file.readline().split()
+        return int(words[_STEAL]) / os.sysconf("SC_CLK_TCK")
+    except (OSError, IndexError, ValueError, AttributeError):  # no Linux, or an old one
+        return None
 
 
 def load_of_machine() -> list[float] | None:

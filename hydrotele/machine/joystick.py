@@ -5,7 +5,7 @@
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from pydantic import Field, model_validator
 
@@ -13,6 +13,7 @@ from hydrotele.core.datafile import (
     Facts,
     Name,
     NonNegative,
+    Number,
     Positive,
     Vector,
     parse,
@@ -81,14 +82,76 @@ class AloneFacts(Facts):
     ratio: Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
 
 
+Shape = tuple[Positive, Number, Positive]
+
+
 class HandFacts(Facts):
-    """The hand on the handle: mass [kg], damping and stiffness [N s/m], [N/m]; rotations [N m]."""
+    """The hand on the handle: mass [kg], damping and stiffness [N s/m], [N/m]; rotations [N m].
+
+    An arm is stiffer towards its shoulder than across. In the handle's horizontal plane the mass is
+    multiplied by `mass_shape`, damping and stiffness by `stiffness_shape`: xx, xy and yy of a
+    symmetric matrix [1].
+    """
 
     mass: NonNegative
     damping: NonNegative
     stiffness: NonNegative
     rotation_damping: NonNegative = 0.0
     rotation_stiffness: NonNegative = 0.0
+    mass_shape: Shape = (1.0, 0.0, 1.0)
+    stiffness_shape: Shape = (1.0, 0.0, 1.0)
+
+    @model_validator(mode="after")
+    def _check(self):
+        for name in ("mass_shape", "stiffness_shape"):
+            xx, xy, yy = getattr(self, name)
+            if not xx * yy > xy * xy:
+                raise ValueError(f"{name}: xx {xx:g} times yy {yy:g} must be more than xy^2")
+        return self
+
+    @property
+    def carried(self) -> float:
+        """Mass that hangs on the handle [kg]; what is more in a direction hangs on the shoulder."""
+        return self.mass * min(1.0, principal(self.mass_shape).least)
+
+    def along(self, axis: int) -> tuple[float, float, float]:
+        """Mass, damping and stiffness along or about one axis of the handle, the others at rest.
+
+        Args:
+            axis: place of x, y, z, rx, ry or rz.
+
+        Returns:
+            [kg], [N s/m], [N/m]; of rotations 0, [N m s/rad], [N m/rad].
+        """
+        if axis > 2:
+            return 0.0, self.rotation_damping, self.rotation_stiffness
+        heavy, stiff = ((s[0], s[2], 1.0)[axis] for s in (self.mass_shape, self.stiffness_shape))
+        return heavy * self.mass, stiff * self.damping, stiff * self.stiffness
+
+
+class Principal(NamedTuple):
+    """Principal values of a shape, and the angle of the greater one's axis from x [rad]."""
+
+    least: float
+    greatest: float
+    angle: float
+
+
+def principal(shape: Shape) -> Principal:
+    """Principal values of a symmetric 2 x 2 matrix, and where its long axis points.
+
+    Args:
+        shape: xx, xy, yy.
+
+    Returns:
+        Its principal values and the long axis' angle from x [rad].
+
+    >>> [round(v, 6) for v in principal((2.5, 0.5, 2.5))]
+    [2.0, 3.0, 0.785398]
+    """
+    xx, xy, yy = shape
+    mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    return Principal(mean - half, mean + half, 0.5 * math.atan2(2.0 * xy, xx - yy))
 
 
 class DetentFacts(Facts):

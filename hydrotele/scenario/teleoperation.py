@@ -222,8 +222,8 @@ class Perception(Facts):
 
     `file` has other parameters than `hydrotele/teleop/operator.yaml`, which tells what is known of
     each; `drawn` takes the operator of that number from the spread given there. `grip` (relaxed,
-    normal, firm) and `posture` (near, mid, far) replace the joystick file's hand. Every parameter
-    that is set here counts instead of the file's:
+    normal, firm) replaces the joystick file's hand, `posture` (near, mid, far) gives it
+    the ellipses of an arm. Every parameter that is set here counts instead of the file's:
 
     visual_delay: from seeing to acting [s]; touch: from feeling to acting [s]; crossover: of the
     loops that he closes by sight, at most [rad/s]; force_weber, position_weber, integration_weber:

@@ -3,6 +3,12 @@
 The cab's frame is not inertial: its acceleration counts against gravity, and its turning acts on
 the flotor as force and torque. Coils are warmed by their currents, and push less where the field of
 their magnets falls off towards the ends of the gap.
+
+Steps are those of a leapfrog: places at the steps, velocities half a step before, and what changes
+between two control periods acts at the mean of before and after in the step between them; damping
+counts half by the velocity before a step and half by that after it. Places are then exact to the
+second order of the step, and a held force moves a free body exactly. The same steps without that
+mean run half a step ahead, as if the control sampled faster than it does.
 """
 
 import math
@@ -14,11 +20,12 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_xml
-from hydrotele.machine.joystick import Joystick
+from hydrotele.machine.joystick import Joystick, principal
 
 GRAVITY = -9.81
 _COOL = 0.9  # heat below which hot coils may have their largest current again
 _STEPS = 2  # physics steps per control period of 5 ms: its stiffest spring turns over in 30 ms
+_HALVES = 15  # currents, applied forces and gravity, which change between periods
 
 
 class SimulatedFlotor:
@@ -27,7 +34,8 @@ class SimulatedFlotor:
     Attributes:
         model: its MuJoCo model; coils are its actuators [A].
         data: its state; `qpos` (7,) handle [m] and quaternion, `qvel` (6,) [m/s] in the stator's
-            axes and [rad/s] in the flotor's.
+            axes and [rad/s] in the flotor's: of now before the first step, then of half a step
+            earlier.
         hand: whether a hand holds the handle.
         heat: (6,) of the coils, see `heat_step`.
         hottest: the most that any of them has had.
@@ -36,8 +44,9 @@ class SimulatedFlotor:
     """
 
     def __init__(
-        self, facts: Joystick, *, hand: bool = True, period: float | None = None, fine: int = 1
-    ) -> None:
+        self, facts: Joystick, *, hand: bool = True, period: float | None = None, fine: int = 1,
+        runge_kutta: bool = False,
+    ) -> None:  # fmt: skip
         """Compile the joystick.
 
         Args:
@@ -45,6 +54,7 @@ class SimulatedFlotor:
             hand: whether a hand holds it.
             period: of the control [s]; the joystick's own by default.
             fine: how many times as many physics steps as for runs with a machine.
+            runge_kutta: fourth-order steps of four times the cost, for motion without stops.
 
         Raises:
             InputError: its MJCF cannot be read or lacks a part.
@@ -71,6 +81,15 @@ class SimulatedFlotor:
         self._gravity = self.model.opt.gravity  # views, which cost time to ask for
         self._gravity[:] = (0.0, 0.0, GRAVITY)
         self._ctrl, self._applied = self.data.ctrl, self.data.qfrc_applied
+        self._leaps, self._started, self._before = not runge_kutta, False, np.zeros((2, _HALVES))
+        self._speed, self._half_damping = self.data.qvel, 0.5 * _damping(self.model)
+        if runge_kutta:
+            self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        else:  # MuJoCo counts it by the velocity after a step
+            self.model.dof_damping *= 0.5
+            self.model.tendon_damping *= 0.5
+            if self.model.ntendon:  # its Euler steps do so for joints only
+                self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self.heat, self.hottest, self.allowed = np.zeros(6), 0.0, facts.coils.max_current
         self._gear, self._full = self.model.actuator_gear, self.model.actuator_gear.copy()
         places = self.model.site_pos[self.model.actuator_trnid[:, 0]]
@@ -85,7 +104,7 @@ class SimulatedFlotor:
         """
         self._load_coils(currents)
         self._applied[:] = muscles
-        mujoco.mj_step(self.model, self.data, nstep=self.steps)
+        self._advance()
 
     def shaken_step(
         self, currents: np.ndarray, muscles: np.ndarray, mount: np.ndarray, spin: float,
@@ -105,7 +124,25 @@ class SimulatedFlotor:
             self._gravity, self._applied,
         )  # fmt: skip
         self._load_coils(currents)
-        mujoco.mj_step(self.model, self.data, nstep=self.steps)
+        self._advance()
+
+    def _advance(self) -> None:
+        """The steps of one period with what has been loaded."""
+        model, data, before = self.model, self.data, self._before
+        if not self._leaps:
+            mujoco.mj_step(model, data, nstep=self.steps)
+            return
+        inputs = self._ctrl, self._applied, self._gravity
+        _keep(*inputs, before)
+        if not self._started:
+            self._started = True
+            before[0] = before[1]
+            _load(*inputs, before, self._half_damping, self._speed, 0.0)
+            mujoco.mj_forward(model, data)
+            self._speed -= 0.5 * model.opt.timestep * data.qacc
+        for k in range(self.steps):
+            _load(*inputs, before, self._half_damping, self._speed, 0.0 if k else 0.5)
+            mujoco.mj_step(model, data)
 
     def _load_coils(self, currents: np.ndarray) -> None:
         """Put currents on the coils, warm them, and weaken those that leave their field."""
@@ -129,10 +166,44 @@ class SimulatedFlotor:
     def place(self, pose: np.ndarray) -> None:
         """Put the handle to a pose at rest, (6,) displacement [m] and rotation vector [rad]."""
         mujoco.mj_resetData(self.model, self.data)
+        self._started = False
         self.data.qpos[:3] = pose[:3]
         angle = float(np.linalg.norm(pose[3:]))
         way = pose[3:] / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
         mujoco.mju_axisAngle2Quat(self.data.qpos[3:7], way, angle)
+
+
+def _damping(model: mujoco.MjModel) -> np.ndarray:
+    """(nv, nv) of joints and fixed tendons."""
+    found, way = np.diag(model.dof_damping), np.zeros((model.ntendon, model.nv))
+    for k in range(model.ntendon):
+        at, many = model.tendon_adr[k], model.tendon_num[k]
+        dofs = model.jnt_dofadr[model.wrap_objid[at : at + many]]
+        way[k, dofs] = model.wrap_prm[at : at + many]
+    return found + way.T @ np.diag(model.tendon_damping) @ way
+
+
+@compiled
+def _keep(ctrl, applied, gravity, before):
+    """Put a period's inputs into the second row of `before` (2, 15), and what was there above."""
+    at = 0
+    for part in (ctrl, applied, gravity):
+        for i in range(len(part)):
+            before[0, at], before[1, at] = before[1, at], part[i]
+            at += 1
+
+
+@compiled
+def _load(ctrl, applied, gravity, before, half_damping, speed, share):
+    """Inputs of a step: this period's with a `share` of the last one's; half of the damping."""
+    at = 0
+    for part in (ctrl, applied, gravity):
+        for i in range(len(part)):
+            part[i] = share * before[0, at] + (1.0 - share) * before[1, at]
+            at += 1
+    for i in range(len(applied)):
+        for k in range(len(speed)):
+            applied[i] -= half_damping[i, k] * speed[k]
 
 
 @compiled
@@ -236,11 +307,11 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
         place, turn = spec.site(f"coil_{k + 1}"), 2.0 * math.pi * (k % 3) / 3.0
         place.pos = facts.coils.radius * np.array([math.cos(turn), math.sin(turn), 0.0])
     if hand and facts.hand.mass > 0.0:
-        grip.mass = facts.hand.mass
+        grip.mass = facts.hand.carried
     else:
         spec.delete(grip)
     if hand:
-        _hold(joints, facts)
+        _hold(spec, joints, facts)
     return spec
 
 
@@ -258,9 +329,30 @@ def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
         spec.geom(name).pos[axis] += way * (far + ball.size[0] + spec.geom(name).size[axis])
 
 
-def _hold(joints, facts: Joystick) -> None:
+def _hold(spec: mujoco.MjSpec, joints, facts: Joystick) -> None:
+    """Springs and dampers of the arm, and its mass beyond what hangs on the handle.
+
+    In the horizontal plane the short axes of its ellipses are on the slides; what the long axes
+    have more is on tendons along them, which add their stiffness, damping and armature.
+    """
+    hand = facts.hand
     for name in ("x", "y", "z", "turn"):
         turns = name == "turn"
-        stiffness = facts.hand.rotation_stiffness if turns else facts.hand.stiffness
-        damping = facts.hand.rotation_damping if turns else facts.hand.damping
-        joints[name].stiffness[0], joints[name].damping[0] = stiffness, damping
+        joints[name].stiffness[0] = hand.rotation_stiffness if turns else hand.stiffness
+        joints[name].damping[0] = hand.rotation_damping if turns else hand.damping
+    firm, heavy = principal(hand.stiffness_shape), principal(hand.mass_shape)
+    joints["z"].armature = hand.mass - hand.carried
+    for name in ("x", "y"):
+        joints[name].stiffness[0] *= firm.least
+        joints[name].damping[0] *= firm.least
+        joints[name].armature = heavy.least * hand.mass - hand.carried
+    for name, axis in (("stiff", firm), ("heavy", heavy)):
+        if axis.greatest <= axis.least * (1.0 + 1e-9):
+            continue
+        more, arm = axis.greatest - axis.least, spec.add_tendon(name=f"arm_{name}")
+        arm.wrap_joint("x", math.cos(axis.angle))
+        arm.wrap_joint("y", math.sin(axis.angle))
+        if name == "stiff":
+            arm.stiffness[0], arm.damping[0] = more * hand.stiffness, more * hand.damping
+        else:
+            arm.armature = more * hand.mass

@@ -301,6 +301,25 @@ _NAMES = {
     ("coordinating_force", "rate"): "rate_position",
     ("coordinating_force", "position"): "position_position",
 }
+_CASE = "analyse a case file: hydrotele analyse teleop CASE.yaml --structure "
+_UNLINEAR = {
+    "four_channel": (
+        "its slave moves by an observed force of the hand, which is not modelled for a machine",
+        _CASE + "four_channel_{}",
+    ),
+    "wave_variables": (
+        "its line uses a wave only as far as energy has come",
+        _CASE + "wave_variables --robust",
+    ),
+    "passivity_control": (
+        "its line damps as much as energy is missing",
+        _CASE + "passivity_control --robust",
+    ),
+    "impedance": (
+        "the stiffness that is felt is identified and changes",
+        "analyse it with pilot.reflection=direct_force, or simulate it: hydrotele run",
+    ),
+}  # reflection: why it has no linear case, and what to do
 _SEARCHED = 2.0 * np.pi * np.geomspace(0.02, 40.0, 4000)  # rad/s
 _STEPS, _NEWTON = 80, 8
 
@@ -381,9 +400,10 @@ def find_loop(name: str, case: LinearCase, task_source: str) -> ScenarioFindings
     Source: Zhu 1994, chapters 3 and 4.
     """
     reflection, mode = case.pilot.reflection, case.pilot.mode
-    if reflection in ("four_channel", "impedance", "wave_variables", "passivity_control"):
-        message = f"{reflection!r} has no linear case of a scenario; write a case file"
-        raise InputError("pilot.reflection", message)
+    if reflection in _UNLINEAR:
+        why, instead = _UNLINEAR[reflection]
+        message = f"{reflection!r} of a scenario has no linear case, because {why}"
+        raise InputError("pilot.reflection", f"{message}; {instead.format(mode)}")
     own = (reflection, mode) in _NAMES
     structure = _NAMES.get((reflection, mode), f"{mode}_force")
     spring = case.spring

@@ -377,8 +377,9 @@ def simulate_levitation(
         What happened.
     """
     control = control or levitation(joystick, frozen=FROZEN if noise > 0.0 else np.inf)
-    flotor = SimulatedFlotor(joystick, hand=False, period=control.period, fine=_FINE)
-    flotor.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    flotor = SimulatedFlotor(
+        joystick, hand=False, period=control.period, fine=_FINE, runge_kutta=True
+    )
     eye = PoseSensor(joystick, noise=noise, diodes=diodes, seed=seed)
     flotor.place(np.zeros(6) if start is None else start)
     n, memory, mount = len(target), initial_controller_state(), np.array(joystick.mount)

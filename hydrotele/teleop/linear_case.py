@@ -9,7 +9,8 @@ follows `k_v V_h / s` (`teleop.linear_machine`); under position control its plac
 task pushes back; the force at the tip comes back through the estimator's two filters, held for a
 sample of the sensors, through the line with its delay, times the ratio.
 
-Left out: dead bands, stops, limits of force and acceleration, loss of contact, sensor noise.
+Left out: dead bands, stops, limits of force and acceleration, loss of contact, sensor noise; the
+other axes of the handle, which are at rest.
 
 The linear case of a teleoperated scenario: machine in contact, joystick, servo, line, task.
 
@@ -69,6 +70,7 @@ from hydrotele.teleop.axis_table import (
 )
 from hydrotele.teleop.master import Master, master
 from hydrotele.teleop.operator_model import DECISIONS, REFLEX
+from hydrotele.teleop.operator_parameters import held_joystick
 from hydrotele.teleop.slave import AHEAD, SMOOTH
 from hydrotele.teleop.switching import Spring
 from hydrotele.teleop.two_port import Impedance, TwoPort
@@ -412,12 +414,10 @@ def linear_case(
     place = np.flatnonzero(numbers.axis[:, COORDINATE] == COORDINATES.index(tip.coordinate))
     if not len(place):
         raise InputError(_WHERE, f"no joystick axis moves {tip.coordinate}")
-    axis, hand, channel = int(place[0]), joystick.hand, pilot.channel
+    axis, channel = int(place[0]), pilot.channel
     turns = AXES[axis].startswith("r")
     flotor = float(numbers.turning[axis - 3]) if turns else float(numbers.mass[0])
-    held = Impedance(hand.mass, hand.damping, hand.stiffness)
-    if turns:
-        held = Impedance(0.0, hand.rotation_damping, hand.rotation_stiffness)
+    held = Impedance(*joystick.hand.along(axis))
     return LinearCase(
         pilot, numbers.axis[axis].copy(), Impedance(flotor), held, tip, servo, clocks, task,
         channel.delay_forward, channel.delay_back,
@@ -462,12 +462,12 @@ class Contact(NamedTuple):
 def scenario_case(
     scenario: Scenario, machine: Machine, joystick: Joystick, coordinate: str | None = None
 ) -> tuple[LinearCase, Contact]:
-    """The linear case of a scenario.
+    """The linear case of a scenario, with the hand of its operator as it is simulated.
 
     Args:
         scenario: with a teleoperated pilot.
         machine: its machine.
-        joystick: its joystick.
+        joystick: its joystick; grip, posture and co-contraction of the operator replace its hand.
         coordinate: of the arm; that of the operator's force target by default, else z.
 
     Returns:
@@ -475,7 +475,7 @@ def scenario_case(
 
     Raises:
         InputError: the scenario is not teleoperated, the arm has no such coordinate, nothing comes
-            back.
+            back, the operator's grip or posture is not known.
     """
     pilot = scenario.pilot
     if not isinstance(pilot, TeleopPilot):
@@ -490,6 +490,7 @@ def scenario_case(
     contact = _contact(scenario, machine, wanted)
     sensors, period = sensor_set(machine, scenario.sensors), 1.0 / scenario.control_rate
     clocks = Clocks(period, max(period, 1.0 / sensors.rate) if sensors else period)
+    joystick = held_joystick(joystick, pilot.perception, scenario.folder)
     numbers, _ = master(joystick, pilot, coordinates)
     tip = tip_drive(machine, contact.joints, wanted, scenario.servo)
     case = linear_case(pilot, joystick, numbers, tip, scenario.servo, clocks, contact.task)

@@ -220,7 +220,8 @@ def look_and_act(loop, tick, target, seen, hand):
     late = max(0.5, facts[DELAY] / step)
     if tick < int(late) + 3:
         return 0.0
-    error = _past(past, tick, late, 0)
+    middle = 0.5 if facts[FORM] == 0.0 else 0.0  # of the step over which he integrates
+    error = _past(past, tick, late + middle, 0)
     rate = (_past(past, tick, late - 0.5, 0) - _past(past, tick, late + 0.5, 0)) / step
     learn(loop, tick, late, _past(past, tick, late, 1))
     best = int(state[CHOSEN])
@@ -462,4 +463,5 @@ def crossover_of(frequencies: np.ndarray, open_loop: np.ndarray) -> Crossover:
     near[k] = near[k + 1] = True
     slope = float(np.polyfit(decades[near], size[near], 1)[0])
     angle = phase[k] + share * (phase[k + 1] - phase[k])
-    return Crossover(float(10.0**place), float(math.pi + angle), slope)
+    margin = math.remainder(math.pi + angle, 2.0 * math.pi)  # sparse sines may hide a turn
+    return Crossover(float(10.0**place), margin, slope)

@@ -8,8 +8,13 @@ variables): the equations `sum dYp/dtheta e_target * W (hand - Yp error) = 0` ho
 parameters whatever the remnant, and their covariance gives the standard errors. W whitens the
 remnant.
 
+The instrument is estimated, too: its errors come from the same remnant as what is left over, and
+where the remnant is most of the error they decide how far estimates scatter. Standard errors are
+therefore those of a jackknife that estimates instrument and parameters anew without one part of
+the record after the other.
+
 Source: Van den Hof and Schrama 1993 (two-stage method); Soderstrom and Stoica 1983 (instrumental
-variables); form of Yp: McRuer and Jex 1967.
+variables); Bekker 1994 (variance with many weak instruments); form of Yp: McRuer and Jex 1967.
 """
 
 import math
@@ -35,6 +40,7 @@ _SETTLES = 6.0  # s until filters have forgotten what was before the record
 _MEMORY, _TAP = 3.0, 0.06  # s of the response of the error to the target, and between its taps
 _PARTS, _RANK = 6, 3e-3  # of the record; smallest singular value that counts, to the largest
 _WHITENER = 0.6  # s of the autoregression of the remnant
+_FLOOR = 3e-2  # of the variance of the remnant, as white noise: the whitener amplifies no more
 _BOUNDS = {
     "gain": (1e-9, 1e9), "delay": (0.02, 1.0), "time_constant": (0.02, 50.0),
     "neuromuscular_frequency": (3.0, 60.0), "neuromuscular_damping": (0.03, 2.0),
@@ -46,7 +52,6 @@ _CERTAIN = 0.5  # standard error of a logarithm beyond which a parameter is not 
 _JACKKNIFE = 8  # parts of the record
 _QUANTILE = 2.36  # of Student's t with the degrees of freedom that they leave, for 95 %
 _DRAWS = 400
-_UNSETTLED = 20.0  # of the criterion, for a fit whose iterations did not settle
 
 
 class Estimate(NamedTuple):
@@ -181,19 +186,22 @@ def identify_operator(
     filtered = {name: _filter(values, step, _highpass) for name, values in signals.items()}
     target, seen, hand = filtered["target"], filtered["error"], filtered["hand"]
     from_target = _instrument(target, seen, step)
-    data = _Data(step, seen, from_target, hand)
+    data = _Data(step, target, seen, from_target, hand)
     kinds = (equalisation,) if equalisation else EQUALISATIONS
     fits = [fit for kind in kinds if (fit := _fit(data, kind)) is not None]
     if not fits:
         raise InputError(source, "shows no answer of the hand to the target: check the columns")
-    best = min(fits, key=lambda fit: fit.criterion + _UNSETTLED * (not fit.settled))
+    best = min(fits, key=lambda fit: (not fit.settled, fit.criterion))
+    best = best._replace(covariance=_covariance(data, best))
     if not best.settled:
-        notes.append("the fit did not settle: record longer, or with more motion of the target")
+        notes.append("the fit did not settle, and tells nothing: record longer, or with more motion"
+                     " of the target")  # fmt: skip
     return _finished(best, data, signals, record, notes)
 
 
 class _Data(NamedTuple):
     step: float
+    target: np.ndarray
     error: np.ndarray
     from_target: np.ndarray
     hand: np.ndarray
@@ -204,8 +212,9 @@ class _Fit(NamedTuple):
     names: tuple[str, ...]
     sign: float
     logs: np.ndarray
-    covariance: np.ndarray
+    covariance: np.ndarray  # empty before `_covariance`
     noise: np.ndarray
+    white: np.ndarray
     criterion: float
     settled: bool
 
@@ -252,8 +261,10 @@ def _filter(values: np.ndarray, step: float, response) -> np.ndarray:
     return np.fft.irfft(np.fft.rfft(values, pad) * response(s), pad)[: len(values)]
 
 
-def _instrument(target: np.ndarray, seen: np.ndarray, step: float) -> np.ndarray:
-    """Part of the error that comes from the target: its response by least squares.
+def _instrument(
+    target: np.ndarray, seen: np.ndarray, step: float, kept: np.ndarray | None = None
+) -> np.ndarray:  # fmt: skip
+    """Part of the error that comes from the target: its response by least squares of `kept` rows.
 
     Each part of the record gets the response that the others have, so that the remnant of a part
     is not in its own instrument (jackknife instrumental variables, Angrist et al. 1999).
@@ -263,13 +274,19 @@ def _instrument(target: np.ndarray, seen: np.ndarray, step: float) -> np.ndarray
     table = np.zeros((len(target), len(lags)))
     for column, lag in enumerate(lags):
         table[lag:, column] = target[: len(target) - lag]
-    made = np.zeros(len(target))
     rows = np.arange(len(target))
     usable = rows >= round(_SETTLES / step)
-    for part in np.array_split(rows, _PARTS):
-        others = usable & ((rows < part[0]) | (rows > part[-1]))
-        taps = np.linalg.lstsq(table[others], seen[others], rcond=_RANK)[0]
-        made[part] = table[part] @ taps
+    usable = usable if kept is None else usable & kept
+    parts = np.array_split(rows, _PARTS)
+    inside = [part[usable[part]] for part in parts]
+    squares = [table[part].T @ table[part] for part in inside]
+    products = [table[part].T @ seen[part] for part in inside]
+    made = np.zeros(len(target))
+    for part, square, product in zip(parts, squares, products, strict=True):
+        size, way = np.linalg.eigh(sum(squares) - square)
+        known = size > _RANK**2 * size[-1]
+        taps = (way[:, known].T @ (sum(products) - product)) / size[known]
+        made[part] = table[part] @ (way[:, known] @ taps)
     return made
 
 
@@ -322,7 +339,7 @@ def _autoregression(noise: np.ndarray, step: float) -> np.ndarray:
     size = len(noise)
     spectrum = np.abs(np.fft.rfft(noise, 2 * size)) ** 2
     r = np.fft.irfft(spectrum)[: order + 1] / size
-    r[0] *= 1.0 + 1e-6
+    r[0] *= 1.0 + _FLOOR
     return np.concatenate([[1.0], -solve_toeplitz(r[:order], r[1 : order + 1])])
 
 
@@ -355,54 +372,81 @@ def _fit(data: _Data, kind: str) -> _Fit | None:
         return (hand - _predicted(data, kind, x, data.from_target))[first:]
 
     logs = least_squares(miss, logs, bounds=(low, high), x_scale=0.3).x
-    noise, covariance, settled = hand, np.eye(len(logs)), False
+    noise, white, settled = hand, np.ones(1), False
     for turn in range(30):
         noise = (hand - _predicted(data, kind, logs, data.error))[first:]
         white = _autoregression(noise, data.step)
-
-        def whitened(values: np.ndarray, white=white) -> np.ndarray:
-            return np.asarray(lfilter(white, [1.0], values[first:]))[len(white) :]
-
-        rest = np.asarray(lfilter(white, [1.0], noise))[len(white) :]
-        count = len(logs)
-        z = np.empty((len(rest), count))
-        d = np.empty((len(rest), count))
-        for k in range(count):
-            z[:, k] = whitened(_slope_of(data, kind, logs, k, data.from_target))
-            d[:, k] = whitened(_slope_of(data, kind, logs, k, data.error))
-        scale = np.linalg.norm(z, axis=0) + 1e-300
-        matrix = (z / scale).T @ (d / scale)
-        move = np.linalg.lstsq(matrix, (z / scale).T @ rest, rcond=1e-10)[0] / scale
+        z, d, rest = _equations(data, kind, logs, sign, white, data.from_target)
+        move = _solution(z, d, rest)[: len(logs)]
         logs = np.clip(logs + np.clip(move, -0.3, 0.3) * (1.0 if turn < 20 else 0.5), low, high)
-        covariance = _covariance(z / scale, d / scale, rest) / np.outer(scale, scale)
         settled = bool(np.abs(move).max() < 1e-3)
         if np.abs(move).max() < 1e-4:
             break
     rest = miss(logs)
-    white = _autoregression(rest, data.step)
-    power = float(np.var(np.asarray(lfilter(white, [1.0], rest))[len(white) :]))
+    left = _autoregression(rest, data.step)
+    power = float(np.var(np.asarray(lfilter(left, [1.0], rest))[len(left) :]))
     size = len(rest)
     criterion = size * math.log(max(power, 1e-300)) + len(logs) * math.log(size)
-    return _Fit(kind, names, sign, logs, covariance, noise, criterion, settled)
+    return _Fit(kind, names, sign, logs, np.zeros((0, 0)), noise, white, criterion, settled)
 
 
-def _covariance(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Covariance of the solution of `z^T (rest - d x) = 0`, the larger of two for every element.
+def _equations(
+    data: _Data, kind: str, logs: np.ndarray, sign: float, white: np.ndarray,
+    instrument: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Whitened instruments (n, m + 1), slopes (n, m + 1), and remnant (n,) at some parameters.
 
-    One takes the whitened remnant as equally large throughout, the other leaves out one part of
-    the record after the other (jackknife): the remnant grows and shrinks with the error, and a
-    burst of it may decide.
+    The last column is what a hand that was displaced at the beginning of the record leaves behind
+    the high-pass, which outlasts the rows that are left out.
     """
-    inverse = np.linalg.pinv(z.T @ d)
-    equal = float(rest @ rest) / (len(rest) - z.shape[1]) * inverse @ (z.T @ z) @ inverse.T
-    moves = []
+    from scipy.signal import lfilter
+
+    first = round(_SETTLES / data.step)
+
+    def whitened(values: np.ndarray) -> np.ndarray:
+        return np.asarray(lfilter(white, [1.0], values[first:]))[len(white) :]
+
+    begun = whitened(np.exp(-_HIGHPASS * data.step * np.arange(len(data.hand))))
+    z, d = (
+        np.column_stack([*(whitened(_slope_of(data, kind, logs, k, values))
+                           for k in range(len(logs))), begun])
+        for values in (instrument, data.error)
+    )  # fmt: skip
+    rest = whitened(sign * data.hand - _predicted(data, kind, logs, data.error))
+    return z, d, rest
+
+
+def _solution(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Solve `z^T (rest - d x) = 0` for x."""
+    scale = np.linalg.norm(z, axis=0) + 1e-300
+    matrix, right = (z / scale).T @ (d / scale), (z / scale).T @ rest
+    return np.linalg.lstsq(matrix, right, rcond=1e-10)[0] / scale
+
+
+def _covariance(data: _Data, fit: _Fit) -> np.ndarray:
+    """Covariance of the logarithms, the larger of two for every element.
+
+    One takes the whitened remnant as equally large throughout and the instrument as known. The
+    other leaves out one part of the record after the other and estimates instrument and parameters
+    anew (jackknife): the remnant grows and shrinks with the error, and is in the instrument, too.
+    """
+    arguments = data, fit.kind, fit.logs, fit.sign, fit.white
+    z, d, rest = _equations(*arguments, data.from_target)
+    scale = np.linalg.norm(z, axis=0) + 1e-300
+    inverse = np.linalg.pinv((z / scale).T @ (d / scale))
+    equal = float(rest @ rest) / (len(rest) - z.shape[1])
+    equal = equal * inverse @ ((z / scale).T @ (z / scale)) @ inverse.T / np.outer(scale, scale)
+    gone, moves = len(data.hand) - len(rest), []
     for part in np.array_split(np.arange(len(rest)), _JACKKNIFE):
-        others = np.ones(len(rest), bool)
-        others[part] = False
-        moves.append(np.linalg.pinv(z[others].T @ d[others]) @ (z[others].T @ rest[others]))
+        kept = np.ones(len(data.hand), bool)
+        kept[gone + part] = False
+        anew = _instrument(data.target, data.error, data.step, kept)
+        z = _equations(*arguments, anew)[0]
+        moves.append(_solution(z[kept[gone:]], d[kept[gone:]], rest[kept[gone:]]))
     apart = (_JACKKNIFE - 1) * np.var(moves, axis=0)
-    scale = np.sqrt(np.maximum(1.0, apart / np.maximum(np.diag(equal), 1e-300)))
-    return equal * np.outer(scale, scale)
+    larger = np.sqrt(np.maximum(1.0, apart / np.maximum(np.diag(equal), 1e-300)))
+    many = len(fit.logs)
+    return (equal * np.outer(larger, larger))[:many, :many]
 
 
 def _slope_of(
@@ -420,10 +464,11 @@ def _finished(
     estimates: dict[str, Estimate] = {}
     for name, log, error in zip(fit.names, fit.logs, errors, strict=True):
         at_bound = min(abs(log - math.log(b)) for b in _BOUNDS[name]) < 1e-3
+        error = error if fit.settled else math.inf
         estimates[name] = _estimate(log, error, _UNITS.get(name, "hand per error"), not at_bound)
         if at_bound or error > _CERTAIN:
             notes.append(f"{name} cannot be told from this record")
-    estimates["remnant"] = _remnant(fit, data, errors[0])
+    estimates["remnant"] = _remnant(fit, data)
     if fit.sign < 0.0:
         notes.append("the hand's sign is turned round: a positive error moves it the negative way")
     first = round(_SETTLES / data.step)
@@ -433,7 +478,7 @@ def _finished(
     if explained < 0.3:
         notes.append(f"only {100 * explained:.0f} % of the hand's motion come from the target")
     w = np.geomspace(0.1, 30.0, 600)
-    element = _close(fit, data, signals, w, estimates, notes)
+    element = _close(fit, data, signals, w, estimates, notes) if fit.settled else ""
     return OperatorFit(
         fit.kind, estimates, element, explained, 1.0 / data.step,
         float(record.time[-1] - record.time[0]), tuple(dict.fromkeys(notes)), w,
@@ -447,7 +492,7 @@ def _estimate(log: float, error: float, unit: str, inside: bool = True) -> Estim
     return Estimate(math.exp(log), low, high, unit, bool(inside and error <= _CERTAIN))
 
 
-def _remnant(fit: _Fit, data: _Data, gain_error: float) -> Estimate:
+def _remnant(fit: _Fit, data: _Data) -> Estimate:
     """Power density of the observation noise over pi times the variance of what is observed."""
     from scipy.signal import welch
 
@@ -467,8 +512,11 @@ def _remnant(fit: _Fit, data: _Data, gain_error: float) -> Estimate:
         power = (power + lead**2 * rate) / (1.0 + (lead * w[band]) ** 2)
     share = density[band] / 2.0 / bare**2 / (np.pi * power)  # two-sided
     count = max(1.0, 1.8 * len(fit.noise) / length * band.sum() * 0.6)
-    error = math.hypot(math.sqrt(1.5 / count), 2.0 * gain_error)
-    return _estimate(math.log(float(share.mean())), error, "1")
+    whole = _response(fit.kind, fit.logs, s)  # of gain and time constant the product counts
+    slopes = np.array([np.real(k / whole).mean() for k in _slopes(fit.kind, fit.logs, s)])
+    doubt = float(slopes @ fit.covariance @ slopes)
+    error = math.sqrt(1.5 / count + 4.0 * max(0.0, doubt))
+    return _estimate(math.log(float(share.mean())), error if fit.settled else math.inf, "1")
 
 
 def _close(

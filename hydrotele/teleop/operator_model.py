@@ -76,6 +76,7 @@ class Muscles(NamedTuple):
         correction: (6,) what was learnt to be missing [N], [N m].
         force: (6,) on the handle [N], [N m].
         arm: (6,) stiffness of arm and hand [N/m], [N m/rad].
+        cross: (1,) the same between x and y [N/m].
         most: (6,) largest force [N], [N m].
         weight: (6,) of the hand, which they carry [N], [N m].
         gain: (1,) of the correction [1/s].
@@ -90,6 +91,7 @@ class Muscles(NamedTuple):
     correction: np.ndarray
     force: np.ndarray
     arm: np.ndarray
+    cross: np.ndarray
     most: np.ndarray
     weight: np.ndarray
     gain: np.ndarray
@@ -103,7 +105,7 @@ def unpack_muscles(flat):
     """The parts of `flat_view(Muscles)`.
 
     Args:
-        flat: (79,) array.
+        flat: (80,) array.
 
     Returns:
         Muscles, views of it.
@@ -116,14 +118,15 @@ def unpack_muscles(flat):
     correction, rest = split(rest, 6)
     force, rest = split(rest, 6)
     arm, rest = split(rest, 6)
+    cross, rest = split(rest, 1)
     most, rest = split(rest, 6)
     weight, rest = split(rest, 6)
     gain, rest = split(rest, 1)
     place, rest = split(rest, 6)
     rate, lag = split(rest, 6)
     return Muscles(
-        wanted, spring, notch.reshape(3, 6), correction, force, arm, most, weight, gain, place,
-        rate, lag,
+        wanted, spring, notch.reshape(3, 6), correction, force, arm, cross, most, weight, gain,
+        place, rate, lag,
     )  # fmt: skip
 
 
@@ -148,13 +151,13 @@ def pull(muscles, past, tremor, handle, tick, period):
     rows, lag = len(past), muscles.lag
     noise = tick % len(tremor)
     for i in range(6):
+        place, rate = muscles.rest[i], muscles.rate[i]
+        muscles.rest[i] = lag[0] * place + lag[1] * rate + lag[2] * muscles.wanted[i]
+        muscles.rate[i] = lag[3] * place + lag[4] * rate + lag[5] * muscles.wanted[i]
+    for i in range(6):
         past[tick % rows, i] = handle[i]
         late = past[(tick + 1) % rows, i]
-        spring, most = muscles.spring[i], muscles.most[i]
-        place, rate = muscles.rest[i], muscles.rate[i]
-        wanted = lag[0] * place + lag[1] * rate + lag[2] * muscles.wanted[i]
-        muscles.rate[i] = lag[3] * place + lag[4] * rate + lag[5] * muscles.wanted[i]
-        muscles.rest[i] = wanted
+        spring, most, wanted = muscles.spring[i], muscles.most[i], muscles.rest[i]
         firm = muscles.arm[i] + spring
         known = firm * wanted
         beyond = abs(wanted) - muscles.notch[0, i]
@@ -164,6 +167,8 @@ def pull(muscles, past, tremor, handle, tick, period):
             if (late if wanted > 0.0 else -late) < muscles.notch[0, i]:
                 back = _THROUGH * spring * muscles.notch[0, i]  # first over the notch's edge
             known = muscles.arm[i] * wanted + (back if wanted > 0.0 else -back)
+        if i < 2:
+            known += muscles.cross[0] * muscles.rest[1 - i]
         fine = _FINE if i < 3 else _FINE_TURN
         gap = min(fine, max(-fine, wanted - late))
         more = muscles.gain[0] * period * firm * gap
@@ -574,9 +579,10 @@ def _muscles(
         notch=numbers.axis[:, [DEADBAND, DROP, OUTSIDE]].T.copy(),
         correction=np.zeros(6),
         force=np.zeros(6),
-        arm=np.array([hand.stiffness] * 3 + [hand.rotation_stiffness] * 3),
+        arm=np.array([hand.along(axis)[2] for axis in range(6)]),
+        cross=np.array([hand.stiffness_shape[1] * hand.stiffness]),
         most=him.largest_force * _LEVERS,
-        weight=np.array([0.0, 0.0, 9.81 * hand.mass, 0.0, 0.0, 0.0]),
+        weight=np.array([0.0, 0.0, 9.81 * hand.carried, 0.0, 0.0, 0.0]),
         gain=np.array([him.muscle]),
         rest=np.zeros(6),
         rate=np.zeros(6),

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from hydrotele.core.datafile import Facts, Name, Number, Positive, parse, read_yaml
 from hydrotele.core.datafile import suggest as suggest_name
 from hydrotele.core.errors import InputError
-from hydrotele.machine.joystick import HandFacts, Joystick
+from hydrotele.machine.joystick import HandFacts, Joystick, Shape
 from hydrotele.scenario.teleoperation import Perception
 
 SHIPPED = Path(__file__).resolve().with_name("operator.yaml")
@@ -48,14 +48,36 @@ class OperatorParameter(Facts):
         return self
 
 
+Pair = tuple[Positive, Positive]
+
+
+class ArmFacts(Facts):
+    """A right arm of two links in a horizontal plane: shoulder, elbow, hand.
+
+    `length` [m], `mass` [kg] and `inertia` [kg m^2] about the links' middles; `joint_stiffness`
+    [N m/rad] of the shoulder, between both, and of the elbow; `usual` names the posture in which
+    the grips' numbers hold.
+    """
+
+    length: Pair
+    mass: Pair
+    inertia: Pair
+    joint_stiffness: Shape
+    usual: Name
+
+
 class OperatorFile(Facts):
-    """A file of operator parameters; `grips` of the hand, `postures` as factors on stiffness."""
+    """A file of operator parameters; `grips` of the hand, the `arm`, and its `postures`.
+
+    A posture is where the hand is from the shoulder: ahead and to the left [m].
+    """
 
     name: Name
     description: str = ""
     parameters: dict[Name, OperatorParameter] = Field(min_length=1)
     grips: dict[Name, HandFacts] = {}
-    postures: dict[Name, Positive] = {}
+    arm: ArmFacts | None = None
+    postures: dict[Name, tuple[Number, Number]] = {}
 
     @model_validator(mode="after")
     def _check(self):
@@ -160,6 +182,7 @@ def load_operator_file(path: Path = SHIPPED) -> OperatorFile:
     return found.model_copy(update={
         "parameters": usual.parameters | found.parameters,
         "grips": usual.grips | found.grips, "postures": usual.postures | found.postures,
+        "arm": found.arm or usual.arm,
     })  # fmt: skip
 
 
@@ -216,7 +239,10 @@ def held_joystick(joystick: Joystick, perception: Perception, folder: str = "") 
         The joystick with another hand.
 
     Raises:
-        InputError: there is no such grip or posture, or the file is not usable.
+        InputError: there is no such grip or posture, it is out of the arm's reach, or the file is
+            not usable.
+
+    Source: `arm_impedance` for the posture; Hogan 1984 for co-contraction.
     """
     file, him = _file_of(perception, folder), perceiving(perception, folder)
     hand = joystick.hand
@@ -230,8 +256,75 @@ def held_joystick(joystick: Joystick, perception: Perception, folder: str = "") 
         if perception.posture not in file.postures:
             message = f"{perception.posture!r}; {suggest_name(perception.posture, file.postures)}"
             raise InputError("pilot.perception.posture", message)
-        factor *= file.postures[perception.posture]
+        hand = postured(hand, file, perception.posture)
     return joystick.model_copy(update={"hand": stiffened(hand, factor)})
+
+
+def postured(hand: HandFacts, file: OperatorFile, posture: str) -> HandFacts:
+    """A hand with the arm's impedance of a posture.
+
+    Args:
+        hand: with the grip's numbers.
+        file: with the arm, and the posture.
+        posture: its name.
+
+    Returns:
+        The hand; up and down, and in rotation, it is the grip's.
+
+    Raises:
+        InputError: a posture is out of the arm's reach.
+    """
+    arm = file.arm
+    assert arm  # of the shipped file, if of no other
+    shapes = []
+    for matrix, usual in zip(
+        arm_impedance(arm, file.postures[posture]),
+        arm_impedance(arm, file.postures[arm.usual]), strict=True,
+    ):  # fmt: skip
+        shape = matrix / math.sqrt(np.linalg.det(usual))
+        shapes.append((float(shape[0, 0]), float(shape[0, 1]), float(shape[1, 1])))
+    return hand.model_copy(update={"mass_shape": shapes[0], "stiffness_shape": shapes[1]})
+
+
+def arm_impedance(arm: ArmFacts, place: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Mass and stiffness that an arm shows at its hand, `J^-T A J^-1` of the joints' matrices.
+
+    Args:
+        arm: two links, the elbow to the right of the line from the shoulder to the hand.
+        place: of the hand, ahead and to the left of the shoulder [m].
+
+    Returns:
+        (2, 2) mass [kg] and stiffness [N/m], ahead and to the left.
+
+    Raises:
+        InputError: the hand cannot be there.
+
+    Source: Hogan 1985 (impedance in other coordinates); Mussa-Ivaldi, Hogan and Bizzi 1985.
+
+    >>> file = load_operator_file()
+    >>> assert file.arm
+    >>> arm_impedance(file.arm, (0.4, 0.0))[1].round().tolist()
+    [[499.0, 22.0], [22.0, 184.0]]
+    """
+    (upper, fore), (x, y) = arm.length, place
+    bend = (x * x + y * y - upper**2 - fore**2) / (2.0 * upper * fore)
+    if not abs(bend) < 1.0:
+        message = f"a hand at {x:g}, {y:g} m is out of reach of links of {upper:g} and {fore:g} m"
+        raise InputError("postures", message)
+    elbow = math.acos(bend)
+    far = fore * math.sin(elbow)
+    shoulder = math.atan2(y, x) - math.atan2(far, upper + fore * bend)
+    along, across = fore * math.cos(shoulder + elbow), fore * math.sin(shoulder + elbow)
+    jacobian = np.array([[-y, -across], [x, along]])
+    (m1, m2), (i1, i2) = arm.mass, arm.inertia
+    second = i2 + m2 * (0.5 * fore) ** 2
+    both = second + 0.5 * m2 * upper * fore * bend
+    first = i1 + m1 * (0.5 * upper) ** 2 + m2 * upper**2 + 2.0 * both - second
+    mass = np.array([[first, both], [both, second]])
+    k_shoulder, k_both, k_elbow = arm.joint_stiffness
+    stiffness = np.array([[k_shoulder, k_both], [k_both, k_elbow]])
+    inverse = np.linalg.inv(jacobian)
+    return inverse.T @ mass @ inverse, inverse.T @ stiffness @ inverse
 
 
 def stiffened(hand: HandFacts, factor: float) -> HandFacts:

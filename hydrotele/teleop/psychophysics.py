@@ -79,7 +79,7 @@ def _arm(him: Operator, hand: HandFacts, expected: float) -> Muscles:
     zero = np.zeros(6)
     return flattened(Muscles(
         wanted=zero, spring=zero + expected, notch=np.full((3, 6), -1.0), correction=zero,
-        force=zero, arm=zero + hand.stiffness, most=zero + him.largest_force,
+        force=zero, arm=zero + hand.stiffness, cross=np.zeros(1), most=zero + him.largest_force,
         weight=np.array([hand.mass, hand.damping, 0.0, 0.0, 0.0, 0.0]),
         gain=np.array([him.muscle]), rest=zero, rate=zero,
         lag=neuromuscular_matrix(him.neuromuscular_frequency, 1.0, _PERIOD),

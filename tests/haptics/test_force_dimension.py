@@ -100,5 +100,5 @@ def test_without_the_package_it_says_what_to_install(monkeypatch):
 
 
 def test_no_such_kind():
-    with pytest.raises(InputError, match="valid: simulated, force-dimension"):
+    with pytest.raises(InputError, match="valid: simulated, force-dimension, haption"):
         open_haptic("phantom", 1e-3)

@@ -5,7 +5,15 @@ import gc
 import numpy as np
 import pytest
 
-from hydrotele.haptics.timing import EDGES, Deadlines, steady, summary_of
+from hydrotele.cli.haptic import computer_sentences
+from hydrotele.haptics.timing import (
+    EDGES,
+    Deadlines,
+    computer_alone,
+    steady,
+    stolen_time,
+    summary_of,
+)
 
 MS = 1_000_000
 
@@ -64,6 +72,47 @@ def test_simulated_time_stands_still_after_a_long_stop(clock):
     assert pacer.pauses == 1 and pacer.late == pytest.approx(0.999, abs=1e-5)
     clock.time += MS // 2
     assert pacer.wait(2e-3) == 0.0 and pacer.missed == 1
+
+
+def test_a_loop_without_work_counts_what_the_computer_takes(clock):
+    """Every hundredth sleep lasts 3 ms too long: the next two deadlines have then passed."""
+    usual, calls = clock.sleep, [0]
+
+    def stalled(seconds):
+        calls[0] += 1
+        usual(seconds + (3e-3 if calls[0] % 100 == 0 else 0.0))
+
+    assert computer_alone(2.0, 1000.0, now=clock.now, sleep=usual)["missed"] == 0
+    found = computer_alone(2.0, 1000.0, now=clock.now, sleep=stalled)
+    assert found["ticks"] == 2000 and found["missed"] == 2 * (calls[0] // 100) > 30
+    # 3 ms after the 0.12 ms before a deadline in which it stays awake, and a tick of 1 ms later
+    assert found["late"]["percentiles_us"]["largest"] == pytest.approx(1880.0, abs=2.0)
+
+
+def test_stolen_time_is_the_kernels(tmp_path):
+    import os
+
+    stat = tmp_path / "stat"
+    stat.write_text("cpu  10 0 20 400 0 0 3 250 0 0\ncpu0 5 0 10 200 0 0 1 125 0 0\n")
+    assert stolen_time(stat) == pytest.approx(250.0 / os.sysconf("SC_CLK_TCK"))
+    stat.write_text("cpu  10 0 20 400\n")  # before Linux 2.6.11
+    assert stolen_time(stat) is None and stolen_time(tmp_path / "none") is None
+
+
+@pytest.mark.parametrize(
+    ("alone", "own", "said"),
+    [(5, 5, []), (50, 80, ["cannot hold 0.1 %"]), (5, 40, ["the rest of the 0.4 %"])],
+)
+def test_report_says_whose_the_missed_deadlines_are(alone, own, said):
+    computer = {"seconds": 10.0, "ticks": 10000, "missed": alone,
+                "late": summary_of(np.full(alone, 2_000_000))}  # fmt: skip
+    found = computer_sentences({"ticks": 10000, "missed": own}, computer)
+    assert len(found) == len(said)
+    for sentence, words in zip(found, said, strict=True):
+        assert words in sentence
+    stolen = computer_sentences({"ticks": 1, "missed": 0},
+                                {"stolen_seconds": 0.4, "stolen_share": 0.02})  # fmt: skip
+    assert stolen == ["time stolen by the host meanwhile: 0.4 s, 2 % of all cores"]
 
 
 def test_garbage_is_collected_again_afterwards():

@@ -53,6 +53,8 @@ def test_the_device_moves_the_machine_and_latency_is_told(driven):
     summary = json.loads((driven / "summary.json").read_text())
     line, machine = summary["haptic"]["line"], summary["haptic"]["machine"]
     assert machine["ticks"] == 3000 and machine["control_rate"] == 1000.0
+    computer = summary["haptic"]["computer"]
+    assert computer["seconds"] == 1.0 and computer["ticks"] == 1000 and "stolen_seconds" in computer
     assert line["poses"] > 0 and line["malformed"] == 0 and line["late"] == 0
     for name in ("answer", "loop", "interval"):
         assert set(line[name]["percentiles_us"]) == {"p50", "p90", "p99", "p99.9", "largest"}

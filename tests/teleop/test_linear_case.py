@@ -94,6 +94,21 @@ def test_limit_falls_with_speed_stiffness_delay_and_lag():
     assert double.largest_ratio == pytest.approx(0.5 * ratio, rel=2e-3)  # two margins' rounding
 
 
+def test_hand_is_that_of_the_scenarios_operator(case):
+    """Grip and co-contraction of the scenario are in the loop, as the station simulates them."""
+    usual = load_joystick().hand
+    assert case.held == Impedance(usual.mass, usual.damping, usual.stiffness)
+    firm = made(pilot__perception="{grip: firm, cocontraction: 0.4}")[0]
+    assert firm.held.mass == pytest.approx(0.8)  # operator.yaml: firm
+    assert firm.held.stiffness == pytest.approx(600.0 * 1.8)  # stiffening 3: 1 + 2 x 0.4
+    far = made(pilot__perception="{grip: normal, posture: far}", coordinate="r")[0]
+    assert far.held.stiffness > 2.0 * 250.0  # towards the shoulder
+    ratios = [structure_findings(c, "rate_force").largest_ratio for c in (case, firm)]
+    assert ratios[1] != pytest.approx(ratios[0], rel=0.02)
+    with pytest.raises(InputError, match="pilot.perception.grip"):
+        made(pilot__perception="{grip: frm}")
+
+
 def test_pole_lies_on_the_axis_at_the_limit(case):
     found = structure_findings(case, "rate_force")
     assert found.unstable_poles == 2 and not found.stable
@@ -127,6 +142,22 @@ def test_every_structure_has_a_margin(reflection, mode):
 
 
 @pytest.mark.parametrize(
+    ("reflection", "mode", "message"),
+    [
+        ("four_channel", "rate", "observed force of the hand.*--structure four_channel_rate"),
+        ("wave_variables", "position", "as far as energy.*--structure wave_variables --robust"),
+        ("passivity_control", "position", "--structure passivity_control --robust"),
+        ("impedance", "rate", "identified and changes; .*direct_force"),
+    ],
+)
+def test_structures_without_a_linear_case_say_why_and_what_to_do(reflection, mode, message):
+    case = made()[0]
+    pilot = case.pilot.model_copy(update={"reflection": reflection, "mode": mode})
+    with pytest.raises(InputError, match=message):
+        find_loop("a", dataclasses.replace(case, pilot=pilot), "")
+
+
+@pytest.mark.parametrize(
     ("overrides", "coordinate", "message"),
     [
         ({}, "head", "no 'head'; the arm has r, theta, z, attitude"),
@@ -136,9 +167,3 @@ def test_every_structure_has_a_margin(reflection, mode):
 def test_what_cannot_be_analysed(overrides, coordinate, message):
     with pytest.raises(InputError, match=message):
         made(coordinate=coordinate, **overrides)
-
-
-def test_a_structure_without_a_linear_case_says_so():
-    case = made(pilot__reflection="four_channel")[0]
-    with pytest.raises(InputError, match="four_channel.*write a case file"):
-        find_loop("a", case, "")

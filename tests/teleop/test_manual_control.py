@@ -1,12 +1,13 @@
 """Crossover model: measured from simulated tracking, learnt gains, remnant, and drawn operators."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.machine.joystick import load_joystick
+from hydrotele.machine.joystick import load_joystick, principal
 from hydrotele.scenario.teleoperation import Perception, TeleopPilot
 from hydrotele.teleop.manual_control import (
     BELIEVED_GAIN,
@@ -18,12 +19,14 @@ from hydrotele.teleop.manual_control import (
     describing_function,
     look_and_act,
     neuromuscular_matrix,
+    operator_response,
     sum_of_sines,
     track,
     visual_loop,
 )
 from hydrotele.teleop.operator_model import recorded_hand
 from hydrotele.teleop.operator_parameters import (
+    arm_impedance,
     drawn_operator,
     held_joystick,
     load_operator_file,
@@ -56,6 +59,15 @@ def test_the_open_loop_falls_by_20_db_per_decade_around_a_published_crossover(
     assert frequency[0] < found.frequency < frequency[1]
     assert margin[0] < math.degrees(found.margin) < margin[1]
     assert found.slope == pytest.approx(-20.0, abs=5.0)
+
+
+def test_a_turn_between_two_sines_does_not_count_as_margin():
+    """1 e^(-0.3 s) / s, margin 90 - 17 degrees; far above, sines are more than a turn apart."""
+    w = np.array([0.3, 0.6, 0.9, 1.2, 2.0, 40.0])
+    for turn in (0.0, 2.0 * np.pi):
+        loop = np.exp(-1j * (0.3 * w + turn)) / (1j * w)
+        assert crossover_of(w, loop).margin == pytest.approx(0.5 * np.pi - 0.3, abs=0.01)
+    assert abs(crossover_of(w[::5], np.exp(-0.3j * w[::5]) / (1j * w[::5])).margin) < np.pi
 
 
 def test_an_operator_with_twice_the_delay_crosses_over_at_a_lower_frequency():
@@ -129,6 +141,49 @@ def test_an_own_file_changes_what_it_names(tmp_path):
         perceiving(Perception(file="bad.yaml"), str(tmp_path))
 
 
+@pytest.mark.parametrize("form", range(3))
+def test_operator_is_as_late_as_his_parameters_say(form):
+    """Without remnant, by the phase of his describing function from 1 to 9 rad/s.
+
+    2 ms at 9 rad/s: he decides every 20 ms, between which what he saw is interpolated.
+    """
+    him, time = dataclasses.replace(HIM, remnant=0.0), np.arange(0.0, 150.0, 0.01)
+    target, w = sum_of_sines(time, 2.5, 120.0, 3)
+    record = track(him, form, 2.0, target, seed=3, surprised=False)
+    found = describing_function([record], w, 30.0)[1] / operator_response(him, form, w)
+    told = (w > 1.0) & (w < 9.0)
+    delay = -np.angle(found[told]) / w[told]
+    assert np.abs(delay).max() < 4e-3 and abs(delay[-1]) < 2e-3, delay
+
+
+def test_posture_makes_ellipses_of_the_hand():
+    """Mussa-Ivaldi et al. 1985: long axis to the shoulder, longer and turning with the hand.
+
+    Mass stays positive, its ellipse along the forearm; the usual posture keeps the grip's size.
+    """
+    stick, file = load_joystick(), load_operator_file()
+    hands = {p: held_joystick(stick, Perception(grip="normal", posture=p)).hand
+             for p in ("near", "mid", "far")}  # fmt: skip
+    long = [principal(h.stiffness_shape) for h in hands.values()]
+    ratio = [p.greatest / p.least for p in long]
+    assert ratio[0] < 2.0 < ratio[1] < 3.0 < ratio[2]
+    assert abs(long[1].angle) < np.deg2rad(5.0) and abs(long[2].angle) < np.deg2rad(5.0)
+    mid = principal(hands["mid"].stiffness_shape)
+    assert mid.least * mid.greatest == pytest.approx(1.0)  # its geometric mean is the grip's
+    assert hands["mid"].stiffness == file.grips["normal"].stiffness
+    assert hands["far"].along(0)[2] > 1.4 * hands["mid"].along(0)[2] > 1.4 * 250.0
+    assert hands["far"].along(1)[2] < 0.7 * hands["mid"].along(1)[2] < 0.7 * 250.0
+    assert hands["far"].along(2)[2] == 250.0
+    assert file.arm
+    turned = [arm_impedance(file.arm, (0.4 * math.cos(a), 0.4 * math.sin(a))) for a in (0.0, 0.5)]
+    c, s = math.cos(0.5), math.sin(0.5)
+    turn = np.array([[c, -s], [s, c]])
+    for here, there in zip(*turned, strict=True):
+        np.testing.assert_allclose(turn @ here @ turn.T, there, rtol=1e-9)
+    with pytest.raises(InputError, match="out of reach"):
+        arm_impedance(file.arm, (0.7, 0.0))
+
+
 def test_grip_posture_and_cocontraction_make_the_hand():
     """Full co-contraction: stiffness times `stiffening`, the damping ratio stays."""
     stick = load_joystick()
@@ -139,7 +194,6 @@ def test_grip_posture_and_cocontraction_make_the_hand():
     assert tense.stiffness == pytest.approx(HIM.stiffening * stick.hand.stiffness)
     ratio = [h.damping / math.sqrt(h.mass * h.stiffness) for h in (tense, stick.hand)]
     assert ratio[0] == pytest.approx(ratio[1])
-    assert held_joystick(stick, Perception(posture="far")).hand.stiffness < stick.hand.stiffness
     with pytest.raises(InputError, match="did you mean 'firm'"):
         held_joystick(stick, Perception(grip="frm"))
 

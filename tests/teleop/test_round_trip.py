@@ -39,7 +39,8 @@ class RoundTrip:
         self.m, self.ms = master(STICK, pilot, ("r", "theta", "z", "attitude"))
         self.s, self.ss = slave(CAT, pilot, self.m, HOME[COLUMNS])
         self.hand = flattened(Muscles(*(np.zeros(6) for _ in range(2)), np.full((3, 6), -1.0),
-                                      *(np.zeros(6) for _ in range(5)), np.zeros(1),
+                                      *(np.zeros(6) for _ in range(3)), np.zeros(1),
+                                      *(np.zeros(6) for _ in range(2)), np.zeros(1),
                                       *(np.zeros(6) for _ in range(3))))  # fmt: skip
         self.forward = np.zeros((1 + forward, 3, 6))
         self.back, self.packet = np.zeros((1 + back, 8, 4)), np.zeros((8, 4))

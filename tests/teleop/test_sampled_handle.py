@@ -61,18 +61,14 @@ def test_the_published_rotational_damping_shakes_every_flotor_of_this_size():
 
 
 def growth(axis: int, stiffness: float, damping: float, joystick) -> float:
-    """How the turning of a handle without a hand grows over a second, by MuJoCo.
-
-    Two Euler steps per period, as runs with a machine make, would let it move half as far again as
-    a held torque does within a period, and hold 1.0 N m s/rad; fifty steps are within 2 %.
-    """
+    """How the turning of a handle without a hand grows over a second, by MuJoCo as in a run."""
     pilot = TeleopPilot.model_validate(
         {"kind": "teleop", "operator": {"kind": "follow"}, "reflection": "none"}
     )
     numbers, state = master(joystick, pilot, ("r", "theta", "z"))
     numbers.axis[axis, NOMINAL], numbers.axis[axis, DAMPING] = stiffness, damping
     numbers.step[:] = 0.0  # readings without steps, so that growth is seen from the beginning
-    flotor, pose = SimulatedFlotor(joystick, hand=False, fine=25), np.zeros(6)
+    flotor, pose = SimulatedFlotor(joystick, hand=False), np.zeros(6)
     pose[axis] = 1e-7  # so that coils are not at their limit in the end
     flotor.place(pose)
     turns = []

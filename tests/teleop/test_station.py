@@ -21,6 +21,7 @@ from hydrotele.teleop.axis_table import (
     GAIN,
     REFLECTED_MOST,
 )
+from hydrotele.teleop.levitation import rotation_vector
 from hydrotele.teleop.master import master
 
 PERIOD = 0.005
@@ -252,20 +253,26 @@ def test_impedance_finds_the_plates_stiffness(sensors, near):
 def worked(duration, **pilot):
     """The energy that the hand truly gave the handle, and what the observer says, by tick [J].
 
-    Of MuJoCo: muscles, the hand's spring and damper and its own mass, times the handle's velocity.
+    Of MuJoCo: the work of the muscles, which are held for a period, less what the hand's own
+    spring, damper and mass have taken; only the speed within a period is a mean.
     """
     session = begin(scenario(duration, **pilot))
     flotor, joystick = session.station._flotor, load_joystick()
     hand, data = joystick.hand, flotor.data
-    true, told, before = [0.0], [0.0], np.zeros(3)
+    true, told, before, turn = [0.0], [0.0], np.zeros(3), np.zeros(3)
     while session.tick < session.scenario.ticks:
         place = data.qpos[:3].copy()
         session.advance()
         speed = (data.qpos[:3] - place) / PERIOD
-        force = session.station.operator.muscles.force[:3] - hand.stiffness * place
-        force -= hand.damping * speed + hand.mass * (speed - before) / PERIOD
+        turn, turned = rotation_vector(data.qpos[3:7]), turn
+        spin = (turn - turned) / PERIOD
+        force = session.station.operator.muscles.force[:3].copy()
         force[2] -= 9.81 * hand.mass
-        true.append(true[-1] + PERIOD * float(force @ speed))
+        force -= hand.stiffness * (place + 0.5 * PERIOD * speed) + hand.damping * speed
+        own = 0.5 * hand.mass * float(speed @ speed - before @ before)
+        torque = session.station.operator.muscles.force[3:] - hand.rotation_damping * spin
+        torque -= hand.rotation_stiffness * 0.5 * (turn + turned)
+        true.append(true[-1] + PERIOD * float(force @ speed + torque @ spin) - own)
         told.append(float(session.station._m.energy[0]))
         before = speed
     return np.array(true[:-1]), np.array(told[1:]), session.station  # read before it moves on
@@ -282,16 +289,22 @@ def test_energy_at_the_handle_is_the_hands_work(reflection):
         assert told.min() > -1e-5  # a spring and a damper are passive
 
 
-def test_a_joystick_that_shakes_the_hand_is_seen_as_active():
+@pytest.mark.parametrize(("aside", "at_stops"), [(0.001, False), (0.004, True)])
+def test_a_joystick_that_shakes_the_hand_is_seen_as_active(aside, at_stops):
     """Direct force of a bouncing machine: energy comes out, as much as MuJoCo says.
 
-    25 %: it bounces against its stops within a few periods, and turns, which counts, too.
+    Speeds are differences over 5 ms: 5 %. What stops take away looks as if it went into the hand.
     """
     hand = {"kind": "follow", "time": [0, 0.5, 1, 2, 2.5, 4],
-            "path": {"y": [0, 0, 0.004, 0.004, -0.004, -0.004],
+            "path": {"y": [0, 0, aside, aside, -aside, -aside],
                      "z": [0, 0, -0.0025, -0.0025, 0, 0]}}  # fmt: skip
-    true, told, _ = worked(4.0, plate={}, reflection="direct_force", z=0.36, operator=hand)
-    assert true[-1] < -0.05 and told[-1] == pytest.approx(true[-1], rel=0.25)
+    true, told, station = worked(4.0, plate={}, reflection="direct_force", z=0.36, operator=hand)
+    coils = np.abs(station.log.master("handle")[:, :3]).max()
+    if at_stops:
+        assert coils > 5e-3 and told[-1] < true[-1] < -0.05
+    else:
+        assert coils < 5e-3 and true[-1] < -5e-4
+        assert told[-1] == pytest.approx(true[-1], rel=0.05)
 
 
 @pytest.mark.parametrize("force", ["dynamic", "true"])
