@@ -142,7 +142,7 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
         "gap": Parameter(
             "rad", present, 0.0, max(0.05, present), 0.01, 1e-3, starts=(0.003, 0.01, 0.03)
         ),
-        "drive_inertia": _inertia(drive, "kg m^2"),
+        "drive_inertia": _inertia("kg m^2", drive.inertia),
         "damping_ratio": _damping_ratio(drive),
         "contact_frequency": Parameter(
             "Hz", rings, min(10.0, rings), max(110.0, rings), 20.0, 20.0, optional=True
@@ -150,10 +150,13 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     }
 
 
-def _inertia(drive: Transmission, unit: str) -> Parameter:
-    """Of the drive side: known to a factor, and no number that one would name a defect by."""
-    own = drive.inertia
-    return Parameter(unit, own, 0.1 * own, 5.0 * own, own, own, optional=True)
+def _inertia(unit: str, own: float, least: float = 0.0, usual: float = 0.0) -> Parameter:
+    """Of the drive side: known to a factor, and no number that one would name a defect by.
+
+    Not below the least that can be stepped; a typical deviation passes what is usual.
+    """
+    scale, low = max(own, usual), min(own, max(0.1 * own, least))
+    return Parameter(unit, own, low, own + 4.0 * scale, scale, scale, optional=True)
 
 
 def _damping_ratio(drive: Transmission) -> Parameter:
@@ -210,20 +213,23 @@ def _travel(machine: Machine, location: str) -> float:
 def _parameters_joint_flexibility(machine: Machine, location: str) -> dict[str, Parameter]:
     """Deflection over force; least is 2 mm of a 1 m stroke, or 2 mrad, at full pressure.
 
-    How heavy the drive side is, and how its spring is damped, is known to a factor.
+    How heavy the drive side is, and how its spring is damped, is known to a factor. It is never
+    lighter than what the oil alone can be stepped with; a stiff spring may need more than stated.
     """
     usual = _travel(machine, location) / largest_force(machine, location)
     transmission = machine.axes[location].transmission
     present = 1.0 / transmission.stiffness if transmission else 0.0
-    turns = drive_turns(machine, location)
     drive = transmission or rigid_drive(machine, location)
+    resolved = [resolved_inertia(machine, location, 0.0, k) for k in (0.0, 1.0 / usual)]
+    inertia = drive.inertia if transmission else max(drive.inertia, resolved[0])
     high = max(4.0 * usual, present)
     starts = (0.3 * usual, 1.0 * usual, 3.0 * usual)
     least = 0.15 * usual
+    turns = drive_turns(machine, location)
     unit, of_inertia = ("rad/(N m)", "kg m^2") if turns else ("m/N", "kg")
     return {
         "compliance": Parameter(unit, present, 0.0, high, usual, least, starts),
-        "drive_inertia": _inertia(drive, of_inertia),
+        "drive_inertia": _inertia(of_inertia, inertia, *resolved),
         "damping_ratio": _damping_ratio(drive),
     }
 
@@ -232,8 +238,8 @@ def _apply_joint_flexibility(machine: Machine, location: str, values: Values) ->
     """Put a spring of 1 / compliance in the transmission; a gap that is there stays.
 
     A cylinder's spring lies in line with it, between piston and rod pin: the length sensor and the
-    oil see the piston. The drive side is as heavy as the rod, or 3 % of a motor's load, and heavier
-    where a stiff spring could not be stepped otherwise.
+    oil see the piston. The drive side is as heavy as stated, else as the rod, or 3 % of a motor's
+    load, and heavier where a stiff spring could not be stepped otherwise.
     """
     compliance, before = values["compliance"], machine.axes[location].transmission
     table = _parameters_joint_flexibility(machine, location)

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.effects import apply_effect
-from hydrotele.effects.transmission import load_inertia
+from hydrotele.effects import EFFECTS, apply_effect
+from hydrotele.effects.transmission import load_inertia, resolved_inertia
 from hydrotele.hydraulics.circuit import SLOTS, actuator_friction, settled_friction
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.replay import replay_log
@@ -125,6 +125,19 @@ def test_a_spring_may_be_shaped_by_its_drives_inertia_and_damping():
     assert shaped.damping == pytest.approx(3 * math.sqrt(0.5) * usual.damping)
     rigid = apply_effect(MACHINE, "joint_flexibility", "swing", {**values, "compliance": 0.0})
     assert rigid == MACHINE
+
+
+@pytest.mark.parametrize("compliance", [2e-8, 3e-7, 1e-6])
+def test_a_drive_as_heavy_as_usual_need_not_be_stated(compliance):
+    """The rig's rod, 3 kg, is lighter than what its oil can be stepped with: 23 kg, then usual."""
+    machine = load_machine("rig")
+    table = EFFECTS["joint_flexibility"].parameters(machine, "slide")
+    least = resolved_inertia(machine, "slide", 0.0, 0.0)
+    assert table["drive_inertia"].nominal == table["drive_inertia"].low == least > 20.0
+    given = {"compliance": compliance}
+    stated = {**given, **{key: table[key].nominal for key in ("drive_inertia", "damping_ratio")}}
+    short, long = (apply_effect(machine, "joint_flexibility", "slide", v) for v in (given, stated))
+    assert short == long
 
 
 @pytest.mark.parametrize("frequency", [20.0, 80.0])
