@@ -16,6 +16,7 @@ from hydrotele.core.compiled import compiled
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.reduced_dynamics import accelerate, advance, place
 from hydrotele.estimate.reduced_model import X, model_space, reduced_model
+from hydrotele.hydraulics.laws import air_compliance
 from hydrotele.hydraulics.parameters import (
     ADDED_DELIVERY,
     actuator_order,
@@ -210,7 +211,11 @@ def input_columns(
             volume = np.maximum(drive.volumes(position[:, i])[side - 2], drive.dead_volume)
             oil = drive.hose_compliance
             if machine.supply:
-                oil += volume / machine.supply.bulk_modulus
+                bubbles = np.array([
+                    air_compliance(p, machine.supply.entrained_air)
+                    for p in states[:, first + 4 * i + side]
+                ])  # fmt: skip
+                oil += volume * (1.0 / machine.supply.bulk_modulus + bubbles)
             columns[:, m, first + 4 * i + side] = 1.0 / oil
     carried = np.einsum("rms,rsk->rmk", columns, flow[:, :size, :size])
     columns = 0.5 * period * (columns + carried)

@@ -324,6 +324,7 @@ _QUIETER_UNSTATED = 0.3  # times the rough noise, where fast motion may be most 
 _ROWS = 3000  # of all runs together that tell the levels; more say the same again
 _ITERATIONS = 12  # of a round: what is left of the way is small against a round's own linearisation
 _SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
+_PARTS = (1.0, 0.5, 0.2)  # of the way to new levels, where teeth make the linear form doubtful
 _LOOSE = {"rate": 0.02, "drive_rate": 0.02, "spool": 0.02, "pressure_head": 1e5,
           "pressure_rod": 1e5, "speed": 2.0}  # fmt: skip
 _LOOSE_POSITION = 1e-4
@@ -420,14 +421,41 @@ def find_levels(
         tracks = _crossed(data, machine, levels, tracks, each, step)
     best = tracks
     for index in range(rounds):
-        before = _whole(tracks)
-        levels = _pruned(_most_likely(data, machine, levels, prior, tracks, each), machine)
-        tracks = _crossed(data, machine, levels, tracks, each, step, bool(start) or index > 0)
-        if _whole(tracks) < _whole(best):  # where a filter hardly follows, its linear form misleads
+        before, old = tracks, levels
+        wanted = _most_likely(data, machine, levels, prior, tracks, each)
+        near = (bool(start) or index > 0) and not _has_gap(machine)
+        for part in _PARTS:  # where a filter hardly follows, its linear form misleads
+            levels = _pruned(_between(old, wanted, part), machine)
+            tracks = _crossed(data, machine, levels, before, each, step, near)
+            if _whole(tracks) < _whole(before) or not _has_gap(machine):
+                break
+        if _whole(tracks) < _whole(best):
             best = tracks
-        if _whole(tracks) > before - _SETTLED:
+        if _whole(tracks) > _whole(before) - _SETTLED:
             break
     return best
+
+
+def _has_gap(machine: Machine) -> bool:
+    """Whether a drive has backlash: Jacobians then hold only as long as the same teeth touch."""
+    return any(a.transmission and a.transmission.backlash for a in machine.axes.values())
+
+
+def _between(old: Levels, new: Levels, part: float) -> Levels:
+    """Levels part of the way from old ones to new ones of the same inputs, in logarithms."""
+    if part == 1.0:
+        return new
+
+    def mean(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.exp((1.0 - part) * np.log(a) + part * np.log(b))
+
+    names = list(new.drift)
+    began = np.array([old.drift.get(name, 0.0) for name in names])
+    drift = mean(np.maximum(began, by_kind(names, DRIFT)), by_kind(names, new.drift))
+    drift = dict(zip(names, drift.tolist(), strict=True))
+    return dataclasses.replace(
+        new, noise=mean(old.noise, new.noise), sizes=mean(old.sizes, new.sizes), drift=drift
+    )
 
 
 def _whole(tracks: Sequence[Track]) -> float:

@@ -18,7 +18,7 @@ from hydrotele.hydraulics.circuit import (
     open_ports,
     pump_response,
 )
-from hydrotele.hydraulics.laws import port_flow, softening
+from hydrotele.hydraulics.laws import air_compliance, port_flow, softening
 from hydrotele.hydraulics.supply import drawn_flow, highest_supply
 from hydrotele.multibody.reduced_mechanism import BAR, DAMPING
 from hydrotele.multibody.reduced_motion import (
@@ -35,6 +35,7 @@ _PORT, _KR = int(Slot.PORT_RELIEF), int(Slot.RELIEF_GAIN)
 _TANK, _KM = int(Slot.TANK_PRESSURE), int(Slot.MAKEUP_GAIN)
 _BETA, _HOSE = int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE)
 _AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
+_BUBBLES = int(Slot.ENTRAINED_AIR)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 _MEMORY, _PUMP = int(Slot.MEMORY), int(Slot.PUMP_FLOW)
 
@@ -116,8 +117,10 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
         r_head, _ = port_flow(p_head, user[_PORT], user[_KR], tank, user[_KM])
         r_rod, _ = port_flow(p_rod, user[_PORT], user[_KR], tank, user[_KM])
         leak = user[_LEAK] * (p_head - p_rod)
-        stored_head = (volumes[0, k] / beta + hose) * head[1, k]
-        stored_rod = (volumes[1, k] / beta + hose) * rod[1, k]
+        soft = 1.0 / beta + air_compliance(p_head, user[_BUBBLES])
+        stored_head = (volumes[0, k] * soft + hose) * head[1, k]
+        soft = 1.0 / beta + air_compliance(p_rod, user[_BUBBLES])
+        stored_rod = (volumes[1, k] * soft + hose) * rod[1, k]
         soft_head = softening(p_head, user[_AIR], user[_ONSET])
         soft_rod = softening(p_rod, user[_AIR], user[_ONSET])
         out[0, k] = stored_head + soft_head * (user[_AH] * velocity[k] + leak - q_head - r_head)

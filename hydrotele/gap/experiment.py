@@ -367,6 +367,7 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "internal_leakage": ("holds",),
     "hose_compliance": ("stairs",),
     "bulk_modulus": ("stairs",),
+    "entrained_air": ("stairs",),
     "pump_flow_limit": ("surges",),
     "relief_pressure": ("surges",),
     "pressure_offset": ("poses", "reversals"),

@@ -82,7 +82,8 @@ def find_gap(
     Args:
         data: the logs; the fit runs decide, the held-out run judges.
         progress: called with (what is being done, share done).
-        effects: names of the effects to try; all if empty.
+        effects: names of the effects to try; all if empty. If some are named, no law is learned
+            and free runs calibrate nothing: what is lacking may be an effect that was not tried.
         jobs: threads.
 
     Returns:

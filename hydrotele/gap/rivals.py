@@ -12,7 +12,13 @@ from hydrotele.effects import EFFECTS
 from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
-from hydrotele.gap.calibrating import fit_until_settled, fitted, free_of_calibration, strained
+from hydrotele.gap.calibrating import (
+    fit_until_settled,
+    fitted,
+    free_of_calibration,
+    loss_of,
+    strained,
+)
 from hydrotele.gap.screening import Screened
 
 _PLAINER = 0.2  # of an effect's probability from which a rival with fewer numbers takes its place
@@ -20,6 +26,7 @@ _SECOND = 2  # rivals that are settled like the effect itself
 _RIVALS = 3  # candidates that are judged in the place of a named effect
 _HOPELESS = 500.0  # loss above the effect's beyond which a rival is let go; or this share of what
 _FAR = 0.5  # the effect brings
+_HOPEFUL = 0.2  # of what the effect takes at the levels of the guess without it: a rival takes more
 _BEHIND = 100.0  # loss above the effect's, of a rival that is not worth another round
 _SAME = 0.1  # squares of whitened errors by which two guesses differ that say the same
 _DRAWS = 4000  # of the Bayesian bootstrap
@@ -156,7 +163,11 @@ def find_rivals(
         return ()
     evidence.set_base(rest)
     fits = fitted(evidence, rest, pool)
-    plausible = [f for f in fits if f.score > 0.0 and not strained(f.guess, -1)][:_RIVALS]
+    own = loss_of(evidence, rest.guess, MIDDLE) - loss_of(evidence, now.guess, MIDDLE)
+    plausible = [
+        f for f in fits
+        if f.score > 0.0 and f.gain > _HOPEFUL * own and not strained(f.guess, -1)
+    ][:_RIVALS]  # fmt: skip
     looked = [(evidence.judged(fit.guess), fit.occam_penalty) for fit in plausible]
     looked = sorted((pair for pair in looked if np.isfinite(pair[0].loss)), key=lambda p: p[0].loss)
     found = []
@@ -178,8 +189,15 @@ _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an inte
 
 
 def worth_naming(guess: Guess, index: int, score: float) -> bool:
-    """Whether an effect is as large as its least size in any parameter, or beyond doubt."""
+    """Whether an effect is as large as its least size in any parameter, or beyond doubt.
+
+    Optional numbers only shape an effect: with all others below their least sizes it is another's
+    form that it makes up for, such as a gap too small to be one that softens a spring.
+    """
     hypothesis, deviation = guess.parts[index]
+    own = np.array([not p.optional for p in hypothesis.parameters.values()])
+    if not own.all() and not np.any(np.abs(deviation[own]) >= hypothesis.least[own]):
+        return False
     return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
 
 

@@ -26,6 +26,7 @@ from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import noise_prior, rippled_at, smoothed_inputs
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, track_run
 from hydrotele.logs.dataset import RunData
+from hydrotele.machine.machine import Machine
 
 _FEW = 16  # candidates that are tried on all runs
 _GLANCE = 20.0  # s of the run that fits worst on which all are tried
@@ -256,13 +257,13 @@ def _loudest(u: np.ndarray, period: float) -> tuple[float, float, int, int]:
     return best
 
 
-_TEETH = "backlash"
+_TEETH, _SPRING = "backlash", "joint_flexibility"
 _GAPS = (0.002, 0.0035, 0.006, 0.01, 0.018, 0.03)  # rad; further apart, one may be jumped over
 _SHAKEN = 3.0  # times its floor, of the white noise on a rate; teeth may be hidden in other lacks
 _DAMPING = 0.05  # damping ratio to begin with: hard teeth, hardly oiled
 _STRETCH = 3.0  # s where a run is busiest: some reversals of a motor
 _STRETCHES = 4  # at most, each of another run, that are taken together at last
-_SIMPLEX = (0.15, 0.5, 1.0, 0.3)  # of the logarithms of gap, inertia and damping ratio; of the rest
+_SIMPLEX = (0.15, 0.5, 1.0, 0.4, 0.3)  # of the logarithms of the numbers of teeth; of the rest
 _SIMPLEXES = (1.0, 0.3)  # times that, one after the other
 _STARTS = 2  # gaps from which to search
 _EVALUATIONS = 60  # of a simplex
@@ -294,8 +295,10 @@ def rattling(
         ):
             continue
         whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(evidence.data.machine, axis))
-        deviation = _likeliest(evidence, whole)
-        if deviation is not None:
+        springs = (_SPRING, axis) in {h.key for h in ahead.guess.hypotheses}
+        rival = ahead.guess.machine(evidence.data.machine) if springs else None
+        deviation = _likeliest(evidence, whole, rival)
+        if deviation is not None and deviation[0] >= whole.least[0]:
             guess = base.guess.plus(whole, deviation)
             found.append(evidence.judged_from(guess, _sensors_only(evidence)))
     return min(found, key=lambda judged: judged.loss, default=None)
@@ -311,38 +314,44 @@ def _sensors_only(evidence: Evidence) -> Levels:
     return Levels(noise_prior(evidence.data).noise)
 
 
-def _likeliest(evidence: Evidence, teeth: Hypothesis) -> np.ndarray | None:
-    """Deviations of the likeliest teeth; None where every gap is less likely than none."""
+def _likeliest(evidence: Evidence, teeth: Hypothesis, rival: Machine | None) -> np.ndarray | None:
+    """Deviations of the likeliest teeth; None where every gap is less likely than none.
+
+    Nor are there any where a spring of the same drive, the rival, explains the busiest stretch
+    better than the best of them.
+    """
     data, levels = evidence.data, _sensors_only(evidence)
     column = list(data.axes).index(teeth.location)
     parts = sorted((_busiest_part(run, column) for run in evidence.runs), key=lambda p: -p[0])
     stretches = [run for _, run in parts[:_STRETCHES]]
-    nominal = np.array([p.nominal for p in teeth.parameters.values()])
+    nominal, size = np.array([p.nominal for p in teeth.parameters.values()]), teeth.size
     scale = np.array([p.scale for p in teeth.parameters.values()])
 
     def deviation(x: np.ndarray) -> np.ndarray:
-        return np.clip((np.exp(x[:3]) - nominal) / scale, teeth.low, teeth.high)
+        return np.clip((np.exp(x[:size]) - nominal) / scale, teeth.low, teeth.high)
 
     def track(x: np.ndarray | None, run: RunData, rest: np.ndarray | None = None) -> Track:
         machine = data.machine if x is None else teeth.machine(data.machine, deviation(x))
         return track_run(machine, data, run, None, evidence.step, levels, rest=rest)
 
-    starts = [np.log([gap, nominal[1], _DAMPING]) for gap in _GAPS]
+    starts = [np.log([gap, nominal[1], _DAMPING, nominal[3]]) for gap in _GAPS]
     none, *tracks = evidence.map(lambda x: track(x, stretches[0]), [None, *starts])
     order = sorted(range(len(starts)), key=lambda k: tracks[k].loss)
     if not tracks[order[0]].loss < none.loss:
         return None
 
-    def climbed(k: int) -> OptimizeResult:
+    def first(x: np.ndarray) -> float:
         """On one stretch, together with where the drive rests as it begins."""
-        answer = OptimizeResult(x=np.append(starts[k], tracks[k].rest))
-        for size in _SIMPLEXES:  # the simplex shrinks into a dent: once more from there
-            answer = _simplex(
-                lambda x: track(x, stretches[0], np.clip(x[3:], -1.0, 1.0)).loss, answer.x, size
-            )
-        return answer
+        return track(x, stretches[0], np.clip(x[size:], -1.0, 1.0)).loss
 
-    best = min(evidence.map(climbed, order[:_STARTS]), key=lambda answer: answer.fun).x[:3]
+    def climbed(k: int) -> OptimizeResult:
+        return _simplex(first, np.append(starts[k], tracks[k].rest), _SIMPLEXES[0])
+
+    best = min(evidence.map(climbed, order[:_STARTS]), key=lambda answer: answer.fun)
+    if rival and best.fun > track_run(rival, data, stretches[0], None, evidence.step, levels).loss:
+        return None
+    # the simplex shrinks into a dent: once more from there
+    best = _simplex(first, best.x, _SIMPLEXES[-1]).x[:size]
     rests = evidence.map(lambda run: track(best, run).rest, stretches)
 
     def loss(x: np.ndarray) -> float:

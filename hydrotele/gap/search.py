@@ -20,7 +20,7 @@ import numpy as np
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.calibration import CALIBRATION, calibration, numbers
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
-from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.hypothesis import Guess, Hypothesis, with_shape
 from hydrotele.estimate.levels import input_excess, noise_prior
 from hydrotele.estimate.track import COARSE, Levels, Track, track_run
 from hydrotele.gap.calibrating import (
@@ -55,6 +55,7 @@ from hydrotele.gap.rivals import (
     worth_naming,
 )
 from hydrotele.gap.screening import Screened, has_unexplained_impacts, rattling, screen, timed
+from hydrotele.machine.machine import Machine
 
 _MUCH = 2.0  # RMS of the errors without unknown inputs, over noise, from which much is lacking
 _TRIED = 5  # candidates that are fitted
@@ -102,7 +103,7 @@ def without_inputs(
         after = _alone(evidence, fits[0].guess)
         if _excess(after) > (1.0 - _PART) * _excess(now):
             break
-        now = after
+        now = _shaped_alone(evidence, after)
         if _rms(now) <= _MUCH or len(now.guess.parts) == 1:
             options.append(_option(evidence, base, now))
     if now.guess.parts and _rms(now) > _MUCH:
@@ -133,6 +134,45 @@ def _beside_calibration(
         slopes = evidence.base_slopes(evidence.step_of(guess, COARSE))
         guess = evidence.fit(guess, 0.0, step=evidence.step_of(guess, MIDDLE), kept=slopes).guess
     return [_option(evidence, base, _alone(evidence, guess))]
+
+
+def _shaped(guess: Guess, machine: Machine) -> Guess | None:
+    """A guess whose last effect has its optional numbers to fit, too; None if it has none."""
+    hypothesis, deviation = guess.parts[-1]
+    whole = with_shape(hypothesis, machine)
+    if whole is None:
+        return None
+    more = np.zeros(whole.size - hypothesis.size)
+    return Guess(guess.parts[:-1]).plus(whole, np.append(deviation, more))
+
+
+def _shaped_alone(evidence: Evidence, now: Judged) -> Judged:
+    """The last effect with the shape that it needs, as long as nothing unknown acts.
+
+    A spring with another damping than usual may be taken for teeth, which are looked for for
+    minutes.
+    """
+    guess = _shaped(now.guess, evidence.data.machine)
+    if guess is None:
+        return now
+    evidence.set_base(now)
+    fit = evidence.fit(guess, 0.0, step=evidence.step_of(guess, MIDDLE))
+    after = _alone(evidence, fit.guess)
+    cost = occam_penalty(fit.information, guess.hypotheses[-1].size)
+    return after if after.loss + cost < now.loss - ENTER else now
+
+
+def _shaped_settled(evidence: Evidence, now: Judged, fit: Fit) -> tuple[Judged, Fit]:
+    """The same where noise levels follow: with its shape if that is likelier."""
+    guess = _shaped(now.guess, evidence.data.machine)
+    if guess is None:
+        return now, fit
+    other, settled = fit_until_settled(evidence, evidence.judged(guess, same=True))
+    costs = [occam_penalty(f.information, len(f.information)) for f in (settled, fit)]
+    if other.loss + costs[0] < now.loss + costs[1] - ENTER:
+        return other, settled
+    evidence.set_base(now)
+    return now, fit
 
 
 def _alone(evidence: Evidence, guess: Guess) -> Judged:
@@ -313,6 +353,7 @@ def _grow(
             added = best.guess.parts[-1][0]
             tell(f"fit {added.name.replace('_', ' ')}", done + 0.02)
             grown, settled = fit_until_settled(evidence, best)
+            grown, settled = _shaped_settled(evidence, grown, settled)
             worth = now.loss - grown.loss - settled.occam_penalty
             last = len(grown.guess.parts) - 1
             if moved and best.guess.hypotheses == moved[0].hypotheses:

@@ -28,6 +28,7 @@ from hydrotele.hydraulics.actuator import (
     pumped_volumes,
 )
 from hydrotele.hydraulics.laws import (
+    air_compliance,
     port_flow,
     pressure_with_air,
     pressure_without_air,
@@ -82,7 +83,7 @@ _SLEW, _PORT = int(Slot.SLEW_LIMIT), int(Slot.PORT_RELIEF)
 _KR, _KM = int(Slot.RELIEF_GAIN), int(Slot.MAKEUP_GAIN)
 _BETA, _TANK = int(Slot.BULK_MODULUS), int(Slot.TANK_PRESSURE)
 _HOSE, _AIR = int(Slot.HOSE_COMPLIANCE), int(Slot.AIR_RELEASE)
-_ONSET = int(Slot.AIR_ONSET)
+_ONSET, _ENTRAINED = int(Slot.AIR_ONSET), int(Slot.ENTRAINED_AIR)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 _ADDED, _PUMP = int(Slot.ADDED_DELIVERY), int(Slot.PUMP_FLOW)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
@@ -90,15 +91,18 @@ _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
 @inlined
-def _chamber_stiffness(user, u, x):
-    """Pressure per volume of both chambers, oil and hose [Pa/m^3]."""
+def _chamber_stiffness(user, u, x, p_head, p_rod):
+    """Pressure per volume of both chambers, oil, hose and the air in the oil [Pa/m^3]."""
     beta = user[u + _BETA]
     volume_head, volume_rod = user[u + _VH], user[u + _VR]
     if user[u + 1] == 1.0:  # Kind.CYLINDER
         inside = min(max(x, 0.0), user[u + _STROKE])
         volume_head += user[u + _AH] * inside
         volume_rod += user[u + _AR] * (user[u + _STROKE] - inside)
-    hose = beta * user[u + _HOSE]
+    hose, air = beta * user[u + _HOSE], user[u + _ENTRAINED]
+    if air > 0.0:
+        volume_head *= 1.0 + beta * air_compliance(p_head, air)
+        volume_rod *= 1.0 + beta * air_compliance(p_rod, air)
     return beta / (volume_head + hose), beta / (volume_rod + hose)
 
 
@@ -110,7 +114,8 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     them says `laws.pressure_with_air`.
 
     `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`,
-    where a hose of compliance C_h counts as `beta C_h` of volume. Beyond an end of the stroke the
+    where a hose of compliance C_h counts as `beta C_h` of volume, and air in the oil as what it
+    gives (`laws.air_compliance`) times beta. Beyond an end of the stroke the
     volumes stay what they are at that end.
 
     Args:
@@ -140,7 +145,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     tank, makeup_gain = user[u + _TANK], user[u + _KM]
     r_head, k_head = port_flow(p_head, port, relief_gain, tank, makeup_gain)
     r_rod, k_rod = port_flow(p_rod, port, relief_gain, tank, makeup_gain)
-    head, rod = _chamber_stiffness(user, u, x)
+    head, rod = _chamber_stiffness(user, u, x, p_head, p_rod)
     rate_head = head * (q_head - user[u + _AH] * v - leak + r_head + added[0])
     rate_rod = rod * (q_rod + user[u + _AR] * v + leak + r_rod + added[1])
     if k_head == 0.0:
@@ -276,7 +281,7 @@ def step_circuit(
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
     coupled = supply_coupling(user, first, count, scratch, p_start, scratch[_FACTORS:])
     if coupled:
-        _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch)
+        _begin_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch)
         _couple(count, act_dot, scratch)
     for i in range(count):
         u, a, k = (first + i) * SLOTS, 4 * i, _FIRST + 2 * i
@@ -319,10 +324,10 @@ def step_circuit(
         rod = 1.5 * scratch[k + 1] + 0.5 * act_dot[a + 3]
         port = user[u + _PORT]
         if act[a + 2] < port < act[a + 2] + dt * head:
-            stiffness = _chamber_stiffness(user, u, length[first + i])[0]
+            stiffness = _chamber_stiffness(user, u, length[first + i], port, act[a + 3])[0]
             head = _relieved(port - act[a + 2], head, stiffness * user[u + _KR], dt)
         if act[a + 3] < port < act[a + 3] + dt * rod:
-            stiffness = _chamber_stiffness(user, u, length[first + i])[1]
+            stiffness = _chamber_stiffness(user, u, length[first + i], act[a + 2], port)[1]
             rod = _relieved(port - act[a + 3], rod, stiffness * user[u + _KR], dt)
         act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], head, dt)
         act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], rod, dt)
@@ -368,7 +373,7 @@ def _softening_ahead(user, u, pressure, rate, dt):
 
 
 @allocation_free
-def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
+def _begin_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch):
     """What a supply pressure of 1 Pa more adds to the stage rates of the fed chambers.
 
     Of `(I - gamma h (D + b w^T)) k = r` with D diagonal, b the rates per supply pressure and
@@ -382,8 +387,9 @@ def _begin_coupling(user, first, count, length, velocity, dt, gamma_h, scratch):
         if scratch[f + 2] == 0.0:
             continue
         head, rod = _chamber_stiffness(
-            user, (first + i) * SLOTS, length[first + i] - dt * velocity[first + i]
-        )
+            user, (first + i) * SLOTS, length[first + i] - dt * velocity[first + i],
+            act[4 * i + 2], act[4 * i + 3],
+        )  # fmt: skip
         own = gamma_h * scratch[f + 2]
         own *= head * scratch[f] if scratch[4 * i + 3] > 0.0 else rod * scratch[f + 1]
         k = _FIRST + 2 * i

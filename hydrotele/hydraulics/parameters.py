@@ -52,6 +52,7 @@ class Slot(enum.IntEnum):
     TANK_PRESSURE = enum.auto()
     AIR_RELEASE = enum.auto()
     AIR_ONSET = enum.auto()
+    ENTRAINED_AIR = enum.auto()
     RELIEF_PRESSURE = enum.auto()
     PUMP_FLOW = enum.auto()
     COULOMB = enum.auto()
@@ -288,6 +289,7 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     _write_holding(numbers, Slot.HOLDING_ROD, axis.load_holding.rod)
     numbers[Slot.BULK_MODULUS] = supply.bulk_modulus
     numbers[Slot.AIR_RELEASE] = supply.dissolved_air * supply.bulk_modulus
+    numbers[Slot.ENTRAINED_AIR] = supply.entrained_air
     numbers[Slot.TANK_PRESSURE] = supply.tank_pressure
     numbers[Slot.RELIEF_PRESSURE] = supply.relief_pressure
     numbers[Slot.PUMP_FLOW] = supply.pump_flow

@@ -85,7 +85,8 @@ class Supply(Facts):
     With a `time_constant` [s] the pump's displacement follows what the valves draw with a
     first-order lag, as a swash plate does; 0: at once. `dissolved_air` is the volume of air, at
     atmosphere, per volume of oil that the oil gives off where it is drawn below atmosphere (mineral
-    oil: 0.07 .. 0.10).
+    oil: 0.07 .. 0.10). `entrained_air` is the volume of the bubbles in it, at atmosphere, per
+    volume of oil: oil with air in it is soft where the pressure is low.
     """
 
     kind: Literal["constant_flow", "load_sensing", "constant_pressure"] = "constant_flow"
@@ -97,6 +98,7 @@ class Supply(Facts):
     time_constant: NonNegative = 0.0
     bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
     dissolved_air: Annotated[float, Field(ge=0.001, le=0.5)] = 0.09
+    entrained_air: Annotated[float, Field(ge=0.0, le=0.2)] = 0.0
 
     @model_validator(mode="after")
     def _check(self):

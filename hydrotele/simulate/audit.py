@@ -9,7 +9,7 @@ import numpy as np
 from mujoco import rollout
 
 from hydrotele.hydraulics.circuit import ACTIVATIONS
-from hydrotele.hydraulics.laws import port_flow, pressure_without_air
+from hydrotele.hydraulics.laws import air_compliance, port_flow, pressure_without_air
 from hydrotele.hydraulics.pump import oil_compliance, switched_speed
 from hydrotele.simulate.closure import pin_count
 from hydrotele.simulate.mechanism import drive_and_load_dofs
@@ -101,7 +101,9 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
         net = inflow + port - swept
         entered = np.sum(0.5 * dt * (net[1:] + net[:-1]))
         middle = 0.5 * (volume[1:] + volume[:-1])
-        soft = middle / supply.bulk_modulus + drive.hose_compliance
+        halfway = 0.5 * (pressure[1:] + pressure[:-1])
+        bubbles = np.array([air_compliance(p, supply.entrained_air) for p in halfway])
+        soft = middle * (1.0 / supply.bulk_modulus + bubbles) + drive.hose_compliance
         oil = np.array([pressure_without_air(p, release) for p in pressure])
         compressed = np.sum(soft * np.diff(oil))
         through = np.sum(np.abs(inflow) + np.abs(port) + np.abs(swept)) * dt

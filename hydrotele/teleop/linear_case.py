@@ -166,7 +166,10 @@ def _inertia(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def _turning_stiffness(arm: ArmBalance, valve: int) -> float:
-    """Stiffness of a joint on its drive's oil [N m/rad], after `place`."""
+    """Stiffness of a joint on its drive's oil [N m/rad], after `place`.
+
+    Without bubbles: how soft they make the oil depends on pressures, of which none are known here.
+    """
     user = arm.model.user[valve * SLOTS : (valve + 1) * SLOTS]
     head, rod = user[Slot.VOLUME_HEAD], user[Slot.VOLUME_ROD]
     if user[Slot.KIND] == Kind.CYLINDER:

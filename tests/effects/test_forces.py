@@ -226,12 +226,13 @@ def test_units_follow_the_drive():
 
     machine, emps = load_machine("cat215"), load_machine("emps")
     units = {
-        ("viscous_friction", "swing"): "N m s/rad", ("viscous_friction", "boom"): "N s/m",
-        ("coulomb_friction", "swing"): "N m", ("coulomb_friction", "boom"): "N",
-        ("joint_flexibility", "swing"): "rad/(N m)", ("joint_flexibility", "boom"): "m/N",
-        ("angle_offset", "boom"): "rad",
+        ("viscous_friction", "swing"): ["N m s/rad"], ("viscous_friction", "boom"): ["N s/m"],
+        ("coulomb_friction", "swing"): ["N m"], ("coulomb_friction", "boom"): ["N"],
+        ("joint_flexibility", "swing"): ["rad/(N m)", "kg m^2", "1"],
+        ("joint_flexibility", "boom"): ["m/N", "kg", "1"],
+        ("angle_offset", "boom"): ["rad"],
     }  # fmt: skip
-    for (name, place), unit in units.items():
-        assert [p.unit for p in EFFECTS[name].parameters(machine, place).values()] == [unit]
+    for (name, place), expected in units.items():
+        assert [p.unit for p in EFFECTS[name].parameters(machine, place).values()] == expected
     assert EFFECTS["coulomb_friction"].parameters(emps, "slide")["coulomb"].unit == "N"
     assert EFFECTS["angle_offset"].parameters(emps, "slide")["offset"].unit == "m"

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.effects import apply_effect
-from hydrotele.effects.transmission import load_inertia
+from hydrotele.effects import EFFECTS, apply_effect
+from hydrotele.effects.transmission import load_inertia, resolved_inertia
 from hydrotele.hydraulics.circuit import SLOTS, actuator_friction, settled_friction
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.replay import replay_log
@@ -111,6 +111,41 @@ def test_a_flexible_cylinder_gives_by_force_times_compliance(compliance):
     # it stands: what accelerates is the softness of the pins, as on the rigid machine
     assert np.abs(data.qacc).max() < 1.5 * np.abs(still.qacc).max()
     assert list(independent_dofs(machine, plant.model)) == sorted(plant.dof)
+
+
+def test_a_spring_may_be_shaped_by_its_drives_inertia_and_damping():
+    """Left out, they are what the library takes; with the compliance none, nothing changes."""
+    plain = apply_effect(MACHINE, "joint_flexibility", "swing", {"compliance": 1e-7})
+    usual = plain.axes["swing"].transmission
+    ratio = usual.damping / (2.0 * math.sqrt(usual.stiffness * usual.inertia))
+    values = {"compliance": 1e-7, "drive_inertia": 0.5 * usual.inertia, "damping_ratio": 3 * ratio}
+    shaped = apply_effect(MACHINE, "joint_flexibility", "swing", values).axes["swing"].transmission
+    assert (shaped.stiffness, shaped.backlash) == (usual.stiffness, 0.0)
+    assert shaped.inertia == pytest.approx(0.5 * usual.inertia)
+    assert shaped.damping == pytest.approx(3 * math.sqrt(0.5) * usual.damping)
+    rigid = apply_effect(MACHINE, "joint_flexibility", "swing", {**values, "compliance": 0.0})
+    assert rigid == MACHINE
+
+
+@pytest.mark.parametrize("compliance", [2e-8, 3e-7, 1e-6])
+def test_a_drive_as_heavy_as_usual_need_not_be_stated(compliance):
+    """The rig's rod, 3 kg, is lighter than what its oil can be stepped with: 23 kg, then usual."""
+    machine = load_machine("rig")
+    table = EFFECTS["joint_flexibility"].parameters(machine, "slide")
+    least = resolved_inertia(machine, "slide", 0.0, 0.0)
+    assert table["drive_inertia"].nominal == table["drive_inertia"].low == least > 20.0
+    given = {"compliance": compliance}
+    stated = {**given, **{key: table[key].nominal for key in ("drive_inertia", "damping_ratio")}}
+    short, long = (apply_effect(machine, "joint_flexibility", "slide", v) for v in (given, stated))
+    assert short == long
+
+
+@pytest.mark.parametrize("frequency", [20.0, 80.0])
+def test_teeth_ring_with_the_frequency_of_their_contact(frequency):
+    teeth = apply_effect(
+        MACHINE, "backlash", "swing", {"gap": GAP, "contact_frequency": frequency}
+    ).axes["swing"].transmission  # fmt: skip
+    assert math.sqrt(teeth.stiffness / teeth.inertia) == pytest.approx(2 * math.pi * frequency)
 
 
 def test_length_reads_the_piston_and_angle_the_load():

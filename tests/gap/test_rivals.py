@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hydrotele.estimate.evidence import Evidence
-from hydrotele.estimate.hypothesis import Guess, hypotheses
-from hydrotele.gap.rivals import is_case_of
+from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses, with_shape
+from hydrotele.gap.rivals import is_case_of, worth_naming
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
 
@@ -33,3 +33,19 @@ def test_a_number_is_a_case_of_its_numbers_by_direction(evidence, name, other, c
     table = {h.key: h for h in hypotheses(evidence.data.machine)}
     guess = Guess(((table[name, "stick"], np.ones(1)),))
     assert is_case_of(evidence, guess, 0, table[other, "stick"]) is case
+
+
+@pytest.mark.parametrize(("gap", "worth"), [(1.8e-4, False), (1.2e-3, True)])
+def test_what_shapes_an_effect_does_not_make_it_one(gap, worth):
+    """A gap of a fifth of the least with a drive that is lighter and damped: a spring, no teeth."""
+    machine = load_machine("cat215")
+    (teeth,) = (h for h in hypotheses(machine, ("backlash",)) if h.location == "swing")
+    whole = with_shape(teeth, machine)
+    assert isinstance(whole, Hypothesis) and whole.size > teeth.size
+    deviation = np.array([gap / whole.parameters["gap"].scale, -0.9, 3.0, 0.0])
+    assert worth_naming(Guess(((whole, deviation),)), 0, 1e4) is worth
+
+
+def test_an_effect_without_optional_numbers_has_no_other_shape():
+    (offset, *_) = hypotheses(load_machine("cat215"), ("angle_offset",))
+    assert with_shape(offset, load_machine("cat215")) is None

@@ -135,6 +135,34 @@ def test_however_fast_it_is_drawn_the_pressure_stays_above_vacuum(boom):
         assert states.min() < 0.0, "nothing cavitates here"
 
 
+@pytest.mark.parametrize("bubbles", [0.005, 0.05])
+def test_bubbles_give_way_by_the_volume_that_they_lose(boom, bubbles):
+    """A closed chamber that is squeezed: oil by beta, air by p V^1.4 = const, written anew.
+
+    1 %: the volume, which shrinks by as much, counts at its mean here.
+    """
+    boom[[Slot.MAKEUP_GAIN, Slot.LEAKAGE]] = 0.0
+    boom[Slot.ENTRAINED_AIR] = bubbles
+    beta, area = boom[Slot.BULK_MODULUS], boom[Slot.AREA_ROD]
+    start, speed, seconds = 1.0e6, 0.05, 0.1
+
+    def motion(time):
+        return 0.6 + speed * time, speed
+
+    rod = run(boom, motion, 2.5e-4, seconds)[:, 1]
+
+    def swept(p):  # at the mean volume of the chamber, which changes by half a per cent
+        middle = boom[Slot.VOLUME_ROD] + area * (boom[Slot.STROKE] - motion(0.5 * seconds)[0])
+        share = (ATMOSPHERE / (ATMOSPHERE + np.array([start, p]))) ** (1.0 / 1.4)
+        return middle * ((p - start) / beta + bubbles * (share[0] - share[1]))
+
+    expected = brentq(lambda p: swept(p) - area * speed * seconds, start, 1.0e8)
+    assert rod[-1] == pytest.approx(expected, rel=0.01)
+    stiff = boom.copy()
+    stiff[Slot.ENTRAINED_AIR] = 0.0
+    assert run(stiff, motion, 2.5e-4, seconds)[-1, 1] > rod[-1] + 1e5
+
+
 def test_a_machine_above_atmosphere_knows_nothing_of_its_air(boom):
     """Not a bit changes with the amount of air where no chamber is drawn empty."""
     ends = []
