@@ -33,6 +33,7 @@ STRIBECK = (
     0.1,
     0.3,
 )  # of a joint's RMS rate: Stribeck velocities that are tried
+_DRY = ("coulomb", "stribeck")  # terms of dry friction
 _ROWS = 5.0  # rows per period of the band that columns of small differences need
 _SMOOTH = 1.5  # times the band, to which rates of late positions are smoothed before
 _READINGS = 20.0  # rows per period of the band that all else needs; more are averaged
@@ -269,7 +270,8 @@ def _run_columns(
     rate = fftconvolve(lengths.rate, smooth[:, None], mode="same", axes=0)
     measured = np.stack([lengths.value, rate])[:, rows]
     value = table.nominal + [about.get(name, 0.0) for name in table.names]
-    late = _Differences(setup, whole, measured, raw.axes, record.period * stride, value)
+    smooth_value = np.where([name.startswith(_DRY) for name in table.names], 0.0, value)
+    late = _Differences(setup, whole, measured, raw.axes, record.period * stride, smooth_value)
     names, slow = late.columns(sizes)
     extra = _onto(slow, band, record.period * stride, own.time)
     fine = np.stack([motion.value, motion.rate, motion.acceleration])
@@ -277,10 +279,15 @@ def _run_columns(
     quick = _onto(quick, band, record.period, own.time)
     for k, name in enumerate(more):
         kind, _, drive = name.partition(".")
+        column = f"coulomb.{drive}"
         if kind == "sharpness":
-            quick[:, :, k] -= own.matrix[:, :, table.names.index(f"coulomb.{drive}")]
-    names = [*names, *more]
-    extra = np.concatenate([extra, quick], axis=2)
+            quick[:, :, k] -= own.matrix[:, :, table.names.index(column)]
+        if kind == "turn" and f"delay.position.{drive}" in names:
+            dry = value[table.names.index(column)]
+            extra[:, :, names.index(f"delay.position.{drive}")] += dry * quick[:, :, k]
+    kept = [k for k, name in enumerate(more) if not name.startswith("turn.")]
+    names = [*names, *(more[k] for k in kept)]
+    extra = np.concatenate([extra, quick[:, :, kept]], axis=2)
     low, thin = low_pass(band, record.period)
     force = low_passed_forces(record.force, record.period, low, thin)
     matrix = np.concatenate([own.matrix, extra], axis=2)
@@ -307,6 +314,7 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, band
 
     What dry friction does where it turns may be nearer to the sign of the rate in the band than to
     the sign expected of the uncertain rate: `sharpness` is the first, of which the second is taken.
+    `turn` is the rate of the sign, which a late position of the drive shifts.
     """
     chain = setup.chain
     found = project(chain, setup.given, *motion)
@@ -328,7 +336,8 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, band
         speed = sizes[drive][2] if drive in sizes else float(np.sqrt(np.mean(rate**2)))
         if drive in rubs:
             calm = fftconvolve(rate, low, mode="same")
-            names.append(f"sharpness.{drive}")
+            names += [f"turn.{drive}", f"sharpness.{drive}"]
+            out.append(np.gradient(share * np.sign(rate)[:, None], period, axis=0))
             out.append(share * np.sign(calm)[:, None])
         for number, part in enumerate(STRIBECK):
             shape = np.exp(-((rate / (part * speed)) ** 2)) * np.sign(rate)
@@ -339,7 +348,11 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, band
 
 @dataclass(frozen=True)
 class _Differences:
-    """Columns by small differences, along every few rows of one run."""
+    """Columns by small differences, along every few rows of one run.
+
+    `value` is without dry friction, whose sign is that of the measured rates: differences of it are
+    all or nothing.
+    """
 
     setup: RegressorSetup
     motion: np.ndarray
