@@ -17,6 +17,8 @@ from scipy.stats import chi2
 from hydrotele.gap.mechanism_columns import Columns
 from hydrotele.gap.mechanism_effects import TYPICAL, MechanismEffect, strengths
 from hydrotele.identify.estimation import autoregression, find_doubtful, weights
+from hydrotele.identify.mechanism import Mechanism
+from hydrotele.multibody.regressor import BODY_PARAMETERS
 
 _ROUNDS, _STEPS = 3, 40
 _STICKS = 0.25  # doubt of a sign from which a drive counts as sticking
@@ -24,6 +26,10 @@ _PARTS, _LONG = 3, 2.0  # parts of the fitted runs that an effect must be alike 
 # how long they are at most [s]
 _VARIES, _CHANCE = 0.6, 1e-3  # share of an effect by which it differs from part to part, where it
 # counts as one that is not constant, and the chance of that by noise
+
+
+_SLOW = 0.1  # share of a drive's Coulomb friction by which its form near rest may differ
+_SHARP = 0.5  # of the way from the expected sign of an uncertain rate to the sign of a calm one
 
 
 @dataclass(frozen=True)
@@ -424,6 +430,42 @@ def _slope(along, p: np.ndarray, scale: np.ndarray) -> np.ndarray:
         away[k] = step
         out.append((along(p + away) - along(p - away)) / (2.0 * step))
     return np.stack(out, axis=1)
+
+
+def possible_errors(mechanism: Mechanism, columns: Columns, share: float = 1.0) -> dict[str, float]:
+    """By how much numbers of the model may be off: column -> standard deviation.
+
+    Masses, moments and inertias by the mapping's uncertainty of the body's own, friction by that of
+    its own; forces and positions may be half a row apart in time, dry friction near rest is never
+    known as well as far from it, and where it turns by no more than twice the band resolves: a
+    drive brakes harder than it starts, so that its smoothed rate passes zero late.
+
+    Args:
+        mechanism: the given model.
+        columns: of its runs.
+        share: of the stated uncertainty.
+
+    Returns:
+        The standard deviations.
+    """
+    off, chain, out = share * mechanism.mapping.uncertainty, mechanism.setup.chain, {}
+    for body, ten in zip(chain.bodies, chain.inertia, strict=True):
+        mass, spread = float(ten[0]), float(ten[4] + ten[7] + ten[9]) / 2.0
+        reach = np.sqrt(max(spread, 0.0) * max(mass, 0.0))
+        for kind in BODY_PARAMETERS:
+            own = mass if kind == "mass" else reach if kind.startswith("moment") else spread
+            out[f"{kind}.{body}"] = off * own
+    for one in mechanism.setup.rubbing:
+        for kind, value in one.nominal.items():
+            out[f"{kind}.{one.place}"] = off * abs(value)
+        if one.place in chain.drives:
+            dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
+            out[f"stribeck0.{one.place}"] = out[f"stribeck2.{one.place}"] = _SLOW * dry
+            out[f"sharpness.{one.place}"] = _SHARP * dry
+    for joint in mechanism.setup.drive_inertia:
+        out[f"drive_inertia.{joint}"] = off * abs(float(chain.armature[chain.index(joint)]))
+    out["delay.force"] = 0.5 * columns.row
+    return out
 
 
 def gather_evidence(columns: Columns, noise: Noise, off: dict[str, float]) -> Evidence:

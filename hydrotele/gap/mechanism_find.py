@@ -32,6 +32,7 @@ from hydrotele.gap.mechanism_evidence import (
     find_noise,
     gather_evidence,
     noise_of,
+    possible_errors,
     row_weights,
     whitened,
 )
@@ -73,7 +74,6 @@ _SHARES = (1.0, 0.5, 0.25, 0.1)  # of the stated uncertainty that are tried: how
 # are off is found, too
 _CALIBRATED = 10.0  # twice the log odds from which numbers of the model count as off
 _TOLD = 3.0  # standard deviations from which a calibrated number is told
-_SLOW = 0.1  # share of a drive's Coulomb friction by which its form near rest may differ
 _NORMAL95 = 1.96
 _SPOILT = -4.0  # standard deviations by which an effect may better the held-out run too little
 _WORSE = 1.02  # times the given model's errors on the held-out run: no patch may do more
@@ -88,7 +88,6 @@ _DIFFERS = (
     "{} at {}, which the fitted runs asked for, is not the same in all parts of them ({} {} {});"
     " it was taken back."
 )
-_SHARP = 0.5  # of the way from the expected sign of an uncertain rate to the sign of a calm one
 _TURNS = 0.05  # doubt of a sign from which what is left may be the form of dry friction near rest
 _LISTED = 3  # notes of that kind
 METRIC = "RMS of the errors of the drives' forces over their noise, all drives, held-out run"
@@ -326,42 +325,6 @@ def nominal_parameters(mechanism: Mechanism) -> dict[str, float]:
         out |= {f"{kind}.{one.place}": float(value) for kind, value in one.nominal.items()}
     for joint in setup.drive_inertia:
         out[f"drive_inertia.{joint}"] = float(chain.armature[chain.index(joint)])
-    return out
-
-
-def possible_errors(mechanism: Mechanism, columns: Columns, share: float = 1.0) -> dict[str, float]:
-    """By how much numbers of the model may be off: column -> standard deviation.
-
-    Masses, moments and inertias by the mapping's uncertainty of the body's own, friction by that of
-    its own; forces and positions may be half a row apart in time, dry friction near rest is never
-    known as well as far from it, and where it turns by no more than twice the band resolves: a
-    drive brakes harder than it starts, so that its smoothed rate passes zero late.
-
-    Args:
-        mechanism: the given model.
-        columns: of its runs.
-        share: of the stated uncertainty.
-
-    Returns:
-        The standard deviations.
-    """
-    off, chain, out = share * mechanism.mapping.uncertainty, mechanism.setup.chain, {}
-    for body, ten in zip(chain.bodies, chain.inertia, strict=True):
-        mass, spread = float(ten[0]), float(ten[4] + ten[7] + ten[9]) / 2.0
-        reach = np.sqrt(max(spread, 0.0) * max(mass, 0.0))
-        for kind in BODY_PARAMETERS:
-            own = mass if kind == "mass" else reach if kind.startswith("moment") else spread
-            out[f"{kind}.{body}"] = off * own
-    for one in mechanism.setup.rubbing:
-        for kind, value in one.nominal.items():
-            out[f"{kind}.{one.place}"] = off * abs(value)
-        if one.place in chain.drives:
-            dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
-            out[f"stribeck0.{one.place}"] = out[f"stribeck2.{one.place}"] = _SLOW * dry
-            out[f"sharpness.{one.place}"] = _SHARP * dry
-    for joint in mechanism.setup.drive_inertia:
-        out[f"drive_inertia.{joint}"] = off * abs(float(chain.armature[chain.index(joint)]))
-    out["delay.force"] = 0.5 * columns.row
     return out
 
 

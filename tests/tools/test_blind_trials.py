@@ -33,7 +33,7 @@ MACHINE = load_machine("cat215", tool="none")
 def test_drawn_sizes_are_plausible_and_never_tiny():
     rng = np.random.default_rng(1)
     signs, names = set(), set()
-    for _ in range(300):
+    for _ in range(900):
         planted = draw_effect(MACHINE, rng)
         names.add(planted.name)
         known = EFFECTS[planted.name].parameters(MACHINE, planted.location)

@@ -76,10 +76,6 @@ OUTSIDE: dict[str, OutsideEffect] = {
             "force", _bore, outside_steps.bore_friction,
         ),
         OutsideEffect(
-            "entrained_air", "air bubbles: oil that is soft at low pressure and stiff at high",
-            "flow", _at(None, fraction=(0.01, 0.06)), outside_steps.entrained_air,
-        ),
-        OutsideEffect(
             "sticking_spool", "a spool that stays put until the command is off by a threshold",
             "valve", _at(None, threshold=(0.015, 0.08)), outside_steps.sticking_spool,
         ),

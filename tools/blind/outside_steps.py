@@ -7,15 +7,11 @@ change the actuators' numbers, activations or applied forces, and no code of the
 
 import math
 
-import numpy as np
-
 from hydrotele.hydraulics.circuit import Slot, circuit_scratch
 from hydrotele.hydraulics.laws import orifice
 from hydrotele.hydraulics.valve import axis_opening
 from hydrotele.simulate.record import state_supply
 
-_ATMOSPHERE = 1.013e5  # Pa
-_POLYTROPIC = 1.2
 _WARM_UP = 40.0  # s
 _REGULATOR = 0.05  # s, of a pump's torque control
 _TANK_LINE = 0.02  # s, filling of a tank line
@@ -29,25 +25,6 @@ def bore_friction(model, i, machine, location, p):
     def step(data):
         off = (data.actuator_length[i] - p["centre"]) / p["width"]
         user[Slot.COULOMB] = base + p["force"] * math.exp(-0.5 * off * off)
-
-    return step
-
-
-def entrained_air(model, i, machine, location, p):
-    """Compressibility `1/beta + fraction (p_0/p)^(1/n) / (n p)`: scales what a step has added."""
-    beta = model.actuator_user[i, Slot.BULK_MODULUS]
-    before = np.full(2, np.nan)
-
-    def step(data):
-        act = data.act
-        for side in (0, 1):
-            place = 4 * i + 2 + side
-            if np.isfinite(before[side]):
-                bar = max(before[side], _ATMOSPHERE)
-                share = (_ATMOSPHERE / bar) ** (1.0 / _POLYTROPIC)
-                air = p["fraction"] * share / (_POLYTROPIC * bar)
-                act[place] = before[side] + (act[place] - before[side]) / (1.0 + beta * air)
-            before[side] = act[place]
 
     return step
 
