@@ -28,11 +28,7 @@ from hydrotele.identify.setup import RegressorSetup
 from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.inverse_dynamics import project
 
-STRIBECK = (
-    0.03,
-    0.1,
-    0.3,
-)  # of a joint's RMS rate: Stribeck velocities that are tried
+STRIBECK = (0.03, 0.1, 0.3)  # of a joint's RMS rate: Stribeck velocities that are tried
 _DRY = ("coulomb", "stribeck")  # terms of dry friction
 _ROWS = 5.0  # rows per period of the band that columns of small differences need
 _SMOOTH = 1.5  # times the band, to which rates of late positions are smoothed before
@@ -270,24 +266,21 @@ def _run_columns(
     rate = fftconvolve(lengths.rate, smooth[:, None], mode="same", axes=0)
     measured = np.stack([lengths.value, rate])[:, rows]
     value = table.nominal + [about.get(name, 0.0) for name in table.names]
-    smooth_value = np.where([name.startswith(_DRY) for name in table.names], 0.0, value)
-    late = _Differences(setup, whole, measured, raw.axes, record.period * stride, smooth_value)
+    slippery = np.where([name.startswith(_DRY) for name in table.names], 0.0, value)
+    late = _Differences(setup, whole, measured, raw.axes, record.period * stride, slippery)
     names, slow = late.columns(sizes)
     extra = _onto(slow, band, record.period * stride, own.time)
     fine = np.stack([motion.value, motion.rate, motion.acceleration])
-    more, quick = _drive_columns(setup, fine, sizes, value, band, record.period)
+    of_drives, quick = _drive_columns(setup, fine, sizes, value, record.period)
     quick = _onto(quick, band, record.period, own.time)
-    for k, name in enumerate(more):
-        kind, _, drive = name.partition(".")
-        column = f"coulomb.{drive}"
-        if kind == "sharpness":
-            quick[:, :, k] -= own.matrix[:, :, table.names.index(column)]
-        if kind == "turn" and f"delay.position.{drive}" in names:
-            dry = value[table.names.index(column)]
-            extra[:, :, names.index(f"delay.position.{drive}")] += dry * quick[:, :, k]
-    kept = [k for k, name in enumerate(more) if not name.startswith("turn.")]
-    names = [*names, *(more[k] for k in kept)]
-    extra = np.concatenate([extra, quick[:, :, kept]], axis=2)
+    rubs, turns, calm = _dry_friction(setup, fine, band, record.period)
+    turns, calm = (_onto(one, band, record.period, own.time) for one in (turns, calm))
+    dry = [table.names.index(f"coulomb.{drive}") for drive in rubs]
+    for k, drive in enumerate(rubs):
+        if f"delay.position.{drive}" in names:
+            extra[:, :, names.index(f"delay.position.{drive}")] += value[dry[k]] * turns[:, :, k]
+    names = [*names, *of_drives, *(f"sharpness.{drive}" for drive in rubs)]
+    extra = np.concatenate([extra, quick, calm - own.matrix[:, :, dry]], axis=2)
     low, thin = low_pass(band, record.period)
     force = low_passed_forces(record.force, record.period, low, thin)
     matrix = np.concatenate([own.matrix, extra], axis=2)
@@ -309,21 +302,14 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
     return CubicSpline(own, passed, axis=0)(np.clip(time, own[0], own[-1]))
 
 
-def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, band, period: float):
-    """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m).
-
-    What dry friction does where it turns may be nearer to the sign of the rate in the band than to
-    the sign expected of the uncertain rate: `sharpness` is the first, of which the second is taken.
-    `turn` is the rate of the sign, which a late position of the drive shifts.
-    """
+def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, period: float):
+    """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m)."""
     chain = setup.chain
     found = project(chain, setup.given, *motion)
     passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.rest)
     base = setup.table(found).matrix @ value + np.einsum("nkv,nv->nk", found.share, passive)
     change = np.gradient(base, period, axis=0)
     names, out = ["delay.force"], [-change]
-    rubs = {one.place for one in setup.rubbing if "coulomb" in one.nominal}
-    low, _ = low_pass(band, period)
     for k, drive in enumerate(chain.drives):
         own = np.arange(len(chain.drives)) == k
         names += [f"scale.force.{drive}", f"delay.force.{drive}"]
@@ -334,11 +320,6 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, band
         names.append(f"spring.{drive}")
         out.append(share * (found.position[:, j, None] - middle))
         speed = sizes[drive][2] if drive in sizes else float(np.sqrt(np.mean(rate**2)))
-        if drive in rubs:
-            calm = fftconvolve(rate, low, mode="same")
-            names += [f"turn.{drive}", f"sharpness.{drive}"]
-            out.append(np.gradient(share * np.sign(rate)[:, None], period, axis=0))
-            out.append(share * np.sign(calm)[:, None])
         for number, part in enumerate(STRIBECK):
             shape = np.exp(-((rate / (part * speed)) ** 2)) * np.sign(rate)
             names.append(f"stribeck{number}.{drive}")
@@ -346,12 +327,29 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, band
     return names, np.stack(out, axis=2)
 
 
+def _dry_friction(setup: RegressorSetup, motion: np.ndarray, band: float, period: float):
+    """Where dry friction of d drives turns: their names, and twice (n, k, d), per unit of friction.
+
+    How fast its sign turns, which a late position of the drive delays; and the sign of the rate in
+    the band. That may be nearer to what friction does where it turns than the sign which is
+    expected of an uncertain rate.
+    """
+    chain, rubs = setup.chain, {one.place for one in setup.rubbing if "coulomb" in one.nominal}
+    drives = [drive for drive in chain.drives if drive in rubs]
+    found, places = project(chain, setup.given, *motion), [chain.index(name) for name in drives]
+    share, rate = found.share[:, :, places], found.rate[:, places]
+    low, _ = low_pass(band, period)
+    calm = fftconvolve(rate, low[:, None], mode="same", axes=0)
+    turns = np.gradient(share * np.sign(rate)[:, None], period, axis=0)
+    return drives, turns, share * np.sign(calm)[:, None]
+
+
 @dataclass(frozen=True)
 class _Differences:
     """Columns by small differences, along every few rows of one run.
 
-    `value` is without dry friction, whose sign is that of the measured rates: differences of it are
-    all or nothing.
+    `value` is without dry friction: that of the drives has the sign of the measured rates, and
+    differences of a sign are all or nothing.
     """
 
     setup: RegressorSetup

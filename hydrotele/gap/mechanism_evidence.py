@@ -26,8 +26,6 @@ _PARTS, _LONG = 3, 2.0  # parts of the fitted runs that an effect must be alike 
 # how long they are at most [s]
 _VARIES, _CHANCE = 0.6, 1e-3  # share of an effect by which it differs from part to part, where it
 # counts as one that is not constant, and the chance of that by noise
-
-
 _SLOW = 0.1  # share of a drive's Coulomb friction by which its form near rest may differ
 _SHARP = 0.5  # of the way from the expected sign of an uncertain rate to the sign of a calm one
 
@@ -437,8 +435,7 @@ def possible_errors(mechanism: Mechanism, columns: Columns, share: float = 1.0) 
 
     Masses, moments and inertias by the mapping's uncertainty of the body's own, friction by that of
     its own; forces and positions may be half a row apart in time, dry friction near rest is never
-    known as well as far from it, and where it turns by no more than twice the band resolves: a
-    drive brakes harder than it starts, so that its smoothed rate passes zero late.
+    known as well as far from it, nor how sharply it turns.
 
     Args:
         mechanism: the given model.

@@ -344,8 +344,8 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
         tell(f"{len(effects)} effects, round {turn + 1}", 0.2 * turn + 0.15)
         noise = find_noise(columns)
         tried = [_search(columns, noise, mechanism, one, effects, found) for one in shares]
-        many = 2.0 * np.log(max(len(effects), 1))
-        best = int(np.argmax([one.total - many * len(one.fitted.effects) for one in tried]))
+        choice = 2.0 * np.log(max(len(effects), 1))  # of one effect among all
+        best = int(np.argmax([one.total - choice * len(one.fitted.effects) for one in tried]))
         found, shares = tried[best], shares[best : best + 1]
         if columns.gap.size < _SCARCE * len(columns.names):
             noise = noise_of(_unexplained(found), columns)
