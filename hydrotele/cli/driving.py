@@ -3,9 +3,10 @@
 import contextlib
 import os
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from hydrotele.cli.console import first_interrupt, notes, out, print_json
 from hydrotele.cli.haptic import own_device, print_latency
@@ -73,19 +74,14 @@ def drive_to_folder(wishes: DriveOptions) -> Path:
     return _driven(wishes)
 
 
-def _driven(wishes: DriveOptions) -> Path:
-    """One drive."""
+def _driven(wishes: DriveOptions, alone: Mapping[str, Any] = MappingProxyType({})) -> Path:
+    """One drive; `alone` is what the computer misses without it, see `computer_alone`."""
     scenario = _scenario(wishes)
     target = wishes.target or Path("runs", scenario.name)
     check_target(target, "run")
     machine = scenario_machine(scenario)
     further = tuple(further_axes(machine))
-    haptic, alone = _is_haptic(wishes), {}
-    if wishes.latency:
-        seconds = min(_ALONE[1], max(_ALONE[0], scenario.duration / 3.0))
-        notes.print(f"a loop without work for {seconds:.0f} s, then the drive", style="dim")
-        alone = computer_alone(seconds, scenario.control_rate, _PRIORITY)
-    if haptic:
+    if _is_haptic(wishes):
         device = HapticHandle(*haptic_address(wishes.device), len(further))
         pacer = Deadlines(scenario.ticks, _PRIORITY)
     else:
@@ -105,7 +101,7 @@ def _driven(wishes: DriveOptions) -> Path:
         }  # fmt: skip
         result.summary["haptic"] = {
             "machine": machine_side, "line": result.summary["haptic"],
-            "computer": alone | _stolen(stolen, clock.monotonic() - begun),
+            "computer": {**alone, **_stolen(stolen, clock.monotonic() - begun)},
         }  # fmt: skip
     _write(result, target, wishes)
     return target
@@ -124,14 +120,23 @@ def _stolen(before: float | None, seconds: float) -> dict[str, float | None]:
 def _measured_latency(wishes: DriveOptions) -> Path:
     """A drive whose latency is shown; beside a simulated device of its own if none is named."""
     if _is_haptic(wishes):
-        return _driven(wishes)
+        return _driven(wishes, _alone(_scenario(wishes).duration))
     if wishes.device != "keyboard":
         message = "has no force output to measure: leave --device out, or name haptic:HOST:PORT"
         raise InputError(f"--latency with --device {wishes.device}", message)
+    duration = LATENCY if wishes.duration is None else wishes.duration
+    _scenario(wishes)  # what is wrong is told at once
+    alone = _alone(duration)  # a device that is just starting has more priority and much to load
     with own_device() as (host, port):
-        duration = LATENCY if wishes.duration is None else wishes.duration
         own = {"device": f"{HAPTIC}:{host}:{port}", "duration": duration}
-        return _driven(wishes._replace(viewer=False, review=False, **own))
+        return _driven(wishes._replace(viewer=False, review=False, **own), alone)
+
+
+def _alone(duration: float) -> dict[str, Any]:
+    """What a loop without work misses, in a third of a drive's duration [s]."""
+    seconds = min(_ALONE[1], max(_ALONE[0], duration / 3.0))
+    notes.print(f"a loop without work for {seconds:.0f} s, then the drive", style="dim")
+    return computer_alone(seconds, RATE, _PRIORITY)
 
 
 def _is_haptic(wishes: DriveOptions) -> bool:

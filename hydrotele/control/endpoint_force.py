@@ -460,6 +460,8 @@ class EndpointForce:
             Names such as `joint.boom`, `pressure_head.boom`.
         """
         r, calls = self._readings, duration / self._readings.period
+        if not (r.still >= calls).any():  # as nearly always: what is not read never counts
+            return ()
         kinds = (("joint", r.position), ("pressure_head", r.valve), ("pressure_rod", r.valve))
         return tuple(
             f"{kind}.{self.axes[i]}"

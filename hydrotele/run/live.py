@@ -142,10 +142,10 @@ class LiveHand:
         What is written down is where a simulated hand is to hold the joystick. It follows with its
         own arm, so that a repetition is alike, not the same bit for bit.
         """
-        wanted = np.round(handle, _LED)
-        if not np.array_equal(wanted, self._wanted):
-            self._wanted = wanted
-            self._note(time, wanted)
+        wanted = [round(value, _LED) for value in handle.tolist()]
+        if wanted != self._wanted.tolist():
+            self._wanted = np.array(wanted)
+            self._note(time, self._wanted)
 
     def _note(self, time: float, wanted: np.ndarray) -> None:
         if time == self._time[-1]:
@@ -265,8 +265,11 @@ def drive(
         haptic.attach(session)
     handle = station.log.master("handle")
     status, told = _status_of(session, further), _Told(session, say)
+    every = station.operator.every
+    # beside a haptic device not in the ticks in which estimate of force and log row are due, too
+    phase = every // 2 if haptic else 0
     while session.tick < session.scenario.ticks:
-        if session.tick % station.operator.every == 0:
+        if session.tick % every == phase:
             reading = device.read(session.time)
             if reading.said:
                 say(reading.said)
