@@ -5,11 +5,13 @@ from typing import Annotated
 
 import typer
 
+from hydrotele.cli.help_page import HelpGroup
 from hydrotele.core.errors import InputError
 
 app = typer.Typer(
-    help="Calibrate the kinematics of a mechanism from measured poses.", no_args_is_help=True
-)
+    cls=HelpGroup, help="Calibrate the kinematics of a mechanism from measured poses.",
+    no_args_is_help=True,
+)  # fmt: skip
 
 Data = Annotated[Path, typer.Option("--data", "-d", help="Folder of measurements.")]
 HeldOut = Annotated[

@@ -21,6 +21,7 @@ from typing import Annotated
 import typer
 
 from hydrotele.cli.calibrating import app as calibrate_app
+from hydrotele.cli.help_page import HelpGroup
 from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
 from hydrotele.cli.option_values import chosen, numbers_of, overrides_of
 from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
@@ -245,6 +246,7 @@ def sweep(
 
 app = typer.Typer(
     name="hydrotele",
+    cls=HelpGroup,
     help="Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo.",
     no_args_is_help=True,
     rich_markup_mode="rich",
@@ -252,7 +254,9 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-analyse_app = typer.Typer(help="Analyse by formula what others simulate.", no_args_is_help=True)
+analyse_app = typer.Typer(
+    cls=HelpGroup, help="Analyse by formula what others simulate.", no_args_is_help=True
+)
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(calibrate_app, name="calibrate")
 
