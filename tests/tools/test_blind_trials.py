@@ -1,5 +1,7 @@
 """The blind trials: planting and hiding; a small series with a stub for the workflow."""
 
+import contextlib
+import io
 import json
 import os
 import shlex
@@ -7,6 +9,7 @@ import signal
 import stat
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -17,6 +20,7 @@ import pytest
 
 from hydrotele.effects import EFFECTS
 from hydrotele.machine.machine_file import load_machine
+from tools import blind_trials
 from tools.blind.draw import SMALLEST, Planted, draw_double, draw_effect, draw_outside, with_effects
 from tools.blind.generate import make_trial
 from tools.blind.motions import motions
@@ -159,9 +163,21 @@ class SmallSeries:
         return [sys.executable, str(SCRIPT), "--out", str(self.out), "--workflow", workflow, *more]
 
     def run(self, *more: str) -> subprocess.CompletedProcess:
-        return subprocess.run(
-            self.command(*more), env=self.environment, capture_output=True, text=True, check=False
-        )
+        """The same in this process: what matters here is what it starts."""
+        told, asked = (io.StringIO(), io.StringIO()), self.command(*more)[1:]
+        with (
+            pytest.MonkeyPatch.context() as patched,
+            contextlib.redirect_stdout(told[0]), contextlib.redirect_stderr(told[1]),
+        ):  # fmt: skip
+            patched.setattr(sys, "argv", asked)
+            for name in ("PYTHONPATH", "TMPDIR"):
+                patched.setenv(name, self.environment[name])
+            patched.setattr(tempfile, "tempdir", self.environment["TMPDIR"])
+            try:
+                status = blind_trials.main()
+            except SystemExit as ended:
+                status = ended.code
+        return subprocess.CompletedProcess(asked, status, *(t.getvalue() for t in told))
 
     def results(self) -> dict[str, tuple[int, str]]:
         found = sorted(self.out.glob("trials/*/result.json"))
