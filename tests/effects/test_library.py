@@ -62,12 +62,13 @@ PLACED = [  # every effect of every machine, with all its places
     if effect.locations(machine_of(name, tool))
 ]  # fmt: skip
 LATER = {"load_holding", "end_stop_stiffness"}  # felt on the way back and at the ends: test_valve
-FELT = [
-    case for case in CASES
+FELT = [  # daily at the last of its places, which all of them change, at the first one nightly
+    case if place == -1 else pytest.param(*case, marks=pytest.mark.nightly)
+    for place in (-1, 0)
+    for case in CASES
     if case[2] not in LATER and case[:2] in (("cat215", "bucket"), ("emps", None))
-    and case[3] in (lambda places: (places[0], places[-1]))(
-        EFFECTS[case[2]].locations(machine_of(*case[:2]))
-    )
+    and case[3] == EFFECTS[case[2]].locations(machine_of(*case[:2]))[place]
+    and (place == -1 or case[3] != EFFECTS[case[2]].locations(machine_of(*case[:2]))[-1])
 ]  # fmt: skip
 
 

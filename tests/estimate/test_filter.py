@@ -155,7 +155,7 @@ def test_the_delay_of_late_readings_is_found_without_bias(name, place, delay, sd
     assert np.sqrt(np.mean(there.whitened[50:] ** 2)) == pytest.approx(1.0, abs=0.04)
 
 
-@pytest.mark.parametrize("rest", [-1.0, -0.45, 1.0])
+@pytest.mark.parametrize("rest", [pytest.param(-1.0, marks=pytest.mark.nightly), -0.45, 1.0])
 def test_a_drive_may_rest_anywhere_in_its_backlash(rest):
     gap = 0.012
     machine = apply_effect(load_machine("cat215"), "backlash", "swing", {"gap": gap})

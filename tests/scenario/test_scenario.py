@@ -21,6 +21,13 @@ from hydrotele.simulate.record import SimulationFailed
 
 PIN = 1.0e-4  # m, asked for by the project: a tenth of a millimetre
 SHORTER = {"hold": "10", "emps_track": "6"}  # s; their later parts repeat the earlier ones
+# Daily, in s: moves or presses like those at first until then, and one scenario of each such kind
+# in full (calibrate_swing, fell_tree, press_direct, steer). In full nightly.
+BEGUN = {
+    "calibrate_boom": "30", "calibrate_pitch": "30", "calibrate_stick": "30", "slow_moves": "50",
+    "feller_slow_moves": "40", "feller_excitation": "20", "press_stiffness": "20",
+    "track_force": "20", "track_rock": "15",
+}  # fmt: skip
 LINES = {"zhu_up": "z", "zhu_down": "z", "zhu_in": "r", "zhu_out": "r"}  # what moves
 
 
@@ -71,10 +78,16 @@ def test_what_a_run_reports_of_its_pins_is_what_every_step_shows(seconds, name):
     assert 0.5 * worst <= reported <= rounded or run.plant.model.neq == 0
 
 
-@pytest.mark.parametrize("name", shipped_scenarios())
-def test_shipped_scenario_runs_in_full_or_says_why_not(name):
+@pytest.mark.parametrize(
+    ("name", "begun"),
+    [
+        *((name, BEGUN.get(name)) for name in shipped_scenarios()),
+        *(pytest.param(name, None, marks=pytest.mark.nightly) for name in BEGUN),
+    ],
+)
+def test_shipped_scenario_runs_in_full_or_says_why_not(name, begun):
     """Its pilot is through before it ends, its log is whole, nothing is infinite."""
-    run = shipped(name)
+    run = shipped(name, duration=begun) if begun else shipped(name)
     assert len(run.measured) == run.scenario.rows == len(run.truth)
     assert all(np.isfinite(v).all() for v in run.truth.columns.values())
     assert run.summary["largest_pin_opening_mm"] < 1e3 * PIN
