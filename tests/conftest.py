@@ -34,12 +34,16 @@ hypothesis.settings.load_profile("hydrotele")
 # that is missing here costs at most its own length at the end. The first two compile unlike code,
 # so that neither process waits for the other.
 LONG = (
-    "gap/test_find.py", "scenario/test_scenario.py", "envs/test_render.py", "cli/test_cli.py",
-    "effects/test_library.py", "gap/test_discover.py", "teleop/test_station.py",
-    "estimate/test_filter.py", "envs/test_gymnasium.py", "estimate/test_reduced_against_plant.py",
-    "models/test_machines.py", "run/test_sweep_processes.py", "cli/test_untrusted_folder.py",
-    "gap/test_rattling.py", "estimate/test_output_error.py", "gap/test_command.py",
-    "core/test_compiled.py", "calibrate/test_mukca.py", "experiments/test_zhu1994.py",
+    "gap/test_find.py", "scenario/test_scenario.py", "envs/test_render.py",
+    "tools/test_blind_baselines.py", "gap/test_rattling.py", "cli/test_cli.py",
+    "tools/test_blind_trials.py", "teleop/test_station.py", "models/test_machines.py",
+    "effects/test_library.py", "estimate/test_reduced_against_plant.py", "gap/test_discover.py",
+    "run/test_sweep_processes.py", "estimate/test_filter.py", "gap/test_balances.py",
+    "envs/test_gymnasium.py", "cli/test_untrusted_folder.py", "gap/test_command.py",
+    "gap/test_mechanism.py", "estimate/test_output_error.py", "calibrate/test_mukca.py",
+    "experiments/test_zhu1994.py", "gap/test_without_inputs.py", "run/test_replay.py",
+    "gap/test_report.py", "gap/test_experiment.py", "teleop/test_analyse_command.py",
+    "core/test_compiled.py",
 )  # fmt: skip
 
 

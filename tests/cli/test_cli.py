@@ -313,15 +313,6 @@ def test_replay_of_several_logs_is_a_list(finished):
     assert logs == [str(finished / "measured.parquet"), str(finished / "truth.parquet")]
 
 
-def test_replay_prints_a_table_and_writes_a_folder(finished, tmp_path):
-    code, out, _ = invoke("replay", finished, "--out", tmp_path / "replay")
-    assert code == 0 and "angle.boom" in out and "deg" in out
-    made = names(tmp_path / "replay")
-    assert "summary.json" in made and any(n.endswith(".png") for n in made)
-    assert any(n.endswith(".rrd") for n in made)
-    assert (finished / "measured.parquet").is_file()
-
-
 def test_replay_with_another_machine_of_the_same_axes(finished, tmp_path):
     from hydrotele.effects import apply_effect
     from hydrotele.machine.machine_file import load_machine, save_machine
@@ -341,13 +332,16 @@ def test_replay_with_a_named_machine_keeps_the_logs_tool(finished):
     assert named == own and "angle.bucket" in named
 
 
-def test_replay_writes_into_runs_by_default(finished, tmp_path, monkeypatch):
+def test_replay_prints_a_table_and_writes_into_runs_by_default(finished, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert invoke("replay", finished / "measured.parquet")[0] == 0
-    assert any(n.endswith(".rrd") for n in names(tmp_path / "runs" / "replay_measured"))
+    code, out, _ = invoke("replay", finished / "measured.parquet")
+    assert code == 0 and "angle.boom" in out and "deg" in out
+    made = names(tmp_path / "runs" / "replay_measured")
+    assert any(n.endswith(".png") for n in made) and any(n.endswith(".rrd") for n in made)
     assert json.loads((tmp_path / "runs/replay_measured/summary.json").read_text())["kind"] == (
         "replay"
     )
+    assert (finished / "measured.parquet").is_file()
 
 
 def test_replay_does_not_replace_the_run_that_it_reads(finished):

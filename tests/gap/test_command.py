@@ -89,6 +89,7 @@ def test_the_patched_machine_runs_and_is_replayed(site, searching):
         "replay", "again/measured.parquet", "--machine", patched, "--json", "--out", "replayed"
     )
     assert code == 0, err
+    assert "summary.json" in names(site / "replayed")
     channels = json.loads(out)["channels"]
     # the same machine, driven with the same commands; a start from noisy rows is off by their noise
     assert channels["angle.boom"]["rms"] < 0.01
@@ -105,9 +106,7 @@ def test_a_machine_with_a_learned_law_runs_and_is_replayed(site, searching):
     short = ("--set", "duration=0.5", "--set", "tool=none", "--no-review")
     code, _, err = invoke("run", "steps", "--machine", patched, *short, "--out", "again")
     assert code == 0, err
-    code, out, err = invoke(
-        "replay", "again/measured.parquet", "--machine", patched, "--json", "--out", "replayed"
-    )
+    code, out, err = invoke("replay", "again/measured.parquet", "--machine", patched, "--json")
     assert code == 0, err
     assert json.loads(out)["channels"]["angle.boom"]["rms"] < 0.01  # as without a law, see above
 

@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from hydrotele.show import gap_report
 from hydrotele.show.gap_recording import channel_rms, gap_windows, most_changed, windowed
 from hydrotele.show.gap_report import write_report
 
@@ -47,9 +48,13 @@ class _Page(HTMLParser):
 def page_of(tmp_path_factory, gap_of):
     folder = tmp_path_factory.mktemp("reports")
 
-    def page(verdict, **changes):
+    def page(verdict, rastered=True, **changes):
+        """A page whose figures are drawn, and made pixels of where a test looks at those."""
         path = folder / "report.html"
-        write_report(dataclasses.replace(gap_of(verdict), **changes), path)
+        with pytest.MonkeyPatch.context() as patched:
+            if not rastered:
+                patched.setattr(gap_report, "png", lambda figure: b"")
+            write_report(dataclasses.replace(gap_of(verdict), **changes), path)
         return _Page(path.read_text(encoding="utf-8")), path.read_text(encoding="utf-8")
 
     return page
@@ -91,13 +96,13 @@ def test_numbers_appear(named, gap_of):
 
 
 def test_no_gap_has_no_patch_and_shows_one_model(page_of):
-    page, _ = page_of("no_gap")
+    page, _ = page_of("no_gap", rastered=False)
     assert "Model and machine agree" in page.text and "patched/" not in page.text
     assert "What was found" not in page.text
 
 
 def test_an_unknown_has_its_section(page_of):
-    page, _ = page_of("unknown")
+    page, _ = page_of("unknown", rastered=False)
     for piece in (
         "What is not explained",
         "3.0 to 4.6 s",
@@ -120,13 +125,13 @@ def test_a_partly_named_gap_shows_calibration_laws_and_what_is_left(page_of):
 
 
 def test_an_ambiguity_has_its_alternatives_and_experiment(page_of):
-    page, _ = page_of("ambiguous")
+    page, _ = page_of("ambiguous", rastered=False)
     for piece in ("pin offset of the boom", "37 %", "Next experiment:", "commands: {boom: 0.2}"):
         assert piece in page.text
 
 
 def test_texts_are_escaped(page_of):
-    page, text = page_of("named", notes=("<b>x</b> & 1 < 2",))
+    page, text = page_of("named", rastered=False, notes=("<b>x</b> & 1 < 2",))
     assert "<b>x</b> & 1 < 2" in page.text and "&lt;b&gt;x&lt;/b&gt; &amp; 1 &lt; 2" in text
 
 
