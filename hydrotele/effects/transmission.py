@@ -52,12 +52,24 @@ def resolved_inertia(machine: Machine, axis: str, inertia: float, stiffness: flo
 
     The oil is stiffest with the piston at its end: `beta (A^2 / V)` of both chambers.
     """
+    return max(inertia, (stiffness + _oil_stiffness(machine, axis)) / _FASTEST**2)
+
+
+def ringing(machine: Machine, axis: str) -> float:
+    """Angular frequency of an axis' drive on the spring of its transmission and its oil [rad/s]."""
+    facts = machine.axes[axis]
+    assert facts.transmission
+    oil = _oil_stiffness(machine, axis) if facts.hydraulic else 0.0
+    return math.sqrt((facts.transmission.stiffness + oil) / facts.transmission.inertia)
+
+
+def _oil_stiffness(machine: Machine, axis: str) -> float:
+    """Of both chambers, with the piston at its end [N/m] or [N m/rad]."""
     drive, cylinder = machine.axes[axis].hydraulic_drive, machine.axes[axis].cylinder
     assert machine.supply
     head, rod = drive.areas
     far = drive.dead_volume + (rod * cylinder.stroke if cylinder else 0.0)
-    oil = machine.supply.bulk_modulus * (head**2 / drive.dead_volume + rod**2 / far)
-    return max(inertia, (stiffness + oil) / _FASTEST**2)
+    return machine.supply.bulk_modulus * (head**2 / drive.dead_volume + rod**2 / far)
 
 
 def with_transmission(machine: Machine, axis: str, transmission: Transmission) -> Machine:

@@ -16,7 +16,7 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.reduced_dynamics import advance, follow_trail, read_channels
 from hydrotele.estimate.reduced_model import Model, model_space, reduced_model
-from hydrotele.estimate.track import DRIFT_TIME, STEP, Levels, fine_enough, track_run
+from hydrotele.estimate.track import DRIFT_TIME, STEP, Levels, steps_per_row, track_run
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import parse_channel
@@ -147,7 +147,7 @@ def machine_runner(machine: Machine, data: Dataset, step: float = STEP) -> Prepa
 
     def prepare(run: RunData) -> Runner:
         track = track_run(machine, data, run, step=step, levels=levels)
-        steps = max(1, round(run.period / fine_enough(machine, step)))
+        steps = steps_per_row(machine, run.period, step)
         late = np.any(model.lag > 0.0) or np.any(model.time_constant > 0.0)
         before = _shown(model, track.states, run.period) if late else None
 

@@ -37,7 +37,7 @@ from hydrotele.effects import Parameter, changed
 from hydrotele.estimate.free_run import _run_from, _shown, following_levels
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.reduced_model import model_space, reduced_model
-from hydrotele.estimate.track import Levels, fine_enough, track_run
+from hydrotele.estimate.track import Levels, steps_per_row, track_run
 from hydrotele.kinematics.from_machine import range_at_drive
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.drives import FlowCurve, Metering
@@ -504,7 +504,7 @@ class _Problem:
                 space.time[1] = run.start + begin * period
                 command = run.command[begin : window.first + window.count + 1]
                 before = _shown(model, states, period) if late else np.zeros((1, len(model.lag)))
-                steps = max(1, round(period / fine_enough(machine, self.step)))
+                steps = steps_per_row(machine, period, self.step)
                 start = states[-1].copy()
                 _run_from(model, space, start, command, lead, period, steps, before, made)
             with np.errstate(over="ignore", invalid="ignore"):

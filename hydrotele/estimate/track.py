@@ -4,12 +4,14 @@ The state before a run's first reading: from its first rows, with a wide spread.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import fminbound
 
+from hydrotele.effects.transmission import ringing
 from hydrotele.estimate.filter import (
     Crossing,
     Gains,
@@ -178,7 +180,8 @@ STEP = (
 )
 COARSE = 4.0e-3  # s, for a first look at a candidate
 _TANGENT = 5.0e-3  # s, for the transition Jacobians: a covariance need not be exact
-_STIFF = 1.0e-3  # s, where a transmission's spring is: with the oil it may ring at 150 Hz
+_STIFF = 1.0e-3  # s, the least that a transmission asks for: its spring may ring at 150 Hz with oil
+_RADIAN = 0.94  # of such a ring that a step may cross: that of 150 Hz in 1 ms
 
 
 @dataclass(frozen=True)
@@ -278,11 +281,27 @@ def fine_enough(machine: Machine, step: float) -> float:
     """A step [s], made smaller where a machine needs it.
 
     A pump's own circuit is stiff, and its piston light: with stiff lines they ring at 200 Hz and
-    more, which steps of some milliseconds make unstable.
+    more, which steps of some milliseconds make unstable. So does a light drive on the spring of its
+    transmission.
     """
-    springs = any(axis.transmission for axis in machine.axes.values())
+    springs = [
+        max(_STIFF, _RADIAN / ringing(machine, name))
+        for name, axis in machine.axes.items() if axis.transmission
+    ]  # fmt: skip
     rigid = [longest_step(machine, name) for name, axis in machine.axes.items() if axis.pump]
-    return min(step, _STIFF if springs else step, *rigid)
+    return min([step, *springs, *rigid])
+
+
+def steps_per_row(machine: Machine, period: float, step: float) -> int:
+    """Steps in which a row is crossed.
+
+    Args:
+        machine: the machine.
+        period: of the rows [s].
+        step: wanted [s]; what it is rounded to may be larger where the machine allows it.
+    """
+    least = math.ceil(period / fine_enough(machine, period) - 1e-6)
+    return max(1, least, round(period / step))
 
 
 def first_rows(track: Track, rows: int) -> Track:
@@ -398,7 +417,7 @@ def _cross(
     rest: np.ndarray, levels: Levels, columns: np.ndarray, noise: np.ndarray,
     linearise: bool = False, given: np.ndarray | None = None,
 ) -> Track:  # fmt: skip
-    step, coarse = fine_enough(machine, step), fine_enough(machine, _TANGENT)
+    fine, coarse = (steps_per_row(machine, run.period, s) for s in (step, _TANGENT))
     space = model_space(model)
     space.time[1] = run.start
     names, late = state_names(machine), late_readings(model, run.period)
@@ -435,10 +454,7 @@ def _cross(
     variances = Variances(
         noise**2, state_drift(names, levels, run.period), by_kind(names, STARTLE) ** 2
     )
-    steps = Steps(
-        max(1, round(run.period / step)), max(1, round(run.period / coarse)),
-        by_kind(names, _NUDGE),
-    )  # fmt: skip
+    steps = Steps(fine, coarse, by_kind(names, _NUDGE))
     own = np.array([names.index(name) for name in known])
     lines = Linearisation(kept is None, given is not None, own, gains, initial, flow)
     loss = filter_run(

@@ -80,6 +80,7 @@ class Slot(enum.IntEnum):
     HOLDING_ROD_RANGE = enum.auto()
     LOAD_SENSING_MARGIN = enum.auto()
     PUMP_DROOP = enum.auto()
+    RELIEF_OVERRIDE = enum.auto()
     STOP_LOW = enum.auto()
     STOP_HIGH = enum.auto()
     STOP_STIFFNESS = enum.auto()
@@ -294,6 +295,7 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     numbers[Slot.RELIEF_PRESSURE] = supply.relief_pressure
     numbers[Slot.PUMP_FLOW] = supply.pump_flow
     numbers[Slot.PUMP_DROOP] = supply.pump_droop
+    numbers[Slot.RELIEF_OVERRIDE] = supply.relief_override
     if supply.kind == "load_sensing":
         numbers[Slot.LOAD_SENSING_MARGIN] = supply.load_sensing_margin
 

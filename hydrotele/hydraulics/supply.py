@@ -19,17 +19,18 @@ _RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
 _MARGIN, _DROOP = int(Slot.LOAD_SENSING_MARGIN), int(Slot.PUMP_DROOP)
 _DROP = int(Slot.COMPENSATED_DROP)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
-_ADDED = int(Slot.ADDED_DELIVERY)
+_ADDED, _OVERRIDE = int(Slot.ADDED_DELIVERY), int(Slot.RELIEF_OVERRIDE)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 
 @allocation_free
-def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0):
+def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, override=0.0):
     """Largest pressure up to the relief setting at which the valves draw no more than the pump.
 
     Solves `sum_i k_i g(min(p_s - p_i, d_i)) = Q_pump - c_p p_s` over the valves whose load check is
     open, by Newton's method in `sqrt(p_s - min p_i)` inside a bracket, which is halved where Newton
-    fails.
+    fails. A relief valve with an override r opens at its setting p_r and lets `(p_s - p_r) / r`
+    through; without one it holds its setting.
 
     Args:
         ports: (>= 4 count,) per axis `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa], the drop `d_i` that
@@ -39,18 +40,21 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0):
         relief: relief setting, scalar [Pa].
         pump_flow: Q_pump, scalar [m^3/s].
         droop: c_p, by which the pump's flow falls with its pressure, scalar [m^3/(s Pa)].
+        override: r, by which the relief's pressure rises with its flow, scalar [Pa s/m^3].
 
     Returns:
         p_s, scalar [Pa].
 
-    Source: nominal model, "Supply"; droop: leakage proportional to the pressure (Merritt 1967).
+    Source: nominal model, "Supply"; droop: leakage proportional to the pressure (Merritt 1967);
+        override: static characteristic of a direct-acting relief valve, linear in its flow.
 
     >>> import numpy as np
     >>> one_valve = np.array([2.0e-6, 5.0e6, 0.0, 0.0])
     >>> round(supply_pressure(one_valve, 1, 5.0e4, 28.0e6, 5.0e-3) / 1e6, 3)
     11.25
     """
-    low, high, p, last = relief, relief, relief, math.inf
+    top = relief + override * pump_flow
+    low, high, p, last = relief, top, top, math.inf
     for i in range(count):
         if ports[4 * i] > 0.0:
             low = min(low, ports[4 * i + 1])
@@ -67,10 +71,13 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0):
         if droop > 0.0:
             excess += droop * p
             slope += droop
+        if p > relief:
+            excess += (p - relief) / override
+            slope += 1.0 / override
         if excess > 0.0:
             high = p
-        elif p == relief:
-            return relief
+        elif p == top:
+            return top
         else:
             low = p
         if abs(excess) <= _FLOW_TOLERANCE * pump_flow or high - low <= 1.0e-15 * relief:
@@ -248,7 +255,7 @@ def drawn_flow(user, first, count, ports, supply):
 
 @inlined
 def highest_supply(user, first, count, ports):
-    """Supply pressure where the pump's flow is not short: the relief's, or that of load sensing.
+    """Supply pressure up to which the pump's flow is short: the relief's, or that of load sensing.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
@@ -293,7 +300,8 @@ def circuit_supply(user, first, count, ports, share):
     """
     s, most = first * SLOTS, highest_supply(user, first, count, ports)
     flow = user[s + _PUMP] * share
-    return supply_pressure(ports, count, user[s + _D], most, flow, user[s + _DROOP])
+    droop, override = user[s + _DROOP], user[s + _OVERRIDE]
+    return supply_pressure(ports, count, user[s + _D], most, flow, droop, override)
 
 
 @allocation_free
@@ -301,8 +309,8 @@ def supply_coupling(user, first, count, ports, supply, out):
     """How the supply pressure follows the chambers that it feeds.
 
     `dp_s/dp_i` is `g_i / (sum_j g_j + c_p)` where the pump's flow is short, 1 for the largest load
-    where load sensing holds its margin, 0 at the relief setting; g_i is the slope of an inlet's
-    flow with its drop.
+    where load sensing holds its margin, 0 at the relief setting, or `g_i / (sum_j g_j + c_p + 1/r)`
+    beyond it where the relief has an override r; g_i is the slope of an inlet's flow with its drop.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
@@ -320,7 +328,9 @@ def supply_coupling(user, first, count, ports, supply, out):
     """
     s, total, leader = first * SLOTS, user[first * SLOTS + _DROOP], -1
     most, load = user[s + _RELIEF], user[s + _TANK]
-    if supply >= most and user[s + _MARGIN] == 0.0:
+    if supply > most and user[s + _OVERRIDE] > 0.0:
+        total += 1.0 / user[s + _OVERRIDE]
+    elif supply >= most and user[s + _MARGIN] == 0.0:
         return False
     for i in range(count):
         out[4 * i + 2], out[4 * i + 3] = 0.0, 0.0
@@ -336,7 +346,7 @@ def supply_coupling(user, first, count, ports, supply, out):
             if leader >= 0:
                 out[4 * leader + 3] = 1.0
             return leader >= 0
-    elif supply >= most:
+    elif supply >= most and user[s + _OVERRIDE] == 0.0:
         return False
     if total <= 0.0:
         return False

@@ -81,7 +81,9 @@ class Supply(Facts):
     `constant_flow`: the pump gives `pump_flow`; what the valves do not draw goes over the relief
     valve. `load_sensing`: it holds the highest load pressure plus `load_sensing_margin`, as far as
     `pump_flow` and `relief_pressure` allow. `constant_pressure`: it holds `relief_pressure`
-    whatever is drawn. `pump_droop` [m^3/(s Pa)] is by how much its flow falls with its pressure.
+    whatever is drawn. `pump_droop` [m^3/(s Pa)] is by how much its flow falls with its pressure;
+    `relief_override` [Pa s/m^3] by how much the relief valve's pressure rises with its flow, beyond
+    `relief_pressure` at which it opens; only a `constant_flow` supply has one.
     With a `time_constant` [s] the pump's displacement follows what the valves draw with a
     first-order lag, as a swash plate does; 0: at once. `dissolved_air` is the volume of air, at
     atmosphere, per volume of oil that the oil gives off where it is drawn below atmosphere (mineral
@@ -94,11 +96,17 @@ class Supply(Facts):
     tank_pressure: NonNegative
     pump_flow: Positive = UNLIMITED_FLOW
     pump_droop: NonNegative = 0.0
+    relief_override: NonNegative = 0.0
     load_sensing_margin: Positive = 2.0e6
     time_constant: NonNegative = 0.0
     bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
     dissolved_air: Annotated[float, Field(ge=0.001, le=0.5)] = 0.09
     entrained_air: Annotated[float, Field(ge=0.0, le=0.2)] = 0.0
+
+    @property
+    def highest_pressure(self) -> float:
+        """With all of the pump's flow over the relief valve [Pa]."""
+        return self.relief_pressure + self.relief_override * self.pump_flow
 
     @model_validator(mode="after")
     def _check(self):
@@ -119,6 +127,11 @@ class Supply(Facts):
             raise ValueError(
                 f"pump_droop {self.pump_droop:g} m^3/(s Pa) leaves nothing of pump_flow"
                 f" {self.pump_flow:g} m^3/s at relief_pressure {self.relief_pressure:g} Pa"
+            )
+        if self.relief_override and self.kind != "constant_flow":
+            raise ValueError(
+                f"a {self.kind} supply sends no flow over its relief valve: leave out"
+                " relief_override, or choose kind constant_flow"
             )
         if self.tank_pressure >= self.relief_pressure:
             raise ValueError(
@@ -201,7 +214,7 @@ class Machine(Facts):
         if pump:
             return pump.stall_pressure
         assert self.supply
-        return self.supply.relief_pressure
+        return self.supply.highest_pressure
 
     def return_pressure(self, axis: str) -> float:
         """Pressure to which a hydraulic axis' oil returns [Pa]: tank or its pump's accumulator."""

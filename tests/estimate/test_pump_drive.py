@@ -10,7 +10,7 @@ from hydrotele.estimate.inputs import Input, input_columns
 from hydrotele.estimate.levels import rough_noise
 from hydrotele.estimate.reduced_dynamics import simulate_rows
 from hydrotele.estimate.reduced_model import model_space, reduced_model, state_names
-from hydrotele.estimate.track import STEP, fine_enough, track_run
+from hydrotele.estimate.track import STEP, steps_per_row, track_run
 from hydrotele.hydraulics.parameters import longest_step
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
@@ -70,7 +70,7 @@ def test_the_filter_follows_its_own_machine(kind, request):
     The readings come from the filter's own steps, as the integrator is not what is tried here.
     """
     made = request.getfixturevalue(kind)
-    shown, _ = simulated(made, round(PERIOD / fine_enough(made, STEP)))
+    shown, _ = simulated(made, steps_per_row(made, PERIOD, STEP))
     noise = np.random.default_rng(5).normal(size=shown.shape) * NOISE
     track = track_run(made, dataset(made, shown + noise), dataset(made, shown + noise).heldout)
     size = np.sqrt(np.mean(track.whitened[STANDING:] ** 2, axis=0))

@@ -64,6 +64,9 @@ CASES = {
     ),
     "load_holding": (("load_holding", "boom.head", {"setting": 40e6}),),
     "pump_droop": (("pump_droop", "supply", {"droop": 7e-11}),),
+    "relief_override": (
+        ("relief_pressure", "supply", {"relief_pressure": 20e6, "relief_override": 9e8}),
+    ),
     "presliding": (
         ("presliding", "swing", {"compliance": 5e-7}),
         ("presliding", "boom", {"compliance": 1e-7}),

@@ -1,5 +1,7 @@
 """Valves by direction and edge, compensators, counterbalance valves and supplies, each by hand."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -12,6 +14,7 @@ from hydrotele.hydraulics.circuit import (
     circuit_supply,
     open_ports,
     step_circuit,
+    supply_coupling,
 )
 from hydrotele.hydraulics.laws import holding_share, spool_step, stop_force, valve_opening
 from hydrotele.hydraulics.parameters import Slot, actuator_parameters
@@ -265,9 +268,37 @@ def test_a_drooping_pump_gives_less_the_higher_its_pressure():
     assert supply_of(STANDING, pump_droop=droop)[0] == 28e6
 
 
+def test_a_relief_valve_with_an_override_holds_more_the_more_flows_over_it():
+    override = 8e8
+    flow = CAT.supply.pump_flow if CAT.supply else math.nan
+    assert supply_of(STANDING, relief_override=override)[0] == 28e6 + override * flow
+    assert supply_of(GREEDY, relief_override=override)[0] == supply_of(GREEDY)[0] < 28e6
+    pressure, user, ports = supply_of(CALM, relief_override=override)
+    drawn = sum(ports[4 * i] * g(max(0.0, pressure - ports[4 * i + 1])) for i in range(3))
+    assert 28e6 < pressure < 28e6 + override * flow
+    assert pressure == pytest.approx(28e6 + override * (user[Slot.PUMP_FLOW] - drawn), rel=1e-9)
+
+
+@pytest.mark.parametrize("act", [CALM, GREEDY])
+def test_the_supply_follows_the_chambers_with_an_override_as_its_coupling_says(act):
+    given = {"relief_override": 8e8}
+    pressure, user, ports = supply_of(act, **given)
+    slopes = np.zeros(len(ports))
+    assert supply_coupling(user, 0, 3, ports, pressure, slopes)
+    for i in range(3):
+        side = 2 if act[4 * i] > 0.0 else 3
+        moved = [list(act), list(act)]
+        moved[0][4 * i + side] += 1e3
+        moved[1][4 * i + side] -= 1e3
+        above, below = (supply_of(other, **given)[0] for other in moved)
+        found = (above - below) / 2e3
+        assert slopes[4 * i + 3] == pytest.approx(found, rel=1e-4, abs=1e-7)
+
+
 @pytest.mark.parametrize(
     ("facts", "message"),
     [
+        ({"kind": "load_sensing", "relief_override": 1e8}, "no flow over its relief valve"),
         ({"kind": "constant_pressure", "pump_flow": 5e-3}, "has no pump_flow"),
         ({"pump_flow": 1.0e3}, "pump_flow is missing"),
         ({"pump_droop": 2e-10}, "leaves nothing of pump_flow"),

@@ -4,7 +4,7 @@ import numpy as np
 
 from hydrotele.estimate.reduced_dynamics import advance, place, read_channels, write_trail
 from hydrotele.estimate.reduced_model import model_space, reduced_model
-from hydrotele.estimate.track import STEP, fine_enough, track_run
+from hydrotele.estimate.track import STEP, steps_per_row, track_run
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 
@@ -31,7 +31,7 @@ def open_loop_error(
     states = track_run(machine, data, run).states
     model = reduced_model(machine, data.channels)
     space = model_space(model)
-    steps = max(1, round(run.period / fine_enough(machine, STEP)))
+    steps = steps_per_row(machine, run.period, STEP)
     rows, c = round(horizon / run.period), len(data.channels)
     errors, shown = [], np.zeros(c)
     for first in range(0, len(run.command) - rows + 1, rows):
