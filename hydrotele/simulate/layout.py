@@ -216,7 +216,7 @@ def field(base, offset, count):
 
 @intrinsic
 def call_step(typingctx, function, model, data):
-    """`mj_step(model, data)`, with the address of that function."""
+    """`mj_step(model, data)`, or another function of these two, as `mj_forward`, by address."""
 
     def codegen(context, builder, signature, args):
         kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t] * 2)
