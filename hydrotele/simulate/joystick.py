@@ -10,6 +10,8 @@ counts half by the velocity before a step and half by that after it. Places are 
 second order of the step, and a held force moves a free body exactly. The same steps without that
 mean run half a step ahead, as if the control sampled faster than it does.
 """
+# pyright: reportCallIssue=false
+# numba's intrinsics are called without their typing context.
 
 import math
 from pathlib import Path
