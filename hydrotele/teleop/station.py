@@ -467,7 +467,8 @@ class Station:
         self._task, self._pose = _task(pilot, seen, self._period, len(axes)), np.zeros(5)
         self._true = pilot.force == "true"
         self._force = self._feel.force if self._feel and not self._true else np.zeros(len(axes))
-        self._contacts = contact_record(plant.model, data, surrounding_geoms(plant))
+        self._owners = plant.model, surrounding_geoms(plant)  # whose memory the addresses are
+        self._contacts = contact_record(plant.model, data, self._owners[1])
         self._elapsed = 0.0
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
         self.operator = OperatorModel(
@@ -497,8 +498,8 @@ class Station:
             "line_state": line.state, "qpos": self._qpos,
             "muscles": flat_view(self.operator.muscles), "past": self.operator.past,
             "tremor": np.ascontiguousarray(self.operator.tremor), "qvel": data.qvel,
-            "qacc": data.qacc, "grid": grid, "table": table, "reference": plan.reference, "rate": plan.rate, "pose": plan.pose,
-            **drives._asdict(), **self.log.arrays(),
+            "qacc": data.qacc, "grid": grid, "table": table, "reference": plan.reference,
+            "rate": plan.rate, "pose": plan.pose, **drives._asdict(), **self.log.arrays(),
         }  # fmt: skip
 
     def _fill_record(self, swing: int, scale: float) -> None:
