@@ -363,7 +363,7 @@ def _known(readings):
 
 _READINGS = np.dtype(
     [("period", np.float64)]
-    + [(name, np.int64) for name in ("settle", "free", "valves", "signals", "axes", "longest")]
+    + [(name, np.int64) for name in ("settle", "free", "valves", "signals", "axes")]
     + [(name, np.int64) for name in ("tables", "position", "valve")]  # addresses from here on
     + [(name, np.int64) for name in ("state", "outside", "last", "still")],
     align=True,
@@ -382,7 +382,7 @@ def _readings_record(r: DriveReadings) -> np.ndarray:
 
 @compiled
 def _update(arm, kept, dynamic, count, joint, head, rod, out):
-    """`endpoint_force_step` with records; how long a channel has read the same is written."""
+    """`endpoint_force_step` of records; its status, and most readings since a channel changed."""
     r = kept[0]
     still = integers(r.still, 3 * r.axes).reshape((3, r.axes))
     readings = DriveReadings(
@@ -391,8 +391,7 @@ def _update(arm, kept, dynamic, count, joint, head, rod, out):
         rows_of(r.last, 3, r.axes), still,
     )  # fmt: skip
     status = endpoint_force_step(arm_of(arm[0]), readings, dynamic, count, joint, head, rod, out)
-    r.longest = still.max()
-    return status
+    return status, still.max()
 
 
 Kind = Literal["static", "dynamic"]
@@ -460,7 +459,7 @@ class EndpointForce:
             self._arm.rate_noise[i] = noise * noise_rms(machine, sensors, channel)
         self.delay = filter_delay(fast) + filter_delay(bandwidth)
         self.task = _TASK[: len(self._arm.joint)]
-        self.force = np.zeros(len(self.task))
+        self.force, self._stillest = np.zeros(len(self.task)), 0
         self._records = arm_record(self._arm), _readings_record(self._readings)
 
     def update(self, joint: np.ndarray, head: np.ndarray, rod: np.ndarray) -> np.ndarray:
@@ -496,9 +495,7 @@ class EndpointForce:
             Names such as `joint.boom`, `pressure_head.boom`.
         """
         r, calls = self._readings, duration / self._readings.period
-        if (
-            self._records[1]["longest"][0] < calls
-        ):  # as nearly always: what is not read never counts
+        if self._stillest < calls:  # as nearly always: what is not read never counts
             return ()
         kinds = (("joint", r.position), ("pressure_head", r.valve), ("pressure_rod", r.valve))
         return tuple(

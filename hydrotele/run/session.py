@@ -124,6 +124,7 @@ class Session:
         self.station = None
         if isinstance(scenario.pilot, TeleopPilot):
             self.station = Station(plant, data, scenario, plan, drives, seen, hand)
+        self._eventful = bool(scenario.surroundings)
         self._around = Surroundings(plant.machine, plant.model, scenario.surroundings)
         self._sites, self._pins = data.site_xpos, pin_sites(plant.model)
         self._worst, self._begin = 0.0, 0.0
@@ -148,7 +149,7 @@ class Session:
         self._begin = self._begin if tick else clock.perf_counter()
         planned_tick(stepper.record, self._planned, tick, stepper.steps, tripped)
         stepper.tick = tick + 1
-        if self.scenario.surroundings:
+        if self._eventful:
             self._around.update(tick * self._dt, data, self._dt)
         self._worst = max(self._worst, widest_pin(self._sites, *self._pins))
         self.tick = tick + 1
