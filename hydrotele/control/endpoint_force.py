@@ -479,7 +479,9 @@ class EndpointForce:
         held, self._tick = self._tick % self._every, self._tick + 1
         if held:
             return self.force
-        status = _update(*self._records, self._dynamic, self._count, joint, head, rod, self.force)
+        status, self._stillest = _update(
+            *self._records, self._dynamic, self._count, joint, head, rod, self.force
+        )
         self._count += status != WAITING
         self.healthy = status == GOOD
         return self.force
