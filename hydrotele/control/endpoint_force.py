@@ -35,6 +35,8 @@ from hydrotele.control.state_filter import (
 )
 from hydrotele.control.tip_balance import (
     arm_joints,
+    arm_of,
+    arm_record,
     arm_tables,
     dynamic_balance,
     free_axes,
@@ -51,6 +53,7 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import noise_rms
 from hydrotele.machine.sensors import SensorSet
+from hydrotele.simulate.layout import address_record, floats, integers, rows_of
 
 _NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
 _GRID = 9  # poses per joint to which the masses' torques are fitted
@@ -358,6 +361,39 @@ def _known(readings):
     return True
 
 
+_READINGS = np.dtype(
+    [("period", np.float64)]
+    + [(name, np.int64) for name in ("settle", "free", "valves", "signals", "axes")]
+    + [(name, np.int64) for name in ("tables", "position", "valve")]  # addresses from here on
+    + [(name, np.int64) for name in ("state", "outside", "last", "still")],
+    align=True,
+)
+
+
+def _readings_record(r: DriveReadings) -> np.ndarray:
+    """(1,) record of DriveReadings whose arrays must outlive it."""
+    arrays = {name: part for name, part in r._asdict().items() if isinstance(part, np.ndarray)}
+    record = address_record(_READINGS, arrays)
+    (record["signals"], _), (_, record["axes"]) = r.state.shape, r.last.shape
+    record["free"], record["valves"] = len(r.position), len(r.valve)
+    record["period"], record["settle"] = r.period, r.settle
+    return record
+
+
+@compiled
+def _update(arm, kept, dynamic, count, joint, head, rod, out):
+    """`endpoint_force_step` of records; its status, and most readings since a channel changed."""
+    r = kept[0]
+    still = integers(r.still, 3 * r.axes).reshape((3, r.axes))
+    readings = DriveReadings(
+        r.period, r.settle, floats(r.tables, 30).reshape((2, 3, 5)), integers(r.position, r.free),
+        integers(r.valve, r.valves), rows_of(r.state, r.signals, 4), floats(r.outside, r.free),
+        rows_of(r.last, 3, r.axes), still,
+    )  # fmt: skip
+    status = endpoint_force_step(arm_of(arm[0]), readings, dynamic, count, joint, head, rod, out)
+    return status, still.max()
+
+
 Kind = Literal["static", "dynamic"]
 BANDWIDTH = 0.7  # Hz
 FAST = 2.5  # Hz
@@ -423,7 +459,8 @@ class EndpointForce:
             self._arm.rate_noise[i] = noise * noise_rms(machine, sensors, channel)
         self.delay = filter_delay(fast) + filter_delay(bandwidth)
         self.task = _TASK[: len(self._arm.joint)]
-        self.force = np.zeros(len(self.task))
+        self.force, self._stillest = np.zeros(len(self.task)), 0
+        self._records = arm_record(self._arm), _readings_record(self._readings)
 
     def update(self, joint: np.ndarray, head: np.ndarray, rod: np.ndarray) -> np.ndarray:
         """Take in the readings of one moment.
@@ -442,8 +479,8 @@ class EndpointForce:
         held, self._tick = self._tick % self._every, self._tick + 1
         if held:
             return self.force
-        status = endpoint_force_step(
-            self._arm, self._readings, self._dynamic, self._count, joint, head, rod, self.force
+        status, self._stillest = _update(
+            *self._records, self._dynamic, self._count, joint, head, rod, self.force
         )
         self._count += status != WAITING
         self.healthy = status == GOOD
@@ -460,7 +497,7 @@ class EndpointForce:
             Names such as `joint.boom`, `pressure_head.boom`.
         """
         r, calls = self._readings, duration / self._readings.period
-        if not (r.still >= calls).any():  # as nearly always: what is not read never counts
+        if self._stillest < calls:  # as nearly always: what is not read never counts
             return ()
         kinds = (("joint", r.position), ("pressure_head", r.valve), ("pressure_rod", r.valve))
         return tuple(

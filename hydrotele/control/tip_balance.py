@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.core.compiled import allocation_free
+from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.reduced_dynamics import place_mechanism
 from hydrotele.estimate.reduced_model import model_space, reduced_model, state_size
@@ -19,6 +19,7 @@ from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.reduced_mechanism import DAMPING, HOME, ReducedMechanism, coordinate_names
 from hydrotele.multibody.reduced_motion import BIAS, DRIFT, RATE, ReducedMotion, gather_forces
+from hydrotele.simulate.layout import address_record, floats, integers, rows_of
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _ODDS = 8.0
@@ -75,6 +76,85 @@ class ArmBalance(NamedTuple):
     angle: np.ndarray
     table: np.ndarray
     work: np.ndarray
+
+
+_ARRAYS = {
+    "mech": ("tree", "shape", "joint", "free", "bound", "gravity", "drive"),
+    "model": ("user", "gear", "transmission"),
+    "motion": ("frame", "jacobian", "momentum", "bar", "mass", "joint", "basis", "loop", "normal"),
+    "space": ("drive", "row"),
+    "arm": (
+        "z",
+        "joint",
+        "task",
+        "gravity",
+        "acceleration",
+        "rate_noise",
+        "angle",
+        "table",
+        "work",
+    ),
+}  # of ArmBalance and its parts
+_ADDRESSES = [f"{part}_{name}" for part, names in _ARRAYS.items() for name in names]
+_ARM = np.dtype(
+    [(name, np.int64) for name in ("links", "bars", "hydraulic", "frames", "coordinates", "free")]
+    + [(name, np.int64) for name in ("drives", "geared", "loops", "joints", "states", "users")]
+    + [(name, np.int64) for name in ("shape_width", "frame_width", "bar_width", "terms")]
+    + [(name, np.int64) for name in _ADDRESSES],
+    align=True,
+)
+
+
+def arm_record(arm: ArmBalance) -> np.ndarray:
+    """(1,) record of an ArmBalance whose arrays must outlive it; `arm_of` reads it."""
+    mech, motion = arm.model.mech, arm.space.motion
+    parts = {"mech": mech, "model": arm.model, "motion": motion, "space": arm.space, "arm": arm}
+    arrays = {f"{p}_{n}": getattr(parts[p], n) for p, names in _ARRAYS.items() for n in names}
+    record = address_record(_ARM, arrays)
+    for name, value in {
+        "links": mech.links, "bars": mech.bars, "hydraulic": arm.model.hydraulic,
+        "frames": len(mech.tree), "coordinates": mech.joint.shape[1], "free": len(mech.free),
+        "drives": len(mech.drive), "geared": len(arm.model.transmission),
+        "loops": len(motion.loop), "joints": len(arm.joint), "states": len(arm.z),
+        "users": len(arm.model.user), "shape_width": mech.shape.shape[1],
+        "frame_width": motion.frame.shape[1], "bar_width": motion.bar.shape[1],
+        "terms": len(arm.gravity),
+    }.items():  # fmt: skip
+        record[name] = value
+    return record
+
+
+@compiled
+def arm_of(r):
+    """The ArmBalance of a record of `arm_record`."""
+    f, c, n, m = r.frames, r.coordinates, r.free, r.joints
+    mech = ReducedMechanism(
+        integers(r.mech_tree, 4 * f).reshape((f, 4)), rows_of(r.mech_shape, f, r.shape_width),
+        r.links, r.bars, rows_of(r.mech_joint, 2, c), integers(r.mech_free, n),
+        integers(r.mech_bound, c - n), floats(r.mech_gravity, 3),
+        integers(r.mech_drive, 2 * r.drives).reshape((r.drives, 2)),
+    )  # fmt: skip
+    motion = ReducedMotion(
+        rows_of(r.motion_frame, f, r.frame_width),
+        floats(r.motion_jacobian, 6 * f * c).reshape((f, c, 6)),
+        floats(r.motion_momentum, 6 * f * c).reshape((f, c, 6)),
+        rows_of(r.motion_bar, r.bars, r.bar_width), rows_of(r.motion_mass, c, c),
+        rows_of(r.motion_joint, 4, c), rows_of(r.motion_basis, c, n),
+        rows_of(r.motion_loop, r.loops, c + 2), rows_of(r.motion_normal, c - n + 1, c - n),
+    )  # fmt: skip
+    return ArmBalance(
+        BalanceModel(
+            mech, floats(r.model_user, r.users), r.hydraulic, integers(r.model_gear, r.drives),
+            rows_of(r.model_transmission, r.geared, 4),
+        ),
+        BalanceSpace(
+            motion, rows_of(r.space_drive, 5, r.drives), rows_of(r.space_row, r.drives, n)
+        ),
+        floats(r.arm_z, r.states), integers(r.arm_joint, m), floats(r.arm_task, 9),
+        floats(r.arm_gravity, r.terms), floats(r.arm_acceleration, n),
+        floats(r.arm_rate_noise, n), floats(r.arm_angle, m), rows_of(r.arm_table, m, m),
+        floats(r.arm_work, n),
+    )  # fmt: skip
 
 
 @allocation_free

@@ -46,6 +46,7 @@ from hydrotele.haptics.packets import (
     packet,
 )
 from hydrotele.haptics.timing import ask_for_priority, summary_of
+from hydrotele.simulate.layout import address_record, floats, integers, rows_of
 from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, REACH, flat_state, flat_view
 from hydrotele.teleop.master import (
     KINDS,
@@ -297,6 +298,84 @@ def _answer_all(handle, line, box):
             count[ANSWERS] += 1
 
 
+_MACHINE_MAIL = np.dtype(
+    [(name, np.int64) for name in ("rows", "columns")]
+    + [(name, np.int64) for name in ("turn", "stamp", "handle")]  # addresses from here on
+    + [(name, np.int64) for name in ("packet", "share", "extra", "dead")],
+    align=True,
+)
+
+
+@compiled
+def take_pose(mail, now, pose):
+    """Take the handle's pose out of the mailbox.
+
+    Args:
+        mail: (1,) record of a Mailbox and of the dead bands.
+        now: scalar [ns].
+        pose: (8,) written: place on the joystick's scale [m], quaternion, buttons.
+
+    Returns:
+        Whether there is one, not older than `SILENT`.
+
+    Source: this module.
+    """
+    r, two, when = mail[0], np.empty(2, np.int64), np.int64(0)
+    turn, stamp, handle = integers(r.turn, 2), integers(r.stamp, 2), floats(r.handle, 8)
+    for _ in range(8):
+        before = turn[_HANDLE]
+        _now(two)
+        pose[:] = handle
+        when = stamp[_HANDLE]
+        _now(two)
+        if before % 2 == 0 and before == turn[_HANDLE]:
+            return now - when <= 1e9 * SILENT and np.isfinite(pose).all()
+    return False
+
+
+@compiled
+def meet(mail, qpos, packet, share, extra, engaged, now):
+    """The machine's turn at the mailbox: leave what is to be reflected, take the pose.
+
+    Args:
+        mail: see `take_pose`.
+        qpos: (7,) written, see `Link.exchange`.
+        packet: (rows, k) see `Link.exchange`.
+        share: of it that counts, scalar.
+        extra: (6,) further force on the handle [N], [N m].
+        engaged: whether the handle has been in its dead bands, scalar.
+        now: scalar [ns].
+
+    Returns:
+        Whether it is or has been there.
+
+    Source: this module.
+    """
+    r, two, pose = mail[0], np.empty(2, np.int64), np.empty(8)
+    turn = integers(r.turn, 2)
+    turn[_MACHINE] += 1
+    _now(two)
+    rows_of(r.packet, r.rows, r.columns)[:] = packet
+    floats(r.extra, 6)[:] = extra
+    floats(r.share, 1)[0], integers(r.stamp, 2)[_MACHINE] = share, now
+    _now(two)
+    turn[_MACHINE] += 1
+    there = take_pose(mail, now, pose)
+    engaged = there and (engaged or _centred(pose, floats(r.dead, 6)))
+    for i in range(7):
+        qpos[i] = pose[i] if engaged else np.nan
+    return engaged
+
+
+@compiled
+def _centred(pose, dead):
+    """Whether no axis of the joystick would command anything."""
+    for i in range(3):
+        if not (abs(pose[i]) <= dead[i] and 2.0 * abs(pose[4 + i]) <= dead[3 + i]):
+            return False
+    return True
+
+
 class Link:
     """The line to a device, open from the beginning; the thread runs from `start` to `close`."""
 
@@ -357,6 +436,10 @@ class Link:
             _CENTRED * numbers.axis[:, REACH],
         )  # fmt: skip
         self._dead[numbers.axis[:, COORDINATE] < 0.0] = np.inf  # moves nothing
+        shared = ("turn", "stamp", "handle", "packet", "share", "extra")
+        arrays = {name: getattr(self.box, name) for name in shared}
+        self._mail = address_record(_MACHINE_MAIL, {**arrays, "dead": self._dead})
+        self._mail["rows"], self._mail["columns"] = rows
         self.line.count[STOP] = 1
         _answer_all(self._socket.fileno(), self.line, self.box)  # compiles
         self.line.count[STOP] = 0
@@ -381,41 +464,15 @@ class Link:
             share: of it that counts.
             extra: (6,) further force on the handle [N], [N m].
         """
-        box = self.box
-        assert box
-        box.turn[_MACHINE] += 1
-        box.packet[:], box.share[0], box.extra[:] = packet, share, extra
-        box.stamp[_MACHINE] = clock.monotonic_ns()
-        box.turn[_MACHINE] += 1
-        pose = self.pose()
-        if pose is None:
-            self.engaged = False
-        elif not self.engaged:
-            self.engaged = self._centred(pose)
-        qpos[:] = np.nan
-        if pose is not None and self.engaged:
-            qpos[:3], qpos[3:] = pose.place, pose.quaternion
+        now = clock.monotonic_ns()
+        self.engaged = meet(self._mail, qpos, packet, share, extra, self.engaged, now)
 
     def pose(self) -> HandlePose | None:
         """The handle on the joystick's scale; None while no pose comes."""
-        box = self.box
-        assert box
-        for _ in range(8):
-            turn = int(box.turn[_HANDLE])
-            values, when = box.handle.copy(), int(box.stamp[_HANDLE])
-            if turn % 2 == 0 and turn == box.turn[_HANDLE]:
-                break
-        else:
-            return None
-        silent = clock.monotonic_ns() - when > 1e9 * SILENT
-        if silent or not np.isfinite(values).all():
+        values = np.empty(8)
+        if not take_pose(self._mail, clock.monotonic_ns(), values):
             return None
         return HandlePose(values[:3], values[3:7], int(values[7]))
-
-    def _centred(self, pose: HandlePose) -> bool:
-        """Whether no axis of the joystick would command anything."""
-        turn = 2.0 * pose.quaternion[1:] * (1.0 if pose.quaternion[0] >= 0.0 else -1.0)
-        return bool((np.abs([*pose.place, *turn]) <= self._dead).all())
 
     def restart_figures(self) -> None:
         """Forget what the line has seen so far, such as a device that waited for the machine."""

@@ -20,7 +20,7 @@ from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.audit import full_state
-from hydrotele.simulate.closure import pin_opening
+from hydrotele.simulate.closure import pin_sites, widest_pin
 from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
@@ -93,6 +93,7 @@ class Session:
         plant, data, plan, seen = prepared
         plan = dataclasses.replace(
             plan, reference=np.ascontiguousarray(plan.reference, float),
+            rate=np.ascontiguousarray(plan.rate, float),
             command=np.ascontiguousarray(plan.command, float),
         )  # fmt: skip
         begin_leapfrog(plant.model, data)
@@ -122,8 +123,10 @@ class Session:
         self._planned = planned_record(self._run)
         self.station = None
         if isinstance(scenario.pilot, TeleopPilot):
-            self.station = Station(plant, scenario, plan, drives, seen, hand)
+            self.station = Station(plant, data, scenario, plan, drives, seen, hand)
+        self._eventful = bool(scenario.surroundings)
         self._around = Surroundings(plant.machine, plant.model, scenario.surroundings)
+        self._sites, self._pins = data.site_xpos, pin_sites(plant.model)
         self._worst, self._begin = 0.0, 0.0
         self.tick = 0
 
@@ -142,13 +145,13 @@ class Session:
         if tick % self.every == 0 and tick // self.every < len(self._recorder.time):
             shown = stepper.shown() if stepper.late else None
             self._recorder.take(tick // self.every, tick * self._dt, data, shown)
-        tripped = self.station is not None and self.station.tick(tick, data, self.seen)
+        tripped = self.station is not None and self.station.tick(tick)
         self._begin = self._begin if tick else clock.perf_counter()
         planned_tick(stepper.record, self._planned, tick, stepper.steps, tripped)
         stepper.tick = tick + 1
-        if self.scenario.surroundings:
+        if self._eventful:
             self._around.update(tick * self._dt, data, self._dt)
-        self._worst = max(self._worst, pin_opening(self.plant.model, data))
+        self._worst = max(self._worst, widest_pin(self._sites, *self._pins))
         self.tick = tick + 1
 
     def set_command(self, axis: str, value: float) -> None:

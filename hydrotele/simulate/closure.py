@@ -4,7 +4,6 @@ Names and poses of a Machine for `multibody.closures`, which closes the loops of
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -29,7 +28,6 @@ from hydrotele.simulate.mechanism import (
 _STEP = 0.2  # largest move of an independent joint between two solutions [rad] or [m]
 _TURN = 0.3  # largest move of a joint that follows, in a round of Newton's method [rad] or [m]
 _CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
-_CONNECT = int(mujoco.mjtEq.mjEQ_CONNECT)
 _FOLLOWED = 1.0e-9  # the same where only looks depend on it
 
 
@@ -58,22 +56,36 @@ def pin_count(model: mujoco.MjModel) -> int:
 
 def pin_opening(model: mujoco.MjModel, data: mujoco.MjData) -> float:
     """Largest distance between the two halves of a pin, with `site_xpos` as it stands [m]."""
-    return math.sqrt(
-        _widest(data.site_xpos, model.eq_type, model.eq_obj1id, model.eq_obj2id, _CONNECT)
-    )
+    return widest_pin(data.site_xpos, *pin_sites(model))
+
+
+def pin_sites(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Sites (p,) of one half of every pin, and (p,) of its other half."""
+    pins = model.eq_type == mujoco.mjtEq.mjEQ_CONNECT
+    return model.eq_obj1id[pins], model.eq_obj2id[pins]
 
 
 @compiled
-def _widest(places, kinds, one, two, connect):
-    """Square of the largest distance between the sites of connects."""
+def widest_pin(places, one, two):
+    """Largest distance between the two halves of a pin.
+
+    Args:
+        places: (nsite, 3) of all sites [m].
+        one: (p,) sites of `pin_sites`.
+        two: (p,) the others.
+
+    Returns:
+        The distance, scalar [m]; 0 without pins.
+
+    Source: this module.
+    """
     widest = 0.0
-    for k in range(len(kinds)):
-        if kinds[k] == connect:
-            gap = 0.0
-            for i in range(3):
-                gap += (places[one[k], i] - places[two[k], i]) ** 2
-            widest = max(widest, gap)
-    return widest
+    for k in range(len(one)):
+        gap = 0.0
+        for i in range(3):
+            gap += (places[one[k], i] - places[two[k], i]) ** 2
+        widest = max(widest, gap)
+    return np.sqrt(widest)
 
 
 class _Linkage(NamedTuple):

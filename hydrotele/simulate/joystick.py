@@ -10,6 +10,8 @@ counts half by the velocity before a step and half by that after it. Places are 
 second order of the step, and a held force moves a free body exactly. The same steps without that
 mean run half a step ahead, as if the control sampled faster than it does.
 """
+# pyright: reportCallIssue=false
+# numba's intrinsics are called without their typing context.
 
 import math
 from pathlib import Path
@@ -21,11 +23,29 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_xml
 from hydrotele.machine.joystick import Joystick, principal
+from hydrotele.simulate.layout import (
+    address_record,
+    call_step,
+    floats,
+    function_address,
+    rows_of,
+)
 
 GRAVITY = -9.81
 _COOL = 0.9  # heat below which hot coils may have their largest current again
 _STEPS = 2  # physics steps per control period of 5 ms: its stiffest spring turns over in 30 ms
 _HALVES = 15  # currents, applied forces and gravity, which change between periods
+
+_FLOTOR = np.dtype(
+    [(name, np.int64) for name in ("mj_step", "mj_forward", "model", "data")]
+    + [(name, np.int64) for name in ("steps", "leaps", "started")]
+    + [(name, np.float64) for name in ("timestep", "period", "mass", "continuous_current")]
+    + [(name, np.float64) for name in ("thermal_time", "max_current", "hottest", "allowed")]
+    + [(name, np.int64) for name in ("com", "inertia", "mount")]  # addresses from here on
+    + [(name, np.int64) for name in ("ctrl", "applied", "gravity", "before")]
+    + [(name, np.int64) for name in ("speed", "acceleration", "half_damping", "heat")],
+    align=True,
+)
 
 
 class SimulatedFlotor:
@@ -38,9 +58,9 @@ class SimulatedFlotor:
             earlier.
         hand: whether a hand holds the handle.
         heat: (6,) of the coils, see `heat_step`.
-        hottest: the most that any of them has had.
-        allowed: current that the coils may have now [A]: the largest, or, once one of them is hot
-            and until it has cooled down, the one that they bear for ever.
+        record: (1,) the same for native code, see `flotor_step`.
+        weakens: whether coils lose force towards the end of their gap: `weaken_coils` then comes
+            before every period.
     """
 
     def __init__(
@@ -70,19 +90,9 @@ class SimulatedFlotor:
         self.model = spec.compile()
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
         self.data = mujoco.MjData(self.model)
-        body = self.model.body("flotor")
-        self._mass, self._com = float(body.mass[0]), body.ipos.copy()
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, body.iquat)
-        turn = turn.reshape(3, 3)
-        self._inertia = turn @ np.diag(body.inertia) @ turn.T
-        self._inertia += self._mass * (self._com @ self._com * np.eye(3))
-        self._inertia -= self._mass * np.outer(self._com, self._com)
-        self._gravity = self.model.opt.gravity  # views, which cost time to ask for
-        self._gravity[:] = (0.0, 0.0, GRAVITY)
-        self._ctrl, self._applied = self.data.ctrl, self.data.qfrc_applied
-        self._leaps, self._started, self._before = not runge_kutta, False, np.zeros((2, _HALVES))
-        self._speed, self._half_damping = self.data.qvel, 0.5 * _damping(self.model)
+        self.model.opt.gravity[:] = (0.0, 0.0, GRAVITY)
+        self.heat, self.weakens = np.zeros(6), facts.coils.edge_loss > 0.0
+        self._fill_record(0.5 * _damping(self.model), not runge_kutta)
         if runge_kutta:
             self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
         else:  # MuJoCo counts it by the velocity after a step
@@ -90,21 +100,64 @@ class SimulatedFlotor:
             self.model.tendon_damping *= 0.5
             if self.model.ntendon:  # its Euler steps do so for joints only
                 self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        self.heat, self.hottest, self.allowed = np.zeros(6), 0.0, facts.coils.max_current
         self._gear, self._full = self.model.actuator_gear, self.model.actuator_gear.copy()
         places = self.model.site_pos[self.model.actuator_trnid[:, 0]]
         self._spots = places + np.array(
             facts.flotor.handle
         )  # from the flotor's to the coils' frame
 
+    def _fill_record(self, half_damping: np.ndarray, leaps: bool) -> None:
+        """What native code needs; the arrays whose addresses it has are kept with it."""
+        model, data, body, coils = (
+            self.model,
+            self.data,
+            self.model.body("flotor"),
+            self.facts.coils,
+        )
+        mass, com, turn = float(body.mass[0]), body.ipos.copy(), np.zeros(9)
+        mujoco.mju_quat2Mat(turn, body.iquat)
+        turn = turn.reshape(3, 3)
+        inertia = turn @ np.diag(body.inertia) @ turn.T
+        inertia += mass * (com @ com * np.eye(3))
+        inertia -= mass * np.outer(com, com)
+        self._arrays = {
+            "com": com, "inertia": inertia, "mount": np.array(self.facts.mount, float),
+            "ctrl": data.ctrl, "applied": data.qfrc_applied, "gravity": model.opt.gravity,
+            "before": np.zeros((2, _HALVES)), "speed": data.qvel, "acceleration": data.qacc,
+            "half_damping": half_damping, "heat": self.heat,
+        }  # fmt: skip
+        self.record = address_record(_FLOTOR, self._arrays)
+        for name, value in {
+            "mj_step": function_address("mj_step"), "mj_forward": function_address("mj_forward"),
+            "model": model._address, "data": data._address, "steps": self.steps, "leaps": leaps,
+            "timestep": model.opt.timestep, "period": self.period, "mass": mass,
+            "continuous_current": coils.continuous_current, "thermal_time": coils.thermal_time,
+            "max_current": coils.max_current, "allowed": coils.max_current,
+        }.items():  # fmt: skip
+            self.record[name] = value
+
+    @property
+    def hottest(self) -> float:
+        """The most heat that any of the coils has had, see `heat_step`."""
+        return float(self.record["hottest"][0])
+
+    @property
+    def allowed(self) -> float:
+        """Current that the coils may have now [A].
+
+        The largest, or, once one of them is hot and until it has cooled down, the one that they
+        bear for ever.
+        """
+        return float(self.record["allowed"][0])
+
     def step(self, currents: np.ndarray, muscles: np.ndarray) -> None:
         """Go on by one control period with held currents (6,) [A] and muscle forces (6,) [N, N m].
 
         Muscles act on the handle: force along the stator's axes, torque about them.
         """
-        self._load_coils(currents)
-        self._applied[:] = muscles
-        self._advance()
+        if self.weakens:
+            self.weaken_coils()
+        _step(self.record, np.asarray(currents, float), np.asarray(muscles, float))
 
     def shaken_step(
         self, currents: np.ndarray, muscles: np.ndarray, mount: np.ndarray, spin: float,
@@ -119,54 +172,26 @@ class SimulatedFlotor:
             spin: turning of the cab [rad/s].
             spin_rate: its rate [rad/s^2].
         """
-        _shake(
-            self._mass, self._com, self._inertia, mount, spin, spin_rate, muscles,
-            self._gravity, self._applied,
-        )  # fmt: skip
-        self._load_coils(currents)
-        self._advance()
+        if self.weakens:
+            self.weaken_coils()
+        self._arrays["mount"][:] = mount
+        currents, muscles = np.asarray(currents, float), np.asarray(muscles, float)
+        _shaken_step(self.record, currents, muscles, float(spin), float(spin_rate))
 
-    def _advance(self) -> None:
-        """The steps of one period with what has been loaded."""
-        model, data, before = self.model, self.data, self._before
-        if not self._leaps:
-            mujoco.mj_step(model, data, nstep=self.steps)
-            return
-        inputs = self._ctrl, self._applied, self._gravity
-        _keep(*inputs, before)
-        if not self._started:
-            self._started = True
-            before[0] = before[1]
-            _load(*inputs, before, self._half_damping, self._speed, 0.0)
-            mujoco.mj_forward(model, data)
-            self._speed -= 0.5 * model.opt.timestep * data.qacc
-        for k in range(self.steps):
-            _load(*inputs, before, self._half_damping, self._speed, 0.0 if k else 0.5)
-            mujoco.mj_step(model, data)
-
-    def _load_coils(self, currents: np.ndarray) -> None:
-        """Put currents on the coils, warm them, and weaken those that leave their field."""
-        self._ctrl[:] = currents
-        c = self.facts.coils
-        hot = heat_step(self.heat, currents, c.continuous_current, c.thermal_time, self.period)
-        self.hottest = max(self.hottest, hot)
-        if hot >= 1.0:
-            self.allowed = min(c.max_current, c.continuous_current)
-        elif hot < _COOL:
-            self.allowed = c.max_current
-        if c.edge_loss > 0.0:
-            turn, handle = np.empty(9), np.array(self.facts.flotor.handle)
-            mujoco.mju_quat2Mat(turn, self.data.qpos[3:7])
-            turn = turn.reshape(3, 3)
-            place = self.data.qpos[:3] + handle - turn @ handle
-            gap = self.facts.workspace.translation
-            shares = field_shares(self._spots, place, turn, gap, c.edge_loss)
-            self._gear[:] = self._full * shares[:, None]
+    def weaken_coils(self) -> None:
+        """Weaken the coils that leave their field, as far as the flotor stands from its centre."""
+        turn, handle = np.empty(9), np.array(self.facts.flotor.handle)
+        mujoco.mju_quat2Mat(turn, self.data.qpos[3:7])
+        turn = turn.reshape(3, 3)
+        place = self.data.qpos[:3] + handle - turn @ handle
+        gap = self.facts.workspace.translation
+        shares = field_shares(self._spots, place, turn, gap, self.facts.coils.edge_loss)
+        self._gear[:] = self._full * shares[:, None]
 
     def place(self, pose: np.ndarray) -> None:
         """Put the handle to a pose at rest, (6,) displacement [m] and rotation vector [rad]."""
         mujoco.mj_resetData(self.model, self.data)
-        self._started = False
+        self.record["started"] = 0
         self.data.qpos[:3] = pose[:3]
         angle = float(np.linalg.norm(pose[3:]))
         way = pose[3:] / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
@@ -184,26 +209,114 @@ def _damping(model: mujoco.MjModel) -> np.ndarray:
 
 
 @compiled
-def _keep(ctrl, applied, gravity, before):
+def flotor_step(r, currents, muscles):
+    """Go on by one control period with held currents.
+
+    Args:
+        r: `SimulatedFlotor.record[0]`, written: heat, and what MuJoCo has of the joystick.
+        currents: (6,) [A].
+        muscles: (6,) on the handle [N], [N m].
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    applied = floats(r.applied, 6)
+    for i in range(6):
+        applied[i] = muscles[i]
+    _go_on(r, currents)
+
+
+@compiled
+def shaken_flotor_step(r, currents, muscles, spin, spin_rate):
+    """Like `flotor_step`, in a cab that turns about a vertical axis.
+
+    Args:
+        r: see `flotor_step`.
+        currents: (6,) [A].
+        muscles: (6,) on the handle [N], [N m].
+        spin: turning of the cab, scalar [rad/s].
+        spin_rate: its rate, scalar [rad/s^2].
+
+    Returns:
+        Nothing.
+
+    Source: forces of inertia in a frame that turns.
+    """
+    _shake(
+        r.mass, floats(r.com, 3), rows_of(r.inertia, 3, 3), floats(r.mount, 3), spin, spin_rate,
+        muscles, floats(r.gravity, 3), floats(r.applied, 6),
+    )  # fmt: skip
+    _go_on(r, currents)
+
+
+@compiled
+def _go_on(r, currents):
+    """The steps of one period with currents, and with the forces that have been loaded."""
+    ctrl, heat = floats(r.ctrl, 6), floats(r.heat, 6)
+    for i in range(6):
+        ctrl[i] = currents[i]
+    hot = heat_step(heat, currents, r.continuous_current, r.thermal_time, r.period)
+    r.hottest = max(r.hottest, hot)
+    if hot >= 1.0:
+        r.allowed = min(r.max_current, r.continuous_current)
+    elif hot < _COOL:
+        r.allowed = r.max_current
+    if not r.leaps:
+        for _ in range(r.steps):
+            call_step(r.mj_step, r.model, r.data)
+        return
+    inputs = ctrl, floats(r.applied, 6), floats(r.gravity, 3)
+    before, speed = rows_of(r.before, 2, _HALVES), floats(r.speed, 6)
+    damping = rows_of(r.half_damping, 6, 6)
+    _keep(inputs, before)
+    if not r.started:
+        r.started = 1
+        for i in range(_HALVES):
+            before[0, i] = before[1, i]
+        _load(inputs, before, damping, speed, 0.0)
+        call_step(r.mj_forward, r.model, r.data)
+        acceleration = floats(r.acceleration, 6)
+        for i in range(6):
+            speed[i] -= 0.5 * r.timestep * acceleration[i]
+    for k in range(r.steps):
+        _load(inputs, before, damping, speed, 0.0 if k else 0.5)
+        call_step(r.mj_step, r.model, r.data)
+
+
+@compiled
+def _keep(inputs, before):
     """Put a period's inputs into the second row of `before` (2, 15), and what was there above."""
     at = 0
-    for part in (ctrl, applied, gravity):
+    for part in inputs:
         for i in range(len(part)):
             before[0, at], before[1, at] = before[1, at], part[i]
             at += 1
 
 
 @compiled
-def _load(ctrl, applied, gravity, before, half_damping, speed, share):
+def _load(inputs, before, half_damping, speed, share):
     """Inputs of a step: this period's with a `share` of the last one's; half of the damping."""
     at = 0
-    for part in (ctrl, applied, gravity):
+    for part in inputs:
         for i in range(len(part)):
             part[i] = share * before[0, at] + (1.0 - share) * before[1, at]
             at += 1
+    applied = inputs[1]
     for i in range(len(applied)):
         for k in range(len(speed)):
             applied[i] -= half_damping[i, k] * speed[k]
+
+
+@compiled
+def _step(record, currents, muscles):
+    flotor_step(record[0], currents, muscles)
+
+
+@compiled
+def _shaken_step(record, currents, muscles, spin, spin_rate):
+    shaken_flotor_step(record[0], currents, muscles, spin, spin_rate)
 
 
 @compiled

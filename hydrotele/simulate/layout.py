@@ -83,7 +83,7 @@ def field_offsets(struct: str) -> dict[str, int]:
     """Offset of every field of a MuJoCo struct.
 
     Args:
-        struct: "mjModel" or "mjData".
+        struct: "mjModel", "mjData" or "mjContact".
 
     Returns:
         Field name -> offset [byte].
@@ -96,8 +96,15 @@ def field_offsets(struct: str) -> dict[str, int]:
     return _struct_layout(structs.STRUCTS[struct].fields)[0]
 
 
+@functools.cache
+def struct_size(struct: str) -> int:
+    """Size of a MuJoCo struct in an array of them [byte]."""
+    return _struct_layout(structs.STRUCTS[struct].fields)[1]
+
+
 def _read(address: int, dtype) -> float:
-    kind = {np.float64: ctypes.c_double, np.int64: ctypes.c_int64}[dtype]
+    kinds = {np.float64: ctypes.c_double, np.int64: ctypes.c_int64, np.int32: ctypes.c_int32}
+    kind = kinds[dtype]
     return kind.from_address(address).value
 
 
@@ -110,7 +117,7 @@ def option_offset(name: str) -> int:
 
 _ARRAYS = ("actuator_user", "actuator_actadr", "numeric_adr", "numeric_size", "numeric_data")
 _PROBE = """<mujoco><option timestep="0.0123"/><custom><numeric name="n" data="1 2 3"/></custom>
-<worldbody><body><joint name="j" type="slide"/>
+<worldbody><geom type="plane" size="1 1 1"/><body><joint name="j" type="slide"/>
 <geom size="0.1"/></body></worldbody><actuator>
 <general joint="j" dyntype="integrator" user="1 2 3"/><motor joint="j"/></actuator></mujoco>"""
 
@@ -125,6 +132,7 @@ def verify_layout() -> None:
     """
     model = mujoco.MjModel.from_xml_string(_PROBE)
     data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)  # its body touches the plane
     data.time = 0.456
     in_model, in_data = field_offsets("mjModel"), field_offsets("mjData")
     wrong = [
@@ -142,6 +150,18 @@ def verify_layout() -> None:
         for name in ("ctrl", "act", "act_dot", "actuator_velocity", "actuator_length")
         if _read(data._address + in_data[name], np.int64) != getattr(data, name).ctypes.data
     ]
+    contact, first = data.contact, _read(data._address + in_data["contact"], np.int64)
+    wrong += [
+        f"contact.{name}"
+        for name in ("frame", "geom")
+        if first + field_offsets("mjContact")[name] != getattr(contact, name).ctypes.data
+    ]
+    if struct_size("mjContact") != contact.frame.strides[0]:
+        wrong.append("the next contact")
+    if _read(data._address + in_data["ncon"], np.int32) != data.ncon:
+        wrong.append("ncon")
+    if data._address + in_data["warning"] + 4 != data.warning.number.ctypes.data:
+        wrong.append("warning")
     if _read(model._address + option_offset("timestep"), np.float64) != 0.0123:
         wrong.append("opt.timestep")
     if _read(data._address + in_data["time"], np.float64) != 0.456:
@@ -185,6 +205,12 @@ def integers(address, count):
     return carray(pointer(address), (count,), np.int64)
 
 
+@compiled
+def short_integers(address, count):
+    """(count,) 32-bit integers at an address."""
+    return carray(pointer(address), (count,), np.int32)
+
+
 def address_record(kind: np.dtype, arrays: dict[str, np.ndarray]) -> np.ndarray:
     """A record of the addresses of arrays, for native code that takes many of them at once.
 
@@ -216,7 +242,7 @@ def field(base, offset, count):
 
 @intrinsic
 def call_step(typingctx, function, model, data):
-    """`mj_step(model, data)`, with the address of that function."""
+    """`mj_step(model, data)`, or another function of these two, as `mj_forward`, by address."""
 
     def codegen(context, builder, signature, args):
         kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t] * 2)
@@ -226,6 +252,23 @@ def call_step(typingctx, function, model, data):
         return context.get_dummy_value()
 
     return types.void(types.int64, types.int64, types.int64), codegen
+
+
+@intrinsic
+def call_contact_force(typingctx, function, model, data, contact, wrench):
+    """`mj_contactForce(model, data, contact, wrench)`, all by address but the contact's number."""
+
+    def codegen(context, builder, signature, args):
+        place, integer = cgutils.voidptr_t, ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [place, place, integer, place])
+        function, model, data, contact, wrench = args
+        pointers = [builder.inttoptr(at, place) for at in (model, data, wrench)]
+        called = builder.inttoptr(function, kind.as_pointer())
+        builder.call(called, [*pointers[:2], builder.trunc(contact, integer), pointers[2]])
+        return context.get_dummy_value()
+
+    five = (types.int64,) * 5
+    return types.void(*five), codegen
 
 
 @intrinsic

@@ -8,6 +8,8 @@ but for friction.
 
 What a run shows: true channels from recorded states.
 """
+# pyright: reportCallIssue=false
+# numba's intrinsics are called without their typing context.
 
 import dataclasses
 import math
@@ -27,6 +29,17 @@ from hydrotele.hydraulics.circuit import (
     open_ports,
 )
 from hydrotele.simulate.closure import following_joints
+from hydrotele.simulate.layout import (
+    address_record,
+    call_contact_force,
+    field_offsets,
+    floats,
+    function_address,
+    integers,
+    rows_of,
+    short_integers,
+    struct_size,
+)
 from hydrotele.simulate.mechanism import TIP_SITE
 from hydrotele.simulate.plant import Plant, added_by_terms
 from hydrotele.simulate.surroundings import is_surrounding_object, object_joints
@@ -90,12 +103,23 @@ def aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     """Staggered positions (..., nq) a step back along velocities (..., nv); see `Record`."""
-    if model.nq == model.nv:
-        return qpos - model.opt.timestep * qvel
-    plain = _plain_joints(model.jnt_type)
-    positions = qpos.copy()
-    positions[..., :plain] -= model.opt.timestep * qvel[..., :plain]
+    positions = np.array(qpos)
+    rows, rates = positions.reshape(-1, model.nq), qvel.reshape(-1, model.nv)
+    _step_back(rows, rates, model.opt.timestep, _plain_positions(model))
     return positions
+
+
+@compiled
+def _step_back(positions, velocities, timestep, plain):
+    """Move the first `plain` positions of every row (n, nq) back by a step."""
+    for row in range(len(positions)):
+        for i in range(plain):
+            positions[row, i] -= timestep * velocities[row, i]
+
+
+def _plain_positions(model: mujoco.MjModel) -> int:
+    """Number of positions that can be moved by their own velocities."""
+    return model.nq if model.nq == model.nv else _plain_joints(model.jnt_type)
 
 
 _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
@@ -128,6 +152,42 @@ def split_delay(delay: float, timestep: float) -> tuple[int, float]:
     return steps, rest if rest > _WHOLE else 0.0
 
 
+_ROW = np.dtype(
+    [(name, np.int64) for name in ("rows", "nq", "nv", "na", "plain", "sites", "tip", "warning")]
+    + [("timestep", np.float64)]
+    + [(name, np.int64) for name in ("qpos", "qvel", "qacc", "act", "site")]  # addresses from here
+    + [(name, np.int64) for name in ("to_time", "to_qpos", "to_qvel", "to_qacc", "to_act")]
+    + [(name, np.int64) for name in ("to_contact", "to_tip")],
+    align=True,
+)
+_WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
+
+
+@compiled
+def _take(record, contacts, row, time):
+    """Write the present state into a row; whether it is finite, and MuJoCo without warning."""
+    r = record[0]
+    velocity, acceleration, act = floats(r.qvel, r.nv), floats(r.qacc, r.nv), floats(r.act, r.na)
+    floats(r.to_time, r.rows)[row] = time
+    positions = rows_of(r.to_qpos, r.rows, r.nq)[row : row + 1]
+    positions[0] = floats(r.qpos, r.nq)
+    _step_back(positions, velocity.reshape((1, r.nv)), r.timestep, r.plain)
+    to_velocity = rows_of(r.to_qvel, r.rows, r.nv)[row]
+    good = True
+    for i in range(r.nv):
+        to_velocity[i] = velocity[i] - 0.5 * r.timestep * acceleration[i]
+        good = good and np.isfinite(acceleration[i])
+    rows_of(r.to_qacc, r.rows, r.nv)[row] = acceleration
+    rows_of(r.to_act, r.rows, r.na)[row] = act
+    if r.tip >= 0:
+        rows_of(r.to_tip, r.rows, 3)[row] = rows_of(r.site, r.sites, 3)[r.tip]
+    sum_contact_forces(contacts, rows_of(r.to_contact, r.rows, 3)[row])
+    warnings = short_integers(r.warning, 2 * _WARNINGS)  # information and number of each
+    for kind in range(_WARNINGS):
+        good = good and warnings[2 * kind + 1] == 0
+    return good
+
+
 class Recorder:
     """Arrays that a run fills, one row per log sample.
 
@@ -139,9 +199,9 @@ class Recorder:
     def __init__(self, plant: Plant, rows: int) -> None:
         """Make room for all rows."""
         model = plant.model
-        self.model, self._step = model, model.opt.timestep
+        self.model, self._data = model, None
         self.tip_site = model.site(TIP_SITE).id if plant.machine.arm else -1
-        self.around = surrounding_bodies(plant)
+        self.around = surrounding_geoms(plant)
         self.time = np.zeros(rows)
         self.qpos, self.qvel = np.zeros((rows, model.nq)), np.zeros((rows, model.nv))
         self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
@@ -164,19 +224,33 @@ class Recorder:
         Raises:
             SimulationFailed: the state is not finite, or MuJoCo warns.
         """
-        self.time[row], qacc = time, data.qacc
-        self.qpos[row] = aligned_positions(self.model, data)
-        self.qvel[row] = data.qvel - 0.5 * self._step * qacc
-        self.qacc[row] = qacc
-        self.act[row] = data.act
+        if data is not self._data:
+            self._find(data)
         if shown is not None and self.late.shape[1]:
             self.late[row] = shown
-        if self.tip_site >= 0:
-            self.tip[row] = data.site_xpos[self.tip_site]
-        if data.ncon:
-            self.contact[row] = contact_force(self.model, data, self.around)
-        if not np.isfinite(qacc).all() or data.warning.number.any():
+        if not _take(self._row, self._contacts, row, time):
             raise SimulationFailed(self._story(row))
+
+    def _find(self, data: mujoco.MjData) -> None:
+        """Look up where everything is that is taken, and where it is put."""
+        model, self._data = self.model, data
+        self._row = address_record(
+            _ROW,
+            {
+                "qpos": data.qpos, "qvel": data.qvel, "qacc": data.qacc, "act": data.act,
+                "site": data.site_xpos, "to_time": self.time, "to_qpos": self.qpos,
+                "to_qvel": self.qvel, "to_qacc": self.qacc, "to_act": self.act,
+                "to_contact": self.contact, "to_tip": self.tip,
+            },
+        )  # fmt: skip
+        for name, value in {
+            "rows": len(self.time), "nq": model.nq, "nv": model.nv, "na": model.na,
+            "plain": _plain_positions(model), "sites": model.nsite, "tip": self.tip_site,
+            "warning": data._address + field_offsets("mjData")["warning"],
+            "timestep": model.opt.timestep,
+        }.items():  # fmt: skip
+            self._row[name] = value
+        self._contacts = contact_record(model, data, self.around)
 
     def _story(self, row: int) -> str:
         lines = [f"the simulation became unstable at {self.time[row]:.3f} s; the last states:"]
@@ -201,6 +275,15 @@ def surrounding_bodies(plant: Plant) -> np.ndarray:
     return (model.body_weldid == 0) | (np.array(named) & bool(plant.surroundings))
 
 
+def surrounding_geoms(plant: Plant) -> np.ndarray:
+    """The same of each geom, (ngeom,) integers."""
+    return _of_geoms(plant.model, surrounding_bodies(plant))
+
+
+def _of_geoms(model: mujoco.MjModel, around: np.ndarray) -> np.ndarray:
+    return around[model.geom_bodyid].astype(np.int64)
+
+
 def contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
     """Sum of all contact forces on the machine, (3,) [N] in the world frame.
 
@@ -209,27 +292,74 @@ def contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray
         data: with contacts and their forces.
         around: (nbody,) of `surrounding_bodies`.
     """
-    total, count = np.zeros(3), data.ncon
-    if not count:
-        return total
-    contacts, wrenches = data.contact, np.empty((count, 6))
-    for k, wrench in enumerate(wrenches):
-        mujoco.mj_contactForce(model, data, k, wrench)
-    _add_forces(contacts.frame, contacts.geom, wrenches, model.geom_bodyid, around, total)
+    total, around = np.zeros(3), _of_geoms(model, around)
+    sum_contact_forces(contact_record(model, data, around), total)
     return total
 
 
+_CONTACTS = np.dtype(
+    [(name, np.int64) for name in ("function", "model", "data", "count", "contacts", "geoms")]
+    + [(name, np.int64) for name in ("size", "frame", "geom", "around")],
+    align=True,
+)
+
+
+def contact_record(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
+    """Where native code finds contacts and their forces, for `sum_contact_forces`.
+
+    Args:
+        model: the model.
+        data: its data; it and the model must outlive the record.
+        around: (ngeom,) of `surrounding_geoms`, which must outlive it, too.
+
+    Returns:
+        (1,) record.
+    """
+    found, in_data = address_record(_CONTACTS, {"around": around}), field_offsets("mjData")
+    for name, value in {
+        "function": function_address("mj_contactForce"), "model": model._address,
+        "data": data._address, "count": data._address + in_data["ncon"],
+        "contacts": data._address + in_data["contact"], "geoms": len(around),
+        "size": struct_size("mjContact"), "frame": field_offsets("mjContact")["frame"],
+        "geom": field_offsets("mjContact")["geom"],
+    }.items():  # fmt: skip
+        found[name] = value
+    return found
+
+
 @compiled
-def _add_forces(frames, geoms, wrenches, bodies, around, total):
+def sum_contact_forces(record, total):
+    """Sum of all contact forces on the machine.
+
+    Args:
+        record: of `contact_record`.
+        total: (3,) written, world frame [N].
+
+    Returns:
+        Nothing.
+
+    Source: `contact_force`.
+    """
+    total[:] = 0.0
+    _add_contact_forces(record[0], total)
+
+
+@compiled
+def _add_contact_forces(r, total):
     """Add the forces of contacts, turned into the world, on bodies that are not around."""
-    for k in range(len(wrenches)):
-        first = around[bodies[geoms[k, 0]]]
-        if first == around[bodies[geoms[k, 1]]]:
+    around, wrench = integers(r.around, r.geoms), np.empty(6)
+    first_contact = integers(r.contacts, 1)[0]
+    for k in range(short_integers(r.count, 1)[0]):
+        contact = first_contact + k * r.size
+        geom = short_integers(contact + r.geom, 2)
+        first = around[geom[0]]
+        if first == around[geom[1]]:
             continue  # the machine touching itself is no ground force
-        sign = 1.0 if first else -1.0
+        call_contact_force(r.function, r.model, r.data, k, wrench.ctypes.data)
+        frame, sign = floats(contact + r.frame, 9), 1.0 if first else -1.0
         for i in range(3):
-            force = frames[k, i] * wrenches[k, 0] + frames[k, 3 + i] * wrenches[k, 1]
-            total[i] += sign * (force + frames[k, 6 + i] * wrenches[k, 2])
+            force = frame[i] * wrench[0] + frame[3 + i] * wrench[1]
+            total[i] += sign * (force + frame[6 + i] * wrench[2])
 
 
 _BRISTLE, _STIFFNESS = int(Slot.BRISTLE), int(Slot.BRISTLE_STIFFNESS)

@@ -6,7 +6,8 @@ goes to the machine in another packet, late; there it becomes joint references.
 
 What the operator's station saw and did, by control tick, and its channels for the logs.
 
-One control period of teleoperation in two compiled halves, before and after the joystick moves.
+One control period of teleoperation in two compiled halves, before and after the joystick moves, and
+as a whole around the simulated joystick.
 
 Delay lines are rings: what is written at a tick is read as many ticks later as the ring is long.
 """
@@ -34,9 +35,10 @@ from hydrotele.machine.sensors import SensorSet
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Channel, Fault, TeleopPilot
 from hydrotele.simulate.feedback import Feedback
-from hydrotele.simulate.joystick import SimulatedFlotor
+from hydrotele.simulate.joystick import SimulatedFlotor, flotor_step, shaken_flotor_step
+from hydrotele.simulate.layout import address_record, floats, integers, rows_of
 from hydrotele.simulate.plant import Plant
-from hydrotele.simulate.record import contact_force, surrounding_bodies
+from hydrotele.simulate.record import contact_record, sum_contact_forces, surrounding_geoms
 from hydrotele.teleop.axis_table import DAMPING, DEADBAND, REACH, flat_view
 from hydrotele.teleop.master import (
     CONTROLLED,
@@ -126,7 +128,7 @@ class MasterSide(NamedTuple):
         master: (168,) Master.
         state: (123,) MasterState, written.
         qpos: (7,) of the flotor: position [m] and quaternion.
-        muscles: (79,) Muscles, written.
+        muscles: (80,) Muscles, written.
         past: (reflex + 1, 6) see `pull`.
         tremor: (n, 6) see `pull`.
     """
@@ -231,6 +233,91 @@ def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, dri
         velocity[columns[i]] = scale * arm[columns[i]] * s.ahead[i]
 
 
+_STATION = np.dtype(
+    [(name, np.int64) for name in ("axes", "joints", "ticks", "dofs", "swing", "simulated")]
+    + [(name, np.int64) for name in ("forward_rows", "back_rows", "ages", "past_rows")]
+    + [(name, np.int64) for name in ("tremor_rows", "points", "pose_columns")]
+    + [(name, np.int64) for name in ("slave_size", "slave_state_size", "muscles_size")]
+    + [(name, np.int64) for name in ("master_size", "master_state_size")]
+    + [("scale", np.float64)]
+    + [(name, np.int64) for name in ("joint", "force", "columns")]  # addresses from here on
+    + [(name, np.int64) for name in ("slave", "slave_state", "master", "master_state")]
+    + [(name, np.int64) for name in ("forward", "back", "packet", "age", "line_state")]
+    + [(name, np.int64) for name in ("qpos", "muscles", "past", "tremor", "qvel", "qacc")]
+    + [(name, np.int64) for name in ("grid", "table", "reference", "rate", "pose")]
+    + [(name, np.int64) for name in ("velocity", "arm", "volume_head", "volume_rod")]
+    + [(name, np.int64) for name in ("log_master", "log_slave", "log_force", "log_muscles")],
+    align=True,
+)
+
+
+@compiled
+def _sides(r):
+    """SlaveSide, Line and MasterSide of a record."""
+    k, rows, back = r.joints, r.forward_rows, r.back_rows
+    machine = SlaveSide(
+        floats(r.joint, r.axes), floats(r.force, k), integers(r.columns, k),
+        floats(r.slave, r.slave_size), floats(r.slave_state, r.slave_state_size),
+    )  # fmt: skip
+    line = Line(
+        floats(r.forward, rows * 18).reshape((rows, 3, 6)),
+        floats(r.back, back * 8 * k).reshape((back, 8, k)), rows_of(r.packet, 8, k),
+        integers(r.age, 2 * r.ages).reshape((r.ages, 2)), floats(r.line_state, FADING + 1),
+    )  # fmt: skip
+    operator = MasterSide(
+        floats(r.master, r.master_size), floats(r.master_state, r.master_state_size),
+        floats(r.qpos, 7), floats(r.muscles, r.muscles_size), rows_of(r.past, r.past_rows, 6),
+        rows_of(r.tremor, r.tremor_rows, 6),
+    )  # fmt: skip
+    return machine, line, operator
+
+
+@compiled
+def round_trip(station, flotor, tick, fresh, elapsed, tripped):
+    """Once around: to the hand, a period of the simulated joystick, to the machine, into the log.
+
+    Args:
+        station: record of a Station.
+        flotor: `SimulatedFlotor.record`, written.
+        tick: scalar.
+        fresh: see `to_the_hand`, scalar.
+        elapsed: see `to_the_hand`, scalar [s].
+        tripped: see `to_the_hand`, scalar.
+
+    Returns:
+        Whether a flag of the slave's stands: held at the edge, line silent, valves closed.
+
+    Source: `to_the_hand`, `simulate.joystick`, `to_the_machine`.
+    """
+    r = station[0]
+    machine, line, operator = _sides(r)
+    to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator)
+    s, m = unpack_slave_state(machine.state, r.joints), unpack_master_state(operator.state)
+    force, n, nu = unpack_muscles(operator.muscles).force, r.ticks, r.axes
+    if r.simulated:
+        unpack_master(operator.master).most[0] = flotor[0].allowed
+        if r.swing < 0:
+            flotor_step(flotor[0], m.currents, force)
+        else:
+            spin, spin_rate = floats(r.qvel, r.dofs)[r.swing], floats(r.qacc, r.dofs)[r.swing]
+            shaken_flotor_step(flotor[0], m.currents, force, spin, spin_rate)
+    rows_of(r.log_master, n, r.master_state_size)[tick] = operator.state
+    rows_of(r.log_slave, n, r.slave_state_size)[tick] = machine.state
+    rows_of(r.log_force, n, r.joints)[tick] = machine.force
+    rows_of(r.log_muscles, n, 6)[tick] = force
+    drive = DriveReference(
+        rows_of(r.velocity, n, nu)[tick], rows_of(r.arm, n, nu)[tick],
+        rows_of(r.volume_head, n, nu)[tick], rows_of(r.volume_rod, n, nu)[tick],
+    )  # fmt: skip
+    to_the_machine(
+        tick, machine, line, rows_of(r.grid, nu, 2),
+        floats(r.table, nu * r.points * 3).reshape((nu, r.points, 3)), r.scale,
+        rows_of(r.reference, n, nu)[tick], rows_of(r.rate, n, nu)[tick], drive,
+    )  # fmt: skip
+    rows_of(r.pose, n, r.pose_columns)[tick] = s.pose[: r.pose_columns]
+    return s.flags[BLOCKED] != 0.0 or s.flags[SILENT] != 0.0 or s.flags[TRIPPED] != 0.0
+
+
 _LENGTHS = ("m", "m", "m", "rad", "rad", "rad")
 _FORCES = ("N", "N", "N", "N m", "N m", "N m")
 _STIFFNESS = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
@@ -266,10 +353,10 @@ class StationLog:
         self.force, self.muscles = np.zeros((ticks, len(coordinates))), np.zeros((ticks, 6))
         self.touching = np.zeros(ticks, bool)
 
-    def take(self, tick: int, force: np.ndarray, muscles: np.ndarray, touching: bool) -> None:
-        """Keep what stands after the operator's half of a tick."""
-        self._master[tick], self._slave[tick] = self._one, self._two
-        self.force[tick], self.muscles[tick], self.touching[tick] = force, muscles, touching
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What `round_trip` writes a row of after the operator's half of a tick."""
+        return {"log_master": self._master, "log_slave": self._slave, "log_force": self.force,
+                "log_muscles": self.muscles}  # fmt: skip
 
     def cut(self, ticks: int) -> None:
         """Keep the first ticks only."""
@@ -342,17 +429,18 @@ class Station:
     """
 
     def __init__(
-        self, plant: Plant, scenario: Scenario, plan: Plan, drives: DriveReferences,
-        seen: Feedback, hand: Hand | None = None,
+        self, plant: Plant, data: mujoco.MjData, scenario: Scenario, plan: Plan,
+        drives: DriveReferences, seen: Feedback, hand: Hand | None = None,
     ) -> None:  # fmt: skip
         """Put everything in place.
 
         Args:
             plant: the simulated machine.
+            data: its state.
             scenario: with a teleoperated pilot.
             plan: references of the run, written tick by tick.
             drives: those of the drives, written tick by tick.
-            seen: what the machine's sensors say.
+            seen: what the machine's sensors say, refreshed before every tick.
             hand: where a live operator wants the handle.
 
         Raises:
@@ -361,8 +449,8 @@ class Station:
         pilot = scenario.pilot
         assert isinstance(pilot, TeleopPilot)
         machine = plant.machine
-        self._plant, self._pilot, self._plan, self._drives = plant, pilot, plan, drives
-        self._scale, self._period = scenario.servo.feedforward, 1.0 / scenario.control_rate
+        self._pilot, self._plan, self._data, self._seen = pilot, plan, data, seen
+        self._period = 1.0 / scenario.control_rate
         joystick = load_joystick(_beside(scenario, pilot.joystick))
         joystick = held_joystick(joystick, pilot.perception, scenario.folder)
         _, axes, _ = arm_facts(machine)
@@ -374,28 +462,60 @@ class Station:
         self._line = _line(pilot, scenario, len(axes))
         self._flotor = SimulatedFlotor(joystick, period=self._period)
         self._qpos = self._flotor.data.qpos
-        self._mount = np.array(joystick.mount)
-        self._swing = int(plant.dof[self.columns[0]]) if pilot.mount == "cab" else -1
-        self._grid, self._table = drive_tables(machine, plan.axes)
         self._sensors = sensor_set(machine, scenario.sensors)
         self._feel = _estimator(machine, plan.axes, pilot, seen, self._period, self._sensors)
-        self._around = surrounding_bodies(plant)
         self._task, self._pose = _task(pilot, seen, self._period, len(axes)), np.zeros(5)
-        self._force = np.zeros(len(axes))
+        self._true = pilot.force == "true"
+        self._force = self._feel.force if self._feel and not self._true else np.zeros(len(axes))
+        self._owners = plant.model, surrounding_geoms(plant)  # whose memory the addresses are
+        self._contacts = contact_record(plant.model, data, self._owners[1])
         self._elapsed = 0.0
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
         self.operator = OperatorModel(
             pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed,
             hand, scenario.folder,
         )  # fmt: skip
-        self._master_flat, self._m_flat = flat_view(self._master), flat_view(self._m)
-        self._slave_flat, self._s_flat = flat_view(self._slave), flat_view(self._s)
-        self._hand_flat = flat_view(self.operator.muscles)
         self.notes: list[str] = []
         self._said: set[str] = set()
         self.tripped = False
         self._faults = [_Fault(fault, plan.axes) for fault in pilot.faults]
         self._exchange: Exchange | None = None
+        self._arrays = self._addressed(machine, drives)
+        self._record = address_record(_STATION, self._arrays)
+        swing = int(plant.dof[self.columns[0]]) if pilot.mount == "cab" else -1
+        self._fill_record(swing, scenario.servo.feedforward)
+
+    def _addressed(self, machine: Machine, drives: DriveReferences) -> dict[str, np.ndarray]:
+        """Arrays of `round_trip`."""
+        plan, data, line = self._plan, self._data, self._line
+        grid, table = drive_tables(machine, plan.axes)
+        assert plan.pose is not None
+        return {
+            "joint": self._seen.joint, "force": self._force, "columns": self.columns,
+            "slave": flat_view(self._slave), "slave_state": flat_view(self._s),
+            "master": flat_view(self._master), "master_state": flat_view(self._m),
+            "forward": line.forward, "back": line.back, "packet": line.packet, "age": line.age,
+            "line_state": line.state, "qpos": self._qpos,
+            "muscles": flat_view(self.operator.muscles), "past": self.operator.past,
+            "tremor": np.ascontiguousarray(self.operator.tremor), "qvel": data.qvel,
+            "qacc": data.qacc, "grid": grid, "table": table, "reference": plan.reference,
+            "rate": plan.rate, "pose": plan.pose, **drives._asdict(), **self.log.arrays(),
+        }  # fmt: skip
+
+    def _fill_record(self, swing: int, scale: float) -> None:
+        """Sizes of the arrays, degree of freedom of the cab, scale of drive velocities."""
+        sizes = {name: len(array) for name, array in self._arrays.items()}
+        for name, value in {
+            "axes": sizes["joint"], "joints": sizes["columns"], "ticks": sizes["reference"],
+            "dofs": sizes["qvel"], "swing": swing, "simulated": 1, "ages": sizes["age"],
+            "forward_rows": sizes["forward"], "back_rows": sizes["back"],
+            "past_rows": sizes["past"], "tremor_rows": sizes["tremor"],
+            "slave_size": sizes["slave"], "slave_state_size": sizes["slave_state"],
+            "master_size": sizes["master"], "master_state_size": sizes["master_state"],
+            "muscles_size": sizes["muscles"], "points": self._arrays["table"].shape[1],
+            "pose_columns": self._arrays["pose"].shape[1], "scale": scale,
+        }.items():  # fmt: skip
+            self._record[name] = value
 
     def attach(self, exchange: Exchange) -> None:
         """Let a device in a person's hand take the place of the simulated joystick.
@@ -406,6 +526,7 @@ class Station:
             exchange: called once per control tick, see `Exchange`.
         """
         self._exchange = exchange
+        self._record["simulated"] = 0
 
     @property
     def numbers(self) -> Master:
@@ -427,89 +548,55 @@ class Station:
         """(2, 6) edge of the dead band and stop of every axis of the joystick [m], [rad]."""
         return self._master.axis[:, [DEADBAND, REACH]].T
 
-    def tick(self, tick: int, data: mujoco.MjData, seen: Feedback) -> bool:
+    def tick(self, tick: int) -> bool:
         """Go once around; references and drive references of this tick are written.
 
         Args:
             tick: the control tick.
-            data: the plant's state.
-            seen: the sensors' readings of now.
 
         Returns:
             Whether the valves are to be closed.
         """
+        seen, operator, pilot = self._seen, self.operator, self._pilot
         for fault in self._faults:
             fault.freeze(tick * self._period, seen)
         fresh = tick % seen.every == 0
-        self._felt(data, seen, fresh)
-        if self._pilot.tip_over:
+        if fresh or self._true:
+            self._felt(fresh)
+        if pilot.tip_over:
             push_back(
-                self._pilot.tip_over, self._master, self._line.packet, self._slave.start,
+                pilot.tip_over, self._master, self._line.packet, self._slave.start,
                 self._m.handle, self._m.speed, self._m.extra,
             )  # fmt: skip
         if self._exchange:
             share = float(self._line.state[SHARE])
             self._exchange(self._qpos, self._line.packet, share, self._m.extra)
-        if tick % self.operator.every == 0:
-            self.operator.decide(tick)
-        operator = self.operator
-        to_the_hand(
-            tick, fresh, self._elapsed, self.tripped, self._machine(seen), self._line,
-            MasterSide(
-                self._master_flat, self._m_flat, self._qpos, self._hand_flat, operator.past,
-                operator.tremor,
-            ),
-        )  # fmt: skip
+        elif self._flotor.weakens:
+            self._flotor.weaken_coils()
+        if tick % operator.every == 0:
+            operator.decide(tick)
+        told = round_trip(
+            self._record, self._flotor.record, tick, fresh, self._elapsed, self.tripped
+        )
         self._elapsed = seen.period
-        self._move_flotor(data)
-        self.log.take(tick, self._force, operator.muscles.force, data.ncon > 0)
-        self._ask(tick, seen)
-        self._check(tick, seen)
+        self.log.touching[tick] = self._data.ncon > 0
+        if told or tick % 20 == 0:
+            self._check(tick)
         return self.tripped
 
-    def _machine(self, seen: Feedback) -> SlaveSide:
-        return SlaveSide(seen.joint, self._force, self.columns, self._slave_flat, self._s_flat)
-
-    def _felt(self, data: mujoco.MjData, seen: Feedback, fresh: bool) -> None:
+    def _felt(self, fresh: bool) -> None:
         """Force at the tip, and what the task is like if that is reflected."""
+        seen = self._seen
         if self._feel and fresh:
-            self._force = self._feel.update(seen.joint, seen.head, seen.rod)
-        if self._pilot.force == "true":
-            self._force = self._true_force(data)
-        if self._task:
-            if fresh:
-                task_forward(self._slave.arm, seen.joint[self.columns], self._pose)
-                self._task.update(self._force, self._pose[: len(self._force)])
+            self._feel.update(seen.joint, seen.head, seen.rod)
+        if self._true:
+            self._true_force()
+        if self._task and fresh:
+            task_forward(self._slave.arm, seen.joint[self.columns], self._pose)
+            self._task.update(self._force, self._pose[: len(self._force)])
             self._line.back[:, TASK_STIFFNESS] = self._task.stiffness
             self._line.back[:, TASK_DAMPING] = self._task.damping
             self._line.back[:, TASK_MASS] = self._task.mass
-
-    def _move_flotor(self, data: mujoco.MjData) -> None:
-        """One period of the joystick, shaken by the cab if it stands there."""
-        if self._exchange:
-            return
-        currents, muscles = self._m.currents, self.operator.muscles.force
-        if self._swing < 0:
-            self._master.most[0] = self._flotor.allowed
-            self._flotor.step(currents, muscles)
-            return
-        self._master.most[0] = self._flotor.allowed
-        w, a = float(data.qvel[self._swing]), float(data.qacc[self._swing])
-        self._flotor.shaken_step(currents, muscles, self._mount, w, a)
-
-    def _ask(self, tick: int, seen: Feedback) -> None:
-        """Turn the packet that arrives into references."""
-        plan, drives = self._plan, self._drives
-        to_the_machine(
-            tick, self._machine(seen), self._line, self._grid, self._table, self._scale,
-            plan.reference[tick], plan.rate[tick],
-            DriveReference(
-                drives.velocity[tick], drives.arm[tick], drives.volume_head[tick],
-                drives.volume_rod[tick],
-            ),
-        )  # fmt: skip
-        if plan.pose is not None:
-            plan.pose[tick] = self._s.pose[: plan.pose.shape[1]]
 
     def summary(self) -> dict[str, float | int | bool | None]:
         """Figures of the run: energy at the handle, currents, how far it was used, trips."""
@@ -526,7 +613,7 @@ class Station:
             "tripped": self.tripped,
         }
 
-    def _check(self, tick: int, seen: Feedback) -> None:
+    def _check(self, tick: int) -> None:
         """Close the valves where something is not as it must be; say why, once."""
         now, s = tick * self._period, self._s
         if s.flags[BLOCKED] and "edge" not in self._said:
@@ -535,7 +622,7 @@ class Station:
             self._say("silent", f"no packet came for a while at {now:.2f} s: rates went to zero")
         why = ""
         if s.flags[TRIPPED]:
-            error = np.abs(seen.joint[self.columns] - s.joint)
+            error = np.abs(self._seen.joint[self.columns] - s.joint)
             name = self._plan.axes[self.columns[int(np.argmax(np.nan_to_num(error, nan=np.inf)))]]
             why = f"{name} does not follow its reference"
         elif self._feel and self._sensors and tick % 20 == 0:
@@ -549,16 +636,17 @@ class Station:
         self._said.add(key)
         self.notes.append(sentence)
 
-    def _true_force(self, data: mujoco.MjData) -> np.ndarray:
+    def _true_force(self) -> None:
         """The simulator's own contact force in task coordinates, without moments of the tool."""
-        force = np.zeros(len(self.coordinates))
-        if not data.ncon:
-            return force
-        x, y, z = contact_force(self._plant.model, data, self._around)
+        self._force[:] = 0.0
+        if not self._data.ncon:
+            return
+        total = np.zeros(3)
+        sum_contact_forces(self._contacts, total)
+        x, y, z = total
         r, theta = self._s.measured[0, :2]
         c, s = math.cos(theta), math.sin(theta)
-        force[:3] = x * c + y * s, r * (y * c - x * s), z
-        return force
+        self._force[:3] = x * c + y * s, r * (y * c - x * s), z
 
 
 class _Fault:
@@ -635,6 +723,7 @@ def _line(pilot: TeleopPilot, scenario: Scenario, k: int) -> Line:
     lost[: round(channel.lost_from / period)] = False
     age = np.stack([arrivals(delays[:, side]) for side in range(2)], axis=1)
     age[lost] = -1
+    age = np.ascontiguousarray(age, np.int64)
     longest = np.maximum(delays.max(axis=0), 0)
     return Line(
         np.zeros((1 + longest[0], 3, 6)), np.zeros((1 + longest[1], 8, k)), np.zeros((8, k)), age,

@@ -50,6 +50,11 @@ def test_model_fields_lie_where_the_bindings_show_them(field):
         ("mjData", "act_dot", 8),
         ("mjData", "actuator_length", 8),
         ("mjData", "actuator_velocity", 8),
+        ("mjData", "ncon", 4),
+        ("mjData", "contact", 8),
+        ("mjData", "warning", 4),
+        ("mjContact", "frame", 8),
+        ("mjContact", "geom", 4),
     ],
 )
 def test_a_moved_field_is_detected(fresh, monkeypatch, struct, field, shift):
