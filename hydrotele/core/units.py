@@ -49,6 +49,7 @@ UNITS: Mapping[str, tuple[str, float]] = {
     "cm^2": ("m^2", 1e-4),
     "cm^3/bar": ("m^3/Pa", 1e-11),
     "L/min per 100 bar": ("m^3/(s Pa)", 1e-10 / 60),
+    "bar per 100 L/min": ("Pa s/m^3", 6e7),
 }
 """Unit -> (SI unit, factor to it). All are pure scalings."""
 
@@ -81,6 +82,7 @@ _IN_REPORTS: Mapping[str, tuple[tuple[float, str], ...]] = {
     "Pa": ((1e6, "MPa"), (0.0, "bar")),
     "m^3/s": ((0.0, "L/min"),),
     "m^3/(s Pa)": ((0.0, "L/min per 100 bar"),),
+    "Pa s/m^3": ((0.0, "bar per 100 L/min"),),
     "m^3/Pa": ((0.0, "cm³/bar"),),
     "N": ((1e3, "kN"), (0.0, "N")),
     "N m": ((1e3, "kN m"), (0.0, "N m")),

@@ -460,8 +460,7 @@ def test_a_library_that_makes_another_error_of_sigterm_changes_no_exit_status():
     """As dm_control's parser does with whatever is raised while it reads an element."""
     code = """if True:
         import os, signal, time
-        from hydrotele.cli import help_page
-from hydrotele.cli import main as cli
+        from hydrotele.cli import main as cli
         def app():
             try:
                 os.kill(os.getpid(), signal.SIGTERM)
