@@ -19,7 +19,7 @@ import numpy as np
 SPIN = 120e-6  # s before a deadline in which a process stays awake
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 EDGES = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # us, of histograms
-_SLACK = 29  # PR_SET_TIMERSLACK of prctl
+_SLACK, _NO_HUGE_PAGES = 29, 41  # PR_SET_TIMERSLACK and PR_SET_THP_DISABLE of prctl
 _STAT, _STEAL = Path("/proc/stat"), 8  # word of its first line: proc(5)
 
 
@@ -200,7 +200,10 @@ def ask_for_priority(level: int) -> bool:
 
 @contextlib.contextmanager
 def steady(level: int) -> Iterator[bool]:
-    """No garbage collection, exact sleeps and, where permitted, priority.
+    """No garbage collection, exact sleeps, small pages and, where permitted, priority.
+
+    The first touch of a huge page of a long array, such as a log's, makes 2 MB of it: that takes
+    milliseconds.
 
     Args:
         level: see `ask_for_priority`; 0 asks for none.
@@ -208,7 +211,8 @@ def steady(level: int) -> Iterator[bool]:
     Yields:
         Whether there is priority.
     """
-    _sleep_exactly()
+    _control(_SLACK, 1000)  # the system wakes this thread when it is time, not 50 us later
+    _control(_NO_HUGE_PAGES, 1)
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -218,11 +222,12 @@ def steady(level: int) -> Iterator[bool]:
     finally:
         if given:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        _control(_NO_HUGE_PAGES, 0)
         gc.enable()
         gc.unfreeze()
 
 
-def _sleep_exactly() -> None:
-    """Let the system wake this thread when it is time, not 50 us later (Linux)."""
+def _control(option: int, value: int) -> None:
+    """Set an option of this process or thread, where the system knows it (Linux, prctl(2))."""
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_SLACK, 1000, 0, 0, 0)
+        ctypes.CDLL(None).prctl(option, value, 0, 0, 0)

@@ -269,7 +269,7 @@ def drive(
     # beside a haptic device not in the ticks in which estimate of force and log row are due, too
     phase = every // 2 if haptic else 0
     while session.tick < session.scenario.ticks:
-        if session.tick % every == phase:
+        if session.tick % every == phase or not session.tick:  # what it compiles is in no hurry
             reading = device.read(session.time)
             if reading.said:
                 say(reading.said)
