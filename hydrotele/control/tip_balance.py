@@ -83,18 +83,10 @@ _ARRAYS = {
     "model": ("user", "gear", "transmission"),
     "motion": ("frame", "jacobian", "momentum", "bar", "mass", "joint", "basis", "loop", "normal"),
     "space": ("drive", "row"),
-    "arm": (
-        "z",
-        "joint",
-        "task",
-        "gravity",
-        "acceleration",
-        "rate_noise",
-        "angle",
-        "table",
-        "work",
-    ),
-}  # of ArmBalance and its parts
+    "arm": ("z", "joint", "task", "gravity", "acceleration", "rate_noise", "angle", "table",
+            "work"),
+}  # fmt: skip
+# Arrays of ArmBalance and of its parts, whose addresses a record has.
 _ADDRESSES = [f"{part}_{name}" for part, names in _ARRAYS.items() for name in names]
 _ARM = np.dtype(
     [(name, np.int64) for name in ("links", "bars", "hydraulic", "frames", "coordinates", "free")]

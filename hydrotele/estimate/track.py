@@ -298,7 +298,10 @@ def steps_per_row(machine: Machine, period: float, step: float) -> int:
     Args:
         machine: the machine.
         period: of the rows [s].
-        step: wanted [s]; what it is rounded to may be larger where the machine allows it.
+        step: about what they should be [s]; they are finer where the machine needs it.
+
+    Returns:
+        Their number, at least 1.
     """
     least = math.ceil(period / fine_enough(machine, period) - 1e-6)
     return max(1, least, round(period / step))

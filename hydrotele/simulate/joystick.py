@@ -108,12 +108,8 @@ class SimulatedFlotor:
 
     def _fill_record(self, half_damping: np.ndarray, leaps: bool) -> None:
         """What native code needs; the arrays whose addresses it has are kept with it."""
-        model, data, body, coils = (
-            self.model,
-            self.data,
-            self.model.body("flotor"),
-            self.facts.coils,
-        )
+        model, data, coils = self.model, self.data, self.facts.coils
+        body = model.body("flotor")
         mass, com, turn = float(body.mass[0]), body.ipos.copy(), np.zeros(9)
         mujoco.mju_quat2Mat(turn, body.iquat)
         turn = turn.reshape(3, 3)

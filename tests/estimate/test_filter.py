@@ -13,7 +13,7 @@ from hydrotele.estimate.reduced_model import (
     reduced_model,
     state_names,
 )
-from hydrotele.estimate.track import track_run
+from hydrotele.estimate.track import steps_per_row, track_run
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
@@ -273,3 +273,17 @@ def test_a_drive_that_rests_in_the_middle_of_its_backlash_is_not_looked_for_agai
     assert len(searches) == 1
     track_run(machine, data, run, rest=np.full(1, np.nan))
     assert len(searches) == 2
+
+
+def test_steps_resolve_a_drive_on_its_spring_and_oil_and_are_no_finer_than_needed():
+    """The drive of the swing's teeth rings at 44 Hz on steel and oil: a step is 0.94 rad of it."""
+    machine = load_machine("cat215")
+    teeth = apply_effect(machine, "backlash", "swing", {"gap": 0.01})
+    swing, supply = teeth.axes["swing"], teeth.supply
+    assert swing.motor and swing.transmission and supply
+    oil = 2.0 * supply.bulk_modulus * swing.motor.displacement**2 / swing.motor.dead_volume
+    rate = np.sqrt((swing.transmission.stiffness + oil) / swing.transmission.inertia)
+    assert rate == pytest.approx(2.0 * np.pi * 43.7, rel=1e-2)
+    assert steps_per_row(teeth, 0.02, 1e-3) == 20, "what is asked for is finer"
+    assert steps_per_row(teeth, 0.02, 5e-3) == np.ceil(0.02 * rate / 0.94) == 6
+    assert steps_per_row(machine, 0.02, 5e-3) == 4, "nothing rings"
