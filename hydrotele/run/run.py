@@ -223,7 +223,7 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
     while session.tick < scenario.ticks:
         if progress and session.tick % stride == 0:
             progress(session.time, scenario.duration)
-        session.advance()
+        session.advance(min(stride - session.tick % stride, scenario.ticks - session.tick))
     if progress:
         progress(scenario.duration, scenario.duration)
     return finished(session, scenario)

@@ -1,4 +1,4 @@
-"""A run under way: one control tick at a time, for as long as whoever drives it wants.
+"""A run under way: by control ticks, for as long as whoever drives it wants.
 
 Everything a tick writes has room for the scenario's whole duration; a run that ends earlier is cut
 to the rows that it has.
@@ -17,10 +17,10 @@ from hydrotele.control.servo import drive_references, servo_parameters
 from hydrotele.control.tick import Controller, Planned, planned_record, planned_tick
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
+from hydrotele.run.ticks import look_at_pins, planned_ticks, teleoperated_ticks, ticks_of
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.audit import full_state
-from hydrotele.simulate.closure import pin_sites, widest_pin
 from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record, Recorder, begin_leapfrog
@@ -124,10 +124,11 @@ class Session:
         self.station = None
         if isinstance(scenario.pilot, TeleopPilot):
             self.station = Station(plant, data, scenario, plan, drives, seen, hand)
-        self._eventful = bool(scenario.surroundings)
         self._around = Surroundings(plant.machine, plant.model, scenario.surroundings)
-        self._sites, self._pins = data.site_xpos, pin_sites(plant.model)
-        self._worst, self._begin = 0.0, 0.0
+        self._ticks = ticks_of(
+            plant.model, data, self._stepper.steps, self.every, scenario.rows, self._dt
+        )
+        self._begin = 0.0
         self.tick = 0
 
     @property
@@ -135,24 +136,49 @@ class Session:
         """Simulated time of the next tick [s]."""
         return self.tick / self.scenario.control_rate
 
-    def advance(self) -> None:
-        """Go on by one control tick.
+    def advance(self, most: int = 1) -> None:
+        """Go on by one control tick, and by those after it that need nothing but native code.
+
+        Args:
+            most: number of ticks to go on by at most.
 
         Raises:
             SimulationFailed: states became infinite or not a number.
         """
-        tick, data, stepper = self.tick, self.data, self._stepper
-        if tick % self.every == 0 and tick // self.every < len(self._recorder.time):
-            shown = stepper.shown() if stepper.late else None
-            self._recorder.take(tick // self.every, tick * self._dt, data, shown)
-        tripped = self.station is not None and self.station.tick(tick)
-        self._begin = self._begin if tick else clock.perf_counter()
-        planned_tick(stepper.record, self._planned, tick, stepper.steps, tripped)
-        stepper.tick = tick + 1
-        if self._eventful:
-            self._around.update(tick * self._dt, data, self._dt)
-        self._worst = max(self._worst, widest_pin(self._sites, *self._pins))
-        self.tick = tick + 1
+        end = self.tick + most
+        while self.tick < end:
+            self._go_on(end)
+            if not self._begin:
+                self._begin = clock.perf_counter()
+
+    def _go_on(self, end: int) -> None:
+        """Go on natively until Python has something to do, or until a tick."""
+        first, station, stepper = self.tick, self.station, self._stepper
+        if self._around.changes or not first:
+            end = first + 1
+        if stepper.late:
+            row, left = divmod(first, self.every)
+            end = min(end, first + self.every - left)
+            if not left and row < len(self._recorder.late):
+                self._recorder.show(row, stepper.shown())
+        records = (self._ticks.record, stepper.record, self._planned,
+                   *self._recorder.records(self.data))  # fmt: skip
+        if station is None:
+            self.tick = planned_ticks(*records, first, end, False)
+        else:
+            station.prepare(first)
+            end = min(end, station.until(first))
+            self.tick = teleoperated_ticks(*records, *station.records, first, end, station.tripped)
+        if self._ticks.record["failed"][0]:
+            raise self._recorder.failure(self.tick // self.every)
+        if station and self.tick < end:
+            stopped = station.notice(self.tick)
+            planned_tick(stepper.record, self._planned, self.tick, stepper.steps, stopped)
+            look_at_pins(self._ticks.record)
+            self.tick += 1
+        stepper.tick = self.tick
+        if self._around.changes:
+            self._around.update(first * self._dt, self.data, self._dt)
 
     def set_command(self, axis: str, value: float) -> None:
         """Command an axis that the joystick does not move, from the next tick on.
@@ -194,7 +220,9 @@ class Session:
         record = self._recorder.record(rows)
         commands = self._commands[: self.tick]
         events = tuple(self._around.events)
-        return SessionResult(plan, record, commands, self._worst, wall, station, events)
+        return SessionResult(
+            plan, record, commands, float(self._ticks.widest[0]), wall, station, events
+        )
 
 
 def _cut_plan(plan: Plan, ticks: int) -> Plan:

@@ -164,8 +164,20 @@ _WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
 
 
 @compiled
-def _take(record, contacts, row, time):
-    """Write the present state into a row; whether it is finite, and MuJoCo without warning."""
+def take_row(record, contacts, row, time):
+    """Write the present state into a row.
+
+    Args:
+        record: of a `Recorder`.
+        contacts: of `contact_record`.
+        row: which one, scalar.
+        time: its time, scalar [s].
+
+    Returns:
+        Whether the state is finite, and MuJoCo without warning.
+
+    Source: `Record`.
+    """
     r = record[0]
     velocity, acceleration, act = floats(r.qvel, r.nv), floats(r.qacc, r.nv), floats(r.act, r.na)
     floats(r.to_time, r.rows)[row] = time
@@ -224,12 +236,22 @@ class Recorder:
         Raises:
             SimulationFailed: the state is not finite, or MuJoCo warns.
         """
+        self.records(data)
+        if shown is not None:
+            self.show(row, shown)
+        if not take_row(self._row, self._contacts, row, time):
+            raise self.failure(row)
+
+    def show(self, row: int, shown: np.ndarray) -> None:
+        """Keep what the sensors of `sensed_channels` show (c,), where one of them is late."""
+        if self.late.shape[1]:
+            self.late[row] = shown
+
+    def records(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        """For `take_row`: its own record and that of the contacts."""
         if data is not self._data:
             self._find(data)
-        if shown is not None and self.late.shape[1]:
-            self.late[row] = shown
-        if not _take(self._row, self._contacts, row, time):
-            raise SimulationFailed(self._story(row))
+        return self._row, self._contacts
 
     def _find(self, data: mujoco.MjData) -> None:
         """Look up where everything is that is taken, and where it is put."""
@@ -252,12 +274,13 @@ class Recorder:
             self._row[name] = value
         self._contacts = contact_record(model, data, self.around)
 
-    def _story(self, row: int) -> str:
+    def failure(self, row: int) -> SimulationFailed:
+        """What to raise where a row is not finite."""
         lines = [f"the simulation became unstable at {self.time[row]:.3f} s; the last states:"]
         for r in range(max(0, row - 3), row + 1):
             qpos, act = (np.array2string(a[r], precision=4) for a in (self.qpos, self.act))
             lines += [f"  t={self.time[r]:.3f} qpos={qpos}", f"    spools and pressures={act}"]
-        return "\n".join(lines)
+        return SimulationFailed("\n".join(lines))
 
     def record(self, rows: int | None = None) -> Record:
         """All rows as a Record, or the first ones."""

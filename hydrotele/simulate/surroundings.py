@@ -343,6 +343,11 @@ class Surroundings:
             if isinstance(thing, LogOnGround)
         ]
 
+    @property
+    def changes(self) -> bool:
+        """Whether there is anything to cut or to hold."""
+        return bool(self._trees or self._logs)
+
     def update(self, time: float, data: mujoco.MjData, period: float) -> None:
         """Saw and hold, once per control period.
 

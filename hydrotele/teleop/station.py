@@ -5,17 +5,11 @@ the master, late; the joystick reflects it; the operator feels, sees and pushes;
 goes to the machine in another packet, late; there it becomes joint references.
 
 What the operator's station saw and did, by control tick, and its channels for the logs.
-
-One control period of teleoperation in two compiled halves, before and after the joystick moves, and
-as a whole around the simulated joystick.
-
-Delay lines are rings: what is written at a tick is read as many ticks later as the ring is long.
 """
 
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -23,9 +17,8 @@ import numpy as np
 from hydrotele.control.endpoint_force import EndpointForce
 from hydrotele.control.plan import Plan
 from hydrotele.control.resolved_motion import COORDINATES, arm_facts
-from hydrotele.control.servo import DriveReference, DriveReferences, drive_row, drive_tables
+from hydrotele.control.servo import DriveReferences, drive_tables
 from hydrotele.control.task_impedance import TaskImpedance
-from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.joystick import AXES, load_joystick
@@ -35,287 +28,41 @@ from hydrotele.machine.sensors import SensorSet
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Channel, Fault, TeleopPilot
 from hydrotele.simulate.feedback import Feedback
-from hydrotele.simulate.joystick import SimulatedFlotor, flotor_step, shaken_flotor_step
-from hydrotele.simulate.layout import address_record, floats, integers, rows_of
+from hydrotele.simulate.joystick import SimulatedFlotor
+from hydrotele.simulate.layout import address_record, field_offsets
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import contact_record, sum_contact_forces, surrounding_geoms
-from hydrotele.teleop.axis_table import DAMPING, DEADBAND, REACH, flat_view
+from hydrotele.teleop.axis_table import DEADBAND, REACH, flat_view
 from hydrotele.teleop.master import (
-    CONTROLLED,
-    SENT,
     TASK_DAMPING,
     TASK_MASS,
     TASK_STIFFNESS,
-    WAVES,
     Master,
     MasterState,
     master,
-    master_step,
     push_back,
-    unpack_master,
-    unpack_master_state,
 )
 from hydrotele.teleop.network import arrivals, in_periods, load_delays
-from hydrotele.teleop.operator_model import Hand, OperatorModel, pull, unpack_muscles
+from hydrotele.teleop.operator_model import Hand, OperatorModel
 from hydrotele.teleop.operator_parameters import held_joystick
+from hydrotele.teleop.round_trip import (
+    CHECKED,
+    SHARE,
+    STATION,
+    Line,
+)
 from hydrotele.teleop.slave import (
     BLOCKED,
-    HAND,
-    HANDLE,
-    HANDLE_SPEED,
     SILENT,
     TRIPPED,
     SlaveState,
-    measure_task,
-    report,
     slave,
-    slave_step,
-    unpack_slave,
-    unpack_slave_state,
 )
-
-QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
 
 Exchange = Callable[[np.ndarray, np.ndarray, float, np.ndarray], None]
 """What a device does once per control tick: writes where its handle is, (7,) as the flotor's [m]
 and quaternion, not a number without one; and takes the machine's packet (rows, k), the share of it
 that counts, and the further force on the handle (6,) [N], [N m]."""
-
-
-class SlaveSide(NamedTuple):
-    """The machine as teleoperation sees it; k joints of the arm among nu axes.
-
-    Attributes:
-        joint: (nu,) measured [rad] or [m].
-        force: (k,) at the tip, task coordinates [N], [N m].
-        columns: (k,) places of the arm's joints among the axes.
-        slave: (23 + 14 k,) Slave.
-        state: (102 + 3 k,) SlaveState, written.
-    """
-
-    joint: np.ndarray
-    force: np.ndarray
-    columns: np.ndarray
-    slave: np.ndarray
-    state: np.ndarray
-
-
-class Line(NamedTuple):
-    """The line between joystick and machine.
-
-    Attributes:
-        forward: (n, 3, 6) packets of the master on their way, written: displacement and rate of
-            the handle, what is left of the hand's force beyond the joystick's own spring and
-            damper; of a passive line the sum of waves or the place, and energy, in their place.
-        back: (n, 8, k) packets of the machine on their way, written.
-        packet: (8, k) the last one that the master got, written.
-        age: (ticks, 2) age of the packet that arrives then, forward and back, in ticks; below 0
-            where none arrives that is newer than the last.
-        state: (5,) QUIET, SHARE, written, PERIOD, SILENCE, FADING [s].
-    """
-
-    forward: np.ndarray
-    back: np.ndarray
-    packet: np.ndarray
-    age: np.ndarray
-    state: np.ndarray
-
-
-class MasterSide(NamedTuple):
-    """Joystick and operator.
-
-    Attributes:
-        master: (168,) Master.
-        state: (123,) MasterState, written.
-        qpos: (7,) of the flotor: position [m] and quaternion.
-        muscles: (80,) Muscles, written.
-        past: (reflex + 1, 6) see `pull`.
-        tremor: (n, 6) see `pull`.
-    """
-
-    master: np.ndarray
-    state: np.ndarray
-    qpos: np.ndarray
-    muscles: np.ndarray
-    past: np.ndarray
-    tremor: np.ndarray
-
-
-@compiled
-def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
-    """Report the machine to the master, reflect, pull: ends in coil currents and muscle forces.
-
-    Args:
-        tick: scalar.
-        fresh: whether the sensors have a new sample, scalar.
-        elapsed: since the last one, scalar [s].
-        tripped: whether the machine has been stopped for good, scalar.
-        machine: SlaveSide.
-        line: Line.
-        operator: MasterSide.
-
-    Returns:
-        Nothing.
-
-    Source: `teleop.master`, `teleop.slave`, `teleop.operator_model`.
-    """
-    joint, force, columns, slave_flat, state_flat = machine
-    forward, back, packet, age, state = line
-    master_flat, master_state, qpos, hand_flat, past, tremor = operator
-    k = len(columns)
-    slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
-    m, hand = unpack_master_state(master_state), unpack_muscles(hand_flat)
-    period, rows = state[PERIOD], len(back)
-    arm = np.empty(k)
-    for i in range(k):
-        arm[i] = joint[columns[i]]
-    measure_task(slave, arm, fresh, elapsed, s)
-    report(slave, force, s, back[tick % rows])
-    late = age[tick % len(age), 1]
-    if late < 0:
-        state[QUIET] += period
-    else:
-        state[QUIET] = 0.0
-        come = back[(tick - late) % rows]
-        for row in range(len(come)):
-            for i in range(k):  # a number that is none does not count
-                if np.isfinite(come[row, i]):
-                    packet[row, i] = come[row, i]
-    goal = 0.0 if tripped or state[QUIET] > state[SILENCE] else 1.0
-    state[SHARE] += (goal - state[SHARE]) * min(1.0, period / state[FADING])
-    numbers = unpack_master(master_flat)
-    master_step(numbers, qpos, packet, state[SHARE], period, tick == 0, m)
-    pull(hand, past, tremor, m.handle, tick, period)
-    ahead = forward[tick % len(forward)]
-    for i in range(6):
-        own = m.stiffness[i] * m.handle[i] + numbers.axis[i, DAMPING] * m.speed[i]
-        ahead[HANDLE, i], ahead[HANDLE_SPEED, i] = m.handle[i], m.speed[i]
-        ahead[HAND, i] = m.hand[i] - own
-        if numbers.kind[0] == WAVES or numbers.kind[0] == CONTROLLED:
-            ahead[HANDLE_SPEED, i], ahead[HAND, i] = m.line[i, SENT], m.line[i, SENT + 1]
-
-
-@compiled
-def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, drive):
-    """Take the packet that arrives, and write the references of joints and drives.
-
-    Args:
-        tick: scalar.
-        machine: SlaveSide.
-        line: Line.
-        grid: (nu, 2) of `drive_tables`.
-        table: (nu, POINTS, 3) of `drive_tables`.
-        scale: of drive velocities, scalar.
-        reference: (nu,) joint references, those of the arm written [rad] or [m].
-        rate: (nu,) the same, their rates [rad/s] or [m/s].
-        drive: DriveReference, written.
-
-    Returns:
-        Nothing.
-
-    Source: `teleop.slave`, `control.servo`.
-    """
-    joint, force, columns, slave_flat, state_flat = machine
-    forward, _, _, age, state = line
-    velocity, arm, volume_head, volume_rod = drive
-    k, rows = len(columns), len(forward)
-    slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
-    measured = np.empty(k)
-    for i in range(k):
-        measured[i] = joint[columns[i]]
-    late = age[tick % len(age), 0]
-    come = forward[(tick - max(late, 0)) % rows]
-    slave_step(slave, come, late >= 0, force, measured, state[PERIOD], s)
-    for i in range(k):
-        reference[columns[i]], rate[columns[i]] = s.joint[i], s.joint_rate[i]
-    drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod)
-    for i in range(k):
-        velocity[columns[i]] = scale * arm[columns[i]] * s.ahead[i]
-
-
-_STATION = np.dtype(
-    [(name, np.int64) for name in ("axes", "joints", "ticks", "dofs", "swing", "simulated")]
-    + [(name, np.int64) for name in ("forward_rows", "back_rows", "ages", "past_rows")]
-    + [(name, np.int64) for name in ("tremor_rows", "points", "pose_columns")]
-    + [(name, np.int64) for name in ("slave_size", "slave_state_size", "muscles_size")]
-    + [(name, np.int64) for name in ("master_size", "master_state_size")]
-    + [("scale", np.float64)]
-    + [(name, np.int64) for name in ("joint", "force", "columns")]  # addresses from here on
-    + [(name, np.int64) for name in ("slave", "slave_state", "master", "master_state")]
-    + [(name, np.int64) for name in ("forward", "back", "packet", "age", "line_state")]
-    + [(name, np.int64) for name in ("qpos", "muscles", "past", "tremor", "qvel", "qacc")]
-    + [(name, np.int64) for name in ("grid", "table", "reference", "rate", "pose")]
-    + [(name, np.int64) for name in ("velocity", "arm", "volume_head", "volume_rod")]
-    + [(name, np.int64) for name in ("log_master", "log_slave", "log_force", "log_muscles")],
-    align=True,
-)
-
-
-@compiled
-def _sides(r):
-    """SlaveSide, Line and MasterSide of a record."""
-    k, rows, back = r.joints, r.forward_rows, r.back_rows
-    machine = SlaveSide(
-        floats(r.joint, r.axes), floats(r.force, k), integers(r.columns, k),
-        floats(r.slave, r.slave_size), floats(r.slave_state, r.slave_state_size),
-    )  # fmt: skip
-    line = Line(
-        floats(r.forward, rows * 18).reshape((rows, 3, 6)),
-        floats(r.back, back * 8 * k).reshape((back, 8, k)), rows_of(r.packet, 8, k),
-        integers(r.age, 2 * r.ages).reshape((r.ages, 2)), floats(r.line_state, FADING + 1),
-    )  # fmt: skip
-    operator = MasterSide(
-        floats(r.master, r.master_size), floats(r.master_state, r.master_state_size),
-        floats(r.qpos, 7), floats(r.muscles, r.muscles_size), rows_of(r.past, r.past_rows, 6),
-        rows_of(r.tremor, r.tremor_rows, 6),
-    )  # fmt: skip
-    return machine, line, operator
-
-
-@compiled
-def round_trip(station, flotor, tick, fresh, elapsed, tripped):
-    """Once around: to the hand, a period of the simulated joystick, to the machine, into the log.
-
-    Args:
-        station: record of a Station.
-        flotor: `SimulatedFlotor.record`, written.
-        tick: scalar.
-        fresh: see `to_the_hand`, scalar.
-        elapsed: see `to_the_hand`, scalar [s].
-        tripped: see `to_the_hand`, scalar.
-
-    Returns:
-        Whether a flag of the slave's stands: held at the edge, line silent, valves closed.
-
-    Source: `to_the_hand`, `simulate.joystick`, `to_the_machine`.
-    """
-    r = station[0]
-    machine, line, operator = _sides(r)
-    to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator)
-    s, m = unpack_slave_state(machine.state, r.joints), unpack_master_state(operator.state)
-    force, n, nu = unpack_muscles(operator.muscles).force, r.ticks, r.axes
-    if r.simulated:
-        unpack_master(operator.master).most[0] = flotor[0].allowed
-        if r.swing < 0:
-            flotor_step(flotor[0], m.currents, force)
-        else:
-            spin, spin_rate = floats(r.qvel, r.dofs)[r.swing], floats(r.qacc, r.dofs)[r.swing]
-            shaken_flotor_step(flotor[0], m.currents, force, spin, spin_rate)
-    rows_of(r.log_master, n, r.master_state_size)[tick] = operator.state
-    rows_of(r.log_slave, n, r.slave_state_size)[tick] = machine.state
-    rows_of(r.log_force, n, r.joints)[tick] = machine.force
-    rows_of(r.log_muscles, n, 6)[tick] = force
-    drive = DriveReference(
-        rows_of(r.velocity, n, nu)[tick], rows_of(r.arm, n, nu)[tick],
-        rows_of(r.volume_head, n, nu)[tick], rows_of(r.volume_rod, n, nu)[tick],
-    )  # fmt: skip
-    to_the_machine(
-        tick, machine, line, rows_of(r.grid, nu, 2),
-        floats(r.table, nu * r.points * 3).reshape((nu, r.points, 3)), r.scale,
-        rows_of(r.reference, n, nu)[tick], rows_of(r.rate, n, nu)[tick], drive,
-    )  # fmt: skip
-    rows_of(r.pose, n, r.pose_columns)[tick] = s.pose[: r.pose_columns]
-    return s.flags[BLOCKED] != 0.0 or s.flags[SILENT] != 0.0 or s.flags[TRIPPED] != 0.0
 
 
 _LENGTHS = ("m", "m", "m", "rad", "rad", "rad")
@@ -351,12 +98,12 @@ class StationLog:
         self._master = np.zeros((ticks, len(self._one)))
         self._slave = np.zeros((ticks, len(self._two)))
         self.force, self.muscles = np.zeros((ticks, len(coordinates))), np.zeros((ticks, 6))
-        self.touching = np.zeros(ticks, bool)
+        self.touching = np.zeros(ticks, np.int64)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What `round_trip` writes a row of after the operator's half of a tick."""
         return {"log_master": self._master, "log_slave": self._slave, "log_force": self.force,
-                "log_muscles": self.muscles}  # fmt: skip
+                "log_muscles": self.muscles, "touching": self.touching}  # fmt: skip
 
     def cut(self, ticks: int) -> None:
         """Keep the first ticks only."""
@@ -469,7 +216,6 @@ class Station:
         self._force = self._feel.force if self._feel and not self._true else np.zeros(len(axes))
         self._owners = plant.model, surrounding_geoms(plant)  # whose memory the addresses are
         self._contacts = contact_record(plant.model, data, self._owners[1])
-        self._elapsed = 0.0
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
         self.operator = OperatorModel(
             pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed,
@@ -481,7 +227,7 @@ class Station:
         self._faults = [_Fault(fault, plan.axes) for fault in pilot.faults]
         self._exchange: Exchange | None = None
         self._arrays = self._addressed(machine, drives)
-        self._record = address_record(_STATION, self._arrays)
+        self._record = address_record(STATION, self._arrays)
         swing = int(plant.dof[self.columns[0]]) if pilot.mount == "cab" else -1
         self._fill_record(swing, scenario.servo.feedforward)
 
@@ -514,6 +260,8 @@ class Station:
             "master_size": sizes["master"], "master_state_size": sizes["master_state"],
             "muscles_size": sizes["muscles"], "points": self._arrays["table"].shape[1],
             "pose_columns": self._arrays["pose"].shape[1], "scale": scale,
+            "sampled": self._seen.every, "sample_period": self._seen.period,
+            "contacts": self._data._address + field_offsets("mjData")["ncon"],
         }.items():  # fmt: skip
             self._record[name] = value
 
@@ -548,14 +296,11 @@ class Station:
         """(2, 6) edge of the dead band and stop of every axis of the joystick [m], [rad]."""
         return self._master.axis[:, [DEADBAND, REACH]].T
 
-    def tick(self, tick: int) -> bool:
-        """Go once around; references and drive references of this tick are written.
+    def prepare(self, tick: int) -> None:
+        """Do before `round_trip` what native code does not: feel, decide, exchange with a device.
 
         Args:
             tick: the control tick.
-
-        Returns:
-            Whether the valves are to be closed.
         """
         seen, operator, pilot = self._seen, self.operator, self._pilot
         for fault in self._faults:
@@ -575,14 +320,28 @@ class Station:
             self._flotor.weaken_coils()
         if tick % operator.every == 0:
             operator.decide(tick)
-        told = round_trip(
-            self._record, self._flotor.record, tick, fresh, self._elapsed, self.tripped
-        )
-        self._elapsed = seen.period
-        self.log.touching[tick] = self._data.ncon > 0
-        if told or tick % 20 == 0:
-            self._check(tick)
+
+    def until(self, tick: int) -> int:
+        """The next tick after this one that is to be prepared."""
+        if self._faults or self._true or self._pilot.tip_over or self._exchange:
+            return tick + 1
+        if self._flotor.weakens:
+            return tick + 1
+        return tick + min(e - tick % e for e in (self.operator.every, self._seen.every))
+
+    def notice(self, tick: int) -> bool:
+        """Look whether all is well, before the machine moves; whether the valves are to be closed.
+
+        Args:
+            tick: one of which `round_trip` says something, or a multiple of `CHECKED`.
+        """
+        self._check(tick)
         return self.tripped
+
+    @property
+    def records(self) -> tuple[np.ndarray, np.ndarray]:
+        """Records of station and simulated joystick for `round_trip`."""
+        return self._record, self._flotor.record
 
     def _felt(self, fresh: bool) -> None:
         """Force at the tip, and what the task is like if that is reflected."""
@@ -625,7 +384,7 @@ class Station:
             error = np.abs(self._seen.joint[self.columns] - s.joint)
             name = self._plan.axes[self.columns[int(np.argmax(np.nan_to_num(error, nan=np.inf)))]]
             why = f"{name} does not follow its reference"
-        elif self._feel and self._sensors and tick % 20 == 0:
+        elif self._feel and self._sensors and tick % CHECKED == 0:
             frozen = self._feel.frozen(self._pilot.safety.frozen)
             why = f"the sensor {frozen[0]} always reads the same" if frozen else ""
         if why and not self.tripped:

@@ -11,7 +11,7 @@ import pytest
 import hydrotele
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log, load_log, save_log
-from hydrotele.run.run import prepare, run_scenario, scenario_machine
+from hydrotele.run.run import begin, finished, prepare, run_scenario, scenario_machine
 from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario
 from hydrotele.simulate.audit import audit, full_state
 from hydrotele.simulate.record import SimulationFailed, begin_leapfrog
@@ -52,6 +52,25 @@ def test_progress_and_timing_do_not_change_the_run():
     watched = run_scenario(load_scenario("zhu_in", {"duration": "2"}), lambda *a: seen.append(a))
     assert same(watched.truth, run_scenario(load_scenario("zhu_in", {"duration": "2"})).truth)
     assert seen[-1] == (2.0, 2.0) and all(0 <= done <= total for done, total in seen)
+
+
+@pytest.mark.parametrize("asked", [
+    ("zhu_in", {"duration": "2"}),
+    ("press_stiffness", {"duration": "3", "pilot.channel.lost": "0.3"}),
+    ("press_stiffness", {"duration": "1", "pilot.safety.following_error": "1e-3"}),
+    ("fell_tree", {"duration": "1"}),
+])  # fmt: skip
+def test_ticks_one_by_one_are_those_of_a_run(asked):
+    """What native code does by itself is what it does tick by tick, also where valves close."""
+    scenario = load_scenario(*asked)
+    session = begin(scenario)
+    while session.tick < scenario.ticks:
+        session.advance()
+    one, run = finished(session, scenario), run_scenario(scenario)
+    assert same(one.truth, run.truth) and same(one.measured, run.measured)
+    assert one.summary["notes"] == run.summary["notes"]
+    if "pilot.safety.following_error" in asked[1]:
+        assert any("closed for good" in note for note in run.summary["notes"])
 
 
 def test_measured_keeps_the_truth_apart():

@@ -11,8 +11,7 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.teleop.axis_table import flat_view, flattened
 from hydrotele.teleop.master import master
 from hydrotele.teleop.operator_model import Muscles
-from hydrotele.teleop.slave import AGE, slave
-from hydrotele.teleop.station import (
+from hydrotele.teleop.round_trip import (
     QUIET,
     SHARE,
     Line,
@@ -21,6 +20,7 @@ from hydrotele.teleop.station import (
     to_the_hand,
     to_the_machine,
 )
+from hydrotele.teleop.slave import AGE, slave
 
 CAT, STICK, PERIOD, FADE = load_machine("cat215", "bucket"), load_joystick(), 0.005, 0.2
 AXES = tuple(CAT.axes)

@@ -1,0 +1,278 @@
+"""One control period of teleoperation, once around between the operator's hand and the machine.
+
+Two compiled halves, before and after the joystick moves, and the whole around the simulated
+joystick. Delay lines are rings: what is written at a tick is read as many ticks later as the ring
+is long.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.control.servo import DriveReference, drive_row
+from hydrotele.core.compiled import compiled
+from hydrotele.simulate.joystick import flotor_step, shaken_flotor_step
+from hydrotele.simulate.layout import floats, integers, rows_of, short_integers
+from hydrotele.teleop.axis_table import DAMPING
+from hydrotele.teleop.master import (
+    CONTROLLED,
+    SENT,
+    WAVES,
+    master_step,
+    unpack_master,
+    unpack_master_state,
+)
+from hydrotele.teleop.operator_model import pull, unpack_muscles
+from hydrotele.teleop.slave import (
+    BLOCKED,
+    HAND,
+    HANDLE,
+    HANDLE_SPEED,
+    SILENT,
+    TRIPPED,
+    measure_task,
+    report,
+    slave_step,
+    unpack_slave,
+    unpack_slave_state,
+)
+
+QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
+CHECKED = 20  # ticks between two looks at whether all is well
+
+
+class SlaveSide(NamedTuple):
+    """The machine as teleoperation sees it; k joints of the arm among nu axes.
+
+    Attributes:
+        joint: (nu,) measured [rad] or [m].
+        force: (k,) at the tip, task coordinates [N], [N m].
+        columns: (k,) places of the arm's joints among the axes.
+        slave: (23 + 14 k,) Slave.
+        state: (102 + 3 k,) SlaveState, written.
+    """
+
+    joint: np.ndarray
+    force: np.ndarray
+    columns: np.ndarray
+    slave: np.ndarray
+    state: np.ndarray
+
+
+class Line(NamedTuple):
+    """The line between joystick and machine.
+
+    Attributes:
+        forward: (n, 3, 6) packets of the master on their way, written: displacement and rate of
+            the handle, what is left of the hand's force beyond the joystick's own spring and
+            damper; of a passive line the sum of waves or the place, and energy, in their place.
+        back: (n, 8, k) packets of the machine on their way, written.
+        packet: (8, k) the last one that the master got, written.
+        age: (ticks, 2) age of the packet that arrives then, forward and back, in ticks; below 0
+            where none arrives that is newer than the last.
+        state: (5,) QUIET, SHARE, written, PERIOD, SILENCE, FADING [s].
+    """
+
+    forward: np.ndarray
+    back: np.ndarray
+    packet: np.ndarray
+    age: np.ndarray
+    state: np.ndarray
+
+
+class MasterSide(NamedTuple):
+    """Joystick and operator.
+
+    Attributes:
+        master: (168,) Master.
+        state: (123,) MasterState, written.
+        qpos: (7,) of the flotor: position [m] and quaternion.
+        muscles: (80,) Muscles, written.
+        past: (reflex + 1, 6) see `pull`.
+        tremor: (n, 6) see `pull`.
+    """
+
+    master: np.ndarray
+    state: np.ndarray
+    qpos: np.ndarray
+    muscles: np.ndarray
+    past: np.ndarray
+    tremor: np.ndarray
+
+
+@compiled
+def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
+    """Report the machine to the master, reflect, pull: ends in coil currents and muscle forces.
+
+    Args:
+        tick: scalar.
+        fresh: whether the sensors have a new sample, scalar.
+        elapsed: since the last one, scalar [s].
+        tripped: whether the machine has been stopped for good, scalar.
+        machine: SlaveSide.
+        line: Line.
+        operator: MasterSide.
+
+    Returns:
+        Nothing.
+
+    Source: `teleop.master`, `teleop.slave`, `teleop.operator_model`.
+    """
+    joint, force, columns, slave_flat, state_flat = machine
+    forward, back, packet, age, state = line
+    master_flat, master_state, qpos, hand_flat, past, tremor = operator
+    k = len(columns)
+    slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
+    m, hand = unpack_master_state(master_state), unpack_muscles(hand_flat)
+    period, rows = state[PERIOD], len(back)
+    arm = np.empty(k)
+    for i in range(k):
+        arm[i] = joint[columns[i]]
+    measure_task(slave, arm, fresh, elapsed, s)
+    report(slave, force, s, back[tick % rows])
+    late = age[tick % len(age), 1]
+    if late < 0:
+        state[QUIET] += period
+    else:
+        state[QUIET] = 0.0
+        come = back[(tick - late) % rows]
+        for row in range(len(come)):
+            for i in range(k):  # a number that is none does not count
+                if np.isfinite(come[row, i]):
+                    packet[row, i] = come[row, i]
+    goal = 0.0 if tripped or state[QUIET] > state[SILENCE] else 1.0
+    state[SHARE] += (goal - state[SHARE]) * min(1.0, period / state[FADING])
+    numbers = unpack_master(master_flat)
+    master_step(numbers, qpos, packet, state[SHARE], period, tick == 0, m)
+    pull(hand, past, tremor, m.handle, tick, period)
+    ahead = forward[tick % len(forward)]
+    for i in range(6):
+        own = m.stiffness[i] * m.handle[i] + numbers.axis[i, DAMPING] * m.speed[i]
+        ahead[HANDLE, i], ahead[HANDLE_SPEED, i] = m.handle[i], m.speed[i]
+        ahead[HAND, i] = m.hand[i] - own
+        if numbers.kind[0] == WAVES or numbers.kind[0] == CONTROLLED:
+            ahead[HANDLE_SPEED, i], ahead[HAND, i] = m.line[i, SENT], m.line[i, SENT + 1]
+
+
+@compiled
+def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, drive):
+    """Take the packet that arrives, and write the references of joints and drives.
+
+    Args:
+        tick: scalar.
+        machine: SlaveSide.
+        line: Line.
+        grid: (nu, 2) of `drive_tables`.
+        table: (nu, POINTS, 3) of `drive_tables`.
+        scale: of drive velocities, scalar.
+        reference: (nu,) joint references, those of the arm written [rad] or [m].
+        rate: (nu,) the same, their rates [rad/s] or [m/s].
+        drive: DriveReference, written.
+
+    Returns:
+        Nothing.
+
+    Source: `teleop.slave`, `control.servo`.
+    """
+    joint, force, columns, slave_flat, state_flat = machine
+    forward, _, _, age, state = line
+    velocity, arm, volume_head, volume_rod = drive
+    k, rows = len(columns), len(forward)
+    slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
+    measured = np.empty(k)
+    for i in range(k):
+        measured[i] = joint[columns[i]]
+    late = age[tick % len(age), 0]
+    come = forward[(tick - max(late, 0)) % rows]
+    slave_step(slave, come, late >= 0, force, measured, state[PERIOD], s)
+    for i in range(k):
+        reference[columns[i]], rate[columns[i]] = s.joint[i], s.joint_rate[i]
+    drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod)
+    for i in range(k):
+        velocity[columns[i]] = scale * arm[columns[i]] * s.ahead[i]
+
+
+STATION = np.dtype(
+    [(name, np.int64) for name in ("axes", "joints", "ticks", "dofs", "swing", "simulated")]
+    + [(name, np.int64) for name in ("forward_rows", "back_rows", "ages", "past_rows")]
+    + [(name, np.int64) for name in ("tremor_rows", "points", "pose_columns")]
+    + [(name, np.int64) for name in ("slave_size", "slave_state_size", "muscles_size")]
+    + [(name, np.int64) for name in ("master_size", "master_state_size")]
+    + [("sampled", np.int64), ("scale", np.float64), ("sample_period", np.float64)]
+    + [(name, np.int64) for name in ("joint", "force", "columns")]  # addresses from here on
+    + [(name, np.int64) for name in ("slave", "slave_state", "master", "master_state")]
+    + [(name, np.int64) for name in ("forward", "back", "packet", "age", "line_state")]
+    + [(name, np.int64) for name in ("qpos", "muscles", "past", "tremor", "qvel", "qacc")]
+    + [(name, np.int64) for name in ("grid", "table", "reference", "rate", "pose")]
+    + [(name, np.int64) for name in ("velocity", "arm", "volume_head", "volume_rod")]
+    + [(name, np.int64) for name in ("log_master", "log_slave", "log_force", "log_muscles")]
+    + [(name, np.int64) for name in ("touching", "contacts")],
+    align=True,
+)
+
+
+@compiled
+def _sides(r):
+    """SlaveSide, Line and MasterSide of a record."""
+    k, rows, back = r.joints, r.forward_rows, r.back_rows
+    machine = SlaveSide(
+        floats(r.joint, r.axes), floats(r.force, k), integers(r.columns, k),
+        floats(r.slave, r.slave_size), floats(r.slave_state, r.slave_state_size),
+    )  # fmt: skip
+    line = Line(
+        floats(r.forward, rows * 18).reshape((rows, 3, 6)),
+        floats(r.back, back * 8 * k).reshape((back, 8, k)), rows_of(r.packet, 8, k),
+        integers(r.age, 2 * r.ages).reshape((r.ages, 2)), floats(r.line_state, FADING + 1),
+    )  # fmt: skip
+    operator = MasterSide(
+        floats(r.master, r.master_size), floats(r.master_state, r.master_state_size),
+        floats(r.qpos, 7), floats(r.muscles, r.muscles_size), rows_of(r.past, r.past_rows, 6),
+        rows_of(r.tremor, r.tremor_rows, 6),
+    )  # fmt: skip
+    return machine, line, operator
+
+
+@compiled
+def round_trip(station, flotor, tick, tripped):
+    """Once around: to the hand, a period of the simulated joystick, to the machine, into the log.
+
+    Args:
+        station: record of a Station.
+        flotor: `SimulatedFlotor.record`, written.
+        tick: scalar.
+        tripped: see `to_the_hand`, scalar.
+
+    Returns:
+        Whether a flag of the slave's stands: held at the edge, line silent, valves closed.
+
+    Source: `to_the_hand`, `simulate.joystick`, `to_the_machine`.
+    """
+    r = station[0]
+    machine, line, operator = _sides(r)
+    fresh, elapsed = tick % r.sampled == 0, r.sample_period if tick > 0 else 0.0
+    to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator)
+    s, m = unpack_slave_state(machine.state, r.joints), unpack_master_state(operator.state)
+    force, n, nu = unpack_muscles(operator.muscles).force, r.ticks, r.axes
+    if r.simulated:
+        unpack_master(operator.master).most[0] = flotor[0].allowed
+        if r.swing < 0:
+            flotor_step(flotor[0], m.currents, force)
+        else:
+            spin, spin_rate = floats(r.qvel, r.dofs)[r.swing], floats(r.qacc, r.dofs)[r.swing]
+            shaken_flotor_step(flotor[0], m.currents, force, spin, spin_rate)
+    rows_of(r.log_master, n, r.master_state_size)[tick] = operator.state
+    rows_of(r.log_slave, n, r.slave_state_size)[tick] = machine.state
+    rows_of(r.log_force, n, r.joints)[tick] = machine.force
+    rows_of(r.log_muscles, n, 6)[tick] = force
+    drive = DriveReference(
+        rows_of(r.velocity, n, nu)[tick], rows_of(r.arm, n, nu)[tick],
+        rows_of(r.volume_head, n, nu)[tick], rows_of(r.volume_rod, n, nu)[tick],
+    )  # fmt: skip
+    to_the_machine(
+        tick, machine, line, rows_of(r.grid, nu, 2),
+        floats(r.table, nu * r.points * 3).reshape((nu, r.points, 3)), r.scale,
+        rows_of(r.reference, n, nu)[tick], rows_of(r.rate, n, nu)[tick], drive,
+    )  # fmt: skip
+    rows_of(r.pose, n, r.pose_columns)[tick] = s.pose[: r.pose_columns]
+    integers(r.touching, n)[tick] = short_integers(r.contacts, 1)[0] > 0
+    return s.flags[BLOCKED] != 0.0 or s.flags[SILENT] != 0.0 or s.flags[TRIPPED] != 0.0
