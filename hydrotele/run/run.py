@@ -4,6 +4,7 @@ Summary of a run: speed, pins, contact, tracking, and what produced it.
 """
 
 import dataclasses
+import functools
 import json
 import subprocess
 from collections.abc import Callable
@@ -70,7 +71,7 @@ def summarise(
         "notes": [*plan.notes, *_doubts(plant, record)],
         "largest_contact_force_N": float(np.linalg.norm(record.contact, axis=1).max()),
         "tracking": _tracking(plant, plan, record),
-        "versions": _versions(),
+        "versions": dict(_versions()),
         "git_commit": _git_commit(),
     }
 
@@ -115,6 +116,7 @@ def _size(error: np.ndarray, unit: str) -> dict[str, Any]:
     return {"rms": rms, "max": largest, "unit": unit}
 
 
+@functools.cache
 def _versions() -> dict[str, str]:
     names = ("mujoco", "dm-control", "numpy", "scipy", "numba", "pyarrow", "rerun-sdk")
     return {"hydrotele": hydrotele.__version__, **{n: version(n) for n in names}}

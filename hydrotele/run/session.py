@@ -128,6 +128,10 @@ class Session:
         self._ticks = ticks_of(
             plant.model, data, self._stepper.steps, self.every, scenario.rows, self._dt
         )
+        self._records = (
+            self._ticks.record, self._stepper.record, self._planned, *self._recorder.records(data),
+            *(self.station.records if self.station else ()),
+        )  # fmt: skip
         self._begin = 0.0
         self.tick = 0
 
@@ -161,16 +165,14 @@ class Session:
             end = min(end, first + self.every - left)
             if not left and row < len(self._recorder.late):
                 self._recorder.show(row, stepper.shown())
-        records = (self._ticks.record, stepper.record, self._planned,
-                   *self._recorder.records(self.data))  # fmt: skip
         if station is None:
-            self.tick = planned_ticks(*records, first, end, False)
+            self.tick = planned_ticks(*self._records, first, end, False)
         else:
             station.prepare(first)
             end = min(end, station.until(first))
-            self.tick = teleoperated_ticks(*records, *station.records, first, end, station.tripped)
-        if self._ticks.record["failed"][0]:
-            raise self._recorder.failure(self.tick // self.every)
+            self.tick = teleoperated_ticks(*self._records, first, end, station.tripped)
+        if self.tick < 0:
+            raise self._recorder.failure((-1 - self.tick) // self.every)
         if station and self.tick < end:
             stopped = station.notice(self.tick)
             planned_tick(stepper.record, self._planned, self.tick, stepper.steps, stopped)

@@ -17,7 +17,7 @@ from hydrotele.simulate.record import take_row
 from hydrotele.teleop.round_trip import CHECKED, round_trip
 
 _TICKS = np.dtype(
-    [(name, np.int64) for name in ("steps", "every", "rows", "sites", "pins", "failed")]
+    [(name, np.int64) for name in ("steps", "every", "rows", "sites", "pins")]
     + [("period", np.float64)]
     + [(name, np.int64) for name in ("places", "one", "two", "widest")],  # addresses
     align=True,
@@ -28,7 +28,7 @@ class Ticks(NamedTuple):
     """What native ticks need beside machine, plan and station.
 
     Attributes:
-        record: (1,) for native code; `failed` is not 0 once a row was not finite.
+        record: (1,) for native code.
         widest: (1,) largest opening of a pin so far [m].
         kept: arrays whose addresses the record has.
     """
@@ -77,13 +77,13 @@ def planned_ticks(ticks, simulated, planned, row, contacts, first, last, stopped
         stopped: whether all commands are 0, scalar.
 
     Returns:
-        The tick to go on with, scalar: `last`, or the one whose row failed.
+        The tick to go on with, scalar: `last`; or -1 less the one whose row is not finite.
 
     Source: `control.tick`.
     """
     for tick in range(first, last):
         if not _write_down(ticks[0], row, contacts, tick):
-            return tick
+            return -1 - tick
         planned_tick(simulated, planned, tick, ticks[0].steps, stopped)
         look_at_pins(ticks)
     return last
@@ -108,14 +108,14 @@ def teleoperated_ticks(
         stopped: whether the machine has been stopped for good, scalar.
 
     Returns:
-        The tick to go on with, scalar: `last`, the one whose row failed, or the one whose physics
-        is left to do.
+        The tick to go on with, scalar: `last`, or the one whose physics is left to do; or -1 less
+        the one whose row is not finite.
 
     Source: `control.tick`, `teleop.round_trip`.
     """
     for tick in range(first, last):
         if not _write_down(ticks[0], row, contacts, tick):
-            return tick
+            return -1 - tick
         if round_trip(station, flotor, tick, stopped) or tick % CHECKED == 0:
             return tick
         planned_tick(simulated, planned, tick, ticks[0].steps, stopped)
@@ -128,10 +128,7 @@ def _write_down(r, row, contacts, tick):
     """Write the row that is due at a tick, if one is; whether all is well."""
     if tick % r.every != 0 or tick // r.every >= r.rows:
         return True
-    if take_row(row, contacts, tick // r.every, tick * r.period):
-        return True
-    r.failed = 1
-    return False
+    return take_row(row, contacts, tick // r.every, tick * r.period)
 
 
 @compiled

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from hydrotele.core.compiled import compiled
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.laws import air_compliance, port_flow, pressure_without_air
 from hydrotele.hydraulics.pump import oil_compliance, switched_speed
@@ -94,20 +95,30 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
         (p_rod, table[:, 2 + 3 * i] + leak + more[:, i, 2], -rod * v[:, i], volume_rod),
     )
     for pressure, inflow, swept, volume in sides:
-        port = np.array([
-            port_flow(p, valve.port_relief, valve.port_relief_gain, supply.tank_pressure,
-                      valve.makeup_gain)[0] for p in pressure
-        ])  # fmt: skip
+        port, bubbles, oil = _chamber_laws(
+            pressure, valve.port_relief, valve.port_relief_gain, supply.tank_pressure,
+            valve.makeup_gain, supply.entrained_air, release,
+        )  # fmt: skip
         net = inflow + port - swept
         entered = np.sum(0.5 * dt * (net[1:] + net[:-1]))
         middle = 0.5 * (volume[1:] + volume[:-1])
-        halfway = 0.5 * (pressure[1:] + pressure[:-1])
-        bubbles = np.array([air_compliance(p, supply.entrained_air) for p in halfway])
         soft = middle * (1.0 / supply.bulk_modulus + bubbles) + drive.hose_compliance
-        oil = np.array([pressure_without_air(p, release) for p in pressure])
         compressed = np.sum(soft * np.diff(oil))
         through = np.sum(np.abs(inflow) + np.abs(port) + np.abs(swept)) * dt
         yield abs(entered - compressed) / max(through, 1e-12)
+
+
+@compiled
+def _chamber_laws(pressure, relief, gain, tank, makeup, air, release):
+    """Port flows (n,), compliances of the air halfway (n - 1,), pressures without air (n,)."""
+    n = len(pressure)
+    port, bubbles, oil = np.empty(n), np.empty(n - 1), np.empty(n)
+    for row in range(n):
+        port[row] = port_flow(pressure[row], relief, gain, tank, makeup)[0]
+        oil[row] = pressure_without_air(pressure[row], release)
+    for row in range(n - 1):
+        bubbles[row] = air_compliance(0.5 * (pressure[row] + pressure[row + 1]), air)
+    return port, bubbles, oil
 
 
 def _flows_after_switching(plant, i, act, x, v):
@@ -149,12 +160,12 @@ def _energy_balance(plant, qpos, qvel, work, dt):
     model = plant.model
     data = mujoco.MjData(model)
     last = len(qpos) - 1
-    energy = np.empty(2)
+    energy, rows = np.empty(2), 3 * pin_count(model)
     for row in (*range(0, last, _LOOK_EVERY), last):
         data.qpos[:], data.qvel[:] = qpos[row], qvel[row]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
-        if data.ncon or data.nefc > 3 * pin_count(model):
+        if data.ncon or data.nefc > rows:
             return None
         if row in (0, last):
             mujoco.mj_energyPos(model, data)

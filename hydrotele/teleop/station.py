@@ -225,6 +225,9 @@ class Station:
         self._said: set[str] = set()
         self.tripped = False
         self._faults = [_Fault(fault, plan.axes) for fault in pilot.faults]
+        self._every_tick = bool(
+            self._faults or self._true or pilot.tip_over or self._flotor.weakens
+        )
         self._exchange: Exchange | None = None
         self._arrays = self._addressed(machine, drives)
         self._record = address_record(STATION, self._arrays)
@@ -323,11 +326,10 @@ class Station:
 
     def until(self, tick: int) -> int:
         """The next tick after this one that is to be prepared."""
-        if self._faults or self._true or self._pilot.tip_over or self._exchange:
+        if self._exchange or self._every_tick:
             return tick + 1
-        if self._flotor.weakens:
-            return tick + 1
-        return tick + min(e - tick % e for e in (self.operator.every, self._seen.every))
+        every = math.gcd(self.operator.every, self._seen.every)
+        return tick - tick % every + every
 
     def notice(self, tick: int) -> bool:
         """Look whether all is well, before the machine moves; whether the valves are to be closed.
