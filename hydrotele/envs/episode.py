@@ -63,7 +63,6 @@ TASK_PARAMETERS = np.dtype(
     [
         ("call", _I),
         ("count", _I),
-        ("kind", _I),  # number of the task
         ("mode", _I),
         ("autoreset", _I),
         ("axes", _I),  # number of actuators k
@@ -138,6 +137,7 @@ TASK_PARAMETERS = np.dtype(
         ("places", _I),  # (fields, 3): address for all variants, address for all n, floats in each
         ("terrain", _I),  # (n, width)
         ("eq_rows", _I),  # (n, neq eq_width) of every simulation, 0 where no task writes them
+        ("task", _I),  # its native code, see `world`
         ("mj_step", _I),
         ("mj_set_state", _I),
         # where mjData and mjModel keep their members [byte]

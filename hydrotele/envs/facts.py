@@ -103,7 +103,7 @@ def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
     task, options, plant = setup.task, setup.options, setup.variants.plant
     if options.action not in ACTIONS:
         raise InputError(f"action {options.action!r}", suggest(options.action, ACTIONS))
-    facts["kind"], facts["mode"] = KINDS.index(task.kind), ACTIONS.index(options.action)
+    facts["task"], facts["mode"] = KINDS[task.kind].address, ACTIONS.index(options.action)
     facts["autoreset"], facts["count"] = autoreset, count
     clock = setup.clock
     facts["ticks"], facts["substeps"], facts["period"], facts["horizon"] = clock[:2] + clock[2:]

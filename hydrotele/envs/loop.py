@@ -7,8 +7,6 @@ references, pose rates those of the arm by resolved motion, and the joint servo 
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
 # numba's intrinsics are called without their typing context, and carray is its documented API.
 
-from typing import NamedTuple
-
 import mujoco
 import numpy as np
 from numba import carray, types
@@ -22,23 +20,31 @@ from hydrotele.envs.episode import (
     AXES,
     CHANNELS,
     DISABLED,
-    EPISODE_STATE,
     JOINT_RATE,
     MEASURES,
     NEXT_STEP,
     RESET,
     RESOLVED_MOTION,
     SAME_STEP,
-    TASK_PARAMETERS,
     VALVE,
     uniform,
 )
-from hydrotele.envs.kinds import begin_task, observe_task, reward_task, tick_task
+from hydrotele.envs.observation import observe_machine
+from hydrotele.envs.world import (
+    BEGIN,
+    OBSERVE,
+    REWARD,
+    TICK,
+    call_task,
+    episodes,
+    parameters_at,
+    world,
+)
 from hydrotele.hydraulics.parameters import SLOTS
 from hydrotele.kinematics.task import task_forward
 from hydrotele.simulate.feedback import Readings, Sensors, hold_readings, read_sensors
 from hydrotele.simulate.fleet import STATE
-from hydrotele.simulate.layout import call_set_state, field, floats, pointer
+from hydrotele.simulate.layout import call_set_state, floats, pointer
 from hydrotele.simulate.stepping import (
     CommandLine,
     SensorPast,
@@ -177,107 +183,25 @@ def sense(f, e, sim):
 assert CHANNELS >= 3 * AXES + 1
 
 
-class World(NamedTuple):
-    """Live arrays of one simulation.
-
-    Attributes:
-        qpos: (nq,) positions; staggered, see `simulate.record`.
-        qvel: (nv,) velocities.
-        act: (na,) activations.
-        ctrl: (k,) commands that act.
-        tip: (3,) place of the arm's tip at the time of the activations [m].
-        xfrc: (6 nbody,) forces and torques from outside on bodies, world frame [N], [N m].
-        xpos: (3 nbody,) places of bodies [m], of the last physics step.
-        xipos: (3 nbody,) places of their centres of mass [m].
-        xquat: (4 nbody,) quaternions of the bodies.
-        xmat: (9 nbody,) their rotation matrices.
-        eq_active: (neq,) uint8, which equalities act; part of the state.
-        eq_data: (neq eq_width,) numbers of the equalities for the rest of this call.
-        eq_rows: the same from the next call on; empty unless the task writes them.
-        terrain: (width,) what the episode keeps of its ground, empty without.
-        measures: (MEASURES,) figures of this step, for `info`.
-        model: address of mjModel.
-        data: address of mjData.
-    """
-
-    qpos: np.ndarray
-    qvel: np.ndarray
-    act: np.ndarray
-    ctrl: np.ndarray
-    tip: np.ndarray
-    xfrc: np.ndarray
-    xpos: np.ndarray
-    xipos: np.ndarray
-    xquat: np.ndarray
-    xmat: np.ndarray
-    eq_active: np.ndarray
-    eq_data: np.ndarray
-    eq_rows: np.ndarray
-    terrain: np.ndarray
-    measures: np.ndarray
-    model: int
-    data: int
-
-
-@compiled
-def world(f, m, d, sim):
-    """The World of a simulation.
-
-    Args:
-        f: record of TASK_PARAMETERS.
-        m: address of its mjModel, scalar.
-        d: address of its mjData, scalar.
-        sim: its number, scalar.
-
-    Returns:
-        The World.
-
-    Source: `simulate.layout`.
-    """
-    place = carray(pointer(d + f.at_site), (1,), np.int64)[0]
-    active = carray(pointer(d + f.at_eq_active), (1,), np.int64)[0]
-    numbers = f.neq * f.eq_width
-    site = f.tip_site if f.tip_site >= 0 else 0
-    return World(
-        field(d, f.at_qpos, f.nq),
-        field(d, f.at_qvel, f.nv),
-        field(d, f.at_act, f.na),
-        field(d, f.at_ctrl, f.axes),
-        floats(place + 24 * site, 3),
-        field(d, f.at_xfrc, 6 * f.nbody),
-        field(d, f.at_xpos, 3 * f.nbody),
-        field(d, f.at_xipos, 3 * f.nbody),
-        field(d, f.at_xquat, 4 * f.nbody),
-        field(d, f.at_xmat, 9 * f.nbody),
-        carray(pointer(active), (f.neq,), np.uint8),
-        field(m, f.at_eq_data, numbers),
-        floats(f.eq_rows + 8 * sim * numbers, numbers if f.eq_rows else 0),
-        floats(f.terrain + 8 * sim * f.width, f.width),
-        floats(f.measures + 8 * sim * MEASURES, MEASURES),
-        m,
-        d,
-    )
-
-
 _WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
 _FIRST_BAD, _LAST_BAD = int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC)
 _SIGNATURE = types.void(types.int64, types.int64, types.intc, types.int64)
 
 
 @compiled
-def _simulation(f, e, w, number):
+def _simulation(f, e, w):
     """An episode's plant for `simulate.stepping`."""
     ring = floats(
-        f.commands + 8 * number * f.delayed_command * AXES, f.delayed_command * AXES
+        f.commands + 8 * w.number * f.delayed_command * AXES, f.delayed_command * AXES
     ).reshape((f.delayed_command, AXES))
     delays = floats(f.delays + 8 * e.variant * AXES * 2, AXES * 2).reshape((AXES, 2))
     c = f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
     sensed = floats(
-        f.sensed + 8 * number * f.delayed_sensor * CHANNELS, f.delayed_sensor * CHANNELS
+        f.sensed + 8 * w.number * f.delayed_sensor * CHANNELS, f.delayed_sensor * CHANNELS
     ).reshape((f.delayed_sensor, CHANNELS))
     lags = floats(f.lags + 8 * e.variant * CHANNELS * 2, CHANNELS * 2).reshape((CHANNELS, 2))
     past = SensorPast(
-        sensed, floats(f.sensed_before + 8 * number * CHANNELS, c), lags,
+        sensed, floats(f.sensed_before + 8 * w.number * CHANNELS, c), lags,
         floats(f.ratios + 8 * e.variant * CHANNELS, CHANNELS),
     )  # fmt: skip
     none = f.qpos[:0]
@@ -315,7 +239,7 @@ def _unstable(f, e, d):
 
 
 @compiled
-def _begin_episode(f, e, w, number):
+def _begin_episode(f, e, w):
     """Put the simulation at the start of a variant, and draw a new goal."""
     e.last_variant, e.last_fault = e.variant, e.fault
     e.variant = int(uniform(e) * f.variants)
@@ -325,7 +249,7 @@ def _begin_episode(f, e, w, number):
     for n in range(f.fields):
         size = places[3 * n + 2]
         given = floats(places[3 * n] + 8 * e.variant * size, size)
-        taken = floats(places[3 * n + 1] + 8 * number * size, size)
+        taken = floats(places[3 * n + 1] + 8 * w.number * size, size)
         for c in range(size):
             taken[c] = given[c]
     e.episode += 1
@@ -333,30 +257,32 @@ def _begin_episode(f, e, w, number):
     e.command[:] = 0.0
     for i in range(f.axes):
         e.command[i] = w.ctrl[i]
-    sim = _simulation(f, e, w, number)
+    sim = _simulation(f, e, w)
     begin_past(sim, w.ctrl)
     tips = floats(f.start_tips + 24 * e.variant, 3)
-    e.tip[:] = tips
+    for c in range(3):
+        e.tip[c] = tips[c]
     e.reference_rate[:], e.pose_rate[:] = 0.0, 0.0
     sense(f, e, sim)
-    e.reference[:] = e.joint
-    e.sampled_reference[:] = e.joint
+    for i in range(len(e.joint)):
+        e.reference[i] = e.sampled_reference[i] = e.joint[i]
     if f.arm_axes > 0:
         task_forward(f.arm, e.reference[: f.arm_axes], e.pose)
     for i in range(f.hydraulic):
         e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
     w.measures[:] = 0.0
-    begin_task(f, e, w)
+    call_task(f, w, BEGIN, 0)
 
 
 @compiled
-def _observe(f, e, w, address, sim):
+def _observe(f, e, w, address):
     """Write the observation; readings saturate at the ends of their ranges."""
     n = f.observations
-    out = carray(pointer(address + 4 * sim * n), (n,), np.float32)
+    out = carray(pointer(address + 4 * w.number * n), (n,), np.float32)
     low = carray(pointer(f.low), (n,), np.float32)
     high = carray(pointer(f.high), (n,), np.float32)
-    observe_task(f, e, w, out)
+    at = observe_machine(f, e, out)
+    call_task(f, w, OBSERVE, address + 4 * (w.number * n + at))
     for c in range(n):
         if not low[c] <= out[c] <= high[c]:
             e.saturated += 1
@@ -364,50 +290,55 @@ def _observe(f, e, w, address, sim):
 
 
 @compiled
-def _step(f, e, w, number, action):
+def _step(f, e, w, action):
     """One environment step; reward, whether the task is over, whether the time is."""
-    sim = _simulation(f, e, w, number)
+    sim = _simulation(f, e, w)
     for _ in range(f.ticks):
         act(f, e, action)
         _tick(f, e, sim)
         e.tick += 1
         sense(f, e, sim)
-        tick_task(f, e, w)  # after the physics: before, MuJoCo's places are another simulation's
-    e.tip[:] = w.tip
+        call_task(
+            f, w, TICK, 0
+        )  # after the physics: before, MuJoCo's places are another simulation's
+    for c in range(3):
+        e.tip[c] = w.tip[c]
     e.step += 1
     if _unstable(f, e, w.data):
         e.fault = 1
         e.faults += 1
         return 0.0, True, False
-    reward, done = reward_task(f, e, w)
+    reward = call_task(f, w, REWARD, 0)
+    done = e.over != 0
     return reward, done, e.step >= f.horizon and not done
 
 
 @compiled
 def _advance(m, d, sim, argument):
-    f = carray(pointer(argument), (1,), TASK_PARAMETERS)[0]
-    e = carray(pointer(f.episodes), (f.count,), EPISODE_STATE)[sim]
-    w = world(f, m, d, sim)
+    f = parameters_at(argument)[0]
+    e, w = episodes(f)[sim], world(f, m, d, sim, argument)
     reward = carray(pointer(f.reward), (f.count,), np.float64)
     terminated = carray(pointer(f.terminated), (f.count,), np.uint8)
     truncated = carray(pointer(f.truncated), (f.count,), np.uint8)
     reward[sim], terminated[sim], truncated[sim] = 0.0, 0, 0
     fresh = f.call == RESET or (f.autoreset == NEXT_STEP and e.over != 0)
     if fresh:
-        _begin_episode(f, e, w, sim)
-        _observe(f, e, w, f.observation, sim)
+        _begin_episode(f, e, w)
+        _observe(f, e, w, f.observation)
         return
     if f.autoreset == DISABLED and e.over != 0:
         return
     action = carray(pointer(f.action + 4 * sim * f.actions), (f.actions,), np.float32)
-    value, done, late = _step(f, e, w, sim, action)
+    value, done, late = _step(f, e, w, action)
     reward[sim], terminated[sim], truncated[sim] = value, done, late
     e.over = 1 if done or late else 0
     if f.autoreset == SAME_STEP and e.over != 0:
-        floats(f.final_measures + 8 * sim * MEASURES, MEASURES)[:] = w.measures
-        _observe(f, e, w, f.final, sim)
-        _begin_episode(f, e, w, sim)
-    _observe(f, e, w, f.observation, sim)
+        final = floats(f.final_measures + 8 * sim * MEASURES, MEASURES)
+        for c in range(MEASURES):
+            final[c] = w.measures[c]
+        _observe(f, e, w, f.final)
+        _begin_episode(f, e, w)
+    _observe(f, e, w, f.observation)
 
 
 @callback(_SIGNATURE)

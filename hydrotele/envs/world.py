@@ -1,0 +1,156 @@
+"""What native code of an environment sees of its simulation, and how it calls that of its task.
+
+Every task has code of its own, called by address: so a task compiles without the others, and the
+loop that calls them without any.
+"""
+# pyright: reportCallIssue=false, reportPrivateImportUsage=false
+# numba's intrinsics are called without their typing context, and carray is its documented API.
+
+from typing import NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import carray, types
+from numba.extending import intrinsic
+
+from hydrotele.core.compiled import compiled
+from hydrotele.envs.episode import EPISODE_STATE, MEASURES, TASK_PARAMETERS
+from hydrotele.simulate.layout import field, floats, pointer
+
+BEGIN, TICK, OBSERVE, REWARD = range(4)
+"""What a task is called for: a new episode, after a control period, for what it observes of itself,
+for the reward of the step that is over."""
+
+TASK_CODE = types.float64(*(types.int64,) * 6)
+"""(what it is called for, mjModel*, mjData*, number, TASK_PARAMETERS*, where to observe, float32*)
+-> the reward."""
+
+
+class World(NamedTuple):
+    """Live arrays of one simulation.
+
+    Attributes:
+        qpos: (nq,) positions; staggered, see `simulate.record`.
+        qvel: (nv,) velocities.
+        act: (na,) activations.
+        ctrl: (k,) commands that act.
+        tip: (3,) place of the arm's tip at the time of the activations [m].
+        xfrc: (6 nbody,) forces and torques from outside on bodies, world frame [N], [N m].
+        xpos: (3 nbody,) places of bodies [m], of the last physics step.
+        xipos: (3 nbody,) places of their centres of mass [m].
+        xquat: (4 nbody,) quaternions of the bodies.
+        xmat: (9 nbody,) their rotation matrices.
+        eq_active: (neq,) uint8, which equalities act; part of the state.
+        eq_data: (neq eq_width,) numbers of the equalities for the rest of this call.
+        eq_rows: the same from the next call on; empty unless the task writes them.
+        terrain: (width,) what the episode keeps of its ground, empty without.
+        measures: (MEASURES,) figures of this step, for `info`.
+        model: address of mjModel.
+        data: address of mjData.
+        number: of the simulation.
+        argument: address of the record of TASK_PARAMETERS.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    act: np.ndarray
+    ctrl: np.ndarray
+    tip: np.ndarray
+    xfrc: np.ndarray
+    xpos: np.ndarray
+    xipos: np.ndarray
+    xquat: np.ndarray
+    xmat: np.ndarray
+    eq_active: np.ndarray
+    eq_data: np.ndarray
+    eq_rows: np.ndarray
+    terrain: np.ndarray
+    measures: np.ndarray
+    model: int
+    data: int
+    number: int
+    argument: int
+
+
+@compiled
+def parameters_at(argument):
+    """(1,) record of TASK_PARAMETERS at an address, scalar."""
+    return carray(pointer(argument), (1,), TASK_PARAMETERS)
+
+
+@compiled
+def episodes(f):
+    """(count,) records of EPISODE_STATE of a record of TASK_PARAMETERS."""
+    return carray(pointer(f.episodes), (f.count,), EPISODE_STATE)
+
+
+@compiled
+def world(f, m, d, number, argument):
+    """The live arrays of a simulation.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        m: address of its mjModel, scalar.
+        d: address of its mjData, scalar.
+        number: its number, scalar.
+        argument: address of `f`, scalar.
+
+    Returns:
+        World.
+
+    Source: `simulate.layout`.
+    """
+    place = carray(pointer(d + f.at_site), (1,), np.int64)[0]
+    active = carray(pointer(d + f.at_eq_active), (1,), np.int64)[0]
+    numbers = f.neq * f.eq_width
+    site = f.tip_site if f.tip_site >= 0 else 0
+    return World(
+        field(d, f.at_qpos, f.nq),
+        field(d, f.at_qvel, f.nv),
+        field(d, f.at_act, f.na),
+        field(d, f.at_ctrl, f.axes),
+        floats(place + 24 * site, 3),
+        field(d, f.at_xfrc, 6 * f.nbody),
+        field(d, f.at_xpos, 3 * f.nbody),
+        field(d, f.at_xipos, 3 * f.nbody),
+        field(d, f.at_xquat, 4 * f.nbody),
+        field(d, f.at_xmat, 9 * f.nbody),
+        carray(pointer(active), (f.neq,), np.uint8),
+        field(m, f.at_eq_data, numbers),
+        floats(f.eq_rows + 8 * number * numbers, numbers if f.eq_rows else 0),
+        floats(f.terrain + 8 * number * f.width, f.width),
+        floats(f.measures + 8 * number * MEASURES, MEASURES),
+        m,
+        d,
+        number,
+        argument,
+    )
+
+
+@intrinsic
+def _call(typingctx, function, part, model, data, number, argument, out):
+    """Call a function of the signature TASK_CODE by its address."""
+
+    def codegen(context, builder, signature, args):
+        kind = ir.FunctionType(ir.DoubleType(), [ir.IntType(64)] * 6)
+        return builder.call(builder.inttoptr(args[0], kind.as_pointer()), args[1:])
+
+    return types.float64(*(types.int64,) * 7), codegen
+
+
+@compiled
+def call_task(f, w, part, out):
+    """Let the task do its part.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        w: World.
+        part: BEGIN, TICK, OBSERVE or REWARD, scalar.
+        out: address of the float32 that OBSERVE writes, scalar; 0 for the others.
+
+    Returns:
+        The reward, scalar; 0 but for REWARD, which also writes `over` of the episode.
+
+    Source: this module.
+    """
+    return _call(f.task, part, w.model, w.data, w.number, w.argument, out)
