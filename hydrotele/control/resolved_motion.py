@@ -68,8 +68,10 @@ def follow_pose(g, ranges, wanted, rate, blocked, pose, q, speed):
     if held:
         speed[:] = 0.0
         return True
-    q[:] = found
-    pose[:] = wanted
+    for i in range(k):
+        q[i] = found[i]
+    for i in range(len(pose)):
+        pose[i] = wanted[i]
     if k < 4:
         pose[3] = found[1] + found[2]
     return False

@@ -44,7 +44,7 @@ from hydrotele.hydraulics.parameters import SLOTS
 from hydrotele.kinematics.task import task_forward
 from hydrotele.simulate.feedback import Readings, Sensors, hold_readings, read_sensors
 from hydrotele.simulate.fleet import STATE
-from hydrotele.simulate.layout import call_set_state, floats, pointer
+from hydrotele.simulate.layout import call_set_state, copy_to, floats, pointer
 from hydrotele.simulate.stepping import (
     CommandLine,
     SensorPast,
@@ -260,8 +260,7 @@ def _begin_episode(f, e, w):
     sim = _simulation(f, e, w)
     begin_past(sim, w.ctrl)
     tips = floats(f.start_tips + 24 * e.variant, 3)
-    for c in range(3):
-        e.tip[c] = tips[c]
+    copy_to(e.tip, tips)
     e.reference_rate[:], e.pose_rate[:] = 0.0, 0.0
     sense(f, e, sim)
     for i in range(len(e.joint)):
@@ -301,8 +300,7 @@ def _step(f, e, w, action):
         call_task(
             f, w, TICK, 0
         )  # after the physics: before, MuJoCo's places are another simulation's
-    for c in range(3):
-        e.tip[c] = w.tip[c]
+    copy_to(e.tip, w.tip)
     e.step += 1
     if _unstable(f, e, w.data):
         e.fault = 1
@@ -333,9 +331,7 @@ def _advance(m, d, sim, argument):
     reward[sim], terminated[sim], truncated[sim] = value, done, late
     e.over = 1 if done or late else 0
     if f.autoreset == SAME_STEP and e.over != 0:
-        final = floats(f.final_measures + 8 * sim * MEASURES, MEASURES)
-        for c in range(MEASURES):
-            final[c] = w.measures[c]
+        copy_to(floats(f.final_measures + 8 * sim * MEASURES, MEASURES), w.measures)
         _observe(f, e, w, f.final)
         _begin_episode(f, e, w)
     _observe(f, e, w, f.observation)

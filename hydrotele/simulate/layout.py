@@ -206,6 +206,23 @@ def integers(address, count):
 
 
 @compiled
+def copy_to(there, values):
+    """Copy numbers into the first places of an array.
+
+    numba's own assignment compiles words for its error message with it, which takes seconds.
+
+    Args:
+        there: (>= n,) written.
+        values: (n,).
+
+    Returns:
+        Nothing.
+    """
+    for i in range(len(values)):
+        there[i] = values[i]
+
+
+@compiled
 def short_integers(address, count):
     """(count,) 32-bit integers at an address."""
     return carray(pointer(address), (count,), np.int32)

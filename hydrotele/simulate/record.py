@@ -32,6 +32,7 @@ from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.layout import (
     address_record,
     call_contact_force,
+    copy_to,
     field_offsets,
     floats,
     function_address,
@@ -182,17 +183,17 @@ def take_row(record, contacts, row, time):
     velocity, acceleration, act = floats(r.qvel, r.nv), floats(r.qacc, r.nv), floats(r.act, r.na)
     floats(r.to_time, r.rows)[row] = time
     positions = rows_of(r.to_qpos, r.rows, r.nq)[row : row + 1]
-    positions[0] = floats(r.qpos, r.nq)
+    copy_to(positions[0], floats(r.qpos, r.nq))
     _step_back(positions, velocity.reshape((1, r.nv)), r.timestep, r.plain)
     to_velocity = rows_of(r.to_qvel, r.rows, r.nv)[row]
     good = True
     for i in range(r.nv):
         to_velocity[i] = velocity[i] - 0.5 * r.timestep * acceleration[i]
         good = good and np.isfinite(acceleration[i])
-    rows_of(r.to_qacc, r.rows, r.nv)[row] = acceleration
-    rows_of(r.to_act, r.rows, r.na)[row] = act
+    copy_to(rows_of(r.to_qacc, r.rows, r.nv)[row], acceleration)
+    copy_to(rows_of(r.to_act, r.rows, r.na)[row], act)
     if r.tip >= 0:
-        rows_of(r.to_tip, r.rows, 3)[row] = rows_of(r.site, r.sites, 3)[r.tip]
+        copy_to(rows_of(r.to_tip, r.rows, 3)[row], rows_of(r.site, r.sites, 3)[r.tip])
     sum_contact_forces(contacts, rows_of(r.to_contact, r.rows, 3)[row])
     warnings = short_integers(r.warning, 2 * _WARNINGS)  # information and number of each
     for kind in range(_WARNINGS):

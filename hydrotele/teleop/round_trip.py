@@ -12,7 +12,7 @@ import numpy as np
 from hydrotele.control.servo import DriveReference, drive_row
 from hydrotele.core.compiled import compiled
 from hydrotele.simulate.joystick import flotor_step, shaken_flotor_step
-from hydrotele.simulate.layout import floats, integers, rows_of, short_integers
+from hydrotele.simulate.layout import copy_to, floats, integers, rows_of, short_integers
 from hydrotele.teleop.axis_table import DAMPING
 from hydrotele.teleop.master import (
     CONTROLLED,
@@ -260,10 +260,10 @@ def round_trip(station, flotor, tick, tripped):
         else:
             spin, spin_rate = floats(r.qvel, r.dofs)[r.swing], floats(r.qacc, r.dofs)[r.swing]
             shaken_flotor_step(flotor[0], m.currents, force, spin, spin_rate)
-    rows_of(r.log_master, n, r.master_state_size)[tick] = operator.state
-    rows_of(r.log_slave, n, r.slave_state_size)[tick] = machine.state
-    rows_of(r.log_force, n, r.joints)[tick] = machine.force
-    rows_of(r.log_muscles, n, 6)[tick] = force
+    copy_to(rows_of(r.log_master, n, r.master_state_size)[tick], operator.state)
+    copy_to(rows_of(r.log_slave, n, r.slave_state_size)[tick], machine.state)
+    copy_to(rows_of(r.log_force, n, r.joints)[tick], machine.force)
+    copy_to(rows_of(r.log_muscles, n, 6)[tick], force)
     drive = DriveReference(
         rows_of(r.velocity, n, nu)[tick], rows_of(r.arm, n, nu)[tick],
         rows_of(r.volume_head, n, nu)[tick], rows_of(r.volume_rod, n, nu)[tick],
@@ -273,6 +273,6 @@ def round_trip(station, flotor, tick, tripped):
         floats(r.table, nu * r.points * 3).reshape((nu, r.points, 3)), r.scale,
         rows_of(r.reference, n, nu)[tick], rows_of(r.rate, n, nu)[tick], drive,
     )  # fmt: skip
-    rows_of(r.pose, n, r.pose_columns)[tick] = s.pose[: r.pose_columns]
+    copy_to(rows_of(r.pose, n, r.pose_columns)[tick], s.pose[: r.pose_columns])
     integers(r.touching, n)[tick] = short_integers(r.contacts, 1)[0] > 0
     return s.flags[BLOCKED] != 0.0 or s.flags[SILENT] != 0.0 or s.flags[TRIPPED] != 0.0
