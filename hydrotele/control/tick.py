@@ -17,8 +17,8 @@ from hydrotele.control.servo import (
     servo_step,
 )
 from hydrotele.core.compiled import compiled
+from hydrotele.core.memory import address_record, floats, integers, rows_of
 from hydrotele.simulate.feedback import FeedbackTable, Readings, Sensors, sample
-from hydrotele.simulate.layout import address_record, floats, integers, rows_of
 from hydrotele.simulate.stepping import simulation, step_physics
 
 

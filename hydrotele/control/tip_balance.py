@@ -11,6 +11,7 @@ import numpy as np
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
+from hydrotele.core.memory import address_record, floats, integers, rows_of
 from hydrotele.estimate.reduced_dynamics import place_mechanism
 from hydrotele.estimate.reduced_model import model_space, reduced_model, state_size
 from hydrotele.hydraulics.circuit import actuator_friction
@@ -19,7 +20,6 @@ from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.reduced_mechanism import DAMPING, HOME, ReducedMechanism, coordinate_names
 from hydrotele.multibody.reduced_motion import BIAS, DRIFT, RATE, ReducedMotion, gather_forces
-from hydrotele.simulate.layout import address_record, floats, integers, rows_of
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _ODDS = 8.0

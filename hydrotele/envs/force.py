@@ -12,6 +12,7 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import compiled
+from hydrotele.core.memory import field
 from hydrotele.envs.episode import uniform_between
 from hydrotele.envs.observation import Field
 from hydrotele.envs.starts import draw_start
@@ -20,7 +21,6 @@ from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 from hydrotele.scenario.surroundings import Plate, SurroundingObject
-from hydrotele.simulate.layout import field
 
 WEAKEST, STRONGEST = 1.0e4, 3.5e4  # N, forces that are wanted
 OVERLOAD = 1.0e5  # N

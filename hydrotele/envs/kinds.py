@@ -10,6 +10,7 @@ import numpy as np
 from numba import carray
 
 from hydrotele.core.compiled import Callback, callback, compiled
+from hydrotele.core.memory import pointer
 from hydrotele.envs.force import begin_force, observe_force, reward_force, tick_force
 from hydrotele.envs.grade import begin_grade, observe_grade, reward_grade, tick_bed
 from hydrotele.envs.line import begin_line, observe_line, reward_line
@@ -26,7 +27,6 @@ from hydrotele.envs.world import (
     parameters_at,
     world,
 )
-from hydrotele.simulate.layout import pointer
 
 
 @compiled

@@ -15,6 +15,7 @@ from hydrotele.control.resolved_motion import follow_pose
 from hydrotele.control.servo import POINTS, ComputedForce, DriveReference, Measured, drive_row
 from hydrotele.control.tick import Controller, TickReference, control_tick
 from hydrotele.core.compiled import callback, compiled
+from hydrotele.core.memory import copy_to, floats, pointer
 from hydrotele.envs.episode import (
     ARM,
     AXES,
@@ -44,7 +45,7 @@ from hydrotele.hydraulics.parameters import SLOTS
 from hydrotele.kinematics.task import task_forward
 from hydrotele.simulate.feedback import Readings, Sensors, hold_readings, read_sensors
 from hydrotele.simulate.fleet import STATE
-from hydrotele.simulate.layout import call_set_state, copy_to, floats, pointer
+from hydrotele.simulate.layout import call_set_state
 from hydrotele.simulate.stepping import (
     CommandLine,
     SensorPast,

@@ -14,8 +14,8 @@ from numba import carray, types
 from numba.extending import intrinsic
 
 from hydrotele.core.compiled import compiled
+from hydrotele.core.memory import field, floats, pointer
 from hydrotele.envs.episode import EPISODE_STATE, MEASURES, TASK_PARAMETERS
-from hydrotele.simulate.layout import field, floats, pointer
 
 BEGIN, TICK, OBSERVE, REWARD = range(4)
 """What a task is called for: a new episode, after a control period, for what it observes of itself,

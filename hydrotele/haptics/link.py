@@ -20,6 +20,7 @@ from numba import types
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
+from hydrotele.core.memory import address_record, floats, integers, rows_of
 from hydrotele.haptics.device import HandlePose
 from hydrotele.haptics.packets import (
     ABLE,
@@ -46,7 +47,6 @@ from hydrotele.haptics.packets import (
     packet,
 )
 from hydrotele.haptics.timing import ask_for_priority, summary_of
-from hydrotele.simulate.layout import address_record, floats, integers, rows_of
 from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, REACH, flat_state, flat_view
 from hydrotele.teleop.master import (
     KINDS,

@@ -11,8 +11,8 @@ import numpy as np
 
 from hydrotele.control.tick import planned_tick
 from hydrotele.core.compiled import compiled
+from hydrotele.core.memory import address_record, floats, integers, rows_of
 from hydrotele.simulate.closure import pin_sites, widest_pin
-from hydrotele.simulate.layout import address_record, floats, integers, rows_of
 from hydrotele.simulate.record import take_row
 from hydrotele.teleop.round_trip import CHECKED, round_trip
 

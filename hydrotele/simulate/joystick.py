@@ -22,14 +22,9 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_xml
+from hydrotele.core.memory import address_record, floats, rows_of
 from hydrotele.machine.joystick import Joystick, principal
-from hydrotele.simulate.layout import (
-    address_record,
-    call_step,
-    floats,
-    function_address,
-    rows_of,
-)
+from hydrotele.simulate.layout import call_step, function_address
 
 GRAVITY = -9.81
 _COOL = 0.9  # heat below which hot coils may have their largest current again

@@ -5,10 +5,8 @@ rules, and are checked against addresses and values that the bindings expose.
 
 MuJoCo's shared library, for what its Python bindings do not show.
 
-Memory that C hands to compiled code: addresses seen as arrays, C functions called by address.
-
-Addresses come in as numbers, so that compiled functions can be cached on disk: a function pointer
-of ctypes could not.
+Its functions called from compiled code, by address: a number, so that what calls them can be cached
+on disk, which a function pointer of ctypes could not.
 """
 
 import ctypes
@@ -19,11 +17,9 @@ import mujoco
 import numpy as np
 from llvmlite import ir
 from mujoco.introspect import ast_nodes, structs
-from numba import carray, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
-
-from hydrotele.core.compiled import compiled
 
 
 @functools.cache
@@ -171,90 +167,6 @@ def verify_layout() -> None:
             f"MuJoCo {mujoco.__version__} keeps {', '.join(wrong)} elsewhere than its own"
             " description says; install a version in the range of pyproject.toml"
         )
-
-
-# pyright: reportCallIssue=false, reportPrivateImportUsage=false
-# numba's intrinsics are called without their typing context, and carray is its documented API.
-
-
-@intrinsic
-def pointer(typingctx, address):
-    """Reinterpret an int64 address as void*."""
-
-    def codegen(context, builder, signature, args):
-        return builder.inttoptr(args[0], cgutils.voidptr_t)
-
-    return types.voidptr(types.int64), codegen
-
-
-@compiled
-def floats(address, count):
-    """(count,) floats at an address."""
-    return carray(pointer(address), (count,), np.float64)
-
-
-@compiled
-def rows_of(address, rows, columns):
-    """(rows, columns) floats at an address."""
-    return floats(address, rows * columns).reshape((rows, columns))
-
-
-@compiled
-def integers(address, count):
-    """(count,) 64-bit integers at an address."""
-    return carray(pointer(address), (count,), np.int64)
-
-
-@compiled
-def copy_to(there, values):
-    """Copy numbers into the first places of an array.
-
-    numba's own assignment compiles words for its error message with it, which takes seconds.
-
-    Args:
-        there: (>= n,) written.
-        values: (n,).
-
-    Returns:
-        Nothing.
-    """
-    for i in range(len(values)):
-        there[i] = values[i]
-
-
-@compiled
-def short_integers(address, count):
-    """(count,) 32-bit integers at an address."""
-    return carray(pointer(address), (count,), np.int32)
-
-
-def address_record(kind: np.dtype, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """A record of the addresses of arrays, for native code that takes many of them at once.
-
-    Reading a named tuple of arrays costs numba a microsecond each, a record none.
-
-    Args:
-        kind: record type with a field of 64-bit integers for every array.
-        arrays: field -> contiguous array of 64-bit floats or integers, which must outlive it.
-
-    Returns:
-        (1,) record; other fields are 0.
-
-    Raises:
-        TypeError: an array is of another kind.
-    """
-    record = np.zeros(1, kind)
-    for name, array in arrays.items():
-        if array.dtype not in (np.float64, np.int64) or not array.flags.c_contiguous:
-            raise TypeError(f"{name} must be contiguous 64-bit numbers, not {array.dtype}")
-        record[name] = array.ctypes.data
-    return record
-
-
-@compiled
-def field(base, offset, count):
-    """(count,) floats that a struct at `base` points to with its member at `offset`."""
-    return floats(carray(pointer(base + offset), (1,), np.int64)[0], count)
 
 
 @intrinsic

@@ -24,6 +24,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from hydrotele.core.compiled import allocation_free, callback, compiled
+from hydrotele.core.memory import floats, pointer
 from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate, settled_bristle_friction
 from hydrotele.hydraulics.circuit import (
     MAX_AXES,
@@ -43,14 +44,7 @@ from hydrotele.hydraulics.circuit import (
     step_circuit,
 )
 from hydrotele.hydraulics.parameters import CURVE, CURVE_KNOTS, MARKER
-from hydrotele.simulate.layout import (
-    field_offsets,
-    floats,
-    mujoco_library,
-    option_offset,
-    pointer,
-    verify_layout,
-)
+from hydrotele.simulate.layout import field_offsets, mujoco_library, option_offset, verify_layout
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND, COUNT, FORCE, added_with_slope
 from hydrotele.terms.table import MARKER as TERMS

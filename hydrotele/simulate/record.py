@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import compiled
+from hydrotele.core.memory import address_record, copy_to, floats, integers, rows_of, short_integers
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS,
     SCRATCH,
@@ -30,15 +31,9 @@ from hydrotele.hydraulics.circuit import (
 )
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.layout import (
-    address_record,
     call_contact_force,
-    copy_to,
     field_offsets,
-    floats,
     function_address,
-    integers,
-    rows_of,
-    short_integers,
     struct_size,
 )
 from hydrotele.simulate.mechanism import TIP_SITE

@@ -11,8 +11,8 @@ import numpy as np
 
 from hydrotele.control.servo import DriveReference, drive_row
 from hydrotele.core.compiled import compiled
+from hydrotele.core.memory import copy_to, floats, integers, rows_of, short_integers
 from hydrotele.simulate.joystick import flotor_step, shaken_flotor_step
-from hydrotele.simulate.layout import copy_to, floats, integers, rows_of, short_integers
 from hydrotele.teleop.axis_table import DAMPING
 from hydrotele.teleop.master import (
     CONTROLLED,

@@ -20,6 +20,7 @@ from hydrotele.control.resolved_motion import COORDINATES, arm_facts
 from hydrotele.control.servo import DriveReferences, drive_tables
 from hydrotele.control.task_impedance import TaskImpedance
 from hydrotele.core.errors import InputError
+from hydrotele.core.memory import address_record
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.joystick import AXES, load_joystick
 from hydrotele.machine.machine import Machine
@@ -29,7 +30,7 @@ from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Channel, Fault, TeleopPilot
 from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.joystick import SimulatedFlotor
-from hydrotele.simulate.layout import address_record, field_offsets
+from hydrotele.simulate.layout import field_offsets
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import contact_record, sum_contact_forces, surrounding_geoms
 from hydrotele.teleop.axis_table import DEADBAND, REACH, flat_view
