@@ -104,7 +104,7 @@ class Planned(NamedTuple):
 
 
 _I, _SERVO = np.int64, 14
-_PLANNED = np.dtype(
+PLANNED = np.dtype(
     [(name, _I) for name in ("axes", "ticks", "channels", "samples", "every", "known")]
     + [("period", np.float64)]
     + [(name, _I) for name in ("parameters", "closed", "load", "command")]  # addresses from here on
@@ -114,6 +114,7 @@ _PLANNED = np.dtype(
     + [(name, _I) for name in ("force", "force_rate", "reference", "planned_command", "given")],
     align=True,
 )
+"""Record of a Planned."""
 
 
 def planned_record(run: Planned) -> np.ndarray:
@@ -126,7 +127,7 @@ def planned_record(run: Planned) -> np.ndarray:
         "force_rate": run.forces.rate, "reference": run.reference, "planned_command": run.command,
         "given": run.given,
     }  # fmt: skip
-    record = address_record(_PLANNED, arrays)
+    record = address_record(PLANNED, arrays)
     (record["ticks"], record["axes"]), record["every"] = run.reference.shape, table.every
     (record["samples"], record["channels"]), record["period"] = table.errors.shape, table.period
     record["known"] = run.forces.known

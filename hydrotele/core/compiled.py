@@ -82,34 +82,11 @@ class Callback:
 
     def __init__(self, function, signature) -> None:
         self._function, self._signature = function, signature
-        self._elsewhere: subprocess.Popen | None = None
 
     def compile_elsewhere(self) -> None:
-        """Begin to compile in a process beside this one, where that is still to be done.
-
-        The function has to be a module's, so that the other process finds it.
-        """
+        """Begin to compile in a process beside this one, see the function of that name."""
         module, name = self._function.__module__, self._function.__name__
-        with _caching(module) as cache:
-            folder = Path(_CONFIG.CACHE_DIR)
-        if (
-            not cache
-            or self._elsewhere
-            or any(folder.glob(f"*{name}-{_line(self._function)}.*.nbi"))
-        ):
-            return
-        path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, sys.path)])
-        self._elsewhere = subprocess.Popen(
-            [sys.executable, "-P", "-c", f"from {module} import {name}; {name}.address"],
-            env={**os.environ, "PYTHONPATH": path}, stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        atexit.register(self._end)
-
-    def _end(self) -> None:
-        if self._elsewhere:
-            self._elsewhere.kill()
-            self._elsewhere.wait()
+        compile_elsewhere(self._function, f"from {module} import {name}; {name}.address")
 
     @functools.cached_property
     def _compiled(self) -> Any:
@@ -127,6 +104,39 @@ class Callback:
     def ctypes(self) -> Any:
         """The same as a ctypes function."""
         return self._compiled.ctypes
+
+
+def compile_elsewhere(function, code: str) -> None:
+    """Begin to compile in a process beside this one, where that is still to be done.
+
+    Args:
+        function: what is compiled, one of a module; or its `compiled` form.
+        code: Python code that compiles it.
+    """
+    function = getattr(function, "py_func", function)
+    with _caching(function.__module__) as cache:
+        folder = Path(_CONFIG.CACHE_DIR)
+    if not cache or code in _ELSEWHERE or any(folder.glob(_index(function))):
+        return
+    path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, sys.path)])
+    _ELSEWHERE[code] = process = subprocess.Popen(
+        [sys.executable, "-P", "-c", code], env={**os.environ, "PYTHONPATH": path},
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    atexit.register(_end, process)
+
+
+_ELSEWHERE: dict[str, subprocess.Popen] = {}
+
+
+def _end(process: subprocess.Popen) -> None:
+    process.kill()
+    process.wait()
+
+
+def _index(function) -> str:
+    """Pattern of the file that lists what is compiled of a function."""
+    return f"*{function.__name__}-{_line(function)}.*.nbi"
 
 
 def cache_folder() -> Path | None:

@@ -27,7 +27,9 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.noise import sensor_set
 from hydrotele.run.session import PreparedRun, Session
+from hydrotele.run.ticks import compile_ahead
 from hydrotele.scenario.scenario import Scenario, own_machine
+from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.audit import audit
 from hydrotele.simulate.feedback import Feedback, feedback, measure
 from hydrotele.simulate.mechanism import flexible_axes
@@ -241,6 +243,8 @@ def begin(scenario: Scenario, hand: Hand | None = None) -> Session:
     Raises:
         InputError: the scenario asks for what the machine has not.
     """
+    if isinstance(scenario.pilot, TeleopPilot):
+        compile_ahead()
     return Session(prepare(scenario), scenario, scenario_model(scenario), hand)
 
 

@@ -8,20 +8,24 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numba import boolean, int64, typeof
 
-from hydrotele.control.tick import planned_tick
-from hydrotele.core.compiled import compiled
+from hydrotele.control.tick import PLANNED, planned_tick
+from hydrotele.core.compiled import compile_elsewhere, compiled
 from hydrotele.core.memory import address_record, floats, integers, rows_of
 from hydrotele.simulate.closure import pin_sites, widest_pin
-from hydrotele.simulate.record import take_row
-from hydrotele.teleop.round_trip import CHECKED, round_trip
+from hydrotele.simulate.joystick import FLOTOR
+from hydrotele.simulate.record import CONTACTS, STATE_ROW, take_row
+from hydrotele.simulate.stepping import SIMULATION
+from hydrotele.teleop.round_trip import CHECKED, STATION, round_trip
 
-_TICKS = np.dtype(
+TICKS = np.dtype(
     [(name, np.int64) for name in ("steps", "every", "rows", "sites", "pins")]
     + [("period", np.float64)]
     + [(name, np.int64) for name in ("places", "one", "two", "widest")],  # addresses
     align=True,
 )
+"""Record of Ticks."""
 
 
 class Ticks(NamedTuple):
@@ -55,7 +59,7 @@ def ticks_of(
     widest = np.zeros(1)
     kept = {"places": data.site_xpos, "one": one.astype(np.int64), "two": two.astype(np.int64),
             "widest": widest}  # fmt: skip
-    record = address_record(_TICKS, kept)
+    record = address_record(TICKS, kept)
     for name, value in {"steps": steps, "every": every, "rows": rows, "period": period,
                         "sites": model.nsite, "pins": len(one)}.items():  # fmt: skip
         record[name] = value
@@ -147,3 +151,15 @@ def look_at_pins(ticks):
     widest, places = floats(r.widest, 1), rows_of(r.places, r.sites, 3)
     one, two = integers(r.one, r.pins), integers(r.two, r.pins)
     widest[0] = max(widest[0], widest_pin(places, one, two))
+
+
+def compile_ahead() -> None:
+    """Begin to compile what a teleoperated run calls, in a process beside this one."""
+    compile_elsewhere(teleoperated_ticks, f"from {__name__} import compile_ticks; compile_ticks()")
+
+
+def compile_ticks() -> None:
+    """Compile what a teleoperated run calls."""
+    records = TICKS, SIMULATION, PLANNED, STATE_ROW, CONTACTS, STATION, FLOTOR
+    arguments = *(typeof(np.zeros(1, kind)) for kind in records), int64, int64, boolean
+    teleoperated_ticks.compile(arguments)

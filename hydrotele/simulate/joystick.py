@@ -31,7 +31,7 @@ _COOL = 0.9  # heat below which hot coils may have their largest current again
 _STEPS = 2  # physics steps per control period of 5 ms: its stiffest spring turns over in 30 ms
 _HALVES = 15  # currents, applied forces and gravity, which change between periods
 
-_FLOTOR = np.dtype(
+FLOTOR = np.dtype(
     [(name, np.int64) for name in ("mj_step", "mj_forward", "model", "data")]
     + [(name, np.int64) for name in ("steps", "leaps", "started")]
     + [(name, np.float64) for name in ("timestep", "period", "mass", "continuous_current")]
@@ -41,6 +41,7 @@ _FLOTOR = np.dtype(
     + [(name, np.int64) for name in ("speed", "acceleration", "half_damping", "heat")],
     align=True,
 )
+"""Record of a SimulatedFlotor."""
 
 
 class SimulatedFlotor:
@@ -117,7 +118,7 @@ class SimulatedFlotor:
             "before": np.zeros((2, _HALVES)), "speed": data.qvel, "acceleration": data.qacc,
             "half_damping": half_damping, "heat": self.heat,
         }  # fmt: skip
-        self.record = address_record(_FLOTOR, self._arrays)
+        self.record = address_record(FLOTOR, self._arrays)
         for name, value in {
             "mj_step": function_address("mj_step"), "mj_forward": function_address("mj_forward"),
             "model": model._address, "data": data._address, "steps": self.steps, "leaps": leaps,

@@ -148,7 +148,7 @@ def split_delay(delay: float, timestep: float) -> tuple[int, float]:
     return steps, rest if rest > _WHOLE else 0.0
 
 
-_ROW = np.dtype(
+STATE_ROW = np.dtype(
     [(name, np.int64) for name in ("rows", "nq", "nv", "na", "plain", "sites", "tip", "warning")]
     + [("timestep", np.float64)]
     + [(name, np.int64) for name in ("qpos", "qvel", "qacc", "act", "site")]  # addresses from here
@@ -156,6 +156,7 @@ _ROW = np.dtype(
     + [(name, np.int64) for name in ("to_contact", "to_tip")],
     align=True,
 )
+"""Record of a Recorder."""
 _WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
 
 
@@ -253,7 +254,7 @@ class Recorder:
         """Look up where everything is that is taken, and where it is put."""
         model, self._data = self.model, data
         self._row = address_record(
-            _ROW,
+            STATE_ROW,
             {
                 "qpos": data.qpos, "qvel": data.qvel, "qacc": data.qacc, "act": data.act,
                 "site": data.site_xpos, "to_time": self.time, "to_qpos": self.qpos,
@@ -316,11 +317,12 @@ def contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray
     return total
 
 
-_CONTACTS = np.dtype(
+CONTACTS = np.dtype(
     [(name, np.int64) for name in ("function", "model", "data", "count", "contacts", "geoms")]
     + [(name, np.int64) for name in ("size", "frame", "geom", "around")],
     align=True,
 )
+"""Record of `contact_record`."""
 
 
 def contact_record(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
@@ -334,7 +336,7 @@ def contact_record(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarra
     Returns:
         (1,) record.
     """
-    found, in_data = address_record(_CONTACTS, {"around": around}), field_offsets("mjData")
+    found, in_data = address_record(CONTACTS, {"around": around}), field_offsets("mjData")
     for name, value in {
         "function": function_address("mj_contactForce"), "model": model._address,
         "data": data._address, "count": data._address + in_data["ncon"],

@@ -97,7 +97,7 @@ class Simulation(NamedTuple):
 
 
 _I = np.int64
-_SIMULATION = np.dtype(
+SIMULATION = np.dtype(
     [(name, _I) for name in ("mj_step", "model", "data", "nq", "nv", "na", "nu")]
     + [("timestep", np.float64)]
     + [(name, _I) for name in ("axes", "hydraulic", "rods", "channels", "ticks", "back")]
@@ -107,13 +107,14 @@ _SIMULATION = np.dtype(
     + [(name, _I) for name in ("past_ring", "past_before", "past_delay", "past_ratio")],
     align=True,
 )
+"""Record of a Simulation."""
 
 
 def simulation_record(sim: Simulation) -> np.ndarray:
     """(1,) record of a Simulation whose arrays must outlive it; `simulation` reads it."""
     line, past = sim.line, sim.past
     record = address_record(
-        _SIMULATION,
+        SIMULATION,
         {
             "qpos": sim.qpos, "qvel": sim.qvel, "act": sim.act, "ctrl": sim.ctrl, "user": sim.user,
             "joint_qpos": sim.joint_qpos, "joint_dof": sim.joint_dof, "rod_qpos": sim.rod_qpos,

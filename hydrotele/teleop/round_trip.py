@@ -209,6 +209,7 @@ STATION = np.dtype(
     + [(name, np.int64) for name in ("touching", "contacts")],
     align=True,
 )
+"""Record of a Station."""
 
 
 @compiled
