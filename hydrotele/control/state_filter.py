@@ -8,7 +8,6 @@ straight line, which is exact for what ramps, and finite for one that is held.
 import math
 
 import numpy as np
-from scipy.linalg import expm
 
 from hydrotele.core.compiled import allocation_free, compiled
 
@@ -36,6 +35,8 @@ def filter_table(bandwidth: float, period: float) -> np.ndarray:
     >>> filter_table(1.0, 0.01)[:, 3:].sum(axis=1).round(4) + 0.0  # a step of both readings
     array([0.    , 0.0119, 2.3279])
     """
+    from scipy.linalg import expm  # a third of a second that most runs do not need
+
     w = 2.0 * math.pi * bandwidth
     block = np.zeros((5, 5))
     block[0, 1] = block[1, 2] = block[3, 4] = 1.0
