@@ -121,3 +121,36 @@ def test_the_first_compilation_is_announced(tmp_path):
         "law(1.0)"
     )
     assert "compiling numerical code once" in _run(ROOT, tmp_path, code)[1]
+
+
+ELSEWHERE = """
+import numpy as np
+from hydrotele.core import compiled
+from hydrotele.simulate.closure import widest_pin
+code = "import numpy as np; from hydrotele.simulate.closure import widest_pin as f"
+code += "; f(np.zeros((2, 3)), np.zeros(1, int), np.ones(1, int))"
+for _ in range(2):
+    compiled.compile_elsewhere(widest_pin, code)
+for process in compiled._ELSEWHERE.values():
+    assert process.wait() == 0
+widest_pin(np.zeros((2, 3)), np.zeros(1, int), np.ones(1, int))
+print(len(compiled._ELSEWHERE), sum(widest_pin.stats.cache_hits.values()))
+"""
+
+
+def test_what_a_process_beside_has_compiled_is_loaded_and_is_not_compiled_again(tmp_path):
+    assert _run(ROOT, tmp_path, ELSEWHERE)[0] == ["1", "1"]
+    assert _run(ROOT, tmp_path, ELSEWHERE)[0] == ["0", "1"]
+
+
+def test_a_teleoperated_run_finds_what_was_compiled_ahead(tmp_path):
+    """Its arguments are of the types that `compile_ticks` says: nothing is compiled again."""
+    code = """
+from hydrotele.run import ticks
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
+ticks.compile_ticks()
+run_scenario(load_scenario("press_stiffness", {"duration": "0.2"}))
+print(len(ticks.teleoperated_ticks.signatures))
+"""
+    assert _run(ROOT, os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), code)[0] == ["1"]
