@@ -11,12 +11,24 @@ import mujoco
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.core.compiled import compiled
+from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.memory import field
 from hydrotele.envs.episode import uniform_between
 from hydrotele.envs.observation import Field
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Task
+from hydrotele.envs.world import (
+    BEGIN,
+    OBSERVE,
+    REWARD,
+    TASK_CODE,
+    TICK,
+    episodes,
+    observed,
+    parameters_at,
+    rewarded,
+    world,
+)
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
@@ -242,3 +254,19 @@ HOLD_FORCE = Task(
     pose_rates=(0.3, 0.1, 0.3, 0.3, 0.25),  # as `press_stiffness`
 )
 """A force on a plate."""
+
+
+@callback(TASK_CODE)
+def code(part, m, d, number, argument, out):
+    """The task in native code, see `world`."""
+    f = parameters_at(argument)[0]
+    e, w = episodes(f)[number], world(f, m, d, number, argument)
+    if part == BEGIN:
+        begin_force(f, e, w)
+    elif part == TICK:
+        tick_force(f, e, w)
+    elif part == OBSERVE:
+        observe_force(f, e, observed(f, out), 0)
+    elif part == REWARD:
+        return rewarded(e, reward_force(f, e, w))
+    return 0.0

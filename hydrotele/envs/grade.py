@@ -15,12 +15,24 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from hydrotele.core.compiled import compiled
+from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ARM, PARAMETERS, uniform, uniform_between
 from hydrotele.envs.observation import Field, reach
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Task
+from hydrotele.envs.world import (
+    BEGIN,
+    OBSERVE,
+    REWARD,
+    TASK_CODE,
+    TICK,
+    episodes,
+    observed,
+    parameters_at,
+    rewarded,
+    world,
+)
 from hydrotele.kinematics.task import task_forward, task_jacobian
 from hydrotele.machine.machine import Machine
 from hydrotele.soil.facts import (
@@ -470,3 +482,19 @@ GRADE = Task(
     swing_locked=True,
 )  # fmt: skip
 """Ground graded to a plane."""
+
+
+@callback(TASK_CODE)
+def code(part, m, d, number, argument, out):
+    """The task in native code, see `world`."""
+    f = parameters_at(argument)[0]
+    e, w = episodes(f)[number], world(f, m, d, number, argument)
+    if part == BEGIN:
+        begin_grade(f, e, w)
+    elif part == TICK:
+        tick_bed(f, e, w)
+    elif part == OBSERVE:
+        observe_grade(f, e, w, observed(f, out), 0)
+    elif part == REWARD:
+        return rewarded(e, reward_grade(f, e, w))
+    return 0.0

@@ -8,11 +8,22 @@ import math
 
 import numpy as np
 
-from hydrotele.core.compiled import compiled
+from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import ARM, uniform, uniform_between
 from hydrotele.envs.observation import Field, pose_fields, reach
 from hydrotele.envs.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.envs.task import Task
+from hydrotele.envs.world import (
+    BEGIN,
+    OBSERVE,
+    REWARD,
+    TASK_CODE,
+    episodes,
+    observed,
+    parameters_at,
+    rewarded,
+    world,
+)
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
@@ -254,3 +265,17 @@ STRAIGHT_LINE = Task(
     pose_rates=(0.9, 0.3, 0.9, 0.4, 0.25),  # half as much again as the fastest line
 )
 """A straight line of the tip."""
+
+
+@callback(TASK_CODE)
+def code(part, m, d, number, argument, out):
+    """The task in native code, see `world`."""
+    f = parameters_at(argument)[0]
+    e, w = episodes(f)[number], world(f, m, d, number, argument)
+    if part == BEGIN:
+        begin_line(f, e)
+    elif part == OBSERVE:
+        observe_line(f, e, observed(f, out), 0)
+    elif part == REWARD:
+        return rewarded(e, reward_line(f, e, w))
+    return 0.0

@@ -15,11 +15,23 @@ import math
 import mujoco
 import numpy as np
 
-from hydrotele.core.compiled import compiled
+from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import ARM, uniform, uniform_between
 from hydrotele.envs.observation import Field, reach
 from hydrotele.envs.starts import draw_start
 from hydrotele.envs.task import Task
+from hydrotele.envs.world import (
+    BEGIN,
+    OBSERVE,
+    REWARD,
+    TASK_CODE,
+    TICK,
+    episodes,
+    observed,
+    parameters_at,
+    rewarded,
+    world,
+)
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
@@ -422,3 +434,19 @@ PLACE_LOG = Task(
     servo=Servo(position_gain=2.5, axis_gains={"boom": 2.0}),
 )  # fmt: skip
 """A log picked up and laid down with the CAT 215's claw."""
+
+
+@callback(TASK_CODE)
+def code(part, m, d, number, argument, out):
+    """The task in native code, see `world`."""
+    f = parameters_at(argument)[0]
+    e, w = episodes(f)[number], world(f, m, d, number, argument)
+    if part == BEGIN:
+        begin_place(f, e, w)
+    elif part == TICK:
+        tick_grapple(f, e, w)
+    elif part == OBSERVE:
+        observe_place(f, e, w, observed(f, out), 0)
+    elif part == REWARD:
+        return rewarded(e, reward_place(f, e, w))
+    return 0.0

@@ -9,11 +9,22 @@ import math
 
 import numpy as np
 
-from hydrotele.core.compiled import compiled
+from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import ARM, uniform_between
 from hydrotele.envs.observation import Field, pose_fields, reach
 from hydrotele.envs.starts import draw_start, path_effort, pose_read, turned
 from hydrotele.envs.task import Task
+from hydrotele.envs.world import (
+    BEGIN,
+    OBSERVE,
+    REWARD,
+    TASK_CODE,
+    episodes,
+    observed,
+    parameters_at,
+    rewarded,
+    world,
+)
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
@@ -181,3 +192,17 @@ REACH_FELLER = Task(
     pose_rates=(0.5, 0.2, 0.5, 0.2, 0.2),
 )
 """A pose of a feller-buncher's head."""
+
+
+@callback(TASK_CODE)
+def code(part, m, d, number, argument, out):
+    """The task in native code, see `world`."""
+    f = parameters_at(argument)[0]
+    e, w = episodes(f)[number], world(f, m, d, number, argument)
+    if part == BEGIN:
+        begin_reach(f, e)
+    elif part == OBSERVE:
+        observe_reach(f, e, observed(f, out), 0)
+    elif part == REWARD:
+        return rewarded(e, reward_reach(f, e, w))
+    return 0.0

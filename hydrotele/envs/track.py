@@ -8,9 +8,20 @@ import math
 
 import numpy as np
 
-from hydrotele.core.compiled import compiled
+from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import ARM, AXES, uniform, uniform_between
 from hydrotele.envs.observation import Field, position_field, rate_field
+from hydrotele.envs.world import (
+    BEGIN,
+    OBSERVE,
+    REWARD,
+    TASK_CODE,
+    episodes,
+    observed,
+    parameters_at,
+    rewarded,
+    world,
+)
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 
@@ -153,3 +164,17 @@ def reward_track(f, e, w):
     error = math.sqrt(square)
     w.measures[0] = error
     return max(-1.0, 1.0 - error / SCALE), False
+
+
+@callback(TASK_CODE)
+def code(part, m, d, number, argument, out):
+    """The task in native code, see `world`."""
+    f = parameters_at(argument)[0]
+    e, w = episodes(f)[number], world(f, m, d, number, argument)
+    if part == BEGIN:
+        begin_track(f, e)
+    elif part == OBSERVE:
+        observe_track(f, e, observed(f, out), 0)
+    elif part == REWARD:
+        return rewarded(e, reward_track(f, e, w))
+    return 0.0

@@ -154,3 +154,33 @@ def call_task(f, w, part, out):
     Source: this module.
     """
     return _call(f.task, part, w.model, w.data, w.number, w.argument, out)
+
+
+@compiled
+def observed(f, out):
+    """Room for what a task observes, at least.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        out: address, scalar.
+
+    Returns:
+        (observations,) float32.
+    """
+    return carray(pointer(out), (f.observations,), np.float32)
+
+
+@compiled
+def rewarded(e, outcome):
+    """Keep whether an episode ends.
+
+    Args:
+        e: record of EPISODE_STATE; `over` is written.
+        outcome: (reward, whether it ends), scalars.
+
+    Returns:
+        The reward, scalar.
+    """
+    reward, done = outcome
+    e.over = 1 if done else 0
+    return reward
