@@ -237,7 +237,7 @@ def pruned(
 ) -> tuple[Judged, Fit | None, tuple[Judged | None, ...]]:
     """Take out effects that the others have made needless; each effect's rest, judged."""
     while True:
-        rests, scores = _rests(evidence, base, now, fit)
+        rests, scores = rests_of(evidence, base, now, fit)
         if len(scores) < 2 or min(scores) >= ENTER:
             return now, fit, tuple(rests)
         worst = rests[int(np.argmin(scores))]
@@ -245,10 +245,20 @@ def pruned(
         now, fit = fit_until_settled(evidence, worst)
 
 
-def _rests(
+def rests_of(
     evidence: Evidence, base: Judged, now: Judged, fit: Fit | None
 ) -> tuple[list[Judged | None], list[float]]:
-    """For each part the guess without it, fitted and judged (None for calibration); scores."""
+    """What a guess is without each of its parts.
+
+    Args:
+        evidence: with the guess as base.
+        base: without any part.
+        now: all parts.
+        fit: of these.
+
+    Returns:
+        For each part the guess without it, fitted and judged (None for calibration); its score.
+    """
     rests: list[Judged | None] = []
     scores: list[float] = []
     slopes = evidence.base_slopes(evidence.slope_step) if now.guess.parts else np.zeros((0, 0))

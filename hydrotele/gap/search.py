@@ -51,6 +51,7 @@ from hydrotele.gap.rivals import (
     moved_last,
     plain_form,
     pruned,
+    rests_of,
     without_needless,
     worth_naming,
 )
@@ -553,8 +554,8 @@ def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -
     charges: list[float] = []
     rivals: list[Sequence[Rival]] = []
     without: tuple[Judged | None, ...] = ()
-    needless: Guess | None = Guess()
-    while needless is not None:
+    open_ended, replaced = True, False
+    while open_ended:
         tell("drop what is needless", 0.87)
         now, fit, without = pruned(evidence, base, now, fit)
         tell("compare rivals", 0.9)
@@ -569,19 +570,27 @@ def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -
         needless = without_needless(now, charges, rivals)
         if needless is not None:
             now, fit = fit_until_settled(evidence, evidence.judged(needless))
-    rivals = [[r for r in others if not idle(r)] for others in rivals]
-    for index, rest in enumerate(without):
-        if rest and (rival := better(now, index, charges[index], rest, rivals[index])):
-            assert rival.fit
-            old = Rival(now.guess.parts[index][0], now, charges[index], fit)
-            others = (r for r in rivals[index] if r is not rival)
-            now, fit, charges[index] = rival.judged, rival.fit, rival.occam_penalty
-            rivals[index] = [old, *others]
-            # a rival comes last in its guess
-            order = [*(i for i in range(len(without)) if i != index), index]
-            without = tuple(without[i] for i in order)
-            charges, rivals = [charges[i] for i in order], [rivals[i] for i in order]
-            break
+            continue
+        rivals = [[r for r in others if not idle(r)] for others in rivals]
+        open_ended = False
+        for index, rest in enumerate(without):
+            if replaced or not rest:
+                continue
+            if rival := better(now, index, charges[index], rest, rivals[index]):
+                assert rival.fit
+                old = Rival(now.guess.parts[index][0], now, charges[index], fit)
+                others = (r for r in rivals[index] if r is not rival)
+                now, fit, charges[index] = rival.judged, rival.fit, rival.occam_penalty
+                rivals[index] = [old, *others]
+                # a rival comes last in its guess
+                order = [*(i for i in range(len(without)) if i != index), index]
+                charges, rivals = [charges[i] for i in order], [rivals[i] for i in order]
+                replaced = True
+                evidence.set_base(now)
+                rests, scores = rests_of(evidence, base, now, fit)
+                without = tuple(rests)
+                open_ended = min(scores) < ENTER and len(scores) > 1  # beside it, not needed
+                break
     if calibration_of(now.guess):
         now, fit = polished(evidence, now)
     else:
