@@ -1,9 +1,16 @@
-"""Probabilities of explanations: better in a few places only is not surely better."""
+"""Probabilities of explanations, and what becomes of those that a better one makes needless."""
+
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from hydrotele.gap.rivals import weights
+from hydrotele.estimate.evidence import Fit, Judged
+from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.gap import search
+from hydrotele.gap.rivals import Rival, weights
+from hydrotele.machine.machine_file import load_machine
 
 _STRETCHES = 80
 
@@ -39,3 +46,35 @@ def test_a_constant_in_all_changes_nothing():
     own = weights(list(table), [0.0, 1.0, 2.0])
     moved = weights(list(table + rng.normal(size=_STRETCHES)), [0.0, 1.0, 2.0])
     np.testing.assert_allclose(moved, own, rtol=1e-9)  # rounding
+
+
+@pytest.mark.parametrize(("score", "left"), [
+    (3.0, ["inertia_error"]), (50.0, ["link_length", "inertia_error"]),
+])  # fmt: skip
+def test_what_a_rival_leaves_needless_is_taken_out(monkeypatch, score, left):
+    """An effect that the rival's place-taking robs of its worth, as in trial 0005 of seed 611."""
+    machine = load_machine("cat215", "none")
+    wanted = ("com_offset", "link_length", "inertia_error")
+    named = {h.name: h for h in hypotheses(machine, wanted) if h.location in ("stick", "boom")}
+
+    def judged(*names):
+        return Judged(Guess(tuple((named[n], np.ones(named[n].size)) for n in names)), (), 100.0)
+
+    fit = Fit(Guess(), 0.0, 0.0, 0.0, np.eye(1))
+    rival = Rival(named["inertia_error"], judged("link_length", "inertia_error"), 1.0, fit)
+    rests = judged(), judged()
+    prunings = [(judged("com_offset", "link_length"), fit, rests),
+                (judged("inertia_error"), fit, rests[:1])]  # fmt: skip
+    offers = iter([rival])
+    monkeypatch.setattr(search, "pruned", lambda *_: prunings.pop(0))
+    monkeypatch.setattr(search, "moved_last", lambda *_: np.eye(1))
+    monkeypatch.setattr(search, "occam_penalty", lambda *_: 1.0)
+    monkeypatch.setattr(search, "find_rivals", lambda *_: ())
+    monkeypatch.setattr(search, "is_case_of", lambda *_: False)
+    monkeypatch.setattr(search, "better", lambda *_: next(offers, None))
+    monkeypatch.setattr(search, "rests_of", lambda *_: (list(rests), [score, 90.0]))
+    evidence: Any = SimpleNamespace(set_base=lambda base: base)
+    grown = search._Grown(judged("com_offset", "link_length"), fit)
+    found = search._compared(evidence, judged(), grown, lambda *_: None)
+    assert [h.name for h in found.guess.hypotheses] == left
+    assert len(found.without) == len(found.charges) == len(found.rivals) == len(left)
