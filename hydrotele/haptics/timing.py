@@ -1,7 +1,9 @@
 """Keeping a period of a millisecond: absolute deadlines, priority, and what was missed.
 
 A process that has a deadline every millisecond sleeps until shortly before it and spins over the
-rest, since a sleeping process wakes some 50 us late. Python's garbage collector is off meanwhile.
+rest, since a sleeping process wakes some 50 us late. Python's garbage collector is off meanwhile,
+and idle processors stay awake where the system permits it: one that sleeps, or that a virtual
+machine has handed back to its host, wakes up to milliseconds late.
 What a loop without work misses, and the time that a virtual machine's host takes from it, tell what
 the computer can hold at all.
 """
@@ -20,6 +22,7 @@ SPIN = 120e-6  # s before a deadline in which a process stays awake
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 EDGES = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # us, of histograms
 _SLACK, _NO_HUGE_PAGES = 29, 41  # PR_SET_TIMERSLACK and PR_SET_THP_DISABLE of prctl
+_WAKE = Path("/dev/cpu_dma_latency")  # how long processors may take to wake, while it is open
 _STAT, _STEAL = Path("/proc/stat"), 8  # word of its first line: proc(5)
 
 
@@ -200,7 +203,7 @@ def ask_for_priority(level: int) -> bool:
 
 @contextlib.contextmanager
 def steady(level: int) -> Iterator[bool]:
-    """No garbage collection, exact sleeps, small pages and, where permitted, priority.
+    """No garbage collection, exact sleeps, small pages; where permitted, priority and no deep idle.
 
     The first touch of a huge page of a long array, such as a log's, makes 2 MB of it: that takes
     milliseconds.
@@ -210,6 +213,8 @@ def steady(level: int) -> Iterator[bool]:
 
     Yields:
         Whether there is priority.
+
+    Source: Linux, Documentation/power/pm_qos_interface.
     """
     _control(_SLACK, 1000)  # the system wakes this thread when it is time, not 50 us later
     _control(_NO_HUGE_PAGES, 1)
@@ -217,9 +222,13 @@ def steady(level: int) -> Iterator[bool]:
     gc.freeze()
     gc.disable()
     given = level > 0 and ask_for_priority(level)
+    awake = contextlib.ExitStack()
+    with contextlib.suppress(OSError):  # no such system, or not permitted
+        awake.enter_context(_WAKE.open("r+b", buffering=0)).write(bytes(4))
     try:
         yield given
     finally:
+        awake.close()
         if given:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         _control(_NO_HUGE_PAGES, 0)

@@ -1,11 +1,13 @@
 """Deadlines on a clock that the test moves, and what is said of times."""
 
 import gc
+import os
 
 import numpy as np
 import pytest
 
 from hydrotele.cli.haptic import computer_sentences
+from hydrotele.haptics import timing
 from hydrotele.haptics.timing import (
     EDGES,
     Deadlines,
@@ -120,6 +122,25 @@ def test_garbage_is_collected_again_afterwards():
     with steady(0) as priority:
         assert not gc.isenabled() and not priority
     assert gc.isenabled() and gc.get_freeze_count() == 0
+
+
+def test_idle_processors_are_kept_awake_meanwhile(tmp_path, monkeypatch):
+    wake = tmp_path / "wake"
+    wake.touch()
+    monkeypatch.setattr(timing, "_WAKE", wake)
+    with steady(0):
+        assert wake.read_bytes() == bytes(4)  # 0 us, as an int32
+        held = {os.path.realpath(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd")}
+        assert str(wake.resolve()) in held  # the kernel forgets the wish when it is closed
+    after = {os.path.realpath(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd")}
+    assert str(wake.resolve()) not in after
+
+
+def test_a_system_that_keeps_none_awake_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(timing, "_WAKE", tmp_path / "wake")
+    with steady(0):
+        assert not gc.isenabled()
+    assert gc.isenabled() and not (tmp_path / "wake").exists()
 
 
 def test_summary_of_times():
