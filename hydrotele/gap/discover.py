@@ -461,12 +461,12 @@ def _candidates(
         window = _busy_window(seen, [(s.known, s.inputs[:, int(k)]) for s in seen])
         values, speed = [s.values[i.axis] for s in seen], _smoothing(machine, i.axis)
         for balance in balances:
-            tables = possible_tables(balance, values, speed)
-            pairs = paired_tables(balance, values, speed, rank < _COUPLED)
+            tables = possible_tables(values, speed)
+            pairs = paired_tables(values, speed, rank < _COUPLED)
             tables += _likely_pairs(evidence, seen, levels.inputs, (i, balance), pairs)
             looked += tried([(i, balance, table) for table in tables])
             if window:
-                tables = possible_tables(balance, values, speed, window)
+                tables = possible_tables(values, speed, window)
                 inside = tried([(i, balance, table) for table in tables])
                 best = max(inside, key=lambda pair: pair[1].predicted, default=None)
                 if best and best[1].predicted > ENTER:
@@ -521,10 +521,10 @@ def _pump_laws(
 
     speed = _smoothing(machine, own.axis)
     window = _busy_window([seen[k] for k in used], [(rows[k], told[k][0]) for k in used])
-    tables = possible_tables(SUPPLY, values, speed) + paired_tables(SUPPLY, values, speed, True)
+    tables = possible_tables(values, speed) + paired_tables(values, speed, True)
     looked = tried(tables)
     if window:
-        looked += tried(possible_tables(SUPPLY, values, speed, window))
+        looked += tried(possible_tables(values, speed, window))
     return _best_first(looked)
 
 

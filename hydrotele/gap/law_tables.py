@@ -15,12 +15,10 @@ _PAIR_POINTS = 10  # over each of two
 _TIMES = 10  # over time: what acts for a while begins and ends somewhere
 _EDGE = 0.05  # s, in which a law that acts for a while begins and ends
 _SHRINK = 0.1  # precision of an entry, in units of the lack: what no data tells is nothing
-_VARIABLES: Mapping[str, tuple[str, ...]] = {
-    "force": ("velocity", "position", "command", "force", "time"),
-    "flow": ("force", "pressure_head", "pressure_rod", "spool", "pump_speed", "velocity",
-             "position", "pressure_supply", "time"),
-    "command": ("command", "spool", "velocity", "position", "force", "pressure_supply", "time"),
-}  # fmt: skip
+_OWN = (
+    "velocity", "position", "command", "force", "pressure_head", "pressure_rod", "spool",
+    "pump_speed", "pressure_supply", "time",
+)  # fmt: skip
 
 
 class Table(NamedTuple):
@@ -113,13 +111,12 @@ def _shares(x: np.ndarray, points: Sequence[float]) -> np.ndarray:
 
 
 def possible_tables(
-    balance: str, values: Sequence[Mapping[str, np.ndarray]], smoothing: float,
+    values: Sequence[Mapping[str, np.ndarray]], smoothing: float,
     window: tuple[float, ...] = (),
 ) -> list[Table]:  # fmt: skip
-    """Every table over one variable that a law of a balance can have.
+    """Every table over one variable that a law can have.
 
     Args:
-        balance: force, flow_head, flow_rod, `THROUGH` or command.
         values: per run variable -> (n,) values of the drive, and of others (`velocity.swing`).
         smoothing: of the sign of the drive's velocity [m/s] or [rad/s]; friction has points there.
         window: in which they act.
@@ -127,18 +124,17 @@ def possible_tables(
     Returns:
         The tables.
     """
-    names = [n for n in _names(balance, values) if not (window and n == "time")]
+    names = [n for n in _names(values) if not (window and n == "time")]
     points = {n: _points(n, values, _POINTS, smoothing) for n in names}
     return [Table((n,), (p,), window) for n, p in points.items() if p]
 
 
 def paired_tables(
-    balance: str, values: Sequence[Mapping[str, np.ndarray]], smoothing: float, others: bool
+    values: Sequence[Mapping[str, np.ndarray]], smoothing: float, others: bool
 ) -> list[Table]:
-    """Every table over two variables that a law of a balance can have.
+    """Every table over two variables that a law can have.
 
     Args:
-        balance: as of `possible_tables`.
         values: as of `possible_tables`.
         smoothing: as of `possible_tables`.
         others: whether variables of other drives are among them.
@@ -146,7 +142,7 @@ def paired_tables(
     Returns:
         The tables; none has two variables that only their drives tell apart.
     """
-    names = [n for n in _names(balance, values) if others or "." not in n]
+    names = [n for n in _names(values) if others or "." not in n]
     points = {n: _points(n, values, _PAIR_POINTS, smoothing) for n in names}
     pairs = itertools.combinations([n for n in names if points[n]], 2)
     return [
@@ -156,10 +152,9 @@ def paired_tables(
     ]  # fmt: skip
 
 
-def _names(balance: str, values: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
-    own = _VARIABLES[balance.partition("_")[0]]
+def _names(values: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
     others = [n for n in values[0] if "." in n and n.partition(".")[0] in OF_A_DRIVE]
-    return [n for n in (*own, *others) if n in values[0]]
+    return [n for n in (*_OWN, *others) if n in values[0]]
 
 
 def _points(

@@ -130,16 +130,15 @@ def made_up():
     return {name: rng.normal(size=400) for name in NAMES} | {"time": np.linspace(0.0, 9.0, 400)}
 
 
-@pytest.mark.parametrize("balance", ["force", "flow_head", "flow_rod", "flow_through", "command"])
-def test_every_table_is_a_term_that_adds_what_its_columns_say(balance, made_up):
+def test_every_table_is_a_term_that_adds_what_its_columns_say(made_up):
     rng = np.random.default_rng(1)
-    tables = possible_tables(balance, [made_up], 0.01)
-    tables += possible_tables(balance, [made_up], 0.01, (2.0, 5.0))
-    tables += paired_tables(balance, [made_up], 0.01, others=True)
+    tables = possible_tables([made_up], 0.01)
+    tables += possible_tables([made_up], 0.01, (2.0, 5.0))
+    tables += paired_tables([made_up], 0.01, others=True)
     assert len({table.kind for table in tables}) == len(tables) > 20
     assert len({table.name for table in tables}) == len(tables)  # two laws of one place
     order = ["swing", "boom", "stick"]
-    for table in rng.permutation(np.array(tables, object))[:12]:
+    for table in rng.permutation(np.array(tables, object))[:60]:
         table = Table(*table)
         entries = rng.normal(size=table.size)
         term = Term(name="law", axis="boom", balance="force", **table.law(entries))
@@ -157,12 +156,12 @@ def test_every_table_is_a_term_that_adds_what_its_columns_say(balance, made_up):
 
 
 def test_pairs_are_never_of_variables_that_only_their_drives_tell_apart(made_up):
-    pairs = [t.variables for t in paired_tables("command", [made_up], 0.01, others=True)]
+    pairs = [t.variables for t in paired_tables([made_up], 0.01, others=True)]
     assert ("velocity", "spool.swing") in pairs or ("spool.swing", "velocity") in pairs
     assert ("velocity.swing", "spool.swing") in pairs
     assert not any({"velocity", "velocity.swing"} == set(pair) for pair in pairs)
     assert not any({"velocity.swing", "command.stick"} == set(pair) for pair in pairs)
-    alone = paired_tables("command", [made_up], 0.01, others=False)
+    alone = paired_tables([made_up], 0.01, others=False)
     assert not any("." in variable for table in alone for variable in table.variables)
 
 
@@ -175,7 +174,7 @@ def test_a_smooth_surface_is_found_among_other_tables():
         table.variables: at_a_glance(
             table, [(told[k::2], table.columns(values)[k::2]) for k in range(2)]
         )
-        for table in paired_tables("flow_head", [values], 0.01, others=True)
+        for table in paired_tables([values], 0.01, others=True)
     }
     assert max(shares, key=shares.__getitem__) in (
         ("velocity", "pressure_rod"), ("pressure_rod", "velocity")
