@@ -15,7 +15,6 @@ the likelihood, and a law that is faster than the unknown inputs is seen as it i
 blurs it. Entries that follow each other are taken to be alike (P-splines, Eilers and Marx 1996).
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
@@ -37,6 +36,7 @@ from hydrotele.estimate.track import Track, following_model
 from hydrotele.gap.balances import pump_lack
 from hydrotele.gap.law_tables import THROUGH, Table, paired_tables, possible_tables
 from hydrotele.gap.rivals import ENTER
+from hydrotele.gap.screening import busy_window
 from hydrotele.gap.search import lacking
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData
@@ -190,8 +190,6 @@ _STEPS = 3  # of Gauss-Newton for the numbers beside a law
 _DETAIL = 0.05  # of what all laws brought: one that brings less is the last
 _AHEAD = 1.0  # s, of free runs that a law must make better; longer ones drift without readings
 _STEP = 2.0e-3  # s, for the fits
-_BLOCK = 0.25  # s, of the search for a window: less than the memory of an unknown input
-_CONTRAST = 4.0  # times the mean square beyond a window that there is within
 _MOVES = (-0.25, -0.1, 0.0, 0.1, 0.25)  # s, by which a window's ends are moved
 
 
@@ -458,7 +456,7 @@ def _candidates(
         balances = [i.balance]
         if i.balance == "flow_head" and Input("flow_rod", i.axis) in levels.inputs:
             balances.append(THROUGH)
-        window = _busy_window(seen, [(s.known, s.inputs[:, int(k)]) for s in seen])
+        window = busy_window([(_clock(s), s.known, s.inputs[:, int(k)]) for s in seen])
         values, speed = [s.values[i.axis] for s in seen], _smoothing(machine, i.axis)
         for balance in balances:
             tables = possible_tables(values, speed)
@@ -520,7 +518,7 @@ def _pump_laws(
         return [((own, SUPPLY, t), fit) for t, (fit, share) in found if share > _MOSTLY]
 
     speed = _smoothing(machine, own.axis)
-    window = _busy_window([seen[k] for k in used], [(rows[k], told[k][0]) for k in used])
+    window = busy_window([(_clock(seen[k]), rows[k], told[k][0]) for k in used])
     tables = possible_tables(values, speed) + paired_tables(values, speed, True)
     looked = tried(tables)
     if window:
@@ -568,36 +566,8 @@ def _moved_windows(window: tuple[float, ...]) -> list[tuple[float, float]]:
     return [(begin + a, end + b) for a in _MOVES for b in _MOVES if a or b]
 
 
-def _busy_window(
-    seen: Sequence[_Seen], lacks: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> tuple[float, float] | tuple[()]:
-    """Times between which a lack is large, and small beyond, in all runs; or none.
-
-    Of every run the rows (n,) in which it is known, and the lack (n,).
-
-    The change points of the largest likelihood, with one variance within and one beyond, told from
-    the smoother's answer in blocks of `_BLOCK` seconds.
-    """
-    clocks = [next(iter(s.values.values()))["time"] for s in seen]
-    edges = np.arange(0.0, max(float(c[-1]) for c in clocks) + _BLOCK, _BLOCK)
-    squares, counts = np.zeros(len(edges)), np.zeros(len(edges))
-    for (known, lack), clock in zip(lacks, clocks, strict=True):
-        squares[1:] += np.histogram(clock[known], edges, weights=lack[known] ** 2)[0]
-        counts[1:] += np.histogram(clock[known], edges)[0]
-    squares, counts = np.cumsum(squares), np.cumsum(counts)
-    best, found, least = 0.0, (), 1.0 / _BLOCK * counts[-1] / max(1, len(edges) - 1)
-    for a, b in itertools.combinations(range(len(edges)), 2):
-        within, beyond = counts[b] - counts[a], counts[-1] - counts[b] + counts[a]
-        if min(within, beyond) < least:
-            continue
-        high = (squares[b] - squares[a]) / within
-        low = (squares[-1] - squares[b] + squares[a]) / beyond
-        if high > _CONTRAST * low:
-            fall = counts[-1] * np.log(squares[-1] / counts[-1])
-            fall -= within * np.log(high) + beyond * np.log(max(low, 1e-6 * high))
-            if fall > best:
-                best, found = fall, (float(edges[a]), float(edges[b]))
-    return found
+def _clock(seen: _Seen) -> np.ndarray:
+    return next(iter(seen.values.values()))["time"]
 
 
 def _smoothing(machine: Machine, axis: str) -> float:

@@ -13,6 +13,7 @@ no slopes: gaps of several sizes first, then the simplex of Nelder and Mead 1965
 which also moves where the drive rests in the gap as the stretch begins.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -225,20 +226,74 @@ def timed(candidates: Sequence[Hypothesis], base: Judged) -> list[Hypothesis]:
             continue
         if series is None:
             series = [smoothed_inputs(t) for t in base.tracks]
-        place = inputs.index(acts)
-        spans = [
-            _loudest(u[:, place], t.run.period) for u, t in zip(series, base.tracks, strict=True)
-        ]
-        best = int(np.argmax([span[0] for span in spans]))
-        _, size, first, rows = spans[best]
-        run, table = base.tracks[best].run, dict(candidate.parameters)
-        table["size"] = replace(table["size"], starts=(size,))
-        for key, value in (
-            ("start", run.start + first * run.period),
-            ("duration", rows * run.period),
-        ):
-            table[key] = replace(table[key], nominal=value)
+        place, table = inputs.index(acts), dict(candidate.parameters)
+        told = [(t, u[:, place]) for t, u in zip(base.tracks, series, strict=True)]
+        spans = _spans(told)
+        columns = zip(("size", "start", "duration"), zip(*spans, strict=True), strict=True)
+        for key, values in columns:
+            nominal = table[key].nominal if key == "size" else values[0]
+            table[key] = replace(table[key], nominal=nominal, starts=values)
         found.append(replace(candidate, parameters=table))
+    return found
+
+
+def _spans(told: Sequence[tuple[Track, np.ndarray]]) -> list[tuple[float, float, float]]:
+    """Sizes, starts [s] and durations [s] of a pulse, from an unknown input (n,) of every run.
+
+    The span that stands out most in one run, and the one in which all runs lack most: where other
+    unknown inputs do a part, that of a single run may be neither long enough nor of the right size.
+    """
+    loud = [_loudest(u, track.run.period) for track, u in told]
+    best = int(np.argmax([span[0] for span in loud]))
+    _, size, first, rows = loud[best]
+    run = told[best][0].run
+    spans = [(size, run.start + first * run.period, rows * run.period)]
+    clocks = [t.run.start + t.run.period * np.arange(len(u)) for t, u in told]
+    window = busy_window([(c, np.isfinite(u), u) for c, (_, u) in zip(clocks, told, strict=True)])
+    if window:
+        begin, end = window
+        within = [u[(c >= begin) & (c < end)] for c, (_, u) in zip(clocks, told, strict=True)]
+        spans.append((float(np.nanmean(np.concatenate(within))), begin, end - begin))
+    return spans
+
+
+_BLOCK = 0.25  # s, of the search for a window: less than the memory of an unknown input
+_CONTRAST = 4.0  # times the mean square beyond a window that there is within
+
+
+def busy_window(
+    lacks: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+) -> tuple[float, float] | tuple[()]:
+    """Times between which a lack is large, and small beyond, in all runs; or none.
+
+    The change points of the largest likelihood, with one variance within and one beyond, told from
+    the smoother's answer in blocks of `_BLOCK` seconds.
+
+    Args:
+        lacks: of every run the clock (n,) [s], the rows (n,) in which the lack is known, and the
+            lack (n,).
+
+    Returns:
+        Begin and end [s].
+    """
+    edges = np.arange(0.0, max(float(c[-1]) for c, _, _ in lacks) + _BLOCK, _BLOCK)
+    squares, counts = np.zeros(len(edges)), np.zeros(len(edges))
+    for clock, known, lack in lacks:
+        squares[1:] += np.histogram(clock[known], edges, weights=lack[known] ** 2)[0]
+        counts[1:] += np.histogram(clock[known], edges)[0]
+    squares, counts = np.cumsum(squares), np.cumsum(counts)
+    best, found, least = 0.0, (), 1.0 / _BLOCK * counts[-1] / max(1, len(edges) - 1)
+    for a, b in itertools.combinations(range(len(edges)), 2):
+        within, beyond = counts[b] - counts[a], counts[-1] - counts[b] + counts[a]
+        if min(within, beyond) < least:
+            continue
+        high = (squares[b] - squares[a]) / within
+        low = (squares[-1] - squares[b] + squares[a]) / beyond
+        if high > _CONTRAST * low:
+            fall = counts[-1] * np.log(squares[-1] / counts[-1])
+            fall -= within * np.log(high) + beyond * np.log(max(low, 1e-6 * high))
+            if fall > best:
+                best, found = fall, (float(edges[a]), float(edges[b]))
     return found
 
 

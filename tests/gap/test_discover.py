@@ -15,7 +15,7 @@ from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import columns_of
 from hydrotele.estimate.responses import error_responses
 from hydrotele.estimate.track import track_run
-from hydrotele.gap.discover import Regression, _better, _busy_window, _law, _Seen, at_a_glance
+from hydrotele.gap.discover import Regression, _better, _law, _Seen, at_a_glance
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.law_tables import Table, paired_tables, possible_tables
 from hydrotele.logs.dataset import load_dataset
@@ -181,18 +181,6 @@ def test_a_smooth_surface_is_found_among_other_tables():
     )  # fmt: skip
     strange = [s for pair, s in shares.items() if not {"velocity", "pressure_rod"} & set(pair)]
     assert len(strange) > 10 and max(strange) < 0.2 * max(shares.values())
-
-
-def test_a_window_is_seen_where_a_lack_is_there_for_a_while(made_up):
-    clock = np.linspace(0.0, 20.0, 1000)
-    rng = np.random.default_rng(3)
-    inside = (clock > 6.1) & (clock < 11.4)
-    known, values = np.ones(1000, bool), {"boom": {"time": clock}}
-    seen = [_Seen(values, known, np.zeros((1000, 0)))] * 3
-    busy = [(known, rng.normal(size=1000) * np.where(inside, 5.0, 0.5)) for _ in range(3)]
-    begin, end = _busy_window(seen, busy)
-    assert (begin, end) == (pytest.approx(6.1, abs=0.26), pytest.approx(11.4, abs=0.26))
-    assert _busy_window(seen, [(known, rng.normal(size=1000)) for _ in range(3)]) == ()
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from hydrotele.effects import Parameter
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
-from hydrotele.gap.screening import screen
+from hydrotele.gap.screening import _spans, busy_window, screen
 
 ROWS, CHANNELS = 400, 3
 
@@ -100,3 +100,29 @@ def test_a_candidate_at_its_bound_is_tried_to_the_other_side_only(parts):
     (only,) = screen(evidence, Guess(), [candidate("true", low=0.0)])
     assert only.start == pytest.approx([0.4], abs=0.1)
     assert min(seen) >= 0.0
+
+
+CLOCK = np.linspace(0.0, 20.0, 1000, endpoint=False)
+INSIDE = (CLOCK > 6.1) & (CLOCK < 11.4)
+
+
+def test_a_window_is_seen_where_a_lack_is_there_for_a_while():
+    rng, known = np.random.default_rng(3), np.ones(1000, bool)
+    quiet = [(CLOCK, known, rng.normal(size=1000)) for _ in range(3)]
+    busy = [(c, k, u * np.where(INSIDE, 5.0, 0.5)) for c, k, u in quiet]
+    begin, end = busy_window(busy)
+    assert (begin, end) == (pytest.approx(6.1, abs=0.26), pytest.approx(11.4, abs=0.26))
+    assert busy_window(quiet) == ()
+
+
+def test_a_pulse_is_looked_for_where_all_runs_lack_something():
+    """In one run it is told as short and strong, in another with the wrong sign."""
+    rng = np.random.default_rng(4)
+    short = (CLOCK > 7.0) & (CLOCK < 8.0)
+    told = [np.where(short, -60.0, np.where(INSIDE, -4.0, 0.0)), np.where(INSIDE, -25.0, 0.0),
+            np.where(INSIDE, 20.0, 0.0)]  # fmt: skip
+    track = SimpleNamespace(run=SimpleNamespace(period=0.02, start=0.0))
+    pairs = [(track, u + rng.normal(size=1000)) for u in told]
+    loud, common = _spans(pairs)
+    assert loud[1] == pytest.approx(7.0, abs=0.3) and loud[2] == pytest.approx(1.0, abs=0.3)
+    assert common[1] == pytest.approx(6.1, abs=0.3) and common[2] == pytest.approx(5.3, abs=0.5)
