@@ -321,7 +321,8 @@ def without_details(
     """Effects, and those that are details: nothing that these data say of the machine itself.
 
     What closes next to nothing may only mend the form of an effect of the same axis that closes
-    most, as a trace of presliding does for teeth, or make up for what is lacking still.
+    most, as a trace of presliding does for teeth, or make up for what is lacking still. Nor does
+    it make what closes most ambiguous if it is rather not there.
 
     Args:
         named: the effects, with shares of the gap.
@@ -334,9 +335,9 @@ def without_details(
     """
 
     def detail(effect: NamedEffect) -> bool:
-        axis = effect.location.partition(".")[0]
+        axis, likely = effect.location.partition(".")[0], effect.mechanism_probability >= LIKELY
         mends = effect.share <= _TRACE_OF_FORM and any(
-            other.share > 0.5 and other.location.partition(".")[0] == axis
+            other.share > 0.5 and (other.location.partition(".")[0] == axis or not likely)
             for other in named if other is not effect
         )  # fmt: skip
         told = any(not e.low <= e.nominal <= e.high for e in effect.parameters.values())

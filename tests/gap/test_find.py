@@ -140,9 +140,11 @@ def test_truth_columns_change_nothing(tmp_path):
 def test_what_may_only_make_up_for_something_else_is_a_detail():
     """Not where it is of another axis and nothing is lacking, or closes more of the gap."""
 
-    def effect(name: str, location: str, share: float, low: float = 0.5) -> NamedEffect:
+    def effect(
+        name: str, location: str, share: float, low: float = 0.5, probability: float = 0.99
+    ) -> NamedEffect:
         numbers = {"size": Estimate(1.0, "N", low, 1.5, 0.0)}
-        return NamedEffect(name, location, 0.99, numbers, (), share)
+        return NamedEffect(name, location, probability, numbers, (), share)
 
     teeth, trace = effect("backlash", "swing", 0.9), effect("presliding", "swing", 0.001)
     elsewhere = effect("coulomb_friction", "stick", 0.001)
@@ -152,3 +154,6 @@ def test_what_may_only_make_up_for_something_else_is_a_detail():
     effects = (teeth, trace, elsewhere, larger, offset, untold)
     assert without_details(effects, False) == ((teeth, elsewhere, larger, offset), (trace, untold))
     assert without_details(effects, True) == ((teeth, larger), (trace, elsewhere, offset, untold))
+    unlikely = effect("valve_gain", "stick", 0.002, probability=0.1)
+    assert without_details((teeth, unlikely), False) == ((teeth,), (unlikely,))
+    assert without_details((unlikely,), False) == ((unlikely,), ())  # nothing else explains it
