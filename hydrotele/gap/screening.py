@@ -13,7 +13,6 @@ no slopes: gaps of several sizes first, then the simplex of Nelder and Mead 1965
 which also moves where the drive rests in the gap as the stretch begins.
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -282,18 +281,21 @@ def busy_window(
         squares[1:] += np.histogram(clock[known], edges, weights=lack[known] ** 2)[0]
         counts[1:] += np.histogram(clock[known], edges)[0]
     squares, counts = np.cumsum(squares), np.cumsum(counts)
+    if not squares[-1] > 0.0:
+        return ()
     best, found, least = 0.0, (), 1.0 / _BLOCK * counts[-1] / max(1, len(edges) - 1)
-    for a, b in itertools.combinations(range(len(edges)), 2):
-        within, beyond = counts[b] - counts[a], counts[-1] - counts[b] + counts[a]
-        if min(within, beyond) < least:
-            continue
-        high = (squares[b] - squares[a]) / within
-        low = (squares[-1] - squares[b] + squares[a]) / beyond
-        if high > _CONTRAST * low:
-            fall = counts[-1] * np.log(squares[-1] / counts[-1])
-            fall -= within * np.log(high) + beyond * np.log(max(low, 1e-6 * high))
-            if fall > best:
-                best, found = fall, (float(edges[a]), float(edges[b]))
+    for a in range(len(edges) - 1):
+        within = counts[a + 1 :] - counts[a]
+        beyond = counts[-1] - within
+        inside = squares[a + 1 :] - squares[a]
+        with np.errstate(divide="ignore", invalid="ignore"):  # spans without rows are left out
+            high, low = inside / within, (squares[-1] - inside) / beyond
+            fall = -within * np.log(high) - beyond * np.log(np.maximum(low, 1e-6 * high))
+        fits = (np.minimum(within, beyond) >= least) & (high > _CONTRAST * low)
+        fall = np.where(fits, counts[-1] * np.log(squares[-1] / counts[-1]) + fall, 0.0)
+        k = int(np.argmax(fall))
+        if fall[k] > best:
+            best, found = float(fall[k]), (float(edges[a]), float(edges[a + 1 + k]))
     return found
 
 

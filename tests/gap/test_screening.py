@@ -113,6 +113,9 @@ def test_a_window_is_seen_where_a_lack_is_there_for_a_while():
     begin, end = busy_window(busy)
     assert (begin, end) == (pytest.approx(6.1, abs=0.26), pytest.approx(11.4, abs=0.26))
     assert busy_window(quiet) == ()
+    assert busy_window([(CLOCK, known, np.zeros(1000))]) == ()
+    late = [(c + 40.0, k, u) for c, k, u in busy]  # stretches of a long record
+    assert busy_window(late) == pytest.approx((begin + 40.0, end + 40.0))
 
 
 def test_a_pulse_is_looked_for_where_all_runs_lack_something():
