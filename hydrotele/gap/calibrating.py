@@ -249,6 +249,7 @@ def calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
             slopes = evidence.base_slopes(coarse)
         else:
             slopes = evidence.slopes(guess, evidence.errors(guess, coarse), step=coarse)
+            evidence.keep_information(guess, slopes)
         fit = evidence.fit(guess, 0.0, step=step, kept=slopes, steps=3)
         before, judged = judged.loss, evidence.judged(fit.guess)
         guess, cost = fit.guess, occam_penalty(fit.information, group.size)

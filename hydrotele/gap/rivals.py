@@ -25,7 +25,7 @@ _PLAINER = 0.2  # of an effect's probability from which a rival with fewer numbe
 _SECOND = 2  # rivals that are settled like the effect itself
 _RIVALS = 3  # candidates that are judged in the place of a named effect
 _HOPELESS = 500.0  # loss above the effect's beyond which a rival is let go; or this share of what
-_FAR = 0.5  # the effect brings
+_FAR = 0.3  # the effect brings
 _HOPEFUL = 0.2  # of what the effect takes at the levels of the guess without it: a rival takes more
 _BEHIND = 100.0  # loss above the effect's, of a rival that is not worth another round
 _SAME = 0.1  # squares of whitened errors by which two guesses differ that say the same
@@ -114,6 +114,37 @@ def is_case_of(evidence: Evidence, guess: Guess, index: int, other: Hypothesis) 
     return float(change @ change) < _SAME
 
 
+_HALF = 0.5  # of what more numbers cost, that they must take of the loss at the effect's levels
+
+
+def brings_no_more(evidence: Evidence, now: Judged, index: int, other: Hypothesis) -> bool:
+    """Whether an effect is a case of another whose further numbers bring nothing.
+
+    Where the effect was settled the other begins with all its numbers equal, and needs no search of
+    its own from the guess without the effect.
+
+    Args:
+        evidence: with the guess as its base.
+        now: all effects.
+        index: of the effect.
+        other: the other one.
+    """
+    if not is_case_of(evidence, now.guess, index, other):
+        return False
+    hypothesis, deviation = now.guess.parts[index]
+    (value,) = hypothesis.values(deviation).values()
+    start = np.array([(value - p.nominal) / p.scale for p in other.parameters.values()])
+    first = sum(h.size for h in now.guess.hypotheses[:index])
+    kept = np.delete(evidence.base_slopes(evidence.slope_step), first, axis=1)
+    instead = now.guess.without(index).plus(other, start)
+    step = evidence.step_of(instead, MIDDLE)
+    fit = evidence.fit(instead, loss_of(evidence, now.guess, step), kept=kept, steps=2, step=step)
+    own = evidence.base_slopes(evidence.slope_step)[:, first]
+    left = own - kept @ np.linalg.solve(kept.T @ kept + np.eye(kept.shape[1]), kept.T @ own)
+    more = fit.occam_penalty - float(np.log1p(own @ left))
+    return fit.gain < _HALF * more
+
+
 def plain_form(hypothesis: Hypothesis, candidates: Sequence[Hypothesis]) -> Hypothesis | None:
     """The same mechanism at the same place with one number instead of several of its unit."""
     known = EFFECTS.get(hypothesis.name)
@@ -159,6 +190,7 @@ def find_rivals(
     free = {c.key for c in free_of_calibration([s.hypothesis for s in ranking], now.guess)}
     pool = [s for s in ranking if s.hypothesis.key not in taken and s.score > 0.0
             and s.hypothesis.key in free][: 2 * _RIVALS]  # fmt: skip
+    pool = [s for s in pool if not brings_no_more(evidence, now, index, s.hypothesis)]
     if not pool:
         return ()
     evidence.set_base(rest)

@@ -333,8 +333,8 @@ def _grow(
                 options = _best_pairs(evidence, now, ranked)
         early = []  # once: what is refused does not come back
         moved = promoted(evidence, now, fit, candidates) if fit else None
-        if moved:
-            let_go = _let_go(evidence, now, moved)
+        let_go, ready = _let_go(evidence, now, moved) if moved else (None, None)
+        if let_go:
             options = sorted([*options, let_go], key=_score)
             if let_go[1] > _PLAIN * options[0][1] and ended(now.guess):
                 options = [let_go, *(one for one in options if one is not let_go)]
@@ -353,7 +353,10 @@ def _grow(
         if best:
             added = best.guess.parts[-1][0]
             tell(f"fit {added.name.replace('_', ' ')}", done + 0.02)
-            grown, settled = fit_until_settled(evidence, best)
+            if ready and let_go and best is let_go[0]:
+                grown, settled = evidence.set_base(best), ready
+            else:
+                grown, settled = fit_until_settled(evidence, best)
             grown, settled = _shaped_settled(evidence, grown, settled)
             worth = now.loss - grown.loss - settled.occam_penalty
             last = len(grown.guess.parts) - 1
@@ -602,15 +605,17 @@ def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -
     return Found(base, now, fit, first, tuple(charges), without, compared, grown.weak)
 
 
-def _let_go(evidence: Evidence, now: Judged, moved: tuple[Guess, float]) -> tuple[Judged, float]:
-    """A guess of `promoted`, judged, and its score: fitted, where a number had come to its end."""
+def _let_go(
+    evidence: Evidence, now: Judged, moved: tuple[Guess, float]
+) -> tuple[tuple[Judged, float], Fit | None]:
+    """A guess of `promoted`, judged, and its score; its fit where a number had come to its end."""
     guess, gain = moved
-    judged = evidence.judged(guess)
+    judged, fit = evidence.judged(guess), None
     if ended(now.guess):
-        judged, _ = fit_until_settled(evidence, judged)
+        judged, fit = fit_until_settled(evidence, judged)
         evidence.set_base(now)
         gain += max(0.0, now.loss - judged.loss)
-    return judged, gain
+    return (judged, gain), fit
 
 
 def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from hydrotele.effects import apply_effect
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses, with_shape
-from hydrotele.gap.rivals import is_case_of, worth_naming
+from hydrotele.gap.rivals import brings_no_more, is_case_of, worth_naming
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
 
@@ -33,6 +34,25 @@ def test_a_number_is_a_case_of_its_numbers_by_direction(evidence, name, other, c
     table = {h.key: h for h in hypotheses(evidence.data.machine)}
     guess = Guess(((table[name, "stick"], np.ones(1)),))
     assert is_case_of(evidence, guess, 0, table[other, "stick"]) is case
+
+
+@pytest.mark.parametrize(("bands", "more"), [((0.07, 0.07), False), ((0.05, 0.09), True)])
+def test_numbers_by_direction_are_asked_where_the_directions_differ(bands, more):
+    """An effect that was fitted, beside the same with two numbers, from there on."""
+    model = load_machine("cat215")
+    values = dict(zip(("positive", "negative"), bands, strict=True))
+    data, _ = machine_data(model, apply_effect(model, "valve_deadband_direction", "stick", values))
+    table = {h.key: h for h in hypotheses(model)}
+    evidence = Evidence(data, data.fit, 1)
+    try:
+        guess = Guess(((table["valve_deadband", "stick"], np.ones(1)),))
+        evidence.set_base(Guess())
+        now = evidence.set_base(evidence.fit(guess, 0.0).guess)
+        other = table["valve_deadband_direction", "stick"]
+        assert brings_no_more(evidence, now, 0, other) is not more
+        assert not brings_no_more(evidence, now, 0, table["flow_curve", "stick"])
+    finally:
+        evidence.close()
 
 
 @pytest.mark.parametrize(("gap", "worth"), [(1.8e-4, False), (1.2e-3, True)])
