@@ -13,6 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from hydrotele.estimate.hypothesis import Guess
 from hydrotele.estimate.inputs import MEMORY
@@ -38,6 +40,7 @@ _ROUNDS = 2  # of linearisation for the levels of the first base; later ones sta
 _NEW = 6  # numbers more than the base before had, for whose directions its own ones do
 _UNKNOWN = 2500.0  # information of a new one, until it is known: it shows by its fiftieth
 _MOVE = 1.0  # of the errors, by which they are moved for the slopes of many numbers
+_TRACE = 1.0e-9  # of a typical deviation
 _CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
 
 
@@ -328,8 +331,7 @@ class Evidence:
         loss = _loss(errors, guess)
         slopes = slopes_at(guess, errors)
         for _ in range(steps):
-            d = guess.deviation
-            move = -np.linalg.solve(slopes.T @ slopes + np.eye(len(d)), slopes.T @ errors + d)
+            d, move = guess.deviation, _move(guess, slopes, errors)
             better = None
             for shrink in (1.0, 0.5, 0.2, 0.05):
                 moved = guess.at(d + shrink * move)
@@ -347,6 +349,24 @@ class Evidence:
         information = slopes.T @ slopes + np.eye(slopes.shape[1])
         last = guess.parts[-1][0].size if guess.parts else 0
         return Fit(guess, loss, before - loss, occam_penalty(information, last), information)
+
+
+def _move(guess: Guess, slopes: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """(P,) Gauss-Newton step to the best deviations within bounds, as far as slopes (E, P) tell.
+
+    Where a number would leave its bounds the others move as is best with that one at its end.
+    """
+    d = guess.deviation
+    root = np.linalg.cholesky(slopes.T @ slopes + np.eye(len(d)))
+    target = -solve_triangular(root, slopes.T @ errors + d, lower=True)
+    move = solve_triangular(root.T, target)
+    low, high = (
+        np.concatenate([getattr(h, side) for h in guess.hypotheses]) - d for side in ("low", "high")
+    )
+    if np.all((move >= low) & (move <= high)):
+        return move
+    # a trace beyond the ends, so that `at` puts what ends there at its end exactly
+    return lsq_linear(root.T, target, (low - _TRACE, high + _TRACE), method="bvls").x
 
 
 def occam_penalty(information: np.ndarray, last: int) -> float:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hydrotele.effects import apply_effect
-from hydrotele.estimate.evidence import Evidence
-from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.effects import Parameter, apply_effect
+from hydrotele.estimate.evidence import Evidence, _move
+from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
 
@@ -46,3 +46,27 @@ def test_the_gain_of_an_effect_does_not_depend_on_the_step(evidence, name, devia
     assert gains[2] == pytest.approx(gains[0], rel=0.1)
     integrator = np.sum(evidence.step_effect(Guess(), 10e-3) ** 2)
     assert integrator > 0.5 * abs(gains[0])
+
+
+def test_where_a_number_ends_the_others_move_as_is_best_with_it_there():
+    """Three numbers that hardly differ in what they do, two with little room, by brute force."""
+    rng = np.random.default_rng(3)
+    slopes = rng.normal(size=(50, 1)) + 0.2 * rng.normal(size=(50, 3))
+    errors = slopes @ np.array([4.0, -3.0, 1.0]) + 0.1 * rng.normal(size=50)
+    rooms = ((-1.0, 1.0), (-0.5, 9.0), (-9.0, 9.0))
+    table = {f"p{k}": Parameter("1", 0.0, *room, 1.0, 0.1) for k, room in enumerate(rooms)}
+    here = Guess(((Hypothesis("made", "up", table), np.array([0.3, 0.0, 0.2])),))
+
+    def loss(d: np.ndarray) -> np.ndarray:
+        left = errors + (d - here.deviation) @ slopes.T
+        return np.sum(left**2, axis=-1) + np.sum(d**2, axis=-1)
+
+    found = here.at(here.deviation + _move(here, slopes, errors)).deviation
+    grids = [np.linspace(*room, 121) for room in rooms]
+    tried = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1).reshape(-1, 3)
+    assert loss(found) <= loss(tried).min()
+    assert found[0] == -1.0 and found[1] < 9.0
+    free = here.deviation - np.linalg.solve(
+        slopes.T @ slopes + np.eye(3), slopes.T @ errors + here.deviation
+    )
+    assert loss(found) < 0.9 * loss(here.at(free).deviation)  # each number cut off by itself
