@@ -161,12 +161,20 @@ def plain_form(hypothesis: Hypothesis, candidates: Sequence[Hypothesis]) -> Hypo
 def better(
     now: Judged, index: int, cost: float, rest: Judged, rivals: Sequence[Rival]
 ) -> Rival | None:
-    """The rival that should take an effect's place: likelier, or nearly as likely and plainer."""
+    """The rival that should take an effect's place: likelier, or nearly as likely and plainer.
+
+    By the same measure an effect keeps its place beside one with more numbers.
+    """
     size = now.guess.parts[index][0].size
     table = effect_probabilities(now, cost, rest, rivals)
+
+    def needed(rival: Rival) -> float:
+        more = rival.hypothesis.size - size
+        return table[0] * (1.0 if more == 0 else _PLAINER if more < 0 else 1.0 / _PLAINER)
+
     found = [
         (chance, rival) for chance, rival in zip(table[2:], rivals, strict=True)
-        if rival.fit and chance > (_PLAINER if rival.hypothesis.size < size else 1.0) * table[0]
+        if rival.fit and chance > needed(rival)
     ]  # fmt: skip
     return max(found, key=lambda pair: pair[0])[1] if found else None
 

@@ -8,8 +8,8 @@ import pytest
 
 from hydrotele.estimate.evidence import Fit, Judged
 from hydrotele.estimate.hypothesis import Guess, hypotheses
-from hydrotele.gap import search
-from hydrotele.gap.rivals import Rival, weights
+from hydrotele.gap import rivals, search
+from hydrotele.gap.rivals import Rival, better, weights
 from hydrotele.machine.machine_file import load_machine
 
 _STRETCHES = 80
@@ -23,9 +23,9 @@ def test_better_everywhere_is_sure():
 
 def test_better_in_two_stretches_only_is_not_sure():
     """The same 80 in two stretches: a draw leaves both out with probability e^-2 = 0.14 or so."""
-    better = np.full(_STRETCHES, 100.0)
-    better[[10, 50]] -= 40.0
-    chances = weights([better, np.full(_STRETCHES, 100.0)], [10.0, 0.0])
+    ahead = np.full(_STRETCHES, 100.0)
+    ahead[[10, 50]] -= 40.0
+    chances = weights([ahead, np.full(_STRETCHES, 100.0)], [10.0, 0.0])
     assert 0.6 < chances[0] < 0.99
     plain = 1.0 / (1.0 + np.exp(-0.5 * (80.0 - 10.0)))
     assert plain > 0.999999  # what the likelihood alone would say
@@ -46,6 +46,29 @@ def test_a_constant_in_all_changes_nothing():
     own = weights(list(table), [0.0, 1.0, 2.0])
     moved = weights(list(table + rng.normal(size=_STRETCHES)), [0.0, 1.0, 2.0])
     np.testing.assert_allclose(moved, own, rtol=1e-9)  # rounding
+
+
+@pytest.mark.parametrize(
+    ("own", "other", "chance", "replaced"),
+    [
+        ("inertia_error", "com_offset", 0.58, False),  # trial 0010 of seed 711: they do the same
+        ("inertia_error", "com_offset", 0.90, True),
+        ("com_offset", "inertia_error", 0.42, True),
+        ("com_offset", "inertia_error", 0.10, False),
+        ("com_offset", "pin_offset", 0.51, True),
+        ("com_offset", "pin_offset", 0.49, False),
+    ],
+)
+def test_what_is_plainer_stands_unless_it_is_much_unlikelier(
+    monkeypatch, own, other, chance, replaced
+):
+    machine = load_machine("cat215", "none")
+    named = {h.name: h for h in hypotheses(machine, (own, other)) if h.location == "boom"}
+    guess = Guess(((named[own], np.ones(named[own].size)),))
+    now, rest = Judged(guess, (), 0.0), Judged(Guess(), (), 1.0)
+    rival = Rival(named[other], rest, 1.0, Fit(Guess(), 0.0, 0.0, 0.0, np.eye(1)))
+    monkeypatch.setattr(rivals, "effect_probabilities", lambda *_: [1.0 - chance, 0.0, chance])
+    assert (better(now, 0, 1.0, rest, [rival]) is rival) is replaced
 
 
 @pytest.mark.parametrize(("score", "left"), [
