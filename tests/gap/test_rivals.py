@@ -40,7 +40,7 @@ def test_a_number_is_a_case_of_its_numbers_by_direction(evidence, name, other, c
 def test_numbers_by_direction_are_asked_where_the_directions_differ(bands, more):
     """An effect that was fitted, beside the same with two numbers, from there on."""
     model = load_machine("cat215")
-    values = dict(zip(("positive", "negative"), bands, strict=True))
+    values: dict[str, float] = {"positive": bands[0], "negative": bands[1]}
     data, _ = machine_data(model, apply_effect(model, "valve_deadband_direction", "stick", values))
     table = {h.key: h for h in hypotheses(model)}
     evidence = Evidence(data, data.fit, 1)
