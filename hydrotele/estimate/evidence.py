@@ -357,6 +357,8 @@ def _move(guess: Guess, slopes: np.ndarray, errors: np.ndarray) -> np.ndarray:
     Where a number would leave its bounds the others move as is best with that one at its end.
     """
     d = guess.deviation
+    if not len(d):  # a guess of nothing, or of what is held
+        return d
     root = np.linalg.cholesky(slopes.T @ slopes + np.eye(len(d)))
     target = -solve_triangular(root, slopes.T @ errors + d, lower=True)
     move = solve_triangular(root.T, target)

@@ -70,3 +70,9 @@ def test_where_a_number_ends_the_others_move_as_is_best_with_it_there():
         slopes.T @ slopes + np.eye(3), slopes.T @ errors + here.deviation
     )
     assert loss(found) < 0.9 * loss(here.at(free).deviation)  # each number cut off by itself
+
+
+def test_a_guess_of_nothing_is_fitted_as_it_is(evidence):
+    """A search may end with none of its effects left: the fit has no numbers then."""
+    fit = evidence.fit(Guess(), 0.0)
+    assert fit.guess == Guess() and fit.information.shape == (0, 0)
