@@ -459,17 +459,16 @@ def _candidates(
         window = busy_window([(_clock(s), s.known, s.inputs[:, int(k)]) for s in seen])
         values, speed = [s.values[i.axis] for s in seen], _smoothing(machine, i.axis)
         for balance in balances:
-            tables = possible_tables(values, speed)
-            pairs = paired_tables(values, speed, rank < _COUPLED)
-            tables += _likely_pairs(evidence, seen, levels.inputs, (i, balance), pairs)
-            looked += tried([(i, balance, table) for table in tables])
-            if window:
-                tables = possible_tables(values, speed, window)
-                inside = tried([(i, balance, table) for table in tables])
+            at = i, balance
+            for span in ((), window) if window else ((),):
+                tables = possible_tables(values, speed, span)
+                pairs = paired_tables(values, speed, rank < _COUPLED, span)
+                tables += _likely_pairs(evidence, seen, levels.inputs, at, pairs)
+                inside = tried([(*at, table) for table in tables])
                 best = max(inside, key=lambda pair: pair[1].predicted, default=None)
-                if best and best[1].predicted > ENTER:
+                if span and best and best[1].predicted > ENTER:
                     moved = [best[0][2]._replace(window=w) for w in _moved_windows(window)]
-                    inside += tried([(i, balance, table) for table in moved])
+                    inside += tried([(*at, table) for table in moved])
                 looked += inside
     best = _best_first(looked)[:_TRIED] + _pump_laws(evidence, judged, seen)[:1]
     return [_law(machine, case, answer, seen) for case, answer in best]
@@ -519,11 +518,10 @@ def _pump_laws(
 
     speed = _smoothing(machine, own.axis)
     window = busy_window([(_clock(seen[k]), rows[k], told[k][0]) for k in used])
-    tables = possible_tables(values, speed) + paired_tables(values, speed, True)
-    looked = tried(tables)
-    if window:
-        looked += tried(possible_tables(values, speed, window))
-    return _best_first(looked)
+    windows = ((), window) if window else ((),)
+    tables = [t for w in windows for t in possible_tables(values, speed, w)]
+    tables += [t for w in windows for t in paired_tables(values, speed, True, w)]
+    return _best_first(tried(tables))
 
 
 def _likely_pairs(

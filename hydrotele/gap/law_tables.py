@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hydrotele.terms.facts import OF_A_DRIVE
+from hydrotele.terms.table import acting
 
 THROUGH = "flow_through"
 """Balance of a flow from the head side to the rod side."""
 _POINTS = 14  # of a table over one variable; what keeps them alike is in the regression
 _PAIR_POINTS = 10  # over each of two
 _TIMES = 10  # over time: what acts for a while begins and ends somewhere
-_EDGE = 0.05  # s, in which a law that acts for a while begins and ends
 _SHRINK = 0.1  # precision of an entry, in units of the lack: what no data tells is nothing
 _OWN = (
     "velocity", "position", "command", "force", "pressure_head", "pressure_rod", "spool",
@@ -28,7 +28,7 @@ class Table(NamedTuple):
         variables: one or two of a drive's state; those of another drive with its axis, such as
             `velocity.swing`.
         points: rising points of each [its unit].
-        window: times between which it acts [s], with one variable only; empty for always.
+        window: times between which it acts [s]; empty for always.
     """
 
     variables: tuple[str, ...]
@@ -63,8 +63,7 @@ class Table(NamedTuple):
             across = _shares(values[self.variables[1]], self.points[1])
             found = (found[:, :, None] * across[:, None]).reshape(len(found), -1)
         if self.window:
-            shown = _shares(values["time"], _edges(self.window))
-            found *= (shown[:, 1] + shown[:, 2])[:, None]
+            found *= acting(values["time"], *self.window)[:, None]
         return found
 
     def precision(self, smoothness: float) -> np.ndarray:
@@ -77,26 +76,18 @@ class Table(NamedTuple):
         return smoothness * found + _SHRINK * np.eye(self.size)
 
     def law(self, entries: np.ndarray) -> dict[str, Any]:
-        """Law, parameters and variables of a term with some entries (K,)."""
-        plain = [v.partition(".")[0] for v in self.variables]
-        points = list(self.points)
-        if self.window:
-            plain, points = [*plain, "time"], [*points, _edges(self.window)]
-            entries = np.outer(entries, (0.0, 1.0, 1.0, 0.0)).ravel()
+        """Law, parameters, variables and window of a term with some entries (K,)."""
+        plain, points = [v.partition(".")[0] for v in self.variables], self.points
+        where = {"of": self.of, "window": self.window or None}
         if len(plain) == 1:
             table = {"variable": plain[0], "points": points[0], "values": tuple(entries.tolist())}
-            return {"law": "linear_table", "parameters": table, "of": self.of}
+            return {"law": "linear_table", "parameters": table, **where}
         rows = entries.reshape(len(points[0]), -1)
         table = {
             "row_variable": plain[0], "column_variable": plain[1], "row_points": points[0],
             "column_points": points[1], "values": tuple(tuple(row) for row in rows.tolist()),
         }  # fmt: skip
-        return {"law": "table2", "parameters": table, "of": self.of}
-
-
-def _edges(window: Sequence[float]) -> tuple[float, ...]:
-    begin, end = window
-    return begin - _EDGE, begin + _EDGE, end - _EDGE, end + _EDGE
+        return {"law": "table2", "parameters": table, **where}
 
 
 def _shares(x: np.ndarray, points: Sequence[float]) -> np.ndarray:
@@ -130,7 +121,10 @@ def possible_tables(
 
 
 def paired_tables(
-    values: Sequence[Mapping[str, np.ndarray]], smoothing: float, others: bool
+    values: Sequence[Mapping[str, np.ndarray]],
+    smoothing: float,
+    others: bool,
+    window: tuple[float, ...] = (),
 ) -> list[Table]:
     """Every table over two variables that a law can have.
 
@@ -138,15 +132,17 @@ def paired_tables(
         values: as of `possible_tables`.
         smoothing: as of `possible_tables`.
         others: whether variables of other drives are among them.
+        window: in which they act.
 
     Returns:
         The tables; none has two variables that only their drives tell apart.
     """
     names = [n for n in _names(values) if others or "." not in n]
+    names = [n for n in names if not (window and n == "time")]
     points = {n: _points(n, values, _PAIR_POINTS, smoothing) for n in names}
     pairs = itertools.combinations([n for n in names if points[n]], 2)
     return [
-        Table((a, b), (points[a], points[b])) for a, b in pairs
+        Table((a, b), (points[a], points[b]), window) for a, b in pairs
         if a.partition(".")[0] != b.partition(".")[0]
         and a.partition(".")[2] in ("", b.partition(".")[2] or a.partition(".")[2])
     ]  # fmt: skip

@@ -26,7 +26,8 @@ class Term(Facts):
     that the valves share, which follows it with a lag of 20 ms [m^3/s]). `name` says what put it
     there, such as an effect's name. In `of` the variables that are another drive's: `{velocity:
     swing}` lets the law see the swing's velocity as its `velocity`. In `domain` a variable's range,
-    beyond which it counts with the nearer end; the `uncertainty` is the standard deviation of what
+    beyond which it counts with the nearer end. With a `window` it acts only between two times [s],
+    each with 0.1 s of rise or fall around it. The `uncertainty` is the standard deviation of what
     the law adds. `source` is the file or plug-in that defines the law, empty for laws of hydrotele.
     """
 
@@ -37,6 +38,7 @@ class Term(Facts):
     parameters: Mapping[str, Value] = {}
     of: dict[str, Name] = {}
     domain: dict[str, tuple[float, float]] = {}
+    window: tuple[float, float] | None = None
     uncertainty: NonNegative | None = None
     description: str = ""
     source: str = ""
@@ -59,5 +61,7 @@ class Term(Facts):
                 raise ValueError(f"domain: {variable!r}; {suggest(variable, VARIABLES)}")
             if not low < high:
                 raise ValueError(f"domain of {variable}: [{low:g}, {high:g}] must rise")
+        if self.window and not self.window[0] < self.window[1]:
+            raise ValueError("window: [{:g}, {:g}] must rise".format(*self.window))
         LAWS[self.law].numbers(self.parameters)
         return self

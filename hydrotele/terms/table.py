@@ -28,11 +28,23 @@ FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = np.arange(len(BALANCES), dtyp
 MARKER = 215325.75  # of a table of terms among other custom numbers of a model
 NO_TERMS = np.zeros(0)
 COUNT = 1  # place of the number of terms, after the marker
-_AXIS, _BALANCE, _LAW, _CHECKSUM, _PARAMETERS, _DOMAIN, _RANGES, _OTHERS, _ROW = range(
-    9
-)  # of a term
+(
+    _AXIS,
+    _BALANCE,
+    _LAW,
+    _CHECKSUM,
+    _PARAMETERS,
+    _DOMAIN,
+    _RANGES,
+    _OTHERS,
+    _BEGIN,
+    _END,
+    _ROW,
+) = range(11)  # of a term
 _HEAD = 2
 _MOST = 1024  # laws in a process
+_EDGE = 0.1  # s, in which a term with a window comes and goes
+_ALWAYS = (-1.0e18, 1.0e18)  # s, finite, as models keep numbers as text
 _SPEED = 1.0e-6  # m/s or rad/s, and of the speed: difference for slopes, small against 5 mm/s
 _PRESSURE = 100.0  # Pa, the same: small against the smoothing of an orifice
 
@@ -129,7 +141,7 @@ def terms_table(terms: Sequence[Term], order: Sequence[str]) -> np.ndarray:
         at = first + len(back)
         rows += [
             order.index(term.axis), BALANCES.index(term.balance), place, checksum(term.law), at,
-            at + len(numbers), len(term.domain), len(term.of),
+            at + len(numbers), len(term.domain), len(term.of), *(term.window or _ALWAYS),
         ]  # fmt: skip
         others = [x for name, axis in term.of.items() for x in (VARIABLES[name], order.index(axis))]
         back += [*numbers, *ranges, *others]
@@ -207,6 +219,14 @@ def _of_drive(i, k, s, drives):
     return s[k]
 
 
+def acting(time, begin, end):
+    """Share with which a term acts at a time, or at many; of scalars it is compiled, too."""
+    return np.minimum(1.0, np.maximum(0.0, 0.5 + np.minimum(time - begin, end - time) / _EDGE))
+
+
+_acting = allocation_free(acting)
+
+
 @allocation_free
 def added(terms, balance, axis, s, drives):
     """What the terms add to a balance of a drive.
@@ -227,6 +247,9 @@ def added(terms, balance, axis, s, drives):
     for term in range(int(terms[COUNT])):
         at = _HEAD + _ROW * term
         if int(terms[at + _AXIS]) != axis or int(terms[at + _BALANCE]) != balance:
+            continue
+        share = _acting(s.time, terms[at + _BEGIN], terms[at + _END])
+        if share == 0.0:
             continue
         place = int(terms[at + _LAW])
         if place < 0 or place >= _MOST:
@@ -249,7 +272,7 @@ def added(terms, balance, axis, s, drives):
                 _seen(terms, at, np.int64(8), s.command, s, drives),
                 _seen(terms, at, np.int64(9), s.force, s, drives),
             )
-        total += _call(address, terms, int(terms[at + _PARAMETERS]), seen)
+        total += share * _call(address, terms, int(terms[at + _PARAMETERS]), seen)
     return total
 
 

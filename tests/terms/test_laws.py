@@ -137,6 +137,15 @@ def test_beyond_its_domain_a_variable_counts_with_the_nearer_end():
     )
 
 
+def test_with_a_window_a_term_acts_for_a_while():
+    table = terms_table([force_term("constant", {"value": 4.0}, window=(2.0, 3.0))], ["a"])
+    at = {t: added(table, FORCE, 0, STATE._replace(time=t), NO_DRIVES)
+          for t in (1.9, 1.975, 2.0, 2.5, 3.0, 3.1)}  # fmt: skip
+    assert list(at.values()) == pytest.approx([0.0, 1.0, 2.0, 4.0, 2.0, 0.0])
+    with pytest.raises(ValidationError, match=r"window: \[3, 2\] must rise"):
+        force_term("constant", {"value": 1.0}, window=(3.0, 2.0))
+
+
 def test_a_law_may_see_variables_of_another_drive():
     law_ = ("formula", {"velocity": 1.0, "pressure_rod": 1e-6, "position": 10.0})
     term = force_term(*law_, of={"velocity": "b", "pressure_rod": "b"}, domain={"velocity": (0, 2)})
