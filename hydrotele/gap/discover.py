@@ -191,6 +191,8 @@ _DETAIL = 0.05  # of what all laws brought: one that brings less is the last
 _AHEAD = 1.0  # s, of free runs that a law must make better; longer ones drift without readings
 _STEP = 2.0e-3  # s, for the fits
 _MOVES = (-0.25, -0.1, 0.0, 0.1, 0.25)  # s, by which a window's ends are moved
+_LOUD = 0.2  # of the mean square in a window that its ends have
+_AS_GOOD = 0.98  # of the most that is predicted: of such windows the shortest is taken
 
 
 @dataclass(frozen=True)
@@ -456,7 +458,8 @@ def _candidates(
         balances = [i.balance]
         if i.balance == "flow_head" and Input("flow_rod", i.axis) in levels.inputs:
             balances.append(THROUGH)
-        window = busy_window([(_clock(s), s.known, s.inputs[:, int(k)]) for s in seen])
+        told = [(_clock(s), s.known, s.inputs[:, int(k)]) for s in seen]
+        window, whole = busy_window(told, _LOUD), busy_window(told)
         values, speed = [s.values[i.axis] for s in seen], _smoothing(machine, i.axis)
         for balance in balances:
             at = i, balance
@@ -467,8 +470,9 @@ def _candidates(
                 inside = tried([(*at, table) for table in tables])
                 best = max(inside, key=lambda pair: pair[1].predicted, default=None)
                 if span and best and best[1].predicted > ENTER:
-                    moved = [best[0][2]._replace(window=w) for w in _moved_windows(window)]
-                    inside += tried([(*at, table) for table in moved])
+                    ends = {*_moved_windows(window), *_moved_windows(whole)}
+                    moved = tried([(*at, best[0][2]._replace(window=w)) for w in ends])
+                    inside = [pair for pair in inside if pair is not best] + [_shortest(moved)]
                 looked += inside
     best = _best_first(looked)[:_TRIED] + _pump_laws(evidence, judged, seen)[:1]
     return [_law(machine, case, answer, seen) for case, answer in best]
@@ -559,9 +563,16 @@ def _regressed(judged: Judged, seen: Sequence[_Seen], case: _Case) -> Regression
 
 
 def _moved_windows(window: tuple[float, ...]) -> list[tuple[float, float]]:
-    """Windows whose ends are somewhat earlier or later."""
+    """A window, and some whose ends are somewhat earlier or later."""
     begin, end = window
-    return [(begin + a, end + b) for a in _MOVES for b in _MOVES if a or b]
+    return [(begin + a, end + b) for a in _MOVES for b in _MOVES if begin + a < end + b]
+
+
+def _shortest(looked: Sequence[tuple[_Case, Regression]]) -> tuple[_Case, Regression]:
+    """Of windows that predict about as much, the shortest one."""
+    most = _AS_GOOD * max(answer.predicted for _, answer in looked)
+    good = (pair for pair in looked if pair[1].predicted >= most)
+    return min(good, key=lambda pair: pair[0][2].window[1] - pair[0][2].window[0])
 
 
 def _clock(seen: _Seen) -> np.ndarray:

@@ -15,7 +15,7 @@ from hydrotele.estimate.levels import rippled, undisturbed_loss
 from hydrotele.estimate.stretches import busiest, thinned
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances
-from hydrotele.gap.calibrating import calibrate_freely
+from hydrotele.gap.calibrating import calibrate_freely, fit_until_settled
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, discover
 from hydrotele.gap.experiment import next_experiment
@@ -104,7 +104,7 @@ def find_gap(
         discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
             tell("learn laws of what no effect explains", 0.93)
-            discovery = discover(evidence, found.judged)
+            found, discovery = _learned(evidence, found)
             if discovery.refused:
                 notes.append(_REFUSED)
         tell("judge on the held-out run", 0.96)
@@ -294,7 +294,6 @@ def _named(
 ) -> tuple[NamedEffect, ...]:
     """Effects of a search, with their numbers in the last guess, which may have learned laws."""
     effects, first = [], 0
-    ideal = min(sum(map(undisturbed_loss, found.judged.tracks)), found.judged.loss)
     for index, (hypothesis, deviation) in enumerate(last.parts[: len(found.guess.parts)]):
         own = spread[first : first + hypothesis.size]
         first += hypothesis.size
@@ -302,8 +301,7 @@ def _named(
         if hypothesis.name == CALIBRATION or rest is None:
             continue
         chance, others = _chances(found, index, rest)
-        part = (rest.loss - found.judged.loss) / max(rest.loss - ideal, 1.0)
-        trust = believed_part(part)
+        trust = _trust(found, rest)
         chance *= trust
         others = tuple(dataclasses.replace(a, probability=trust * a.probability) for a in others)
         effects.append(
@@ -313,6 +311,45 @@ def _named(
             )
         )  # fmt: skip
     return tuple(sorted(effects, key=lambda effect: -effect.probability))
+
+
+def _trust(found: Found, rest: Judged) -> float:
+    """Probability that an effect is the mechanism, by the share that it takes of what is lacking.
+
+    Args:
+        found: the search.
+        rest: its guess without the effect.
+    """
+    ideal = min(sum(map(undisturbed_loss, found.judged.tracks)), found.judged.loss)
+    return believed_part((rest.loss - found.judged.loss) / max(rest.loss - ideal, 1.0))
+
+
+def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
+    """Laws of what the effects leave; of all that is lacking, where none of these can be believed.
+
+    An effect that takes a small part of a law's work stands in the way of the rest, and nothing
+    takes it back where the law does not act.
+    """
+    rests = [rest for rest in found.without if rest is not None]
+    if rests and all(_trust(found, rest) < LIKELY for rest in rests):
+        bare = _without_effects(evidence, found)
+        discovery = discover(evidence, bare.judged)
+        if discovery.laws and discovery.judged.loss < found.judged.loss:
+            return bare, discovery
+        evidence.set_base(found.judged)
+    return found, discover(evidence, found.judged)
+
+
+def _without_effects(evidence: Evidence, found: Found) -> Found:
+    """A search that named nothing, with its calibration, if there is one, fitted again."""
+    place = next((p for p in found.guess.parts if p[0].name == CALIBRATION), None)
+    if place is None:
+        evidence.set_base(found.base)
+        return found.emptied()
+    judged, fit = fit_until_settled(evidence, evidence.judged(Guess((place,))))
+    return dataclasses.replace(
+        found.emptied(), judged=judged, fit=fit, charges=(0.0,), without=(None,), rivals=((),)
+    )
 
 
 def without_details(

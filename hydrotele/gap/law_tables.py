@@ -115,8 +115,7 @@ def possible_tables(
     Returns:
         The tables.
     """
-    names = [n for n in _names(values) if not (window and n == "time")]
-    points = {n: _points(n, values, _POINTS, smoothing) for n in names}
+    points = {n: _points(n, values, _POINTS, smoothing, window) for n in _names(values)}
     return [Table((n,), (p,), window) for n, p in points.items() if p]
 
 
@@ -138,8 +137,7 @@ def paired_tables(
         The tables; none has two variables that only their drives tell apart.
     """
     names = [n for n in _names(values) if others or "." not in n]
-    names = [n for n in names if not (window and n == "time")]
-    points = {n: _points(n, values, _PAIR_POINTS, smoothing) for n in names}
+    points = {n: _points(n, values, _PAIR_POINTS, smoothing, window) for n in names}
     pairs = itertools.combinations([n for n in names if points[n]], 2)
     return [
         Table((a, b), (points[a], points[b]), window) for a, b in pairs
@@ -154,9 +152,15 @@ def _names(values: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
 
 
 def _points(
-    name: str, values: Sequence[Mapping[str, np.ndarray]], count: int, smoothing: float
-) -> tuple[float, ...]:
-    """Points of a variable, half-way between evenly and by quantiles; none if it never moves."""
+    name: str, values: Sequence[Mapping[str, np.ndarray]], count: int, smoothing: float,
+    window: tuple[float, ...],
+) -> tuple[float, ...]:  # fmt: skip
+    """Points of a variable, half-way between evenly and by quantiles; none if it never moves.
+
+    Those of the time lie evenly in the window, if there is one.
+    """
+    if name == "time" and window:
+        return tuple(np.linspace(*window, _TIMES).tolist())
     x = np.concatenate([v[name] for v in values])
     x = x[np.isfinite(x)]
     if len(x) < 10 * count or np.ptp(x) == 0.0:

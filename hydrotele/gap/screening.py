@@ -262,6 +262,7 @@ _CONTRAST = 4.0  # times the mean square beyond a window that there is within
 
 def busy_window(
     lacks: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    share: float = 0.0,
 ) -> tuple[float, float] | tuple[()]:
     """Times between which a lack is large, and small beyond, in all runs; or none.
 
@@ -271,6 +272,8 @@ def busy_window(
     Args:
         lacks: of every run the clock (n,) [s], the rows (n,) in which the lack is known, and the
             lack (n,).
+        share: of the mean square within that the first and the last block must have; what a filter
+            takes for a lack fades after the lack has ended.
 
     Returns:
         Begin and end [s].
@@ -283,7 +286,7 @@ def busy_window(
     squares, counts = np.cumsum(squares), np.cumsum(counts)
     if not squares[-1] > 0.0:
         return ()
-    best, found, least = 0.0, (), 1.0 / _BLOCK * counts[-1] / max(1, len(edges) - 1)
+    best, found, least = 0.0, (0, 0), 1.0 / _BLOCK * counts[-1] / max(1, len(edges) - 1)
     for a in range(len(edges) - 1):
         within = counts[a + 1 :] - counts[a]
         beyond = counts[-1] - within
@@ -295,8 +298,13 @@ def busy_window(
         fall = np.where(fits, counts[-1] * np.log(squares[-1] / counts[-1]) + fall, 0.0)
         k = int(np.argmax(fall))
         if fall[k] > best:
-            best, found = float(fall[k]), (float(edges[a]), float(edges[a + 1 + k]))
-    return found
+            best, found = float(fall[k]), (a, a + 1 + k)
+    if not best > 0.0:
+        return ()
+    own = slice(*found)
+    each = np.diff(squares)[own] / np.maximum(np.diff(counts)[own], 1.0)
+    loud = found[0] + np.flatnonzero(each >= share * np.mean(each))
+    return float(edges[loud[0]]), float(edges[loud[-1] + 1])
 
 
 def _loudest(u: np.ndarray, period: float) -> tuple[float, float, int, int]:

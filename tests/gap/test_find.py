@@ -5,14 +5,21 @@ Half of every fitted run is enough to tell what is asserted here; all ten whole 
 """
 
 import shutil
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
+from hydrotele.estimate.evidence import Judged
+from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.stretches import busiest
+from hydrotele.gap import find
+from hydrotele.gap.discover import Discovery
 from hydrotele.gap.find import find_gap, without_details
 from hydrotele.gap.result import Estimate, NamedEffect
+from hydrotele.gap.search import Found
 from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.logs.log import Log, load_log, save_log
 from hydrotele.machine.machine_file import load_machine
@@ -128,6 +135,34 @@ def test_a_length_offset_as_small_as_a_pin_may_be_off_is_ambiguous(tmp_path):
     assert sum(likely.values()) < 1.0 + 1e-9
     assert max(likely, key=likely.__getitem__) == (effect.name, effect.location)
     assert gap.next_experiment and gap.next_experiment["scenario"]
+
+
+@pytest.mark.parametrize(("without", "by_laws", "kept"), [
+    (52.6, 20.0, False),  # the effect takes a twentieth of what is lacking, laws all but all
+    (52.6, 70.0, True),  # laws alone leave more than the effect does
+    (52.6, None, True),  # no law is worth its entries
+    (500.0, 20.0, True),  # an effect that can be believed stays
+])  # fmt: skip
+def test_laws_are_learned_of_all_that_lacks_where_no_effect_can_be_believed(
+    monkeypatch, without, by_laws, kept
+):
+    machine = load_machine("cat215", "none")
+    (offset,) = (h for h in hypotheses(machine, ("command_offset",)) if h.location == "boom")
+    effect = Judged(Guess(((offset, np.ones(1)),)), (), 50.0)
+    base = Judged(Guess(), (), without)
+    search: Any = Found(base, effect, None, (), (5.0,), (base,), ((),), None)
+
+    def learn(_, judged):
+        if judged.guess.parts or by_laws is None:
+            return Discovery(judged, ())
+        law: Any = "law"
+        return Discovery(Judged(Guess(), (), by_laws), (law,))
+
+    monkeypatch.setattr(find, "discover", learn)
+    evidence: Any = SimpleNamespace(set_base=lambda base: base)
+    found, discovery = find._learned(evidence, search)
+    assert bool(found.guess.parts) is kept
+    assert bool(discovery.laws) is not kept
 
 
 def test_truth_columns_change_nothing(tmp_path):

@@ -113,6 +113,10 @@ def test_a_window_is_seen_where_a_lack_is_there_for_a_while():
     begin, end = busy_window(busy)
     assert (begin, end) == (pytest.approx(6.1, abs=0.26), pytest.approx(11.4, abs=0.26))
     assert busy_window(quiet) == ()
+    tail = [(c, k, u + np.where((c >= end) & (c < end + 1.0), 2.0, 0.0)) for c, k, u in busy]
+    longer = busy_window(tail)
+    assert longer and longer[1] > end, "what fades after it belongs to it"
+    assert busy_window(tail, 0.25) == (begin, end)
     assert busy_window([(CLOCK, known, np.zeros(1000))]) == ()
     late = [(c + 40.0, k, u) for c, k, u in busy]  # stretches of a long record
     assert busy_window(late) == pytest.approx((begin + 40.0, end + 40.0))
