@@ -15,6 +15,7 @@ the likelihood, and a law that is faster than the unknown inputs is seen as it i
 blurs it. Entries that follow each other are taken to be alike (P-splines, Eilers and Marx 1996).
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
@@ -189,6 +190,7 @@ _AGAIN = 5  # times that a law is fitted again inside the machine
 _STEPS = 3  # of Gauss-Newton for the numbers beside a law
 _DETAIL = 0.05  # of what all laws brought: one that brings less is the last
 _AHEAD = 1.0  # s, of free runs that a law must make better; longer ones drift without readings
+_FAR_AHEAD = 5.0  # s, of those that it must not make worse
 _STEP = 2.0e-3  # s, for the fits
 _MOVES = (-0.25, -0.1, 0.0, 0.1, 0.25)  # s, by which a window's ends are moved
 _LOUD = 0.2  # of the mean square in a window that its ends have
@@ -349,33 +351,49 @@ def _side(balance: str) -> str:
     return "flow_head" if balance == THROUGH else balance
 
 
-def _better(now: tuple[float, float], before: tuple[float, float]) -> bool:
-    """Whether free runs are better and none got lost; true where there are none."""
-    return bool(np.isnan(now[0]) or (now[0] < before[0] and now[1] <= before[1]))
+class _OpenLoop(NamedTuple):
+    """Errors of free runs in units of the noise; NaN where all runs are shorter.
+
+    Attributes:
+        median: of the windows of `_AHEAD`, RMS over the channels: one window that diverges says
+            nothing of the others.
+        rms: over all rows of these windows.
+        far: the same of windows of `_FAR_AHEAD`.
+    """
+
+    median: float
+    rms: float
+    far: float
+
+
+def _better(now: _OpenLoop, before: _OpenLoop) -> bool:
+    """Whether free runs are better, none got lost and long ones are no worse."""
+    short = np.isnan(now.median) or (now.median < before.median and now.rms <= before.rms)
+    return bool(short and (np.isnan(now.far) or now.far <= before.far))
 
 
 def _open_loop(
     evidence: Evidence, runs: Sequence[RunData], judged: Judged, noise: np.ndarray
-) -> tuple[float, float]:
-    """RMS errors of free runs through some runs over all channels, in units of a noise (c,).
+) -> _OpenLoop:
+    """Errors of free runs through some runs over all channels, in units of a noise (c,).
 
-    A law is to make simulations better, not only predictions from one reading to the next. First by
-    the median window of each channel, as one that diverges says nothing of the others; then by the
-    mean square of all, as a law must not make any diverge. NaN where all runs are shorter than a
-    window.
+    A law is to make simulations better, not only predictions from one reading to the next.
     """
     prepare = machine_runner(judged.guess.machine(evidence.data.machine), evidence.data, _STEP)
 
     def sizes(run: RunData) -> np.ndarray:
-        errors = free_run_errors(prepare(run), run, (_AHEAD,), to_end=False)
-        table = [(h.median / noise, h.rms / noise) for h in errors.horizons.values()]
-        return np.reshape(table, (-1, 2, len(noise)))
+        found = free_run_errors(prepare(run), run, (_AHEAD, _FAR_AHEAD), to_end=False).horizons
+        near, far = (found.get(f"{seconds:g}") for seconds in (_AHEAD, _FAR_AHEAD))
+        nothing = np.full(len(noise), np.nan)
+        return np.array([
+            near.median / noise if near else nothing, near.rms / noise if near else nothing,
+            far.rms / noise if far else nothing,
+        ])  # fmt: skip
 
-    found = np.concatenate(evidence.map(sizes, runs))
-    if not len(found) or np.isnan(found).all():
-        return np.nan, np.nan
-    median, whole = np.sqrt(np.nanmean(found**2, axis=(0, 2)))
-    return float(median), float(whole)
+    squares = np.array(evidence.map(sizes, runs)) ** 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # no window is long enough
+        return _OpenLoop(*np.sqrt(np.nanmean(squares, axis=(0, 2))).tolist())
 
 
 @compiled

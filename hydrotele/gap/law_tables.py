@@ -160,7 +160,8 @@ def _points(
     Those of the time lie evenly in the window, if there is one.
     """
     if name == "time" and window:
-        return tuple(np.linspace(*window, _TIMES).tolist())
+        begin, end = window
+        return tuple(np.linspace(begin, end, _TIMES).tolist())
     x = np.concatenate([v[name] for v in values])
     x = x[np.isfinite(x)]
     if len(x) < 10 * count or np.ptp(x) == 0.0:

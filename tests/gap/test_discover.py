@@ -15,7 +15,7 @@ from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import columns_of
 from hydrotele.estimate.responses import error_responses
 from hydrotele.estimate.track import track_run
-from hydrotele.gap.discover import Regression, _better, _law, _Seen, at_a_glance
+from hydrotele.gap.discover import Regression, _better, _law, _OpenLoop, _Seen, at_a_glance
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.law_tables import Table, paired_tables, possible_tables
 from hydrotele.logs.dataset import load_dataset
@@ -186,12 +186,14 @@ def test_a_smooth_surface_is_found_among_other_tables():
 @pytest.mark.parametrize(
     ("now", "before", "kept"),
     [
-        ((0.9, 1.9), (1.0, 2.0), True),
-        ((0.9, 2.1), (1.0, 2.0), False),  # some windows got worse more than the others better
-        ((0.9, np.inf), (1.0, 2.0), False),  # one diverged
-        ((1.1, 1.9), (1.0, 2.0), False),
-        ((np.nan, np.nan), (np.nan, np.nan), True),  # no run is long enough to tell
+        ((0.9, 1.9, 4.0), (1.0, 2.0, 5.0), True),
+        ((0.9, 2.1, 4.0), (1.0, 2.0, 5.0), False),  # some got worse more than the others better
+        ((0.9, np.inf, 4.0), (1.0, 2.0, 5.0), False),  # one diverged
+        ((1.1, 1.9, 4.0), (1.0, 2.0, 5.0), False),
+        ((0.9, 1.9, 5.1), (1.0, 2.0, 5.0), False),  # better at first, worse later
+        ((0.9, 1.9, np.nan), (1.0, 2.0, np.nan), True),  # no run is long enough for long ones
+        ((np.nan,) * 3, (np.nan,) * 3, True),  # nor for short ones
     ],
 )
 def test_a_law_is_kept_where_free_runs_get_better_and_none_is_lost(now, before, kept):
-    assert _better(now, before) is kept
+    assert _better(_OpenLoop(*now), _OpenLoop(*before)) is kept
