@@ -4,6 +4,8 @@ import contextlib
 import json
 import re
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 Progress = Callable[[float, float], None]
+_BEAT = 15.0  # s between lines that say how far a command is, where there is no terminal
 
 _STYLES = "bold|dim|red|green|yellow|blue|magenta"
 _NO_TAG = re.compile(rf"(?<!\\)\[(?!/\]|(?:{_STYLES})(?: (?:{_STYLES}))*\])")
@@ -87,13 +90,40 @@ def table(title: str, *columns: str) -> Table:
 
 
 @contextlib.contextmanager
+def _heartbeat(label: str) -> Iterator[Callable[[str], None]]:
+    """A line on stderr every `_BEAT` seconds, with what was told last and the time that it took."""
+    begin, last, over = time.perf_counter(), ["begins"], threading.Event()
+
+    def beat() -> None:
+        while not over.wait(_BEAT):
+            line = f"{label}: {last[0]}, {time.perf_counter() - begin:.0f} s"
+            notes.print(line, markup=False, soft_wrap=True)
+
+    def tell(text: str) -> None:
+        last[0] = text
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield tell
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextlib.contextmanager
 def progress_bar(label: str, quiet: bool = False) -> Iterator[Progress | None]:
-    """A bar with simulated time and real-time factor on stderr; None where nobody watches."""
-    if quiet or not notes.is_terminal:
+    """A bar with simulated time and real-time factor on stderr, or now and then a line.
+
+    The line is for what is no terminal, such as the log of a job; None where all is to be quiet.
+    """
+    if quiet:
         yield None
         return
-    import time
-
+    if not notes.is_terminal:
+        with _heartbeat(label) as tell:
+            yield lambda done, total: tell(f"{done:.1f} of {total:.1f} s simulated")
+        return
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     text = TextColumn("{task.completed:6.1f} / {task.total:.1f} s  {task.fields[factor]}")
@@ -113,9 +143,13 @@ def progress_bar(label: str, quiet: bool = False) -> Iterator[Progress | None]:
 
 @contextlib.contextmanager
 def stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | None]:
-    """A bar with the stage of the search on stderr; None where nobody watches."""
-    if quiet or not notes.is_terminal:
+    """A bar with the stage of the search on stderr, or now and then a line; None if quiet."""
+    if quiet:
         yield None
+        return
+    if not notes.is_terminal:
+        with _heartbeat(label) as tell:
+            yield lambda said, fraction: tell(f"{100.0 * fraction:.0f} %, {said}")
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 

@@ -1,8 +1,11 @@
 """What is printed: our styles are styles, and names or paths with brackets are text."""
 
+import time
+
 import pytest
 
-from hydrotele.cli.console import _Console
+from hydrotele.cli import console
+from hydrotele.cli.console import _Console, progress_bar, stages
 
 
 @pytest.mark.parametrize(
@@ -25,3 +28,22 @@ def test_own_styles_are_styles():
     with console.capture() as seen:
         console.print("[bold green]done[/] now")
     assert seen.get() == "\x1b[1;32mdone\x1b[0m now\n"
+
+
+@pytest.mark.parametrize(("bar", "told"), [
+    (stages, ("calibrate", 0.25, "job: 25 %, calibrate, 0 s")),
+    (progress_bar, (12.0, 60.0, "job: 12.0 of 60.0 s simulated, 0 s")),
+])  # fmt: skip
+def test_off_a_terminal_a_line_says_now_and_then_how_far_a_command_is(
+    bar, told, monkeypatch, capsys
+):
+    monkeypatch.setattr(console, "_BEAT", 0.02)
+    with bar("job", False) as progress:
+        progress(*told[:2])
+        time.sleep(0.2)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines and set(lines) == {told[2]}
+    with bar("job", True) as progress:
+        assert progress is None
+        time.sleep(0.1)
+    assert capsys.readouterr().err == ""
