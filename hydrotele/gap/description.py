@@ -14,6 +14,7 @@ from hydrotele.gap.customary import amount, in_customary_units
 from hydrotele.gap.discover import Discovery, Learned
 from hydrotele.gap.law_tables import THROUGH
 from hydrotele.gap.result import (
+    LIKELY,
     SURE,
     Alternative,
     Candidate,
@@ -225,7 +226,8 @@ def headline(gap: Gap) -> str:
     if gap.verdict == "partly":
         return _capital("; ".join([*map(_brief, gap.effects), "the rest has no known cause"]))
     if gap.verdict == "unknown" or not gap.effects:
-        known = " and ".join(effect_title(effect) for effect in gap.effects)
+        likely = (e for e in gap.effects if e.mechanism_probability > LIKELY)
+        known = " and ".join(map(effect_title, likely))
         also = f", besides {known}" if known else ""
         return f"Model and machine disagree in a way that no known effect explains{also}"
     titles = [effect_title(effect) for effect in gap.effects]

@@ -30,6 +30,7 @@ from hydrotele.gap.residuals import (
     rms,
 )
 from hydrotele.gap.result import (
+    LIKELY,
     SURE,
     Alternative,
     Candidate,
@@ -48,7 +49,6 @@ from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import parse_channel
 
-LIKELY = 0.5  # probability above which an effect may explain a part: likelier than all else
 PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
 _TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`
 _WORSE = 1.05  # times the given model's errors on the held-out run: no patch may do more

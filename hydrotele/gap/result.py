@@ -15,6 +15,8 @@ from hydrotele.effects import EFFECTS
 
 SURE = 0.95
 """Probability of a mechanism below which it is called ambiguous."""
+LIKELY = 0.5
+"""Probability above which an effect may explain a part: likelier than all else."""
 
 Verdict = Literal["named", "partly", "ambiguous", "unknown", "no_gap"]
 

@@ -40,6 +40,14 @@ def test_an_unknown_says_law_channel_and_dependence_in_plain_words(gap_of):
     assert "pressure_head" not in words
 
 
+def test_beside_an_unknown_only_what_is_likely_is_said_to_be_known(gap_of):
+    (effect,) = gap_of("named").effects
+    for probability, said in ((0.9, ", besides payload at the tool"), (0.006, "")):
+        told = (dataclasses.replace(effect, probability=probability),)
+        gap = dataclasses.replace(gap_of("unknown"), effects=told)
+        assert headline(gap).endswith(f"in a way that no known effect explains{said}")
+
+
 def test_an_ambiguity_names_both_and_the_experiment(gap_of):
     gap = gap_of("ambiguous")
     assert headline(gap) == "Either length offset of the boom or pin offset of the boom"
