@@ -109,12 +109,14 @@ def test_two_laws_of_one_balance_are_written_and_read(tmp_path):
     found = Regression(1.0, np.array([1.0, 2.0]) * 1e-5, np.eye(2), 1.0, 0.1)
     patched = rig
     for variable in ("position", "velocity", "position"):
-        table = Table((variable,), ((-0.1, 0.1),))
+        table = Table((variable,), ((-0.1, 0.1),), (1.0, 2.5) if variable == "velocity" else ())
         for balance in ("flow_head", "flow_through"):
             law = _law(patched, (case, balance, table), found, [seen])
             patched = law.hypothesis.machine(patched, np.zeros(0))
     save_machine(patched, tmp_path / "machine.yaml")
-    assert len(load_machine(str(tmp_path / "machine.yaml")).terms) == 9  # through is on both sides
+    terms = load_machine(str(tmp_path / "machine.yaml")).terms
+    assert len(terms) == 9  # through is on both sides
+    assert [t.window for t in terms] == 3 * [None] + 3 * [(1.0, 2.5)] + 3 * [None]
 
 
 NAMES = (
@@ -135,10 +137,11 @@ def test_every_table_is_a_term_that_adds_what_its_columns_say(made_up):
     tables = possible_tables([made_up], 0.01)
     tables += possible_tables([made_up], 0.01, (2.0, 5.0))
     tables += paired_tables([made_up], 0.01, others=True)
+    tables += paired_tables([made_up], 0.01, others=True, window=(2.0, 5.0))
     assert len({table.kind for table in tables}) == len(tables) > 20
     assert len({table.name for table in tables}) == len(tables)  # two laws of one place
     order = ["swing", "boom", "stick"]
-    for table in rng.permutation(np.array(tables, object))[:60]:
+    for table in rng.permutation(np.array(tables, object))[:90]:
         table = Table(*table)
         entries = rng.normal(size=table.size)
         term = Term(name="law", axis="boom", balance="force", **table.law(entries))
