@@ -221,6 +221,7 @@ _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
 _WORTH = 0.1  # of the best screened score: below it a candidate is not fitted
 _PAIRED = 6  # candidates that are tried in pairs where no single one helps
 _REFUSED = 3  # effects that may turn out to be none before a search ends
+_NIBBLED = 0.5  # of what is lacking, that an effect leaves after which a calibration is tried again
 Progress = Callable[[str, float], None]
 
 
@@ -372,11 +373,13 @@ def _grow(
                 ranked = _others(ranked, [added.key])
                 refused += 1
                 continue
+        # effects that take little each: numbers are wrong everywhere, which showed less before them
+        nibbled = lacking(grown, evidence) > _NIBBLED * lacking(now, evidence)
         if (
             begin.calibrates
             and not calibration_of(now.guess)
             and lacking(grown, evidence) > LACKING
-            and (best is None or not tried)
+            and (best is None or not tried or nibbled)
         ):
             tell("calibrate the uncertain numbers", done + 0.04)
             tried = True

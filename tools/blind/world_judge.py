@@ -20,6 +20,9 @@ Fixed before any trial was run:
 - Since 23 November 2026 an effect that is planted beside wrong numbers is drawn anew where all its
   numbers are uncertain ones of the machine and differ by less than three of their standard
   deviations: by what the machine states, that is no effect. `redrawn` in the key names them.
+- Since 26 November 2026, after trials 0010 of 711 and 0004 of 722: an offset centre of mass and an
+  inertia of a link that turns about a vertical axis are one effect under two names, and either is
+  right (`same` in the answers).
 - Something outside the library is right if no effect of the library has more than one half, in any
   verdict.
 """

@@ -123,8 +123,11 @@ def draw_trial(model: Facts, kind: str, turn: int, rng: np.random.Generator) -> 
         name, place, values = draw_library_effect(facts, rng, tuple(p["name"] for p in planted))
         facts = apply_effect(facts, name, place, values)
         planted.append(
-            {"name": name, "location": place, "right": [[name, place]], "parameters": values}
-        )
+            {
+                "name": name, "location": place, "parameters": values,
+                "right": [[one, place] for one in _same_effects(model, name, place)],
+            }
+        )  # fmt: skip
     for part in planted:
         rest = bare
         for other in planted:
@@ -231,6 +234,22 @@ def refuse_uncertain(model: Facts, drawn: Drawn) -> None:
         if all(p and key in values and abs(values[key] - p.nominal) < _APART * p.scale
                for key, p in zip(part["parameters"], known, strict=True)):  # fmt: skip
             raise InputError("trial", f"{name} of {place} is within what its numbers may be off by")
+
+
+def _same_effects(model: Facts, name: str, place: str) -> tuple[str, ...]:
+    """Names under which an effect changes the same: about a vertical axis a mass has no weight.
+
+    Where the mass of a link that turns about such an axis, fixed in the ground, sits shows in its
+    moment of inertia alone.
+    """
+    pair = ("com_offset", "inertia_error")
+    if name not in pair or place not in model.axes:
+        return (name,)
+    joint = model.joints[model.axes[place].joint]
+    link = model.links[model.link_of(model.axes[place].joint)]
+    upright = joint.type == "hinge" and not np.cross(joint.axis, model.gravity).any()
+    same = upright and link.parent == "world"
+    return (name, *(p for p in pair if same and p != name))
 
 
 def true_parameters(model: Facts, truth: Facts) -> dict[str, dict[str, float]]:
