@@ -84,7 +84,7 @@ def write_gap(
 ) -> None:
     """Write gap.json, the report, the patched machine, the next experiment and the recording."""
     write_json(folder / "gap.json", gap_document(gap))
-    if has_patch(gap):
+    if has_patch(gap) or gap.patched.sensors != gap.machine.sensors:
         from hydrotele.simulate.plant import build_plant
 
         patched = folder / "patched"

@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 
 from hydrotele.estimate.hypothesis import Guess
 from hydrotele.estimate.inputs import MEMORY
-from hydrotele.estimate.levels import find_levels
+from hydrotele.estimate.levels import find_levels, with_jitter
 from hydrotele.estimate.track import (
     COARSE,
     STEP,
@@ -154,6 +154,19 @@ class Evidence:
         )
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + _prior(guess))
+
+    def with_jitter(self, judged: Judged) -> Judged:
+        """A guess with instants that jitter, if its readings tell so; else as given."""
+        if not self.lacking:
+            return judged
+        machine = judged.guess.machine(self.data.machine)
+        tracks = with_jitter(self.data, machine, judged.tracks, self.map, self.step)
+        loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
+        return (
+            judged
+            if tracks is judged.tracks
+            else Judged(judged.guess, tracks, loss + _prior(judged.guess))
+        )
 
     def set_base(self, guess: Guess | Judged) -> Judged:
         """Compute gains anew for a guess; later errors are whitened with them."""

@@ -269,7 +269,7 @@ class Variances(NamedTuple):
     """Noise of readings and of the process.
 
     Attributes:
-        reading: (c,) of a reading.
+        reading: (n, c) of the readings of every row; (0, c) where gains are kept.
         drift: (nz,) that a row adds to the state.
         unknown_command: (nz,) that a row with unknown command adds.
     """
@@ -411,7 +411,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
             for s in range(few):
                 error -= hc[s] * delta[s]
             if fresh:
-                total = noise[c]
+                total = noise[row, c]
                 pull[:] = 0.0
                 for k in range(full):  # a reading depends on few states
                     if hc[k] != 0.0:

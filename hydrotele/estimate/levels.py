@@ -7,12 +7,7 @@ lack something). An accuracy that a machine states is a prior for its channel. S
 intervals count what a model lacks, and a channel without a stated accuracy costs that channel its
 prior and nothing else.
 
-A run's filter linearised about a track: likelihood and its slopes for other noise levels.
-
-The transition Jacobians of a track make its Kalman filter a linear one, which can be run again
-with other noise of the readings and other process noise at a fraction of the cost. A disturbance
-smoother goes back through it: it gives the slopes of the likelihood with respect to all levels in
-one pass, and the disturbances themselves, which say where and when the model lacks something.
+The readings' own instants may jitter: their noise then grows with the rate of what they show.
 """
 
 import dataclasses
@@ -22,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from hydrotele.core.compiled import compiled
 from hydrotele.estimate.inputs import Input, decay, input_columns, input_sizes, possible_inputs
+from hydrotele.estimate.linear_run import LinearRun, Smoothed, linear_run, smooth
 from hydrotele.estimate.reduced_model import state_names
 from hydrotele.estimate.stretches import busiest_rows
 from hydrotele.estimate.track import (
@@ -33,278 +28,14 @@ from hydrotele.estimate.track import (
     Levels,
     Track,
     by_kind,
-    row_noise,
+    row_variances,
+    squared_rates,
     state_drift,
     track_run,
 )
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import channel_sensor, converter
-
-
-class LinearRun(NamedTuple):
-    """A run of n rows linearised about a track, with c channels and nz states.
-
-    Attributes:
-        flow: (n, nz, nz) d (state before the next row) / d (state after this one), the latter
-            along the first index.
-        slope: (n, c, nz) d reading / d state.
-        error: (n, c) readings less what the track predicted, NaN where missing.
-        correction: (n, nz) what the track's own filter added to the state at every row.
-        initial: (nz, nz) covariance before the first reading.
-        startle: (n, nz) variance that rows with unknown commands add.
-    """
-
-    flow: np.ndarray
-    slope: np.ndarray
-    error: np.ndarray
-    correction: np.ndarray
-    initial: np.ndarray
-    startle: np.ndarray
-
-
-def linear_run(track: Track, startle: np.ndarray, rows: slice = slice(None)) -> LinearRun:
-    """Linearise a run.
-
-    Args:
-        track: made with `linearise`.
-        startle: (nz,) variance that a row with unknown command adds.
-        rows: part of the run to keep; the state's covariance before it is that before the run.
-
-    Returns:
-        The linear run.
-    """
-    run: RunData = track.run
-    raw = track.whitened * track.gains.spread
-    correction = np.einsum("rcs,rc->rs", track.gains.gain, np.nan_to_num(raw))
-    unknown = np.outer(~run.command_known, startle)
-    return LinearRun(
-        track.flow[rows], track.gains.slope[rows], (run.reading - track.predicted)[rows],
-        correction[rows], track.initial, unknown[rows],
-    )  # fmt: skip
-
-
-@compiled
-def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
-    """Kalman filter of a linear run; deviations of the state count from the track's.
-
-    Args:
-        run: LinearRun.
-        noise: (c,) variance of a reading.
-        drift: (nz,) variance that a row adds to the state.
-        whitened: (n, c) written: prediction errors over their spread, NaN where missing.
-        width: (n, c) written: their predicted standard deviation [channel's unit].
-        gain: (n, c, nz) written: corrections of the state per prediction error.
-        before: (n, nz) written: deviations before each row's readings.
-        covariance: (n or 0, nz, nz) written: their covariances.
-
-    Returns:
-        -2 log likelihood without its constant.
-
-    Source: Anderson and Moore 1979, Optimal Filtering, chapter 6; sequential readings.
-    """
-    rows, channels, size = run.slope.shape
-    p, work = run.initial.copy(), np.zeros((size, size))
-    d, pull = np.zeros(size), np.zeros(size)
-    loss = 0.0
-    for row in range(rows):
-        before[row] = d
-        if len(covariance) > 0:
-            covariance[row] = p
-        for c in range(channels):
-            y = run.error[row, c]
-            if np.isnan(y):
-                whitened[row, c] = np.nan
-                width[row, c] = np.nan
-                continue
-            h = run.slope[row, c]
-            total = noise[c]
-            pull[:] = 0.0
-            for k in range(size):  # a reading depends on few states
-                if h[k] != 0.0:
-                    y -= h[k] * d[k]
-                    for s in range(size):
-                        pull[s] += p[k, s] * h[k]
-            for s in range(size):
-                total += h[s] * pull[s]
-            width[row, c] = np.sqrt(total)
-            whitened[row, c] = y / width[row, c]
-            loss += y * y / total + np.log(total)
-            for s in range(size):
-                gain[row, c, s] = pull[s] / total
-                d[s] += gain[row, c, s] * y
-            for s in range(size):
-                part = gain[row, c, s]
-                for k in range(size):
-                    p[s, k] -= part * pull[k]
-        if row == rows - 1:
-            break
-        for s in range(size):
-            pull[s] = d[s] - run.correction[row, s]
-        f = run.flow[row]
-        d[:] = 0.0
-        for s in range(size):
-            for r in range(size):
-                d[r] += f[s, r] * pull[s]
-        for a in range(size):  # work = F p, then p = work F'; the innermost index is contiguous
-            for b in range(size):
-                work[a, b] = 0.0
-            for k in range(size):
-                part = f[k, a]
-                if part == 0.0:
-                    continue
-                for b in range(size):
-                    work[a, b] += part * p[k, b]
-        for a in range(size):
-            p[a] = 0.0
-            for k in range(size):
-                part = work[a, k]
-                for b in range(a + 1):
-                    p[a, b] += part * f[k, b]
-        for a in range(size):
-            for b in range(a):
-                p[b, a] = p[a, b]
-            p[a, a] += drift[a] + run.startle[row, a]
-    return loss
-
-
-@compiled
-def linear_smoother(run, whitened, width, gain, noise_slope, drift_slope, pulls, lacks):
-    """Go back through a linear filter: slopes of its loss, and the smoothed disturbances.
-
-    Args:
-        run: LinearRun.
-        whitened: as `linear_filter` wrote them.
-        width: see whitened.
-        gain: see whitened.
-        noise_slope: (c,) written: d loss / d (variance of a reading).
-        drift_slope: (nz,) written: d loss / d (variance that a row adds).
-        pulls: (n, nz) written: r of the rows; a row's smoothed disturbance on its way to the next
-            is the row's variance times the next row's r, and its smoothed deviation before the
-            readings the covariance there times its own r.
-        lacks: (n, nz) written: diagonal of N; the disturbance's variance is q - q N q.
-
-    Returns:
-        Nothing.
-
-    Source: Koopman and Shephard 1992, Biometrika 79(4), Eqs 2.4-2.6; de Jong 1989.
-    """
-    rows, channels, size = run.slope.shape
-    r, n = np.zeros(size), np.zeros((size, size))
-    work, pull, new = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-    turned = np.zeros((size, size))
-    noise_slope[:] = 0.0
-    drift_slope[:] = 0.0
-    for row in range(rows - 1, -1, -1):
-        if row < rows - 1:
-            f = run.flow[row]
-            for s in range(size):
-                drift_slope[s] += n[s, s] - r[s] * r[s]
-            for s in range(size):
-                for k in range(size):
-                    turned[k, s] = f[s, k]
-            new[:] = 0.0
-            for k in range(size):
-                for s in range(size):
-                    new[s] += turned[k, s] * r[k]
-            for s in range(size):
-                r[s] = new[s]
-            for a in range(size):  # n = F' n F with f the transpose of F
-                for b in range(size):
-                    work[a, b] = 0.0
-                for k in range(size):
-                    part = f[a, k]
-                    if part == 0.0:
-                        continue
-                    for b in range(size):
-                        work[a, b] += part * n[k, b]
-            for a in range(size):
-                n[a] = 0.0
-                for k in range(size):
-                    part = work[a, k]
-                    for b in range(a + 1):
-                        n[a, b] += part * turned[k, b]
-            for a in range(size):
-                for b in range(a):
-                    n[b, a] = n[a, b]
-        for c in range(channels - 1, -1, -1):
-            if np.isnan(whitened[row, c]):
-                continue
-            h, k_gain = run.slope[row, c], gain[row, c]
-            square = width[row, c] * width[row, c]
-            u = whitened[row, c] / width[row, c]
-            inner = 1.0 / square
-            pull[:] = 0.0
-            for k in range(size):
-                u -= k_gain[k] * r[k]
-                for s in range(size):
-                    pull[s] += n[k, s] * k_gain[k]
-            for s in range(size):
-                inner += k_gain[s] * pull[s]
-            noise_slope[c] += inner - u * u
-            for s in range(size):
-                if h[s] != 0.0:  # a reading depends on few states
-                    r[s] += h[s] * u
-                    for k in range(size):
-                        n[s, k] += h[s] * (0.5 * inner * h[k] - pull[k])
-                        n[k, s] += h[s] * (0.5 * inner * h[k] - pull[k])
-        for s in range(size):
-            pulls[row, s] = r[s]
-            lacks[row, s] = n[s, s]
-
-
-class Smoothed(NamedTuple):
-    """What a run's filter and smoother say at some noise levels.
-
-    Attributes:
-        loss: -2 log likelihood without its constant.
-        noise_slope: (c,) d loss / d variance of a reading.
-        drift_slope: (nz,) d loss / d variance that a row adds.
-        whitened: (n, c) prediction errors over their spread.
-        width: (n, c) that spread.
-        disturbance: (n, nz) smoothed disturbance of the state on its way to the next row.
-        known: (n, nz) share of the disturbance's variance that the readings resolve, 0 .. 1.
-        deviation: (n, nz) smoothed state less the track's before the row's readings; empty unless
-            asked for.
-    """
-
-    loss: float
-    noise_slope: np.ndarray
-    drift_slope: np.ndarray
-    whitened: np.ndarray
-    width: np.ndarray
-    disturbance: np.ndarray
-    known: np.ndarray
-    deviation: np.ndarray
-
-
-def smooth(run: LinearRun, noise: np.ndarray, drift: np.ndarray, states: bool = False) -> Smoothed:
-    """Filter and smoother of a linear run.
-
-    Args:
-        run: LinearRun.
-        noise: (c,) variance of a reading [channel's unit squared].
-        drift: (nz,) variance that a row adds to the state.
-        states: whether to return the smoothed deviation of the state, too.
-
-    Returns:
-        What they say.
-    """
-    rows, channels, size = run.slope.shape
-    whitened, width = np.empty((rows, channels)), np.empty((rows, channels))
-    gain, before = np.zeros((rows, channels, size)), np.empty((rows, size))
-    covariance = np.empty((rows if states else 0, size, size))
-    loss = linear_filter(run, noise, drift, whitened, width, gain, before, covariance)
-    noise_slope, drift_slope = np.zeros(channels), np.zeros(size)
-    pulls, lacks = np.empty((rows, size)), np.empty((rows, size))
-    linear_smoother(run, whitened, width, gain, noise_slope, drift_slope, pulls, lacks)
-    own = drift + run.startle
-    disturbance, known = np.zeros((rows, size)), np.zeros((rows, size))
-    disturbance[:-1] = own[:-1] * pulls[1:]
-    known[:-1] = own[:-1] * lacks[1:]
-    deviation = before + np.einsum("rsk,rk->rs", covariance, pulls) if states else before[:0]
-    return Smoothed(loss, noise_slope, drift_slope, whitened, width, disturbance, known, deviation)
-
 
 WHITE = ("rate", "drive_rate", "spool", "speed", "pressure_head", "pressure_rod")
 """Kinds of states to which white noise is added, too: ripple and what the rows are too slow for.
@@ -321,6 +52,11 @@ _NOISIER = 1.25  # times the rough noise that a channel's noise can be: what is 
 _QUIETER = 0.7  # times the stated or the rough noise, whichever is smaller: readings that scatter
 # less than they do are no sensor, but a lack that is faster than the unknown inputs
 _QUIETER_UNSTATED = 0.3  # times the rough noise, where fast motion may be most of it
+_LEAST_JITTER, _MOST_JITTER = 1.0e-3, 0.5  # of a period; less does not show, more is no clock
+_BEGUN_JITTER = 0.03  # of a period, from which jitter is sought
+_JITTERS = 30.0  # twice the log likelihood that it must bring
+_TOLD_JITTER = 0.3  # of its variance: standard deviation with which a channel tells jitter
+_ALIKE = 0.5  # of its variance, by which channels may differ beside that
 _ROWS = 3000  # of all runs together that tell the levels; more say the same again
 _ITERATIONS = 12  # of a round: what is left of the way is small against a round's own linearisation
 _SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
@@ -356,6 +92,12 @@ def _rounding(data: Dataset, channel: str) -> float:
     sensors = data.machine.sensors.get(data.sensors) if data.sensors else None
     step = converter(channel_sensor(data.machine, sensors, channel), channel).step
     return step / 12.0**0.5
+
+
+def stated_jitter(data: Dataset) -> float:
+    """Standard deviation of the instants at which the machine's sensors read [s]; 0 if none."""
+    sensors = data.machine.sensors.get(data.sensors) if data.sensors else None
+    return sensors.jitter if sensors else 0.0
 
 
 class Prior(NamedTuple):
@@ -417,7 +159,8 @@ def find_levels(
         rough = Levels(noise, drift={**_LOOSE, **dict.fromkeys(held, _LOOSE_POSITION)})
         tracks = _crossed(data, machine, rough, (), each, step)
         inputs = possible_inputs(machine)
-        levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
+        sizes = 0.01 * input_sizes(machine, inputs)
+        levels = Levels(noise, inputs, sizes, jitter=stated_jitter(data))
         tracks = _crossed(data, machine, levels, tracks, each, step)
     best = tracks
     for index in range(rounds):
@@ -425,7 +168,7 @@ def find_levels(
         wanted = _most_likely(data, machine, levels, prior, tracks, each)
         near = (bool(start) or index > 0) and not _has_gap(machine)
         for part in _PARTS:  # where a filter hardly follows, its linear form misleads
-            levels = _pruned(_between(old, wanted, part), machine)
+            levels = _pruned(_between(old, wanted, part), machine, tracks[0].run.period)
             tracks = _crossed(data, machine, levels, before, each, step, near)
             if _whole(tracks) < _whole(before) or not _has_gap(machine):
                 break
@@ -433,7 +176,62 @@ def find_levels(
             best = tracks
         if _whole(tracks) > _whole(before) - _SETTLED:
             break
-    return best
+    return best if start else with_jitter(data, machine, best, each, step)
+
+
+def with_jitter(
+    data: Dataset, machine: Machine, tracks: tuple[Track, ...], each: Callable = map,
+    step: float = STEP,
+) -> tuple[Track, ...]:  # fmt: skip
+    """The same with instants that jitter, if that is clearly likelier and all channels say so.
+
+    What a model lacks makes readings wrong by more the faster they move, too, but each channel by
+    another time.
+
+    Args:
+        data: the dataset.
+        machine: the machine.
+        tracks: its linearised tracks of the fit runs.
+        each: such as `map`, perhaps on several workers.
+        step: largest step of the integrator [s].
+
+    Returns:
+        Tracks whose levels have a jitter, or the given ones.
+    """
+    levels, period = tracks[0].levels, tracks[0].run.period
+    if levels.jitter:
+        return tracks
+    levels = dataclasses.replace(levels, jitter=_BEGUN_JITTER * period)
+    wanted = _most_likely(data, machine, levels, noise_prior(data), tracks, each)
+    wanted = _pruned(wanted, machine, period)
+    if not wanted.jitter:
+        return tracks
+    found = _crossed(data, machine, wanted, tracks, each, step, not _has_gap(machine))
+    likelier = _whole(found) < _whole(tracks) - _JITTERS
+    return found if likelier and _agree_on_jitter(found) else tracks
+
+
+def _agree_on_jitter(tracks: Sequence[Track]) -> bool:
+    """Whether every channel that tells the jitter by itself says the same, and several do.
+
+    Each channel's own jitter is one step of Fisher scoring away from that of all.
+    """
+    levels = tracks[0].levels
+    slope = information = np.zeros(len(levels.noise))
+    for track in tracks:
+        names = list(track.names)
+        drift = state_drift(names, levels, track.run.period)
+        linear = linear_run(track, by_kind(names, STARTLE) ** 2)
+        found = smooth(linear, row_variances(levels, track.run), drift)
+        shares = levels.jitter**2 * squared_rates(track.run) / found.width**2
+        slope = slope + np.nansum(shares * (found.whitened**2 - 1.0), axis=0)
+        information = information + np.nansum(shares**2, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):  # channels that never move say nothing
+        off, spread = slope / information, np.sqrt(2.0 / information)
+    told = spread < _TOLD_JITTER
+    return np.count_nonzero(told) > 1 and bool(
+        np.all(np.abs(off) < _ALIKE + 3.0 * spread, where=told)
+    )
 
 
 def _has_gap(machine: Machine) -> bool:
@@ -454,8 +252,9 @@ def _between(old: Levels, new: Levels, part: float) -> Levels:
     drift = mean(np.maximum(began, by_kind(names, DRIFT)), by_kind(names, new.drift))
     drift = dict(zip(names, drift.tolist(), strict=True))
     return dataclasses.replace(
-        new, noise=mean(old.noise, new.noise), sizes=mean(old.sizes, new.sizes), drift=drift
-    )
+        new, noise=mean(old.noise, new.noise), sizes=mean(old.sizes, new.sizes), drift=drift,
+        jitter=(old.jitter ** (1.0 - part)) * new.jitter**part,
+    )  # fmt: skip
 
 
 def _whole(tracks: Sequence[Track]) -> float:
@@ -480,11 +279,12 @@ def _possible(levels: Levels, machine: Machine) -> Levels:
     return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept])
 
 
-def _pruned(levels: Levels, machine: Machine) -> Levels:
-    """Levels without the inputs that are none."""
+def _pruned(levels: Levels, machine: Machine, period: float) -> Levels:
+    """Levels without the inputs that are none, and without jitter where it is none."""
     kept = levels.sizes > 2.0 * LEAST * input_sizes(machine, levels.inputs)
     inputs = tuple(i for i, keep in zip(levels.inputs, kept, strict=True) if keep)
-    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept])
+    jitter = levels.jitter if levels.jitter > 2.0 * _LEAST_JITTER * period else 0.0
+    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept], jitter=jitter)
 
 
 def _crossed(
@@ -549,42 +349,52 @@ def _most_likely(
     names, c, m = list(tracks[0].names), len(data.channels), len(levels.inputs)
     white = _white_states(machine, names)
     places, floor = [names.index(n) for n in white], by_kind(white, DRIFT)
-    w = c + m
+    w, jittered = c + m, levels.jitter > 0.0
+    end = w + len(white)
     rows = max(_ROWS // len(tracks), _ROWS // 8)
-    runs = [(_part(track, names, rows), track.run) for track in tracks]
-    weight = sum(len(t.run.command) for t in tracks) / sum(len(r.error) for r, _ in runs)
+    runs = [_part(track, names, rows, jittered) for track in tracks]
+    weight = sum(len(t.run.command) for t in tracks) / sum(len(run[0].error) for run in runs)
     largest = input_sizes(machine, levels.inputs)
     first = len(names) - m
 
     def of(x: np.ndarray) -> Levels:
-        drift = dict(zip(white, np.exp(x[w:]), strict=True))
-        return dataclasses.replace(levels, noise=np.exp(x[:c]), sizes=np.exp(x[c:w]), drift=drift)
+        drift = dict(zip(white, np.exp(x[w:end]), strict=True))
+        return dataclasses.replace(
+            levels, noise=np.exp(x[:c]), sizes=np.exp(x[c:w]), drift=drift,
+            jitter=float(np.exp(x[end])) if jittered else 0.0,
+        )  # fmt: skip
 
     def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
         now, slope = of(x), np.zeros(len(x))
 
-        def one(pair: tuple) -> tuple[float, np.ndarray, np.ndarray]:
-            run: RunData = pair[1]
-            drift, noise = state_drift(names, now, run.period), row_noise(now, run) ** 2
-            found = smooth(pair[0], noise, drift)
-            return found.loss, noise * found.noise_slope, drift * found.drift_slope
+        def one(part: tuple) -> tuple[float, np.ndarray, np.ndarray, float]:
+            run: RunData = part[1]
+            drift = state_drift(names, now, run.period)
+            found = smooth(part[0], row_variances(now, run, part[2]), drift, rates=part[2])
+            noise = now.noise**2 if run.behind is None else now.noise**2 / run.behind
+            per_jitter = now.jitter**2 * found.jitter_slope
+            return found.loss, noise * found.noise_slope, drift * found.drift_slope, per_jitter
 
         total = 0.0
-        for value, per_noise, per_drift in each(one, runs):
+        for value, per_noise, per_drift, per_jitter in each(one, runs):
             total += value
             slope[:c] += 2.0 * per_noise
             slope[c:w] += 2.0 * per_drift[first:]
-            slope[w:] += 2.0 * per_drift[places]
+            slope[w:end] += 2.0 * per_drift[places]
+            slope[end:] += 2.0 * per_jitter
         off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
         slope[:c] += 2.0 * off / prior.width / weight
         slope[c:] += 2.0 * lack / _LACK / weight
         return total + float(off @ off + lack @ lack) / weight, slope
 
-    low = np.log(np.concatenate([prior.low, LEAST * largest, floor]))
-    high = np.log(np.concatenate([prior.high, largest, _MOST * floor]))
+    period = min(track.run.period for track in tracks)
+    low = np.concatenate([prior.low, LEAST * largest, floor, [_LEAST_JITTER * period]])
+    high = np.concatenate([prior.high, largest, _MOST * floor, [_MOST_JITTER * period]])
+    low, high = (np.log(bound[: end + jittered]) for bound in (low, high))
     began = np.array([levels.drift.get(n, 0.0) for n in white])
     start = np.log(np.concatenate([
         levels.noise, np.maximum(levels.sizes, 3 * LEAST * largest), np.maximum(began, 1.5 * floor),
+        [levels.jitter] if jittered else [],
     ]))  # fmt: skip
     found = minimize(
         loss, np.clip(start, low, high), jac=True, method="L-BFGS-B",
@@ -602,9 +412,14 @@ def _white_states(machine: Machine, names: Sequence[str]) -> list[str]:
     return [n for n in names if n.partition(".")[0] in WHITE or n in held]
 
 
-def _part(track: Track, names: list[str], rows: int) -> LinearRun:
-    """The stretch of a run in which the commands change most, linearised."""
-    return linear_run(track, by_kind(names, STARTLE) ** 2, busiest_rows(track.run, rows))
+def _part(
+    track: Track, names: list[str], rows: int, jittered: bool
+) -> tuple[LinearRun, RunData, np.ndarray | None]:
+    """The stretch of a run in which the commands change most: linearised, and its squared rates."""
+    busy = busiest_rows(track.run, rows)
+    rates = np.ascontiguousarray(squared_rates(track.run)[busy]) if jittered else None
+    linear = linear_run(track, by_kind(names, STARTLE) ** 2, busy)
+    return linear, track.run.part(busy.start, busy.stop), rates
 
 
 def smoothed_inputs(track: Track, answer: tuple[LinearRun, Smoothed] | None = None) -> np.ndarray:
@@ -632,7 +447,7 @@ def smoothed(track: Track) -> tuple[LinearRun, Smoothed]:
     names = list(track.names)
     run = linear_run(track, by_kind(names, STARTLE) ** 2)
     drift = state_drift(names, track.levels, track.run.period)
-    return run, smooth(run, row_noise(track.levels, track.run) ** 2, drift, True)
+    return run, smooth(run, row_variances(track.levels, track.run), drift, True)
 
 
 def undisturbed_loss(track: Track) -> float:
@@ -643,7 +458,7 @@ def undisturbed_loss(track: Track) -> float:
     initial = run.initial.copy()
     first = len(names) - m
     drift[first:], initial[first:] = 0.0, 0.0
-    noise = row_noise(track.levels, track.run) ** 2
+    noise = row_variances(track.levels, track.run)
     width = smooth(run._replace(initial=initial), noise, drift).width
     there = np.isfinite(track.whitened)
     return float(np.sum(1.0 + 2.0 * np.log(width[there])))
@@ -666,7 +481,7 @@ def input_excess(track: Track) -> float:
     names, m = list(track.names), len(track.levels.inputs)
     run = linear_run(track, by_kind(names, STARTLE) ** 2)
     drift = state_drift(names, track.levels, track.run.period)
-    noise = row_noise(track.levels, track.run) ** 2
+    noise = row_variances(track.levels, track.run)
     loss = smooth(run, noise, drift).loss
     drift[len(names) - m :] = 0.0
     initial = run.initial.copy()

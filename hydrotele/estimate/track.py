@@ -194,6 +194,7 @@ class Levels:
         sizes: (m,) their stationary standard deviations [N], [N m], [m^3/s] or [1].
         drift: kind of state -> standard deviation of what 20 ms add to it, where that is not the
             floor that `DRIFT` states.
+        jitter: standard deviation of the instants at which channels are read [s].
         penalty: -2 log prior of the levels.
     """
 
@@ -201,6 +202,7 @@ class Levels:
     inputs: tuple[Input, ...] = ()
     sizes: np.ndarray = field(default_factory=lambda: np.zeros(0))
     drift: Mapping[str, float] = field(default_factory=dict)
+    jitter: float = 0.0
     penalty: float = 0.0
 
 
@@ -268,6 +270,7 @@ STARTLE = {
     "added_delivery": 0.1,
 }
 
+_SLOPE, _SIDE = np.array([-2.0, -1.0, 0.0, 1.0, 2.0]) / 10.0, 2  # of a line through five rows
 _DOUBT = 3.0  # times a reading's noise: lacks of pressure below it are taken for noise
 _LOOK = 3.0  # s at a run's start that tell where drives rested in their backlash
 
@@ -324,9 +327,33 @@ def known_levels(data: Dataset) -> bool:
     return bool(np.all(np.isfinite(data.noise)))
 
 
-def row_noise(levels: Levels, run: RunData) -> np.ndarray:
-    """(c,) standard deviation of a reading of a run, which may be a mean of logged ones."""
-    return levels.noise if run.behind is None else levels.noise / np.sqrt(run.behind)
+def row_variances(levels: Levels, run: RunData, rates: np.ndarray | None = None) -> np.ndarray:
+    """(n, c) variance of the readings of a run, which may be means of logged ones.
+
+    An instant that is off by dt makes a reading wrong by its rate times dt. The `squared_rates` of
+    the run are found where they are not given.
+    """
+    noise = levels.noise if run.behind is None else levels.noise / np.sqrt(run.behind)
+    found = np.tile(noise**2, (len(run.reading), 1))
+    if levels.jitter:
+        found += levels.jitter**2 * (squared_rates(run) if rates is None else rates)
+    return found
+
+
+def squared_rates(run: RunData) -> np.ndarray:
+    """(n, c) squares of the rates of a run's readings, over as many as one is the mean of.
+
+    Rates are slopes of straight lines through five rows, missing ones filled in linearly.
+    """
+    rows, channels = run.reading.shape
+    found, clock = np.zeros((rows, channels)), np.arange(rows)
+    for c in range(channels):
+        good = np.isfinite(run.reading[:, c])
+        if rows < len(_SLOPE) or np.count_nonzero(good) < 2:
+            continue
+        whole = np.pad(np.interp(clock, clock[good], run.reading[good, c]), _SIDE, mode="edge")
+        found[:, c] = np.convolve(whole, _SLOPE[::-1], mode="valid") / run.period
+    return found**2 if run.behind is None else found**2 / run.behind
 
 
 def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
@@ -366,7 +393,7 @@ def track_run(
     if kept is not None:
         levels, columns = kept.levels, _for_states(kept, names)
     levels = levels or Levels(data.noise)
-    noise = row_noise(levels, run)
+    noise = row_variances(levels, run) if kept is None else np.zeros((0, len(data.channels)))
     if columns is None:
         columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
     play = model.transmission[:, BACKLASH] > 0.0
@@ -377,7 +404,9 @@ def track_run(
         rows = min(max(2, round(_LOOK / run.period)), len(run.command))
         first, part = run.part(0, rows), columns[:rows]
         rest = find_rest(
-            lambda r: _cross(machine, model, data, first, None, step, r, levels, part, noise).loss,
+            lambda r: (
+                _cross(machine, model, data, first, None, step, r, levels, part, noise[:rows]).loss
+            ),
             play,
         )
     elif rest is None or not known:
@@ -455,7 +484,7 @@ def _cross(
         given = None
     flow = np.empty((rows if linearise else 0, full, full)) if given is None else given
     variances = Variances(
-        noise**2, state_drift(names, levels, run.period), by_kind(names, STARTLE) ** 2
+        noise, state_drift(names, levels, run.period), by_kind(names, STARTLE) ** 2
     )
     steps = Steps(fine, coarse, by_kind(names, _NUDGE))
     own = np.array([names.index(name) for name in known])

@@ -11,7 +11,7 @@ from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.estimate.inputs import input_sizes, input_units
-from hydrotele.estimate.levels import rippled, undisturbed_loss
+from hydrotele.estimate.levels import rippled, stated_jitter, undisturbed_loss
 from hydrotele.estimate.stretches import busiest, thinned
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances
@@ -68,6 +68,7 @@ _ALIKE = 1.0e-3  # of the squares of what an effect changes: readings that are a
 _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
 _OFF = 0.05  # by which noise must differ from the stated to be noted
+_JITTER = 0.2  # by which jitter must
 Progress = Callable[[str, float], None]
 
 
@@ -149,6 +150,9 @@ def find_gap(
     calibration = _calibration(discovery.judged.guess, spread)
     if opened:  # what free runs left uncertain was the search's prior, not the machine's
         patched = changed(patched, "uncertainty", given.uncertainty)
+    jitter = _jitter(data, judge.levels)
+    if jitter[0] != jitter[1] and data.sensors:
+        patched = changed(patched, f"sensors.{data.sensors}.jitter", jitter[0])
     return Gap(
         machine=given,
         patched=patched,
@@ -173,6 +177,7 @@ def find_gap(
         learned=learned,
         lacks=lacks,
         noise=_noise(data, judge.levels),
+        jitter=jitter,
         notes=(*data.notes, *notes, *map(detail_words, details),
                *_notes(found, data, judge.levels, floor)),
         seconds=time.perf_counter() - begin,
@@ -185,7 +190,8 @@ class _Judge:
     def __init__(self, data: Dataset, judged: Judged) -> None:
         found = judged.tracks[0].levels
         self.data, self.ripple = data, rippled(found)
-        self.levels = Levels(found.noise, drift=found.drift if self.ripple else {})
+        drift = found.drift if self.ripple else {}
+        self.levels = Levels(found.noise, drift=drift, jitter=found.jitter)
         self.runs = (data.heldout, *data.fit)
 
     def tracks(
@@ -505,6 +511,12 @@ def _experiment(machine: Machine, verdict: Verdict, named: Sequence[NamedEffect]
     return next_experiment(machine, "these effects cannot be told apart with this data", pairs)
 
 
+def _jitter(data: Dataset, levels: Levels) -> tuple[float, float]:
+    """Jitter as found, and as stated [s]; what hardly differs from the stated one is that."""
+    found, stated = levels.jitter, stated_jitter(data)
+    return (found if abs(found - stated) > _JITTER * max(found, stated) else stated), stated
+
+
 def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> list[str]:
     notes = []
     ratio = levels.noise / data.noise
@@ -514,6 +526,13 @@ def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> 
     ]  # fmt: skip
     if off:
         notes.append(f"Noise that differs from what the machine states: {', '.join(off)}.")
+    jitter, stated = _jitter(data, levels)
+    if jitter != stated:
+        notes.append(
+            f"The instants at which rows are read jitter by {1e3 * jitter:.3g} ms (standard"
+            f" deviation; stated: {1e3 * stated:.3g} ms): readings are the less sure the faster"
+            " they change, and all channels say so alike. Their noise counts it."
+        )
     if not known_levels(data):
         unstated = [c for c, n in zip(data.channels, data.noise, strict=True) if not np.isfinite(n)]
         notes.append(f"The machine states no accuracy of {', '.join(unstated)}; the noise there was"

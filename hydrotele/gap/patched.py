@@ -64,7 +64,7 @@ def write_effects(gap: Gap, folder: Path) -> None:
             document["parameters"][name]["nominal"] = estimate.nominal
         record["effects"].append(document)
     document = gap_document(gap)
-    record |= {"calibration": document["calibration"], "learned": document["learned"]}
+    record |= {key: document[key] for key in ("calibration", "learned", "jitter")}
     text = yaml.safe_dump(finite(record), sort_keys=False, default_flow_style=None)
     (folder / EFFECTS_FILE).write_text(text, encoding="utf-8")
 
@@ -79,6 +79,9 @@ def _head(gap: Gap) -> list[str]:
         lines.append(f"- calibrated {number_title(key)}: {_found(estimate, key)}")
     for law in gap.learned:
         lines.append(f"- learned {learned_title(law)} (see terms): {law.formula} [{law.unit}]")
+    found, stated = gap.jitter
+    if found != stated:
+        lines.append(f"- jitter of the sensors: {1e3 * found:.3g} ms, was {1e3 * stated:.3g} ms")
     return [*lines, f"Values, units and intervals for programs are in {EFFECTS_FILE}."]
 
 

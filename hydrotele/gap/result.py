@@ -245,6 +245,7 @@ class Gap(Generic[Model]):
         learned: laws found from the data, in the patched machine.
         lacks: what the patched machine still lacks, balance by balance, the largest first.
         noise: channel -> (found, stated) standard deviation of a reading [SI]; NaN if not stated.
+        jitter: (found, stated) standard deviation of the instants at which rows are read [s].
         notes: what was left out or mended in the data, one sentence each.
         seconds: wall time of the search.
         open_loop: how far the models run away from the measured motion when the measured forces
@@ -268,6 +269,7 @@ class Gap(Generic[Model]):
     learned: tuple[LearnedLaw, ...] = ()
     lacks: tuple[Lack, ...] = ()
     noise: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    jitter: tuple[float, float] = (0.0, 0.0)
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
     open_loop: Mapping[str, Any] | None = None
@@ -294,6 +296,8 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         `lacks`: what the patched machine still lacks: `balance`, `axis`, standard deviation `size`
         [`unit`], `part` of the largest that makes sense.
         `noise`: channel -> `found` and `stated` standard deviation of a reading [SI].
+        `jitter`: `found` and `stated` standard deviation of the instants at which rows are read
+        [s].
         `gap`: RMS prediction errors `before` and `after`, and `noise_floor`, of the held-out run.
         `tests`: residual test -> `value`, `limit`, `passed`.
         `laws`: balance -> `unit` and `places`, place -> RMS `before`, `after` and `noise`.
@@ -330,6 +334,7 @@ def gap_document(gap: Gap) -> dict[str, Any]:
             channel: {"found": found, "stated": stated}
             for channel, (found, stated) in gap.noise.items()
         },
+        "jitter": dict(zip(("found", "stated"), gap.jitter, strict=True)),
         "gap": {
             "metric": size.metric,
             "before": size.before,

@@ -376,7 +376,8 @@ def has_unexplained_impacts(evidence: Evidence, judged: Judged, axis: str) -> bo
 
 
 def _sensors_only(evidence: Evidence) -> Levels:
-    return Levels(noise_prior(evidence.data).noise)
+    jitter = evidence.tracks[0].levels.jitter
+    return Levels(noise_prior(evidence.data).noise, jitter=jitter)
 
 
 def _likeliest(evidence: Evidence, teeth: Hypothesis, rival: Machine | None) -> np.ndarray | None:

@@ -199,7 +199,8 @@ def _option(evidence: Evidence, base: Judged, alone: Judged) -> tuple[Judged, fl
 
 
 def _sensors(evidence: Evidence) -> Levels:
-    return Levels(noise_prior(evidence.data).noise)
+    jitter = evidence.tracks[0].levels.jitter
+    return Levels(noise_prior(evidence.data).noise, jitter=jitter)
 
 
 def _excess(judged: Judged) -> float:
@@ -276,15 +277,34 @@ def search(
     tell("find noise levels of the given model", 0.0)
     base = evidence.set_base(Guess())
     candidates = timed(candidates, base)
-    tell("try every effect as if nothing unknown acted", 0.03)
-    bold, early, teeth = _early_options(evidence, base, candidates)
-    grown = _grow(evidence, base, _Grown(base, early=early, first=bold.ranking), candidates, tell)
+    grown, teeth = _begun(evidence, base, candidates, tell)
+    jittered = evidence.with_jitter(grown.now)
+    if jittered is not grown.now:  # hidden before by what the model lacked
+        tell("search again with instants that jitter", 0.03)
+        evidence.set_base(jittered)
+        base = evidence.set_base(evidence.judged(Guess(), reopened=True))
+        grown, teeth = _begun(evidence, base, candidates, tell)
     if teeth:
         grown = _toothed(evidence, base, grown, teeth, candidates, tell)
     if grown.fit and mostly_right(grown.now.guess, grown.fit):
         grown = _sparse(evidence, base, grown, candidates, tell)
     grown = _by_number(evidence, _plain(evidence, grown, candidates), candidates)
     return _compared(evidence, base, grown, tell)
+
+
+def _begun(
+    evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis], tell: Progress
+) -> tuple["_Grown", Judged | None]:
+    """A search from the given machine: how far it gets, and teeth to try with a calibration."""
+    tell("try every effect as if nothing unknown acted", 0.03)
+    bold = without_inputs(evidence, base, candidates)
+    options = [option for option in bold.options if option[1] > ENTER]
+    ahead, _ = min(options, key=_score, default=(base, 0.0))
+    teeth = rattling(evidence, base, ahead, candidates)
+    if teeth and teeth.loss < base.loss:
+        options.append((teeth, base.loss - teeth.loss - ENTER))
+    begin = _Grown(base, early=sorted(options, key=_score), first=bold.ranking)
+    return _grow(evidence, base, begin, candidates, tell), teeth
 
 
 @dataclass(frozen=True)
@@ -395,11 +415,8 @@ def _grow(
             if roomy or wider.hypotheses == now.guess.hypotheses:
                 break
             tell("calibrate with more room", done + 0.04)
-            (now, fit), ranked, roomy = (
-                fit_until_settled(evidence, evidence.judged(wider)),
-                None,
-                True,
-            )
+            now, fit = fit_until_settled(evidence, evidence.judged(wider))
+            ranked, roomy = None, True
             continue
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = first if ranked is None else ranked
@@ -640,19 +657,6 @@ def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -
 def lacking(judged: Judged, evidence: Evidence) -> float:
     """Twice the log likelihood that the unknown inputs of a guess bring."""
     return sum(evidence.map(input_excess, judged.tracks))
-
-
-def _early_options(
-    evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis]
-) -> tuple[WithoutInputs, list[tuple[Judged, float]], Judged | None]:
-    """What stands out as long as nothing unknown is let act, and teeth; best first; and these."""
-    bold = without_inputs(evidence, base, candidates)
-    options = [option for option in bold.options if option[1] > ENTER]
-    ahead, _ = min(options, key=_score, default=(base, 0.0))
-    teeth = rattling(evidence, base, ahead, candidates)
-    if teeth and teeth.loss < base.loss:
-        options.append((teeth, base.loss - teeth.loss - ENTER))
-    return bold, sorted(options, key=_score), teeth
 
 
 def _others(

@@ -37,11 +37,13 @@ class Sensor(Facts):
 class SensorSet(Facts):
     """Sensors of a machine by kind of channel, sampled at `rate` [Hz].
 
+    The log's rows are read at instants that are off by `jitter` [s], normal, of all channels alike.
     What `channels` says of a channel, such as `pressure_head.boom`, holds there in place of its
     kind; an empty entry says that nothing is known of it.
     """
 
     rate: Positive = 50.0
+    jitter: NonNegative = 0.0
     angle: Sensor = Sensor()
     position: Sensor = Sensor()
     length: Sensor = Sensor()

@@ -299,7 +299,7 @@ def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> t
     sensors = sensor_set(machine, scenario.sensors)
     readings = {c: v for c, v in values.items() if c.startswith("command.")}
     visible |= late_channels(plant, record)
-    readings |= measure(machine, sensors, scenario.seed, visible, errors)
+    readings |= measure(machine, sensors, scenario.seed, visible, errors, 1.0 / scenario.log_rate)
     units = {c: units[c] for c in readings}
     return truth, _log(scenario, machine, record.time, readings, units, scenario.sensors)
 

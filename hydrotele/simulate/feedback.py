@@ -111,7 +111,7 @@ def _through_coupling(error: SensorError, values: np.ndarray) -> np.ndarray:
 
 def measure(
     machine: Machine, sensors: SensorSet | None, seed: int, truth: Mapping[str, np.ndarray],
-    errors: Mapping[str, np.ndarray] | None = None,
+    errors: Mapping[str, np.ndarray] | None = None, period: float = 0.0,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """What the sensors read of true values.
 
@@ -122,6 +122,7 @@ def measure(
         truth: channel -> (n,) true values; where a sensor reads late, those that it reads
             (`record.late_channels`).
         errors: channel -> (n,) errors already drawn; others are drawn here.
+        period: time between rows [s], for instants that jitter; between rows values run straight.
 
     Returns:
         Channel -> (n,) readings.
@@ -131,6 +132,9 @@ def measure(
     """
     readings = {}
     for channel, values in apply_sensor_errors(machine, truth).items():
+        if sensors and sensors.jitter and period:
+            rows = np.arange(len(values))
+            values = np.interp(rows + _instants(sensors, seed, len(values)) / period, rows, values)
         sensor = channel_sensor(machine, sensors, channel)
         if sensor.error_rms or sensor.bits:
             error = (errors or {}).get(channel)
@@ -139,6 +143,12 @@ def measure(
             values = _convert_all(values + error, *converter(sensor, channel))
         readings[channel] = np.asarray(values, dtype=float)
     return readings
+
+
+def _instants(sensors: SensorSet, seed: int, count: int) -> np.ndarray:
+    """(n,) by how much rows are read late [s], the same of all channels."""
+    stream = np.random.Generator(np.random.PCG64([seed, zlib.crc32(b"jitter")]))
+    return stream.normal(0.0, sensors.jitter, count)
 
 
 class Sensors(NamedTuple):

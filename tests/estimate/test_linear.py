@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.estimate.levels import LinearRun, smooth
+from hydrotele.estimate.linear_run import LinearRun, smooth
 
 ROWS, CHANNELS, SIZE = 40, 2, 3
 
@@ -19,7 +19,7 @@ def made():
         np.ascontiguousarray(flow), rng.normal(size=(ROWS, CHANNELS, SIZE)), error,
         np.zeros((ROWS, SIZE)), np.diag([1.0, 2.0, 0.5]), 0.05 * rng.random((ROWS, SIZE)),
     )  # fmt: skip
-    return run, np.array([0.4, 1.3]), np.array([0.2, 0.0, 0.1])
+    return run, np.tile([0.4, 1.3], (ROWS, 1)), np.array([0.2, 0.0, 0.1])
 
 
 def textbook(run, noise, drift):
@@ -32,7 +32,7 @@ def textbook(run, noise, drift):
     for row in range(ROWS):
         priors.append((x, p))
         there = np.isfinite(run.error[row])
-        h, r = run.slope[row][there], np.diag(noise[there])
+        h, r = run.slope[row][there], np.diag(noise[row][there])
         s = h @ p @ h.T + r
         v = run.error[row][there] - h @ x
         loss += v @ np.linalg.solve(s, v) + np.linalg.slogdet(s)[1]
@@ -72,7 +72,18 @@ def test_slopes_are_those_of_differences(made, which, place):
     found, losses, step = smooth(*made), [], 1e-5
     for sign in (1.0, -1.0):
         level = {"noise": noise.copy(), "drift": drift.copy()}
-        level[which][place] += sign * step
+        level[which][..., place] += sign * step
         losses.append(smooth(run, level["noise"], level["drift"]).loss)
     slope = {"noise": found.noise_slope, "drift": found.drift_slope}[which][place]
     assert slope == pytest.approx((losses[0] - losses[1]) / (2.0 * step), rel=1e-5)
+
+
+def test_the_slope_along_jitter_is_that_of_differences(made):
+    """The variance of an instant times the square of a reading's rate adds to the reading's."""
+    run, noise, drift = made
+    rates = np.random.default_rng(8).random(noise.shape)
+    found, step = smooth(run, noise, drift, rates=rates), 1e-5
+    losses = [smooth(run, noise + sign * step * rates, drift).loss for sign in (1.0, -1.0)]
+    slope = (losses[0] - losses[1]) / (2.0 * step)
+    assert found.jitter_slope == pytest.approx(slope, rel=1e-5)
+    assert smooth(run, noise, drift).jitter_slope == 0.0
