@@ -159,8 +159,7 @@ def find_levels(
         rough = Levels(noise, drift={**_LOOSE, **dict.fromkeys(held, _LOOSE_POSITION)})
         tracks = _crossed(data, machine, rough, (), each, step)
         inputs = possible_inputs(machine)
-        sizes = 0.01 * input_sizes(machine, inputs)
-        levels = Levels(noise, inputs, sizes, jitter=stated_jitter(data))
+        levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
         tracks = _crossed(data, machine, levels, tracks, each, step)
     best = tracks
     for index in range(rounds):
@@ -168,7 +167,7 @@ def find_levels(
         wanted = _most_likely(data, machine, levels, prior, tracks, each)
         near = (bool(start) or index > 0) and not _has_gap(machine)
         for part in _PARTS:  # where a filter hardly follows, its linear form misleads
-            levels = _pruned(_between(old, wanted, part), machine, tracks[0].run.period)
+            levels = _pruned(_between(old, wanted, part), machine)
             tracks = _crossed(data, machine, levels, before, each, step, near)
             if _whole(tracks) < _whole(before) or not _has_gap(machine):
                 break
@@ -186,7 +185,8 @@ def with_jitter(
     """The same with instants that jitter, if that is clearly likelier and all channels say so.
 
     What a model lacks makes readings wrong by more the faster they move, too, but each channel by
-    another time.
+    another time. Jitter that is there is found anew; otherwise it is held, for what another machine
+    lacks may take its place.
 
     Args:
         data: the dataset.
@@ -196,18 +196,17 @@ def with_jitter(
         step: largest step of the integrator [s].
 
     Returns:
-        Tracks whose levels have a jitter, or the given ones.
+        Tracks with a jitter that was found, or the given ones.
     """
     levels, period = tracks[0].levels, tracks[0].run.period
-    if levels.jitter:
+    begun = levels.jitter or stated_jitter(data) or _BEGUN_JITTER * period
+    begin = dataclasses.replace(levels, jitter=begun)
+    wanted = _most_likely(data, machine, begin, noise_prior(data), tracks, each, jittered=True)
+    if wanted.jitter < 2.0 * _LEAST_JITTER * period:
         return tracks
-    levels = dataclasses.replace(levels, jitter=_BEGUN_JITTER * period)
-    wanted = _most_likely(data, machine, levels, noise_prior(data), tracks, each)
-    wanted = _pruned(wanted, machine, period)
-    if not wanted.jitter:
-        return tracks
+    wanted = _pruned(wanted, machine)
     found = _crossed(data, machine, wanted, tracks, each, step, not _has_gap(machine))
-    likelier = _whole(found) < _whole(tracks) - _JITTERS
+    likelier = _whole(found) < _whole(tracks) - (0.0 if levels.jitter else _JITTERS)
     return found if likelier and _agree_on_jitter(found) else tracks
 
 
@@ -253,7 +252,6 @@ def _between(old: Levels, new: Levels, part: float) -> Levels:
     drift = dict(zip(names, drift.tolist(), strict=True))
     return dataclasses.replace(
         new, noise=mean(old.noise, new.noise), sizes=mean(old.sizes, new.sizes), drift=drift,
-        jitter=(old.jitter ** (1.0 - part)) * new.jitter**part,
     )  # fmt: skip
 
 
@@ -279,12 +277,11 @@ def _possible(levels: Levels, machine: Machine) -> Levels:
     return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept])
 
 
-def _pruned(levels: Levels, machine: Machine, period: float) -> Levels:
-    """Levels without the inputs that are none, and without jitter where it is none."""
+def _pruned(levels: Levels, machine: Machine) -> Levels:
+    """Levels without the inputs that are none."""
     kept = levels.sizes > 2.0 * LEAST * input_sizes(machine, levels.inputs)
     inputs = tuple(i for i, keep in zip(levels.inputs, kept, strict=True) if keep)
-    jitter = levels.jitter if levels.jitter > 2.0 * _LEAST_JITTER * period else 0.0
-    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept], jitter=jitter)
+    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept])
 
 
 def _crossed(
@@ -343,16 +340,16 @@ def columns_of(machine: Machine, near: Track, inputs: Sequence[Input]) -> np.nda
 
 def _most_likely(
     data: Dataset, machine: Machine, levels: Levels, prior: Prior, tracks: Sequence[Track],
-    each: Callable,
+    each: Callable, jittered: bool = False,
 ) -> Levels:  # fmt: skip
-    """Levels of the largest posterior probability in the linearised runs."""
+    """Levels of the largest posterior probability in the linearised runs; jitter if asked for."""
     names, c, m = list(tracks[0].names), len(data.channels), len(levels.inputs)
     white = _white_states(machine, names)
     places, floor = [names.index(n) for n in white], by_kind(white, DRIFT)
-    w, jittered = c + m, levels.jitter > 0.0
+    w = c + m
     end = w + len(white)
     rows = max(_ROWS // len(tracks), _ROWS // 8)
-    runs = [_part(track, names, rows, jittered) for track in tracks]
+    runs = [_part(track, names, rows, levels.jitter > 0.0) for track in tracks]
     weight = sum(len(t.run.command) for t in tracks) / sum(len(run[0].error) for run in runs)
     largest = input_sizes(machine, levels.inputs)
     first = len(names) - m
@@ -361,7 +358,7 @@ def _most_likely(
         drift = dict(zip(white, np.exp(x[w:end]), strict=True))
         return dataclasses.replace(
             levels, noise=np.exp(x[:c]), sizes=np.exp(x[c:w]), drift=drift,
-            jitter=float(np.exp(x[end])) if jittered else 0.0,
+            jitter=float(np.exp(x[end])) if jittered else levels.jitter,
         )  # fmt: skip
 
     def loss(x: np.ndarray) -> tuple[float, np.ndarray]:

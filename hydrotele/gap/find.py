@@ -527,7 +527,12 @@ def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> 
     if off:
         notes.append(f"Noise that differs from what the machine states: {', '.join(off)}.")
     jitter, stated = _jitter(data, levels)
-    if jitter != stated:
+    if not jitter and stated:
+        notes.append(
+            f"Nothing tells that rows are read at instants that jitter by {1e3 * stated:.3g} ms, as"
+            " the machine states."
+        )
+    elif jitter != stated:
         notes.append(
             f"The instants at which rows are read jitter by {1e3 * jitter:.3g} ms (standard"
             f" deviation; stated: {1e3 * stated:.3g} ms): readings are the less sure the faster"

@@ -222,6 +222,7 @@ _NEAR = 0.3  # of the best fitted score: below it a candidate is not judged
 _WORTH = 0.1  # of the best screened score: below it a candidate is not fitted
 _PAIRED = 6  # candidates that are tried in pairs where no single one helps
 _REFUSED = 3  # effects that may turn out to be none before a search ends
+_OTHER = 0.05  # of a jitter, by which it is another one than the search was made with
 _NIBBLED = 0.5  # of what is lacking, that an effect leaves after which a calibration is tried again
 Progress = Callable[[str, float], None]
 
@@ -279,7 +280,8 @@ def search(
     candidates = timed(candidates, base)
     grown, teeth = _begun(evidence, base, candidates, tell)
     jittered = evidence.with_jitter(grown.now)
-    if jittered is not grown.now:  # hidden before by what the model lacked
+    before, after = (judged.tracks[0].levels.jitter for judged in (grown.now, jittered))
+    if abs(after - before) > _OTHER * max(after, before):  # before, what the model lacked hid it
         tell("search again with instants that jitter", 0.03)
         evidence.set_base(jittered)
         base = evidence.set_base(evidence.judged(Guess(), reopened=True))

@@ -101,3 +101,38 @@ def test_what_a_rival_leaves_needless_is_taken_out(monkeypatch, score, left):
     found = search._compared(evidence, judged(), grown, lambda *_: None)
     assert [h.name for h in found.guess.hypotheses] == left
     assert len(found.without) == len(found.charges) == len(found.rivals) == len(left)
+
+
+def test_a_calibration_is_tried_again_beside_effects_that_take_little(monkeypatch):
+    """Trial 0005 of seed 744: it lost to a large effect, and nine numbers were named one by one."""
+    added = hypotheses(load_machine("cat215"), ["valve_gain"])
+    lacks, options, tried = [1000.0, 400.0, 390.0, 100.0], [], []
+    for count in (1, 2, 3):
+        guess = Guess(tuple((h, np.zeros(h.size)) for h in added[:count]))
+        options.append([(Judged(guess, (), 1000.0 - 100.0 * count), 100.0)])
+    options.append([])  # nothing more is found
+
+    def calibrated(evidence, now):
+        tried.append(len(now.guess.parts))
+        return None, 0.0
+
+    fit = Fit(Guess(), 0.0, 0.0, 0.0, np.eye(1))
+    for name, value in {
+        "calibrated": calibrated,
+        "screen": lambda *_: [],
+        "_best_singles": lambda *_: options.pop(0),
+        "fit_until_settled": lambda _, judged: (judged, fit),
+        "_shaped_settled": lambda _, judged, settled: (judged, settled),
+        "promoted": lambda *_: None,
+        "lacking": lambda judged, _: lacks[len(judged.guess.parts)],
+        "_lacked": lambda _, candidates, now: candidates,
+        **dict.fromkeys(("worth_naming", "differs_significantly"), lambda *_: True),
+        "strained": lambda *_: False,
+    }.items():
+        monkeypatch.setattr(search, name, value)
+    evidence: Any = SimpleNamespace(set_base=lambda judged: judged)
+    base = Judged(Guess(), (), 1000.0)
+    grown = search._grow(evidence, base, search._Grown(base), added, lambda *_: None)
+    assert len(grown.now.guess.parts) == 3
+    # at first; beside one, as the second leaves nearly all; and where nothing more is found
+    assert tried == [0, 1, 3]

@@ -5,9 +5,12 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from hydrotele.effects import apply_effect
+from hydrotele.effects.effect import changed
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess
 from hydrotele.estimate.levels import with_jitter
+from hydrotele.gap.find import find_gap
+from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine_file import load_machine
@@ -51,7 +54,7 @@ def levels(data):
     try:
         tracks = evidence.set_base(Guess()).tracks
         again = with_jitter(evidence.data, data.machine, tracks)
-        assert again is tracks  # found once or never
+        assert again[0].levels.jitter == pytest.approx(tracks[0].levels.jitter, rel=0.05)
         return tracks[0].levels
     finally:
         evidence.close()
@@ -65,8 +68,10 @@ def test_jitter_and_noise_are_told_apart(truth, tmp_path):
     np.testing.assert_allclose(found.noise, data.noise, rtol=0.15)  # 3.3 standard deviations
 
 
-def test_a_steady_clock_is_left_alone(truth, tmp_path):
-    assert levels(dataset(truth, load_machine("cat215"), tmp_path, 0.0)).jitter == 0.0
+@pytest.mark.parametrize("stated", [0.0, 0.002])
+def test_a_steady_clock_is_left_alone(truth, tmp_path, stated):
+    machine = changed(load_machine("cat215"), f"sensors.{SITE}.jitter", stated)
+    assert levels(dataset(truth, machine, tmp_path, 0.0)).jitter == 0.0
 
 
 @pytest.mark.parametrize("name, place, values", [
@@ -77,6 +82,21 @@ def test_what_a_model_lacks_is_not_taken_for_jitter(truth, tmp_path, name, place
     """Its errors grow with the rates as well, but the channels ask for different times."""
     wrong = apply_effect(load_machine("cat215"), name, place, values)
     assert levels(dataset(truth, wrong, tmp_path, 0.0)).jitter == 0.0
+
+
+def test_jitter_that_another_lack_hides_is_found_with_it(truth, tmp_path):
+    """By the given machine an angle is read 50 ms late, and its errors hide what the clock does."""
+    wrong = apply_effect(load_machine("cat215"), "angle_delay", "boom", {"delay": 0.05})
+    data = dataset(truth, wrong, tmp_path, JITTER)
+    assert levels(data).jitter == 0.0
+    gap = find_gap(data, effects=("angle_delay", "valve_gain"))
+    assert [(e.name, e.location) for e in gap.effects] == [("angle_delay", "boom")]
+    late = gap.effects[0].parameters["delay"]
+    assert late.value < 3.0 * (late.high - late.low) / (2.0 * 1.96)  # it is read at once
+    found = gap_document(gap)["jitter"]
+    assert found["stated"] == 0.0 and found["found"] == pytest.approx(JITTER, rel=0.1)
+    assert gap.patched.sensors[SITE].jitter == found["found"]
+    assert any("jitter" in note for note in gap.notes)
 
 
 def test_a_logger_that_jitters_reads_all_channels_at_its_own_instants():
