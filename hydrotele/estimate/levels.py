@@ -228,9 +228,8 @@ def _agree_on_jitter(tracks: Sequence[Track]) -> bool:
     with np.errstate(divide="ignore", invalid="ignore"):  # channels that never move say nothing
         off, spread = slope / information, np.sqrt(2.0 / information)
     told = spread < _TOLD_JITTER
-    return np.count_nonzero(told) > 1 and bool(
-        np.all(np.abs(off) < _ALIKE + 3.0 * spread, where=told)
-    )
+    alike = np.abs(off[told]) < _ALIKE + 3.0 * spread[told]
+    return len(alike) > 1 and bool(alike.all())
 
 
 def _has_gap(machine: Machine) -> bool:
