@@ -61,6 +61,7 @@ class HorizonError:
         rms: (c,) RMS error over all rows of all windows; infinite where one diverged, NaN without
             a reading [channel's unit].
         final: (c,) the same of the windows' last rows.
+        each: (w, c) RMS error of every window.
         median: (c,) median over the windows of each window's RMS error.
     """
 
@@ -69,6 +70,7 @@ class HorizonError:
     diverged: int
     rms: np.ndarray
     final: np.ndarray
+    each: np.ndarray
     median: np.ndarray
 
 
@@ -266,7 +268,7 @@ def _judge(runner: Runner, run: RunData, starts: np.ndarray, count: int) -> Hori
     return HorizonError(
         seconds=count * run.period, windows=len(starts), diverged=int(gone.sum()),
         rms=_rms(error.reshape(-1, error.shape[2])), final=_rms(error[:, -1]),
-        median=np.array([_median(column) for column in each.T]),
+        each=each, median=np.array([_median(column) for column in each.T]),
     )  # fmt: skip
 
 

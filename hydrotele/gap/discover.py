@@ -29,7 +29,7 @@ from hydrotele.estimate.evidence import Evidence, Judged, flat
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.inputs import SUPPLY, Input, input_sizes
-from hydrotele.estimate.levels import smoothed, smoothed_inputs
+from hydrotele.estimate.levels import columns_of, smoothed, smoothed_inputs
 from hydrotele.estimate.reduced_dynamics import place, supply_of
 from hydrotele.estimate.reduced_model import X, model_space
 from hydrotele.estimate.responses import error_responses
@@ -191,6 +191,7 @@ _STEPS = 3  # of Gauss-Newton for the numbers beside a law
 _DETAIL = 0.05  # of what all laws brought: one that brings less is the last
 _AHEAD = 1.0  # s, of free runs that a law must make better; longer ones drift without readings
 _FAR_AHEAD = 5.0  # s, of those that it must not make worse
+_LOST = 1.0e3  # times the noise: errors of a free run that got lost
 _STEP = 2.0e-3  # s, for the fits
 _MOVES = (-0.25, -0.1, 0.0, 0.1, 0.25)  # s, by which a window's ends are moved
 _LOUD = 0.2  # of the mean square in a window that its ends have
@@ -334,41 +335,45 @@ def _with_law(evidence: Evidence, judged: Judged, law: Learned) -> Judged:
 def _refitted(
     evidence: Evidence, judged: Judged, seen: Sequence[_Seen], law: Learned
 ) -> Learned | None:
-    """A law with what the machine that has it still lacks in its form; None for nothing."""
-    inputs = judged.tracks[0].levels.inputs
-    i = next((n for n in inputs if n.name == f"{_side(law.balance)}.{law.axis}"), None)
-    if i is None or (law.balance == THROUGH and Input("flow_rod", law.axis) not in inputs):
-        return None
-    more = _regressed(judged, seen, (i, law.balance, law.table))
+    """A law with what the machine that has it still lacks in its form; None for nothing.
+
+    Where its input is no longer needed, readings tell the entries far better than beside it: what
+    they have wrong adds up then. That matters in free runs.
+    """
+    levels, case = judged.tracks[0].levels, (_input(law.balance, law.axis), law.balance, law.table)
+    known = dict(zip(levels.inputs, levels.sizes, strict=True))
+    spread = float(np.sqrt(np.mean(np.diag(law.covariance))))
+    more = _regressed(evidence, judged, seen, case, known.get(case[0], spread))
     if more.predicted < ENTER:
         return None
-    entries = law.entries + more.entries
-    found = more._replace(entries=entries)
-    return _law(evidence.data.machine, (i, law.balance, law.table), found, seen, law.hypothesis)
+    found = more._replace(entries=law.entries + more.entries)
+    return _law(evidence.data.machine, case, found, seen, law.hypothesis)
 
 
-def _side(balance: str) -> str:
-    return "flow_head" if balance == THROUGH else balance
+def _input(balance: str, axis: str) -> Input:
+    """The unknown input in whose place a law of a balance is."""
+    return Input("flow_head" if balance == THROUGH else balance, axis)
 
 
 class _OpenLoop(NamedTuple):
     """Errors of free runs in units of the noise; NaN where all runs are shorter.
 
     Attributes:
-        median: of the windows of `_AHEAD`, RMS over the channels: one window that diverges says
-            nothing of the others.
+        usual: geometric mean over the windows of `_AHEAD` of their RMS over rows and channels, none
+            below the noise: one window that diverges says little of the others, and most of them
+            nothing of a law that rarely acts.
         rms: over all rows of these windows.
         far: the same of windows of `_FAR_AHEAD`.
     """
 
-    median: float
+    usual: float
     rms: float
     far: float
 
 
 def _better(now: _OpenLoop, before: _OpenLoop) -> bool:
     """Whether free runs are better, none got lost and long ones are no worse."""
-    short = np.isnan(now.median) or (now.median < before.median and now.rms <= before.rms)
+    short = np.isnan(now.usual) or (now.usual < before.usual and now.rms <= before.rms)
     return bool(short and (np.isnan(now.far) or now.far <= before.far))
 
 
@@ -384,16 +389,16 @@ def _open_loop(
     def sizes(run: RunData) -> np.ndarray:
         found = free_run_errors(prepare(run), run, (_AHEAD, _FAR_AHEAD), to_end=False).horizons
         near, far = (found.get(f"{seconds:g}") for seconds in (_AHEAD, _FAR_AHEAD))
-        nothing = np.full(len(noise), np.nan)
-        return np.array([
-            near.median / noise if near else nothing, near.rms / noise if near else nothing,
-            far.rms / noise if far else nothing,
-        ])  # fmt: skip
+        if near is None:
+            return np.full(3, np.nan)
+        each = np.sqrt(np.nanmean((near.each / noise) ** 2, axis=1))
+        squares = [np.nanmean((h.rms / noise) ** 2) if h else np.nan for h in (near, far)]
+        return np.array([np.nanmean(np.log(np.clip(each, 1.0, _LOST))), *squares])
 
-    squares = np.array(evidence.map(sizes, runs)) ** 2
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # no window is long enough
-        return _OpenLoop(*np.sqrt(np.nanmean(squares, axis=(0, 2))).tolist())
+        warnings.simplefilter("ignore", RuntimeWarning)  # no window is long enough, nothing is read
+        usual, rms, far = np.nanmean(evidence.map(sizes, runs), axis=0)
+    return _OpenLoop(float(np.exp(usual)), float(np.sqrt(rms)), float(np.sqrt(far)))
 
 
 @compiled
@@ -467,8 +472,12 @@ def _candidates(
 
     def tried(cases: Sequence[_Case]) -> list[tuple[_Case, Regression]]:
         cases = [c for c in cases if (c[1], c[0].axis, *c[2].kind) not in taken]
-        return list(zip(cases, evidence.map(lambda c: _regressed(judged, seen, c), cases),
-                        strict=True))  # fmt: skip
+        sizes = dict(zip(levels.inputs, levels.sizes.tolist(), strict=True))
+
+        def one(case: _Case) -> Regression:
+            return _regressed(evidence, judged, seen, case, sizes[case[0]])
+
+        return list(zip(cases, evidence.map(one, cases), strict=True))
 
     looked = []
     for rank, k in enumerate(order[:_LARGEST]):
@@ -565,19 +574,23 @@ def _likely_pairs(
     return [tables[k] for k in np.argsort(found)[::-1][:_PAIRS]]
 
 
-def _regressed(judged: Judged, seen: Sequence[_Seen], case: _Case) -> Regression:
-    """Regression of a table in the place of an unknown input."""
+def _regressed(
+    evidence: Evidence, judged: Judged, seen: Sequence[_Seen], case: _Case, size: float
+) -> Regression:
+    """Regression of a table in the place of an unknown input of some size, if it is there."""
     i, balance, table = case
-    levels = judged.tracks[0].levels
-    k = levels.inputs.index(i)
+    inputs = (i, Input("flow_rod", i.axis)) if balance == THROUGH else (i,)
+    machine, there = judged.guess.machine(evidence.data.machine), judged.tracks[0].levels.inputs
     parts = []
     for track, s in zip(judged.tracks, seen, strict=True):
-        column = track.columns[:, k]
-        if balance == THROUGH:
-            column = track.columns[:, levels.inputs.index(Input("flow_rod", i.axis))] - column
+        if set(inputs) <= set(there):
+            columns = track.columns[:, [there.index(n) for n in inputs]]
+        else:
+            columns = columns_of(machine, track, inputs)
+        column = columns[:, 1] - columns[:, 0] if balance == THROUGH else columns[:, 0]
         shares = table.columns(s.values[i.axis])
         parts.append((track, column, np.where(s.known[:, None], shares, 0.0)))
-    return regression(table, parts, float(levels.sizes[k]))
+    return regression(table, parts, size)
 
 
 def _moved_windows(window: tuple[float, ...]) -> list[tuple[float, float]]:

@@ -5,6 +5,8 @@ into the head side that goes with the position in waves and with the square of t
 """
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import columns_of
 from hydrotele.estimate.responses import error_responses
 from hydrotele.estimate.track import track_run
+from hydrotele.gap import discover
 from hydrotele.gap.discover import Regression, _better, _law, _OpenLoop, _Seen, at_a_glance
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.law_tables import Table, paired_tables, possible_tables
@@ -200,3 +203,21 @@ def test_a_smooth_surface_is_found_among_other_tables():
 )
 def test_a_law_is_kept_where_free_runs_get_better_and_none_is_lost(now, before, kept):
     assert _better(_OpenLoop(*now), _OpenLoop(*before)) is kept
+
+
+def test_one_lost_window_says_little_and_what_is_below_noise_nothing(monkeypatch):
+    """Nine windows at half the noise and one lost: 1000^(1/10); the mean square tells the loss."""
+    each = np.full((10, 2), 0.5)
+    each[3] = np.inf
+    near = SimpleNamespace(each=each, rms=np.array([np.inf, 2.0]))
+    found = SimpleNamespace(horizons={"1": near})
+    monkeypatch.setattr(discover, "machine_runner", lambda *_: lambda run: None)
+    monkeypatch.setattr(discover, "free_run_errors", lambda *_, to_end: found)
+    evidence: Any = SimpleNamespace(
+        data=SimpleNamespace(machine=None), map=lambda f, x: [*map(f, x)]
+    )
+    judged: Any = SimpleNamespace(guess=SimpleNamespace(machine=lambda machine: machine))
+    run: Any = None
+    ahead = discover._open_loop(evidence, [run], judged, np.ones(2))
+    assert ahead.usual == pytest.approx(1000.0**0.1) and ahead.rms == np.inf
+    assert np.isnan(ahead.far)
