@@ -9,8 +9,8 @@ import pytest
 from hydrotele.gap.result import gap_document
 
 _KEYS = {
-    "verdict", "effects", "calibration", "learned", "unknown", "lacks", "noise", "gap", "tests",
-    "laws", "next_experiment", "notes", "seconds",
+    "verdict", "effects", "calibration", "learned", "unknown", "lacks", "noise", "jitter", "gap",
+    "tests", "laws", "next_experiment", "notes", "seconds",
 }  # fmt: skip
 
 
@@ -24,6 +24,7 @@ def test_keys_are_the_fixed_ones(gap_of, verdict):
     document = _read(gap_of(verdict))
     assert document.keys() == _KEYS and document["verdict"] == verdict
     assert document["gap"].keys() == {"metric", "before", "after", "noise_floor"}
+    assert document["jitter"] == {"found": 0.0, "stated": 0.0}
     assert (document["unknown"] is None) == (verdict not in ("unknown", "partly"))
     assert (document["next_experiment"] is None) == (verdict != "ambiguous")
 

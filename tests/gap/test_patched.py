@@ -63,3 +63,10 @@ def test_calibrated_numbers_and_learned_laws_come_back(tmp_path, gap_of):
     record = yaml.safe_load((tmp_path / "effects.yaml").read_text())
     assert record["calibration"]["mass.stick"]["nominal"] == 610.0
     assert record["learned"][0]["formula"] == "-3e+05 above(position, 0.55)"
+
+
+def test_jitter_of_the_logger_is_said(tmp_path, gap_of):
+    write_patch(dataclasses.replace(gap_of("named"), jitter=(0.003, 0.0)), tmp_path)
+    assert "# - jitter of the sensors: 3 ms, was 0 ms" in (tmp_path / "machine.yaml").read_text()
+    record = yaml.safe_load((tmp_path / "effects.yaml").read_text())
+    assert record["jitter"] == {"found": 0.003, "stated": 0.0}
