@@ -161,12 +161,10 @@ class Evidence:
             return judged
         machine = judged.guess.machine(self.data.machine)
         tracks = with_jitter(self.data, machine, judged.tracks, self.map, self.step)
+        if tracks is judged.tracks:
+            return judged
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
-        return (
-            judged
-            if tracks is judged.tracks
-            else Judged(judged.guess, tracks, loss + _prior(judged.guess))
-        )
+        return Judged(judged.guess, tracks, loss + _prior(judged.guess))
 
     def set_base(self, guess: Guess | Judged) -> Judged:
         """Compute gains anew for a guess; later errors are whitened with them."""

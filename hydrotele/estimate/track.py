@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import fminbound
+from scipy.signal import savgol_filter
 
 from hydrotele.effects.transmission import ringing
 from hydrotele.estimate.filter import (
@@ -270,7 +271,7 @@ STARTLE = {
     "added_delivery": 0.1,
 }
 
-_SLOPE, _SIDE = np.array([-2.0, -1.0, 0.0, 1.0, 2.0]) / 10.0, 2  # of a line through five rows
+_ROWS_OF_A_RATE = 5
 _DOUBT = 3.0  # times a reading's noise: lacks of pressure below it are taken for noise
 _LOOK = 3.0  # s at a run's start that tell where drives rested in their backlash
 
@@ -343,17 +344,18 @@ def row_variances(levels: Levels, run: RunData, rates: np.ndarray | None = None)
 def squared_rates(run: RunData) -> np.ndarray:
     """(n, c) squares of the rates of a run's readings, over as many as one is the mean of.
 
-    Rates are slopes of straight lines through five rows, missing ones filled in linearly.
+    Rates are slopes of straight lines through five rows, missing ones filled in linearly; 0 of a
+    channel that was never read, and in a run of fewer rows.
     """
-    rows, channels = run.reading.shape
-    found, clock = np.zeros((rows, channels)), np.arange(rows)
-    for c in range(channels):
-        good = np.isfinite(run.reading[:, c])
-        if rows < len(_SLOPE) or np.count_nonzero(good) < 2:
-            continue
-        whole = np.pad(np.interp(clock, clock[good], run.reading[good, c]), _SIDE, mode="edge")
-        found[:, c] = np.convolve(whole, _SLOPE[::-1], mode="valid") / run.period
-    return found**2 if run.behind is None else found**2 / run.behind
+    whole, clock = np.zeros(run.reading.shape), np.arange(len(run.reading))
+    for c, reading in enumerate(run.reading.T):
+        if (good := np.isfinite(reading)).any():
+            whole[:, c] = np.interp(clock, clock[good], reading[good])
+    if len(whole) < _ROWS_OF_A_RATE:
+        return np.zeros(whole.shape)
+    rates = savgol_filter(whole, _ROWS_OF_A_RATE, 1, deriv=1, delta=run.period, axis=0)
+    found = np.asarray(rates) ** 2
+    return found if run.behind is None else found / run.behind
 
 
 def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
