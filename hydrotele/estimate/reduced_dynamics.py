@@ -26,6 +26,7 @@ from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate
 from hydrotele.hydraulics.circuit import (
     actuator_stop,
     add_to_commands,
+    advance_memories,
     circuit_supply,
     delivered_share,
     drive_state,
@@ -531,10 +532,13 @@ def advance(model, sp, z, command, row, period, steps, trail):
                 add_commands(model, sp, h)
                 given = GIVEN
             first = np.int64(0)  # numba compiles a function anew for a written number
-            step_circuit(
+            _, supply = step_circuit(
                 model.user, first, count, act, drive[given], drive[X], drive[V], h, sp.act_dot,
                 sp.scratch, model.terms, sp.time[0], model.memory,
             )  # fmt: skip
+            if model.memory >= 0 and len(model.terms) > 0:
+                drives = Drives(count, act, drive[X], drive[V], drive[COMMAND])
+                advance_memories(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], supply)
             for k in range(4 * count):
                 act[k] += h * sp.act_dot[k]
         if model.memory >= 0:

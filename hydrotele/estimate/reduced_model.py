@@ -5,13 +5,17 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.hydraulics.circuit import NO_MEMORY, SCRATCH
-from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters, extra_state_names
+from hydrotele.hydraulics.parameters import (
+    actuator_order,
+    actuator_parameters,
+    extra_state_names,
+    terms_of,
+)
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import parse_channel
 from hydrotele.multibody.reduced_mechanism import ReducedMechanism, coordinate_names, mechanism
 from hydrotele.multibody.reduced_motion import ReducedMotion, motion_space
-from hydrotele.terms.table import terms_table
 
 POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)
 _KINDS = {
@@ -26,9 +30,10 @@ class Model(NamedTuple):
     """Numbers of the reduced model; n independent coordinates, t transmissions, h valves.
 
     A state is `(n positions, t drive positions, n rates, t drive rates, 4 h activations)` and what
-    bristles and a slow pump remember, see `parameters.extra_state_names`. Its pressures are those
-    that the oil would have if it held its air (`laws.pressure_without_air`): any number is one,
-    which a filter needs, and they are the felt ones wherever these are not below the atmosphere's.
+    bristles, a slow pump and terms remember, see `parameters.extra_state_names`. Its pressures are
+    those that the oil would have if it held its air (`laws.pressure_without_air`): any number is
+    one, which a filter needs, and they are the felt ones wherever these are not below the
+    atmosphere's.
 
     Attributes:
         mech: the mechanism.
@@ -138,7 +143,7 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         scale=np.array([e.scale for e in errors], float),
         offset=np.array([e.offset for e in errors], float),
         lag=np.array([e.delay for e in errors], float),
-        terms=terms_table(machine.terms, order),
+        terms=terms_of(machine),
         time_constant=np.array([e.time_constant for e in errors], float),
         memory=len(extra_state_names(machine)) or NO_MEMORY,
     )

@@ -44,7 +44,7 @@ _WIDE = {
     "position": 0.02, "drive": 0.0, "rate": 0.05, "drive_rate": 0.0, "spool": 0.02,
     "spool_rate": 0.2, "pressure_head": 1e6, "pressure_rod": 1e6,
     "speed": 1.0, "pressure_load": 1e5, "bristle": 0.5, "delivery": 0.3,
-    "added_delivery": 0.1,
+    "added_delivery": 0.1, "memory": 0.0,
 }  # fmt: skip
 _SLIP = 0.01  # m/s or rad/s, rate at which a drive may leave its load
 _LOOSE = 0.02  # of the backlash, within which a drive's rest is known once it was looked for
@@ -248,7 +248,8 @@ _NUDGE = {
     "position": 1e-6, "drive": 1e-6, "rate": 1e-5, "drive_rate": 1e-5, "spool": 1e-5,
     "spool_rate": 1e-3, "pressure_head": 100.0, "pressure_rod": 100.0,
     "speed": 1e-3, "pressure_load": 100.0,
-    "bristle": 1e-3, "delivery": 1e-4, "added_delivery": 1e-4, "late": 1.0, "input": 1.0,
+    "bristle": 1e-3, "delivery": 1e-4, "added_delivery": 1e-4, "memory": 1e-3, "late": 1.0,
+    "input": 1.0,
 }  # fmt: skip
 # What 20 ms may add to a state beyond the model: integrator error, not physics.
 DRIFT = {

@@ -12,7 +12,7 @@ from hydrotele.effects import EFFECTS
 from hydrotele.estimate.inputs import SUPPLY, Input, input_units
 from hydrotele.gap.customary import amount, in_customary_units
 from hydrotele.gap.discover import Discovery, Learned
-from hydrotele.gap.law_tables import THROUGH
+from hydrotele.gap.law_tables import AHEAD, PLAYED, THROUGH, Memory
 from hydrotele.gap.result import (
     LIKELY,
     SURE,
@@ -29,7 +29,9 @@ from hydrotele.gap.result import (
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import OF_A_DRIVE
+from hydrotele.terms.table import SWITCH
 
+_PLAYED, _AHEAD = "played ", "lead of the "  # of a variable and its play
 _PLACES = {"tool": "at the tool", "base": "of the base", "all": "of all axes"}
 _SIDES = {"head": "head side", "rod": "rod side"}
 _COUNTS = ("no place", "one place", "two places", "three places", "four places")
@@ -93,17 +95,19 @@ def channel_words(channel: str) -> str:
 def variable_words(variable: str) -> str:
     """A variable of a learned law in plain words.
 
-    >>> variable_words("pressure_rod.swing")
-    'rod side pressure of the swing'
+    >>> variable_words("pressure_rod.swing"), variable_words("played velocity")
+    ('rod side pressure of the swing', 'played velocity')
     """
     name, _, axis = variable.partition(".")
-    words = _VARIABLES.get(name, name.replace("_", " "))
+    front = next((front for front in (_PLAYED, _AHEAD) if name.startswith(front)), "")
+    plain = name.removeprefix(front)
+    words = front + _VARIABLES.get(plain, plain.replace("_", " "))
     return f"{words} of the {axis}" if axis else words
 
 
 def learned_words(
     balance: str, axis: str, variable: str, size: float, unit: str, resembles: str,
-    other: str = "", window: Sequence[float] = (),
+    other: str = "", when: str = "",
 ) -> str:  # fmt: skip
     """What a learned law does, in a sentence or two.
 
@@ -114,16 +118,32 @@ def learned_words(
     if other:
         how += f" and the {variable_words(other)}"
     how = how.replace("the position", "position").replace("the time", "time")
-    if window:
-        how += f", from {window[0]:.3g} to {window[1]:.3g} s"
+    how += f", {when}" if when else ""
     text = f"{_capital(_LACKS[balance].format(axis=axis))}, {amount(size, unit)} RMS, {how}."
     return f"{text} It resembles {resembles.replace('_', ' ')}." if resembles else text
+
+
+def memory_words(memory: Memory, unit: str) -> str:
+    """What a learned law remembers, in a few words.
+
+    >>> memory_words(Memory(1, "velocity", 0.0, 0.02), "m/s")
+    'velocity through a play of 20 mm/s to either side'
+    >>> memory_words(Memory(SWITCH, "pressure_rod.boom", 8e6, 1.2e7), "Pa")
+    'on once the rod side pressure of the boom is above 12 MPa, off again below 8 MPa'
+    """
+    what, first = variable_words(memory.variable), amount(memory.end, unit)
+    if memory.way != SWITCH:
+        return f"{what} through a play of {first} to either side"
+    ways = ("above", "below") if memory.end > memory.begin else ("below", "above")
+    last = amount(memory.begin, unit)
+    return f"on once the {what} is {ways[0]} {first}, off again {ways[1]} {last}"
 
 
 def learned_title(law: LearnedLaw) -> str:
     """On what a learned law acts and on what it depends, in a few words."""
     what = _LACKS[law.balance].format(axis=law.axis).partition(" ")[2]
     where = f", at the median {variable_words(law.other)}" if law.other else ""
+    where += f", {law.memory}" if law.memory else ""
     return _capital(f"{what} over {variable_words(law.variable)}{where}")
 
 
@@ -450,32 +470,39 @@ def learned_laws(
 
 def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
     """A law along its (first) variable, with the other variable at its median."""
-    table = law.table
+    table, seen = law.table, dict(law.seen)
+    seen |= table.memory.seen(seen) if table.memory else {}
     variable, other = table.variables[0], table.variables[1] if len(table.variables) > 1 else ""
-    points = np.unique(np.quantile(law.seen[variable], np.linspace(0.01, 0.99, _POINTS)))
+    points = np.unique(np.quantile(seen[variable], np.linspace(0.01, 0.99, _POINTS)))
     probe = {variable: points}
     if other:
-        probe[other] = np.full(len(points), float(np.median(law.seen[other])))
+        probe[other] = np.full(len(points), float(np.median(seen[other])))
     if table.window:
         probe["time"] = np.full(len(points), sum(table.window) / 2.0)
-    columns = table.columns(probe)
+    columns = table._replace(memory=None).columns(probe)
     error = np.sqrt(np.maximum(np.einsum("pk,kl,pl->p", columns, law.covariance, columns), 0.0))
     along = table.columns(law.seen) @ law.entries
     balance = "flow_head" if law.balance == THROUGH else law.balance
     (unit,) = input_units(machine, [Input(balance, law.axis)])
-    resembles = "" if table.of or table.window else _resembles(law, along)
-    name, _, axis = variable.partition(".")
-    length = "rad" if _turns(machine, axis or law.axis) else "m"
+    resembles = "" if table.of or table.window or table.memory else _resembles(law, along)
+    if table.memory:
+        names = {PLAYED: _PLAYED + table.memory.variable, AHEAD: _AHEAD + table.memory.variable}
+        variable, other = (names.get(v, v) for v in (variable, other))
+    when = "from {:.3g} to {:.3g} s".format(*table.window) if table.window else ""
+    memory = ""
+    if table.memory:
+        memory = memory_words(table.memory, _variable_unit(machine, law, table.memory.variable))
+        when = " and ".join([memory, *([when] if when else [])])
     size = float(np.sqrt(np.mean(along**2)))
     if law.balance == SUPPLY:
         variable, other = (_with_axis(v, law.axis) for v in (variable, other))
     return LearnedLaw(
         law.balance, law.axis, _formula(law),
         learned_words(
-            law.balance, law.axis, variable, size, unit, resembles, other, table.window
+            law.balance, law.axis, variable, size, unit, resembles, other, when
         ),
         resembles, variable, tuple(points.tolist()), tuple((columns @ law.entries).tolist()),
-        tuple(error.tolist()), unit, _unit_of(name, unit, length), share, other,
+        tuple(error.tolist()), unit, _variable_unit(machine, law, variable), share, other, memory,
     )  # fmt: skip
 
 
@@ -499,6 +526,11 @@ def _formula(law: Learned) -> str:
         ways = (f"{v}: {len(p)} points from {p[0]:.3g} to {p[-1]:.3g}"
                 for v, p in zip(table.variables, table.points, strict=True))  # fmt: skip
         text = f"table2({'; '.join(ways)})"
+    if table.memory:
+        ((kind, facts),) = table.memory.facts.items()
+        facts = {**facts, "variable": table.memory.variable}
+        told = ", ".join(f"{k} {v:.4g}" for k, v in facts.items() if k != "variable")
+        text += f" {kind}({facts['variable']}, {told})"
     return text + (" from {:.4g} to {:.4g} s".format(*table.window) if table.window else "")
 
 
@@ -507,10 +539,13 @@ def _turns(machine: Machine, axis: str) -> bool:
     return machine.axes[axis].cylinder is None and machine.position_kind(axis) == "angle"
 
 
-def _unit_of(variable: str, unit: str, length: str) -> str:
-    if variable == "force":
+def _variable_unit(machine: Machine, law: Learned, variable: str) -> str:
+    """SI unit of a law's variable."""
+    name, _, axis = variable.removeprefix(_PLAYED).removeprefix(_AHEAD).partition(".")
+    length = "rad" if _turns(machine, axis or law.axis) else "m"
+    if name == "force":
         return "N m" if length == "rad" else "N"
-    return _UNITS.get(variable) or (f"{length}/s" if variable == "velocity" else length)
+    return _UNITS.get(name) or (f"{length}/s" if name == "velocity" else length)
 
 
 def _resembles(law: Learned, along: np.ndarray) -> str:

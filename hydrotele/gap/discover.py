@@ -16,7 +16,7 @@ blurs it. Entries that follow each other are taken to be alike (P-splines, Eiler
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from typing import NamedTuple
@@ -35,7 +35,14 @@ from hydrotele.estimate.reduced_model import X, model_space
 from hydrotele.estimate.responses import error_responses
 from hydrotele.estimate.track import Track, following_model
 from hydrotele.gap.balances import pump_lack
-from hydrotele.gap.law_tables import THROUGH, Table, paired_tables, possible_tables
+from hydrotele.gap.law_tables import (
+    THROUGH,
+    Table,
+    finer_memories,
+    paired_tables,
+    possible_tables,
+    remembering_tables,
+)
 from hydrotele.gap.rivals import ENTER
 from hydrotele.gap.screening import busy_window
 from hydrotele.gap.search import lacking
@@ -181,6 +188,9 @@ LEARNED = "learned"
 _MOST = 3  # laws that are learned one after the other
 _LARGEST = 4  # unknown inputs in whose places laws are looked for
 _COUPLED = 2  # of these, for which variables of other drives are paired, too
+_REMEMBERED = 3  # tables over one and over two variables that are tried with memories
+_MEMORIES = 6  # tables with a memory that are looked at closely, for each lack
+_FINER = (0.4, 0.2, 0.1)  # of a memory's width, by which it is changed
 _PAIRS = 12  # tables over two variables that are looked at closely, for each lack
 _TRIED = 2  # laws that are put into the machine, of all that the regression finds
 _MOSTLY = 0.5  # of the square of what a pump lacks that a law must predict to be tried
@@ -210,6 +220,7 @@ class Learned:
         entries: (K,) of the table [unit of the balance].
         covariance: (K, K) of the entries.
         left: RMS of the lack that it does not take [unit of the balance].
+        charge: what its entries cost, of -2 log likelihood.
         smoothing: of the sign of the velocity [m/s] or [rad/s].
         seen: variable -> values along the fit runs.
     """
@@ -221,6 +232,7 @@ class Learned:
     entries: np.ndarray
     covariance: np.ndarray
     left: float
+    charge: float
     smoothing: float
     seen: Mapping[str, np.ndarray] = field(repr=False)
 
@@ -240,6 +252,18 @@ class Discovery:
     judged: Judged
     laws: tuple[Learned, ...]
     refused: int = 0
+    ahead: "OpenLoop | None" = None
+
+    def stands_for(self, other: "Discovery", charges: float) -> bool:
+        """Whether its laws tell the runs as well as another guess does that has effects, too.
+
+        Args:
+            other: with effects, and laws beside them.
+            charges: what the numbers of these effects cost, of -2 log likelihood.
+        """
+        costs = [d.judged.loss + sum(law.charge for law in d.laws) for d in (self, other)]
+        ahead = self.ahead and other.ahead and better_ahead(self.ahead, other.ahead)
+        return bool(self.laws and ahead and costs[0] <= costs[1] + charges)
 
 
 class _Seen(NamedTuple):
@@ -283,19 +307,21 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
         if found is None:
             break
         now = _open_loop(evidence, evidence.runs, found[0], noise)
-        if not _better(now, ahead):
+        if not better_ahead(now, ahead):
             break
         ahead, fall = now, judged.loss - found[0].loss
         judged, law = found
         laws.append(law)
         if fall < _DETAIL * (begin - judged.loss) or lacking(judged, evidence) < ENTER:
             break
-    if laws and not _better(*(_open_loop(evidence, heldout, j, noise) for j in (judged, bare))):
-        return Discovery(begun, (), len(laws))
+    last, first = (_open_loop(evidence, heldout, j, noise) for j in (judged, bare))
+    if laws and not better_ahead(last, first):
+        return Discovery(begun, (), len(laws), first)
     found = judged.guess.parts
     own = [old if n else new for n, old, new in zip(named, parts, found, strict=False)]
     guess = Guess((*own, *found[len(parts) :]))
-    return Discovery(replace(judged, guess=guess, loss=judged.loss + prior), tuple(laws))
+    judged = replace(judged, guess=guess, loss=judged.loss + prior)
+    return Discovery(judged, tuple(laws), ahead=last)
 
 
 def _best_law(
@@ -355,7 +381,7 @@ def _input(balance: str, axis: str) -> Input:
     return Input("flow_head" if balance == THROUGH else balance, axis)
 
 
-class _OpenLoop(NamedTuple):
+class OpenLoop(NamedTuple):
     """Errors of free runs in units of the noise; NaN where all runs are shorter.
 
     Attributes:
@@ -371,7 +397,7 @@ class _OpenLoop(NamedTuple):
     far: float
 
 
-def _better(now: _OpenLoop, before: _OpenLoop) -> bool:
+def better_ahead(now: OpenLoop, before: OpenLoop) -> bool:
     """Whether free runs are better, none got lost and long ones are no worse."""
     short = np.isnan(now.usual) or (now.usual < before.usual and now.rms <= before.rms)
     return bool(short and (np.isnan(now.far) or now.far <= before.far))
@@ -379,7 +405,7 @@ def _better(now: _OpenLoop, before: _OpenLoop) -> bool:
 
 def _open_loop(
     evidence: Evidence, runs: Sequence[RunData], judged: Judged, noise: np.ndarray
-) -> _OpenLoop:
+) -> OpenLoop:
     """Errors of free runs through some runs over all channels, in units of a noise (c,).
 
     A law is to make simulations better, not only predictions from one reading to the next.
@@ -398,7 +424,7 @@ def _open_loop(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # no window is long enough, nothing is read
         usual, rms, far = np.nanmean(evidence.map(sizes, runs), axis=0)
-    return _OpenLoop(float(np.exp(usual)), float(np.sqrt(rms)), float(np.sqrt(far)))
+    return OpenLoop(float(np.exp(usual)), float(np.sqrt(rms)), float(np.sqrt(far)))
 
 
 @compiled
@@ -495,6 +521,8 @@ def _candidates(
                 pairs = paired_tables(values, speed, rank < _COUPLED, span)
                 tables += _likely_pairs(evidence, seen, levels.inputs, at, pairs)
                 inside = tried([(*at, table) for table in tables])
+                if rank < _COUPLED and not span:
+                    inside += _remembered(evidence, seen, levels.inputs, inside, tried)
                 best = max(inside, key=lambda pair: pair[1].predicted, default=None)
                 if span and best and best[1].predicted > ENTER:
                     ends = {*_moved_windows(window), *_moved_windows(whole)}
@@ -505,12 +533,54 @@ def _candidates(
     return [_law(machine, case, answer, seen) for case, answer in best]
 
 
+def _remembered(
+    evidence: Evidence, seen: Sequence[_Seen], inputs: Sequence[Input],
+    looked: Sequence[tuple[_Case, Regression]], tried: Callable,
+) -> list[tuple[_Case, Regression]]:  # fmt: skip
+    """The likeliest laws with a memory: tables that may do, with what each could remember."""
+    if not looked:
+        return []
+    (i, balance, _), _ = looked[0]
+    values = [s.values[i.axis] for s in seen]
+    best = sorted(looked, key=lambda pair: -pair[1].predicted)
+    single = [case[2] for case, _ in best if len(case[2].variables) == 1]
+    paired = [case[2] for case, _ in best if len(case[2].variables) == 2][:_REMEMBERED]
+    others = [table.variables[0] for table in single]
+    tables = [t for table in [*single, *paired]
+              for t in remembering_tables(table, values, table.variables)]  # fmt: skip
+    for table in single[:_REMEMBERED]:
+        rest = [name for name in others if name not in table.variables]
+        tables += remembering_tables(table, values, rest)
+
+    def judged(some: Sequence[Table]) -> list[tuple[float, Table]]:
+        return list(zip(_glances(evidence, seen, inputs, (i, balance), some), some, strict=True))
+
+    first = sorted(judged(tables), key=lambda pair: -pair[0])
+    likely: list[tuple[float, Table]] = []
+    for share, table in first:  # the best of each kind
+        if table.kind not in [other.kind for _, other in likely]:
+            likely.append((share, table))
+    found = []
+    for share, table in likely[:_MEMORIES]:
+        for step in _FINER:
+            moved = max(judged(finer_memories(table, step)), key=lambda pair: pair[0])
+            share, table = moved if moved[0] > share else (share, table)
+        found.append((i, balance, table))
+    closely = tried(found)
+    if not closely:
+        return []
+    case, answer = max(closely, key=lambda pair: pair[1].predicted)
+    return [*closely, *tried([(i, balance, t) for t in finer_memories(case[2], _FINER[-1])])]
+
+
 def _best_first(looked: Sequence[tuple[_Case, Regression]]) -> list[tuple[_Case, Regression]]:
-    """What is worth its entries, by what it predicts; one variable goes before two."""
+    """What is worth its entries, by what it predicts; what is plain goes first."""
     most = max((answer.predicted for _, answer in looked), default=0.0)
 
     def place(pair: tuple[_Case, Regression]) -> tuple[bool, float]:
-        plain = len(pair[0][2].variables) == 1 and pair[1].predicted >= _PLAINER * most
+        table = pair[0][2]
+        plain = len(table.variables) == 1 and not table.memory
+        plain = plain and pair[1].predicted >= _PLAINER * most
         return not plain, -pair[1].predicted
 
     return sorted((pair for pair in looked if pair[1].predicted > ENTER), key=place)
@@ -560,6 +630,15 @@ def _likely_pairs(
     tables: Sequence[Table],
 ) -> list[Table]:  # fmt: skip
     """Those that take most of an unknown input as the smoother tells it."""
+    found = _glances(evidence, seen, inputs, at, tables)
+    return [tables[k] for k in np.argsort(found)[::-1][:_PAIRS]]
+
+
+def _glances(
+    evidence: Evidence, seen: Sequence[_Seen], inputs: Sequence[Input], at: tuple[Input, str],
+    tables: Sequence[Table],
+) -> list[float]:  # fmt: skip
+    """Share of an unknown input, as the smoother tells it, that each table takes."""
     i, balance = at
     told = [s.inputs[s.known, inputs.index(i)] for s in seen]
     if balance == THROUGH:
@@ -570,8 +649,7 @@ def _likely_pairs(
         shares = [table.columns(s.values[i.axis])[s.known] for s in seen]
         return at_a_glance(table, list(zip(told, shares, strict=True)))
 
-    found = evidence.map(glance, tables)
-    return [tables[k] for k in np.argsort(found)[::-1][:_PAIRS]]
+    return evidence.map(glance, tables)
 
 
 def _regressed(
@@ -640,5 +718,5 @@ def _law(
     hypothesis = Hypothesis(name, known.location if known else f"{i.axis}.{table.name}", {}, change)
     return Learned(
         hypothesis, balance, i.axis, table, found.entries, found.covariance, found.left,
-        _smoothing(machine, i.axis), everywhere,
+        found.charge, _smoothing(machine, i.axis), everywhere,
     )  # fmt: skip

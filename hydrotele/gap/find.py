@@ -62,6 +62,7 @@ _REFUSED = (
 )
 _MINOR = 0.02  # share of the gap up to which something is a detail; laws are rarely closer to a
 # machine than 15 % of what they do
+_OF_LAWS = 0.1  # of what a guess explains, by laws beside effects, from which laws are tried alone
 _TRACE_OF_FORM = 0.005  # share up to which an effect only mends the form of one beside it
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _ALIKE = 1.0e-3  # of the squares of what an effect changes: readings that are alike to 3 %
@@ -333,6 +334,8 @@ def _trust(found: Found, rest: Judged) -> float:
 def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
     """Laws of what the effects leave; of all that is lacking, where none of these can be believed.
 
+    Nor can they where laws alone tell the runs as well: what they do is a part of these.
+
     An effect that takes a small part of a law's work stands in the way of the rest, and nothing
     takes it back where the law does not act.
     """
@@ -343,7 +346,16 @@ def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
         if discovery.laws and discovery.judged.loss < found.judged.loss:
             return bare, discovery
         evidence.set_base(found.judged)
-    return found, discover(evidence, found.judged)
+        return found, discover(evidence, found.judged)
+    beside = discover(evidence, found.judged)
+    fall, whole = found.judged.loss - beside.judged.loss, found.base.loss - beside.judged.loss
+    if rests and beside.laws and fall > _OF_LAWS * whole:
+        bare = _without_effects(evidence, found)
+        alone = discover(evidence, bare.judged)
+        if alone.stands_for(beside, sum(found.charges)):
+            return bare, alone
+        evidence.set_base(beside.judged)
+    return found, beside
 
 
 def _without_effects(evidence: Evidence, found: Found) -> Found:

@@ -1,4 +1,7 @@
-"""Forms that a learned law can have: a table over one or two variables, linear in between."""
+"""Forms that a learned law can have: a table over one or two variables, linear in between.
+
+It may see a variable through a play, or be switched by one, as a relay with hysteresis does.
+"""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -6,8 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hydrotele.core.compiled import compiled
 from hydrotele.terms.facts import OF_A_DRIVE
-from hydrotele.terms.table import acting
+from hydrotele.terms.table import PLAY, SWITCH, acting, remembered
 
 THROUGH = "flow_through"
 """Balance of a flow from the head side to the rod side."""
@@ -21,29 +25,85 @@ _OWN = (
 )  # fmt: skip
 
 
+PLAYED, AHEAD = "played", "ahead"
+"""What a law's play lets through of its variable, and by how much the variable is ahead of it."""
+
+
+class Memory(NamedTuple):
+    """How a law remembers a variable.
+
+    Attributes:
+        way: PLAY or SWITCH of `terms.table`.
+        variable: as of a table [its unit].
+        begin: 0 of a play; where a switch goes off.
+        end: half width of a play; where a switch goes on.
+    """
+
+    way: int
+    variable: str
+    begin: float
+    end: float
+
+    def along(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(n,) what is remembered along a run [1], see `terms.table.remembered`."""
+        x = (np.asarray(values[self.variable], float) - self.begin) / (self.end - self.begin)
+        return _along(self.way, x)
+
+    def seen(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """What a law sees of it along a run, (n,) each: `PLAYED` and `AHEAD` of a play."""
+        if self.way != PLAY:
+            return {}
+        played = self.end * self.along(values)
+        return {PLAYED: played, AHEAD: np.asarray(values[self.variable]) - played}
+
+    @property
+    def facts(self) -> dict[str, dict[str, Any]]:
+        """Keys of a term."""
+        plain = self.variable.partition(".")[0]
+        if self.way == PLAY:
+            return {"play": {"variable": plain, "half_width": self.end}}
+        return {"switch": {"variable": plain, "on": self.end, "off": self.begin}}
+
+
+@compiled
+def _along(way, x):
+    """What is remembered after each of (n,) values; what is not known changes nothing."""
+    held, out = 0.0, np.empty(len(x))
+    for k in range(len(x)):
+        if np.isfinite(x[k]):
+            held = remembered(way, held, x[k])
+        out[k] = held
+    return out
+
+
 class Table(NamedTuple):
     """A form that a law can have: entries at points of one or two variables.
 
     Attributes:
         variables: one or two of a drive's state; those of another drive with its axis, such as
-            `velocity.swing`.
+            `velocity.swing`; `PLAYED` and `AHEAD` of a play.
         points: rising points of each [its unit].
         window: times between which it acts [s]; empty for always.
+        memory: what it remembers, if it does.
     """
 
     variables: tuple[str, ...]
     points: tuple[tuple[float, ...], ...]
     window: tuple[float, ...] = ()
+    memory: Memory | None = None
 
     @property
-    def kind(self) -> tuple[tuple[str, ...], bool]:
-        """Variables, and whether it acts for a while only."""
-        return self.variables, bool(self.window)
+    def kind(self) -> tuple[tuple[str, ...], bool, int]:
+        """Variables, whether it acts for a while only, and in what way it remembers."""
+        return self.variables, bool(self.window), self.memory.way if self.memory else 0
 
     @property
     def name(self) -> str:
         """On what it depends, such as `spool,time`."""
         text = ",".join(self.variables)
+        if self.memory:
+            m = self.memory
+            text += f"@{m.variable}~{m.end:.4g}" + (f"/{m.begin:.4g}" if m.begin else "")
         return text + (f"@{self.window[0]:.4g}-{self.window[1]:.4g}" if self.window else "")
 
     @property
@@ -54,14 +114,27 @@ class Table(NamedTuple):
     @property
     def of(self) -> dict[str, str]:
         """Variable -> the drive that it is of, where that is not the law's own."""
-        return dict(v.split(".") for v in self.variables if "." in v)
+        named = (*self.variables, *([self.memory.variable] if self.memory else []))
+        return dict(v.split(".") for v in named if "." in v)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether no two of its variables are only told apart by their drives."""
+        memory = [self.memory.variable] if self.memory else []
+        named = {v for v in (*self.variables, *memory) if v not in (PLAYED, AHEAD)}
+        return len({v.partition(".")[0] for v in named}) == len(named)
 
     def columns(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(n, K) shares of the entries along data; row by row they add to 1 where the law acts."""
+        """(n, K) shares of the entries along a run; row by row they add to 1 where the law acts."""
+        held = self.memory.along(values) if self.memory else None
+        if held is not None and self.memory and self.memory.way == PLAY:
+            values = {**values, **self.memory.seen(values)}
         found = _shares(values[self.variables[0]], self.points[0])
         if len(self.variables) == 2:
             across = _shares(values[self.variables[1]], self.points[1])
             found = (found[:, :, None] * across[:, None]).reshape(len(found), -1)
+        if held is not None and self.memory and self.memory.way == SWITCH:
+            found *= held[:, None]
         if self.window:
             found *= acting(values["time"], *self.window)[:, None]
         return found
@@ -79,6 +152,7 @@ class Table(NamedTuple):
         """Law, parameters, variables and window of a term with some entries (K,)."""
         plain, points = [v.partition(".")[0] for v in self.variables], self.points
         where = {"of": self.of, "window": self.window or None}
+        where |= self.memory.facts if self.memory else {}
         if len(plain) == 1:
             table = {"variable": plain[0], "points": points[0], "values": tuple(entries.tolist())}
             return {"law": "linear_table", "parameters": table, **where}
@@ -143,6 +217,73 @@ def paired_tables(
         Table((a, b), (points[a], points[b]), window) for a, b in pairs
         if a.partition(".")[0] != b.partition(".")[0]
         and a.partition(".")[2] in ("", b.partition(".")[2] or a.partition(".")[2])
+    ]  # fmt: skip
+
+
+_WAYS = 3  # points over how far a variable is ahead of its play: both ways and between
+_WIDTHS = (0.06, 0.15, 0.3)  # half widths of plays, of the variable's range
+_THRESHOLDS = ((0.75, 0.25), (0.9, 0.5), (0.5, 0.1))  # quantiles at which a switch goes on and off
+
+
+def remembering_tables(
+    table: Table, values: Sequence[Mapping[str, np.ndarray]], variables: Sequence[str]
+) -> list[Table]:
+    """A table with every memory that is tried at first.
+
+    Args:
+        table: without a memory.
+        values: as of `possible_tables`.
+        variables: that may be remembered; of a play only those of the table.
+
+    Returns:
+        The tables; none whose variables only their drives tell apart.
+    """
+    found = []
+    for name in variables:
+        if name == "time":
+            continue
+        x = np.concatenate([v[name] for v in values])
+        x = x[np.isfinite(x)]
+        low, high = np.quantile(x, [0.01, 0.99]) if len(x) else (0.0, 0.0)
+        if not high > low:
+            continue
+        for width in _WIDTHS if name in table.variables else ():
+            play = Memory(PLAY, name, 0.0, float(width * (high - low)))
+            through = tuple(PLAYED if v == name else v for v in table.variables)
+            found.append(table._replace(variables=through, memory=play))
+            if len(table.variables) == 1:
+                ways = tuple((play.end * np.linspace(-1.0, 1.0, _WAYS)).tolist())
+                found.append(Table((AHEAD,), (ways,), memory=play))
+                found.append(Table((name, AHEAD), (*table.points, ways), memory=play))
+        for on, off in _THRESHOLDS:
+            upper, lower = np.quantile(x, [on, off])
+            if upper > lower:
+                for ends in ((lower, upper), (upper, lower)):
+                    switch = Memory(SWITCH, name, *map(float, ends))
+                    found.append(table._replace(memory=switch))
+    return [table for table in found if table.is_clear]
+
+
+def _over(table: Table, memory: Memory) -> Table:
+    """A table with another memory; points over what is ahead go with its width."""
+    assert table.memory
+    ratio = memory.end / table.memory.end if memory.way == PLAY else 1.0
+    points = tuple(
+        tuple(ratio * x for x in own) if name == AHEAD else own
+        for name, own in zip(table.variables, table.points, strict=True)
+    )
+    return table._replace(points=points, memory=memory)
+
+
+def finer_memories(table: Table, step: float) -> list[Table]:
+    """A table with a memory, and some whose memories are somewhat different."""
+    m = table.memory
+    assert m
+    way = step * (m.end - m.begin)
+    begins = (m.begin,) if m.way == PLAY else (m.begin - way, m.begin, m.begin + way)
+    return [
+        _over(table, m._replace(begin=a, end=b))
+        for a in begins for b in (m.end - way, m.end, m.end + way) if a != b
     ]  # fmt: skip
 
 

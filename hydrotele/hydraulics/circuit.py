@@ -55,8 +55,16 @@ from hydrotele.hydraulics.supply import (
     with_added,
 )
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
-from hydrotele.terms.law import Drives, DriveState
-from hydrotele.terms.table import COMMAND, FLOW_SUPPLY, added, added_flows
+from hydrotele.terms.law import VARIABLES, Drives, DriveState
+from hydrotele.terms.table import (
+    COMMAND,
+    COUNT,
+    FLOW_SUPPLY,
+    added,
+    added_flows,
+    memory_of,
+    remember,
+)
 
 __all__ = [
     "ACTIVATIONS", "MAX_AXES", "NO_MEMORY", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
@@ -88,6 +96,8 @@ _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 _ADDED, _PUMP = int(Slot.ADDED_DELIVERY), int(Slot.PUMP_FLOW)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
+_TIME, _POSITION, _VELOCITY = (VARIABLES[name] for name in ("time", "position", "velocity"))
+_COMMAND, _SUPPLY, _PUSH = (VARIABLES[n] for n in ("command", "pressure_supply", "force"))
 
 
 @inlined
@@ -167,7 +177,7 @@ def _flows_of_terms(
     """What the terms add to the flows of an axis, see `terms.table.added_flows`."""
     u = i * SLOTS
     force = user[u + _AH] * p_head - user[u + _AR] * p_rod
-    s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command[i], force)
+    s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command[i], force, 0.0, 0.0)
     return added_flows(terms, i, s, drives)
 
 
@@ -188,6 +198,7 @@ def _delivery_of_terms(user, first, count, terms, act, length, velocity, command
             s = DriveState(
                 time, length[first + i] - dt * velocity[first + i], velocity[first + i],
                 act[a], act[a + 1], act[a + 2], act[a + 3], supply, command[first + i], force,
+                0.0, 0.0,
             )  # fmt: skip
             total += added(terms, FLOW_SUPPLY, first + i, s, drives)
     wanted = total / user[first * SLOTS + _PUMP]
@@ -332,6 +343,52 @@ def step_circuit(
         act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], head, dt)
         act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], rod, dt)
     return p_start, p_end
+
+
+@allocation_free
+def advance_memories(user, terms, drives, act_dot, dt, time, supply):
+    """Write the rates of what terms remember over a step, once those of all activations are known.
+
+    Args:
+        user: (nu * SLOTS,) actuator numbers.
+        terms: (n,) table of the machine's terms.
+        drives: Drives with the activations at the start of the step, positions at its end and
+            velocities over it, and the commands that arrive.
+        act_dot: (>= 4 count,) mean rates over the step; those of the terms' memories are written
+            [1/s].
+        dt: step, scalar [s].
+        time: at the start of the step, scalar [s].
+        supply: pressure at the end of the step, scalar [Pa].
+
+    Returns:
+        Nothing.
+
+    Source: `terms.table.remembered`.
+    """
+    act, count = drives.act, drives.count
+    for term in range(int(terms[COUNT])):
+        place, i, k = memory_of(terms, term)
+        if not (4 * count <= place < len(act_dot) and 0 <= i < len(drives.velocity)):
+            continue
+        a = 4 * i
+        if k == _TIME:
+            value = time + dt
+        elif k == _POSITION:
+            value = drives.position[i]
+        elif k == _VELOCITY:
+            value = drives.velocity[i]
+        elif k == _COMMAND:
+            value = drives.command[i]
+        elif k == _SUPPLY:
+            value = supply
+        elif i >= count:
+            value = 0.0
+        elif k == _PUSH:
+            head, rod = act[a + 2] + dt * act_dot[a + 2], act[a + 3] + dt * act_dot[a + 3]
+            value = user[i * SLOTS + _AH] * head - user[i * SLOTS + _AR] * rod
+        else:
+            value = act[a + k - 3] + dt * act_dot[a + k - 3]
+        act_dot[place] = (remember(terms, term, value, act[place]) - act[place]) / dt
 
 
 @allocation_free
@@ -522,10 +579,10 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
     u, a = i * SLOTS, 4 * i
     if i >= count:
         force = gain * command - user[u + _OFFSET]
-        return DriveState(time, x, v, 0.0, 0.0, 0.0, 0.0, supply, command, force)
+        return DriveState(time, x, v, 0.0, 0.0, 0.0, 0.0, supply, command, force, 0.0, 0.0)
     force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
     return DriveState(
-        time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3], supply, command, force
+        time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3], supply, command, force, 0.0, 0.0
     )
 
 

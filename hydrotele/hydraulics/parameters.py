@@ -11,6 +11,7 @@ import numpy as np
 from hydrotele.kinematics.from_machine import drive_travel
 from hydrotele.machine.drives import Axis, Counterbalance, FlowCurve, LoadCylinder, Pump, Valve
 from hydrotele.machine.machine import Machine, Supply
+from hydrotele.terms.table import remembering, terms_table
 
 CURVE_KNOTS = 8  # at most, of a valve's flow curve in one direction
 
@@ -164,8 +165,8 @@ def extra_state_names(machine: Machine) -> list[str]:
     """Names of the states that follow the activations of the hydraulic axes, in their order.
 
     `bristle.<axis>` of every hydraulic axis with presliding friction, `delivery.supply` of a pump
-    with a time constant, `added_delivery.supply` of one to whose flow terms add, then
-    `bristle.<axis>` of the force drives. None in most machines.
+    with a time constant, `added_delivery.supply` of one to whose flow terms add, `memory.term_<k>`
+    of every term with a memory, then `bristle.<axis>` of the force drives. None in most machines.
     """
     supply, rubbing = machine.supply, [
         n for n in actuator_order(machine) if machine.axes[n].drive.friction.presliding
@@ -175,6 +176,7 @@ def extra_state_names(machine: Machine) -> list[str]:
         names.append(DELIVERY)
     if any(term.balance == "flow_supply" for term in machine.terms):
         names.append(ADDED_DELIVERY)
+    names += [f"memory.term_{k + 1}" for k in range(len(remembering(machine.terms)))]
     return names + [f"bristle.{n}" for n in rubbing if not machine.axes[n].hydraulic]
 
 
@@ -189,7 +191,8 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
     """
     count = len(machine.hydraulic_axes)
     memory = {name: 4 * count + k for k, name in enumerate(extra_state_names(machine))}
-    shared = sum(name.partition(".")[2] in ("supply", *machine.hydraulic_axes) for name in memory)
+    rubbing = [f"bristle.{n}" for n, axis in machine.axes.items() if not axis.hydraulic]
+    shared = sum(name not in rubbing for name in memory)
     table = {}
     for name in actuator_order(machine):
         numbers = np.zeros(SLOTS)
@@ -219,6 +222,13 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
             numbers[Slot.OFFSET] = axis.force.offset if axis.force else 0.0
         table[name] = numbers
     return table
+
+
+def terms_of(machine: Machine) -> np.ndarray:
+    """The machine's terms as compiled code reads them, see `terms.table.terms_table`."""
+    names, first = extra_state_names(machine), 4 * len(machine.hydraulic_axes)
+    own = [k for k, name in enumerate(names) if name.startswith("memory.")]
+    return terms_table(machine.terms, actuator_order(machine), first + own[0] if own else 0)
 
 
 def longest_step(machine: Machine, name: str) -> float:

@@ -348,6 +348,11 @@ def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply 
             _expect(axis, axes, f"terms.{k}.of.{variable}")
             if variable not in ("position", "velocity", "command") and not axes[axis].hydraulic:
                 raise ValueError(f"terms.{k}.of: axis {axis} has no {variable}")
+        memory = term.play or term.switch
+        if memory and not any(axis.hydraulic for axis in axes.values()):
+            raise ValueError(f"terms.{k}: a memory needs a machine with hydraulic axes")
+        if memory and memory.variable == "force" and not axes[term.axis].hydraulic:
+            raise ValueError(f"terms.{k}: a memory of the force is one of a hydraulic axis")
         key = (term.name, term.axis, term.balance)
         if key in seen:
             raise ValueError(

@@ -81,6 +81,7 @@ TRUTH: Mapping[str, Kind] = {
     "bristle": Kind(("1",), "part of a drive's breakaway force that friction holds it with"),
     "delivery": Kind(("1",), "part of its largest flow that the pump is set to", "none"),
     "added_delivery": Kind(("1",), "part of its largest flow that terms add to a pump's", "none"),
+    "memory": Kind(("1",), "what a term remembers: played variable over half width, or 0 to 1"),
     "flow_head": Kind(("m^3/s",), "valve flow into the head side chamber"),
     "flow_rod": Kind(("m^3/s",), "valve flow into the rod side chamber"),
     "flow_supply": Kind(("m^3/s",), "pump flow", "none"),

@@ -26,13 +26,12 @@ from hydrotele.core.datafile import Vector
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import check_assets, read_xml
 from hydrotele.hydraulics.circuit import ACTIVATIONS
-from hydrotele.hydraulics.parameters import SLOTS, Slot, actuator_order, actuator_parameters
+from hydrotele.hydraulics.parameters import SLOTS, Slot, actuator_parameters, terms_of
 from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
 from hydrotele.machine.drives import Axis, Cylinder, Pin
 from hydrotele.machine.machine import Link, Machine
 from hydrotele.scenario.surroundings import SurroundingObject
 from hydrotele.simulate.surroundings import write_surroundings
-from hydrotele.terms.table import terms_table
 
 OWN = "hydrotele_"
 """What the names begin with of all that no file of the user names."""
@@ -233,7 +232,7 @@ def _completed(
         add_element(body, "site", name=TIP_SITE, pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
     if machine.terms:
-        table = terms_table(machine.terms, actuator_order(machine))
+        table = terms_of(machine)
         add_element(root.custom, "numeric", name="hydrotele_terms", size=len(table), data=table)
     _write_scene(root, ground, looks)
     write_surroundings(root, machine, surroundings, looks)

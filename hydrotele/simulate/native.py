@@ -35,6 +35,7 @@ from hydrotele.hydraulics.circuit import (
     Slot,
     actuator_friction,
     add_to_commands,
+    advance_memories,
     circuit_supply,
     delivered_share,
     drive_state,
@@ -148,10 +149,10 @@ def _advance_force_drive(user, u, act, rate, velocity, command, low, high, dt):
 
 @allocation_free
 def _advance_with_memory(
-    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time
+    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time, arrived
 ):
-    """`step_circuit` of axes that have bristles or a slow pump, and the bristles' rates."""
-    step_circuit(
+    """`step_circuit` of what remembers, and the rates of bristles and of terms' memories."""
+    _, supply = step_circuit(
         user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time,
         len(act) - 4 * count,
     )  # fmt: skip
@@ -160,6 +161,9 @@ def _advance_with_memory(
         if user[u + _STIFFNESS] > 0.0:
             at = int(user[u + _BRISTLE])
             act_dot[at] = bristle_rate(user, u, act[at], velocity[i], user[u + _FELT], dt)
+    if len(terms) > 0 and first == 0:
+        drives = Drives(count, act, length, velocity, arrived)
+        advance_memories(user, terms, drives, act_dot, dt, time, supply)
 
 
 @allocation_free
@@ -294,7 +298,7 @@ def _callbacks(remembers):
                     given[j] = 0.0
                 command = given
                 break
-        terms = floats(m, 0)
+        terms, arrived = floats(m, 0), command
         if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
             terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
         if len(terms) > 0 and first == 0:
@@ -310,7 +314,7 @@ def _callbacks(remembers):
         else:
             _advance_with_memory(
                 user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms,
-                time,
+                time, arrived,
             )  # fmt: skip
         return 0.0
 

@@ -33,6 +33,7 @@ from hydrotele.hydraulics.parameters import (
     actuator_order,
     actuator_parameters,
     extra_state_names,
+    terms_of,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.surroundings import SurroundingObject
@@ -50,7 +51,7 @@ from hydrotele.simulate.mechanism import (
 )
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.terms.law import Drives
-from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added, terms_table
+from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added
 
 
 def set_bristles(machine: Machine, model: mujoco.MjModel) -> None:
@@ -402,7 +403,7 @@ def added_by_terms(
         drives = [machine.axes[name].force for name in order]
         _evaluate(
             np.concatenate(list(actuator_parameters(machine).values())),
-            terms_table(machine.terms, order), len(machine.hydraulic_axes),
+            terms_of(machine), len(machine.hydraulic_axes),
             np.array([drive.gain if drive else 0.0 for drive in drives]),
             np.ascontiguousarray(time, float), np.ascontiguousarray(act, float),
             np.ascontiguousarray(x, float), np.ascontiguousarray(v, float),

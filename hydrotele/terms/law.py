@@ -39,6 +39,8 @@ class DriveState(NamedTuple):
         pressure_supply: at the valves' inlet [Pa].
         command: to the valve or drive, as it arrives, without the terms that add to it [1], [V].
         force: of the oil on the piston, or of a force drive, before friction [N] or [N m].
+        played: what the term's play lets through of its variable [its unit]; 0 without a play.
+        ahead: by how much the variable is ahead of that, up to half a width to either side.
     """
 
     time: float
@@ -51,6 +53,8 @@ class DriveState(NamedTuple):
     pressure_supply: float
     command: float
     force: float
+    played: float
+    ahead: float
 
 
 class Drives(NamedTuple):

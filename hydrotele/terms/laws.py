@@ -148,7 +148,7 @@ def pulse(s: DriveState, size: float, start: float, duration: float, edge: float
     Its edges are half waves of a cosine, `edge` of the duration long and centred on its ends, so
     that a derivative with respect to every parameter exists.
 
-    >>> state = DriveState(*[0.0] * 10)
+    >>> state = DriveState(*[0.0] * 12)
     >>> [pulse(state._replace(time=t), 8.0, 1.0, 2.0) for t in (0.8, 1.0, 2.0, 3.0, 3.2)]
     [0.0, 4.0, 8.0, 4.0, 0.0]
     """
@@ -204,7 +204,7 @@ def linear_table(s: DriveState, variable: Variable, points: Numbers, values: Num
     """Linear interpolation in one variable, constant beyond the first and the last point.
 
     >>> import numpy as np
-    >>> state = DriveState(*[0.0] * 10)._replace(velocity=0.15)
+    >>> state = DriveState(*[0.0] * 12)._replace(velocity=0.15)
     >>> float(linear_table(state, 2, np.array([0.0, 0.1, 0.2]), np.array([0.0, 10.0, 30.0])))
     20.0
     """
@@ -234,7 +234,7 @@ def table2(
     `values` has a row for each of the `row_points`.
 
     >>> import numpy as np
-    >>> state = DriveState(*[0.0] * 10)._replace(position=0.5, velocity=9.0)
+    >>> state = DriveState(*[0.0] * 12)._replace(position=0.5, velocity=9.0)
     >>> axis = np.array([0.0, 1.0])
     >>> float(table2(state, 1, 2, axis, axis, np.array([0.0, 1.0, 10.0, 21.0])))
     11.0
@@ -261,7 +261,7 @@ def formula(s: DriveState, numbers: Numbers) -> float:
     """A sum of coefficients times products of basic functions; see `hydrotele.terms.laws`.
 
     >>> import numpy as np
-    >>> state = DriveState(*[0.0] * 10)._replace(velocity=-2.0)
+    >>> state = DriveState(*[0.0] * 12)._replace(velocity=-2.0)
     >>> coded = formula_arguments({"1": 5.0, "velocity * abs(velocity)": 3.0})
     >>> float(formula(state, np.array(coded["numbers"])))
     -7.0

@@ -25,7 +25,7 @@ from hydrotele.terms.law import LAWS, VARIABLES, DriveState, Law, Numbers, Varia
 
 # numpy's integers, since numba compiles a function anew for each of Python's that it is called with
 FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = np.arange(len(BALANCES), dtype=np.int64)
-MARKER = 215325.75  # of a table of terms among other custom numbers of a model
+MARKER = 215326.75  # of a table of terms among other custom numbers of a model
 NO_TERMS = np.zeros(0)
 COUNT = 1  # place of the number of terms, after the marker
 (
@@ -39,8 +39,15 @@ COUNT = 1  # place of the number of terms, after the marker
     _OTHERS,
     _BEGIN,
     _END,
+    _WAY,
+    _PLACE,
+    _REMEMBERED,
+    _SHIFT,
+    _SCALE,
     _ROW,
-) = range(11)  # of a term
+) = range(16)  # of a term
+PLAY, SWITCH = 1, 2  # ways in which a term has a memory, 0 for none
+_BAND = 0.1  # of what lies between a switch's thresholds, over which it comes about
 _HEAD = 2
 _MOST = 1024  # laws in a process
 _EDGE = 0.1  # s, in which a term with a window comes and goes
@@ -117,12 +124,14 @@ def _compiled_anew(function):
     return njit(error_model="numpy", nogil=True)(function)
 
 
-def terms_table(terms: Sequence[Term], order: Sequence[str]) -> np.ndarray:
+def terms_table(terms: Sequence[Term], order: Sequence[str], memory: int = 0) -> np.ndarray:
     """Terms as the numbers that compiled code reads.
 
     Args:
         terms: of a machine.
         order: axis names in actuator order.
+        memory: place, among the activations, of what the first term with a memory remembers; the
+            others' follow. 0 where nothing keeps it: what those terms see has then not moved yet.
 
     Returns:
         (n,) numbers, none where there are no terms: marker, count, a row per term, then the laws'
@@ -134,6 +143,7 @@ def terms_table(terms: Sequence[Term], order: Sequence[str]) -> np.ndarray:
     if not terms:
         return NO_TERMS
     rows, back, first = [], [], _HEAD + _ROW * len(terms)
+    places = {id(term): memory + k for k, term in enumerate(remembering(terms)) if memory}
     for term in terms:
         place = law_place(term.law)
         numbers = LAWS[term.law].numbers(term.parameters)
@@ -142,10 +152,26 @@ def terms_table(terms: Sequence[Term], order: Sequence[str]) -> np.ndarray:
         rows += [
             order.index(term.axis), BALANCES.index(term.balance), place, checksum(term.law), at,
             at + len(numbers), len(term.domain), len(term.of), *(term.window or _ALWAYS),
+            *_memory_numbers(term, places.get(id(term), 0)),
         ]  # fmt: skip
         others = [x for name, axis in term.of.items() for x in (VARIABLES[name], order.index(axis))]
         back += [*numbers, *ranges, *others]
     return np.array([MARKER, len(terms), *rows, *back], float)
+
+
+def remembering(terms: Sequence[Term]) -> list[Term]:
+    """The terms that have a memory."""
+    return [term for term in terms if term.play or term.switch]
+
+
+def _memory_numbers(term: Term, place: int) -> tuple[float, ...]:
+    """Way, place, variable, shift and scale of a term's memory."""
+    if term.play:
+        return PLAY, place, VARIABLES[term.play.variable], 0.0, term.play.half_width
+    if term.switch:
+        switch = term.switch
+        return SWITCH, place, VARIABLES[switch.variable], switch.off, switch.on - switch.off
+    return 0, 0, 0, 0.0, 1.0
 
 
 @intrinsic
@@ -204,6 +230,79 @@ def _seen(terms, at, k, value, s, drives):
 
 
 @allocation_free
+def _held(terms, at, drives):
+    """What a term remembers, scalar [1]; 0 where nothing keeps it."""
+    place = int(terms[at + _PLACE])
+    return drives.act[place] if 0 < place < len(drives.act) else 0.0
+
+
+@allocation_free
+def _value(terms, at, s, drives):
+    """The variable of a term's memory as it is now, of the drive that it is of [its unit]."""
+    k = int(terms[at + _REMEMBERED])
+    last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
+    for j in range(last, last + 2 * int(terms[at + _OTHERS]), 2):
+        if int(terms[j]) == k:
+            return _of_drive(int(terms[j + 1]), k, s, drives)
+    return s[k]
+
+
+@allocation_free
+def remembered(way, held, x):
+    """What a term remembers after a variable has moved.
+
+    Args:
+        way: PLAY or SWITCH.
+        held: what it remembered before, scalar [1].
+        x: of a play the variable over the half width; of a switch 0 where it goes off and 1 where
+            it goes on, scalar [1].
+
+    Returns:
+        Scalar [1]: what is seen over the half width, or the share with which the law acts.
+
+    Source: play and relay with hysteresis, Visintin 1994, Differential Models of Hysteresis; the
+        relay's jumps are ramps.
+    """
+    if way == PLAY:
+        return min(x + 1.0, max(x - 1.0, held))
+    low = min(1.0, max(0.0, (x - 1.0) / _BAND + 0.5))
+    high = min(1.0, max(0.0, x / _BAND + 0.5))
+    return min(high, max(low, held))
+
+
+@allocation_free
+def remember(terms, term, value, held):
+    """What a term remembers after its variable has come to a value.
+
+    Args:
+        terms: (n,) table of `terms_table`.
+        term: index of a term with a memory.
+        value: of its variable, scalar [its unit].
+        held: what it remembered before, scalar [1].
+
+    Returns:
+        Scalar [1].
+
+    Source: `remembered`.
+    """
+    at = _HEAD + _ROW * term
+    x = (value - terms[at + _SHIFT]) / terms[at + _SCALE]
+    return remembered(terms[at + _WAY], held, x)
+
+
+@allocation_free
+def memory_of(terms, term):
+    """(place among the activations, axis, variable) of a term's memory, place 0 for none."""
+    at = _HEAD + _ROW * term
+    axis, k = int(terms[at + _AXIS]), int(terms[at + _REMEMBERED])
+    last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
+    for j in range(last, last + 2 * int(terms[at + _OTHERS]), 2):
+        if int(terms[j]) == k:
+            axis = int(terms[j + 1])
+    return int(terms[at + _PLACE]), axis, k
+
+
+@allocation_free
 def _of_drive(i, k, s, drives):
     """Variable k of drive i; what all drives share is that of the state."""
     if i < 0 or i >= len(drives.velocity):
@@ -249,6 +348,8 @@ def added(terms, balance, axis, s, drives):
         if int(terms[at + _AXIS]) != axis or int(terms[at + _BALANCE]) != balance:
             continue
         share = _acting(s.time, terms[at + _BEGIN], terms[at + _END])
+        if terms[at + _WAY] == SWITCH:
+            share *= _held(terms, at, drives)
         if share == 0.0:
             continue
         place = int(terms[at + _LAW])
@@ -259,7 +360,12 @@ def added(terms, balance, axis, s, drives):
         if address == 0 or _word(entry + 8) != int(terms[at + _CHECKSUM]):
             continue
         seen = s
-        if terms[at + _RANGES] > 0.0 or terms[at + _OTHERS] > 0.0:
+        played = terms[at + _WAY] == PLAY
+        let_through, own = 0.0, 0.0
+        if played:
+            let_through = terms[at + _SCALE] * _held(terms, at, drives)
+            own = _value(terms, at, s, drives)
+        if played or terms[at + _RANGES] > 0.0 or terms[at + _OTHERS] > 0.0:
             seen = DriveState(
                 _seen(terms, at, np.int64(0), s.time, s, drives),
                 _seen(terms, at, np.int64(1), s.position, s, drives),
@@ -271,6 +377,8 @@ def added(terms, balance, axis, s, drives):
                 _seen(terms, at, np.int64(7), s.pressure_supply, s, drives),
                 _seen(terms, at, np.int64(8), s.command, s, drives),
                 _seen(terms, at, np.int64(9), s.force, s, drives),
+                let_through,
+                own - let_through,
             )
         total += share * _call(address, terms, int(terms[at + _PARAMETERS]), seen)
     return total
@@ -281,7 +389,8 @@ def _moved(s, velocity, head, rod):
     """The state with another velocity and other pressures."""
     return DriveState(
         s.time, s.position, s.velocity + velocity, s.spool, s.spool_rate, s.pressure_head + head,
-        s.pressure_rod + rod, s.pressure_supply, s.command, s.force,
+        s.pressure_rod + rod, s.pressure_supply, s.command, s.force, s.played,
+        s.ahead,
     )  # fmt: skip
 
 

@@ -81,7 +81,7 @@ def test_a_file_adds_an_effect_that_runs_and_can_be_handed_on(gas_spring, tmp_pa
 
 def test_the_force_of_the_example_is_that_of_a_gas_spring(gas_spring):
     force = LAWS["gas_spring_force"].function
-    closed = DriveState(*[0.0] * 10)
+    closed = DriveState(*[0.0] * 12)
     assert force(closed, 400.0, 0.8) == -400.0
     assert force(closed._replace(position=0.4), 400.0, 0.8) == pytest.approx(-400.0 * 2**1.3)
 

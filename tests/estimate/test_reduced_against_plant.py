@@ -115,7 +115,7 @@ def begin(machine, model, z, state):
     for s, name in enumerate(state_names(machine)):
         kind, _, where = name.partition(".")
         axis = joints.get(where, where)
-        if kind in ("drive", "drive_rate", "bristle", "delivery", "added_delivery"):
+        if kind in ("drive", "drive_rate", "bristle", "delivery", "added_delivery", "memory"):
             z[s] = state[kind.replace("rate", "velocity")][axis]
         else:
             z[s] = state[renamed.get(kind, kind)][state["order"].index(axis)]
@@ -273,6 +273,45 @@ def test_terms_with_variables_of_another_drive(machine_of, reduced_of, tmp_path)
         run = run_scenario(own.model_copy(update={"tool": None}))
         assert not beyond(differences_of(reduced_of, machine, run, 40))
         assert beyond(differences_of(reduced_of, nominal, run, 40)), "without it it would be seen"
+
+
+def test_terms_with_a_memory(machine_of, reduced_of, tmp_path):
+    """Force, flow and command that see a variable through a play, or that a relay switches."""
+    nominal = machine_of("cat215/none")
+    laws = (
+        ("boom", "force", {"played": -2e5}, {},
+         {"play": {"variable": "velocity", "half_width": 0.02}}),
+        ("stick", "flow_head", {"1": 4e-4}, {"pressure_rod": "boom"},
+         {"switch": {"variable": "pressure_rod", "on": 3.0e6, "off": 1.5e6}}),
+        ("swing", "command", {"played": 0.3}, {},
+         {"play": {"variable": "command", "half_width": 0.1}}),
+        ("swing", "force", {"1": 3e3}, {"position": "boom"},
+         {"switch": {"variable": "position", "on": 0.81, "off": 0.795}}),
+    )  # fmt: skip
+    terms = tuple(
+        Term.model_validate({
+            "name": "t", "axis": axis, "balance": balance, "law": "formula", "parameters": law,
+            "of": of, **memory,
+        })
+        for axis, balance, law, of, memory in laws
+    )  # fmt: skip
+    plan = scenario("cat215/none", nominal.axes, (), 1.25e-4)
+    for k, term in enumerate(terms):
+        (tmp_path / f"{k}").mkdir()
+        machine = nominal.model_copy(update={"terms": (term,)})
+        save_machine(machine, tmp_path / f"{k}" / "machine.yaml")
+        own = plan.model_copy(update={"machine": str(tmp_path / f"{k}" / "machine.yaml")})
+        run = run_scenario(own.model_copy(update={"tool": None}))
+        held = run.truth["truth.memory.term_1"]
+        assert np.ptp(held) > 0.9, "it was moved"
+        # what is remembered counts from the next step on: the plant's step
+        assert not beyond(differences_of(reduced_of, machine, run, 160)), k
+        assert beyond(differences_of(reduced_of, nominal, run, 40)), "without it it would be seen"
+        law = {"velocity" if k == 0 else "command": v for v in term.parameters.values()}
+        forgetful = term.model_copy(update={"play": None, "switch": None} | (
+            {"parameters": law} if term.play else {}))  # fmt: skip
+        other = nominal.model_copy(update={"terms": (forgetful,)})
+        assert beyond(differences_of(reduced_of, other, run, 40)), "nor is it a law without memory"
 
 
 def test_the_plant_converges_to_the_reduced_model(machine_of, reduced_of):

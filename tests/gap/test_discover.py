@@ -19,9 +19,16 @@ from hydrotele.estimate.levels import columns_of, find_levels
 from hydrotele.estimate.responses import error_responses
 from hydrotele.estimate.track import track_run
 from hydrotele.gap import discover
-from hydrotele.gap.discover import Regression, _better, _law, _OpenLoop, _Seen, at_a_glance
+from hydrotele.gap.discover import OpenLoop, Regression, _law, _Seen, at_a_glance, better_ahead
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.law_tables import Table, paired_tables, possible_tables
+from hydrotele.gap.law_tables import (
+    Memory,
+    Table,
+    finer_memories,
+    paired_tables,
+    possible_tables,
+    remembering_tables,
+)
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine, save_machine
@@ -29,7 +36,7 @@ from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.terms.facts import Term
 from hydrotele.terms.law import Drives, DriveState
-from hydrotele.terms.table import FORCE, added, terms_table
+from hydrotele.terms.table import FORCE, PLAY, SWITCH, added, remember, terms_table
 from tests.estimate.test_filter import machine_data
 
 PERIOD, SECONDS = 0.01, 10.0
@@ -158,8 +165,74 @@ def test_every_table_is_a_term_that_adds_what_its_columns_say(made_up):
             act = np.zeros(12)
             act[0] = made_up["spool.swing"][row]
             drives = Drives(3, act, np.zeros(3), np.array([swing, 0, 0]), np.array([0, 0, stick]))
-            got = added(written, FORCE, 1, DriveState(**own, spool_rate=0.0), drives)
+            got = added(
+                written, FORCE, 1, DriveState(**own, spool_rate=0.0, played=0.0, ahead=0.0), drives
+            )
             assert got == pytest.approx(columns[row] @ entries, rel=1e-9, abs=1e-12)
+
+
+_OF_MEMORIES = ("velocity", "command.stick")
+
+
+def test_every_table_with_a_memory_is_such_a_term():
+    """Row by row the term, whose memory follows as it does in every simulator."""
+    rng = np.random.default_rng(3)
+    values = {name: np.cumsum(rng.normal(size=400)) / 10 for name in NAMES if name != "force"}
+    first = [t for t in possible_tables([values], 0.01) if t.variables[0] == "velocity"]
+    second = [
+        t
+        for t in paired_tables([values], 0.01, others=True)
+        if t.variables in (("velocity", "spool.swing"), ("velocity", "velocity.swing"))
+    ]
+    tables = [
+        t
+        for table in first + second
+        for t in remembering_tables(table, [values], list(_OF_MEMORIES))
+    ]
+    ways = {(t.memory.way, t.memory.variable, len(t.variables)) for t in tables}
+    assert ways >= {(PLAY, "velocity", 1), (PLAY, "velocity", 2), (SWITCH, "command.stick", 1),
+                    (SWITCH, "velocity", 2)}  # fmt: skip
+    assert any(t.variables == ("velocity", "ahead") for t in tables)
+    order = ["swing", "boom", "stick"]
+    for table in [t for k, t in enumerate(tables) if k % 3 == 0]:
+        entries = rng.normal(size=table.size)
+        term = Term(name="law", axis="boom", balance="force", **table.law(entries))
+        written, held = terms_table([term], order, 12), 0.0
+        columns, told = table.columns(values), []
+        for row in range(400):
+            now = {name: column[row] for name, column in values.items()}
+            held = remember(written, 0, now[table.memory.variable], held)
+            act = np.append(np.zeros(12), held)
+            act[0] = now["spool.swing"]
+            drives = Drives(3, act, np.zeros(3), np.array([now["velocity.swing"], 0, 0]),
+                            np.array([0, 0, now["command.stick"]]))  # fmt: skip
+            own = {name: now[name] for name in now if "." not in name}
+            state = DriveState(**own, spool_rate=0.0, force=0.0, played=0.0, ahead=0.0)
+            told.append(added(written, FORCE, 1, state, drives))
+        assert told == pytest.approx(columns @ entries, rel=1e-9, abs=1e-9)
+        assert np.ptp(told) > 0.0
+
+
+def test_thresholds_of_a_relay_are_found():
+    """A constant that a pressure switches, in noise as large: to a tenth of the range."""
+    rng = np.random.default_rng(4)
+    t = np.arange(6000) / 50.0
+    values = {"velocity": np.sin(t), "pressure_rod": np.sin(0.7 * t) + 0.4 * np.sin(2.9 * t)}
+    truth = Memory(SWITCH, "pressure_rod", -0.5, 0.6)
+    told = truth.along(values) + rng.normal(size=6000)
+
+    def share(table):
+        cut = [slice(0, 3000), slice(3000, 6000)]
+        columns = table.columns(values)
+        return at_a_glance(table, [(told[c], columns[c]) for c in cut])
+
+    (table,) = (t for t in possible_tables([values], 0.01) if t.variables == ("velocity",))
+    best = max(remembering_tables(table, [values], values), key=share)
+    for step in (0.4, 0.2, 0.1):
+        best = max(finer_memories(best, step), key=share)
+    assert best.memory.way == SWITCH and best.memory.variable == "pressure_rod"
+    assert [best.memory.begin, best.memory.end] == pytest.approx([-0.5, 0.6], abs=0.28)
+    assert share(best) > 1.3 * share(table), "the same table without a memory"
 
 
 def test_pairs_are_never_of_variables_that_only_their_drives_tell_apart(made_up):
@@ -203,7 +276,7 @@ def test_a_smooth_surface_is_found_among_other_tables():
     ],
 )
 def test_a_law_is_kept_where_free_runs_get_better_and_none_is_lost(now, before, kept):
-    assert _better(_OpenLoop(*now), _OpenLoop(*before)) is kept
+    assert better_ahead(OpenLoop(*now), OpenLoop(*before)) is kept
 
 
 def test_one_lost_window_says_little_and_what_is_below_noise_nothing(monkeypatch):

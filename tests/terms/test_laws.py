@@ -10,7 +10,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine, Supply
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms import laws
-from hydrotele.terms.facts import Term
+from hydrotele.terms.facts import Play, Term
 from hydrotele.terms.law import LAWS, NO_DRIVES, VARIABLES, Drives, DriveState, law
 from hydrotele.terms.laws import formula_arguments
 from hydrotele.terms.table import (
@@ -20,12 +20,14 @@ from hydrotele.terms.table import (
     added,
     added_flows,
     added_with_slope,
+    remember,
     terms_table,
 )
 
 STATE = DriveState(
     time=1.7, position=0.43, velocity=-0.21, spool=0.3, spool_rate=-2.0, pressure_head=9.0e6,
     pressure_rod=4.0e6, pressure_supply=2.0e7, command=0.4, force=1.2e5,
+    played=0.0, ahead=0.0,
 )  # fmt: skip
 USED = {
     "constant": {"value": 12.0},
@@ -163,6 +165,69 @@ def test_a_law_may_see_variables_of_another_drive():
         force_term(*law_, of={"force": "b"})
 
 
+def carried(term, values):
+    """What a term of axis a remembers along values of its variable."""
+    table, held, told = terms_table([term], ["a"], 4), 0.0, []
+    for value in values:
+        held = remember(table, 0, value, held)
+        told.append(held)
+    return table, told
+
+
+def test_a_play_follows_half_a_width_behind():
+    play = {"variable": "velocity", "half_width": 0.2}
+    term = force_term("formula", {"played": 10.0, "velocity": 1.0}, play=play)
+    table, told = carried(term, [0.1, 0.5, 0.4, 0.2, 0.0, -0.3])
+    assert 0.2 * np.array(told) == pytest.approx([0.0, 0.3, 0.3, 0.3, 0.2, -0.1])
+    drives = Drives(1, np.array([0.0, 0, 0, 0, 1.5]), np.zeros(1), np.zeros(1), np.zeros(1))
+    assert added(table, FORCE, 0, STATE, drives) == pytest.approx(10.0 * 0.3 - 0.21)
+    assert added(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(-0.21), "nothing keeps it"
+    other, _ = carried(force_term("formula", {"ahead": 10.0}, play=play), [])
+    assert added(other, FORCE, 0, STATE, drives) == pytest.approx(10.0 * (-0.21 - 0.3))
+    place_at = 13
+    table[place_at] = 1e9  # as anyone may write it into a model
+    assert added(table, FORCE, 0, STATE, drives) == pytest.approx(-0.21)
+
+
+@pytest.mark.parametrize(
+    ("on", "off", "values", "shares"),
+    [
+        (8.0, 4.0, [0, 6, 9, 6, 5, 3, 6], [0, 0, 1, 1, 1, 0, 0]),
+        (4.0, 8.0, [9, 6, 3, 6, 7, 9, 6], [0, 0, 1, 1, 1, 0, 0]),
+        (8.0, 4.0, [0, 8, 8.1, 7, 4, 3.9], [0, 0.5, 0.75, 0.75, 0.5, 0.25]),  # over 0.4 around each
+    ],
+)
+def test_a_switch_has_a_hysteresis(on, off, values, shares):
+    switch = {"variable": "spool", "on": on, "off": off}
+    table, told = carried(force_term("constant", {"value": 5.0}, switch=switch), values)
+    assert told == pytest.approx(shares)
+    for share in shares:
+        act = np.array([0.0, 0, 0, 0, share])
+        drives = Drives(1, act, np.zeros(1), np.zeros(1), np.zeros(1))
+        assert added(table, FORCE, 0, STATE, drives) == pytest.approx(5.0 * share)
+
+
+def test_memories_that_cannot_be_are_refused():
+    play, switch = (
+        {"variable": "spool", "half_width": 0.1},
+        {"variable": "spool", "on": 1, "off": 0},
+    )
+    for memory, message in (
+        ({"play": play, "switch": switch}, "a term has one of them"),
+        ({"play": play | {"half_width": 0.0}}, "greater than 0"),
+        ({"play": play | {"variable": "played"}}, "play: 'played' is no variable"),
+        ({"switch": switch | {"variable": "sppol"}}, "did you mean 'spool'"),
+        ({"switch": switch | {"off": 1}}, "between them must lie something"),
+    ):
+        with pytest.raises(ValidationError, match=message):
+            force_term("constant", {"value": 1.0}, **memory)
+    emps = load_machine("emps")
+    term = Term(name="t", axis="slide", balance="force", law="constant", parameters={"value": 1.0},
+                play=Play(variable="velocity", half_width=0.1))  # fmt: skip
+    with pytest.raises(ValidationError, match="needs a machine with hydraulic axes"):
+        Machine.model_validate(emps.model_dump() | {"terms": [term.model_dump()]})
+
+
 def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
     """As in a file that another process has exported."""
     table = terms_table([force_term("constant", {"value": 12.0})], ["a"])
@@ -186,7 +251,7 @@ def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
         ("constant", {"value": [1.0, 2.0]}, "must be a finite number, not"),
         ("constant", {"value": "much"}, "must be a finite number, not 'much'"),
         ("linear_table", {"variable": "speed", "points": [0, 1], "values": [0, 1]},
-         "'speed' is no variable; .*valid: command"),
+         "'speed' is no variable; .*valid: ahead, command"),
         ("linear_table", {"variable": "velocity", "points": [0, 1, 1], "values": [0, 1, 2]},
          "must be at least two numbers that rise"),
         ("linear_table", {"variable": "velocity", "points": [0, 1], "values": [0, 1, 2]},
