@@ -193,6 +193,7 @@ _MEMORIES = 6  # tables with a memory that are looked at closely, for each lack
 _FINER = (0.4, 0.2, 0.1)  # of a memory's width, by which it is changed
 _PAIRS = 12  # tables over two variables that are looked at closely, for each lack
 _TRIED = 2  # laws that are put into the machine, of all that the regression finds
+_OTHERS = 3  # of other balances, one by one, where free runs get better by none of these
 _MOSTLY = 0.5  # of the square of what a pump lacks that a law must predict to be tried
 _SHORT_ROWS = 20  # of a run in which its pump is short that it takes to be read
 _PLAINER = 0.9  # of the best law's fall that one of a single variable needs to go before it
@@ -303,13 +304,16 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
     for _ in range(_MOST):
         evidence.set_base(judged)
         seen = [_see(evidence.data, judged, track) for track in judged.tracks]
-        found = _best_law(evidence, judged, seen, _candidates(evidence, judged, seen, laws))
+        found = None
+        for candidates in _candidates(evidence, judged, seen, laws):
+            tried = _best_law(evidence, judged, seen, candidates)
+            now = _open_loop(evidence, evidence.runs, tried[0], noise) if tried else ahead
+            if tried and better_ahead(now, ahead):
+                found, ahead = tried, now
+                break
         if found is None:
             break
-        now = _open_loop(evidence, evidence.runs, found[0], noise)
-        if not better_ahead(now, ahead):
-            break
-        ahead, fall = now, judged.loss - found[0].loss
+        fall = judged.loss - found[0].loss
         judged, law = found
         laws.append(law)
         if fall < _DETAIL * (begin - judged.loss) or lacking(judged, evidence) < ENTER:
@@ -490,8 +494,8 @@ _Case = tuple[Input, str, Table]
 
 def _candidates(
     evidence: Evidence, judged: Judged, seen: Sequence[_Seen], laws: Sequence[Learned]
-) -> list[Learned]:
-    """Laws worth a trial for the largest lacks, those that predict best first."""
+) -> list[list[Learned]]:
+    """Laws worth a trial for the largest lacks: those that predict best, then of other balances."""
     machine, levels = evidence.data.machine, judged.tracks[0].levels
     order = np.argsort(-levels.sizes / input_sizes(machine, levels.inputs))
     taken = {law.kind for law in laws}
@@ -529,8 +533,15 @@ def _candidates(
                     moved = tried([(*at, best[0][2]._replace(window=w)) for w in ends])
                     inside = [pair for pair in inside if pair is not best] + [_shortest(moved)]
                 looked += inside
-    best = _best_first(looked)[:_TRIED] + _pump_laws(evidence, judged, seen)[:1]
-    return [_law(machine, case, answer, seen) for case, answer in best]
+    ranked = _best_first(looked)
+    best = ranked[:_TRIED] + _pump_laws(evidence, judged, seen)[:1]
+    where = {(case[1], case[0].axis) for case, _ in best}
+    groups = [best] if best else []
+    for case, answer in ranked:
+        if (case[1], case[0].axis) not in where and len(groups) <= _OTHERS:
+            where.add((case[1], case[0].axis))
+            groups.append([(case, answer)])
+    return [[_law(machine, case, answer, seen) for case, answer in group] for group in groups]
 
 
 def _remembered(

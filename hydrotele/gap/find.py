@@ -17,7 +17,7 @@ from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_ru
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.calibrating import calibrate_freely, fit_until_settled
 from hydrotele.gap.description import describe, learned_laws
-from hydrotele.gap.discover import Discovery, discover
+from hydrotele.gap.discover import Discovery, better_ahead, discover
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.residuals import (
     believed,
@@ -334,10 +334,9 @@ def _trust(found: Found, rest: Judged) -> float:
 def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
     """Laws of what the effects leave; of all that is lacking, where none of these can be believed.
 
-    Nor can they where laws alone tell the runs as well: what they do is a part of these.
-
-    An effect that takes a small part of a law's work stands in the way of the rest, and nothing
-    takes it back where the law does not act.
+    Nor can they where laws alone tell the runs as well: what they do is a part of these. An effect
+    that takes a small part of a law's work stands in the way of the rest, and nothing takes it back
+    where the law does not act; where free runs do not get better by it either, it is left out.
     """
     rests = [rest for rest in found.without if rest is not None]
     if rests and all(_trust(found, rest) < LIKELY for rest in rests):
@@ -346,7 +345,9 @@ def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
         if discovery.laws and discovery.judged.loss < found.judged.loss:
             return bare, discovery
         evidence.set_base(found.judged)
-        return found, discover(evidence, found.judged)
+        beside = discover(evidence, found.judged)
+        ahead = beside.ahead and discovery.ahead and better_ahead(beside.ahead, discovery.ahead)
+        return (found, beside) if ahead else (bare, discovery)
     beside = discover(evidence, found.judged)
     fall, whole = found.judged.loss - beside.judged.loss, found.base.loss - beside.judged.loss
     if rests and beside.laws and fall > _OF_LAWS * whole:
