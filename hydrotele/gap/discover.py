@@ -202,6 +202,7 @@ _STEPS = 3  # of Gauss-Newton for the numbers beside a law
 _DETAIL = 0.05  # of what all laws brought: one that brings less is the last
 _AHEAD = 1.0  # s, of free runs that a law must make better; longer ones drift without readings
 _FAR_AHEAD = 5.0  # s, of those that it must not make worse
+_LOSS = 0.1  # of what free runs gain by effects and laws that laws alone may lose
 _LOST = 1.0e3  # times the noise: errors of a free run that got lost
 _STEP = 2.0e-3  # s, for the fits
 _MOVES = (-0.25, -0.1, 0.0, 0.1, 0.25)  # s, by which a window's ends are moved
@@ -243,28 +244,53 @@ class Learned:
         return self.balance, self.axis, *self.table.kind
 
 
+class OpenLoop(NamedTuple):
+    """Errors of free runs in units of the noise; NaN where all runs are shorter.
+
+    Attributes:
+        usual: geometric mean over the windows of `_AHEAD` of their RMS over rows and channels, none
+            below the noise: one window that diverges says little of the others, and most of them
+            nothing of a law that rarely acts.
+        rms: over all rows of these windows.
+        far: the same of windows of `_FAR_AHEAD`.
+    """
+
+    usual: float
+    rms: float
+    far: float
+
+
+_NOT_RUN = OpenLoop(np.nan, np.nan, np.nan)
+
+
 @dataclass(frozen=True)
 class Discovery:
     """The guess with its learned laws, judged, and these laws.
 
     `refused` of them made free runs of the held-out run worse and were taken back.
+    Errors of these free runs are `ahead`, and `before` without the laws.
     """
 
     judged: Judged
     laws: tuple[Learned, ...]
     refused: int = 0
-    ahead: "OpenLoop | None" = None
+    ahead: OpenLoop = _NOT_RUN
+    before: OpenLoop = _NOT_RUN
 
     def stands_for(self, other: "Discovery", charges: float) -> bool:
         """Whether its laws tell the runs as well as another guess does that has effects, too.
+
+        Free runs are told as well where a tenth of what the other one gains at most is lost, and
+        less than the noise (of squares of RMS).
 
         Args:
             other: with effects, and laws beside them.
             charges: what the numbers of these effects cost, of -2 log likelihood.
         """
         costs = [d.judged.loss + sum(law.charge for law in d.laws) for d in (self, other)]
-        ahead = self.ahead and other.ahead and better_ahead(self.ahead, other.ahead)
-        return bool(self.laws and ahead and costs[0] <= costs[1] + charges)
+        bare, own, others = (np.square(a) for a in (self.before, self.ahead, other.ahead))
+        lost = own - others > np.clip(_LOSS * (bare - others), 0.0, 1.0)
+        return bool(self.laws and not lost.any() and costs[0] <= costs[1] + charges)
 
 
 class _Seen(NamedTuple):
@@ -320,12 +346,12 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
             break
     last, first = (_open_loop(evidence, heldout, j, noise) for j in (judged, bare))
     if laws and not better_ahead(last, first):
-        return Discovery(begun, (), len(laws), first)
+        return Discovery(begun, (), len(laws), first, first)
     found = judged.guess.parts
     own = [old if n else new for n, old, new in zip(named, parts, found, strict=False)]
     guess = Guess((*own, *found[len(parts) :]))
     judged = replace(judged, guess=guess, loss=judged.loss + prior)
-    return Discovery(judged, tuple(laws), ahead=last)
+    return Discovery(judged, tuple(laws), 0, last, first)
 
 
 def _best_law(
@@ -383,22 +409,6 @@ def _refitted(
 def _input(balance: str, axis: str) -> Input:
     """The unknown input in whose place a law of a balance is."""
     return Input("flow_head" if balance == THROUGH else balance, axis)
-
-
-class OpenLoop(NamedTuple):
-    """Errors of free runs in units of the noise; NaN where all runs are shorter.
-
-    Attributes:
-        usual: geometric mean over the windows of `_AHEAD` of their RMS over rows and channels, none
-            below the noise: one window that diverges says little of the others, and most of them
-            nothing of a law that rarely acts.
-        rms: over all rows of these windows.
-        far: the same of windows of `_FAR_AHEAD`.
-    """
-
-    usual: float
-    rms: float
-    far: float
 
 
 def better_ahead(now: OpenLoop, before: OpenLoop) -> bool:

@@ -346,8 +346,8 @@ def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
             return bare, discovery
         evidence.set_base(found.judged)
         beside = discover(evidence, found.judged)
-        ahead = beside.ahead and discovery.ahead and better_ahead(beside.ahead, discovery.ahead)
-        return (found, beside) if ahead else (bare, discovery)
+        better = better_ahead(beside.ahead, discovery.ahead)
+        return (found, beside) if better else (bare, discovery)
     beside = discover(evidence, found.judged)
     fall, whole = found.judged.loss - beside.judged.loss, found.base.loss - beside.judged.loss
     if rests and beside.laws and fall > _OF_LAWS * whole:
