@@ -16,7 +16,7 @@ from hydrotele.estimate.evidence import Judged
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.stretches import busiest
 from hydrotele.gap import find
-from hydrotele.gap.discover import Discovery
+from hydrotele.gap.discover import Discovery, OpenLoop
 from hydrotele.gap.find import find_gap, without_details
 from hydrotele.gap.result import Estimate, NamedEffect
 from hydrotele.gap.search import Found
@@ -137,32 +137,90 @@ def test_a_length_offset_as_small_as_a_pin_may_be_off_is_ambiguous(tmp_path):
     assert gap.next_experiment and gap.next_experiment["scenario"]
 
 
-@pytest.mark.parametrize(("without", "by_laws", "kept"), [
-    (52.6, 20.0, False),  # the effect takes a twentieth of what is lacking, laws all but all
-    (52.6, 70.0, True),  # laws alone leave more than the effect does
-    (52.6, None, True),  # no law is worth its entries
-    (500.0, 20.0, True),  # an effect that can be believed stays
-])  # fmt: skip
-def test_laws_are_learned_of_all_that_lacks_where_no_effect_can_be_believed(
-    monkeypatch, without, by_laws, kept
-):
-    machine = load_machine("cat215", "none")
-    (offset,) = (h for h in hypotheses(machine, ("command_offset",)) if h.location == "boom")
+class Learning:
+    """Stands in for `discover`: what it makes of guesses with an effect and without one."""
+
+    def __init__(self, beside: Discovery, alone: Discovery):
+        self.beside, self.alone = beside, alone
+
+    def __call__(self, _, judged: Judged) -> Discovery:
+        return self.beside if judged.guess.parts else self.alone
+
+
+def searched(without: float) -> Any:
+    """A search that found an offset, with a loss of 50 and one of its own without it."""
+    (offset,) = (
+        h
+        for h in hypotheses(load_machine("cat215", "none"), ("command_offset",))
+        if h.location == "boom"
+    )
     effect = Judged(Guess(((offset, np.ones(1)),)), (), 50.0)
     base = Judged(Guess(), (), without)
-    search: Any = Found(base, effect, None, (), (5.0,), (base,), ((),), None)
+    return Found(base, effect, None, (), (5.0,), (base,), ((),), None)
 
-    def learn(_, judged):
-        if judged.guess.parts or by_laws is None:
-            return Discovery(judged, ())
-        law: Any = "law"
-        return Discovery(Judged(Guess(), (), by_laws), (law,))
 
-    monkeypatch.setattr(find, "discover", learn)
+def discovery(search, effect: bool, loss: float, charge: float | None, *ahead: float) -> Discovery:
+    """What is learned beside the effect or alone: free runs come from 10 times the noise."""
+    laws: Any = () if charge is None else (SimpleNamespace(charge=charge),)
+    guess = search.judged.guess if effect else Guess()
+    errors, before = OpenLoop(*ahead), OpenLoop(10.0, 10.0, 10.0)
+    return Discovery(Judged(guess, (), loss), laws, 0, errors, before)
+
+
+def learned(monkeypatch, search, beside: Discovery, alone: Discovery):
+    """Whether the effect stays, and what is taken to be learned."""
+    monkeypatch.setattr(find, "discover", Learning(beside, alone))
     evidence: Any = SimpleNamespace(set_base=lambda base: base)
-    found, discovery = find._learned(evidence, search)
-    assert bool(found.guess.parts) is kept
-    assert bool(discovery.laws) is not kept
+    found, taken = find._learned(evidence, search)
+    return bool(found.guess.parts), taken
+
+
+BARE, GOOD, NEAR, FAR = (10.0,) * 3, (1.1,) * 3, (1.3,) * 3, (2.0,) * 3
+
+
+@pytest.mark.parametrize(("without", "by_laws", "ahead", "kept"), [
+    (52.6, 20.0, GOOD, False),  # the effect takes a twentieth of what is lacking, laws all but all
+    (52.6, 70.0, FAR, True),  # laws alone leave more than the effect does
+    (52.6, None, BARE, True),  # no law is worth its entries, free runs get better by the effect
+    (52.6, None, GOOD, False),  # they do not
+    (500.0, 20.0, NEAR, True),  # an effect that can be believed stays
+])  # fmt: skip
+def test_laws_are_learned_of_all_that_lacks_where_no_effect_can_be_believed(
+    monkeypatch, without, by_laws, ahead, kept
+):
+    search = searched(without)
+    charge = None if by_laws is None else 1.0
+    alone = discovery(search, False, by_laws or without, charge, *ahead)
+    beside = discovery(search, True, 50.0, None, *NEAR)
+    stays, taken = learned(monkeypatch, search, beside, alone)
+    assert stays is kept
+    assert taken is (beside if kept else alone)
+
+
+@pytest.mark.parametrize(("loss", "charge", "ahead", "stands"), [
+    (-20.0, 4.0, GOOD, True),  # five of charges are saved by four more
+    (-20.0, 4.0, NEAR, True),  # free runs lose little of what they gain
+    (-20.0, 4.0, FAR, False),  # they lose more than the noise
+    (-20.0, 9.0, GOOD, False),  # laws that need more cost more than the effect saves
+    (-10.0, 4.0, GOOD, False),  # they leave more
+])  # fmt: skip
+def test_laws_alone_stand_for_an_effect_that_does_a_part_of_their_work(
+    monkeypatch, loss, charge, ahead, stands
+):
+    search = searched(500.0)
+    alone = discovery(search, False, loss, charge, *ahead)
+    beside = discovery(search, True, -20.0, 1.0, *GOOD)
+    stays, taken = learned(monkeypatch, search, beside, alone)
+    assert stays is not stands
+    assert taken is (alone if stands else beside)
+
+
+def test_laws_alone_are_not_tried_where_an_effect_does_most(monkeypatch):
+    search = searched(5000.0)
+    beside = discovery(search, True, 20.0, 1.0, *GOOD)
+    stays, taken = learned(monkeypatch, search, beside, discovery(search, False, 1.0, 0.0, *GOOD))
+    assert stays
+    assert taken is beside
 
 
 def test_truth_columns_change_nothing(tmp_path):
