@@ -51,7 +51,9 @@ def _respond(slope, gain, spread, whitened, flow, column, values, out):
         moved[:] = next_
 
 
-def error_responses(track: Track, column: np.ndarray, values: np.ndarray) -> np.ndarray:
+def error_responses(
+    track: Track, column: np.ndarray, values: np.ndarray, rows: slice = slice(None)
+) -> np.ndarray:
     """Change of a track's whitened errors per unit of each of p additions.
 
     Args:
@@ -59,6 +61,7 @@ def error_responses(track: Track, column: np.ndarray, values: np.ndarray) -> np.
         column: (n, nz) what a unit of the addition, held over a row, adds to the model's states, as
             `inputs.input_columns` has it [state's unit per unit of the addition].
         values: (n, p) the additions in every row.
+        rows: some of the track's, n of which there are values.
 
     Returns:
         (n, c, p) changes [1 per unit of the addition]; 0 where a reading is missing.
@@ -67,9 +70,9 @@ def error_responses(track: Track, column: np.ndarray, values: np.ndarray) -> np.
         chapter 8.
     """
     gains = track.gains
-    out = np.zeros((*track.whitened.shape, values.shape[1]))
+    out = np.zeros((*track.whitened[rows].shape, values.shape[1]))
     _respond(
-        gains.slope, gains.gain, gains.spread, track.whitened, track.flow,
-        np.ascontiguousarray(column), np.ascontiguousarray(values), out,
+        gains.slope[rows], gains.gain[rows], gains.spread[rows], track.whitened[rows],
+        track.flow[rows], np.ascontiguousarray(column)[rows], np.ascontiguousarray(values), out,
     )  # fmt: skip
     return out

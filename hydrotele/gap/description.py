@@ -11,7 +11,8 @@ import numpy as np
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.inputs import SUPPLY, Input, input_units
 from hydrotele.gap.customary import amount, in_customary_units
-from hydrotele.gap.discover import Discovery, Learned
+from hydrotele.gap.discover import Discovery
+from hydrotele.gap.law_candidates import Learned
 from hydrotele.gap.law_tables import AHEAD, PLAYED, THROUGH, Memory
 from hydrotele.gap.result import (
     LIKELY,

@@ -1,6 +1,13 @@
 """Forms that a learned law can have: a table over one or two variables, linear in between.
 
 It may see a variable through a play, or be switched by one, as a relay with hysteresis does.
+
+Regression of prediction errors on the entries of a law's table, judged by runs left out.
+
+The errors are those of a track whose unknown inputs have taken up what they could; how they answer
+to an addition is known to first order (`estimate.responses`). So a reading counts as it does in
+the likelihood, and a law that is faster than the unknown inputs is seen as it is, not as a smoother
+blurs it. Entries that follow each other are taken to be alike (P-splines, Eilers and Marx 1996).
 """
 
 import itertools
@@ -10,6 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
+from hydrotele.estimate.responses import error_responses
+from hydrotele.estimate.track import Track
 from hydrotele.terms.facts import OF_A_DRIVE
 from hydrotele.terms.table import PLAY, SWITCH, acting, remembered
 
@@ -315,3 +324,191 @@ def _points(
         points = {p for p in points if abs(p) > 2.0 * smoothing} | {-smoothing, smoothing}
     rounded = sorted({float(f"{p:.6g}") for p in points})
     return tuple(rounded) if len(rounded) > 1 else ()
+
+
+_PARTS = 4  # of a single run, left out one by one
+_GLANCED = 2000  # rows of a run that are looked at in blocks
+_BLOCKS = 400  # of these at most
+_HELD = 0.1  # s of a block
+_MEMORY_ROWS = 15.0  # that a smoother's answer is alike
+_SMOOTHNESS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # of the entries, in units of the lack
+
+
+class Regression(NamedTuple):
+    """A law's entries.
+
+    Attributes:
+        predicted: fall of -2 log likelihood in runs that were left out, all together.
+        entries: (K,) [unit of the addition].
+        covariance: (K, K) of the entries [unit of the addition, squared].
+        charge: what the entries cost: log determinant of what the data add to their precision.
+        left: RMS of what the law does not take of the unknown input [unit of the addition].
+    """
+
+    predicted: float
+    entries: np.ndarray
+    covariance: np.ndarray
+    charge: float
+    left: float
+
+
+def regression(
+    table: Table, parts: Sequence[tuple[Track, np.ndarray, np.ndarray, np.ndarray]], size: float
+) -> Regression:
+    """Fit a table's entries to the errors of some tracks.
+
+    Args:
+        table: with K entries.
+        parts: per run the track, its whitened errors (n c,), what a unit of the addition does
+            (n, nz), and the entries' shares (n, K).
+        size: standard deviation of the unknown input in whose place the law is put.
+
+    Returns:
+        The regression, with the smoothness that predicts best what was left out.
+    """
+    answers = []
+    for track, errors, column, shares in parts:
+        slope = error_responses(track, column, shares * size)
+        answers.append((slope.reshape(-1, slope.shape[2]), errors))
+    falls, x, covariance, charge = _entries(table, answers)
+    along = np.concatenate([shares @ x for *_, shares in parts])
+    left = size * float(np.sqrt(max(1.0 - np.mean(along**2), 0.0)))
+    return Regression(falls, x * size, covariance * size**2, charge, left)
+
+
+def lack_regression(
+    table: Table, parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> tuple[Regression, float]:
+    """Fit a table's entries to a lack that readings tell row by row.
+
+    Args:
+        table: with K entries.
+        parts: per run the lack (n,), its standard deviation (n,) and the entries' shares (n, K).
+
+    Returns:
+        (The regression, the share of the lack's square in its standard deviations that it predicts
+        where it was left out); rows over which smoothed readings hang together count as one.
+    """
+    lack = np.concatenate([told for told, _, _ in parts])
+    size = float(np.sqrt(np.mean(lack**2)))
+    answers = []
+    for told, deviation, shares in parts:
+        each = np.sqrt(_MEMORY_ROWS) * deviation
+        answers.append((-size * shares / each[:, None], told / each))
+    falls, x, covariance, charge = _entries(table, answers)
+    along = np.concatenate([shares @ x for _, _, shares in parts])
+    left = float(np.sqrt(np.mean((lack - size * along) ** 2)))
+    share = falls / sum(float(errors @ errors) for _, errors in answers)
+    return Regression(falls, x * size, covariance * size**2, charge, left), share
+
+
+def _entries(
+    table: Table, answers: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Fall of what is left out, entries, their covariance and charge, with the best smoothness.
+
+    Args:
+        table: with K entries.
+        answers: per run the slopes of its errors with the entries (n, K), and the errors (n,).
+    """
+    if len(answers) == 1:
+        cuts = (np.array_split(part, _PARTS) for part in answers[0])
+        answers = list(zip(*cuts, strict=True))
+    curvature = np.array([s.T @ s for s, _ in answers])
+    slope = np.array([s.T @ e for s, e in answers])
+    falls = {
+        smooth: sum(
+            _left_out(curvature, slope, table.precision(smooth), k) for k in range(len(curvature))
+        )
+        for smooth in _SMOOTHNESS
+    }
+    smooth = max(falls, key=falls.__getitem__)
+    prior = table.precision(smooth)
+    whole = curvature.sum(axis=0) + prior
+    x = -np.linalg.solve(whole, slope.sum(axis=0))
+    charge = np.linalg.slogdet(whole)[1] - np.linalg.slogdet(prior)[1]
+    return falls[smooth], x, np.linalg.inv(whole), float(charge)
+
+
+class Ground(NamedTuple):
+    """How errors of a run answer to an addition that is held over blocks of rows.
+
+    Attributes:
+        rows: first row that is looked at, and the one after the last.
+        width: rows of a block.
+        curvature: (P, B, B) products of the answers to B blocks with each other, in each of P parts
+            of the run, in units of the lack.
+        slope: (P, B) products of the answers with the errors.
+    """
+
+    rows: tuple[int, int]
+    width: int
+    curvature: np.ndarray
+    slope: np.ndarray
+
+    def blocks(self, columns: np.ndarray) -> np.ndarray:
+        """(B, K) means of (n, K) columns over the blocks."""
+        own = columns[slice(*self.rows)]
+        begins = np.arange(0, len(own), self.width)
+        counts = np.minimum(self.width, len(own) - begins)
+        return np.add.reduceat(own, begins, axis=0) / counts[:, None]
+
+
+def ground(
+    track: Track, errors: np.ndarray, column: np.ndarray, told: np.ndarray, known: np.ndarray,
+    alone: bool,
+) -> Ground:  # fmt: skip
+    """What a glance at a law needs of a run.
+
+    Args:
+        track: linearised, with n rows and c channels.
+        errors: (n c,) whitened.
+        column: (n, nz) what a unit of the addition does, in units of the lack.
+        told: (n,) what is lacking: of a long run its loudest stretch is looked at.
+        known: (n,) rows in which a law may be sought.
+        alone: whether it is the only run: parts of it can be left out then.
+    """
+    rows = len(told)
+    squares = np.concatenate([[0.0], np.cumsum(np.nan_to_num(told) ** 2)])
+    length = min(rows, _GLANCED)
+    begin = int(np.argmax(squares[length:] - squares[: rows + 1 - length]))
+    own = slice(begin, begin + length)
+    width = max(1, round(_HELD / track.run.period), -(-length // _BLOCKS))
+    held = np.eye(-(-length // width))[np.arange(length) // width] * known[own, None]
+    answers = error_responses(track, column, held, own)
+    whole = errors.reshape(rows, -1)[own]
+    curvature, slope, parts = [], [], _PARTS if alone else 1
+    for s, e in zip(np.array_split(answers, parts), np.array_split(whole, parts), strict=True):
+        flat = s.reshape(-1, s.shape[2])
+        curvature.append(flat.T @ flat)
+        slope.append(flat.T @ e.ravel())
+    return Ground((begin, begin + length), width, np.array(curvature), np.array(slope))
+
+
+def at_a_glance(table: Table, runs: Sequence[tuple[Ground, np.ndarray]]) -> float:
+    """Fall of the loss that a table predicts in what is left out, seen block by block.
+
+    Args:
+        table: with K entries.
+        runs: the ground of each and the entries' shares along it (n, K).
+
+    Returns:
+        The fall of -2 log likelihood; what is faster than a block is missed.
+    """
+    curvature, slope = [], []
+    for below, shares in runs:
+        held = below.blocks(shares)
+        curvature += [held.T @ (c @ held) for c in below.curvature]
+        slope += [held.T @ s for s in below.slope]
+    c, s = np.array(curvature), np.array(slope)
+    return max(
+        sum(_left_out(c, s, table.precision(smooth), k) for k in range(len(c)))
+        for smooth in _SMOOTHNESS[1::2]
+    )
+
+
+def _left_out(curvature: np.ndarray, slope: np.ndarray, prior: np.ndarray, out: int) -> float:
+    """Fall of the loss of a part that the fit of the entries has not seen."""
+    others = curvature.sum(axis=0) - curvature[out] + prior
+    x = -np.linalg.solve(others, slope.sum(axis=0) - slope[out])
+    return -float(2.0 * slope[out] @ x + x @ curvature[out] @ x)

@@ -16,8 +16,7 @@ from hydrotele.estimate.reduced_model import (
     state_size,
 )
 from hydrotele.gap.balances import balances, peak_lag, pump_lack, window_lags
-from hydrotele.gap.discover import lack_regression
-from hydrotele.gap.law_tables import Table
+from hydrotele.gap.law_tables import Table, lack_regression
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.drives import Transmission
 from hydrotele.machine.machine_file import load_machine

@@ -6,7 +6,8 @@ import numpy as np
 
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.description import describe, learned_laws
-from hydrotele.gap.discover import Discovery, Learned
+from hydrotele.gap.discover import Discovery
+from hydrotele.gap.law_candidates import Learned
 from hydrotele.gap.law_tables import Table
 from hydrotele.gap.result import Lack, Prediction
 from hydrotele.machine.machine_file import load_machine
@@ -27,8 +28,8 @@ def learned(table, entries, balance="force", axis="boom", covariance=None):
     hypothesis = Hypothesis(f"learned_{balance}", f"{axis}.x", {}, lambda m, _: m)
     covariance = np.eye(len(entries)) if covariance is None else covariance
     law = Learned(
-        hypothesis, balance, axis, table, np.array(entries, float), covariance, 1.0, _SMOOTHING,
-        SEEN,
+        hypothesis, balance, axis, table, np.array(entries, float), covariance, 1.0, 1.0,
+        _SMOOTHING, SEEN,
     )  # fmt: skip
     guess = Guess(((hypothesis, np.zeros(0)),))
     (found,) = learned_laws(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 from hydrotele.estimate.evidence import Evidence, Judged
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
@@ -19,11 +20,15 @@ from hydrotele.estimate.levels import columns_of, find_levels
 from hydrotele.estimate.responses import error_responses
 from hydrotele.estimate.track import track_run
 from hydrotele.gap import discover
-from hydrotele.gap.discover import OpenLoop, Regression, _law, _Seen, at_a_glance, better_ahead
+from hydrotele.gap.discover import OpenLoop, better_ahead
 from hydrotele.gap.find import find_gap
+from hydrotele.gap.law_candidates import Seen, learned_law, see
 from hydrotele.gap.law_tables import (
+    Ground,
     Memory,
+    Regression,
     Table,
+    at_a_glance,
     finer_memories,
     paired_tables,
     possible_tables,
@@ -116,13 +121,13 @@ def test_two_laws_of_one_balance_are_written_and_read(tmp_path):
     """A machine that learned twice, or learns again after it was patched, is still a machine."""
     rig, case = load_machine("rig"), Input("flow_head", "slide")
     values = {"position": np.array([0.0, 0.4]), "velocity": np.array([-1.0, 1.0])}
-    seen = _Seen({"slide": values}, np.ones(2, bool), np.zeros((2, 1)))
+    seen = Seen({"slide": values}, np.ones(2, bool), {})
     found = Regression(1.0, np.array([1.0, 2.0]) * 1e-5, np.eye(2), 1.0, 0.1)
     patched = rig
     for variable in ("position", "velocity", "position"):
         table = Table((variable,), ((-0.1, 0.1),), (1.0, 2.5) if variable == "velocity" else ())
         for balance in ("flow_head", "flow_through"):
-            law = _law(patched, (case, balance, table), found, [seen])
+            law = learned_law(patched, (case, balance, table), found, [seen])
             patched = law.hypothesis.machine(patched, np.zeros(0))
     save_machine(patched, tmp_path / "machine.yaml")
     terms = load_machine(str(tmp_path / "machine.yaml")).terms
@@ -213,6 +218,15 @@ def test_every_table_with_a_memory_is_such_a_term():
         assert np.ptp(told) > 0.0
 
 
+CUT = slice(0, 3000), slice(3000, 6000)
+
+
+def readings(told):
+    """The ground of a run whose rows (n,) each tell an addition by itself, in units of noise."""
+    eye: Any = [scipy.sparse.identity(len(told), format="csr")]
+    return Ground((0, len(told)), 1, eye, -told[None])
+
+
 def test_thresholds_of_a_relay_are_found():
     """A constant that a pressure switches, in noise as large: to a tenth of the range."""
     rng = np.random.default_rng(4)
@@ -222,9 +236,8 @@ def test_thresholds_of_a_relay_are_found():
     told = truth.along(values) + rng.normal(size=6000)
 
     def share(table):
-        cut = [slice(0, 3000), slice(3000, 6000)]
         columns = table.columns(values)
-        return at_a_glance(table, [(told[c], columns[c]) for c in cut])
+        return at_a_glance(table, [(readings(told[c]), columns[c]) for c in CUT])
 
     (table,) = (t for t in possible_tables([values], 0.01) if t.variables == ("velocity",))
     best = max(remembering_tables(table, [values], values), key=share)
@@ -252,7 +265,7 @@ def test_a_smooth_surface_is_found_among_other_tables():
     told = np.cos(1.5 * x + y) + rng.normal(size=6000)
     shares = {
         table.variables: at_a_glance(
-            table, [(told[k::2], table.columns(values)[k::2]) for k in range(2)]
+            table, [(readings(told[c]), table.columns(values)[c]) for c in CUT]
         )
         for table in paired_tables([values], 0.01, others=True)
     }
@@ -310,14 +323,14 @@ def test_a_law_is_fitted_again_where_nothing_unknown_is_needed_any_more():
     evidence = Evidence(data, (data.heldout,), 1, lacking=True)
     try:
         judged = evidence.set_base(Guess())
-        seen = [discover._see(data, judged, track) for track in judged.tracks]
-        law = _law(machine, (Input("flow_head", "boom"), "flow_head", table), begun, seen)
+        seen = [see(data, judged, track) for track in judged.tracks]
+        law = learned_law(machine, (Input("flow_head", "boom"), "flow_head", table), begun, seen)
         guess = Guess().plus(law.hypothesis, np.zeros(0))
         (track,) = judged.tracks
         levels = dataclasses.replace(track.levels, inputs=(), sizes=np.zeros(0))
         without = dataclasses.replace(track, levels=levels)
         tracks = find_levels(data, guess.machine(machine), (without,))
-        again = discover._refitted(evidence, Judged(guess, tracks, 0.0), seen, law)
+        again = discover._refitted(evidence, Judged(guess, tracks, 0.0), law)
     finally:
         evidence.close()
     assert again is not None
