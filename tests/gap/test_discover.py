@@ -22,7 +22,7 @@ from hydrotele.estimate.track import track_run
 from hydrotele.gap import discover
 from hydrotele.gap.discover import OpenLoop, better_ahead
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.law_candidates import Seen, learned_law, see
+from hydrotele.gap.law_candidates import Lacks, Seen, learned_law, see
 from hydrotele.gap.law_tables import (
     Ground,
     Memory,
@@ -34,6 +34,7 @@ from hydrotele.gap.law_tables import (
     possible_tables,
     remembering_tables,
 )
+from hydrotele.gap.rivals import ENTER
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine, save_machine
@@ -331,9 +332,20 @@ def test_a_law_is_fitted_again_where_nothing_unknown_is_needed_any_more():
         without = dataclasses.replace(track, levels=levels)
         tracks = find_levels(data, guess.machine(machine), (without,))
         again = discover._refitted(evidence, Judged(guess, tracks, 0.0), law)
+        assert again is not None
+        guess = Guess().plus(again.hypothesis, np.zeros(0))
+        tracks = find_levels(data, guess.machine(machine), (without,))
+        lacks, place = Lacks.of(evidence, Judged(guess, tracks, 0.0)), (law.balance, law.axis)
+        at = Input(*place), law.balance
+        assert at[0] not in lacks.sizes
+        told = lacks.without(again)
+        switched = table._replace(memory=Memory(SWITCH, "velocity", -0.02, 0.02))
+        own, other = (told.regressed((*at, form)) for form in (table, switched))
     finally:
         evidence.close()
-    assert again is not None
+    # what would be lacking without it is this law, and no other one says as much
+    assert own.entries[1] == pytest.approx(again.entries[1], rel=0.1)
+    assert other.predicted < own.predicted - 10.0 * ENTER
     off = again.entries - true
     # three standard deviations in two dimensions; the entry that these positions tell is nearer
     assert off @ np.linalg.solve(again.covariance, off) < 11.8
