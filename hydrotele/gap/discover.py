@@ -71,7 +71,7 @@ class Discovery:
     ahead: OpenLoop = _NOT_RUN
     before: OpenLoop = _NOT_RUN
 
-    def stands_for(self, other: "Discovery", charges: float) -> bool:
+    def stands_for(self, other: "Discovery", allowed: float) -> bool:
         """Whether its laws tell the runs as well as another guess does that has effects, too.
 
         Free runs are told as well where a tenth of what the other one gains at most is lost (of the
@@ -79,13 +79,13 @@ class Discovery:
 
         Args:
             other: with effects, and laws beside them.
-            charges: what the numbers of these effects cost, of -2 log likelihood.
+            allowed: by how much it may be worse with all its laws cost, of -2 log likelihood.
         """
         costs = [d.judged.loss + sum(law.charge for law in d.laws) for d in (self, other)]
         bare, own, others = (np.square(a) for a in (self.before, self.ahead, other.ahead))
         gain = np.maximum(bare - others, 0.0)
         lost = own - others > np.minimum(_LOSS * gain, np.maximum(1.0, _LOSS**2 * gain))
-        return bool(self.laws and not lost.any() and costs[0] <= costs[1] + charges)
+        return bool(self.laws and not lost.any() and costs[0] <= costs[1] + allowed)
 
 
 def discover(evidence: Evidence, judged: Judged) -> Discovery:
@@ -143,6 +143,24 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
     guess = Guess((*own, *found[len(parts) :]))
     judged = replace(judged, guess=guess, loss=judged.loss + prior)
     return Discovery(judged, tuple(laws), refused, last, first)
+
+
+def relearned(evidence: Evidence, judged: Judged, laws: Sequence[Learned]) -> Discovery:
+    """Laws that were learned beside other effects than a guess has, fitted again without these.
+
+    Args:
+        evidence: the runs.
+        judged: the guess, without effects.
+        laws: in the order in which they were learned.
+    """
+    stages, found = [judged], []
+    for law in laws:
+        evidence.set_base(stages[-1])
+        now, fitted = _settled(evidence, stages[-1], _with_law(evidence, stages[-1], law), law)
+        stages.append(now)
+        found.append(fitted)
+    good, last, first = _held_out(evidence, stages, judged.tracks[0].levels.noise)
+    return Discovery(stages[good], tuple(found[:good]), len(found) - good, last, first)
 
 
 def _held_out(

@@ -17,7 +17,7 @@ from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_ru
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.calibrating import calibrate_freely, fit_until_settled
 from hydrotele.gap.description import describe, learned_laws
-from hydrotele.gap.discover import Discovery, better_ahead, discover
+from hydrotele.gap.discover import Discovery, better_ahead, discover, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.residuals import (
     believed,
@@ -352,9 +352,15 @@ def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
     fall, whole = found.judged.loss - beside.judged.loss, found.base.loss - beside.judged.loss
     if rests and beside.laws and fall > _OF_LAWS * whole:
         bare = _without_effects(evidence, found)
-        alone = discover(evidence, bare.judged)
-        if alone.stands_for(beside, sum(found.charges)):
-            return bare, alone
+        # what effects bring beside laws may be what the form of these misses
+        allowed = sum(found.charges) + _MINOR * whole
+        for alone in (
+            lambda: relearned(evidence, bare.judged, beside.laws),
+            lambda: discover(evidence, bare.judged),
+        ):
+            discovery = alone()
+            if discovery.stands_for(beside, allowed):
+                return bare, discovery
         evidence.set_base(beside.judged)
     return found, beside
 

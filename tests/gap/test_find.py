@@ -137,6 +137,9 @@ def test_a_length_offset_as_small_as_a_pin_may_be_off_is_ambiguous(tmp_path):
     assert gap.next_experiment and gap.next_experiment["scenario"]
 
 
+BARE, GOOD, NEAR, FAR = (10.0,) * 3, (1.1,) * 3, (1.3,) * 3, (2.0,) * 3
+
+
 class Learning:
     """Stands in for `discover`: what it makes of guesses with an effect and without one."""
 
@@ -167,15 +170,16 @@ def discovery(search, effect: bool, loss: float, charge: float | None, *ahead: f
     return Discovery(Judged(guess, (), loss), laws, 0, errors, before)
 
 
-def learned(monkeypatch, search, beside: Discovery, alone: Discovery):
-    """Whether the effect stays, and what is taken to be learned."""
+def learned(
+    monkeypatch, search, beside: Discovery, alone: Discovery, again: Discovery | None = None
+):
+    """Whether the effect stays, and what is taken to be learned; `again`: its laws without it."""
     monkeypatch.setattr(find, "discover", Learning(beside, alone))
+    none = discovery(search, False, 1000.0, None, *BARE)
+    monkeypatch.setattr(find, "relearned", lambda evidence, judged, laws: again or none)
     evidence: Any = SimpleNamespace(set_base=lambda base: base)
     found, taken = find._learned(evidence, search)
     return bool(found.guess.parts), taken
-
-
-BARE, GOOD, NEAR, FAR = (10.0,) * 3, (1.1,) * 3, (1.3,) * 3, (2.0,) * 3
 
 
 @pytest.mark.parametrize(("without", "by_laws", "ahead", "kept"), [
@@ -201,8 +205,9 @@ def test_laws_are_learned_of_all_that_lacks_where_no_effect_can_be_believed(
     (-20.0, 4.0, GOOD, True),  # five of charges are saved by four more
     (-20.0, 4.0, NEAR, True),  # free runs lose little of what they gain
     (-20.0, 4.0, FAR, False),  # they lose more than the noise
-    (-20.0, 9.0, GOOD, False),  # laws that need more cost more than the effect saves
-    (-10.0, 4.0, GOOD, False),  # they leave more
+    (-12.0, 4.0, GOOD, True),  # a fiftieth of the gap more is what their form may miss
+    (-20.0, 19.0, GOOD, False),  # laws that need more cost more than the effect saves
+    (-2.0, 4.0, GOOD, False),  # they leave more
 ])  # fmt: skip
 def test_laws_alone_stand_for_an_effect_that_does_a_part_of_their_work(
     monkeypatch, loss, charge, ahead, stands
@@ -213,6 +218,16 @@ def test_laws_alone_stand_for_an_effect_that_does_a_part_of_their_work(
     stays, taken = learned(monkeypatch, search, beside, alone)
     assert stays is not stands
     assert taken is (alone if stands else beside)
+
+
+def test_the_same_laws_without_the_effect_are_tried_first(monkeypatch):
+    search = searched(500.0)
+    beside = discovery(search, True, -20.0, 1.0, *GOOD)
+    again = discovery(search, False, -20.0, 2.0, *GOOD)
+    alone = discovery(search, False, -30.0, 1.0, *GOOD)
+    stays, taken = learned(monkeypatch, search, beside, alone, again)
+    assert not stays
+    assert taken is again
 
 
 def test_laws_alone_are_not_tried_where_an_effect_does_most(monkeypatch):
