@@ -88,7 +88,7 @@ class Discovery:
         return bool(self.laws and not lost.any() and costs[0] <= costs[1] + allowed)
 
 
-def discover(evidence: Evidence, judged: Judged) -> Discovery:
+def discover(evidence: Evidence, judged: Judged, noise: np.ndarray) -> Discovery:
     """Learn laws of what a guess lacks, one after the other.
 
     The numbers of named effects stay as they are: a law is what remains after them, and must not
@@ -97,6 +97,7 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
     Args:
         evidence: the runs.
         judged: the guess, judged with unknown inputs.
+        noise: (c,) of the channels, the same for all guesses whose free runs are compared.
 
     Returns:
         The guess with the laws that are worth their parameters, as many of them as make free runs
@@ -111,7 +112,6 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
     ]
     prior = sum(float(d @ d) for n, (_, d) in zip(named, parts, strict=True) if n)
     judged = replace(judged, guess=Guess(tuple(held)), loss=judged.loss - prior)
-    noise = judged.tracks[0].levels.noise  # the same for all laws: each finds other levels
     stages, begin = [judged], judged.loss
     ahead = _open_loop(evidence, evidence.runs, judged, noise)
     hopeless: set[tuple[str, str]] = set()
@@ -145,12 +145,15 @@ def discover(evidence: Evidence, judged: Judged) -> Discovery:
     return Discovery(judged, tuple(laws), refused, last, first)
 
 
-def relearned(evidence: Evidence, judged: Judged, laws: Sequence[Learned]) -> Discovery:
+def relearned(
+    evidence: Evidence, judged: Judged, noise: np.ndarray, laws: Sequence[Learned]
+) -> Discovery:
     """Laws that were learned beside other effects than a guess has, fitted again without these.
 
     Args:
         evidence: the runs.
         judged: the guess, without effects.
+        noise: as of `discover`.
         laws: in the order in which they were learned.
     """
     stages, found = [judged], []
@@ -159,7 +162,7 @@ def relearned(evidence: Evidence, judged: Judged, laws: Sequence[Learned]) -> Di
         now, fitted = _settled(evidence, stages[-1], _with_law(evidence, stages[-1], law), law)
         stages.append(now)
         found.append(fitted)
-    good, last, first = _held_out(evidence, stages, judged.tracks[0].levels.noise)
+    good, last, first = _held_out(evidence, stages, noise)
     return Discovery(stages[good], tuple(found[:good]), len(found) - good, last, first)
 
 

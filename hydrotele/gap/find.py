@@ -338,29 +338,27 @@ def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
     that takes a small part of a law's work stands in the way of the rest, and nothing takes it back
     where the law does not act; where free runs do not get better by it either, it is left out.
     """
+    noise = found.base.tracks[0].levels.noise  # every guess finds other levels
     rests = [rest for rest in found.without if rest is not None]
     if rests and all(_trust(found, rest) < LIKELY for rest in rests):
         bare = _without_effects(evidence, found)
-        discovery = discover(evidence, bare.judged)
-        if discovery.laws and discovery.judged.loss < found.judged.loss:
-            return bare, discovery
+        alone = discover(evidence, bare.judged, noise)
+        if alone.laws and alone.judged.loss < found.judged.loss:
+            return bare, alone
         evidence.set_base(found.judged)
-        beside = discover(evidence, found.judged)
-        better = better_ahead(beside.ahead, discovery.ahead)
-        return (found, beside) if better else (bare, discovery)
-    beside = discover(evidence, found.judged)
+        beside = discover(evidence, found.judged, noise)
+        return (found, beside) if better_ahead(beside.ahead, alone.ahead) else (bare, alone)
+    beside = discover(evidence, found.judged, noise)
     fall, whole = found.judged.loss - beside.judged.loss, found.base.loss - beside.judged.loss
     if rests and beside.laws and fall > _OF_LAWS * whole:
         bare = _without_effects(evidence, found)
         # what effects bring beside laws may be what the form of these misses
         allowed = sum(found.charges) + _MINOR * whole
-        for alone in (
-            lambda: relearned(evidence, bare.judged, beside.laws),
-            lambda: discover(evidence, bare.judged),
-        ):
-            discovery = alone()
-            if discovery.stands_for(beside, allowed):
-                return bare, discovery
+        alone = relearned(evidence, bare.judged, noise, beside.laws)
+        if not alone.stands_for(beside, allowed):
+            alone = discover(evidence, bare.judged, noise)
+        if alone.stands_for(beside, allowed):
+            return bare, alone
         evidence.set_base(beside.judged)
     return found, beside
 

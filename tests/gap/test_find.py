@@ -146,7 +146,7 @@ class Learning:
     def __init__(self, beside: Discovery, alone: Discovery):
         self.beside, self.alone = beside, alone
 
-    def __call__(self, _, judged: Judged) -> Discovery:
+    def __call__(self, _, judged: Judged, noise) -> Discovery:
         return self.beside if judged.guess.parts else self.alone
 
 
@@ -158,7 +158,8 @@ def searched(without: float) -> Any:
         if h.location == "boom"
     )
     effect = Judged(Guess(((offset, np.ones(1)),)), (), 50.0)
-    base = Judged(Guess(), (), without)
+    track: Any = SimpleNamespace(levels=SimpleNamespace(noise=np.ones(2)))
+    base = Judged(Guess(), (track,), without)
     return Found(base, effect, None, (), (5.0,), (base,), ((),), None)
 
 
@@ -176,7 +177,7 @@ def learned(
     """Whether the effect stays, and what is taken to be learned; `again`: its laws without it."""
     monkeypatch.setattr(find, "discover", Learning(beside, alone))
     none = discovery(search, False, 1000.0, None, *BARE)
-    monkeypatch.setattr(find, "relearned", lambda evidence, judged, laws: again or none)
+    monkeypatch.setattr(find, "relearned", lambda evidence, judged, noise, laws: again or none)
     evidence: Any = SimpleNamespace(set_base=lambda base: base)
     found, taken = find._learned(evidence, search)
     return bool(found.guess.parts), taken
