@@ -33,6 +33,7 @@ from hydrotele.gap.law_tables import (
     lack_regression,
     paired_tables,
     possible_tables,
+    predicted_by_choice,
     regression,
     remembering_tables,
 )
@@ -292,6 +293,9 @@ def candidate_laws(
     if not any(balance == SUPPLY for balance, _ in hopeless):
         pump = _pump_laws(lacks)[:1]
     best = ranked[:_TRIED] + pump
+    for size in (1, 2):  # what one remembers may be chance
+        plain = [p for p in ranked if not p[0][2].memory and len(p[0][2].variables) == size][:1]
+        best += [pair for pair in plain if pair not in best]
     where = {(case[1], case[0].axis) for case, _ in best}
     groups = [best] if best else []
     for case, answer in ranked:
@@ -325,24 +329,28 @@ def possible_laws(
 
     grounds = lacks.grounds(at)
 
-    def glances(tables: Sequence[Table]) -> list[float]:
-        def one(table: Table) -> float:
+    def glances(tables: Sequence[Table]) -> list[np.ndarray]:
+        def one(table: Table) -> np.ndarray:
             shares = [table.columns(v) for v in values]
             return at_a_glance(table, list(zip(grounds, shares, strict=True)))
 
         return lacks.evidence.map(one, tables)
 
-    def likely(tables: Sequence[Table], most: int) -> list[Table]:
-        return [tables[k] for k in np.argsort(glances(tables))[::-1][:most]]
+    def likely(tables: Sequence[Table], most: int) -> list[tuple[float, Table]]:
+        found = zip([float(falls.sum()) for falls in glances(tables)], tables, strict=True)
+        return sorted(found, key=lambda pair: -pair[0])[:most]
 
     for span in ((), window) if window else ((),):
         every = possible_tables(values, speed, span)
         names = [table.variables[0] for table in every]
         single = likely(every, _SINGLES)
         pairs = likely(paired_tables(values, speed, coupled, span), _PAIRS)
-        inside = tried([*single, *pairs])
-        if coupled and not span:
-            inside += tried(_remembered(values, names, single, pairs[:_REMEMBERED], glances))
+        plain = [table for _, table in (*single, *pairs)]
+        inside = tried(plain)
+        if coupled and not span and plain:
+            few = plain[: len(single)], plain[len(single) :][:_REMEMBERED]
+            least = max(fall for fall, _ in (*single, *pairs)) + ENTER
+            inside += tried(_remembered(values, names, *few, glances, least))
         best = max(inside, key=lambda pair: pair[1].predicted, default=None)
         if best and best[0][2].memory:
             inside += tried(finer_memories(best[0][2], _FINER[-1]))
@@ -356,28 +364,40 @@ def possible_laws(
 
 def _remembered(
     values: Sequence[Mapping[str, np.ndarray]], names: Sequence[str], single: Sequence[Table],
-    pairs: Sequence[Table], glances: Callable[[Sequence[Table]], list[float]],
+    pairs: Sequence[Table], glances: Callable[[Sequence[Table]], list[np.ndarray]], least: float,
 ) -> list[Table]:  # fmt: skip
-    """The likeliest laws with a memory: tables that may do, with what each could remember."""
+    """The likeliest laws with a memory: tables that may do, with what each could remember.
+
+    Those of a kind that predicts less than `least`, where runs that are left out choose nothing of
+    what is remembered, are none.
+    """
     tables = [t for table in [*single, *pairs]
               for t in remembering_tables(table, values, table.variables)]  # fmt: skip
     for table in single[:_REMEMBERED]:
         rest = [name for name in names if name not in table.variables]
         tables += remembering_tables(table, values, rest)
 
-    def judged(some: Sequence[Table]) -> list[tuple[float, Table]]:
-        return list(zip(glances(some), some, strict=True))
+    looked: dict[tuple, list[tuple[np.ndarray, Table]]] = {}
 
-    likely: list[tuple[float, Table]] = []
-    for share, table in sorted(judged(tables), key=lambda pair: -pair[0]):  # the best of each kind
-        if table.kind not in [other.kind for _, other in likely]:
-            likely.append((share, table))
+    def best(some: Sequence[Table]) -> tuple[float, Table]:
+        found = list(zip(glances(some), some, strict=True))
+        for falls, table in found:
+            looked.setdefault(table.kind, []).append((falls, table))
+        falls, table = max(found, key=lambda pair: pair[0].sum())
+        return float(falls.sum()), table
+
+    if not tables:
+        return []
+    best(tables)
+    first = [max(kind, key=lambda pair: pair[0].sum()) for kind in looked.values()]
     found = []
-    for share, table in likely[:_MEMORIES]:
+    for falls, table in sorted(first, key=lambda pair: -pair[0].sum())[:_MEMORIES]:
+        share = float(falls.sum())
         for step in chain.from_iterable([step] * _MOVED for step in _FINER):
-            moved = max(judged(finer_memories(table, step)), key=lambda pair: pair[0])
+            moved = best(finer_memories(table, step))
             share, table = moved if moved[0] > share else (share, table)
-        found.append(table)
+        if predicted_by_choice([falls for falls, _ in looked[table.kind]]) > least:
+            found.append(table)
     return found
 
 

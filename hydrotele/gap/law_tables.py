@@ -485,15 +485,16 @@ def ground(
     return Ground((begin, begin + length), width, np.array(curvature), np.array(slope))
 
 
-def at_a_glance(table: Table, runs: Sequence[tuple[Ground, np.ndarray]]) -> float:
-    """Fall of the loss that a table predicts in what is left out, seen block by block.
+def at_a_glance(table: Table, runs: Sequence[tuple[Ground, np.ndarray]]) -> np.ndarray:
+    """Falls of the loss that a table predicts in what is left out, seen block by block.
 
     Args:
         table: with K entries.
         runs: the ground of each and the entries' shares along it (n, K).
 
     Returns:
-        The fall of -2 log likelihood; what is faster than a block is missed.
+        (R,) falls of -2 log likelihood of R runs, or of parts of a single one; what is faster than
+        a block is missed.
     """
     curvature, slope = [], []
     for below, shares in runs:
@@ -501,10 +502,23 @@ def at_a_glance(table: Table, runs: Sequence[tuple[Ground, np.ndarray]]) -> floa
         curvature += [held.T @ (c @ held) for c in below.curvature]
         slope += [held.T @ s for s in below.slope]
     c, s = np.array(curvature), np.array(slope)
-    return max(
-        sum(_left_out(c, s, table.precision(smooth), k) for k in range(len(c)))
-        for smooth in _SMOOTHNESS[1::2]
-    )
+    precisions = [table.precision(smooth) for smooth in _SMOOTHNESS[1::2]]
+    falls = [np.array([_left_out(c, s, p, k) for k in range(len(c))]) for p in precisions]
+    return max(falls, key=np.sum)
+
+
+def predicted_by_choice(falls: Sequence[np.ndarray]) -> float:
+    """Fall in runs left out, if the others choose among tables, too: each knows no more of it.
+
+    Of hundreds of memories one fits the runs there are. What it predicts counts if the others would
+    have chosen one that does.
+
+    Args:
+        falls: (R,) of each table, as of `at_a_glance`.
+    """
+    table = np.array(falls)
+    others = table.sum(axis=1, keepdims=True) - table
+    return float(table[np.argmax(others, axis=0), np.arange(table.shape[1])].sum())
 
 
 def _left_out(curvature: np.ndarray, slope: np.ndarray, prior: np.ndarray, out: int) -> float:

@@ -238,7 +238,7 @@ def test_thresholds_of_a_relay_are_found():
 
     def share(table):
         columns = table.columns(values)
-        return at_a_glance(table, [(readings(told[c]), columns[c]) for c in CUT])
+        return at_a_glance(table, [(readings(told[c]), columns[c]) for c in CUT]).sum()
 
     (table,) = (t for t in possible_tables([values], 0.01) if t.variables == ("velocity",))
     best = max(remembering_tables(table, [values], values), key=share)
@@ -267,7 +267,7 @@ def test_a_smooth_surface_is_found_among_other_tables():
     shares = {
         table.variables: at_a_glance(
             table, [(readings(told[c]), table.columns(values)[c]) for c in CUT]
-        )
+        ).sum()
         for table in paired_tables([values], 0.01, others=True)
     }
     assert max(shares, key=shares.__getitem__) in (
