@@ -232,11 +232,21 @@ def _completed(
         add_element(body, "site", name=TIP_SITE, pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
     if machine.terms:
-        table = terms_of(machine)
-        add_element(root.custom, "numeric", name="hydrotele_terms", size=len(table), data=table)
+        _write_terms(root, terms_of(machine))
     _write_scene(root, ground, looks)
     write_surroundings(root, machine, surroundings, looks)
     return root
+
+
+_NUMERIC = 500  # numbers that MuJoCo reads of one element; it overruns its stack by more
+
+
+def _write_terms(root, table: np.ndarray) -> None:
+    """Add the table of terms, in elements that follow each other, as their numbers do then."""
+    for part, first in enumerate(range(0, len(table), _NUMERIC), start=1):
+        data = table[first : first + _NUMERIC]
+        name = "hydrotele_terms" + (f"_{part}" if part > 1 else "")
+        add_element(root.custom, "numeric", name=name, size=len(data), data=data)
 
 
 def add_element(parent, kind: str, **attributes):

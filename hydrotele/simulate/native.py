@@ -110,8 +110,11 @@ def _terms_of(m, m_nnumeric, m_adr, m_size, m_data):
         sizes = carray(pointer(m + m_size), (1,), np.int64)[0]
         for k in range(count):
             place = data + 8 * np.int64(carray(pointer(at), (count,), np.int32)[k])
-            size = np.int64(carray(pointer(sizes), (count,), np.int32)[k])
-            if size > COUNT and floats(place, 1)[0] == TERMS:
+            own = carray(pointer(sizes), (count,), np.int32)
+            if own[k] > COUNT and floats(place, 1)[0] == TERMS:
+                size = np.int64(0)
+                for part in range(k, count):  # a long table goes on in the elements after it
+                    size += own[part]
                 return floats(place, size)
     return floats(m, 0)
 
