@@ -351,7 +351,7 @@ def advance_memories(user, terms, drives, act_dot, dt, time, supply):
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
-        terms: (n,) table of the machine's terms.
+        terms: (n,) table of the machine's terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
             velocities over it, and the commands that arrive.
         act_dot: (>= 4 count,) mean rates over the step; those of the terms' memories are written

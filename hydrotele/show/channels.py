@@ -22,6 +22,7 @@ TITLES: Mapping[str, str] = {
     "flow_supply": "pump flow",
     "delivery": "flow that the pump is set to",
     "added_delivery": "flow that terms add to the pump's",
+    "memory": "what terms remember, in shares of their play or switch",
     "pressure_supply": "supply pressure",
     "pressure_head": "head side pressure",
     "pressure_rod": "rod side pressure",
