@@ -353,7 +353,7 @@ def advance_memories(user, terms, drives, act_dot, dt, time, supply):
         user: (nu * SLOTS,) actuator numbers.
         terms: (n,) table of the machine's terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
-            velocities over it, and the commands that arrive.
+            velocities over it, and the commands that arrive [SI, commands in 1].
         act_dot: (>= 4 count,) mean rates over the step; those of the terms' memories are written
             [1/s].
         dt: step, scalar [s].
