@@ -32,6 +32,7 @@ from hydrotele.gap.law_tables import (
     finer_memories,
     paired_tables,
     possible_tables,
+    predicted_by_choice,
     remembering_tables,
 )
 from hydrotele.gap.rivals import ENTER
@@ -350,3 +351,26 @@ def test_a_law_is_fitted_again_where_nothing_unknown_is_needed_any_more():
     # three standard deviations in two dimensions; the entry that these positions tell is nearer
     assert off @ np.linalg.solve(again.covariance, off) < 11.8
     assert abs(off[1]) < 0.5 * abs(small[1] - true)
+
+
+def test_a_choice_that_only_the_own_run_would_make_predicts_nothing():
+    """Of two tables that fit one run each the other runs choose the wrong one; a third fits all."""
+    chance = [np.array([90.0, -10.0, -10.0]), np.array([-20.0, 70.0, -10.0])]
+    assert predicted_by_choice(chance) < 0.0 < max(falls.sum() for falls in chance)
+    true = np.array([50.0, 50.0, 50.0])
+    assert predicted_by_choice([*chance, true]) == pytest.approx(150.0)
+
+
+@pytest.mark.parametrize(("errors", "good"), [
+    ((9.0, 5.0, 3.0), 2),  # both help
+    ((9.0, 5.0, 12.0), 1),  # the second one spoils what the first brought
+    ((9.0, 10.0, 11.0), 0),
+])  # fmt: skip
+def test_as_many_laws_are_kept_as_help_the_held_out_run(monkeypatch, errors, good):
+    monkeypatch.setattr(
+        discover, "_open_loop", lambda e, runs, stage, noise: OpenLoop(*3 * [stage])
+    )
+    evidence: Any = SimpleNamespace(data=SimpleNamespace(heldout=None))
+    stages: Any = errors
+    kept, last, first = discover._held_out(evidence, stages, np.ones(1))
+    assert (kept, last.far, first.far) == (good, errors[good], 9.0)
