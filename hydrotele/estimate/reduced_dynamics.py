@@ -60,7 +60,7 @@ from hydrotele.multibody.reduced_motion import LENGTH as BAR_LENGTH
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
-from hydrotele.terms.table import added_with_slope
+from hydrotele.terms.table import acts_on, added_with_slope
 
 _AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 
@@ -139,6 +139,9 @@ def term_force(model, sp, z, i, velocity):
         (force [N] or [N m], d force / d velocity); of a force drive with the terms of its command.
     """
     count = model.hydraulic
+    commanded = i >= count and acts_on(model.terms, ON_COMMAND, i)
+    if not (commanded or acts_on(model.terms, ON_FORCE, i)):
+        return 0.0, 0.0
     supply = supply_of(model, sp, z) if count > 0 else 0.0
     s = drive_state(
         model.user, i, count, sp.act, supply, sp.time[0], sp.drive[X, i], velocity,
@@ -146,7 +149,7 @@ def term_force(model, sp, z, i, velocity):
     )  # fmt: skip
     drives = Drives(count, sp.act, sp.drive[X], sp.drive[V], sp.drive[COMMAND])
     force, slope = added_with_slope(model.terms, ON_FORCE, i, s, drives)
-    if i >= count:
+    if commanded:
         more, steep = added_with_slope(model.terms, ON_COMMAND, i, s, drives)
         force += model.gain[i] * more
         slope += model.gain[i] * steep

@@ -57,9 +57,13 @@ from hydrotele.hydraulics.supply import (
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
 from hydrotele.terms.law import VARIABLES, Drives, DriveState
 from hydrotele.terms.table import (
+    ANY,
     COMMAND,
     COUNT,
+    FLOW_HEAD,
+    FLOW_ROD,
     FLOW_SUPPLY,
+    acts_on,
     added,
     added_flows,
     memory_of,
@@ -175,6 +179,8 @@ def _flows_of_terms(
     terms, i, user, time, x, v, spool, rate, p_head, p_rod, supply, command, drives
 ):
     """What the terms add to the flows of an axis, see `terms.table.added_flows`."""
+    if not (acts_on(terms, FLOW_HEAD, i) or acts_on(terms, FLOW_ROD, i)):
+        return _NO_FLOWS
     u = i * SLOTS
     force = user[u + _AH] * p_head - user[u + _AR] * p_rod
     s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command[i], force, 0.0, 0.0)
@@ -191,7 +197,7 @@ def _delivery_of_terms(user, first, count, terms, act, length, velocity, command
     if at == 0:
         return 0.0
     total, drives = 0.0, Drives(count, act, length, velocity, command)
-    if len(terms) > 0:
+    if acts_on(terms, FLOW_SUPPLY, ANY):
         for i in range(count):
             u, a = (first + i) * SLOTS, 4 * i
             force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
@@ -611,6 +617,10 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
 
     Source: docs/effects.md, laws of one's own: the balance `command`.
     """
+    if not acts_on(terms, COMMAND, ANY):
+        for i in range(count):
+            out[i] = command[i]
+        return
     open_ports(user, act, act, scratch, 0, count, 0.0, act)
     supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
     middle = time + 0.5 * dt

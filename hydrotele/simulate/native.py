@@ -47,7 +47,7 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.hydraulics.parameters import CURVE, CURVE_KNOTS, MARKER
 from hydrotele.simulate.layout import field_offsets, mujoco_library, option_offset, verify_layout
 from hydrotele.terms.law import Drives
-from hydrotele.terms.table import COMMAND, COUNT, FORCE, added_with_slope
+from hydrotele.terms.table import COMMAND, COUNT, FORCE, acts_on, added_with_slope
 from hydrotele.terms.table import MARKER as TERMS
 
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
@@ -361,13 +361,14 @@ def _callbacks(remembers):
             held = int(user[_COUNT])
             if not _sound(user, 0, held, nu, carray(pointer(m + m_na), (1,), np.int64)[0]):
                 terms = floats(m, 0)
-        if len(terms) > 0:
+        commanded = gain != 0.0 and acts_on(terms, COMMAND, i)
+        if commanded or acts_on(terms, FORCE, i):
             s, drives = _state(
                 d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, d_velocity, nu,
                 carray(_stack(0), (2 * SCRATCH,), np.float64),
             )  # fmt: skip
             more, steep = added_with_slope(terms, FORCE, i, s, drives)
-            if gain != 0.0:
+            if commanded:
                 extra, slope = added_with_slope(terms, COMMAND, i, s, drives)
                 more += gain * extra
                 steep += gain * slope

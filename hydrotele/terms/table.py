@@ -25,6 +25,7 @@ from hydrotele.terms.law import LAWS, VARIABLES, DriveState, Law, Numbers, Varia
 
 # numpy's integers, since numba compiles a function anew for each of Python's that it is called with
 FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = np.arange(len(BALANCES), dtype=np.int64)
+ANY = np.int64(-1)  # drive, where it does not matter which
 MARKER = 215326.75  # of a table of terms among other custom numbers of a model
 NO_TERMS = np.zeros(0)
 COUNT = 1  # place of the number of terms, after the marker
@@ -324,6 +325,27 @@ def acting(time, begin, end):
 
 
 _acting = allocation_free(acting)
+
+
+@allocation_free
+def acts_on(terms, balance, axis):
+    """Whether a term adds to a balance of a drive: what it would see need not be known if not.
+
+    Args:
+        terms: (n,) table of `terms_table`.
+        balance: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
+        axis: index of the actuator, or ANY.
+
+    Returns:
+        bool.
+    """
+    if len(terms) == 0:
+        return False
+    for term in range(int(terms[COUNT])):
+        at = _HEAD + _ROW * term
+        if int(terms[at + _BALANCE]) == balance and (axis == ANY or int(terms[at + _AXIS]) == axis):
+            return True
+    return False
 
 
 @allocation_free
