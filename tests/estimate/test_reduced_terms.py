@@ -158,3 +158,13 @@ def test_second_order_in_the_step(kind, machine_of, reduced_of):
     # two halvings: a sixteenth; first order would leave a fourth. Valves that open within a step
     # cost some of it, as in the model without terms
     assert differences[-1] < 0.4**2 * differences[0], differences
+
+
+@pytest.mark.parametrize("balance", ["force", "flow_head", "flow_rod", "command"])
+def test_a_term_that_adds_nothing_changes_nothing(balance, machine_of, reduced_of):
+    """What a balance is given by a law of size 0 is, to the last bit, what it has without terms."""
+    machine = machine_of("cat215/none")
+    nothing = with_terms(machine, "t", [term("stick", balance, "constant", value=0.0)])
+    runs = [free_run(reduced_of, one, 40, 8, 0.4) for one in (machine, nothing)]
+    assert np.ptp(runs[0][:, 2]) > 1e-3, "it moves"
+    assert np.array_equal(*runs)

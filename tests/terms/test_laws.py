@@ -14,9 +14,14 @@ from hydrotele.terms.facts import Play, Term
 from hydrotele.terms.law import LAWS, NO_DRIVES, VARIABLES, Drives, DriveState, law
 from hydrotele.terms.laws import formula_arguments
 from hydrotele.terms.table import (
+    ANY,
+    COMMAND,
+    FLOW_HEAD,
     FLOW_ROD,
+    FLOW_SUPPLY,
     FORCE,
     NO_TERMS,
+    acts_on,
     added,
     added_flows,
     added_with_slope,
@@ -127,6 +132,22 @@ def test_terms_add_up_and_know_their_slopes():
     assert -head == rod == pytest.approx(1e-8 * math.sqrt(5e6))
     exact = -0.5e-8 / math.sqrt(5e6)
     assert [by_head, by_rod] == pytest.approx([exact, exact], rel=1e-4)  # differences of 100 Pa
+
+
+def test_balances_and_drives_that_terms_act_on():
+    terms = [
+        Term(name="t", axis=axis, balance=balance, law="constant", parameters={"value": 1.0})
+        for axis, balance in (("a", "force"), ("b", "flow_rod"), ("b", "force"))
+    ]
+    table = terms_table(terms, ["a", "b", "c"])
+    told = {
+        (balance, drive)
+        for balance in (FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY)
+        for drive in (0, 1, 2, ANY)
+        if acts_on(table, balance, drive)
+    }
+    assert told == {(FORCE, 0), (FORCE, 1), (FORCE, ANY), (FLOW_ROD, 1), (FLOW_ROD, ANY)}
+    assert not acts_on(NO_TERMS, FORCE, ANY)
 
 
 def test_beyond_its_domain_a_variable_counts_with_the_nearer_end():
