@@ -63,6 +63,7 @@ _REFUSED = (
 _MINOR = 0.02  # share of the gap up to which something is a detail; laws are rarely closer to a
 # machine than 15 % of what they do
 _OF_LAWS = 0.1  # of what a guess explains, by laws beside effects, from which laws are tried alone
+_MOST_OF_IT = 2 / 3  # of what is lacking: an effect that takes more is no part of a law's work
 _TRACE_OF_FORM = 0.005  # share up to which an effect only mends the form of one beside it
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _ALIKE = 1.0e-3  # of the squares of what an effect changes: readings that are alike to 3 %
@@ -327,16 +328,23 @@ def _trust(found: Found, rest: Judged) -> float:
         found: the search.
         rest: its guess without the effect.
     """
+    return believed_part(_part(found, rest))
+
+
+def _part(found: Found, rest: Judged) -> float:
+    """Share of what a search lacks without an effect that the effect takes."""
     ideal = min(sum(map(undisturbed_loss, found.judged.tracks)), found.judged.loss)
-    return believed_part((rest.loss - found.judged.loss) / max(rest.loss - ideal, 1.0))
+    return (rest.loss - found.judged.loss) / max(rest.loss - ideal, 1.0)
 
 
 def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
     """Laws of what the effects leave; of all that is lacking, where none of these can be believed.
 
-    Nor can they where laws alone tell the runs as well: what they do is a part of these. An effect
-    that takes a small part of a law's work stands in the way of the rest, and nothing takes it back
-    where the law does not act; where free runs do not get better by it either, it is left out.
+    Nor can they where laws alone tell the runs as well, unless one of them takes most of what is
+    lacking by itself: what they do is a part of these laws, whose many entries can do what a few
+    numbers do. An effect that takes a small part of a law's work stands in the way of the rest, and
+    nothing takes it back where the law does not act; where free runs do not get better by it
+    either, it is left out.
     """
     noise = found.base.tracks[0].levels.noise  # every guess finds other levels
     rests = [rest for rest in found.without if rest is not None]
@@ -350,7 +358,8 @@ def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
         return (found, beside) if better_ahead(beside.ahead, alone.ahead) else (bare, alone)
     beside = discover(evidence, found.judged, noise)
     fall, whole = found.judged.loss - beside.judged.loss, found.base.loss - beside.judged.loss
-    if rests and beside.laws and fall > _OF_LAWS * whole:
+    leading = any(_part(found, rest) > _MOST_OF_IT for rest in rests)
+    if rests and not leading and beside.laws and fall > _OF_LAWS * whole:
         bare = _without_effects(evidence, found)
         # what effects bring beside laws may be what the form of these misses
         allowed = sum(found.charges) + _MINOR * whole

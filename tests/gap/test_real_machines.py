@@ -18,7 +18,7 @@ from hydrotele.machine.machine_file import load_machine
 from tests.measured import REAL, needs_real
 from tools.real_machines import FIRST_THREE_QUARTERS, PUSH, ec20_splits, force_error, pushed
 
-pytestmark = [needs_real, pytest.mark.nightly]
+pytestmark = needs_real
 
 
 def test_emps_names_friction_that_depends_on_the_direction():
@@ -38,6 +38,7 @@ def test_emps_names_friction_that_depends_on_the_direction():
     assert force_error(gap.patched, data.heldout, 20.0) < 3.2
 
 
+@pytest.mark.nightly
 def test_the_command_reads_a_record_whose_columns_only_the_machine_can_name(tmp_path):
     """The record calls its columns `position` and `drive_voltage`; there is no noise floor."""
     out = tmp_path / "gap"
@@ -50,6 +51,7 @@ def test_the_command_reads_a_record_whose_columns_only_the_machine_can_name(tmp_
     assert document["noise"]["position.slide"]["stated"] is None
 
 
+@pytest.mark.nightly
 def test_emps_locates_a_hidden_push_in_time_and_size():
     data = pushed(load_dataset(REAL / "emps" / "main.parquet", load_machine("emps")), *PUSH)
     found = {e.name: e for e in find_gap(data).effects}
@@ -62,6 +64,7 @@ def test_emps_locates_a_hidden_push_in_time_and_size():
     assert push.parameters["duration"].value == pytest.approx(duration, abs=0.02)
 
 
+@pytest.mark.nightly
 def test_a_minute_of_the_ec20_is_worth_more_than_a_table_of_all():
     """Delay and table of command to speed are fitted to all but the last quarter, which judges.
 
@@ -85,12 +88,14 @@ def test_a_minute_of_the_ec20_is_worth_more_than_a_table_of_all():
         assert np.all(horizon.rms < found["table"].horizons[seconds].rms)
 
 
+@pytest.mark.nightly
 def test_a_machine_that_states_no_open_numbers_is_not_fitted_to_free_runs():
     data = load_dataset(REAL / "volvo_ec20" / "long.parquet", load_machine("ec20"))
     sure = data.machine.model_copy(update={"uncertainty": {"mass": 0.05}})
     assert calibrate_freely(dataclasses.replace(data, machine=sure), 1) is None
 
 
+@pytest.mark.nightly
 def test_long_records_are_cut_to_where_the_commands_change():
     data = load_dataset(REAL / "emps" / "main.parquet", load_machine("emps"))
     short = busiest(data, 6.0)
