@@ -11,7 +11,7 @@ from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.estimate.inputs import input_sizes, input_units
-from hydrotele.estimate.levels import rippled, stated_jitter, undisturbed_loss
+from hydrotele.estimate.levels import rippled, stated_jitter
 from hydrotele.estimate.stretches import busiest, thinned
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances
@@ -43,7 +43,7 @@ from hydrotele.gap.result import (
     Prediction,
     Verdict,
 )
-from hydrotele.gap.rivals import TOLD, effect_probabilities
+from hydrotele.gap.rivals import TOLD, effect_probabilities, part_taken
 from hydrotele.gap.search import Found, lacking, search
 from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
@@ -328,13 +328,7 @@ def _trust(found: Found, rest: Judged) -> float:
         found: the search.
         rest: its guess without the effect.
     """
-    return believed_part(_part(found, rest))
-
-
-def _part(found: Found, rest: Judged) -> float:
-    """Share of what a search lacks without an effect that the effect takes."""
-    ideal = min(sum(map(undisturbed_loss, found.judged.tracks)), found.judged.loss)
-    return (rest.loss - found.judged.loss) / max(rest.loss - ideal, 1.0)
+    return believed_part(part_taken(rest, found.judged))
 
 
 def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
@@ -358,7 +352,7 @@ def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
         return (found, beside) if better_ahead(beside.ahead, alone.ahead) else (bare, alone)
     beside = discover(evidence, found.judged, noise)
     fall, whole = found.judged.loss - beside.judged.loss, found.base.loss - beside.judged.loss
-    leading = any(_part(found, rest) > _MOST_OF_IT for rest in rests)
+    leading = any(part_taken(rest, found.judged) > _MOST_OF_IT for rest in rests)
     if rests and not leading and beside.laws and fall > _OF_LAWS * whole:
         bare = _without_effects(evidence, found)
         # what effects bring beside laws may be what the form of these misses

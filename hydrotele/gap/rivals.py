@@ -12,6 +12,7 @@ from hydrotele.effects import EFFECTS
 from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.levels import undisturbed_loss
 from hydrotele.gap.calibrating import (
     fit_until_settled,
     fitted,
@@ -19,6 +20,7 @@ from hydrotele.gap.calibrating import (
     loss_of,
     strained,
 )
+from hydrotele.gap.residuals import believed_part
 from hydrotele.gap.screening import Screened
 
 _PLAINER = 0.2  # of an effect's probability from which a rival with fewer numbers takes its place
@@ -224,6 +226,7 @@ def find_rivals(
 
 ENTER = 15.0  # twice the log evidence an effect must bring; 100 clean machines stay below 14.7
 TOLD = 9.0  # square of an effect's deviation over its uncertainty: three standard deviations
+_UNBELIEVABLE = 0.05  # probability up to which an effect is not looked at further: a part of 14 %
 _BEYOND_DOUBT = 300.0  # score of an effect that is named however small: an integrator of first
 # order at 1 ms alone looks like a delay of 0.5 ms with a score of 267
 
@@ -239,6 +242,29 @@ def worth_naming(guess: Guess, index: int, score: float) -> bool:
     if not own.all() and not np.any(np.abs(deviation[own]) >= hypothesis.least[own]):
         return False
     return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
+
+
+def part_taken(rest: Judged, judged: Judged) -> float:
+    """Share of what a guess lacks that one with more takes of it.
+
+    Args:
+        rest: the guess.
+        judged: the one with more.
+
+    Returns:
+        1 where nothing is lacking any more, see `undisturbed_loss`.
+    """
+    ideal = min(sum(map(undisturbed_loss, judged.tracks)), judged.loss)
+    return (rest.loss - judged.loss) / max(rest.loss - ideal, 1.0)
+
+
+def telling(now: Judged, after: Judged) -> bool:
+    """Whether a guess takes so much of what another one lacks that what it adds may be believed.
+
+    What takes less is left to calibration and to laws. Effects are added largest first, so that a
+    small one is weighed against what the others have left.
+    """
+    return believed_part(part_taken(now, after)) > _UNBELIEVABLE
 
 
 def differs_significantly(guess: Guess, fit: Fit, index: int) -> bool:

@@ -52,6 +52,7 @@ from hydrotele.gap.rivals import (
     plain_form,
     pruned,
     rests_of,
+    telling,
     without_needless,
     worth_naming,
 )
@@ -629,7 +630,7 @@ def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -
 
 def _let_go(
     evidence: Evidence, now: Judged, moved: tuple[Guess, float]
-) -> tuple[tuple[Judged, float], Fit | None]:
+) -> tuple[tuple[Judged, float] | None, Fit | None]:
     """A guess of `promoted`, judged, and its score; its fit where a number had come to its end."""
     guess, gain = moved
     judged, fit = evidence.judged(guess), None
@@ -637,7 +638,7 @@ def _let_go(
         judged, fit = fit_until_settled(evidence, judged)
         evidence.set_base(now)
         gain += max(0.0, now.loss - judged.loss)
-    return (judged, gain), fit
+    return (judged, gain) if telling(now, judged) else None, fit
 
 
 def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:
@@ -665,9 +666,7 @@ def _others(
     ranked: Sequence[Screened] | None, keys: Sequence[tuple[str, str]]
 ) -> Sequence[Screened] | None:
     """A ranking without some candidates."""
-    if ranked is None:
-        return None
-    return [r for r in ranked if r.hypothesis.key not in keys]
+    return ranked and [r for r in ranked if r.hypothesis.key not in keys]
 
 
 def _score(option: tuple[Judged, float]) -> float:
@@ -696,11 +695,11 @@ def _best_singles(
 def _judged_best(
     evidence: Evidence, now: Judged, fits: Sequence[Fit]
 ) -> list[tuple[Judged, float]]:
-    """Those fits that bring enough with levels of their own, and their scores, best first."""
+    """Fits that bring enough with levels of their own and may be believed, and their scores."""
     judged = [evidence.judged(fit.guess) for fit in fits]
     scores = [now.loss - j.loss - fit.occam_penalty for j, fit in zip(judged, fits, strict=True)]
-    found = [(j, score) for j, score in zip(judged, scores, strict=True) if score >= ENTER]
-    return sorted(found, key=_score)
+    options = [o for o in zip(judged, scores, strict=True) if o[1] >= ENTER and telling(now, o[0])]
+    return sorted(options, key=_score)
 
 
 def _best_pairs(

@@ -1,12 +1,16 @@
 """Rivals of an effect: what is but another way of saying it is none."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.estimate.evidence import Evidence
+from hydrotele.estimate.evidence import Evidence, Judged
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses, with_shape
-from hydrotele.gap.rivals import brings_no_more, is_case_of, worth_naming
+from hydrotele.gap import rivals
+from hydrotele.gap.rivals import brings_no_more, is_case_of, part_taken, telling, worth_naming
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
 
@@ -69,3 +73,18 @@ def test_what_shapes_an_effect_does_not_make_it_one(gap, worth):
 def test_an_effect_without_optional_numbers_has_no_other_shape():
     (offset, *_) = hypotheses(load_machine("cat215"), ("angle_offset",))
     assert with_shape(offset, load_machine("cat215")) is None
+
+
+@pytest.mark.parametrize(("after", "ideal", "part", "told"), [
+    (900.0, 0.0, 0.1, False),  # a tenth of what is lacking: others do nine of it
+    (800.0, 0.0, 0.2, True),
+    (900.0, 880.0, 100 / 120, True),  # as little, but nearly nothing is left
+    (900.0, 950.0, 1.0, True),  # nothing is lacking any more
+    (1010.0, 0.0, -0.01, False),  # worse
+])  # fmt: skip
+def test_what_takes_little_of_what_is_lacking_is_not_added(monkeypatch, after, ideal, part, told):
+    monkeypatch.setattr(rivals, "undisturbed_loss", lambda track: track.ideal)
+    tracks: Any = (SimpleNamespace(ideal=0.25 * ideal), SimpleNamespace(ideal=0.75 * ideal))
+    now, more = Judged(Guess(), (), 1000.0), Judged(Guess(), tracks, after)
+    assert part_taken(now, more) == pytest.approx(part)
+    assert telling(now, more) is told
