@@ -63,7 +63,7 @@ _REFUSED = (
 _MINOR = 0.02  # share of the gap up to which something is a detail; laws are rarely closer to a
 # machine than 15 % of what they do
 _OF_LAWS = 0.1  # of what a guess explains, by laws beside effects, from which laws are tried alone
-_MOST_OF_IT = 2 / 3  # of what is lacking: an effect that takes more is no part of a law's work
+_MOST_OF_IT = 0.9  # of what is lacking: an effect that takes more is no part of a law's work
 _TRACE_OF_FORM = 0.005  # share up to which an effect only mends the form of one beside it
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _ALIKE = 1.0e-3  # of the squares of what an effect changes: readings that are alike to 3 %
@@ -71,6 +71,7 @@ _NORMAL95 = 1.96
 _FLOOR = (0.5, 2.0)  # RMS between which a perfect model's errors must lie
 _OFF = 0.05  # by which noise must differ from the stated to be noted
 _JITTER = 0.2  # by which jitter must
+_FAR = 3.0  # stated uncertainties, by which a calibrated number must
 Progress = Callable[[str, float], None]
 
 
@@ -493,6 +494,17 @@ def _all_calibrated(
     return {k: e for k, e in (later | freely | first).items() if k not in gone}
 
 
+def _far(guess: Guess) -> list[str]:
+    """Calibrated numbers that moved far beyond what is stated as uncertain."""
+    return [
+        f"{key} {p.nominal + d * p.scale:.4g} {p.unit} (model: {p.nominal:.4g}; {abs(d):.1f} times)"
+        for hypothesis, deviation in guess.parts
+        if hypothesis.name == CALIBRATION
+        for (key, p), d in zip(hypothesis.parameters.items(), deviation, strict=True)
+        if abs(d) > _FAR
+    ]
+
+
 def _noise(data: Dataset, levels: Levels) -> dict[str, tuple[float, float]]:
     return {
         channel: (float(found), float(stated))
@@ -562,6 +574,11 @@ def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> 
         unstated = [c for c, n in zip(data.channels, data.noise, strict=True) if not np.isfinite(n)]
         notes.append(f"The machine states no accuracy of {', '.join(unstated)}; the noise there was"
                      " found from the readings.")  # fmt: skip
+    if far := _far(found.guess):
+        notes.append(
+            f"Calibrated by more than {_FAR:g} times what is stated as uncertain: {', '.join(far)}."
+            " They are as likely effects as wrong statements."
+        )
     if floor is None:
         notes.append(
             "What a perfect model would leave cannot be told: runs made with the patched machine"

@@ -244,27 +244,29 @@ def worth_naming(guess: Guess, index: int, score: float) -> bool:
     return score >= _BEYOND_DOUBT or bool(np.any(np.abs(deviation) >= hypothesis.least))
 
 
-def part_taken(rest: Judged, judged: Judged) -> float:
+def part_taken(rest: Judged, judged: Judged, saved: float = 0.0) -> float:
     """Share of what a guess lacks that one with more takes of it.
 
     Args:
         rest: the guess.
         judged: the one with more.
+        saved: what the guess costs beside its loss, and the other one does not.
 
     Returns:
         1 where nothing is lacking any more, see `undisturbed_loss`.
     """
     ideal = min(sum(map(undisturbed_loss, judged.tracks)), judged.loss)
-    return (rest.loss - judged.loss) / max(rest.loss - ideal, 1.0)
+    whole = rest.loss + saved
+    return (whole - judged.loss) / max(whole - ideal, 1.0)
 
 
-def telling(now: Judged, after: Judged) -> bool:
+def telling(now: Judged, after: Judged, saved: float = 0.0) -> bool:
     """Whether a guess takes so much of what another one lacks that what it adds may be believed.
 
     What takes less is left to calibration and to laws. Effects are added largest first, so that a
-    small one is weighed against what the others have left.
+    small one is weighed against what the others have left. Arguments as of `part_taken`.
     """
-    return believed_part(part_taken(now, after)) > _UNBELIEVABLE
+    return believed_part(part_taken(now, after, saved)) > _UNBELIEVABLE
 
 
 def differs_significantly(guess: Guess, fit: Fit, index: int) -> bool:

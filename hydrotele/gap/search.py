@@ -638,7 +638,7 @@ def _let_go(
         judged, fit = fit_until_settled(evidence, judged)
         evidence.set_base(now)
         gain += max(0.0, now.loss - judged.loss)
-    return (judged, gain) if telling(now, judged) else None, fit
+    return (judged, gain) if telling(now, judged, moved[1]) else None, fit
 
 
 def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:

@@ -88,3 +88,12 @@ def test_what_takes_little_of_what_is_lacking_is_not_added(monkeypatch, after, i
     now, more = Judged(Guess(), (), 1000.0), Judged(Guess(), tracks, after)
     assert part_taken(now, more) == pytest.approx(part)
     assert telling(now, more) is told
+
+
+def test_a_number_that_becomes_an_effect_need_not_make_the_loss_smaller(monkeypatch):
+    """It saves what it cost to be that far off; nothing is lacking before or after."""
+    monkeypatch.setattr(rivals, "undisturbed_loss", lambda track: 1010.0)
+    track: Any = None
+    now, after = Judged(Guess(), (track,), 1000.0), Judged(Guess(), (track,), 1002.0)
+    assert not telling(now, after)
+    assert telling(now, after, 30.0)
