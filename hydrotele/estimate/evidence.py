@@ -8,6 +8,7 @@ How well the numbers of named effects are known: noise, run-to-run scatter, inte
 """
 
 import dataclasses
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ from hydrotele.machine.machine import Machine
 
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
 _STEPS = 6
-MIDDLE = 2.0e-3  # s, step at which guesses are fitted
+MIDDLE = 2.0e-3  # s, step at which guesses are fitted; candidates take COARSE
 _MANY = 10  # numbers of a base from which their slopes are taken at a coarser step
 BLOCK = 2.0  # s of a run that count as one witness: longer than what a model lacks remembers
 _ROUNDS = 2  # of linearisation for the levels of the first base; later ones start from near by
@@ -87,6 +88,17 @@ class Judged:
         return np.concatenate([_blocks(track, seconds) for track in self.tracks])
 
 
+def _threads(jobs: int, runs: int) -> int:
+    """Workers: one for each run where jobs are all processors, which take turns then.
+
+    Three runs on two workers would take as long as four.
+    """
+    processors = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    )
+    return min(max(jobs, runs), 2 * jobs) if 1 < jobs >= (processors or 1) else jobs
+
+
 class Evidence:
     """Runs of a dataset, tracks of a base guess, and workers to try other guesses."""
 
@@ -101,7 +113,7 @@ class Evidence:
         """
         self.step, self.lacking = step, lacking or not known_levels(data)
         self.data, self.runs = dataclasses.replace(data, fit=tuple(runs)), tuple(runs)
-        self._pool = ThreadPoolExecutor(jobs)
+        self._pool = ThreadPoolExecutor(_threads(jobs, len(self.runs)))
         self.tracks: tuple[Track, ...] = ()
         self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
         self._slopes = dict[float, np.ndarray]()

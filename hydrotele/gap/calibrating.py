@@ -396,7 +396,7 @@ def uncalibrated(guess: Guess, machine: Machine, keys: Collection[str]) -> Guess
     return Guess(tuple(parts))
 
 
-_STEPS = 3  # of Gauss-Newton for a candidate
+FIT_STEPS = 3  # of Gauss-Newton for a candidate
 _SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
 _UNMOVED = 0.3  # standard deviations by which a number may still move
 _IDLE = 3.0  # fall of the loss that is not worth another round of a calibration
@@ -411,12 +411,14 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
 
     def fit(candidate: Screened) -> Fit:
         more = now.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, MIDDLE)
+        step = evidence.step_of(more, COARSE)
         kept = evidence.base_slopes(evidence.slope_step, parallel=False)
         before = loss_of(evidence, now.guess, step)
 
         def climb(start: Guess) -> Fit:
-            return evidence.fit(start, before, parallel=False, step=step, kept=kept, steps=_STEPS)
+            return evidence.fit(
+                start, before, parallel=False, step=step, kept=kept, steps=FIT_STEPS
+            )
 
         found = climb(more)
         wider = widened(found.guess)

@@ -331,8 +331,7 @@ def possible_laws(
 
     def glances(tables: Sequence[Table]) -> list[np.ndarray]:
         def one(table: Table) -> np.ndarray:
-            shares = [table.columns(v) for v in values]
-            return at_a_glance(table, list(zip(grounds, shares, strict=True)))
+            return at_a_glance(table, list(zip(grounds, values, strict=True)))
 
         return lacks.evidence.map(one, tables)
 

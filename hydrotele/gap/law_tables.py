@@ -10,6 +10,7 @@ the likelihood, and a law that is faster than the unknown inputs is seen as it i
 blurs it. Entries that follow each other are taken to be alike (P-splines, Eilers and Marx 1996).
 """
 
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -135,27 +136,31 @@ class Table(NamedTuple):
 
     def columns(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """(n, K) shares of the entries along a run; row by row they add to 1 where the law acts."""
+        entries, weights = self.weights(values)
+        found = np.zeros((len(entries), self.size))
+        np.put_along_axis(found, entries, weights, axis=1)
+        return found
+
+    def weights(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 2) or (n, 4) entries that have a share in a row of a run, and these shares."""
         held = self.memory.along(values) if self.memory else None
         if held is not None and self.memory and self.memory.way == PLAY:
             values = {**values, **self.memory.seen(values)}
-        found = _shares(values[self.variables[0]], self.points[0])
+        entries, weights = _weights(values[self.variables[0]], self.points[0])
         if len(self.variables) == 2:
-            across = _shares(values[self.variables[1]], self.points[1])
-            found = (found[:, :, None] * across[:, None]).reshape(len(found), -1)
+            across, shares = _weights(values[self.variables[1]], self.points[1])
+            entries = entries[:, :, None] * len(self.points[1]) + across[:, None]
+            weights = weights[:, :, None] * shares[:, None]
+            entries, weights = entries.reshape(len(across), -1), weights.reshape(len(across), -1)
         if held is not None and self.memory and self.memory.way == SWITCH:
-            found *= held[:, None]
+            weights = weights * held[:, None]
         if self.window:
-            found *= acting(values["time"], *self.window)[:, None]
-        return found
+            weights = weights * acting(values["time"], *self.window)[:, None]
+        return entries, weights
 
     def precision(self, smoothness: float) -> np.ndarray:
         """(K, K) prior precision of the entries: of their second differences, and of each."""
-        found = np.zeros((1, 1))
-        for points in self.points:
-            bends = np.diff(np.eye(len(points)), 2, axis=0)
-            own = np.kron(np.eye(len(found)), bends.T @ bends)
-            found = np.kron(found, np.eye(len(points))) + own
-        return smoothness * found + _SHRINK * np.eye(self.size)
+        return smoothness * _bending(tuple(map(len, self.points))) + _SHRINK * np.eye(self.size)
 
     def law(self, entries: np.ndarray) -> dict[str, Any]:
         """Law, parameters, variables and window of a term with some entries (K,)."""
@@ -173,15 +178,24 @@ class Table(NamedTuple):
         return {"law": "table2", "parameters": table, **where}
 
 
-def _shares(x: np.ndarray, points: Sequence[float]) -> np.ndarray:
-    """(n, K) weights of linear interpolation, constant beyond the ends."""
+@functools.cache
+def _bending(counts: tuple[int, ...]) -> np.ndarray:
+    """(K, K) products of second differences of entries with so many points of each variable."""
+    found = np.zeros((1, 1))
+    for count in counts:
+        bends = np.diff(np.eye(count), 2, axis=0)
+        own = np.kron(np.eye(len(found)), bends.T @ bends)
+        found = np.kron(found, np.eye(count)) + own
+    return found
+
+
+def _weights(x: np.ndarray, points: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 2) points and weights of linear interpolation, constant beyond the ends."""
     at = np.asarray(points)
     x = np.clip(np.nan_to_num(x), at[0], at[-1])
     low = np.clip(np.searchsorted(at, x) - 1, 0, len(at) - 2)
     part = (x - at[low]) / (at[low + 1] - at[low])
-    found, rows = np.zeros((len(x), len(at))), np.arange(len(x))
-    found[rows, low], found[rows, low + 1] = 1.0 - part, part
-    return found
+    return np.stack([low, low + 1], axis=1), np.stack([1.0 - part, part], axis=1)
 
 
 def possible_tables(
@@ -417,9 +431,7 @@ def _entries(
     curvature = np.array([s.T @ s for s, _ in answers])
     slope = np.array([s.T @ e for s, e in answers])
     falls = {
-        smooth: sum(
-            _left_out(curvature, slope, table.precision(smooth), k) for k in range(len(curvature))
-        )
+        smooth: float(_left_out(curvature, slope, table.precision(smooth)).sum())
         for smooth in _SMOOTHNESS
     }
     smooth = max(falls, key=falls.__getitem__)
@@ -446,12 +458,43 @@ class Ground(NamedTuple):
     curvature: np.ndarray
     slope: np.ndarray
 
-    def blocks(self, columns: np.ndarray) -> np.ndarray:
-        """(B, K) means of (n, K) columns over the blocks."""
-        own = columns[slice(*self.rows)]
-        begins = np.arange(0, len(own), self.width)
-        counts = np.minimum(self.width, len(own) - begins)
-        return np.add.reduceat(own, begins, axis=0) / counts[:, None]
+    def blocks(self, table: Table, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(B, K) means over the blocks of a table's shares along the run."""
+        own = slice(*self.rows)
+        entries, weights = table.weights(values)
+        found = np.zeros((self.curvature.shape[1], table.size))
+        _add_blocks(entries[own], weights[own], self.width, found)
+        return found
+
+
+@compiled
+def _add_blocks(entries, weights, width, out):
+    """Means (B, K) over blocks of rows of the shares (n, m) of entries (n, m)."""
+    rows = len(entries)
+    for row in range(rows):
+        block = row // width
+        count = min(width, rows - block * width)
+        for k in range(entries.shape[1]):
+            out[block, entries[row, k]] += weights[row, k] / count
+
+
+@compiled
+def _curved(curvature, held, out):
+    """`held' curvature held` (K, K) of a symmetric curvature (B, B), where held has many zeros."""
+    blocks, size = held.shape
+    work = np.zeros((size, blocks))
+    for b in range(blocks):
+        for k in range(size):
+            share = held[b, k]
+            if share != 0.0:
+                for a in range(blocks):
+                    work[k, a] += share * curvature[b, a]
+    for k in range(size):
+        for b in range(blocks):
+            part = work[k, b]
+            if part != 0.0:
+                for j in range(size):
+                    out[k, j] += part * held[b, j]
 
 
 def ground(
@@ -485,26 +528,28 @@ def ground(
     return Ground((begin, begin + length), width, np.array(curvature), np.array(slope))
 
 
-def at_a_glance(table: Table, runs: Sequence[tuple[Ground, np.ndarray]]) -> np.ndarray:
+def at_a_glance(
+    table: Table, runs: Sequence[tuple[Ground, Mapping[str, np.ndarray]]]
+) -> np.ndarray:
     """Falls of the loss that a table predicts in what is left out, seen block by block.
 
     Args:
         table: with K entries.
-        runs: the ground of each and the entries' shares along it (n, K).
+        runs: the ground of each, and variable -> (n,) values of the drive along it.
 
     Returns:
         (R,) falls of -2 log likelihood of R runs, or of parts of a single one; what is faster than
         a block is missed.
     """
     curvature, slope = [], []
-    for below, shares in runs:
-        held = below.blocks(shares)
-        curvature += [held.T @ (c @ held) for c in below.curvature]
+    for below, values in runs:
+        held = below.blocks(table, values)
+        for c in below.curvature:
+            curvature.append(np.zeros((table.size, table.size)))
+            _curved(c, held, curvature[-1])
         slope += [held.T @ s for s in below.slope]
     c, s = np.array(curvature), np.array(slope)
-    precisions = [table.precision(smooth) for smooth in _SMOOTHNESS[1::2]]
-    falls = [np.array([_left_out(c, s, p, k) for k in range(len(c))]) for p in precisions]
-    return max(falls, key=np.sum)
+    return max((_left_out(c, s, table.precision(p)) for p in _SMOOTHNESS[1::2]), key=np.sum)
 
 
 def predicted_by_choice(falls: Sequence[np.ndarray]) -> float:
@@ -521,8 +566,14 @@ def predicted_by_choice(falls: Sequence[np.ndarray]) -> float:
     return float(table[np.argmax(others, axis=0), np.arange(table.shape[1])].sum())
 
 
-def _left_out(curvature: np.ndarray, slope: np.ndarray, prior: np.ndarray, out: int) -> float:
-    """Fall of the loss of a part that the fit of the entries has not seen."""
-    others = curvature.sum(axis=0) - curvature[out] + prior
-    x = -np.linalg.solve(others, slope.sum(axis=0) - slope[out])
-    return -float(2.0 * slope[out] @ x + x @ curvature[out] @ x)
+def _left_out(curvature: np.ndarray, slope: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """(P,) falls of the loss of each part, with entries fitted to the others.
+
+    Args:
+        curvature: (P, K, K) of the parts.
+        slope: (P, K) of the parts.
+        prior: (K, K) precision of the entries.
+    """
+    others = curvature.sum(axis=0) - curvature + prior
+    x = -np.linalg.solve(others, (slope.sum(axis=0) - slope)[:, :, None])[:, :, 0]
+    return -np.sum(x * (2.0 * slope + (curvature @ x[:, :, None])[:, :, 0]), axis=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import Parameter, apply_effect
-from hydrotele.estimate.evidence import Evidence, _move
+from hydrotele.estimate.evidence import Evidence, _move, _threads
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
@@ -76,3 +76,15 @@ def test_a_guess_of_nothing_is_fitted_as_it_is(evidence):
     """A search may end with none of its effects left: the fit has no numbers then."""
     fit = evidence.fit(Guess(), 0.0)
     assert fit.guess == Guess() and fit.information.shape == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("jobs", "processors", "runs", "threads"),
+    [(2, 2, 3, 3), (2, 2, 1, 2), (2, 2, 20, 4), (1, 2, 3, 1), (1, 1, 3, 1), (2, 8, 3, 2)],
+)
+def test_runs_take_turns_where_the_jobs_are_all_processors(
+    monkeypatch, jobs, processors, runs, threads
+):
+    """Three runs on two processors take 1.5 times as long as one, not twice; no job more else."""
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(processors)), raising=False)
+    assert _threads(jobs, runs) == threads

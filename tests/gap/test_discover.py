@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.sparse
 
 from hydrotele.estimate.evidence import Evidence, Judged
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
@@ -225,8 +224,12 @@ CUT = slice(0, 3000), slice(3000, 6000)
 
 def readings(told):
     """The ground of a run whose rows (n,) each tell an addition by itself, in units of noise."""
-    eye: Any = [scipy.sparse.identity(len(told), format="csr")]
-    return Ground((0, len(told)), 1, eye, -told[None])
+    return Ground((0, len(told)), 1, np.eye(len(told))[None], -told[None])
+
+
+def cut(told, values):
+    """The same in parts, with what is seen along each."""
+    return [(readings(told[c]), {name: x[c] for name, x in values.items()}) for c in CUT]
 
 
 def test_thresholds_of_a_relay_are_found():
@@ -235,11 +238,10 @@ def test_thresholds_of_a_relay_are_found():
     t = np.arange(6000) / 50.0
     values = {"velocity": np.sin(t), "pressure_rod": np.sin(0.7 * t) + 0.4 * np.sin(2.9 * t)}
     truth = Memory(SWITCH, "pressure_rod", -0.5, 0.6)
-    told = truth.along(values) + rng.normal(size=6000)
+    parts = cut(truth.along(values) + rng.normal(size=6000), values)
 
     def share(table):
-        columns = table.columns(values)
-        return at_a_glance(table, [(readings(told[c]), columns[c]) for c in CUT]).sum()
+        return at_a_glance(table, parts).sum()
 
     (table,) = (t for t in possible_tables([values], 0.01) if t.variables == ("velocity",))
     best = max(remembering_tables(table, [values], values), key=share)
@@ -248,6 +250,28 @@ def test_thresholds_of_a_relay_are_found():
     assert best.memory.way == SWITCH and best.memory.variable == "pressure_rod"
     assert [best.memory.begin, best.memory.end] == pytest.approx([-0.5, 0.6], abs=0.28)
     assert share(best) > 1.3 * share(table), "the same table without a memory"
+
+
+def test_blocks_see_what_their_rows_do_on_average(made_up):
+    """A glance at blocks of rows is the regression on means of the rows' columns."""
+    rng = np.random.default_rng(8)
+    width, rows = 7, 400  # the last block is shorter
+    blocks = -(-rows // width)
+    half = rng.normal(size=(blocks, blocks))
+    below = Ground((0, rows), width, np.array([half @ half.T] * 2), rng.normal(size=(2, blocks)))
+    mean = np.equal.outer(np.arange(blocks), np.arange(rows) // width).astype(float)
+    mean /= mean.sum(axis=1, keepdims=True)
+    for table in paired_tables([made_up], 0.01, others=False)[:5]:
+        held = mean @ table.columns(made_up)
+        assert below.blocks(table, made_up) == pytest.approx(held, abs=1e-12)
+        falls = []
+        for smooth in (0.3, 3.0, 30.0):
+            whole = held.T @ half @ half.T @ held + table.precision(smooth)
+            x = [-np.linalg.solve(whole, held.T @ s) for s in below.slope[::-1]]
+            falls.append([-2.0 * s @ held @ e - np.square(half.T @ held @ e).sum()
+                          for s, e in zip(below.slope, x, strict=True)])  # fmt: skip
+        told = at_a_glance(table, [(below, made_up)])
+        assert told == pytest.approx(max(falls, key=sum), rel=1e-6)
 
 
 def test_pairs_are_never_of_variables_that_only_their_drives_tell_apart(made_up):
@@ -265,10 +289,9 @@ def test_a_smooth_surface_is_found_among_other_tables():
     values = {name: rng.normal(size=6000) for name in NAMES}
     x, y = values["velocity"], values["pressure_rod"]
     told = np.cos(1.5 * x + y) + rng.normal(size=6000)
+    parts = cut(told, values)
     shares = {
-        table.variables: at_a_glance(
-            table, [(readings(told[c]), table.columns(values)[c]) for c in CUT]
-        ).sum()
+        table.variables: at_a_glance(table, parts).sum()
         for table in paired_tables([values], 0.01, others=True)
     }
     assert max(shares, key=shares.__getitem__) in (
