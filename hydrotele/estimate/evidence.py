@@ -34,7 +34,7 @@ from hydrotele.machine.machine import Machine
 
 _CLIP = 1.0e3  # a prediction error beyond a thousand spreads says no more than that
 _STEPS = 6
-MIDDLE = 2.0e-3  # s, step at which guesses are fitted; candidates take COARSE
+MIDDLE = 2.0e-3  # s, step at which guesses are fitted
 _MANY = 10  # numbers of a base from which their slopes are taken at a coarser step
 BLOCK = 2.0  # s of a run that count as one witness: longer than what a model lacks remembers
 _ROUNDS = 2  # of linearisation for the levels of the first base; later ones start from near by

@@ -179,8 +179,7 @@ def find_rest(loss: Callable[[np.ndarray], float], free: np.ndarray) -> np.ndarr
 STEP = (
     1.0e-3  # s: 2 ms leaves errors of 1000 in the loss where the pump is starved, 1 ms none of 100
 )
-COARSE = 4.0e-3  # s, for candidates and for slopes of many numbers
-GLANCE = 20.0e-3 / 3.0  # s, for the signature of a candidate: three steps of a row at 50 Hz
+COARSE = 4.0e-3  # s, for a first look at a candidate; at 6.7 ms an inertia that rings is not seen
 _TANGENT = 5.0e-3  # s, for the transition Jacobians: a covariance need not be exact
 _STIFF = 1.0e-3  # s, the least that a transmission asks for: its spring may ring at 150 Hz with oil
 _RADIAN = 0.94  # of such a ring that a step may cross: that of 150 Hz in 1 ms

@@ -411,7 +411,7 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
 
     def fit(candidate: Screened) -> Fit:
         more = now.guess.plus(candidate.hypothesis, candidate.start)
-        step = evidence.step_of(more, COARSE)
+        step = evidence.step_of(more, MIDDLE)
         kept = evidence.base_slopes(evidence.slope_step, parallel=False)
         before = loss_of(evidence, now.guess, step)
 

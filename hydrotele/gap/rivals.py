@@ -13,7 +13,6 @@ from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.levels import undisturbed_loss
-from hydrotele.estimate.track import COARSE
 from hydrotele.gap.calibrating import (
     fit_until_settled,
     fitted,
@@ -206,7 +205,7 @@ def find_rivals(
         return ()
     evidence.set_base(rest)
     fits = fitted(evidence, rest, pool)
-    own = loss_of(evidence, rest.guess, COARSE) - loss_of(evidence, now.guess, COARSE)
+    own = loss_of(evidence, rest.guess, MIDDLE) - loss_of(evidence, now.guess, MIDDLE)
     plausible = [
         f for f in fits
         if f.score > 0.0 and f.gain > _HOPEFUL * own and not strained(f.guess, -1)

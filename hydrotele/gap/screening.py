@@ -24,7 +24,7 @@ from hydrotele.estimate.evidence import Evidence, Judged
 from hydrotele.estimate.hypothesis import WIDE, Guess, Hypothesis
 from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import noise_prior, rippled_at, smoothed_inputs
-from hydrotele.estimate.track import GLANCE, Levels, Track, first_rows, track_run
+from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, track_run
 from hydrotele.logs.dataset import RunData
 from hydrotele.machine.machine import Machine
 
@@ -110,7 +110,7 @@ def _rank(
         there = np.zeros((len(errors), 0)) if slopes is None else slopes
         return _Ground(errors, there, present, matrix, low, high)
 
-    steps = {h.key: evidence.step_of(guess.plus(h, h.starts[-1]), GLANCE) for h in candidates}
+    steps = {h.key: evidence.step_of(guess.plus(h, h.starts[-1]), COARSE) for h in candidates}
     unlike = sorted(set(steps.values()))
     grounds = dict(zip(unlike, evidence.map(ground_of, unlike), strict=True))
 

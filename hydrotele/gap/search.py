@@ -22,7 +22,7 @@ from hydrotele.estimate.calibration import CALIBRATION, calibration, numbers
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, with_shape
 from hydrotele.estimate.levels import input_excess, noise_prior
-from hydrotele.estimate.track import COARSE, GLANCE, Levels, Track, track_run
+from hydrotele.estimate.track import COARSE, Levels, Track, track_run
 from hydrotele.gap.calibrating import (
     FIT_STEPS,
     calibrated,
@@ -711,7 +711,7 @@ def _best_pairs(
     A single one that does all that a pair does is tried alone: signatures may have been too small.
     """
     pool = list(ranked[:_PAIRED])
-    step = max(evidence.step_of(now.guess.plus(s.hypothesis, s.start), GLANCE) for s in pool)
+    step = max(evidence.step_of(now.guess.plus(s.hypothesis, s.start), COARSE) for s in pool)
     ground = evidence.errors(now.guess, step)
 
     def shift(s: Screened) -> np.ndarray:
@@ -735,9 +735,8 @@ def _best_pairs(
         more = now.guess
         for index in pair:
             more = more.plus(pool[index].hypothesis, pool[index].start)
-        fine = evidence.step_of(more, COARSE)
-        before = loss_of(evidence, now.guess, fine)
-        found = evidence.fit(more, before, parallel=False, step=fine, kept=kept, steps=FIT_STEPS)
+        before = loss_of(evidence, now.guess, MIDDLE)
+        found = evidence.fit(more, before, parallel=False, step=MIDDLE, kept=kept, steps=FIT_STEPS)
         sizes = sum(h.size for h, _ in more.parts[len(now.guess.parts) :])
         return Fit(found.guess, found.loss, found.gain, occam_penalty(found.information, sizes),
                    found.information)  # fmt: skip
