@@ -88,7 +88,7 @@ def find_gap(
         progress: called with (what is being done, share done).
         effects: names of the effects to try; all if empty. If some are named, no law is learned
             and free runs calibrate nothing: what is lacking may be an effect that was not tried.
-        jobs: threads.
+        jobs: processors that it may use.
 
     Returns:
         The gap, named or not.
