@@ -57,7 +57,7 @@ def _ratio(machine: Machine, location: str) -> dict[str, Parameter]:
 
     The range holds what attachments, ballast, or a wrong unit of the drawings do.
     """
-    return {"ratio": Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05)}
+    return {"ratio": Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05, starts=(1.0, 6.0))}
 
 
 def _scale_inertia(machine: Machine, location: str, values: Values) -> Machine:

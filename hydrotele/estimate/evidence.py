@@ -1,7 +1,7 @@
 """How well a guess explains the fit runs: prediction errors, slopes, and a step to a better one.
 
 Errors are whitened with gains that are kept while a guess moves, so that they are smooth functions
-of its deviations d. The loss is `sum e(d)^2 + d'd` (a unit-normal prior); a hypothesis is charged
+of its deviations d. The loss is `sum e(d)^2` and what the prior adds; a hypothesis is charged
 `log det(1 + S'S)` for the room that its parameters take (Laplace's approximation of the evidence).
 
 How well the numbers of named effects are known: noise, run-to-run scatter, integrator steps.
@@ -51,7 +51,7 @@ class Fit:
 
     Attributes:
         guess: the guess.
-        loss: `sum e^2 + d'd`.
+        loss: `sum e^2`, and -2 log of the prior.
         gain: fall of the loss against the guess without its last part.
         occam_penalty: what the last part's parameters cost.
         information: (P, P) `S'S + 1` of all parts.
@@ -146,7 +146,7 @@ class Evidence:
                 self.data, machine, self.tracks, self._pool.map, self.step, rounds, same, reopened
             )
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
-        return Judged(guess, tracks, loss + _prior(guess))
+        return Judged(guess, tracks, loss + guess.prior)
 
     def judged_from(self, guess: Guess, levels: Levels) -> Judged:
         """A guess with noise levels found from given ones instead of from those of the base.
@@ -165,7 +165,7 @@ class Evidence:
             self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True
         )
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
-        return Judged(guess, tracks, loss + _prior(guess))
+        return Judged(guess, tracks, loss + guess.prior)
 
     def with_jitter(self, judged: Judged) -> Judged:
         """A guess with instants that jitter, if its readings tell so; else as given."""
@@ -176,7 +176,7 @@ class Evidence:
         if tracks is judged.tracks:
             return judged
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
-        return Judged(judged.guess, tracks, loss + _prior(judged.guess))
+        return Judged(judged.guess, tracks, loss + judged.guess.prior)
 
     def set_base(self, guess: Guess | Judged) -> Judged:
         """Compute gains anew for a guess; later errors are whitened with them."""
@@ -382,8 +382,9 @@ def _move(guess: Guess, slopes: np.ndarray, errors: np.ndarray) -> np.ndarray:
     d = guess.deviation
     if not len(d):  # a guess of nothing, or of what is held
         return d
-    root = np.linalg.cholesky(slopes.T @ slopes + np.eye(len(d)))
-    target = -solve_triangular(root, slopes.T @ errors + d, lower=True)
+    weight = guess.prior_weight
+    root = np.linalg.cholesky(slopes.T @ slopes + np.diag(weight))
+    target = -solve_triangular(root, slopes.T @ errors + weight * d, lower=True)
     move = solve_triangular(root.T, target)
     low, high = (
         np.concatenate([getattr(h, side) for h in guess.hypotheses]) - d for side in ("low", "high")
@@ -409,11 +410,7 @@ def flat(whitened: np.ndarray) -> np.ndarray:
 
 
 def _loss(errors: np.ndarray, guess: Guess) -> float:
-    return float(errors @ errors) + _prior(guess)
-
-
-def _prior(guess: Guess) -> float:
-    return float(guess.deviation @ guess.deviation)
+    return float(errors @ errors) + guess.prior
 
 
 def _blocks(track: Track, seconds: float) -> np.ndarray:

@@ -11,14 +11,21 @@ from hydrotele.machine.machine import Machine
 _CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
 WIDE = 0.3  # of it: for a first look, where friction that sticks or slips makes slopes steep
 _SMOOTH = ("timing", "sensor")  # laws whose effects have a slope at nominal, besides their starts
+_OPEN = ("force", "flow", "valve", "supply")  # laws of which no drawing and no data sheet tells all
+_FREEDOM = 4.0  # degrees of freedom of the t distribution of their effects' sizes
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """An effect at a place of the given machine, with p parameters.
 
-    Deviations are `(value - nominal) / scale`, so that the prior is a unit normal. `change` makes
-    the machine that has it from parameter values; by default the library's effect of that name.
+    Deviations are `(value - nominal) / scale`. `change` makes the machine that has it from
+    parameter values; by default the library's effect of that name.
+
+    The prior of deviations is a unit normal. That of a library effect in a force, a flow, a valve
+    or the supply has the same width and the tails of a t distribution: there `scale` says what is
+    common, and what is rare, as an inertia ten times the model's, is no reason to prefer three
+    other effects of common size.
     """
 
     name: str
@@ -52,6 +59,25 @@ class Hypothesis:
     def least(self) -> np.ndarray:
         """(p,) deviation worth naming."""
         return np.array([p.least / p.scale for p in self.parameters.values()])
+
+    @property
+    def has_wide_prior(self) -> bool:
+        """Whether sizes far from common ones are rare, not impossible."""
+        known = EFFECTS.get(self.name)
+        return known is not None and not self.change and known.law in _OPEN
+
+    def prior(self, deviation: np.ndarray) -> float:
+        """-2 log of the prior at a deviation (p,), 0 at nominal."""
+        squares = deviation**2
+        if self.has_wide_prior:
+            squares = _FREEDOM * np.log1p(squares / _FREEDOM)
+        return float(np.sum(squares))
+
+    def prior_weight(self, deviation: np.ndarray) -> np.ndarray:
+        """(p,) precision of the normal prior that pulls a deviation (p,) as hard as the prior."""
+        if self.has_wide_prior:
+            return 1.0 / (1.0 + deviation**2 / _FREEDOM)
+        return np.ones(len(deviation))
 
     @property
     def starts(self) -> list[np.ndarray]:
@@ -140,6 +166,17 @@ class Guess:
     def deviation(self) -> np.ndarray:
         """(P,) all deviations, in order."""
         return np.concatenate([d for _, d in self.parts]) if self.parts else np.zeros(0)
+
+    @property
+    def prior(self) -> float:
+        """-2 log of the prior of all deviations."""
+        return sum(h.prior(d) for h, d in self.parts)
+
+    @property
+    def prior_weight(self) -> np.ndarray:
+        """(P,) precisions of the normal prior that pulls as hard as the prior does here."""
+        weights = [h.prior_weight(d) for h, d in self.parts]
+        return np.concatenate(weights) if weights else np.zeros(0)
 
     @property
     def hypotheses(self) -> list[Hypothesis]:

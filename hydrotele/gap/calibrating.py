@@ -524,4 +524,4 @@ def strained(guess: Guess, index: int) -> bool:
 def loss_of(evidence: Evidence, guess: Guess, step: float) -> float:
     """Loss of a guess with the base's gains: its errors' squares, and the prior's part."""
     errors = evidence.errors(guess, step)
-    return float(errors @ errors + guess.deviation @ guess.deviation)
+    return float(errors @ errors) + guess.prior

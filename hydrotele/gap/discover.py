@@ -110,7 +110,7 @@ def discover(evidence: Evidence, judged: Judged, noise: np.ndarray) -> Discovery
     held = [
         (h.held(d), np.zeros(0)) if n else (h, d) for n, (h, d) in zip(named, parts, strict=True)
     ]
-    prior = sum(float(d @ d) for n, (_, d) in zip(named, parts, strict=True) if n)
+    prior = sum(h.prior(d) for n, (h, d) in zip(named, parts, strict=True) if n)
     judged = replace(judged, guess=Guess(tuple(held)), loss=judged.loss - prior)
     stages, begin = [judged], judged.loss
     ahead = _open_loop(evidence, evidence.runs, judged, noise)

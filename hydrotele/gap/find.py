@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -64,7 +64,8 @@ _MINOR = 0.02  # share of the gap up to which something is a detail; laws are ra
 # machine than 15 % of what they do
 _OF_LAWS = 0.1  # of what a guess explains, by laws beside effects, from which laws are tried alone
 _MOST_OF_IT = 0.9  # of what is lacking: an effect that takes more is no part of a law's work
-_TRACE_OF_FORM = 0.005  # share up to which an effect only mends the form of one beside it
+_TRACE_OF_FORM = 0.01  # share up to which an effect only mends the form of one beside it, which
+# may be a tenth of what that one does off
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _ALIKE = 1.0e-3  # of the squares of what an effect changes: readings that are alike to 3 %
 _NORMAL95 = 1.96
@@ -140,7 +141,7 @@ def find_gap(
     if failed:
         left = left_over(before[0], after[0], data.channels, floor)
         named = believed(named, learned, left, _lost(tests, learned))
-    named, details = without_details(named, failed)
+    named, details = without_details(named, failed, data.machine.axes)
     verdict = verdict_of(named, failed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
@@ -380,28 +381,34 @@ def _without_effects(evidence: Evidence, found: Found) -> Found:
 
 
 def without_details(
-    named: Sequence[NamedEffect], lacking: bool
+    named: Sequence[NamedEffect], lacking: bool, axes: Collection[str]
 ) -> tuple[tuple[NamedEffect, ...], tuple[NamedEffect, ...]]:
     """Effects, and those that are details: nothing that these data say of the machine itself.
 
     What closes next to nothing may only mend the form of an effect of the same axis that closes
-    most, as a trace of presliding does for teeth, or make up for what is lacking still. Nor does
-    it make what closes most ambiguous if it is rather not there.
+    most, as a trace of presliding does for teeth, or a trace of air in all oil for a hose that
+    swells less the fuller it is; or make up for what is lacking still. Nor does it make what closes
+    most ambiguous if it is rather not there.
 
     Args:
         named: the effects, with shares of the gap.
         lacking: whether the patched machine still lacks something.
+        axes: of the machine; what is located elsewhere, as in all oil, acts on each.
 
     Returns:
         The effects, and the details: those that close at most 2 % where something is lacking, or
-        0.5 % beside such an effect, and those whose 95 % interval holds the given number (of
+        1 % beside such an effect, and those whose 95 % interval holds the given number (of
         several numbers, which may be known together only, where they close at most 2 %).
     """
 
+    def meet(effect: NamedEffect, other: NamedEffect) -> bool:
+        places = {one.location.partition(".")[0] for one in (effect, other)}
+        return len(places & set(axes)) < 2
+
     def detail(effect: NamedEffect) -> bool:
-        axis, likely = effect.location.partition(".")[0], effect.mechanism_probability >= LIKELY
+        likely = effect.mechanism_probability >= LIKELY
         mends = effect.share <= _TRACE_OF_FORM and any(
-            other.share > 0.5 and (other.location.partition(".")[0] == axis or not likely)
+            other.share > 0.5 and (meet(effect, other) or not likely)
             for other in named if other is not effect
         )  # fmt: skip
         told = any(not e.low <= e.nominal <= e.high for e in effect.parameters.values())

@@ -81,13 +81,14 @@ def screen(evidence: Evidence, guess: Guess, candidates: Sequence[Hypothesis]) -
 class _Ground:
     """Where candidates start: errors (E,), slopes (E, P) and deviation (P,) of what is there.
 
-    `matrix` is the (P, P) information of these slopes with the prior's, `low` and `high` (P,) are
-    the bounds of the deviation.
+    `pull` (P,) is half the slope of -2 log of its prior, `matrix` the (P, P) information of these
+    slopes with the prior's, `low` and `high` (P,) are the bounds of the deviation.
     """
 
     errors: np.ndarray
     slopes: np.ndarray
     present: np.ndarray
+    pull: np.ndarray
     matrix: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -101,14 +102,15 @@ def _rank(
 
     present = guess.deviation
     slopes = evidence.base_slopes_of(tracks) if len(present) else None
-    matrix = np.zeros((0, 0)) if slopes is None else slopes.T @ slopes + np.eye(len(present))
+    pull = guess.prior_weight
+    matrix = np.zeros((0, 0)) if slopes is None else slopes.T @ slopes + np.diag(pull)
     low = np.concatenate([np.zeros(0), *(h.low for h in guess.hypotheses)])
     high = np.concatenate([np.zeros(0), *(h.high for h in guess.hypotheses)])
 
     def ground_of(step: float) -> _Ground:
         errors = errors_of(guess, step)
         there = np.zeros((len(errors), 0)) if slopes is None else slopes
-        return _Ground(errors, there, present, matrix, low, high)
+        return _Ground(errors, there, present, pull * present, matrix, low, high)
 
     steps = {h.key: evidence.step_of(guess.plus(h, h.starts[-1]), COARSE) for h in candidates}
     unlike = sorted(set(steps.values()))
@@ -126,7 +128,7 @@ def _rank(
             if np.any(start) and hypothesis.size > 1:
                 rated.append(_point(hypothesis, ground, start, shift_to(start)))
             elif np.any(start):
-                line = _line(hypothesis, ground, (shift_to(start) / start[0])[:, None])
+                line = _line(hypothesis, ground, (shift_to(start) / start[0])[:, None], start)
                 rated.append(Screened(hypothesis, line.score, line.gain, start))
             else:
                 rated.append(_around_nominal(hypothesis, ground, shift_to))
@@ -151,7 +153,7 @@ def _around_nominal(
         slopes[:, k] = np.mean(shifts, axis=0)
         unlike = float(np.sum((shifts[0] - shifts[-1]) ** 2))
         bent |= unlike > _BENT * float(np.sum(shifts[0] ** 2) + np.sum(shifts[-1] ** 2))
-    line = _line(hypothesis, ground, slopes)
+    line = _line(hypothesis, ground, slopes, np.zeros(hypothesis.size))
     best = max(tried, key=lambda s: s.gain)
     if not bent or best.gain <= 0.0:
         return line
@@ -164,13 +166,13 @@ def _point(hypothesis: Hypothesis, ground: _Ground, d: np.ndarray, shift: np.nda
     moved = _without_present(ground, ground.errors + shift)
     along = shift / np.linalg.norm(d)
     cost = float(np.log1p(along @ along - _explained(ground, along)))
-    gain = now - moved - float(d @ d)
+    gain = now - moved - hypothesis.prior(d)
     return Screened(hypothesis, gain - cost, gain, d)
 
 
 def _without_present(ground: _Ground, errors: np.ndarray) -> float:
     """Least loss when what is there may follow, within its bounds."""
-    pull = ground.slopes.T @ errors + ground.present
+    pull = ground.slopes.T @ errors + ground.pull
     fall = _least(ground.matrix, pull, ground.low - ground.present, ground.high - ground.present)[1]
     return float(errors @ errors + fall)
 
@@ -195,22 +197,27 @@ def _explained(ground: _Ground, along: np.ndarray) -> float:
     return float(pull @ np.linalg.solve(ground.matrix, pull))
 
 
-def _line(hypothesis: Hypothesis, ground: _Ground, slopes: np.ndarray) -> Screened:
+def _line(
+    hypothesis: Hypothesis, ground: _Ground, slopes: np.ndarray, start: np.ndarray
+) -> Screened:
     """Best deviation inside the bounds, with straight signatures, what is there following."""
-    own = slopes.T @ slopes + np.eye(hypothesis.size)
+    weight = hypothesis.prior_weight(start)
+    own = slopes.T @ slopes + np.diag(weight)
     cross = ground.slopes.T @ slopes
     whole = np.block([[ground.matrix, cross], [cross.T, own]])
-    pull = np.concatenate([ground.slopes.T @ ground.errors + ground.present,
+    pull = np.concatenate([ground.slopes.T @ ground.errors + ground.pull,
                            slopes.T @ ground.errors])  # fmt: skip
     low = np.concatenate([ground.low - ground.present, hypothesis.low])
     high = np.concatenate([ground.high - ground.present, hypothesis.high])
     x, fall = _least(whole, pull, low, high)
     there = len(ground.present)
+    found = x[there:]
+    fall += hypothesis.prior(found) - float(weight @ found**2)
     gain = _without_present(ground, ground.errors) - float(ground.errors @ ground.errors) - fall
     cost = float(np.linalg.slogdet(whole)[1])
     if there:
         cost -= float(np.linalg.slogdet(ground.matrix)[1])
-    return Screened(hypothesis, gain - cost, gain, x[there:])
+    return Screened(hypothesis, gain - cost, gain, found)
 
 
 def timed(candidates: Sequence[Hypothesis], base: Judged) -> list[Hypothesis]:

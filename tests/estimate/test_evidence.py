@@ -88,3 +88,15 @@ def test_runs_take_turns_where_the_jobs_are_all_processors(
     """Three runs on two processors take 1.5 times as long as one, not twice; no job more else."""
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(processors)), raising=False)
     assert _threads(jobs, runs) == threads
+
+
+def test_a_rare_size_costs_little_and_pulls_little_where_no_drawing_tells(evidence):
+    """The t distribution of 4 degrees, of the unit normal's width; a sensor's fault is normal."""
+    inertia, offset = (guess(evidence, name, 0.0) for name in ("inertia_error", "angle_offset"))
+    for d in (0.1, 1.0, 42.5):  # the last is 9.5 times the model's inertia
+        far = inertia.at(np.array([d]))
+        assert far.prior == pytest.approx(4.0 * np.log(1.0 + d**2 / 4.0))
+        pull = (inertia.at(np.array([d + 1e-6])).prior - far.prior) / 1e-6
+        assert far.prior_weight == pytest.approx([pull / (2.0 * d)], rel=1e-4)  # of a difference
+    assert inertia.at(np.array([0.1])).prior == pytest.approx(0.01, rel=0.01)
+    assert offset.at(np.array([7.0])).prior == 49.0
