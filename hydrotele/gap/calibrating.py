@@ -314,10 +314,14 @@ def promoted(
     table = numbers(evidence.data.machine)
     keys = list(group.parameters)
     first = sum(h.size for h, _ in now.guess.parts[:place])
-    spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))[first : first + group.size]
-    usual = _usual(deviation, spread)
-    moved: dict[tuple[str, str], float] = {}
-    for key, d in zip(keys, deviation, strict=True):
+    own = slice(first, first + group.size)
+    usual = _usual(deviation, np.sqrt(np.diag(np.linalg.inv(fit.information)))[own])
+    widths = np.ones(len(fit.information))
+    widths[own] = usual
+    told_by_runs = np.outer(widths, widths) * (fit.information - np.eye(len(widths)))
+    covariance = np.linalg.inv(told_by_runs + np.eye(len(widths)))[own, own]
+    ratios: dict[tuple[str, str], dict[int, float]] = {}
+    for index, (key, d) in enumerate(zip(keys, deviation, strict=True)):
         effect = table[key].effect
         if effect is None:
             continue
@@ -325,8 +329,15 @@ def promoted(
         if known is None or abs(d * table[key].parameter.scale) < known.parameters[effect[2]].least:
             continue
         ratio = usual * table[key].parameter.scale / known.parameters[effect[2]].scale
-        gain = (d / usual) ** 2 * (1.0 - min(ratio, 1.0) ** 2) + 2.0 * np.log(min(ratio, 1.0))
-        moved[effect[:2]] = moved.get(effect[:2], 0.0) + gain
+        ratios.setdefault(effect[:2], {})[index] = min(ratio, 1.0)
+    moved = {
+        effect: _gain_of_freedom(
+            deviation[list(some)] / usual,
+            covariance[np.ix_(list(some), list(some))],
+            np.array(list(some.values())),
+        )
+        for effect, some in ratios.items()
+    }
     ends = {e[:2] for key in _at_ends(group, deviation) if (e := table[key].effect)}
     told = {key: gain for key, gain in moved.items() if gain > BEYOND or key in ends}
     options = {
@@ -339,6 +350,31 @@ def promoted(
         return stuck[key][0], told[key]
     key = max(told, key=told.__getitem__, default=None)
     return None if key is None or told[key] <= BEYOND else (options[key], told[key])
+
+
+def _gain_of_freedom(deviation: np.ndarray, covariance: np.ndarray, ratio: np.ndarray) -> float:
+    """Twice the log evidence that numbers bring with the wider prior of an effect.
+
+    What one number may not do, others that have nearly the same consequences do in part: a lighter
+    and shorter link for one whose moment of inertia is less. That counts, too: with its prior wide
+    the number moves on until the others are back.
+
+    Args:
+        deviation: (k,) of the numbers, fitted with unit-normal priors.
+        covariance: (k, k) of them after the fit.
+        ratio: (k,) widths of these priors over those of the effect, at most 1.
+
+    >>> import numpy as np
+    >>> alone = _gain_of_freedom(np.array([4.0]), np.array([[0.01]]), np.array([0.25]))
+    >>> shared = _gain_of_freedom(np.array([4.0]), np.array([[0.7]]), np.array([0.25]))
+    >>> untold = _gain_of_freedom(np.array([0.0]), np.array([[1.0]]), np.array([0.25]))
+    >>> round(alone, 1), round(shared, 1), abs(round(untold, 1))
+    (12.4, 41.9, 0.0)
+    """
+    less = np.diag(1.0 - ratio**2)  # precision
+    left = np.eye(len(ratio)) - less @ covariance
+    gain = deviation @ np.linalg.solve(left, less @ deviation)
+    return float(gain - np.linalg.slogdet(left)[1] + 2.0 * np.sum(np.log(ratio)))
 
 
 def let_out(evidence: Evidence, guess: Guess, place: int, known: Hypothesis) -> Guess:
