@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
+from hydrotele.effects import EFFECTS
 from hydrotele.estimate.hypothesis import Guess
 from hydrotele.estimate.inputs import MEMORY
 from hydrotele.estimate.levels import find_levels, with_jitter
@@ -426,6 +427,9 @@ def _blocks(track: Track, seconds: float) -> np.ndarray:
 _FEW = 10  # numbers up to which slopes are taken at the finest step
 _CHANCE = 3.0  # chi-square per degree of freedom that two degrees exceed in 5 % of all cases
 _STRETCHES = 40  # of the runs, if they are not shorter than what unknown inputs remember
+_ROUGH = 4.0  # mean rise of the loss at half a standard deviation to either side; 0.25 if smooth
+_NEAR = (0.5, 1.0, 2.0)  # standard deviations, within which the depth of dents is looked for
+_FARTHEST = 256.0  # standard deviations to which dents are followed
 
 
 def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) -> np.ndarray:
@@ -458,7 +462,66 @@ def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) 
     noisy = np.maximum(np.diag(covariance), _sandwich(evidence, slopes, covariance))
     shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))
     widened = scatter if scatter > _CHANCE else 1.0
-    return np.sqrt(widened * noisy + shift**2 / 3.0)
+    return _beyond_dents(evidence, guess, np.sqrt(widened * noisy + shift**2 / 3.0))
+
+
+def _beyond_dents(evidence: Evidence, guess: Guess, spread: np.ndarray) -> np.ndarray:
+    """Standard deviations where a likelihood has dents, as that of teeth that touch or not.
+
+    A search ends in one dent of many, and the curvature there is that of the dent. Numbers are told
+    no better than by moves that raise the loss by more than dents do; looked for where the runs are
+    filtered anew, number by number, of effects in forces: no other law is met and left.
+
+    Args:
+        evidence: with the guess as its base.
+        guess: fitted.
+        spread: (P,) standard deviations by the curvature, in typical deviations.
+
+    Returns:
+        (P,) the same, of library effects' numbers at least half the geometric mean of the last move
+        that stays among the dents and the first that does not.
+    """
+    first, here, found = 0, guess.deviation, spread.copy()
+    step = evidence.step_of(guess, MIDDLE)
+
+    def losses(moves: Sequence[tuple[int, float]]) -> np.ndarray:
+        """(K,) of the loss after K moves of one number each, in standard deviations."""
+        machines = []
+        for index, size in moves:
+            moved = here.copy()
+            moved[index] += size * spread[index]
+            machines.append(guess.at(moved).machine(evidence.data.machine))
+
+        def one(pair: tuple[Machine, Track]) -> float:
+            machine, track = pair
+            return track_run(machine, evidence.data, track.run, None, step, track.levels,
+                             rest=track.rest).loss  # fmt: skip
+
+        pairs = [(machine, track) for machine in machines for track in evidence.tracks]
+        return np.sum(np.reshape(evidence.map(one, pairs), (len(moves), -1)), axis=1)
+
+    def rises(index: int, sizes: Sequence[float]) -> np.ndarray:
+        """(K, 2) of the loss, for K sizes of a move to either side."""
+        moves = [(index, side * size) for size in sizes for side in (1.0, -1.0)]
+        return losses(moves).reshape(-1, 2) - begin
+
+    begin = None
+    for hypothesis, deviation in guess.parts:
+        own = range(first, first + len(deviation))
+        first += len(deviation)
+        if hypothesis.change or EFFECTS[hypothesis.name].law != "force":
+            continue
+        begin = losses([(0, 0.0)]) if begin is None else begin
+        for index in own:
+            near = rises(index, _NEAR[:1])
+            if abs(near.mean()) < _ROUGH:
+                continue
+            depth = np.abs(np.vstack([near, rises(index, _NEAR[1:])])).max()
+            reach = _NEAR[-1]
+            while reach < _FARTHEST and rises(index, [2.0 * reach]).min() < depth:
+                reach *= 2.0
+            found[index] *= max(1.0, np.sqrt(2.0) * reach / 2.0)
+    return found
 
 
 def _sandwich(evidence: Evidence, slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:

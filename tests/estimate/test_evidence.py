@@ -1,10 +1,13 @@
 """Evidence: errors of guesses at coarse steps, against the same at the full step."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from hydrotele.effects import Parameter, apply_effect
-from hydrotele.estimate.evidence import Evidence, _move, _threads
+from hydrotele.effects import EFFECTS, Parameter, apply_effect
+from hydrotele.estimate import evidence as evidence_module
+from hydrotele.estimate.evidence import Evidence, _beyond_dents, _move, _threads
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
@@ -100,3 +103,30 @@ def test_a_rare_size_costs_little_and_pulls_little_where_no_drawing_tells(eviden
         assert far.prior_weight == pytest.approx([pull / (2.0 * d)], rel=1e-4)  # of a difference
     assert inertia.at(np.array([0.1])).prior == pytest.approx(0.01, rel=0.01)
     assert offset.at(np.array([7.0])).prior == 49.0
+
+
+def test_a_number_among_dents_is_told_no_better_than_they_are_deep(evidence, monkeypatch):
+    """A loss that rises by 1 at one spread, with dents 100 deep that repeat every third of it."""
+    friction = guess(evidence, "coulomb_friction", 0.0)
+    (hypothesis,), spread, known = (
+        friction.hypotheses,
+        np.array([0.01]),
+        EFFECTS["coulomb_friction"],
+    )
+
+    def track_run(depth):
+        def run(machine, *_, **__):
+            value = known.parameters(machine, "boom")["coulomb"].nominal
+            (number,) = hypothesis.parameters.values()
+            z = (value - number.nominal) / number.scale / spread[0]
+            return SimpleNamespace(loss=z**2 + 0.5 * depth * (1.0 - np.cos(19.0 * z)))
+
+        return run
+
+    found = {}
+    for depth in (0.0, 100.0):
+        monkeypatch.setattr(evidence_module, "track_run", track_run(depth))
+        found[depth] = _beyond_dents(evidence, friction, spread)[0] / spread[0]
+    assert found[0.0] == 1.0
+    # dents of 100 hide a rise of as much, at 10 spreads: half the interval, 2 standard deviations
+    assert 0.5 * 10.0 < 2.0 * found[100.0] < 2.0 * 10.0

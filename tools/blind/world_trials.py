@@ -268,7 +268,10 @@ def true_parameters(model: Facts, truth: Facts) -> dict[str, dict[str, float]]:
         for place in effect.locations(model):
             if place not in effect.locations(truth):
                 continue
-            known = effect.parameters(truth, place)
+            known = {
+                key: p for key, p in effect.parameters(truth, place).items()
+                if (name, key) not in _OTHER_FORM
+            }  # fmt: skip
             values = {key: _relative(name, key, place, model, truth) for key in known}
             table[f"{name}({place})"] = {
                 key: known[key].nominal if value is None else value
@@ -278,6 +281,7 @@ def true_parameters(model: Facts, truth: Facts) -> dict[str, dict[str, float]]:
     return {label: values for label, values in table.items() if values}
 
 
+_OTHER_FORM = {("backlash", "damping_ratio")}  # of the independent machine: Hunt and Crossley's
 _ABSOLUTE = (  # effects whose parameters are the machine's own numbers
     "valve_deadband", "spool_lag", "pump_flow_limit", "relief_pressure", "internal_leakage",
     "hose_compliance", "bulk_modulus", "coulomb_friction", "viscous_friction", "stribeck_friction",
