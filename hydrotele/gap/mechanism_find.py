@@ -631,7 +631,8 @@ def _unexplained(found: _Found) -> np.ndarray:
 
 def _believable(named: Sequence[NamedEffect], judged: _Judged):
     """Effects, and those that may only make up for what is lacking on the drive they move most."""
-    named, small = without_details(named, bool(judged.left.lacking.any()))
+    places = {effect.location.partition(".")[0] for effect in named}
+    named, small = without_details(named, bool(judged.left.lacking.any()), places)
     kept, details = [], list(small)
     for effect in named:
         moved = judged.moved[effect.name, effect.location]
