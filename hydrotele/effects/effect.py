@@ -24,7 +24,7 @@ class Parameter:
         nominal: its value in the machine as it is, without the effect.
         low: smallest physically plausible value.
         high: largest physically plausible value.
-        scale: typical size of a deviation from nominal (the prior's standard deviation).
+        scale: typical size of a deviation from nominal, the width of its prior.
         least: deviation below which the effect is not worth naming.
         starts: values from which a search starts where the effect vanishes at nominal, or where
             its slope there tells little; empty where nominal is a good start.
