@@ -17,7 +17,6 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
-from hydrotele.effects import EFFECTS
 from hydrotele.estimate.hypothesis import Guess
 from hydrotele.estimate.inputs import MEMORY
 from hydrotele.estimate.levels import find_levels, with_jitter
@@ -427,8 +426,9 @@ def _blocks(track: Track, seconds: float) -> np.ndarray:
 _FEW = 10  # numbers up to which slopes are taken at the finest step
 _CHANCE = 3.0  # chi-square per degree of freedom that two degrees exceed in 5 % of all cases
 _STRETCHES = 40  # of the runs, if they are not shorter than what unknown inputs remember
-_ROUGH = 4.0  # mean rise of the loss at half a standard deviation to either side; 0.25 if smooth
+_DENTED = ("backlash",)  # effects whose likelihood is full of dents, see `gap.screening`
 _NEAR = (0.5, 1.0, 2.0)  # standard deviations, within which the depth of dents is looked for
+_MOST = 0.8  # of the dents seen are no deeper; where a filter loses its machine one is far deeper
 _FARTHEST = 256.0  # standard deviations to which dents are followed
 
 
@@ -462,34 +462,35 @@ def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) 
     noisy = np.maximum(np.diag(covariance), _sandwich(evidence, slopes, covariance))
     shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))
     widened = scatter if scatter > _CHANCE else 1.0
-    return _beyond_dents(evidence, guess, np.sqrt(widened * noisy + shift**2 / 3.0))
+    spread = np.sqrt(widened * noisy + shift**2 / 3.0)
+    return spread * _beyond_dents(evidence, guess, 1.0 / np.sqrt(np.diag(information)))
 
 
-def _beyond_dents(evidence: Evidence, guess: Guess, spread: np.ndarray) -> np.ndarray:
-    """Standard deviations where a likelihood has dents, as that of teeth that touch or not.
+def _beyond_dents(evidence: Evidence, guess: Guess, alone: np.ndarray) -> np.ndarray:
+    """Factors of standard deviations where a likelihood has dents, as that of teeth with a gap.
 
     A search ends in one dent of many, and the curvature there is that of the dent. Numbers are told
     no better than by moves that raise the loss by more than dents do; looked for where the runs are
-    filtered anew, number by number, of effects in forces: no other law is met and left.
+    filtered anew, number by number.
 
     Args:
         evidence: with the guess as its base.
         guess: fitted.
-        spread: (P,) standard deviations by the curvature, in typical deviations.
+        alone: (P,) standard deviations of each number with the others held, by the curvature.
 
     Returns:
-        (P,) the same, of library effects' numbers at least half the geometric mean of the last move
-        that stays among the dents and the first that does not.
+        (P,) factors, at least 1: half the geometric mean of the last move that stays among the
+        dents and the first that does not.
     """
-    first, here, found = 0, guess.deviation, spread.copy()
+    first, here, found = 0, guess.deviation, np.ones(len(alone))
     step = evidence.step_of(guess, MIDDLE)
 
-    def losses(moves: Sequence[tuple[int, float]]) -> np.ndarray:
-        """(K,) of the loss after K moves of one number each, in standard deviations."""
+    def losses(index: int, sizes: Sequence[float]) -> np.ndarray:
+        """(K, 2) of the loss, for K sizes of a move of a number to either side."""
         machines = []
-        for index, size in moves:
+        for move in np.outer(sizes, (1.0, -1.0)).ravel():
             moved = here.copy()
-            moved[index] += size * spread[index]
+            moved[index] += move * alone[index]
             machines.append(guess.at(moved).machine(evidence.data.machine))
 
         def one(pair: tuple[Machine, Track]) -> float:
@@ -498,29 +499,23 @@ def _beyond_dents(evidence: Evidence, guess: Guess, spread: np.ndarray) -> np.nd
                              rest=track.rest).loss  # fmt: skip
 
         pairs = [(machine, track) for machine in machines for track in evidence.tracks]
-        return np.sum(np.reshape(evidence.map(one, pairs), (len(moves), -1)), axis=1)
+        return np.reshape(evidence.map(one, pairs), (len(sizes), 2, -1)).sum(axis=2)
 
-    def rises(index: int, sizes: Sequence[float]) -> np.ndarray:
-        """(K, 2) of the loss, for K sizes of a move to either side."""
-        moves = [(index, side * size) for size in sizes for side in (1.0, -1.0)]
-        return losses(moves).reshape(-1, 2) - begin
-
-    begin = None
     for hypothesis, deviation in guess.parts:
         own = range(first, first + len(deviation))
         first += len(deviation)
-        if hypothesis.change or EFFECTS[hypothesis.name].law != "force":
+        if hypothesis.name not in _DENTED:
             continue
-        begin = losses([(0, 0.0)]) if begin is None else begin
         for index in own:
-            near = rises(index, _NEAR[:1])
-            if abs(near.mean()) < _ROUGH:
-                continue
-            depth = np.abs(np.vstack([near, rises(index, _NEAR[1:])])).max()
-            reach = _NEAR[-1]
-            while reach < _FARTHEST and rises(index, [2.0 * reach]).min() < depth:
+            near = losses(index, _NEAR) - np.array(_NEAR)[:, None] ** 2
+            level = float(np.median(near))
+            depth, reach = float(np.quantile(np.abs(near - level), _MOST)), _NEAR[-1]
+            while reach < _FARTHEST:
+                rise = float(losses(index, [2.0 * reach]).min()) - level
+                if rise > depth:
+                    break
                 reach *= 2.0
-            found[index] *= max(1.0, np.sqrt(2.0) * reach / 2.0)
+            found[index] = np.sqrt(2.0) * reach / 2.0 if reach > _NEAR[-1] else 1.0
     return found
 
 

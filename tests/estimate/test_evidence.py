@@ -107,26 +107,24 @@ def test_a_rare_size_costs_little_and_pulls_little_where_no_drawing_tells(eviden
 
 def test_a_number_among_dents_is_told_no_better_than_they_are_deep(evidence, monkeypatch):
     """A loss that rises by 1 at one spread, with dents 100 deep that repeat every third of it."""
-    friction = guess(evidence, "coulomb_friction", 0.0)
-    (hypothesis,), spread, known = (
-        friction.hypotheses,
-        np.array([0.01]),
-        EFFECTS["coulomb_friction"],
-    )
+    nominal, alone = evidence.data.machine, np.array([0.01])
+    gap = EFFECTS["backlash"].parameters(nominal, "swing")["gap"]
+    teeth = Hypothesis("backlash", "swing", {"gap": gap})
+    guess = Guess(((teeth, np.array([0.5])),))
 
     def track_run(depth):
         def run(machine, *_, **__):
-            value = known.parameters(machine, "boom")["coulomb"].nominal
-            (number,) = hypothesis.parameters.values()
-            z = (value - number.nominal) / number.scale / spread[0]
-            return SimpleNamespace(loss=z**2 + 0.5 * depth * (1.0 - np.cos(19.0 * z)))
+            value = machine.axes["swing"].transmission.backlash
+            z = ((value - gap.nominal) / gap.scale - 0.5) / alone[0]
+            loss = z**2 + 0.5 * depth * (1.0 - np.cos(19.0 * z))
+            return SimpleNamespace(loss=loss / len(evidence.tracks))
 
         return run
 
     found = {}
     for depth in (0.0, 100.0):
         monkeypatch.setattr(evidence_module, "track_run", track_run(depth))
-        found[depth] = _beyond_dents(evidence, friction, spread)[0] / spread[0]
+        (found[depth],) = _beyond_dents(evidence, guess, alone)
     assert found[0.0] == 1.0
     # dents of 100 hide a rise of as much, at 10 spreads: half the interval, 2 standard deviations
     assert 0.5 * 10.0 < 2.0 * found[100.0] < 2.0 * 10.0
