@@ -133,3 +133,23 @@ def test_a_pulse_is_looked_for_where_all_runs_lack_something():
     loud, common = _spans(pairs)
     assert loud[1] == pytest.approx(7.0, abs=0.3) and loud[2] == pytest.approx(1.0, abs=0.3)
     assert common[1] == pytest.approx(6.1, abs=0.3) and common[2] == pytest.approx(5.3, abs=0.5)
+
+
+def test_a_rare_size_with_a_curved_signature_is_rated_where_it_shows(parts):
+    """An inertia 9 times the model's, 40 typical deviations away; its slope at nominal says less.
+
+    The far start costs 25^2 = 625 by a unit-normal prior, more than the evidence that there is.
+    """
+    noise, signature, _ = parts
+    ratio = Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05, starts=(1.0, 6.0))
+    inertia = Hypothesis("inertia_error", "boom", {"ratio": ratio})
+
+    def curved(d):
+        return 0.5 * (1.0 - np.exp(-d / 10.0)) * signature
+
+    evidence = MadeUp(noise + curved(40.0), {"inertia_error": curved})
+    (found,) = screen(evidence, Guess(), [inertia])
+    whole = float(np.sum(curved(40.0) ** 2))
+    assert whole < 625.0
+    assert 0.8 * whole < found.score < whole
+    assert found.start[0] > 20.0
