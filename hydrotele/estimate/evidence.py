@@ -441,7 +441,7 @@ def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) 
     themselves ask for sizes that scatter beyond chance, it is widened to that scatter (Birge 1932,
     Phys. Rev. 40, 207). What halving the integrator's step would change is added as the half-width
     of a uniform error, for neither step is the truth (Guide to the expression of uncertainty in
-    measurement, 4.3.7).
+    measurement, 4.3.7). A likelihood with dents widens them to the dents' reach.
 
     Args:
         evidence: with the guess as its base.

@@ -1,11 +1,12 @@
 """Numbers of a calibration that stop at the end of their range."""
 
 import numpy as np
+import pytest
 
 from hydrotele.effects import Parameter
 from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
-from hydrotele.gap.calibrating import _further, ended
+from hydrotele.gap.calibrating import _further, _gain_of_freedom, ended
 
 
 def number(name: str, high: float = 6.0) -> Hypothesis:
@@ -42,3 +43,23 @@ def test_how_far_a_number_would_go_is_tried():
     assert further.deviation.tolist() == [24.0] and fall == 1.0 - 19.0**2
     same, none = _further(OneNumber(5.0), guess)
     assert same.deviation.tolist() == [6.0] and none == 0.0
+
+
+def test_the_gain_of_freedom_is_the_ratio_of_evidences():
+    """Against both evidences of a linear model, by the determinants of their readings."""
+    rng = np.random.default_rng(4)
+    slopes, ratio, free = rng.normal(size=(30, 4)), np.array([0.25, 0.6]), [0, 2]
+    slopes[:, 3] = slopes[:, 0] + 0.3 * rng.normal(size=30)  # does nearly the same
+    readings = slopes @ np.array([6.0, 0.5, -2.0, 0.0]) + rng.normal(size=30)
+    widths = np.ones(4)
+
+    def loss():
+        spread = np.eye(30) + (slopes * widths**2) @ slopes.T
+        return readings @ np.linalg.solve(spread, readings) + np.linalg.slogdet(spread)[1]
+
+    covariance = np.linalg.inv(slopes.T @ slopes + np.eye(4))
+    deviation = covariance @ slopes.T @ readings
+    gain = _gain_of_freedom(deviation[free], covariance[np.ix_(free, free)], ratio)
+    before = loss()
+    widths[free] = 1.0 / ratio
+    assert gain == pytest.approx(before - loss(), rel=1e-9)  # rounding

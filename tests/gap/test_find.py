@@ -286,9 +286,7 @@ def test_what_may_only_make_up_for_something_else_is_a_detail():
     )
     unlikely = effect("valve_gain", "stick", 0.002, probability=0.1)
     assert without_details((teeth, unlikely), False, axes) == ((teeth,), (unlikely,))
-    assert without_details((unlikely,), False, axes) == (
-        (unlikely,),
-        (),
-    )  # nothing else explains it
+    # nothing else explains it
+    assert without_details((unlikely,), False, axes) == ((unlikely,), ())
     hose, air = effect("hose_compliance", "boom", 0.99), effect("entrained_air", "all", 0.006)
     assert without_details((hose, air), False, axes) == ((hose,), (air,))  # trial 0006 of seed 780
