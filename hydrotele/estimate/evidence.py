@@ -68,6 +68,11 @@ class Fit:
         """Twice the log of the evidence gained."""
         return self.gain - self.occam_penalty
 
+    @property
+    def whole_penalty(self) -> float:
+        """What all parameters cost."""
+        return occam_penalty(self.information, len(self.information))
+
 
 @dataclass(frozen=True)
 class Judged:

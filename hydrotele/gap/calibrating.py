@@ -432,6 +432,25 @@ def uncalibrated(guess: Guess, machine: Machine, keys: Collection[str]) -> Guess
     return Guess(tuple(parts))
 
 
+def given_again(guess: Guess, axes: Collection[str]) -> Guess:
+    """A guess whose calibration has the numbers of some axes as the machine file states them."""
+    parts = [
+        (h, np.where([_place_of(key) in axes for key in h.parameters], 0.0, d))
+        if h.name == CALIBRATION else (h, d)
+        for h, d in guess.parts
+    ]  # fmt: skip
+    return Guess(tuple(parts))
+
+
+def _place_of(key: str) -> str:
+    """Axis or link of a calibrated number.
+
+    >>> _place_of("mass.boom.rod"), _place_of("bulk_modulus.all")
+    ('boom', 'all')
+    """
+    return key.split(".")[1]
+
+
 FIT_STEPS = 3  # of Gauss-Newton for a candidate
 _SETTLES = 6  # rounds of levels and fit: what inputs took at first is given back bit by bit
 _UNMOVED = 0.3  # standard deviations by which a number may still move

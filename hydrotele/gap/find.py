@@ -141,11 +141,12 @@ def find_gap(
     if failed:
         left = left_over(before[0], after[0], data.channels, floor)
         named = believed(named, learned, left, _lost(tests, learned))
-    named, details = without_details(named, failed, data.machine.axes)
+    lacks = _lacks(data.machine, discovery.judged)
+    perfect = not (failed or learned or lacks)
+    named, details = without_details(named, failed, data.machine.axes, perfect)
     verdict = verdict_of(named, failed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
-    lacks = _lacks(data.machine, discovery.judged)
     unknown = None
     if failed or learned:
         unknown = describe(_lacks(data.machine, found.judged), learned, improved)
@@ -381,7 +382,7 @@ def _without_effects(evidence: Evidence, found: Found) -> Found:
 
 
 def without_details(
-    named: Sequence[NamedEffect], lacking: bool, axes: Collection[str]
+    named: Sequence[NamedEffect], lacking: bool, axes: Collection[str], perfect: bool = False
 ) -> tuple[tuple[NamedEffect, ...], tuple[NamedEffect, ...]]:
     """Effects, and those that are details: nothing that these data say of the machine itself.
 
@@ -394,6 +395,7 @@ def without_details(
         named: the effects, with shares of the gap.
         lacking: whether the patched machine still lacks something.
         axes: of the machine; what is located elsewhere, as in all oil, acts on each.
+        perfect: whether not even a trace is lacking, as where a form is wrong: all are effects.
 
     Returns:
         The effects, and the details: those that close at most 2 % where something is lacking, or
@@ -407,7 +409,7 @@ def without_details(
 
     def detail(effect: NamedEffect) -> bool:
         likely = effect.mechanism_probability >= LIKELY
-        mends = effect.share <= _TRACE_OF_FORM and any(
+        mends = not perfect and effect.share <= _TRACE_OF_FORM and any(
             other.share > 0.5 and (meet(effect, other) or not likely)
             for other in named if other is not effect
         )  # fmt: skip

@@ -13,7 +13,7 @@ no slopes: gaps of several sizes first, then the simplex of Nelder and Mead 1965
 which also moves where the drive rests in the gap as the stretch begins.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -343,37 +343,43 @@ _CLOSE = 0.01  # ends the search
 
 
 def rattling(
-    evidence: Evidence, base: Judged, ahead: Judged, candidates: Sequence[Hypothesis]
+    evidence: Evidence, guess: Guess, ahead: Judged, axes: Collection[str]
 ) -> Judged | None:
     """Teeth with a gap for an axis that shakes, with levels of their own.
 
     Args:
         evidence: on the fit runs.
-        base: the given machine, judged.
-        ahead: the best other explanation so far, or the base: an axis that does not shake with it
-            has no teeth to look for, which takes minutes.
-        candidates: the hypotheses.
+        guess: what acts beside the teeth.
+        ahead: the best other explanation so far: a spring in it is a rival.
+        axes: that shake, see `shaken`; looking at one takes minutes.
 
     Returns:
-        The base with teeth in the axis in which they explain most, which need not be likelier than
-        the base: with wrong numbers, only both together are. None where none shakes or none has
-        teeth that are likelier than none as long as nothing unknown acts.
+        The guess with teeth in the axis in which they explain most, which need not be likelier than
+        the guess: with wrong numbers, only both together are. None where no axis has teeth that are
+        likelier than none as long as nothing unknown acts.
     """
-    found = []
-    for candidate in candidates:
-        axis = candidate.location
-        if candidate.name != _TEETH or not all(
-            has_unexplained_impacts(evidence, j, axis) for j in (base, ahead)
-        ):
-            continue
-        whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(evidence.data.machine, axis))
+    given, found = evidence.data.machine, []
+    for axis in axes:
+        whole = Hypothesis(_TEETH, axis, EFFECTS[_TEETH].parameters(given, axis))
         springs = (_SPRING, axis) in {h.key for h in ahead.guess.hypotheses}
-        rival = ahead.guess.machine(evidence.data.machine) if springs else None
-        deviation = _likeliest(evidence, whole, rival)
+        rival = ahead.guess.machine(given) if springs else None
+        deviation = _likeliest(evidence, guess.machine(given), whole, rival)
         if deviation is not None and deviation[0] >= whole.least[0]:
-            guess = base.guess.plus(whole, deviation)
-            found.append(evidence.judged_from(guess, _sensors_only(evidence)))
+            toothed = guess.plus(whole, deviation)
+            found.append(evidence.judged_from(toothed, _sensors_only(evidence)))
     return min(found, key=lambda judged: judged.loss, default=None)
+
+
+def shaken(
+    evidence: Evidence, candidates: Sequence[Hypothesis], guesses: Sequence[Judged]
+) -> list[str]:
+    """Axes that may have teeth with a gap, and that shake by all of some guesses without them."""
+    return [
+        c.location for c in candidates
+        if c.name == _TEETH
+        and all(has_unexplained_impacts(evidence, judged, c.location) for judged in guesses)
+        and all(c.key not in {h.key for h in judged.guess.hypotheses} for judged in guesses)
+    ]  # fmt: skip
 
 
 def has_unexplained_impacts(evidence: Evidence, judged: Judged, axis: str) -> bool:
@@ -387,8 +393,10 @@ def _sensors_only(evidence: Evidence) -> Levels:
     return Levels(noise_prior(evidence.data).noise, jitter=jitter)
 
 
-def _likeliest(evidence: Evidence, teeth: Hypothesis, rival: Machine | None) -> np.ndarray | None:
-    """Deviations of the likeliest teeth; None where every gap is less likely than none.
+def _likeliest(
+    evidence: Evidence, toothless: Machine, teeth: Hypothesis, rival: Machine | None
+) -> np.ndarray | None:
+    """Deviations of the likeliest teeth of a machine; None where none are likelier than none.
 
     Nor are there any where a spring of the same drive, the rival, explains the busiest stretch
     better than the best of them.
@@ -404,7 +412,7 @@ def _likeliest(evidence: Evidence, teeth: Hypothesis, rival: Machine | None) -> 
         return np.clip((np.exp(x[:size]) - nominal) / scale, teeth.low, teeth.high)
 
     def track(x: np.ndarray | None, run: RunData, rest: np.ndarray | None = None) -> Track:
-        machine = data.machine if x is None else teeth.machine(data.machine, deviation(x))
+        machine = toothless if x is None else teeth.machine(toothless, deviation(x))
         return track_run(machine, data, run, None, evidence.step, levels, rest=rest)
 
     starts = [np.log([gap, nominal[1], _DAMPING, nominal[3]]) for gap in _GAPS]

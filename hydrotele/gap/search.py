@@ -31,6 +31,7 @@ from hydrotele.gap.calibrating import (
     fit_until_settled,
     fitted,
     free_of_calibration,
+    given_again,
     let_out,
     loss_of,
     mostly_right,
@@ -57,7 +58,7 @@ from hydrotele.gap.rivals import (
     without_needless,
     worth_naming,
 )
-from hydrotele.gap.screening import Screened, has_unexplained_impacts, rattling, screen, timed
+from hydrotele.gap.screening import Screened, rattling, screen, shaken, timed
 from hydrotele.machine.machine import Machine
 
 _MUCH = 2.0  # RMS of the errors without unknown inputs, over noise, from which much is lacking
@@ -171,8 +172,7 @@ def _shaped_settled(evidence: Evidence, now: Judged, fit: Fit) -> tuple[Judged, 
     if guess is None:
         return now, fit
     other, settled = fit_until_settled(evidence, evidence.judged(guess, same=True))
-    costs = [occam_penalty(f.information, len(f.information)) for f in (settled, fit)]
-    if other.loss + costs[0] < now.loss + costs[1] - ENTER:
+    if other.loss + settled.whole_penalty < now.loss + fit.whole_penalty - ENTER:
         return other, settled
     evidence.set_base(now)
     return now, fit
@@ -280,16 +280,19 @@ def search(
     tell("find noise levels of the given model", 0.0)
     base = evidence.set_base(Guess())
     candidates = timed(candidates, base)
-    grown, teeth = _begun(evidence, base, candidates, tell)
+    grown = _begun(evidence, base, candidates, tell)
     jittered = evidence.with_jitter(grown.now)
     before, after = (judged.tracks[0].levels.jitter for judged in (grown.now, jittered))
     if abs(after - before) > _OTHER * max(after, before):  # before, what the model lacked hid it
         tell("search again with instants that jitter", 0.03)
         evidence.set_base(jittered)
         base = evidence.set_base(evidence.judged(Guess(), reopened=True))
-        grown, teeth = _begun(evidence, base, candidates, tell)
-    if teeth:
-        grown = _toothed(evidence, base, grown, teeth, candidates, tell)
+        grown = _begun(evidence, base, candidates, tell)
+    if grown.fit and not grown.toothed:
+        now, fit = _with_teeth(evidence, grown.now, grown.fit, candidates, tell)
+        if now is not grown.now:
+            begin = replace(grown, now=now, fit=fit, early=(), toothed=True)
+            grown = _grow(evidence, base, begin, candidates, tell)
     if grown.fit and mostly_right(grown.now.guess, grown.fit):
         grown = _sparse(evidence, base, grown, candidates, tell)
     grown = _by_number(evidence, _plain(evidence, grown, candidates), candidates)
@@ -298,17 +301,17 @@ def search(
 
 def _begun(
     evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis], tell: Progress
-) -> tuple["_Grown", Judged | None]:
-    """A search from the given machine: how far it gets, and teeth to try with a calibration."""
+) -> "_Grown":
+    """A search from the given machine: how far it gets."""
     tell("try every effect as if nothing unknown acted", 0.03)
     bold = without_inputs(evidence, base, candidates)
     options = [option for option in bold.options if option[1] > ENTER]
     ahead, _ = min(options, key=_score, default=(base, 0.0))
-    teeth = rattling(evidence, base, ahead, candidates)
+    teeth = rattling(evidence, base.guess, ahead, shaken(evidence, candidates, (base, ahead)))
     if teeth and teeth.loss < base.loss:
         options.append((teeth, base.loss - teeth.loss - ENTER))
     begin = _Grown(base, early=sorted(options, key=_score), first=bold.ranking)
-    return _grow(evidence, base, begin, candidates, tell), teeth
+    return _grow(evidence, base, begin, candidates, tell)
 
 
 @dataclass(frozen=True)
@@ -323,6 +326,7 @@ class _Grown:
         weak: a candidate that was clear but smaller than worth naming, or None.
         early: options that were found without a screening, best first.
         calibrates: whether all uncertain numbers may be fitted together.
+        toothed: whether teeth were looked for beside a calibration.
     """
 
     now: Judged
@@ -332,6 +336,7 @@ class _Grown:
     weak: Fit | None = None
     early: Sequence[tuple[Judged, float]] = ()
     calibrates: bool = True
+    toothed: bool = False
 
 
 def _grow(
@@ -341,7 +346,7 @@ def _grow(
     """Add what brings most, again and again."""
     now, fit, weak, first = begin.now, begin.fit, begin.weak, begin.first
     early, rankings = begin.early, dict(begin.rankings)
-    refused, tried, roomy, worth = 0, False, False, 0.0
+    refused, tried, roomy, worth, toothed = 0, False, False, 0.0, begin.toothed
     ranked: Sequence[Screened] | None = None  # of the present guess
     while refused < _REFUSED:
         done = 0.85 * (1.0 - 0.7 ** len(now.guess.parts)) + 0.05
@@ -412,6 +417,8 @@ def _grow(
             if other and gain > max(worth, ENTER):
                 best = other
                 grown, settled = fit_until_settled(evidence, other)
+                toothed = True
+                grown, settled = _with_teeth(evidence, grown, settled, candidates, tell)
             elif best:
                 evidence.set_base(grown)
         if best is None:
@@ -425,33 +432,30 @@ def _grow(
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = first if ranked is None else ranked
         now, fit, ranked = grown, settled, None
-    return replace(begin, now=now, fit=fit, first=first, rankings=rankings, weak=weak)
+    return replace(
+        begin, now=now, fit=fit, first=first, rankings=rankings, weak=weak, toothed=toothed
+    )
 
 
-def _toothed(
-    evidence: Evidence, base: Judged, grown: _Grown, teeth: Judged,
-    candidates: Sequence[Hypothesis], tell: Progress,
-) -> _Grown:  # fmt: skip
-    """The search from teeth and a calibration together, if an axis still shakes and that is better.
+def _with_teeth(
+    evidence: Evidence, now: Judged, fit: Fit, candidates: Sequence[Hypothesis], tell: Progress
+) -> tuple[Judged, Fit]:
+    """A guess with teeth in an axis that still shakes, if that is likelier; else as it is.
 
     Where all numbers are wrong, teeth explain nothing before these are right; and calibrated
-    without teeth, some make up for them.
+    without teeth, numbers of their own axis make up for them, which therefore begin as given.
     """
-    own, _ = teeth.guess.parts[-1]
-    known = {hypothesis.key for hypothesis in grown.now.guess.hypotheses}
-    if own.key in known or not has_unexplained_impacts(evidence, grown.now, own.location):
-        return grown
-    tell("calibrate with teeth", 0.78)
-    evidence.set_base(teeth)
-    other, _ = calibrated(evidence, teeth)
-    if other is not None:
-        now, fit = fit_until_settled(evidence, other)
-        begin = replace(grown, now=now, fit=fit, early=(), rankings={own.key: grown.first})
-        toothed = _grow(evidence, base, begin, candidates, tell)
-        if _total(toothed) < _total(grown):
-            return toothed
-    evidence.set_base(grown.now)
-    return grown
+    axes = shaken(evidence, candidates, (now,))
+    if not axes:
+        return now, fit
+    tell("look for teeth with a gap", 0.7)
+    teeth = rattling(evidence, given_again(now.guess, axes), now, axes)
+    if teeth is not None:
+        other, settled = fit_until_settled(evidence, teeth)
+        if other.loss + settled.whole_penalty < now.loss + fit.whole_penalty - ENTER:
+            return other, settled
+        evidence.set_base(now)
+    return now, fit
 
 
 def _sparse(
@@ -570,9 +574,7 @@ def _replaced(
 
 def _total(grown: _Grown) -> float:
     """Loss of a guess and what all its numbers cost."""
-    if grown.fit is None:
-        return grown.now.loss
-    return grown.now.loss + occam_penalty(grown.fit.information, len(grown.fit.information))
+    return grown.now.loss + (grown.fit.whole_penalty if grown.fit else 0.0)
 
 
 def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -> Found:

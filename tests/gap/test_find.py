@@ -290,3 +290,5 @@ def test_what_may_only_make_up_for_something_else_is_a_detail():
     assert without_details((unlikely,), False, axes) == ((unlikely,), ())
     hose, air = effect("hose_compliance", "boom", 0.99), effect("entrained_air", "all", 0.006)
     assert without_details((hose, air), False, axes) == ((hose,), (air,))  # trial 0006 of seed 780
+    slow = effect("pressure_lag", "stick", 0.007)  # as in a library trial
+    assert without_details((air, slow, teeth), False, axes, perfect=True)[0] == (air, slow, teeth)

@@ -22,7 +22,8 @@ def looked(truth):
     evidence = Evidence(data, data.fit, 2, lacking=True)
     try:
         base = evidence.set_base(Guess())
-        return base, gap_rattling.rattling(evidence, base, base, hypotheses(machine, ("backlash",)))
+        axes = gap_rattling.shaken(evidence, hypotheses(machine, ("backlash",)), (base,))
+        return base, gap_rattling.rattling(evidence, base.guess, base, axes)
     finally:
         evidence.close()
 
