@@ -42,6 +42,9 @@ _NEW = 6  # numbers more than the base before had, for whose directions its own 
 _UNKNOWN = 2500.0  # information of a new one, until it is known: it shows by its fiftieth
 _MOVE = 1.0  # of the errors, by which they are moved for the slopes of many numbers
 _TRACE = 1.0e-9  # of a typical deviation
+_GLANCE = 0.1  # of the steps for slopes: a move of all numbers that tells whether there are any
+_RIPPLE, _BENT = 0.01, 0.1  # squares of errors, and share of a change's squares, by which twice
+# the move may change more or less than twice as much
 _CLOSE = 0.05  # fall of the loss that ends a search: far below any threshold
 
 
@@ -121,7 +124,7 @@ class Evidence:
         self._pool = ThreadPoolExecutor(_threads(jobs, len(self.runs)))
         self.tracks: tuple[Track, ...] = ()
         self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
-        self._slopes = dict[float, np.ndarray]()
+        self._slopes, self._smooth = dict[float, np.ndarray](), dict[float, bool]()
         self._information = list[str](), np.zeros((0, 0))
 
     def close(self) -> None:
@@ -187,7 +190,7 @@ class Evidence:
         """Compute gains anew for a guess; later errors are whitened with them."""
         judged = guess if isinstance(guess, Judged) else self.judged(guess)
         self.tracks, self._base = judged.tracks, judged.guess
-        self._steps, self._slopes = {}, {}
+        self._steps, self._slopes, self._smooth = {}, {}, {}
         return judged
 
     @property
@@ -240,6 +243,8 @@ class Evidence:
 
         Guesses are compared at equal steps, lest a finer one be taken for a better machine.
         """
+        if step > MIDDLE and not self._is_smooth(step):
+            step = MIDDLE
         return fine_enough(guess.machine(self.data.machine), step)
 
     def map(self, function: Callable, items: Sequence) -> list:
@@ -266,7 +271,25 @@ class Evidence:
     @property
     def slope_step(self) -> float:
         """Largest step for slopes of the base's numbers [s]: coarser where they are many."""
-        return COARSE if len(self._base.deviation) > _MANY else MIDDLE
+        many = len(self._base.deviation) > _MANY
+        return COARSE if many and self._is_smooth(COARSE) else MIDDLE
+
+    def _is_smooth(self, step: float) -> bool:
+        """Whether errors at a step are smooth functions of the base's numbers [s].
+
+        Where a piston slips and sticks, a coarse step may hit either by the last digit of a number,
+        and slopes say nothing.
+        """
+        if not len(self._base.deviation):
+            return True
+        if step not in self._smooth:
+            way = _GLANCE * self._base.nudges()
+            guesses = [self._base.at(self._base.deviation + k * way) for k in (0.0, 1.0, 2.0)]
+            errors = [self.errors(guess, step, parallel=True) for guess in guesses]
+            change, twice = errors[1] - errors[0], errors[2] - errors[0]
+            bend = float(np.sum((twice - 2.0 * change) ** 2))
+            self._smooth[step] = bend < max(_RIPPLE, _BENT * float(change @ change))
+        return self._smooth[step]
 
     def base_slopes(self, step: float | None = None, parallel: bool = True) -> np.ndarray:
         """(E, P) slopes of the base, kept until there is another base.

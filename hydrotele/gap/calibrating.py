@@ -246,7 +246,7 @@ def calibrated(evidence: Evidence, now: Judged) -> tuple[Judged | None, float]:
         step = evidence.step_of(guess, MIDDLE)
         coarse = evidence.step_of(guess, COARSE)
         if turn:
-            slopes = evidence.base_slopes(coarse)
+            slopes = evidence.base_slopes(evidence.slope_step)
         else:
             slopes = evidence.slopes(guess, evidence.errors(guess, coarse), step=coarse)
             evidence.keep_information(guess, slopes)
