@@ -212,6 +212,7 @@ def _openings(
 
 BEYOND = 15.0  # twice the log evidence that a number must bring to be an effect of its own
 _RIGHT = 0.2  # of the stated uncertainty, by which numbers move that are right
+_MOSTLY = 0.6  # of the stated uncertainty: so right are nearly all
 _INFORMED = 0.5  # of the stated uncertainty is left of a number that the runs tell
 _SEVERAL = 8  # of them say what is usual
 _ROUNDS = 2  # of levels and fit; `search.settle` does the rest
@@ -284,7 +285,7 @@ def mostly_right(guess: Guess, fit: Fit) -> bool:
     for hypothesis, deviation in guess.parts:
         if hypothesis.name == CALIBRATION:
             spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
-            return _usual(deviation, spread[first : first + hypothesis.size]) < 1.0
+            return _usual(deviation, spread[first : first + hypothesis.size]) < _MOSTLY
         first += hypothesis.size
     return False
 
