@@ -150,9 +150,10 @@ def _begun(
     bold = without_inputs(evidence, base, candidates)
     options = [option for option in bold.options if option[1] > ENTER]
     ahead, _ = min(options, key=_score, default=(base, 0.0))
-    teeth = rattling(evidence, base.guess, ahead, shaken(evidence, candidates, (base, ahead)))
-    if teeth and teeth.loss < base.loss:
-        options.append((teeth, base.loss - teeth.loss - ENTER))
+    if not calibration_of(ahead.guess):  # else beside it
+        teeth = rattling(evidence, base.guess, ahead, shaken(evidence, candidates, (base, ahead)))
+        if teeth and teeth.loss < base.loss:
+            options.append((teeth, base.loss - teeth.loss - ENTER))
     begin = _Grown(base, early=sorted(options, key=_score), first=bold.ranking)
     return _grow(evidence, base, begin, candidates, tell)
 
@@ -268,8 +269,6 @@ def _grow(
             if other and gain > max(worth, ENTER):
                 best = other
                 grown, settled = fit_until_settled(evidence, other)
-                toothed = True
-                grown, settled = _with_teeth(evidence, grown, settled, candidates, tell)
             elif best:
                 evidence.set_base(grown)
         if best is None:
@@ -280,6 +279,9 @@ def _grow(
             now, fit = fit_until_settled(evidence, evidence.judged(wider))
             ranked, roomy, ahead = None, True, None
             continue
+        if calibration_of(grown.guess) and settled and not toothed:
+            toothed = True
+            grown, settled = _with_teeth(evidence, grown, settled, candidates, tell)
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = first if ranked is None else ranked
         now, fit, ranked, ahead = grown, settled, None, None

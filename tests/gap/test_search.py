@@ -8,6 +8,7 @@ import pytest
 
 from hydrotele.estimate.evidence import Fit, Judged
 from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.inputs import Input
 from hydrotele.gap import rivals, search
 from hydrotele.gap.rivals import Rival, better, weights
 from hydrotele.machine.machine_file import load_machine
@@ -126,6 +127,7 @@ def test_a_calibration_is_tried_again_beside_effects_that_take_little(monkeypatc
         "promoted": lambda *_: None,
         "lacking": lambda judged, _: lacks[len(judged.guess.parts)],
         "_lacked": lambda _, candidates, now: candidates,
+        "_wrong_everywhere": lambda *_: False,
         **dict.fromkeys(("worth_naming", "differs_significantly"), lambda *_: True),
         "strained": lambda *_: False,
     }.items():
@@ -136,3 +138,22 @@ def test_a_calibration_is_tried_again_beside_effects_that_take_little(monkeypatc
     assert len(grown.now.guess.parts) == 3
     # at first; beside one, as the second leaves nearly all; and where nothing more is found
     assert tried == [0, 1, 3]
+
+
+@pytest.mark.parametrize("balances,early,expected", [
+    (("force", "command"), None, True),
+    (("force", "command"), 900.0, True),  # an effect that leaves most
+    (("force", "command"), 100.0, False),  # one that explains most
+    (("force", "flow_head"), None, False),
+])  # fmt: skip
+def test_numbers_are_wrong_where_forces_and_commands_of_all_axes_lack_something(
+    monkeypatch, balances, early, expected
+):
+    axes = ("boom", "stick")
+    levels = SimpleNamespace(inputs=[Input(kind, axis) for kind in balances for axis in axes])
+    base: Any = Judged(Guess(), (SimpleNamespace(levels=levels),), 1000.0)  # type: ignore
+    option: Any = Judged(Guess(), (), 500.0)
+    monkeypatch.setattr(search, "lacking", lambda judged, _: early if judged is option else 1000.0)
+    begin = search._Grown(base, early=() if early is None else ((option, 100.0),))
+    evidence: Any = SimpleNamespace(data=SimpleNamespace(axes=axes))
+    assert search._wrong_everywhere(evidence, base, begin) == expected
