@@ -7,8 +7,9 @@ import pytest
 
 from hydrotele.effects import EFFECTS, Parameter, apply_effect
 from hydrotele.estimate import evidence as evidence_module
-from hydrotele.estimate.evidence import Evidence, _beyond_dents, _move, _threads
+from hydrotele.estimate.evidence import MIDDLE, Evidence, _beyond_dents, _move, _threads
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.estimate.track import COARSE
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
 
@@ -128,3 +129,30 @@ def test_a_number_among_dents_is_told_no_better_than_they_are_deep(evidence, mon
     assert found[0.0] == 1.0
     # dents of 100 hide a rise of as much, at 10 spreads: half the interval, 2 standard deviations
     assert 0.5 * 10.0 < 2.0 * found[100.0] < 2.0 * 10.0
+
+
+class _Errors(Evidence):
+    """Errors of a formula instead of runs."""
+
+    def __init__(self, formula):
+        """Take (guess, step) -> (E,) errors."""
+        names = {f"n{k}": Parameter("1", 0.0, -3.0, 3.0, 1.0, 0.0) for k in range(12)}
+        many = Hypothesis("many", "all", names)
+        self._base = Guess(((many, np.zeros(many.size)),))
+        self._smooth, self._formula = {}, formula
+
+    def errors(self, guess, step=None, tracks=None, parallel=False):
+        return self._formula(guess.deviation, step)
+
+
+@pytest.mark.parametrize("curve, expected", [
+    (lambda x: np.sin(3.0 * x), COARSE),
+    (lambda x: 20.0 * x + 30.0 * x**2, COARSE),
+    (lambda x: np.sin(1e7 * x), MIDDLE),  # another last digit, another error
+    (lambda x: np.floor(300.0 * x + 0.3), MIDDLE),  # sticks or slips
+])  # fmt: skip
+def test_slopes_are_taken_at_a_step_at_which_errors_are_smooth(curve, expected):
+    def errors(deviation, step):
+        return np.tile(curve(deviation) if step > MIDDLE else deviation, 20)
+
+    assert _Errors(errors).slope_step == expected
