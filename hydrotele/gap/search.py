@@ -527,9 +527,10 @@ def _shaped_settled(evidence: Evidence, now: Judged, fit: Fit) -> tuple[Judged, 
 def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -> list[Hypothesis]:
     """Candidates without those of balances of an axis in which nothing is lacking any more.
 
-    At first all are tried: an effect may show where unknown inputs are too faint to be found.
+    At first all are tried, beside a calibration, too: an effect may show where unknown inputs are
+    too faint to be found.
     """
-    if not now.guess.parts:
+    if not _named_so_far(now.guess):
         return list(candidates)
     axes = {i.axis for i in now.tracks[0].levels.inputs}
     sound = set(evidence.data.axes) - axes

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hydrotele.estimate.calibration import calibration
 from hydrotele.estimate.evidence import Fit, Judged
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.inputs import Input
@@ -157,3 +158,21 @@ def test_numbers_are_wrong_where_forces_and_commands_of_all_axes_lack_something(
     begin = search._Grown(base, early=() if early is None else ((option, 100.0),))
     evidence: Any = SimpleNamespace(data=SimpleNamespace(axes=axes))
     assert search._wrong_everywhere(evidence, base, begin) == expected
+
+
+def test_beside_a_calibration_all_effects_are_tried_beside_an_effect_those_of_axes_that_lack():
+    """Trial 0010 of seed 792: an asymmetry of friction worth 89 where nothing else was lacking."""
+    machine = load_machine("cat215")
+    known = hypotheses(machine, ["friction_asymmetry", "valve_gain", "pressure_offset"])
+    levels = SimpleNamespace(inputs=[Input("force", "stick")])
+    tracks: Any = (SimpleNamespace(levels=levels),)
+    evidence: Any = SimpleNamespace(data=SimpleNamespace(axes=("swing", "boom", "stick")))
+    group = calibration(machine)
+    calibrated = Guess(((group, np.zeros(group.size)),))
+    assert search._lacked(evidence, known, Judged(calibrated, tracks, 0.0)) == known
+    named = calibrated.plus(known[0], np.zeros(known[0].size))
+    left = search._lacked(evidence, known, Judged(named, tracks, 0.0))
+    assert {h.location for h in left if h.name == "friction_asymmetry"} == {"stick"}
+    assert [h for h in left if h.name == "pressure_offset"] == [
+        h for h in known if h.name == "pressure_offset"
+    ]
