@@ -58,6 +58,7 @@ from hydrotele.gap.without_inputs import shaped, without_inputs
 _ALIKE = 0.5  # of the squares of what an effect changes, that a number that does the same leaves
 LACKING = 30.0  # twice the log likelihood that unknown inputs must bring to be there at all
 _MOSTLY = 0.5  # of what the given machine lacks: less is left by what explains it mostly
+_NEARLY_NOTHING = 0.1  # of it: a calibration leaves more where more than numbers is wrong
 _WRONG = ("force", "command")  # balances that lack something in every axis of a wrong machine
 _LITTLE = 0.01  # of what the given machine lacks: an effect that leaves less is tried at once
 _SHORT = 5  # candidates that are fitted after a screening
@@ -196,7 +197,7 @@ def _grow(
     if begin.calibrates and _wrong_everywhere(evidence, base, begin):
         tell("calibrate the uncertain numbers", 0.06)
         ahead = other, _ = calibrated(evidence, now)
-        if other and lacking(other, evidence) < _MOSTLY * lacking(now, evidence):
+        if other and lacking(other, evidence) < _NEARLY_NOTHING * lacking(now, evidence):
             now, fit = fit_until_settled(evidence, other)
             now, fit = _with_teeth(evidence, now, fit, candidates, tell)
             tried, toothed, ahead = True, True, None
