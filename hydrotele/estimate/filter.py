@@ -363,11 +363,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
     Returns:
         -2 log likelihood without its constant; infinite if the states broke down.
 
-    A rate is differenced over its own standard deviation, so that friction that sticks counts by
-    what it does to all rates that may be, not by its slope at the one that is estimated.
-
-    Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings;
-        divided differences after Norgaard, Poulsen and Ravn 2000, Automatica 36(11).
+    Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings.
     """
     command, known, reading, period = rows
     noise, drift, unknown = variances
@@ -384,8 +380,6 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
     if size == begin:  # nothing is late
         trail, rough = trail[:0], rough[:0]
     reached = np.zeros((full + 1, full))
-    wide = nudge.copy()
-    moving = slow = len(model.mech.free) + len(model.transmission)  # rates, behind positions
     moved, work = np.zeros(size), np.zeros((full, full))
     delta, pull = np.zeros(few), np.zeros(full)
     place(model, sp, z)
@@ -451,22 +445,20 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
                     moves = s < size or s == full
                     for r in range(full):
                         reached[s, r] = z[r] if moves else reached[full, r]
-                    if slow <= s < slow + moving:
-                        wide[s] = max(nudge[s], math.sqrt(covariance[s, s]))
                     if s < size:
-                        reached[s, s] += wide[s]
+                        reached[s, s] += nudge[s]
                     if moves:
                         advance(model, sp, reached[s], command, row, period, coarse, rough)
                         shift_delayed(model, late, size, rough, period / coarse, reached[s])
                     elif begin <= s < full:
                         for r in range(size):
-                            reached[s, r] += wide[s] * columns[row, s - begin, r]
-                        reached[s, s] += decay * wide[s]
+                            reached[s, r] += nudge[s] * columns[row, s - begin, r]
+                        reached[s, s] += decay * nudge[s]
                     else:
-                        perturb_delayed(late, s - size, wide[s], reached[s, size:begin])
+                        perturb_delayed(late, s - size, nudge[s], reached[s, size:begin])
                 for s in range(full):
                     for r in range(full):
-                        reached[s, r] = (reached[s, r] - reached[full, r]) / wide[s]
+                        reached[s, r] = (reached[s, r] - reached[full, r]) / nudge[s]
                 if len(flow) > 0:
                     for s in range(full):
                         for r in range(full):
