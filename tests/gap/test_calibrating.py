@@ -6,7 +6,7 @@ import pytest
 from hydrotele.effects import Parameter
 from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
-from hydrotele.gap.calibrating import _further, _gain_of_freedom, ended
+from hydrotele.gap.calibrating import _further, _gain_of_freedom, ended, given_again
 
 
 def number(name: str, high: float = 6.0) -> Hypothesis:
@@ -63,3 +63,13 @@ def test_the_gain_of_freedom_is_the_ratio_of_evidences():
     before = loss()
     widths[free] = 1.0 / ratio
     assert gain == pytest.approx(before - loss(), rel=1e-9)  # rounding
+
+
+def test_numbers_of_an_axis_are_given_again_and_those_of_others_and_effects_stay():
+    names = ("mass.stick", "mass.boom.rod", "bulk_modulus.all")
+    table = {name: Parameter("1", 0.0, -3.0, 3.0, 1.0, 0.0) for name in names}
+    group, effect = Hypothesis(CALIBRATION, "all", table), number("payload")
+    guess = Guess(((group, np.array([1.0, 2.0, 3.0])), (effect, np.array([4.0]))))
+    again = given_again(guess, ["boom"])
+    assert again.hypotheses == guess.hypotheses
+    np.testing.assert_array_equal(again.deviation, [1.0, 0.0, 3.0, 4.0])

@@ -341,6 +341,13 @@ def test_targets_are_missed_by_bad_answers_and_reached_by_good_ones():
     assert all(told) and not any(missed)
 
 
+def test_an_outsider_without_an_answer_closes_nothing():
+    outside = key("outside", part(right=()))
+    assert judge_world(outside, FAILED).open_loop == 0.0
+    assert judge_world(outside, answer("unknown")).open_loop > 0.6
+    assert judge_world(key("near", part()), FAILED).open_loop is None
+
+
 STUB = """
 import json
 print(json.dumps({"verdict": "no_gap", "effects": [], "seconds": 0.1, "memory_bytes": 1e8,

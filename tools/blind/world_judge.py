@@ -64,7 +64,7 @@ class Outcome:
             calibrated: intervals that hold the true numbers and not the model's.
         calibrated: whether each interval of a calibrated number holds the true one.
         one_step: share of the gap that is closed for one-step predictions, None without a gap.
-        open_loop: the same over 5 s.
+        open_loop: the same over 5 s; 0 of an outsider without an answer.
         seconds: that the search says it took.
         memory: peak of its process [bytes].
         visible: least visibility of what was planted.
@@ -119,6 +119,9 @@ def judge_world(key: Document, result: Document) -> Outcome:
     else:
         right = verdict not in ("failed", *_NAMING)
     gap, free = answer.get("gap", {}), answer.get("open_loop", {})
+    open_loop = closed(free.get("before"), free.get("after"), 1.0, _CLEAR_FREE)
+    if key["kind"] == "outside" and not answer:
+        open_loop = 0.0
     return Outcome(
         trial=result["trial"], kind=key["kind"],
         planted=tuple(f"{p['name']}({p['location']})" for p in key["planted"]),
@@ -130,7 +133,7 @@ def judge_world(key: Document, result: Document) -> Outcome:
         ),
         calibrated=tuple(_calibrated(key, answer)),
         one_step=closed(gap.get("before"), gap.get("after"), gap.get("noise_floor")),
-        open_loop=closed(free.get("before"), free.get("after"), 1.0, _CLEAR_FREE),
+        open_loop=open_loop,
         seconds=answer.get("seconds"), memory=answer.get("memory_bytes"),
         visible=min((p["visibility"] for p in key["planted"]), default=None),
     )  # fmt: skip
@@ -243,7 +246,7 @@ def _median_and_most(values: Sequence[float | None]) -> tuple[float, float] | No
 
 
 def _targets(rows: dict[str, Any], groups: dict[str, list[Outcome]]) -> dict[str, Any]:
-    """What issue 16 asks, pooled where it pools."""
+    """What is asked of the search, pooled over kinds where that is asked."""
     bare = [o for name in ("noise, bare", "off, bare") for o in groups.get(name, [])]
     planted = [o for name in ("noise, planted", "off, planted") for o in groups.get(name, [])]
     covered = [flag for o in (*bare, *planted) for flag in o.covered]
