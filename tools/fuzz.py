@@ -411,7 +411,7 @@ def _rig_runs() -> dict[str, Log]:
 
 
 def _command(words: list[str], folder: str) -> None:
-    command = [sys.executable, "-m", "hydrotele.cli", *words]
+    command = [sys.executable, "-m", "hydrotele", *words]
     subprocess.run(command, cwd=folder, check=False, capture_output=True)
 
 

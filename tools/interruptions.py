@@ -95,7 +95,7 @@ class Bench:
     def start(self, words: list[str]) -> subprocess.Popen:
         """Start a command in a session of its own."""
         return subprocess.Popen(
-            [sys.executable, "-m", "hydrotele.cli", *words], cwd=self.folder,
+            [sys.executable, "-m", "hydrotele", *words], cwd=self.folder,
             env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE, text=True, start_new_session=True,
         )  # fmt: skip

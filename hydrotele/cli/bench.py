@@ -166,7 +166,7 @@ def _start(*arguments: str) -> float:
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "hydrotele.cli", *arguments]
+        command = [sys.executable, "-m", "hydrotele", *arguments]
         if arguments[0] == "run":
             command += ["--out", f"{folder}/run"]
         begin = time.perf_counter()

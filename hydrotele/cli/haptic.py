@@ -86,7 +86,7 @@ def own_device() -> Iterator[tuple[str, int]]:
     Raises:
         InputError: it does not begin to listen.
     """
-    command = [sys.executable, "-m", "hydrotele.cli", "haptic-device", "--port", "0", "--until-eof"]
+    command = [sys.executable, "-m", "hydrotele", "haptic-device", "--port", "0", "--until-eof"]
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     )  # a Ctrl-C at the terminal is for the drive

@@ -33,7 +33,7 @@ def hydrotele_process(*words, **facts) -> subprocess.Popen:
     env = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "COLUMNS": "200"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | facts
     return subprocess.Popen(
-        [sys.executable, "-m", "hydrotele.cli", *map(str, words)], env=env, **pipes,
+        [sys.executable, "-m", "hydrotele", *map(str, words)], env=env, **pipes,
         preexec_fn=_heed_interrupts,
     )  # fmt: skip
 

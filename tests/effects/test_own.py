@@ -156,7 +156,7 @@ def test_the_page_is_true_as_written(tmp_path):
     """Every command of docs/effects.md, in order, with the file as printed there."""
     (tmp_path / "gas_spring.py").write_text(FILE, encoding="utf-8")
     commands = re.search(r"```bash\n(.*?)```", PAGE, re.S)[1]
-    program = f'hydrotele() {{ {shlex.quote(sys.executable)} -m hydrotele.cli "$@"; }}\nset -e\n'
+    program = f'hydrotele() {{ {shlex.quote(sys.executable)} -m hydrotele "$@"; }}\nset -e\n'
     paths = [str(Path(hydrotele.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
     environment.pop(own.ENVIRONMENT, None)

@@ -32,7 +32,7 @@ def environment() -> dict[str, str]:
 def start(*words) -> subprocess.Popen:
     """`hydrotele sweep` in a group of its own, as a terminal's foreground job is."""
     return subprocess.Popen(
-        [sys.executable, "-m", "hydrotele.cli", "sweep", *map(str, words)], env=environment(),
+        [sys.executable, "-m", "hydrotele", "sweep", *map(str, words)], env=environment(),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         preexec_fn=_heed_interrupts,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""`python -m hydrotele.cli`."""
+"""`python -m hydrotele` is the command `hydrotele`."""
 
 from hydrotele.cli.main import main
 
