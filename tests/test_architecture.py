@@ -32,6 +32,7 @@ FLOORS = (
     ("show",),
     ("envs",),
     ("cli",),
+    ("__main__",),  # a file: `python -m hydrotele`
 )
 WALLED = {"calibrate", "identify", "gap"}
 _FACTS = set().union(*FLOORS[:6])
