@@ -217,7 +217,7 @@ def _warnings(robot: Robot, sockets: Sequence[Socket], options: Options) -> list
 def _write(
     folder: Path, document: dict[str, Any], found: SocketCalibration, left: Sequence[LeftOut]
 ) -> None:
-    from hydrotele.show.robot_calibration_report import draw_sockets, write_robot_report
+    from hydrotele.show.calibration_report import draw_sockets, write_robot_report
 
     write_json(folder / "calibration.json", document)
     source = f"calibrated by hydrotele {hydrotele.__version__} from {document['data']}"

@@ -192,8 +192,7 @@ def _sweep_names() -> list[str]:
 
 
 def _check_sweep(path: Path) -> str:
-    from hydrotele.run.sweep_checking import check_points, open_base
-    from hydrotele.run.sweep_facts import load_sweep
+    from hydrotele.run.sweep_facts import check_points, load_sweep, open_base
 
     file = load_sweep(path)
     check_points(open_base(file))

@@ -251,7 +251,7 @@ def _write(
     folder: Path, document: dict[str, Any], compared: Sequence[Compared], dataset: Dataset,
     run: RunData, seconds: float,
 ) -> None:  # fmt: skip
-    from hydrotele.show.compare_figures import draw_free_runs
+    from hydrotele.show.overlay import draw_free_runs
 
     write_json(folder / "compare.json", document)
     notes.print("drawing free_run.png ...", style="dim")

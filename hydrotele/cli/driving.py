@@ -21,8 +21,17 @@ from hydrotele.haptics.timing import (
     summary_of,
 )
 from hydrotele.run.devices import Device, Keyboard, open_device
-from hydrotele.run.haptic import HAPTIC, RATE, HapticHandle, haptic_address
-from hydrotele.run.live import Pacer, Status, Watch, drive, further_axes
+from hydrotele.run.live import (
+    HAPTIC,
+    RATE,
+    HapticHandle,
+    Pacer,
+    Status,
+    Watch,
+    drive,
+    further_axes,
+    haptic_address,
+)
 from hydrotele.run.run import Run, scenario_machine
 from hydrotele.run.session import Session
 from hydrotele.scenario.scenario import Scenario, load_scenario

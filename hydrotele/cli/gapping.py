@@ -137,7 +137,7 @@ def gap_mjcf_to_folder(
         InputError: data, mechanism, mapping, effects or target are not usable.
     """
     from hydrotele.gap.mechanism_find import find_mechanism_gap
-    from hydrotele.gap.mechanism_patch import COLUMNS_FILE, write_mechanism
+    from hydrotele.gap.patched import COLUMNS_FILE, write_mechanism
     from hydrotele.show.gap_report import write_report
 
     target = target or Path(f"gap_{data_name(data)}")
@@ -224,7 +224,7 @@ def mechanism_open_loop(
     Raises:
         InputError: a force is not known for a while, or a simulation fails.
     """
-    from hydrotele.gap.mechanism_patch import COLUMNS_FILE, MJCF_FILE, write_mechanism
+    from hydrotele.gap.patched import COLUMNS_FILE, MJCF_FILE, write_mechanism
 
     models = {"before": mechanism}
     if gap.patched is not gap.machine:

@@ -195,7 +195,7 @@ def _heldout(count: int, before: Errors, after: Errors) -> dict[str, Any]:
 
 
 def _write(folder: Path, result, done: Calibration, heldout, posterior) -> None:
-    from hydrotele.show.calibration_figures import corner, error_bars
+    from hydrotele.show.calibration_report import corner, error_bars
 
     write_json(folder / "calibration.json", result)
     save_hybrid(done.robot, folder / "robot.yaml", "calibrated by hydrotele calibrate hybrid")

@@ -239,7 +239,7 @@ def sweep(
     ] = False,
 ) -> None:
     """Do many runs of a scenario, varied by a grid or random samples, into one table."""
-    from hydrotele.cli.sweeping import SweepOptions, sweep_to_folder
+    from hydrotele.cli.running import SweepOptions, sweep_to_folder
 
     sweep_to_folder(file, out, SweepOptions(jobs, dask, fresh, retry_failed, strict, json))
 
@@ -334,7 +334,7 @@ def replay(
     json: Json = False,
 ) -> None:
     """Drive the model with logged commands from the logged initial state; print the differences."""
-    from hydrotele.cli.replaying import replay_logs
+    from hydrotele.cli.reviewing import replay_logs
 
     replay_logs(logs, machine, tool, timestep, out, json)
 
@@ -680,7 +680,7 @@ def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("demo"),
 ) -> None:
     """Run an excavator, replay its log, draw the pictures: a tour of what is there."""
-    from hydrotele.cli.demo import run_demo
+    from hydrotele.cli.running import run_demo
 
     run_demo(out)
 

@@ -1,15 +1,19 @@
-"""`hydrotele review`: a recording of one or two logs, opened, served or photographed."""
+"""`hydrotele replay` and `review`: a log against the model, and recordings of one or two logs."""
 
 import contextlib
+import dataclasses
 import re
 import tempfile
 from pathlib import Path
 
-from hydrotele.cli.console import notes, out
-from hydrotele.cli.opening import open_log
+from hydrotele.cli.console import notes, out, print_json, progress_bar, table, write_json
+from hydrotele.cli.opening import log_path, open_log
 from hydrotele.core.errors import InputError
-from hydrotele.logs.log import Log
+from hydrotele.core.output import check_target, whole_folder
+from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine import Machine
+from hydrotele.run.replay import Replay, replay_log
+from hydrotele.simulate.native import stop_profiling_clock
 
 
 def review_logs(
@@ -104,3 +108,94 @@ def _pair(first, second, machine, tool, which: str) -> dict[str, tuple[Machine, 
     if not usable or {"about", "difference", "ground"} & set(names):
         names = ["first", "second"]
     return dict(zip(names, logs, strict=True))
+
+
+_SHOWN = {"rad": ("deg", 57.29577951308232), "m": ("mm", 1e3), "Pa": ("kPa", 1e-3)}
+
+
+def replay_logs(
+    paths: list[Path], machine: str | None, tool: str | None, timestep: float, target: Path | None,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Replay logs and print how far the model is off.
+
+    Args:
+        paths: log files or run folders.
+        machine: machine to drive, None for the logs' own.
+        tool: its tool, None for the log's.
+        timestep: physics step [s].
+        target: folder for overlay plots and recordings; default is runs/replay_<log>, or none with
+            `as_json`.
+        as_json: print JSON: one object for one log, a list for several.
+
+    Raises:
+        InputError: a log or machine is not usable.
+    """
+    if target is None and not as_json:
+        one = log_path(paths[0])
+        name = one.parent.name if paths[0].is_dir() else one.stem
+        target = Path("runs", f"replay_{name}" if len(paths) == 1 else "replay_logs")
+    if target:
+        check_target(target, "replay")
+    stop_profiling_clock()
+    results = []
+    for path in paths:
+        the_machine, log = open_log(path, machine, tool)
+        with progress_bar(f"replay {log.name}", quiet=as_json) as progress:
+            result = replay_log(log, the_machine, timestep, progress)
+        results.append((the_machine, result))
+        if log.metadata.get("command", "held") != "held":
+            notes.print(
+                f"[yellow]note[/] {path}: commands changed faster than the log has rows, so their"
+                " means are replayed; log with log_rate = control_rate for an exact replay"
+            )
+        if not as_json:
+            _print(str(log_path(path)), result)
+    if target:
+        with whole_folder(target, "replay") as folder:
+            for number, (the_machine, result) in enumerate(results):
+                prefix = f"{number}_" if len(paths) > 1 else ""
+                name = prefix + result.measured.name
+                _write(folder, name, the_machine, result)
+            data = {"kind": "replay", "replays": [as_data(result) for _, result in results]}
+            write_json(folder / "summary.json", data)
+        notes.print(f"written to {target}")
+    if as_json:
+        data = [as_data(result) for _, result in results]
+        print_json(data[0] if len(data) == 1 else data)
+
+
+def as_data(result: Replay) -> dict:
+    """A replay as the JSON that `--json` prints."""
+    return {
+        "log": result.measured.source,
+        "machine": result.simulated.metadata["machine"],
+        "channels": {n: dataclasses.asdict(c) for n, c in result.channels.items()},
+        "realtime_factor": result.realtime_factor,
+    }
+
+
+def _print(source: str, result: Replay) -> None:
+    title = f"{source}: {result.realtime_factor:.0f} x real time"
+    rows = table(title, "channel", "rms", "max", "unit", "of range", "of noise")
+    for name, c in result.channels.items():
+        unit, factor = _SHOWN.get(c.unit, (c.unit, 1.0))
+        share = f"{100 * c.rms / c.range:.3f} %" if c.range else "-"
+        noise = f"{c.rms / c.noise_rms:.2f}" if c.noise_rms else "-"
+        rows.add_row(name, f"{c.rms * factor:.4g}", f"{c.max * factor:.4g}", unit, share, noise)
+    out.print(rows)
+
+
+def _write(folder: Path, name: str, machine, result: Replay) -> None:
+    from hydrotele.show.overlay import plot_overlay
+    from hydrotele.show.recording import write_recording
+
+    save_log(result.simulated, folder / f"{name}_simulated.parquet")
+    run = result.measured.metadata.get("run", name)
+    title = f"{machine.name}, {run}: measured and replayed"
+    plot_overlay(result.measured, result.simulated, folder / f"{name}.png", title=title)
+    entries = {
+        "measured": (machine, result.measured.without_truth()),
+        "simulated": (machine, result.simulated.without_truth()),
+    }
+    write_recording(folder / f"{name}.rrd", entries)

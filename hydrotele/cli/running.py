@@ -1,14 +1,32 @@
-"""`hydrotele run`: a scenario into a folder."""
+"""`hydrotele run`, `sweep` and `demo`: one scenario, many of them, and three to begin with."""
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import typer
+
+from hydrotele.cli.catalogue import export_machine
 from hydrotele.cli.console import notes, out, print_json, progress_bar, table, write_json
+from hydrotele.cli.reviewing import replay_logs
+from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import save_machine
 from hydrotele.run.run import Run, run_scenario, scenario_model
+from hydrotele.run.sweep import (
+    Progress,
+    SweepResult,
+    SweepSettings,
+    default_figures,
+    run_sweep,
+    spread_statistics,
+)
+from hydrotele.run.sweep_facts import SweepFile, load_sweep
+from hydrotele.run.sweep_runs import JOURNAL, Entry, finished
 from hydrotele.scenario.scenario import load_scenario, save_scenario
+from hydrotele.show.sweep_report import Study, write_sweep_report
 from hydrotele.simulate.native import stop_profiling_clock
 
 
@@ -89,3 +107,180 @@ def print_summary(summary: dict[str, Any]) -> None:
     out.print(rows)
     for note in summary["notes"]:
         out.print(f"[yellow]note[/] {note}")
+
+
+def run_demo(target: Path) -> None:
+    """Run three scenarios, replay one, draw the machine; everything lands in one folder.
+
+    Args:
+        target: folder to write into.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(target, f"cannot be made: {error.strerror}") from None
+    _say_step(1, "the bucket goes straight up at 0.5 m/s (Zhu 1994, Fig. 6.45)")
+    run_to_folder("zhu_up", target / "zhu_up", {}, True, False)
+    _say_step(2, "the bucket digs")
+    run_to_folder("dig", target / "dig", {}, True, False)
+    _say_step(3, "all axes move together, logged as the sensors of Khoshzaban 1992 see them")
+    run_to_folder("excitation", target / "excitation", {}, True, False)
+    _say_step(4, "the model is driven with that log's commands: how far is it off?")
+    log = target / "excitation" / "measured.parquet"
+    replay_logs([log], None, None, 1.0e-3, target / "replay", False)
+    _say_step(5, "a picture of the machine")
+    try:
+        export_machine("cat215", "bucket", None, target / "cat215.png", "overview")
+    except InputError as error:
+        notes.print(f"[yellow]no picture[/] {error}")
+    out.print(f"\n[bold green]done[/] Everything is in [bold]{target}[/]. Look at it with")
+    out.print("  source .venv/bin/activate             (in a checkout, once per shell)")
+    out.print(f"  hydrotele review {target}/dig             (rerun viewer)")
+    out.print(f"  hydrotele review {target}/dig --serve     (web viewer)")
+    out.print(f"and see measured against replayed in {target}/replay/measured.png")
+
+
+def _say_step(step: int, text: str) -> None:
+    out.print(f"\n[bold]{step}/5[/] {text}")
+
+
+_ALL_FAILED = 3
+_LISTED = 10
+
+
+class SweepOptions(NamedTuple):
+    """What the command line asks for, beside the file and the folder."""
+
+    jobs: int | None
+    dask: str | None
+    fresh: bool
+    retry_failed: bool
+    strict: bool
+    json: bool
+
+
+def sweep_to_folder(name: str, target: Path | None, wishes: SweepOptions) -> None:
+    """Do a sweep and say what came out.
+
+    Args:
+        name: sweep file, or name of a shipped sweep.
+        target: folder, default `runs/<name>`.
+        wishes: the rest of the command line.
+
+    Raises:
+        InputError: the file, a point of it, the folder or the cluster cannot be used.
+        typer.Exit: interrupted (130), or runs failed (3) where that counts.
+    """
+    file = load_sweep(name)
+    target = target or Path("runs", file.name)
+    how = SweepSettings(wishes.jobs, wishes.dask, wishes.fresh, wishes.retry_failed, write_run)
+    try:
+        with _bar(file.name, wishes.json) as progress:
+            swept = run_sweep(file, target, how, progress)
+    except (KeyboardInterrupt, SystemExit) as stop:
+        done = finished(target / JOURNAL)
+        said = f"{done} of {file.sweep.runs} runs are done and kept in {target}"
+        notes.print(f"stopped: {said}; the same command goes on", markup=False, soft_wrap=True)
+        code = stop.code if isinstance(stop, SystemExit) else 130
+        raise typer.Exit(code if isinstance(code, int) else 1) from None
+    figures = list(file.sweep.figures) or default_figures(swept.table)
+    study = _study(file, swept, figures)
+    if not wishes.json:
+        notes.print("writing report.html ...", style="dim")
+    write_sweep_report(study, target)
+    _say(file, target, swept, figures, wishes.json)
+    failed = len(swept.failed)
+    if failed and (wishes.strict or failed == file.sweep.runs):
+        raise typer.Exit(_ALL_FAILED)
+
+
+def _study(file: SweepFile, swept: SweepResult, figures: list[str]) -> Study:
+    """What the report shows."""
+    sampled = tuple(file.sweep.sample.keys) if file.sweep.sample else ()
+    logarithmic = [k for k in sampled if file.sweep.sample.keys[k].log_uniform]  # pyright: ignore - it has one
+    return Study(
+        file.name, file.sweep.description, file.sweep.scenario, swept.table.columns,
+        swept.table.units, tuple(file.sweep.grid), sampled, tuple(logarithmic), tuple(figures),
+        [(entry.run, entry.reason) for entry in swept.failed],
+    )  # fmt: skip
+
+
+def _say(
+    file: SweepFile, target: Path, swept: SweepResult, figures: list[str], as_json: bool
+) -> None:
+    found = spread_statistics(swept.table, figures)
+    if as_json:
+        print_json({
+            "kind": "sweep", "name": file.name, "folder": str(target), "runs": file.sweep.runs,
+            "done_now": swept.done, "failed": len(swept.failed),
+            "failures": [{"run": e.run, "reason": e.reason, **_values(swept, e)}
+                         for e in swept.failed],
+            "figures": found,
+        })  # fmt: skip
+        return
+    title = f"{file.name}: {file.sweep.runs} runs"
+    shown = table(title, "", "unit", "smallest (run)", "median", "largest (run)")
+    shown.columns[0].overflow = "fold"
+    for name, f in found.items():
+        ends = (f"{f[end]:.4g} ({f[f'{end}_run']})" for end in ("min", "max"))
+        shown.add_row(name, f["unit"], next(ends), f"{f['median']:.4g}", next(ends))
+    if found:
+        out.print(shown)
+    elif len(swept.failed) < file.sweep.runs:
+        out.print("the runs do not differ in any number")
+    if swept.failed:
+        out.print(f"[red]{len(swept.failed)} of {file.sweep.runs} runs failed[/]")
+    for entry in swept.failed[:_LISTED]:
+        varied = ", ".join(f"{key} {_short(value)}" for key, value in _values(swept, entry).items())
+        said = f"  run {entry.run} ({varied}): {entry.reason}"
+        out.print(said, markup=False, soft_wrap=True)
+    if len(swept.failed) > _LISTED:
+        out.print(f"  and {len(swept.failed) - _LISTED} more, in the table's column reason")
+    if not swept.done:
+        out.print("nothing was left to run; --fresh does it anew")
+    out.print(f"written to [bold]{target}[/]; open {target}/report.html", soft_wrap=True)
+
+
+def _values(swept: SweepResult, entry: Entry) -> dict[str, Any]:
+    columns = swept.table.columns
+    return {key: columns[key][entry.run - 1] for key in (*swept.table.varied, "seed")}
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+@contextlib.contextmanager
+def _bar(name: str, quiet: bool) -> Iterator[Progress | None]:
+    """A bar with the time that is left on stderr; None where nobody watches."""
+    if quiet or not notes.is_terminal:
+        yield None
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+               TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, TextColumn("{task.fields[failed]}"), console=notes,
+                  transient=True, speed_estimate_period=600.0) as bar:  # fmt: skip
+        task = bar.add_task(f"check {name}", total=None, failed="")
+        last = ["check"]
+
+        def update(stage: str, done: int, total: int, failed: int) -> None:
+            if stage != last[0]:  # what was done before tells nothing about the time that is left
+                last[0] = stage
+                bar.reset(task, total=total, completed=done)
+            said = f"[red]{failed} failed[/]" if failed else ""
+            bar.update(task, description=f"{stage} {name}", completed=done, total=total,
+                       failed=said)  # fmt: skip
+
+        yield update

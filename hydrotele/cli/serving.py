@@ -10,7 +10,7 @@ Examples:  hydrotele haptic-device    # a simulated one, for hydrotele drive --d
            hydrotele haptic-device --kind "haption:192.168.0.5#5000"       # device elsewhere
 
 \b
-The server reads the handle and writes forces at 1 kHz and speaks UDP (hydrotele.haptics.packets).
+The server reads the handle and writes forces at 1 kHz and speaks UDP (hydrotele.haptics.device).
 It gives no force while no machine answers, and never more than the device may give. Whoever can
 send packets to it moves the device: listen on other addresses than this computer's own only in a
 network of your own.

@@ -18,8 +18,17 @@ from hydrotele.hydraulics.circuit import actuator_friction
 from hydrotele.hydraulics.parameters import SLOTS, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.machine import Machine
-from hydrotele.multibody.reduced_mechanism import DAMPING, HOME, ReducedMechanism, coordinate_names
-from hydrotele.multibody.reduced_motion import BIAS, DRIFT, RATE, ReducedMotion, gather_forces
+from hydrotele.multibody.reduced_mechanism import (
+    BIAS,
+    DAMPING,
+    DRIFT,
+    HOME,
+    RATE,
+    ReducedMechanism,
+    ReducedMotion,
+    coordinate_names,
+    gather_forces,
+)
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _ODDS = 8.0

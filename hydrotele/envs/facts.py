@@ -1,4 +1,7 @@
-"""Numbers that native code reads of a task: clocks, machine, servo, sensors, MuJoCo's layout."""
+"""Numbers that native code reads of a task: clocks, machine, servo, sensors, MuJoCo's layout.
+
+`KINDS` are the tasks in native code by their names: each is a file of its own and compiles alone.
+"""
 
 from typing import NamedTuple
 
@@ -6,10 +9,11 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.control.servo import drive_tables, servo_parameters
+from hydrotele.core.compiled import Callback
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
+from hydrotele.envs import force, grade, line, place, reach, track
 from hydrotele.envs.episode import ACTIONS, TASK_PARAMETERS, VALVE
-from hydrotele.envs.kinds import KINDS
 from hydrotele.envs.observation import Field
 from hydrotele.envs.task import REAL, Options, Task
 from hydrotele.envs.variants import Variants, channels
@@ -20,6 +24,13 @@ from hydrotele.machine.sensors import SensorSet
 from hydrotele.simulate.feedback import samples_every
 from hydrotele.simulate.layout import field_offsets, function_address, verify_layout
 from hydrotele.simulate.mechanism import TIP_SITE
+
+KINDS: dict[str, Callback] = {
+    "track": track.code, "line": line.code, "force": force.code, "reach": reach.code,
+    "grade": grade.code, "place": place.code,
+}  # fmt: skip
+"""Kind of task -> its code, see `world`."""
+
 
 _CONTROL_RATE = 200.0  # Hz, of the servo at least
 _SHARE = 0.8  # of the speed at rated flow, or at what the pump gives, that a full action asks for

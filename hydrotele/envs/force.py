@@ -15,8 +15,7 @@ from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.memory import field
 from hydrotele.envs.episode import uniform_between
 from hydrotele.envs.observation import Field
-from hydrotele.envs.starts import draw_start
-from hydrotele.envs.task import Task
+from hydrotele.envs.task import Task, draw_start
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,

@@ -19,8 +19,7 @@ from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ARM, PARAMETERS, uniform, uniform_between
 from hydrotele.envs.observation import Field, reach
-from hydrotele.envs.starts import draw_start
-from hydrotele.envs.task import Task
+from hydrotele.envs.task import Task, draw_start
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,

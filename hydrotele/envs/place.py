@@ -18,8 +18,7 @@ import numpy as np
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import ARM, uniform, uniform_between
 from hydrotele.envs.observation import Field, reach
-from hydrotele.envs.starts import draw_start
-from hydrotele.envs.task import Task
+from hydrotele.envs.task import Task, draw_start
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,

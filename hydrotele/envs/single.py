@@ -21,7 +21,7 @@ from hydrotele.envs.making import (
     with_rate,
 )
 from hydrotele.envs.stage import Camera, Stage
-from hydrotele.show.markers import write_markers
+from hydrotele.show.canvas import write_markers
 from hydrotele.show.window import check_screen
 
 ADVICE = (

@@ -25,8 +25,7 @@ from hydrotele.envs.line import SETTLE, line_pose
 from hydrotele.envs.place import GOAL_PLACE, HALF_LENGTH, RADIUS
 from hydrotele.envs.track import track_reference
 from hydrotele.kinematics.task import ALONG, BASE_RADIUS, BOOM, SIDE, STICK, task_forward
-from hydrotele.show.canvas import Canvas
-from hydrotele.show.markers import Marker, arrow, ball, box, line, polyline
+from hydrotele.show.canvas import Canvas, Marker, arrow, ball, box, line, polyline
 from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.fleet import STATE
 from hydrotele.soil.facts import CAT215

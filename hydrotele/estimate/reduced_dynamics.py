@@ -45,10 +45,13 @@ from hydrotele.multibody.reduced_closures import (
     place_bars,
     solve,
 )
-from hydrotele.multibody.reduced_mechanism import BAR, CLOSED, DAMPING, JOINT
-from hydrotele.multibody.reduced_motion import (
+from hydrotele.multibody.reduced_mechanism import (
+    BAR,
     BIAS,
+    CLOSED,
+    DAMPING,
     DRIFT,
+    JOINT,
     LENGTH_ROW,
     RATE,
     Q,
@@ -56,7 +59,7 @@ from hydrotele.multibody.reduced_motion import (
     move_links,
     place_links,
 )
-from hydrotele.multibody.reduced_motion import LENGTH as BAR_LENGTH
+from hydrotele.multibody.reduced_mechanism import LENGTH as BAR_LENGTH
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE

@@ -14,8 +14,13 @@ from hydrotele.hydraulics.parameters import (
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import parse_channel
-from hydrotele.multibody.reduced_mechanism import ReducedMechanism, coordinate_names, mechanism
-from hydrotele.multibody.reduced_motion import ReducedMotion, motion_space
+from hydrotele.multibody.reduced_mechanism import (
+    ReducedMechanism,
+    ReducedMotion,
+    coordinate_names,
+    mechanism,
+    motion_space,
+)
 
 POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)
 _KINDS = {

@@ -13,11 +13,11 @@ import numpy as np
 from hydrotele.calibrate.arm import ArmFit, identify_arm
 from hydrotele.calibrate.arm_poses import Poses, with_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data, predicted_readings
+from hydrotele.calibrate.design import STILL, SWEEPS, Clean, sweep_poses
 from hydrotele.calibrate.linkage import Strokes, identified_angles, identify_linkage
 from hydrotele.calibrate.loop import Loop, closure, link_chain, loop_of, unit_of
-from hydrotele.calibrate.sweeps import STILL, SWEEPS, Clean, sweep_poses
 from hydrotele.core.units import PSI
-from hydrotele.experiments.calibrator_poses import RESOLVER, readings, stressed, true_numbers
+from hydrotele.experiments.calibrator import RESOLVER, readings, stressed, true_numbers
 from hydrotele.experiments.finding import Finding, Panel, Progress, perform
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar

@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from hydrotele.experiments import zhu_false_force, zhu_felling, zhu_forces, zhu_motion
-from hydrotele.experiments.claim import Changes, Experiment, Sample
-from hydrotele.experiments.finding import Finding, Progress, performed
+from hydrotele.experiments.finding import Changes, Experiment, Finding, Progress, Sample, performed
 
 EXPERIMENTS: tuple[Experiment, ...] = (
     *zhu_motion.EXPERIMENTS,

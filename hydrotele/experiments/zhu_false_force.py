@@ -14,8 +14,17 @@ import numpy as np
 
 from hydrotele.control.endpoint_force import Gravity, endpoint_force_of_log, identify_gravity
 from hydrotele.effects.effect import changed
-from hydrotele.experiments.claim import Changes, Claim, Experiment, Sample, Verdict, least, spread
-from hydrotele.experiments.finding import Panel, perform
+from hydrotele.experiments.finding import (
+    Changes,
+    Claim,
+    Experiment,
+    Panel,
+    Sample,
+    Verdict,
+    least,
+    perform,
+    spread,
+)
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import identify_with_shapes
 from hydrotele.identify.identified_machine import identified_machine

@@ -4,18 +4,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.experiments.claim import (
+from hydrotele.experiments.finding import (
     Changes,
     Claim,
     Experiment,
+    Panel,
     Sample,
     Verdict,
+    cylindrical,
     drawn,
     largest,
     least,
+    perform,
     spread,
+    truth,
 )
-from hydrotele.experiments.finding import Panel, cylindrical, perform, truth
 from hydrotele.run.run import Run
 from hydrotele.scenario.teleoperation import TeleopPilot, TipOver
 from hydrotele.teleop.master import tipping_share

@@ -13,19 +13,21 @@ import numpy as np
 import yaml
 
 from hydrotele.core.files import models_folder
-from hydrotele.experiments.claim import (
+from hydrotele.experiments.finding import (
     Changes,
     Claim,
     Experiment,
+    Panel,
     Sample,
     Verdict,
     drawn,
     largest,
     least,
     mean,
+    perform,
     spread,
+    truth,
 )
-from hydrotele.experiments.finding import Panel, perform, truth
 from hydrotele.run.run import Run
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track

@@ -9,19 +9,21 @@ from functools import partial
 
 import numpy as np
 
-from hydrotele.experiments.claim import (
+from hydrotele.experiments.finding import (
     Changes,
     Claim,
     Experiment,
+    Panel,
     Sample,
     Verdict,
+    cylindrical,
     drawn,
     largest,
     least,
     mean,
+    perform,
     spread,
 )
-from hydrotele.experiments.finding import Panel, cylindrical, perform
 from hydrotele.run.run import Run
 
 _WAYS = {

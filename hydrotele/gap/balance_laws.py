@@ -20,9 +20,10 @@ from hydrotele.hydraulics.circuit import (
 )
 from hydrotele.hydraulics.laws import air_compliance, port_flow, softening
 from hydrotele.hydraulics.supply import drawn_flow, highest_supply
-from hydrotele.multibody.reduced_mechanism import BAR, DAMPING
-from hydrotele.multibody.reduced_motion import (
+from hydrotele.multibody.reduced_mechanism import (
+    BAR,
     BIAS,
+    DAMPING,
     DRIFT,
     LENGTH_BIAS,
     LENGTH_ROW,

@@ -37,7 +37,7 @@ from hydrotele.gap.mechanism_evidence import (
     whitened,
 )
 from hydrotele.gap.mechanism_lack import Left, find_left, loud_windows, with_variation
-from hydrotele.gap.mechanism_patch import (
+from hydrotele.gap.patched import (
     COLUMNS_FILE,
     MJCF_FILE,
     patch_of,

@@ -1,13 +1,27 @@
-"""The patched machine as a folder: `machine.yaml` with the effects in it, `effects.yaml`."""
+"""The patched machine as a folder: `machine.yaml` with the effects in it, `effects.yaml`.
 
+Of a mechanism without hydraulics, its MJCF and its mapping with what was found in them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import mujoco
+import numpy as np
 import yaml
 
 from hydrotele.gap.customary import in_customary_units
 from hydrotele.gap.description import effect_title, learned_title, number_title
+from hydrotele.gap.mechanism_columns import STRIBECK, tilted
+from hydrotele.gap.mechanism_effects import MechanismEffect
 from hydrotele.gap.result import Estimate, Gap, effect_document, finite, gap_document
+from hydrotele.identify.mechanism import ColumnMapping
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
+from hydrotele.machine.sensors import SensorError
+from hydrotele.multibody.chain import Chain, body_inertia
+from hydrotele.multibody.regressor import BODY_PARAMETERS
 
 EFFECTS_FILE = "effects.yaml"
 
@@ -88,3 +102,228 @@ def _head(gap: Gap) -> list[str]:
 def _found(estimate: Estimate, name: str) -> str:
     s = in_customary_units(estimate, name)
     return f"{s.value} {s.unit} (95 %: {s.low} .. {s.high}), was {s.nominal}"
+
+
+MJCF_FILE, COLUMNS_FILE = "robot.xml", "columns.yaml"
+_THIN = 1e-4  # of its second moments, that a body has at least along every axis
+_SENSORS = {"offset": "offset", "scale": "scale", "delay": "delay"}
+_FRICTION = {
+    "coulomb_friction": "frictionloss", "viscous_friction": "damping",
+    "drive_inertia": "armature",
+}  # fmt: skip
+_BODIES = ("payload", "com_offset", "inertia_error")
+_STATED = {
+    "stribeck_friction": "stribeck", "friction_asymmetry": "viscous_asymmetry",
+    "speed_dependent_force": "quadratic",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Patch:
+    """What is changed in a model.
+
+    Attributes:
+        parameters: regressor's parameter, such as `mass.link` -> its new value.
+        friction: joint -> friction that an MJCF cannot state.
+        errors: `position.JOINT` or `force.DRIVE` -> defect of a sensor.
+        tilt: (3,) small rotation of the base [rad].
+        springs: joint -> (stiffness, rest).
+    """
+
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    friction: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    errors: Mapping[str, SensorError] = field(default_factory=dict)
+    tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    springs: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def sensor_errors(
+    found: Sequence[tuple[MechanismEffect, np.ndarray]], chain: Chain, joints: Sequence[str]
+) -> dict[str, SensorError]:
+    """Defects of sensors among some effects.
+
+    Args:
+        found: effects and their parameters.
+        chain: the mechanism.
+        joints: that are measured.
+
+    Returns:
+        `position.JOINT` or `force.DRIVE` -> defect.
+    """
+    out: dict[str, dict[str, float]] = {}
+
+    def add(channel: str, kind: str, value: float) -> None:
+        known = out.setdefault(channel, {})
+        known[kind] = known.get(kind, 0.0) + value if kind == "delay" else value
+
+    for effect, value in found:
+        kind, _, what = effect.name.rpartition("_")
+        if effect.name == "clock_offset":
+            late = float(value[0])
+            names = (f"force.{d}" for d in chain.drives) if late > 0 else (
+                f"position.{j}" for j in joints)  # fmt: skip
+            for channel in names:
+                add(channel, "delay", abs(late))
+        elif kind in ("force", "angle", "length") and what in _SENSORS:
+            place = "force" if kind == "force" else "position"
+            add(f"{place}.{effect.location}", what, float(value[0]))
+    return {channel: SensorError(**numbers) for channel, numbers in out.items()}
+
+
+def patch_of(
+    found: Sequence[tuple[MechanismEffect, np.ndarray]], chain: Chain, joints: Sequence[str],
+    calibrated: Mapping[str, float], nominal: Mapping[str, float],
+    speeds: Mapping[str, float],
+) -> Patch:  # fmt: skip
+    """The patch that some effects and calibrated numbers make.
+
+    Args:
+        found: effects and their parameters.
+        chain: the mechanism.
+        joints: that are measured.
+        calibrated: regressor's parameter -> by how much it differs.
+        nominal: regressor's parameter -> its given value.
+        speeds: joint -> RMS rate, to which the Stribeck effect's velocity relates.
+
+    Returns:
+        The patch.
+    """
+    changed: dict[str, float] = {}
+    friction: dict[str, dict[str, float]] = {}
+    springs: dict[str, tuple[float, float]] = {}
+    tilt = (0.0, 0.0, 0.0)
+    for name, deviation in calibrated.items():
+        changed[name] = changed.get(name, nominal.get(name, 0.0)) + deviation
+    for effect, value in found:
+        place = effect.location
+        if effect.name in _BODIES or effect.name in _FRICTION:
+            for name, more in zip(effect.columns, effect.coefficients(value), strict=True):
+                changed[name] = changed.get(name, nominal.get(name, 0.0)) + float(more)
+        elif effect.name in _STATED:
+            known = friction.setdefault(place, {})
+            known[_STATED[effect.name]] = float(value[0])
+            if effect.name == "stribeck_friction":
+                known["stribeck_velocity"] = STRIBECK[effect.variant] * speeds[place]
+        elif effect.name == "joint_spring":
+            springs[place] = float(value[0]), float(value[1])
+        elif effect.name == "base_tilt":
+            tilt = float(value[0]), float(value[1]), 0.0
+    return Patch(changed, friction, sensor_errors(found, chain, joints), tilt, springs)
+
+
+def patched_mjcf(mjcf: str | Path, patch: Patch) -> str:
+    """The MJCF with a patch.
+
+    Args:
+        mjcf: file of the given model.
+        patch: what is changed.
+
+    Returns:
+        The XML. Bodies that cannot exist are made so: every moment of inertia at least positive and
+        at most the sum of the others.
+    """
+    spec = mujoco.MjSpec.from_file(str(mjcf))
+    for kind in ("meshdir", "texturedir"):
+        if hasattr(spec, kind):
+            setattr(spec, kind, str((Path(mjcf).parent / getattr(spec, kind)).resolve()))
+    model = spec.compile()
+    by_body: dict[str, dict[str, float]] = {}
+    for name, value in patch.parameters.items():
+        kind, _, place = name.partition(".")
+        if kind in BODY_PARAMETERS:
+            by_body.setdefault(place, {})[kind] = value
+        elif kind in ("coulomb", "viscous", "drive_inertia") and _has_joint(spec, place):
+            joint = spec.joint(place)
+            if kind == "coulomb":
+                joint.frictionloss = max(value, 0.0)
+            elif kind == "viscous":
+                _set_first(joint, "damping", max(value, 0.0))
+            else:
+                joint.armature = value
+    for body, numbers in by_body.items():
+        _set_body(spec.body(body), model, numbers)
+    for place, (stiffness, rest) in patch.springs.items():
+        _set_first(spec.joint(place), "stiffness", stiffness)
+        spec.joint(place).springref = rest
+    if any(patch.tilt):
+        spec.option.gravity = tilted(np.array(spec.option.gravity), np.array(patch.tilt))
+    spec.compile()
+    return spec.to_xml()
+
+
+def _has_joint(spec: Any, name: str) -> bool:
+    return any(joint.name == name for joint in spec.joints)
+
+
+def _set_first(joint: Any, field_name: str, value: float) -> None:
+    """Set a number that newer versions of MuJoCo hold as a polynomial."""
+    now = getattr(joint, field_name)
+    if np.ndim(now):
+        now[0] = value
+    else:
+        setattr(joint, field_name, value)
+
+
+def _set_body(body: Any, model: mujoco.MjModel, numbers: Mapping[str, float]) -> None:
+    """Mass, centre of mass and inertia from parameters about the body's origin."""
+    given = dict(zip(BODY_PARAMETERS, body_inertia(model, model.body(body.name).id), strict=True))
+    ten = np.array([(given | dict(numbers))[kind] for kind in BODY_PARAMETERS])
+    mass = max(ten[0], 1e-6)
+    centre = ten[1:4] / mass
+    xx, xy, xz, yy, yz, zz = ten[4:]
+    about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    about -= mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    size, turn = np.linalg.eigh(about)
+    # second moments along the axes: none may be negative
+    second = 0.5 * size.sum() - size
+    second = np.maximum(second, max(_THIN * second.max(), 1e-12))
+    size = second.sum() - second
+    if np.linalg.det(turn) < 0.0:
+        turn[:, 0] = -turn[:, 0]
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, turn.ravel())
+    body.explicitinertial, body.mass, body.ipos = True, mass, centre
+    body.fullinertia = np.full(6, np.nan)
+    body.inertia, body.iquat = size, quaternion
+
+
+def patched_mapping(given: ColumnMapping, patch: Patch) -> ColumnMapping:
+    """The mapping with a patch.
+
+    Args:
+        given: the mapping.
+        patch: what is changed.
+
+    Returns:
+        The mapping, in which what has become different is no longer alike or absent.
+    """
+    touched = {name.partition(".")[2] for name in patch.parameters}
+    friction = {place: dict(numbers) for place, numbers in given.friction.items()}
+    for place, numbers in patch.friction.items():
+        friction.setdefault(place, {}).update(numbers)
+    errors = dict(given.sensor_errors)
+    for channel, one in patch.errors.items():
+        old = errors.get(channel, SensorError())
+        errors[channel] = SensorError(
+            offset=old.offset + old.scale * one.offset, scale=old.scale * one.scale,
+            delay=old.delay + one.delay, time_constant=old.time_constant,
+        )  # fmt: skip
+    keep = () if touched else given.alike
+    return given.model_copy(update={
+        "friction": friction, "sensor_errors": errors, "alike": keep,
+        "absent": () if touched else given.absent,
+    })  # fmt: skip
+
+
+def write_mechanism(folder: Path, mjcf: str, mapping: ColumnMapping) -> None:
+    """Write `robot.xml` and `columns.yaml`, which every command with --mjcf reads.
+
+    Args:
+        folder: that is there.
+        mjcf: the XML.
+        mapping: the columns.
+    """
+    (folder / MJCF_FILE).write_text(mjcf, encoding="utf-8")
+    document = mapping.model_dump(mode="json", exclude_defaults=True)
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
+    (folder / COLUMNS_FILE).write_text(text, encoding="utf-8")

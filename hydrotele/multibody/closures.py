@@ -11,10 +11,13 @@ import numpy as np
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import Chain, Tree
-from hydrotele.multibody.tree_motion import Frames, move_tree, new_frames, point_column
-from hydrotele.multibody.vectors import (
+from hydrotele.multibody.tree_motion import (
+    Frames,
     add,
     cross,
+    move_tree,
+    new_frames,
+    point_column,
     qr_factor,
     qr_solve,
     rotated,

@@ -21,8 +21,16 @@ from hydrotele.multibody.closures import (
     closure_acceleration,
     loop_space,
 )
-from hydrotele.multibody.tree_motion import move_tree, point_column, wrenches
-from hydrotele.multibody.vectors import dot, qr_factor, qr_solve, subtract, vector
+from hydrotele.multibody.tree_motion import (
+    dot,
+    move_tree,
+    point_column,
+    qr_factor,
+    qr_solve,
+    subtract,
+    vector,
+    wrenches,
+)
 
 _STRIDE = 0.1  # rad or m, to which the given joints move at once, lest a loop change its branch
 _WHERE = "closures"

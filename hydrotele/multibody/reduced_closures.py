@@ -7,16 +7,19 @@ Cholesky factorisation of its own, quicker than a library call at this size.
 import math
 
 from hydrotele.core.compiled import allocation_free
-from hydrotele.multibody.reduced_mechanism import AXIS, HOME, PARENT, REACH
-from hydrotele.multibody.reduced_motion import (
+from hydrotele.multibody.reduced_mechanism import (
     ACCELERATION,
+    AXIS,
     DRIFT,
+    HOME,
     LENGTH,
     LENGTH_BIAS,
     LENGTH_RATE,
     LENGTH_ROW,
     ORIGIN,
+    PARENT,
     RATE,
+    REACH,
     SPIN,
     SPIN_RATE,
     VELOCITY,

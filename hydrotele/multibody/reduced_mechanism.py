@@ -1,14 +1,18 @@
-"""A Machine's mechanism in reduced coordinates, as tables: links, bars, pins of closures, drives.
+"""A Machine's mechanism in reduced coordinates: links, bars, pins of closures, drives, as tables.
 
 A Kalman filter and a tip balance evaluate it at every step, which `inverse_dynamics` is too slow
 for: links alone are in the tree, cylinders are bars between two pins, and nothing allocates. It
 knows a Machine's closures only; the two are tested against each other.
+
+Motion, mass matrix and bias forces are compiled: places and Jacobians of every frame first, then
+rates and accelerations, then Kane's projection.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
+from hydrotele.core.compiled import allocation_free
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import pin_axis
 from hydrotele.machine.machine import Machine, following_joints
@@ -155,3 +159,341 @@ def _tree_order(machine: Machine) -> list[str]:
             if name not in order and (link.parent == "world" or link.parent in order)
         ]
     return order
+
+
+# columns of `frame`
+TURN, ORIGIN, SPIN, VELOCITY = 0, 9, 12, 15
+SPIN_RATE, ACCELERATION, FORCE, FRAME = 18, 21, 24, 30
+LENGTH, LENGTH_RATE, LENGTH_BIAS, LENGTH_ROW = range(4)  # columns of `bar`
+Q, RATE, DRIFT, BIAS = range(4)  # rows of `joint`
+
+
+class ReducedMotion(NamedTuple):
+    """Work space and result of `place_frames` and `move_frames`, for f frames, N coordinates.
+
+    Attributes:
+        frame: (f, FRAME) of every frame: TURN (9, row by row) to the world, ORIGIN [m], SPIN
+            [rad/s], VELOCITY of the origin [m/s]; at zero joint acceleration SPIN_RATE [rad/s^2]
+            and ACCELERATION of the origin minus gravity [m/s^2]; FORCE (6) that this motion needs:
+            force [N] and torque about the origin [N m].
+        jacobian: (f, N, 6) d (velocity, spin) / d rates.
+        momentum: (f, N, 6) d (momentum, angular momentum about the origin) / d rates.
+        bar: (bars, 3 + N) pin-to-pin LENGTH [m], LENGTH_RATE [m/s], LENGTH_BIAS, its acceleration
+            at zero joint acceleration [m/s^2], and from LENGTH_ROW on d length rate / d rates.
+        mass: (N, N) mass matrix of the tree with its bars [kg m^2] or [kg].
+        joint: (4, N) positions Q, RATE, DRIFT, the joint acceleration at zero independent
+            acceleration, and BIAS, gravity and velocity forces [N m] or [N].
+        basis: (N, n) d rates / d independent rates.
+        loop: (3 closures, N + 2) d opening / d rates, opening [m] and its bias acceleration.
+        normal: (N - n + 1, N - n) normal matrix of the closures, and a right-hand side below it.
+    """
+
+    frame: np.ndarray
+    jacobian: np.ndarray
+    momentum: np.ndarray
+    bar: np.ndarray
+    mass: np.ndarray
+    joint: np.ndarray
+    basis: np.ndarray
+    loop: np.ndarray
+    normal: np.ndarray
+
+
+def motion_space(mech: ReducedMechanism) -> ReducedMotion:
+    """Fresh work space, standing at home; the world's row stays as it is written here."""
+    f, n, bound = len(mech.tree), mech.joint.shape[1], len(mech.bound)
+    frame = np.zeros((f, FRAME))
+    frame[:, TURN : TURN + 9] = np.eye(3).ravel()
+    frame[0, ACCELERATION : ACCELERATION + 3] = -mech.gravity
+    basis = np.zeros((n, len(mech.free)))
+    basis[mech.free, np.arange(len(mech.free))] = 1.0
+    joint = np.zeros((4, n))
+    joint[Q] = mech.joint[HOME]
+    return ReducedMotion(
+        frame, np.zeros((f, n, 6)), np.zeros((f, n, 6)), np.zeros((mech.bars, LENGTH_ROW + n)),
+        np.zeros((n, n)), joint, basis, np.zeros((3 * (f - mech.bodies) // 2, n + 2)),
+        np.zeros((bound + 1, bound)),
+    )  # fmt: skip
+
+
+@allocation_free
+def cross(ax, ay, az, bx, by, bz):
+    """Cross product of two vectors given by their components.
+
+    Args:
+        ax: scalar.
+        ay: scalar.
+        az: scalar.
+        bx: scalar.
+        by: scalar.
+        bz: scalar.
+
+    Returns:
+        Its three components.
+
+    Source: definition.
+    """
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@allocation_free
+def rotated(frame, i, x, y, z):
+    """A vector given in a frame, in the world's axes.
+
+    Args:
+        frame: see `ReducedMotion`.
+        i: index of the frame.
+        x: scalar.
+        y: scalar.
+        z: scalar.
+
+    Returns:
+        Its three components.
+
+    Source: definition.
+    """
+    return (
+        frame[i, 0] * x + frame[i, 1] * y + frame[i, 2] * z,
+        frame[i, 3] * x + frame[i, 4] * y + frame[i, 5] * z,
+        frame[i, 6] * x + frame[i, 7] * y + frame[i, 8] * z,
+    )
+
+
+@allocation_free
+def place_origin(tree, shape, frame, jacobian, i):
+    """Origin of a frame as a point of its parent, and its Jacobian.
+
+    Args:
+        tree: see `ReducedMechanism`.
+        shape: see `ReducedMechanism`.
+        frame: see `ReducedMotion`.
+        jacobian: see `ReducedMotion`; the spin's part is that of the parent.
+        i: index of the frame.
+
+    Returns:
+        Nothing.
+
+    Source: rigid-body kinematics.
+    """
+    p = tree[i, PARENT]
+    rx, ry, rz = rotated(
+        frame, p, shape[i, POSITION], shape[i, POSITION + 1], shape[i, POSITION + 2]
+    )
+    frame[i, ORIGIN] = frame[p, ORIGIN] + rx
+    frame[i, ORIGIN + 1] = frame[p, ORIGIN + 1] + ry
+    frame[i, ORIGIN + 2] = frame[p, ORIGIN + 2] + rz
+    for k in range(tree[p, REACH]):
+        wx, wy, wz = jacobian[p, k, 3], jacobian[p, k, 4], jacobian[p, k, 5]
+        jacobian[i, k, 0] = jacobian[p, k, 0] + wy * rz - wz * ry
+        jacobian[i, k, 1] = jacobian[p, k, 1] + wz * rx - wx * rz
+        jacobian[i, k, 2] = jacobian[p, k, 2] + wx * ry - wy * rx
+        jacobian[i, k, 3] = wx
+        jacobian[i, k, 4] = wy
+        jacobian[i, k, 5] = wz
+
+
+@allocation_free
+def move_origin(tree, frame, i):
+    """Rates and accelerations of a placed frame as if it were fixed to its parent.
+
+    Args:
+        tree: see `ReducedMechanism`.
+        frame: see `ReducedMotion`.
+        i: index of the frame.
+
+    Returns:
+        Nothing.
+
+    Source: rigid-body kinematics.
+    """
+    p = tree[i, PARENT]
+    rx = frame[i, ORIGIN] - frame[p, ORIGIN]
+    ry = frame[i, ORIGIN + 1] - frame[p, ORIGIN + 1]
+    rz = frame[i, ORIGIN + 2] - frame[p, ORIGIN + 2]
+    wx, wy, wz = frame[p, SPIN], frame[p, SPIN + 1], frame[p, SPIN + 2]
+    ax, ay, az = frame[p, SPIN_RATE], frame[p, SPIN_RATE + 1], frame[p, SPIN_RATE + 2]
+    vx, vy, vz = cross(wx, wy, wz, rx, ry, rz)
+    tx, ty, tz = cross(ax, ay, az, rx, ry, rz)
+    cx, cy, cz = cross(wx, wy, wz, vx, vy, vz)
+    frame[i, VELOCITY] = frame[p, VELOCITY] + vx
+    frame[i, VELOCITY + 1] = frame[p, VELOCITY + 1] + vy
+    frame[i, VELOCITY + 2] = frame[p, VELOCITY + 2] + vz
+    frame[i, ACCELERATION] = frame[p, ACCELERATION] + tx + cx
+    frame[i, ACCELERATION + 1] = frame[p, ACCELERATION + 1] + ty + cy
+    frame[i, ACCELERATION + 2] = frame[p, ACCELERATION + 2] + tz + cz
+    frame[i, SPIN], frame[i, SPIN + 1], frame[i, SPIN + 2] = wx, wy, wz
+    frame[i, SPIN_RATE], frame[i, SPIN_RATE + 1], frame[i, SPIN_RATE + 2] = ax, ay, az
+
+
+@allocation_free
+def _rotate(frame, i, p, x, y, z, angle):
+    """Turn frame i against p about an axis."""
+    c, s = np.cos(angle), np.sin(angle)
+    k = 1.0 - c
+    r00, r01, r02 = c + x * x * k, x * y * k - z * s, x * z * k + y * s
+    r10, r11, r12 = y * x * k + z * s, c + y * y * k, y * z * k - x * s
+    r20, r21, r22 = z * x * k - y * s, z * y * k + x * s, c + z * z * k
+    for r in range(0, 9, 3):
+        a, b, d = frame[p, r], frame[p, r + 1], frame[p, r + 2]
+        frame[i, r] = a * r00 + b * r10 + d * r20
+        frame[i, r + 1] = a * r01 + b * r11 + d * r21
+        frame[i, r + 2] = a * r02 + b * r12 + d * r22
+
+
+@allocation_free
+def place_links(tree, shape, links, joint, frame, jacobian):
+    """Places and Jacobians of the links.
+
+    Args:
+        tree: see `ReducedMechanism`.
+        shape: see `ReducedMechanism`.
+        links: number of links.
+        joint: see `ReducedMotion`; its positions.
+        frame: see `ReducedMotion`; written.
+        jacobian: see `ReducedMotion`; written.
+
+    Returns:
+        Nothing.
+
+    Source: differential kinematics of a tree.
+    """
+    for i in range(1, 1 + links):
+        p, j = tree[i, PARENT], tree[i, COORDINATE]
+        place_origin(tree, shape, frame, jacobian, i)
+        lx, ly, lz = shape[i, AXIS], shape[i, AXIS + 1], shape[i, AXIS + 2]
+        x, y, z = rotated(frame, p, lx, ly, lz)
+        if tree[i, KIND] == HINGE:
+            _rotate(frame, i, p, lx, ly, lz, joint[Q, j])
+            jacobian[i, j, 3], jacobian[i, j, 4], jacobian[i, j, 5] = x, y, z
+            continue
+        for r in range(9):
+            frame[i, r] = frame[p, r]
+        if tree[i, KIND] == SLIDE:
+            sx, sy, sz = x * joint[Q, j], y * joint[Q, j], z * joint[Q, j]
+            frame[i, ORIGIN] += sx
+            frame[i, ORIGIN + 1] += sy
+            frame[i, ORIGIN + 2] += sz
+            for k in range(tree[p, REACH]):
+                vx, vy, vz = cross(
+                    jacobian[p, k, 3], jacobian[p, k, 4], jacobian[p, k, 5], sx, sy, sz
+                )
+                jacobian[i, k, 0] += vx
+                jacobian[i, k, 1] += vy
+                jacobian[i, k, 2] += vz
+            jacobian[i, j, 0], jacobian[i, j, 1], jacobian[i, j, 2] = x, y, z
+
+
+@allocation_free
+def move_links(tree, links, joint, frame, jacobian):
+    """Rates and accelerations of the placed links.
+
+    Args:
+        tree: see `ReducedMechanism`.
+        links: number of links.
+        joint: see `ReducedMotion`; its rates.
+        frame: see `ReducedMotion`; written.
+        jacobian: see `ReducedMotion`; has the joints' axes.
+
+    Returns:
+        Nothing.
+
+    Source: differential kinematics of a tree.
+    """
+    for i in range(1, 1 + links):
+        move_origin(tree, frame, i)
+        if tree[i, KIND] != HINGE and tree[i, KIND] != SLIDE:
+            continue
+        p, j = tree[i, PARENT], tree[i, COORDINATE]
+        rate, hinge = joint[RATE, j], tree[i, KIND] == HINGE
+        a = 3 if hinge else 0
+        x, y, z = jacobian[i, j, a], jacobian[i, j, a + 1], jacobian[i, j, a + 2]
+        tx, ty, tz = cross(frame[p, SPIN], frame[p, SPIN + 1], frame[p, SPIN + 2], x, y, z)
+        first, second, twice = (SPIN, SPIN_RATE, 1.0) if hinge else (VELOCITY, ACCELERATION, 2.0)
+        frame[i, first] += x * rate
+        frame[i, first + 1] += y * rate
+        frame[i, first + 2] += z * rate
+        frame[i, second] += twice * tx * rate
+        frame[i, second + 1] += twice * ty * rate
+        frame[i, second + 2] += twice * tz * rate
+
+
+@allocation_free
+def gather_forces(mech, m):
+    """Mass matrix and bias forces of the tree with its bars (Kane's projection).
+
+    `M = sum J' P` and `h = sum J' F` with the momenta P and the wrenches F of all bodies.
+
+    Args:
+        mech: ReducedMechanism.
+        m: ReducedMotion after `close_chains`; `momentum`, `mass`, the columns FORCE of `frame` and
+            the row BIAS of `joint` are written.
+
+    Returns:
+        Nothing.
+
+    Source: Kane and Levinson 1985, Dynamics.
+    """
+    bodies, n = 1 + mech.links + 2 * mech.bars, m.mass.shape[0]
+    frame, jacobian, momentum = m.frame, m.jacobian, m.momentum
+    for b in range(1, bodies):
+        _load_body(mech.shape, frame, jacobian, b, mech.tree[b, REACH], momentum)
+    for i in range(n):
+        bias = 0.0
+        for b in range(1, bodies):
+            if mech.tree[b, REACH] > i:
+                for r in range(6):
+                    bias += jacobian[b, i, r] * frame[b, FORCE + r]
+        m.joint[BIAS, i] = bias
+        for j in range(i + 1):
+            mass = 0.0
+            for b in range(1, bodies):
+                if mech.tree[b, REACH] > i:
+                    for r in range(6):
+                        mass += jacobian[b, j, r] * momentum[b, i, r]
+            m.mass[i, j] = mass
+            m.mass[j, i] = mass
+
+
+@allocation_free
+def _load_body(shape, frame, jacobian, b, reach, momentum):
+    """Momentum per unit rate, and force and torque of inertia and gravity, about the origin."""
+    mass = shape[b, MASS]
+    rx, ry, rz = rotated(frame, b, shape[b, COM], shape[b, COM + 1], shape[b, COM + 2])
+    i0, i1, i2 = shape[b, INERTIA], shape[b, INERTIA + 1], shape[b, INERTIA + 2]
+    t0, t1, t2 = frame[b, 0], frame[b, 1], frame[b, 2]
+    t3, t4, t5 = frame[b, 3], frame[b, 4], frame[b, 5]
+    t6, t7, t8 = frame[b, 6], frame[b, 7], frame[b, 8]
+    xx = i0 * t0 * t0 + i1 * t1 * t1 + i2 * t2 * t2  # inertia in the world's axes
+    xy = i0 * t0 * t3 + i1 * t1 * t4 + i2 * t2 * t5
+    xz = i0 * t0 * t6 + i1 * t1 * t7 + i2 * t2 * t8
+    yy = i0 * t3 * t3 + i1 * t4 * t4 + i2 * t5 * t5
+    yz = i0 * t3 * t6 + i1 * t4 * t7 + i2 * t5 * t8
+    zz = i0 * t6 * t6 + i1 * t7 * t7 + i2 * t8 * t8
+    wx, wy, wz = frame[b, SPIN], frame[b, SPIN + 1], frame[b, SPIN + 2]
+    ax, ay, az = frame[b, SPIN_RATE], frame[b, SPIN_RATE + 1], frame[b, SPIN_RATE + 2]
+    vx, vy, vz = cross(wx, wy, wz, rx, ry, rz)
+    cx, cy, cz = cross(wx, wy, wz, vx, vy, vz)
+    tx, ty, tz = cross(ax, ay, az, rx, ry, rz)
+    fx = mass * (frame[b, ACCELERATION] + tx + cx)
+    fy = mass * (frame[b, ACCELERATION + 1] + ty + cy)
+    fz = mass * (frame[b, ACCELERATION + 2] + tz + cz)
+    gx, gy, gz = cross(
+        wx, wy, wz,
+        xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz * wz,
+    )  # fmt: skip
+    sx, sy, sz = cross(rx, ry, rz, fx, fy, fz)
+    frame[b, FORCE], frame[b, FORCE + 1], frame[b, FORCE + 2] = fx, fy, fz
+    frame[b, FORCE + 3] = sx + gx + xx * ax + xy * ay + xz * az
+    frame[b, FORCE + 4] = sy + gy + xy * ax + yy * ay + yz * az
+    frame[b, FORCE + 5] = sz + gz + xz * ax + yz * ay + zz * az
+    for i in range(reach):
+        wx, wy, wz = jacobian[b, i, 3], jacobian[b, i, 4], jacobian[b, i, 5]
+        vx, vy, vz = cross(wx, wy, wz, rx, ry, rz)
+        px = mass * (jacobian[b, i, 0] + vx)
+        py = mass * (jacobian[b, i, 1] + vy)
+        pz = mass * (jacobian[b, i, 2] + vz)
+        sx, sy, sz = cross(rx, ry, rz, px, py, pz)
+        momentum[b, i, 0], momentum[b, i, 1], momentum[b, i, 2] = px, py, pz
+        momentum[b, i, 3] = sx + xx * wx + xy * wy + xz * wz
+        momentum[b, i, 4] = sy + xy * wx + yy * wy + yz * wz
+        momentum[b, i, 5] = sz + xz * wx + yz * wy + zz * wz

@@ -1,16 +1,18 @@
 """A sweep file: which keys of a scenario are varied, and how; frozen, validated.
 
 Keys are those of `hydrotele run --set key=value`, as in `servo.position_gain` or
-`effects.0.parameters.mass`.
-
-The points of a sweep: what every run varies, in an order that never changes.
+`effects.0.parameters.mass`. The points of a sweep, what every run varies, have an order that never
+changes. Each becomes a scenario, checked before the first run as far as that is cheap, that is
+without a compiled model: keys, values, machine, tool, effects and sensors. A start that cannot be
+reached or a plan that asks for too much shows as a failed run.
 """
 
+import hashlib
 import itertools
 import json
 import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -20,7 +22,19 @@ from pydantic import AfterValidator, Field, model_validator
 from hydrotele.core.datafile import Facts, Name, parse, read_yaml, suggest
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import scenarios_folder
-from hydrotele.scenario.scenario import shipped_scenarios
+from hydrotele.effects import EFFECTS, apply_effect
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.noise import sensor_set
+from hydrotele.run.sweep_runs import Inputs
+from hydrotele.scenario.scenario import (
+    Scenario,
+    ScenarioFile,
+    own_machine,
+    read_scenario_file,
+    scenario_from,
+    shipped_scenarios,
+)
 
 Key = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*$")]
 MOST_RUNS = 100_000
@@ -201,7 +215,7 @@ def load_sweep(name_or_path: str | Path) -> SweepFile:
     """Read a sweep file, a shipped one by its name.
 
     Returns:
-        The validated sweep; its points are checked by `sweep_checking.check_points`.
+        The validated sweep; its points are checked by `check_points`.
 
     Raises:
         InputError: names file, line, key path and what is allowed.
@@ -286,3 +300,164 @@ def override_text(value: Any) -> str:
 def overrides(sweep: Sweep, values: dict[str, Any]) -> dict[str, str]:
     """Overrides of the base scenario: those of all runs, then those of one point."""
     return {key: override_text(value) for key, value in (sweep.set | values).items()}
+
+
+Progress = Callable[[int, int], None]
+_Machines = dict[tuple[str, str | None], Machine]
+
+
+class Base(NamedTuple):
+    """A sweep with what all its runs share.
+
+    Attributes:
+        file: the sweep.
+        scenario: file of the base scenario.
+        inputs: the machines that are the user's own.
+    """
+
+    file: SweepFile
+    scenario: ScenarioFile
+    inputs: Inputs
+
+
+class Checked(NamedTuple):
+    """What the check of all points found.
+
+    Attributes:
+        fingerprints: of the scenario of every run, in order.
+        seed: of the first run.
+        units: varied key of an effect -> its unit.
+        axes: of all machines.
+        teleoperated: whether any pilot is.
+    """
+
+    fingerprints: tuple[bytes, ...]
+    seed: int
+    units: dict[str, str]
+    axes: tuple[str, ...]
+    teleoperated: bool
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all scenarios in their order."""
+        return hashlib.sha256(b"".join(self.fingerprints)).hexdigest()
+
+
+def open_base(file: SweepFile) -> Base:
+    """Read the base scenario of a sweep.
+
+    Raises:
+        InputError: there is none, or it is no YAML mapping.
+    """
+    return Base(file, read_scenario_file(file.scenario()), Inputs())
+
+
+def scenario_of(base: Base, point: Point) -> Scenario:
+    """The scenario of a point; its own machines are named by their place in the sweep's folder.
+
+    Raises:
+        InputError: the point is none that `hydrotele run` would take.
+    """
+    scenario = scenario_from(base.scenario, overrides(base.file.sweep, point.values))
+    return base.inputs.named(scenario.model_copy(update={"seed": scenario.seed + point.copy}))
+
+
+def fingerprint(scenario: Scenario) -> bytes:
+    """16 bytes that tell a scenario from any other, wherever its files lie."""
+    return hashlib.sha256(scenario.model_dump_json().encode()).digest()[:16]
+
+
+def check_points(base: Base, progress: Progress | None = None) -> Checked:
+    """Check every point.
+
+    Args:
+        base: of `open_base`.
+        progress: called now and then with (points checked, all points).
+
+    Raises:
+        InputError: the first point that is wrong, with file, line, key and what is allowed.
+    """
+    sweep = base.file.sweep
+    prints: list[bytes] = []
+    machines: _Machines = {}
+    seed = 0
+    units: dict[str, str] = {}
+    teleoperated = False
+    for point in points(sweep):
+        try:
+            if point.copy == 0:
+                scenario = _checked(base, point.values, machines)
+                teleoperated |= scenario.pilot.kind == "teleop"
+                units |= _effect_units(scenario, sweep.varied, machines)
+            whole = scenario_of(base, point)
+        except InputError as error:
+            raise _blamed(base, point, machines, error) from None
+        seed = seed if prints else whole.seed
+        prints.append(fingerprint(whole))
+        if progress and point.run % 100 == 0:
+            progress(point.run, sweep.runs)
+    axes = dict.fromkeys(axis for machine in machines.values() for axis in machine.axes)
+    return Checked(tuple(prints), seed, units, tuple(axes), teleoperated)
+
+
+def _checked(base: Base, values: dict[str, Any], machines: _Machines) -> Scenario:
+    """The scenario of some values, its machine, effects and sensors tried."""
+    scenario = scenario_from(base.scenario, overrides(base.file.sweep, values))
+    machine = _machine_of(scenario, machines)
+    sensor_set(machine, scenario.sensors)
+    for planted in scenario.effects:
+        machine = apply_effect(machine, planted.name, planted.location, planted.parameters)
+    return scenario
+
+
+def _machine_of(scenario: Scenario, machines: _Machines) -> Machine:
+    key = (str(own_machine(scenario) or scenario.machine), scenario.tool)
+    if key not in machines:
+        machines[key] = load_machine(*key)
+    return machines[key]
+
+
+def _blamed(base: Base, point: Point, machines: _Machines, error: InputError) -> InputError:
+    """The error of a point, at the place in the sweep's file that is to blame."""
+    file = base.file
+    for values in ({}, *({key: value} for key, value in point.values.items())):
+        try:
+            _checked(base, values, machines)
+        except InputError as alone:
+            if _said(alone) != _said(error):
+                continue
+            if not values:
+                return InputError(file.place("set"), _said(error)) if file.sweep.set else error
+            ((key, value),) = values.items()
+            return InputError(_place(file, key, value), f"{override_text(value)}: {_said(error)}")
+    said = ", ".join(f"{key} {override_text(value)}" for key, value in point.values.items())
+    return InputError(file.path, f"run {point.run} ({said}): {_said(error)}")
+
+
+def _place(file: SweepFile, key: str, value: Any) -> str:
+    if key in file.sweep.grid:
+        line = file.lines.get(("grid", key, file.sweep.grid[key].index(value)))
+        return f"{file.path}:{line}: grid.{key}" if line else file.place("grid", key)
+    return file.place("sample", "keys", key)
+
+
+def _said(error: InputError) -> str:
+    """What is wrong, without the overrides that the sweep itself gave."""
+    ours = error.where.startswith("--set ") or " with --set " in error.where
+    return error.message if ours else str(error)
+
+
+def _effect_units(
+    scenario: Scenario, varied: tuple[str, ...], machines: _Machines
+) -> dict[str, str]:
+    """Units of the varied parameters of effects."""
+    units = {}
+    for key in varied:
+        parts = key.split(".")
+        if len(parts) == 4 and parts[0] == "effects" and parts[2] == "parameters":
+            planted = scenario.effects[int(parts[1])]
+            effect, machine = EFFECTS[planted.name], _machine_of(scenario, machines)
+            places = effect.locations(machine)
+            known = effect.parameters(machine, planted.location or places[0])
+            units[key] = known[parts[3]].unit
+    return units

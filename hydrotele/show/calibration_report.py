@@ -1,7 +1,8 @@
-"""Reports and pictures of a calibration of an arm, its linkages and the calibrator itself."""
+"""Reports and pictures of calibrations: of arms, linkages, calibrators and serial robots."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from hydrotele.calibrate.bad_data import Region
 from hydrotele.calibrate.design import ARMS, FOREARMS, Design, Survey
 from hydrotele.calibrate.linkage import NAMES, LinkageFit, values_of
 from hydrotele.calibrate.loop import unit_of
+from hydrotele.calibrate.mukca import LeftOut, SocketCalibration
 from hydrotele.show.report_html import Section, drawing, png, write_sections
 
 _MOST_TIP = 0.06  # m: the colour scale of the designs ends there
@@ -137,3 +139,242 @@ def draw_designs(survey: Survey, best: Design) -> bytes:
         figure.axes[0].set_ylabel("forearm [m]")
         figure.axes[0].legend(loc="lower left", fontsize=8)
         return png(figure)
+
+
+_BEFORE, _AFTER, _MARK = "#b9bfc7", "#1769aa", "#e07b00"
+_MOST = 3000  # points of a scatter plot
+_LEVELS = (0.39, 0.86)  # share inside one and two standard deviations of a normal in two dimensions
+
+
+def error_bars(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], what: str) -> bytes:
+    """Errors of every pose before and after calibration, on a logarithmic scale.
+
+    Args:
+        errors: title with unit -> (before (n,), after (n,)).
+        what: which poses these are.
+
+    Returns:
+        A PNG.
+    """
+    with drawing(0.3 + 1.9 * len(errors)) as figure:
+        axes = figure.subplots(len(errors), 1, squeeze=False)[:, 0]
+        for place, (title, (before, after)) in zip(axes, errors.items(), strict=True):
+            at = np.arange(1, len(before) + 1)
+            place.bar(at - 0.2, before, 0.4, color=_BEFORE, label="nominal")
+            place.bar(at + 0.2, after, 0.4, color=_AFTER, label="calibrated")
+            place.set_yscale("log")
+            place.set_title(f"{title}, {len(before)} {what}")
+            place.margins(x=0.01)
+            place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        axes[-1].set_xlabel("pose")
+        return png(figure)
+
+
+def corner(
+    sample: np.ndarray, names: Sequence[str], mark: np.ndarray | None = None,
+    mark_label: str = "", unit: str = "mm or mrad",
+) -> bytes:  # fmt: skip
+    """Marginal posteriors: histograms on the diagonal, pairs of parameters below it.
+
+    Args:
+        sample: (n, p) draws [unit].
+        names: the p parameters.
+        mark: (p,) a point to show, such as the truth [unit].
+        mark_label: what it is.
+        unit: of all.
+
+    Returns:
+        A PNG.
+    """
+    p = len(names)
+    thin = sample[:: max(1, len(sample) // _MOST)]
+    with drawing(1.5 * p) as figure:
+        axes = figure.subplots(p, p, squeeze=False, sharex="col")
+        for row in range(p):
+            for column in range(p):
+                place = axes[row, column]
+                if column > row:
+                    place.axis("off")
+                    continue
+                if row == column:
+                    place.hist(sample[:, row], 40, density=True, color=_AFTER, alpha=0.8)
+                    place.set_yticks([])
+                else:
+                    place.plot(thin[:, column], thin[:, row], ".", ms=1.5, alpha=0.3, color=_AFTER)
+                    _contours(place, sample[:, column], sample[:, row])
+                    share = np.corrcoef(sample[:, column], sample[:, row])[0, 1]
+                    place.text(0.04, 0.96, f"{share:+.2f}", transform=place.transAxes, va="top",
+                               fontsize=7)  # fmt: skip
+                if mark is not None:
+                    place.axvline(mark[column], color=_MARK, lw=1.0)
+                    if row != column:
+                        place.axhline(mark[row], color=_MARK, lw=1.0)
+                if row == p - 1:
+                    place.set_xlabel(f"{names[column]}")
+                if column == 0 and row > 0:
+                    place.set_ylabel(f"{names[row]}")
+                elif column > 0:
+                    place.set_yticklabels([])
+        label = f"{unit}; lines: {mark_label}" if mark is not None else unit
+        figure.suptitle(f"Posterior [{label}]; numbers: correlation", fontsize=9)
+        return png(figure)
+
+
+def _contours(place, x: np.ndarray, y: np.ndarray) -> None:
+    """Contours that hold 39 and 86 % of the draws."""
+    counts, xs, ys = np.histogram2d(x, y, 30)
+    order = np.sort(counts.ravel())[::-1]
+    share = np.cumsum(order) / order.sum()
+    levels = sorted({float(order[np.searchsorted(share, level)]) for level in _LEVELS})
+    middle = [0.5 * (edge[1:] + edge[:-1]) for edge in (xs, ys)]
+    place.contour(*middle, counts.T, levels=levels, colors="#0d3f66", linewidths=0.8)
+
+
+NOMINAL, CALIBRATED = "#e07b00", "#1769aa"
+
+
+def draw_sockets(found: SocketCalibration, left: Sequence[LeftOut]) -> bytes:
+    """Distance of every row's ball from its socket's mean, and the distances of the sockets.
+
+    Args:
+        found: the calibration.
+        left: places predicted without having been fitted; where there are none, the fit is shown.
+
+    Returns:
+        A PNG.
+    """
+    before, after, apart = {}, {}, {}
+    for one in left:
+        before |= one.nominal.rows
+        after |= one.calibrated.rows
+        apart |= one.calibrated.distances
+    if not left:
+        before, after, apart = found.before.rows, found.after.rows, found.after.distances
+    names = list(after)
+    with drawing(6.4) as figure:
+        upper, lower = figure.subplots(2, 1, height_ratios=(1.7, 1.0))
+        place = 0
+        for k, name in enumerate(names):
+            x = place + np.arange(len(after[name]))
+            for rows, colour, label in (
+                (before[name], NOMINAL, "nominal robot, ball fitted"),
+                (after[name], CALIBRATED, "calibrated on the others" if left else "calibrated"),
+            ):
+                upper.plot(x, 1e3 * rows, ".", color=colour, ms=4, label="" if k else label)
+                rms = 1e3 * float(np.sqrt(np.mean(rows**2)))
+                upper.plot(x[[0, -1]], [rms, rms], color=colour, lw=1.6)
+            if k % 2:
+                upper.axvspan(place - 0.5, place + len(x) - 0.5, color="0.96", lw=0, zorder=0)
+            place += len(x)
+        middles = np.cumsum([0, *(len(after[n]) for n in names)])
+        upper.set_xticks(0.5 * (middles[1:] + middles[:-1]))
+        upper.set_xticklabels([n.replace("/", "\n").replace("hole_", "socket ") for n in names],
+                              fontsize=7 if len(names) > 8 else 8.5)  # fmt: skip
+        upper.tick_params(axis="x", length=0)
+        upper.grid(axis="x", visible=False)
+        upper.set_xlim(-0.5, place - 0.5)
+        upper.set_yscale("log")
+        upper.yaxis.set_major_formatter("{x:g}")
+        upper.set_ylabel("ball from its socket's\nmean [mm]; lines: RMS")
+        upper.set_title(f"{found.nominal.name}: consistency of the predicted ball")
+        upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False,
+                     fontsize=8.5, borderaxespad=0.1, markerscale=2.0)  # fmt: skip
+        _draw_distances(lower, apart, found.options.distance)
+        return png(figure)
+
+
+def _draw_distances(plot: Any, apart: dict[str, float], given: float | None) -> None:
+    if not apart:
+        plot.set_axis_off()
+        plot.text(0.0, 0.5, "no place has two sockets", transform=plot.transAxes)
+        return
+    values = 1e3 * np.array(list(apart.values()))
+    x = np.arange(len(values))
+    plot.plot(x, values, "o", color=CALIBRATED, ms=6)
+    if given is not None:
+        plot.axhspan(1e3 * given - 0.1, 1e3 * given + 0.1, color="0.5", alpha=0.15, lw=0)
+        plot.axhline(1e3 * given, color="0.4", lw=1.0)
+        reach = 1.25 * max(0.2, float(np.abs(values - 1e3 * given).max()))
+        plot.set_ylim(1e3 * given - reach, 1e3 * given + reach)
+    plot.set_xticks(x)
+    plot.set_xticklabels(list(apart))
+    plot.set_xlim(-0.6, len(values) - 0.4)
+    plot.grid(axis="x", visible=False)
+    plot.set_ylabel("sockets apart [mm]")
+    plot.set_title("Distance of the sockets; grey: the tool's, +- 0.1 mm")
+
+
+def write_robot_report(path: Path, document: dict[str, Any], picture: bytes) -> None:
+    """Write one page that needs nothing else.
+
+    Args:
+        path: HTML file to write.
+        document: `calibration.json`.
+        picture: of `draw_sockets`.
+    """
+    judged, fitted = document["heldout"], document["fitted"]
+    figures = [
+        ("before", fitted["nominal_rms_mm"], "nominal robot, RMS mm"),
+        ("after", fitted["rms_mm"], "calibrated, on the fitted rows, RMS mm"),
+    ]
+    sections = [Section("Distances of the ball from its sockets", picture=picture)]
+    if judged:
+        figures.append(("after", judged["rms_mm"], "calibrated, not fitted, RMS mm"))
+        rows = [
+            (name, f"{one['nominal_rms_mm']:.3f}", f"{one['rms_mm']:.3f}",
+             f"{one['rms_without_outliers_mm']:.3f}", one["model"])
+            for name, one in judged["parts"].items()
+        ]  # fmt: skip
+        sections.append(Section(
+            "Places that were not fitted", "Root mean square distance of the ball from its"
+            " socket's mean, predicted by a calibration on all others.",
+            ("place", "nominal mm", "calibrated mm", "without outliers mm", "joints"), rows, "-nnn",
+        ))  # fmt: skip
+    notes = [*(f"{o['socket']}, row {o['row']}: {o['distance_mm']:.2f} mm from its socket, not"
+               " fitted" for o in document["outliers"]), *document["notes"],
+             f"data: {document['data']}"]  # fmt: skip
+    sections += [_parameters(document), _told(document),
+                 Section("Notes", "What was left out, and what to know.", notes=notes)]  # fmt: skip
+    write_sections(
+        path, f"hydrotele {hydrotele.__version__} - closed-chain calibration from joint angles",
+        f"{document['robot']}: {len(document['places'])} places,"
+        f" {sum(document['rows'].values())} postures",
+        f"Joints: {document['model']}. Noise of a coordinate {document['noise_mm']:.3f} mm."
+        f" Search: {document['status']}.",
+        sections, [(kind, f"{value:.3f}", what) for kind, value, what in figures],
+    )  # fmt: skip
+
+
+def _parameters(document: dict[str, Any]) -> Section:
+    rows = []
+    for one in document["parameters"]:
+        unit, factor = _customary(one["unit"])
+        reach = "" if one["std"] is None else f"{0.5 * factor * (one['high'] - one['low']):.2g}"
+        told = {"full": "by itself", "combination": "with others"}.get(one["told"], "no")
+        rows.append((one["name"], f"{factor * one['value']:.4g}", reach, unit, told))
+    return Section(
+        "Parameters", "t and r: displacement along and rotation about the axes of a joint's frame,"
+        " z being the joint's axis; rz is the offset of its angle. sag: yielding of a joint under"
+        " a weight at a place beyond. sine and cosine: error of an encoder once per turn.",
+        ("parameter", "value", "95 % +-", "unit", "told"), rows, "-nn",
+    )  # fmt: skip
+
+
+def _told(document: dict[str, Any]) -> Section:
+    units = {one["name"]: one["unit"] for one in document["parameters"]}
+    rows = []
+    for one in document["told"]:
+        unit, factor = _customary(units[one["text"].split()[0]])
+        reach = f"{0.5 * factor * (one['high'] - one['low']):.2g}"
+        rows.append((one["text"], f"{factor * one['value']:.4g}", reach, unit))
+    return Section(
+        "What the data tell", "A parameter or combination is told if its uncertainty is below half"
+        " of its expected size in the noise that there is. How a combination is split between its"
+        " parameters follows from their expected sizes, not from the data.",
+        ("parameter or combination", "value", "95 % +-", "unit"), rows, "-nn",
+        notes=(f"not told at all: {', '.join(document['unknown']) or 'none'}",),
+    )  # fmt: skip
+
+
+def _customary(unit: str) -> tuple[str, float]:
+    return {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(unit, (unit, 1.0))

@@ -6,7 +6,7 @@ from pathlib import Path
 import hydrotele
 from hydrotele.experiments.finding import Finding, Panel, tally
 from hydrotele.show import report_html
-from hydrotele.show.calibration_figures import corner
+from hydrotele.show.calibration_report import corner
 from hydrotele.show.report_html import drawing, png
 
 _COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0", "#a33b3b", "#5b6670")

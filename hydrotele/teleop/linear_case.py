@@ -49,7 +49,7 @@ from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.joystick import AXES, Joystick
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import sensor_set
-from hydrotele.multibody.reduced_motion import gather_forces
+from hydrotele.multibody.reduced_mechanism import gather_forces
 from hydrotele.scenario.scenario import Scenario, Servo
 from hydrotele.scenario.surroundings import Plate
 from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track

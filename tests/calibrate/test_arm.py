@@ -10,6 +10,7 @@ from hydrotele.calibrate.arm_data import moving_link, stage_of, strokes_of
 from hydrotele.calibrate.arm_machine import calibrated_machine, machine_with_loop
 from hydrotele.calibrate.arm_poses import with_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
+from hydrotele.calibrate.design import STILL, sweep_poses
 from hydrotele.calibrate.linkage import (
     Strokes,
     identify_linkage,
@@ -17,9 +18,8 @@ from hydrotele.calibrate.linkage import (
     values_of,
 )
 from hydrotele.calibrate.loop import ball_from, closure, loop_of
-from hydrotele.calibrate.sweeps import STILL, sweep_poses
 from hydrotele.core.errors import InputError
-from hydrotele.experiments.calibrator_poses import perturbed, readings, true_numbers
+from hydrotele.experiments.calibrator import perturbed, readings, true_numbers
 from hydrotele.experiments.khoshzaban1992 import LISTS, TABLE_2
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar

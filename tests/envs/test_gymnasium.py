@@ -14,7 +14,7 @@ import hydrotele.envs
 from hydrotele.core.errors import InputError
 from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.episode import ACTIONS
-from hydrotele.envs.kinds import KINDS
+from hydrotele.envs.facts import KINDS
 
 TRACK = "hydrotele/TrackTrajectory-v0"
 SHORT = {"duration": 0.1, "variants": 3}

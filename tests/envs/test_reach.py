@@ -8,8 +8,7 @@ from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import ARM, DISABLED
 from hydrotele.envs.reach import SUCCESS, TIME
-from hydrotele.envs.starts import draw_start
-from hydrotele.envs.task import Options
+from hydrotele.envs.task import Options, draw_start
 from hydrotele.kinematics.task import REACHED, task_forward, task_inverse
 
 REACH = TASKS["ReachFeller"]

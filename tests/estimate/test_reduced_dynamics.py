@@ -23,8 +23,16 @@ from hydrotele.estimate.reduced_model import predicted_channels, state_names
 from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
 from hydrotele.logs.log import load_log
 from hydrotele.machine.sensors import SensorError
-from hydrotele.multibody.reduced_mechanism import COM, DAMPING, MASS
-from hydrotele.multibody.reduced_motion import BIAS, ORIGIN, RATE, TURN, gather_forces
+from hydrotele.multibody.reduced_mechanism import (
+    BIAS,
+    COM,
+    DAMPING,
+    MASS,
+    ORIGIN,
+    RATE,
+    TURN,
+    gather_forces,
+)
 from tests.measured import TRUTH
 
 PERIOD, RELIEF = 0.02, 28.0e6

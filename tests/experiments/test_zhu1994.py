@@ -12,8 +12,7 @@ from hydrotele.cli import experimenting
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.experiments import zhu_forces, zhu_motion
-from hydrotele.experiments.claim import Sample
-from hydrotele.experiments.finding import Finding, Panel, tally
+from hydrotele.experiments.finding import Finding, Panel, Sample, tally
 from hydrotele.experiments.zhu1994 import EXPERIMENTS, broken_findings
 
 CLAIMS = {claim.name: claim for one in EXPERIMENTS for claim in one.claims}

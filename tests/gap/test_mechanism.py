@@ -13,7 +13,7 @@ from hydrotele.core.files import models_folder
 from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
 from hydrotele.gap.mechanism_evidence import find_noise
 from hydrotele.gap.mechanism_find import find_mechanism_gap
-from hydrotele.gap.mechanism_patch import Patch, patched_mjcf
+from hydrotele.gap.patched import Patch, patched_mjcf
 from hydrotele.identify.mechanism import load_mechanism, mechanism_records
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.machine.sensors import SensorError

@@ -7,8 +7,16 @@ import pytest
 
 from hydrotele.estimate.reduced_dynamics import place
 from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.reduced_mechanism import INERTIA, MASS, coordinate_names
-from hydrotele.multibody.reduced_motion import BIAS, DRIFT, RATE, Q, gather_forces
+from hydrotele.multibody.reduced_mechanism import (
+    BIAS,
+    DRIFT,
+    INERTIA,
+    MASS,
+    RATE,
+    Q,
+    coordinate_names,
+    gather_forces,
+)
 from hydrotele.simulate.closure import closed_chain, independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 
@@ -71,7 +79,7 @@ def test_mass_matrix_and_bias_are_those_of_mujoco(
 def test_reduced_coordinates_and_the_chain_ask_for_the_same_forces(
     name, machine_of, reduced_of, move_at_random
 ):
-    """The two implementations of a closed chain, `reduced_motion` and `inverse_dynamics`."""
+    """The two implementations of a closed chain, `reduced_mechanism` and `inverse_dynamics`."""
     machine = machine_of(name)
     model, space, z = reduced_of(machine)
     names = coordinate_names(machine)

@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 
 from hydrotele.estimate.reduced_dynamics import place
-from hydrotele.multibody.reduced_mechanism import JOINT, REACH
-from hydrotele.multibody.reduced_motion import (
+from hydrotele.multibody.reduced_mechanism import (
     ACCELERATION,
     DRIFT,
+    JOINT,
     LENGTH,
     LENGTH_BIAS,
     LENGTH_RATE,
     LENGTH_ROW,
     ORIGIN,
     RATE,
+    REACH,
     SPIN,
     SPIN_RATE,
     TURN,

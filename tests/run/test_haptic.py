@@ -9,7 +9,7 @@ from hydrotele.cli.driving import DriveOptions, drive_to_folder
 from hydrotele.core.errors import InputError
 from hydrotele.haptics.server import PORT
 from hydrotele.logs.log import load_log
-from hydrotele.run.haptic import haptic_address
+from hydrotele.run.live import haptic_address
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 

@@ -19,8 +19,14 @@ from hydrotele.logs.log import save_log
 from hydrotele.run import sweep_runs as running
 from hydrotele.run.run import run_scenario
 from hydrotele.run.sweep import SweepSettings, outcomes, run_sweep, sweep_folder
-from hydrotele.run.sweep_checking import check_points, open_base, scenario_of
-from hydrotele.run.sweep_facts import load_sweep, overrides, points
+from hydrotele.run.sweep_facts import (
+    check_points,
+    load_sweep,
+    open_base,
+    overrides,
+    points,
+    scenario_of,
+)
 from hydrotele.run.sweep_runs import (
     FAILED,
     OK,

@@ -4,8 +4,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import scenarios_folder
-from hydrotele.run.sweep_checking import check_points, open_base
-from hydrotele.run.sweep_facts import MOST_RUNS, load_sweep, shipped_sweeps
+from hydrotele.run.sweep_facts import MOST_RUNS, check_points, load_sweep, open_base, shipped_sweeps
 from hydrotele.scenario.scenario import shipped_scenarios
 
 EFFECT = "set: {effects: [{name: payload, location: tool, parameters: {mass: 100}}]}\n"

@@ -9,8 +9,14 @@ import math
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.envs.controllers.controller import Controller, columns, position_columns, step_time
-from hydrotele.envs.controllers.rows import ValveLaw, inverse_joints
+from hydrotele.envs.controllers.controller import (
+    Controller,
+    ValveLaw,
+    columns,
+    inverse_joints,
+    position_columns,
+    step_time,
+)
 from hydrotele.envs.controllers.track import RateFeedback
 from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import ACCELERATION, POSE_ACCELERATIONS, TaskSetup, full_rate

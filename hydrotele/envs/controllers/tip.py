@@ -10,8 +10,13 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import COORDINATES, arm_facts
 from hydrotele.core.errors import InputError
-from hydrotele.envs.controllers.controller import Controller, columns, position_columns
-from hydrotele.envs.controllers.rows import ValveLaw, inverse_joints
+from hydrotele.envs.controllers.controller import (
+    Controller,
+    ValveLaw,
+    columns,
+    inverse_joints,
+    position_columns,
+)
 from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import TaskSetup, full_rate
 from hydrotele.envs.line import PREVIEWS

@@ -6,11 +6,12 @@ from hydrotele.control.resolved_motion import COORDINATES, arm_facts
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import (
     Controller,
+    ValveLaw,
     columns,
+    forward_poses,
     position_columns,
     step_time,
 )
-from hydrotele.envs.controllers.rows import ValveLaw, forward_poses
 from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import (
     ACCELERATION,
