@@ -8,11 +8,11 @@ import sys
 import numpy as np
 from study import options, publish
 
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.controllers.catalogue import CONTROLLERS, REFERENCES, make_controller
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.evaluation import SUCCESS, Scores, evaluate
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import REAL, Options
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine

@@ -3,10 +3,10 @@
 python tools/environments_page.py --out docs/environments.md
 """
 
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import set_up
 from hydrotele.envs.episode import ACTIONS
 from hydrotele.envs.facts import TaskSetup
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options, Task
 from tools.study import options, publish
 

@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from hydrotele.envs.catalogue import TASKS
-from hydrotele.envs.controllers.agent import AgentView
 from hydrotele.envs.controllers.catalogue import make_controller, tune
 from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.controllers.track import TrackByValves
@@ -25,6 +23,8 @@ from hydrotele.envs.core import TaskCore, set_up
 from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.evaluation import Scores, compare, evaluate
 from hydrotele.envs.facts import TaskSetup
+from hydrotele.envs.making import TASKS
+from hydrotele.envs.stable_baselines import AgentView
 from hydrotele.envs.task import Options
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine

@@ -26,7 +26,7 @@ from hydrotele.experiments.palida import (
     robot,
 )
 from hydrotele.identify.excitation import design_motion
-from hydrotele.multibody.poses import assemblies, jacobian, joint_positions
+from hydrotele.multibody.closures import assemblies, jacobian, joint_positions
 from tools.study import options, publish
 
 RADIUS = 0.085  # m, at which rotations count

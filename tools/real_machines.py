@@ -21,11 +21,10 @@ import numpy as np
 from hydrotele.estimate.baselines import fit_baseline
 from hydrotele.estimate.free_run import Prepare, free_run_errors, machine_runner
 from hydrotele.estimate.output_error import fit_free_runs, uncertain_parameters
-from hydrotele.estimate.stretches import busiest_rows
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
 from hydrotele.identify.smoothing import zero_phase
-from hydrotele.logs.dataset import Dataset, RunData, load_dataset
+from hydrotele.logs.dataset import Dataset, RunData, busiest_rows, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms.law import NO_DRIVES, DriveState

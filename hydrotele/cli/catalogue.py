@@ -121,7 +121,7 @@ def _effects() -> list[dict]:
 
 def _environments() -> list[dict]:
     """Gymnasium environments."""
-    from hydrotele.envs.catalogue import TASKS
+    from hydrotele.envs.making import TASKS
 
     return [
         {

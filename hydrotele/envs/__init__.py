@@ -3,7 +3,7 @@
 Importing this package registers them: `gymnasium.make("hydrotele/TrackTrajectory-v0")` makes one,
 `gymnasium.make_vec(..., num_envs=1024, vectorization_mode="vector_entry_point")` many in native
 code. `gymnasium.make("hydrotele.envs:hydrotele/TrackTrajectory-v0")` imports it on the way.
-`hydrotele.envs.catalogue.TASKS` says what the tasks are.
+`hydrotele.envs.making.TASKS` says what the tasks are.
 """
 
 from gymnasium.envs.registration import register

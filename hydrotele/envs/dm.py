@@ -25,7 +25,7 @@ def load(
     """Make a task, as `dm_control.suite.load` does.
 
     Args:
-        task_name: of `hydrotele.envs.catalogue.TASKS`.
+        task_name: of `hydrotele.envs.making.TASKS`.
         random: seed of the episodes, or a state that one is drawn from; without, they are drawn
             from the computer's own.
         flat_observation: whether observations are one array, under the key `observations`.

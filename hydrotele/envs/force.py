@@ -30,8 +30,7 @@ from hydrotele.envs.world import (
 )
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import Servo
-from hydrotele.scenario.surroundings import Plate, SurroundingObject
+from hydrotele.scenario.scenario import Plate, Servo, SurroundingObject
 
 WEAKEST, STRONGEST = 1.0e4, 3.5e4  # N, forces that are wanted
 OVERLOAD = 1.0e5  # N

@@ -1,4 +1,4 @@
-"""From the keywords of `gymnasium.make` to a running task, and its spaces."""
+"""The tasks, and from the keywords of `gymnasium.make` to a running one and its spaces."""
 
 import dataclasses
 from typing import Any, get_type_hints
@@ -9,11 +9,51 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, NEXT_STEP, SAME_STEP
+from hydrotele.envs.force import HOLD_FORCE
+from hydrotele.envs.grade import GRADE
+from hydrotele.envs.line import STRAIGHT_LINE
 from hydrotele.envs.loop import advance
-from hydrotele.envs.task import Options
+from hydrotele.envs.place import PLACE_LOG
+from hydrotele.envs.reach import REACH_FELLER
+from hydrotele.envs.task import Options, Task
+from hydrotele.envs.track import track_fields
+from hydrotele.machine.machine import Machine
+
+
+def _about_home(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+    """Axes somewhere in the middle part of their ranges; the swing anywhere in front."""
+    places = {}
+    for name, axis in machine.axes.items():
+        low, high = machine.joints[axis.joint].range or (-0.5, 0.5)
+        places[name] = float(low + (high - low) * rng.uniform(0.3, 0.7))
+    return places
+
+
+TASKS = {
+    task.name: task
+    for task in (
+        Task(
+            name="TrackTrajectory",
+            kind="track",
+            sentence="All axes of an excavator follow Fourier references, without tool.",
+            reward="1 on the trajectory, less 1 for every 0.1 m that the tip is off, at least -1.",
+            machine="cat215",
+            tool="none",
+            start=_about_home,
+            fields=track_fields,
+            measures=(("tip_error", "m"),),
+        ),
+        STRAIGHT_LINE,
+        HOLD_FORCE,
+        REACH_FELLER,
+        GRADE,
+        PLACE_LOG,
+    )
+}
+"""Tasks by name."""
+
 
 _STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 _TYPES: dict[str, TypeAdapter] = {

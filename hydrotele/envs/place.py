@@ -33,8 +33,7 @@ from hydrotele.envs.world import (
 )
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import Servo
-from hydrotele.scenario.surroundings import LogOnGround
+from hydrotele.scenario.scenario import LogOnGround, Servo
 from hydrotele.simulate.feedback import convert
 from hydrotele.simulate.surroundings import CENTRE, GRIP, ROW, TAKEN, grip_step, log_grip
 

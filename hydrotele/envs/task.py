@@ -18,8 +18,7 @@ from hydrotele.envs.episode import ACTIONS, ARM
 from hydrotele.envs.observation import Field
 from hydrotele.kinematics.task import REACHED, task_forward, task_inverse, task_rates
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import Servo
-from hydrotele.scenario.surroundings import SurroundingObject
+from hydrotele.scenario.scenario import Servo, SurroundingObject
 
 ActionKind = Literal["valve", "joint_rate", "resolved_motion"]
 REAL = "real"

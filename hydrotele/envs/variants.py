@@ -20,7 +20,7 @@ from hydrotele.envs.episode import AXES, CHANNELS
 from hydrotele.envs.task import Options, Task
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
-from hydrotele.scenario.surroundings import SurroundingObject
+from hydrotele.scenario.scenario import SurroundingObject
 from hydrotele.simulate.fleet import STATE
 from hydrotele.simulate.mechanism import TIP_SITE
 from hydrotele.simulate.plant import Plant, build_plant, rest_state

@@ -20,7 +20,6 @@ from scipy.optimize import minimize
 from hydrotele.estimate.inputs import Input, decay, input_columns, input_sizes, possible_inputs
 from hydrotele.estimate.linear_run import LinearRun, Smoothed, linear_run, smooth
 from hydrotele.estimate.reduced_model import state_names
-from hydrotele.estimate.stretches import busiest_rows
 from hydrotele.estimate.track import (
     DRIFT,
     STARTLE,
@@ -33,7 +32,7 @@ from hydrotele.estimate.track import (
     state_drift,
     track_run,
 )
-from hydrotele.logs.dataset import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData, busiest_rows
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import channel_sensor, converter
 

@@ -15,8 +15,8 @@ from hydrotele.identify.mechanism import Mechanism, load_mechanism
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.multibody.chain import cardan_angles
+from hydrotele.multibody.closures import joint_positions
 from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.poses import joint_positions
 
 _CHUNK = 1000  # rows at a time: memory that stays in use is faster than new one
 LEGS = range(1, 7)

@@ -39,11 +39,10 @@ from hydrotele.estimate.output_error import (
     table_steps,
     uncertain_parameters,
 )
-from hydrotele.estimate.stretches import thinned
 from hydrotele.estimate.track import COARSE
 from hydrotele.gap.result import Estimate
 from hydrotele.gap.screening import Screened
-from hydrotele.logs.dataset import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData, thinned
 from hydrotele.machine.machine import Machine
 
 _NORMAL95 = 1.96

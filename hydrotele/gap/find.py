@@ -12,7 +12,6 @@ from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.estimate.inputs import input_sizes, input_units
 from hydrotele.estimate.levels import rippled, stated_jitter
-from hydrotele.estimate.stretches import busiest, thinned
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.calibrating import calibrate_freely, fit_until_settled
@@ -45,7 +44,7 @@ from hydrotele.gap.result import (
 )
 from hydrotele.gap.rivals import TOLD, effect_probabilities, part_taken
 from hydrotele.gap.search import Found, lacking, search
-from hydrotele.logs.dataset import Dataset
+from hydrotele.logs.dataset import Dataset, busiest, thinned
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import parse_channel
 

@@ -17,9 +17,8 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.evidence import Evidence, Fit, standard_deviations
 from hydrotele.estimate.hypothesis import Guess, hypotheses
-from hydrotele.estimate.stretches import busiest
 from hydrotele.estimate.track import Levels, known_levels, track_run
-from hydrotele.logs.dataset import Dataset
+from hydrotele.logs.dataset import Dataset, busiest
 from hydrotele.machine.machine import Machine
 
 HYDRAULIC = (

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.surroundings import SurroundingObject
+from hydrotele.scenario.scenario import SurroundingObject
 from hydrotele.simulate.closure import follow_loops, following_joints
 from hydrotele.simulate.mechanism import assemble, mjcf_document
 from hydrotele.simulate.surroundings import object_joints

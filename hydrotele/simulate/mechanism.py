@@ -30,7 +30,7 @@ from hydrotele.hydraulics.parameters import SLOTS, Slot, actuator_parameters, te
 from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
 from hydrotele.machine.drives import Axis, Cylinder, Pin
 from hydrotele.machine.machine import Link, Machine
-from hydrotele.scenario.surroundings import SurroundingObject
+from hydrotele.scenario.scenario import SurroundingObject
 from hydrotele.simulate.surroundings import write_surroundings
 
 OWN = "hydrotele_"

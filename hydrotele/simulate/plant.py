@@ -36,7 +36,7 @@ from hydrotele.hydraulics.parameters import (
     terms_of,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.surroundings import SurroundingObject
+from hydrotele.scenario.scenario import SurroundingObject
 from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
 from hydrotele.simulate.mechanism import (
     TIP_SITE,

@@ -22,7 +22,7 @@ from hydrotele.core.compiled import allocation_free
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.surroundings import LogOnGround, Plate, StandingTree, SurroundingObject
+from hydrotele.scenario.scenario import LogOnGround, Plate, StandingTree, SurroundingObject
 
 CLOSED, OPEN, LINE, STRAIGHT, CENTRE, HALF, OWN, BEFORE, BEHIND = 0, 1, 2, 3, 4, 7, 10, 11, 12
 GRIP = 13

@@ -50,8 +50,7 @@ from hydrotele.machine.joystick import AXES, Joystick
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.noise import sensor_set
 from hydrotele.multibody.reduced_mechanism import gather_forces
-from hydrotele.scenario.scenario import Scenario, Servo
-from hydrotele.scenario.surroundings import Plate
+from hydrotele.scenario.scenario import Plate, Scenario, Servo
 from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track
 from hydrotele.teleop.axis_table import (
     COORDINATE,

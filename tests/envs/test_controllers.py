@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.controllers.catalogue import CONTROLLERS, REFERENCES, make_controller
 from hydrotele.envs.controllers.controller import columns
 from hydrotele.envs.controllers.track import Preview, track_controller
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, SAME_STEP
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 from hydrotele.envs.track import PREVIEWS, track_reference
 

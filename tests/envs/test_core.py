@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 from hydrotele.simulate.feedback import feedback
 from hydrotele.simulate.fleet import STATE

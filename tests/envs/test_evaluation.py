@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.catalogue import TASKS
-from hydrotele.envs.controllers.agent import AgentView, difference_columns
 from hydrotele.envs.controllers.catalogue import make_controller
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, NEXT_STEP
 from hydrotele.envs.evaluation import compare, evaluate
+from hydrotele.envs.making import TASKS
+from hydrotele.envs.stable_baselines import AgentView, difference_columns
 from hydrotele.envs.task import Options
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.force import CELL, FAILURE
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 from hydrotele.simulate.record import contact_force, surrounding_bodies
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.controllers.controller import columns
 from hydrotele.envs.controllers.grade import DUMP, Grade
 from hydrotele.envs.core import TaskCore
@@ -35,6 +34,7 @@ from hydrotele.envs.grade import (
     bed_parameters,
     grade_radii,
 )
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 from hydrotele.kinematics.task import REACHED, task_inverse
 from hydrotele.soil.facts import (

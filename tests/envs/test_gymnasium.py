@@ -12,9 +12,9 @@ from gymnasium.vector import AutoresetMode
 
 import hydrotele.envs
 from hydrotele.core.errors import InputError
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.episode import ACTIONS
 from hydrotele.envs.facts import KINDS
+from hydrotele.envs.making import TASKS
 
 TRACK = "hydrotele/TrackTrajectory-v0"
 SHORT = {"duration": 0.1, "variants": 3}

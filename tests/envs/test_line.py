@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import full_rate
 from hydrotele.envs.line import SETTLE, line_pose, line_way
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 from hydrotele.kinematics.task import REACHED, task_inverse
 

@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.controllers.catalogue import make_controller
 from hydrotele.envs.controllers.place import PERIOD, course
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, SAME_STEP
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.place import (
     GOAL_PLACE,
     LEANING,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import ARM, DISABLED
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.reach import SUCCESS, TIME
 from hydrotele.envs.task import Options, draw_start
 from hydrotele.kinematics.task import REACHED, task_forward, task_inverse

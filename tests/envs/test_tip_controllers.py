@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.controllers.catalogue import make_controller
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import ACTIONS, DISABLED
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 
 COUNT = 4

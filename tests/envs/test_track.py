@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hydrotele.envs.catalogue import TASKS
 from hydrotele.envs.core import TaskCore
+from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 from hydrotele.envs.track import track_reference
 

@@ -15,13 +15,12 @@ import yaml
 from hydrotele.estimate.calibration import calibration
 from hydrotele.estimate.evidence import Judged
 from hydrotele.estimate.hypothesis import Guess, hypotheses
-from hydrotele.estimate.stretches import busiest
 from hydrotele.gap import find
 from hydrotele.gap.discover import Discovery, OpenLoop
 from hydrotele.gap.find import find_gap, without_details
 from hydrotele.gap.result import Estimate, NamedEffect
 from hydrotele.gap.search import Found
-from hydrotele.logs.dataset import Dataset, load_dataset
+from hydrotele.logs.dataset import Dataset, busiest, load_dataset
 from hydrotele.logs.log import Log, load_log, save_log
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import MEASURED

@@ -10,10 +10,9 @@ from typer.testing import CliRunner
 from hydrotele.cli.main import app
 from hydrotele.estimate.baselines import fit_baseline
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
-from hydrotele.estimate.stretches import busiest
 from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.gap.find import find_gap
-from hydrotele.logs.dataset import load_dataset
+from hydrotele.logs.dataset import busiest, load_dataset
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import REAL, needs_real
 from tools.real_machines import FIRST_THREE_QUARTERS, PUSH, ec20_splits, force_error, pushed

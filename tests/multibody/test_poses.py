@@ -6,7 +6,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.poses import assemblies, jacobian, joint_positions
+from hydrotele.multibody.closures import assemblies, jacobian, joint_positions
 
 POSE = tuple(f"platform_{c}" for c in ("x", "y", "z", "rx", "ry", "rz"))
 

@@ -7,8 +7,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import begin, prepare, run_scenario
-from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.scenario.surroundings import LogOnGround
+from hydrotele.scenario.scenario import LogOnGround, Scenario, load_scenario
 from hydrotele.show.pose import body_poses, logged_joints, logged_surroundings, model_with_looks
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.simulate.surroundings import CENTRE, HALF, log_grip

@@ -7,8 +7,12 @@ from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller, Random, Zero
 from hydrotele.envs.controllers.grade import grade_controller
 from hydrotele.envs.controllers.place import place_controller
-from hydrotele.envs.controllers.tip import line_controller, press_controller, reach_controller
-from hydrotele.envs.controllers.track import track_controller
+from hydrotele.envs.controllers.track import (
+    line_controller,
+    press_controller,
+    reach_controller,
+    track_controller,
+)
 from hydrotele.envs.facts import TaskSetup
 
 REFERENCES: dict[str, Callable[[TaskSetup], Controller]] = {
