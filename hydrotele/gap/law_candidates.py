@@ -32,6 +32,7 @@ from hydrotele.gap.law_tables import (
     ground,
     lack_regression,
     paired_tables,
+    parts_left_out,
     possible_tables,
     predicted_by_choice,
     regression,
@@ -53,7 +54,7 @@ _REMEMBERED = 3  # tables over two variables that are tried with memories of the
 # one with those of others, too
 _MEMORIES = 6  # tables with a memory that are looked at closely, for each lack
 _MOVED = 2  # times by each of these
-_FINER = (0.4, 0.2, 0.1)  # of a memory's width, by which it is changed
+_FINER = (0.8, 0.4, 0.2, 0.1)  # of a memory's width, by which it is changed
 _PAIRS = 4  # tables over two variables that are looked at closely, for each lack
 _TRIED = 2  # laws that are put into the machine, of all that the regression finds
 _OTHERS = 3  # of other balances, one by one, where free runs get better by none of these
@@ -246,12 +247,12 @@ class Lacks:
 
     def grounds(self, at: tuple[Input, str]) -> list[Ground]:
         """What glances at laws in a place need of each run."""
-        told, alone = self.told(*at), len(self.seen) == 1
+        told, parts = self.told(*at), parts_left_out(len(self.seen))
 
         def one(k: int) -> Ground:
             column = self.sizes[at[0]] * self._column(k, *at)
             track, known = self.judged.tracks[k], self.seen[k].known
-            return ground(track, self.errors[k], column, told[k], known, alone)
+            return ground(track, self.errors[k], column, told[k], known, parts)
 
         return self.evidence.map(one, range(len(self.seen)))
 
@@ -389,13 +390,15 @@ def _remembered(
         return []
     best(tables)
     first = [max(kind, key=lambda pair: pair[0].sum()) for kind in looked.values()]
+    whole = (len(values), -1) if len(values) > 1 else (-1, 1)  # runs, or parts of a single one
     found = []
     for falls, table in sorted(first, key=lambda pair: -pair[0].sum())[:_MEMORIES]:
         share = float(falls.sum())
         for step in chain.from_iterable([step] * _MOVED for step in _FINER):
             moved = best(finer_memories(table, step))
             share, table = moved if moved[0] > share else (share, table)
-        if predicted_by_choice([falls for falls, _ in looked[table.kind]]) > least:
+        own = [falls.reshape(whole).sum(axis=1) for falls, _ in looked[table.kind]]
+        if predicted_by_choice(own) > least:
             found.append(table)
     return found
 

@@ -2,7 +2,7 @@
 
 It may see a variable through a play, or be switched by one, as a relay with hysteresis does.
 
-Regression of prediction errors on the entries of a law's table, judged by runs left out.
+Regression of prediction errors on the entries of a law's table, judged by parts of runs left out.
 
 The errors are those of a track whose unknown inputs have taken up what they could; how they answer
 to an addition is known to first order (`estimate.responses`). So a reading counts as it does in
@@ -245,7 +245,11 @@ def paired_tables(
 
 _WAYS = 3  # points over how far a variable is ahead of its play: both ways and between
 _WIDTHS = (0.06, 0.15, 0.3)  # half widths of plays, of the variable's range
-_THRESHOLDS = ((0.75, 0.25), (0.9, 0.5), (0.5, 0.1))  # quantiles at which a switch goes on and off
+# quantiles at which a switch goes on and off: far apart, and nearly one
+_THRESHOLDS = (
+    (0.75, 0.25), (0.9, 0.5), (0.5, 0.1),
+    (0.23, 0.17), (0.38, 0.32), (0.53, 0.47), (0.68, 0.62), (0.83, 0.77),
+)  # fmt: skip
 
 
 def remembering_tables(
@@ -341,6 +345,7 @@ def _points(
 
 
 _PARTS = 4  # of a single run, left out one by one
+_HALVES = 2  # of each of several: a law over what no two runs visit alike is told by neither
 _GLANCED = 2000  # rows of a run that are looked at in blocks
 _BLOCKS = 400  # of these at most
 _HELD = 0.1  # s of a block
@@ -348,11 +353,16 @@ _MEMORY_ROWS = 15.0  # that a smoother's answer is alike
 _SMOOTHNESS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # of the entries, in units of the lack
 
 
+def parts_left_out(runs: int) -> int:
+    """Of how many parts of each of some runs one after the other is left out."""
+    return _PARTS if runs == 1 else _HALVES
+
+
 class Regression(NamedTuple):
     """A law's entries.
 
     Attributes:
-        predicted: fall of -2 log likelihood in runs that were left out, all together.
+        predicted: fall of -2 log likelihood in parts of runs that were left out, all together.
         entries: (K,) [unit of the addition].
         covariance: (K, K) of the entries [unit of the addition, squared].
         charge: what the entries cost: log determinant of what the data add to their precision.
@@ -425,9 +435,11 @@ def _entries(
         table: with K entries.
         answers: per run the slopes of its errors with the entries (n, K), and the errors (n,).
     """
-    if len(answers) == 1:
-        cuts = (np.array_split(part, _PARTS) for part in answers[0])
-        answers = list(zip(*cuts, strict=True))
+    parts = parts_left_out(len(answers))
+    answers = [
+        pair for whole in answers
+        for pair in zip(*(np.array_split(part, parts) for part in whole), strict=True)
+    ]  # fmt: skip
     curvature = np.array([s.T @ s for s, _ in answers])
     slope = np.array([s.T @ e for s, e in answers])
     falls = {
@@ -499,7 +511,7 @@ def _curved(curvature, held, out):
 
 def ground(
     track: Track, errors: np.ndarray, column: np.ndarray, told: np.ndarray, known: np.ndarray,
-    alone: bool,
+    parts: int,
 ) -> Ground:  # fmt: skip
     """What a glance at a law needs of a run.
 
@@ -509,7 +521,7 @@ def ground(
         column: (n, nz) what a unit of the addition does, in units of the lack.
         told: (n,) what is lacking: of a long run its loudest stretch is looked at.
         known: (n,) rows in which a law may be sought.
-        alone: whether it is the only run: parts of it can be left out then.
+        parts: that are left out one by one.
     """
     rows = len(told)
     squares = np.concatenate([[0.0], np.cumsum(np.nan_to_num(told) ** 2)])
@@ -520,8 +532,9 @@ def ground(
     held = np.eye(-(-length // width))[np.arange(length) // width] * known[own, None]
     answers = error_responses(track, column, held, own)
     whole = errors.reshape(rows, -1)[own]
-    curvature, slope, parts = [], [], _PARTS if alone else 1
-    for s, e in zip(np.array_split(answers, parts), np.array_split(whole, parts), strict=True):
+    curvature, slope = [], []
+    cuts = (np.array_split(all_rows, parts) for all_rows in (answers, whole))
+    for s, e in zip(*cuts, strict=True):
         flat = s.reshape(-1, s.shape[2])
         curvature.append(flat.T @ flat)
         slope.append(flat.T @ e.ravel())
@@ -538,8 +551,8 @@ def at_a_glance(
         runs: the ground of each, and variable -> (n,) values of the drive along it.
 
     Returns:
-        (R,) falls of -2 log likelihood of R runs, or of parts of a single one; what is faster than
-        a block is missed.
+        (R P,) falls of -2 log likelihood of the P parts of R runs; what is faster than a block is
+        missed.
     """
     curvature, slope = [], []
     for below, values in runs:

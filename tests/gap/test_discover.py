@@ -29,6 +29,7 @@ from hydrotele.gap.law_tables import (
     Table,
     at_a_glance,
     finer_memories,
+    lack_regression,
     paired_tables,
     possible_tables,
     predicted_by_choice,
@@ -250,6 +251,40 @@ def test_thresholds_of_a_relay_are_found():
     assert best.memory.way == SWITCH and best.memory.variable == "pressure_rod"
     assert [best.memory.begin, best.memory.end] == pytest.approx([-0.5, 0.6], abs=0.28)
     assert share(best) > 1.3 * share(table), "the same table without a memory"
+
+
+@pytest.mark.parametrize("level", [0.25, 0.4, 0.6, 0.8])
+def test_a_relay_with_hardly_any_hysteresis_is_found(level):
+    """A constant that a pressure switches at nearly one value, in noise as large."""
+    rng = np.random.default_rng(6)
+    t = np.arange(6000) / 50.0
+    values = {"velocity": np.sin(t), "pressure_rod": np.sin(0.7 * t) + 0.4 * np.sin(2.9 * t)}
+    off, on = np.quantile(values["pressure_rod"], [level - 0.01, level + 0.01])
+    truth = Memory(SWITCH, "pressure_rod", float(off), float(on))
+    parts = cut(truth.along(values) + rng.normal(size=6000), values)
+
+    def share(table):
+        return at_a_glance(table, parts).sum()
+
+    (table,) = (t for t in possible_tables([values], 0.01) if t.variables == ("velocity",))
+    best = max(remembering_tables(table, [values], values), key=share)
+    for step in (0.8, 0.4, 0.2, 0.1):
+        best = max(finer_memories(best, step), key=share)
+    agree = np.mean(best.memory.along(values) == truth.along(values))
+    assert best.memory.way == SWITCH and agree > 0.95
+
+
+def test_a_law_over_what_no_two_runs_visit_alike_is_told():
+    """Each run at positions of its own, all of them in either half: other runs tell nothing."""
+    rng = np.random.default_rng(5)
+    t = np.arange(2000) / 50.0
+    places = [k + 0.5 * np.sin(t) for k in range(3)]
+    values = [{"position": x} for x in places]
+    (table,) = possible_tables(values, 0.01)
+    lacks = [np.sin(4.0 * x) + 0.1 * rng.normal(size=2000) for x in places]
+    deviation = np.full(2000, 0.1)
+    parts = [(lack, deviation, table.columns(v)) for lack, v in zip(lacks, values, strict=True)]
+    assert lack_regression(table, parts)[1] > 0.9
 
 
 def test_blocks_see_what_their_rows_do_on_average(made_up):
