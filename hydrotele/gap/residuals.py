@@ -25,6 +25,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.special import expit
 
 from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import Evidence
@@ -273,7 +274,7 @@ def believed_part(part: float) -> float:
     Returns:
         The probability.
     """
-    return float(1.0 / (1.0 + np.exp(-(part - _PART) / _PART_STEEP)))
+    return float(expit((part - _PART) / _PART_STEEP))
 
 
 def left_over(
