@@ -1,7 +1,8 @@
 """Laws that may be what a guess lacks: looked for in the places of the filter's unknown inputs.
 
 In the place of each of the largest inputs every form of a law (`law_tables`) is glanced at; the
-likeliest are regressed on the prediction errors and ranked by what they predict in parts of runs left out.
+likeliest are regressed on the prediction errors and ranked by what they predict in parts of runs
+that are left out.
 What the pump lacks is read off the supply's balance (`balances.pump_lack`).
 """
 
