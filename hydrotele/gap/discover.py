@@ -4,8 +4,8 @@ The filter's unknown inputs (`estimate.inputs`) say which balance lacks somethin
 in their places tables over one or two physical variables of this drive or another are tried
 (`law_candidates`). What predicts best parts of runs that it was not fitted to is put into the
 machine, looked for again there, where the filter sees clearer, and kept if it is worth its entries
-and makes free runs better. It is a term of the patched machine (`hydrotele.terms`), which every simulator
-calculates.
+and makes free runs better. It is a term of the patched machine (`hydrotele.terms`), which every
+simulator calculates.
 """
 
 import warnings
