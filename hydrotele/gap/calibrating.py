@@ -212,6 +212,7 @@ def _openings(
 BEYOND = 15.0  # twice the log evidence that a number must bring to be an effect of its own
 _RIGHT = 0.2  # of the stated uncertainty, by which numbers move that are right
 _MOSTLY = 0.6  # of the stated uncertainty: so right are nearly all
+_UNUSUAL = 3.0  # stated uncertainties: what moved by less may be a number that is calibrated
 _INFORMED = 0.5  # of the stated uncertainty is left of a number that the runs tell
 _SEVERAL = 8  # of them say what is usual
 _ROUNDS = 2  # of levels and fit; `search.settle` does the rest
@@ -429,6 +430,40 @@ def uncalibrated(guess: Guess, machine: Machine, keys: Collection[str]) -> Guess
             group = calibration(machine, frozenset(numbers(machine)) - frozenset(left))
             bounds = {key: hypothesis.parameters[key] for key in left}  # perhaps widened
             parts[index] = (replace(group, parameters=bounds), np.array(kept))
+    return Guess(tuple(parts))
+
+
+def taken_back(guess: Guess, machine: Machine, index: int) -> Guess | None:
+    """A guess whose calibration has the numbers of one of its effects; see `let_out`.
+
+    Args:
+        guess: effects beside a calibration.
+        machine: the given one.
+        index: of the effect.
+
+    Returns:
+        The guess without the effect; None where not all of the effect's numbers are uncertain ones
+        that moved by less than `_UNUSUAL` of their stated uncertainties.
+    """
+    known, deviation = guess.parts[index]
+    group = calibration_of(guess)
+    table, moved = numbers(machine), {}
+    for (key, p), d in zip(known.parameters.items(), deviation, strict=True):
+        full = f"{known.name}.{known.location}.{key}"
+        if group is None or full in group.parameters or full not in table:
+            return None
+        moved[full] = d * p.scale / table[full].parameter.scale
+        if abs(moved[full]) > _UNUSUAL:
+            return None
+    parts = []
+    for hypothesis, own in guess.without(index).parts:
+        if hypothesis.name == CALIBRATION:
+            moved |= dict(zip(hypothesis.parameters, own, strict=True))
+            other = calibration(machine, frozenset(table) - moved.keys())
+            bounds = other.parameters | hypothesis.parameters  # perhaps widened
+            hypothesis = replace(other, parameters={key: bounds[key] for key in other.parameters})
+            own = np.array([moved[key] for key in other.parameters])
+        parts.append((hypothesis, own))
     return Guess(tuple(parts))
 
 

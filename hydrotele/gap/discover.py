@@ -19,7 +19,6 @@ from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import Evidence, Judged
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.hypothesis import Guess
-from hydrotele.estimate.inputs import SUPPLY
 from hydrotele.gap.law_candidates import Lacks, Learned, candidate_laws, input_of, possible_laws
 from hydrotele.gap.rivals import ENTER
 from hydrotele.gap.search import lacking
@@ -30,6 +29,7 @@ _OTHER_FORMS = 4  # times that another form is looked for in a law's place
 _AGAIN = 5  # times that a law is fitted again inside the machine
 _STEPS = 3  # of Gauss-Newton for the numbers beside a law
 _DETAIL = 0.05  # of what all laws brought: one that brings less is the last
+_TRACE = 0.02  # of what all laws brought: where no more is lacking no further one is looked for
 _AHEAD = 1.0  # s, of free runs that a law must make better; longer ones drift without readings
 _FAR_AHEAD = 5.0  # s, of those that it must not make worse
 _AT_NOISE = 1.1  # times the noise: errors of free runs that no further law is looked for
@@ -113,14 +113,14 @@ def discover(evidence: Evidence, judged: Judged, noise: np.ndarray) -> Discovery
     prior = sum(h.prior(d) for n, (h, d) in zip(named, parts, strict=True) if n)
     judged = replace(judged, guess=Guess(tuple(held)), loss=judged.loss - prior)
     stages, begin = [judged], judged.loss
-    ahead = _open_loop(evidence, evidence.runs, judged, noise)
+    ahead = open_loop(evidence, evidence.runs, judged, noise)
     hopeless: set[tuple[str, str]] = set()
     for _ in range(_MOST):
         evidence.set_base(judged)
         found = None
         for candidates in candidate_laws(Lacks.of(evidence, judged), laws, hopeless):
             tried = _best_law(evidence, judged, candidates, hopeless)
-            now = _open_loop(evidence, evidence.runs, tried[0], noise) if tried else ahead
+            now = open_loop(evidence, evidence.runs, tried[0], noise) if tried else ahead
             if tried and better_ahead(now, ahead):
                 found, ahead = tried, now
                 break
@@ -130,8 +130,9 @@ def discover(evidence: Evidence, judged: Judged, noise: np.ndarray) -> Discovery
         judged, law = found
         laws.append(law)
         stages.append(judged)
-        done = max(ahead.rms, ahead.far) < _AT_NOISE or lacking(judged, evidence) < ENTER
-        if done or fall < _DETAIL * (begin - judged.loss):
+        left, brought = lacking(judged, evidence), begin - judged.loss
+        done = max(ahead.rms, ahead.far) < _AT_NOISE or left < max(ENTER, _TRACE * brought)
+        if done or fall < _DETAIL * brought:
             break
     good, last, first = _held_out(evidence, stages, noise)
     refused, laws = len(laws) - good, laws[:good]
@@ -171,9 +172,9 @@ def _held_out(
 ) -> tuple[int, OpenLoop, OpenLoop]:
     """How many laws make free runs of the held-out run better, these with them, and without any."""
     runs = (evidence.data.heldout,)
-    first = _open_loop(evidence, runs, stages[0], noise)
+    first = open_loop(evidence, runs, stages[0], noise)
     for good in range(len(stages) - 1, 0, -1):
-        last = _open_loop(evidence, runs, stages[good], noise)
+        last = open_loop(evidence, runs, stages[good], noise)
         if better_ahead(last, first):
             return good, last, first
     return 0, first, first
@@ -232,8 +233,6 @@ def _another_form(
     As long as no law is there, an unknown input does much of what it should tell, and hides which
     form it has: most of all what a law remembers, and from where on.
     """
-    if law.balance == SUPPLY:
-        return None
     evidence.set_base(now)
     lacks = Lacks.of(evidence, now).without(law)
     at = input_of(law.balance, law.axis), law.balance
@@ -280,7 +279,7 @@ def better_ahead(now: OpenLoop, before: OpenLoop) -> bool:
     return bool(short and (np.isnan(now.far) or now.far <= before.far))
 
 
-def _open_loop(
+def open_loop(
     evidence: Evidence, runs: Sequence[RunData], judged: Judged, noise: np.ndarray
 ) -> OpenLoop:
     """Errors of free runs through some runs over all channels, in units of a noise (c,).

@@ -16,7 +16,7 @@ from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_ru
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.calibrating import calibrate_freely, fit_until_settled
 from hydrotele.gap.description import describe, learned_laws
-from hydrotele.gap.discover import Discovery, better_ahead, discover, relearned
+from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.residuals import (
     believed,
@@ -343,6 +343,9 @@ def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
     either, it is left out.
     """
     noise = found.base.tracks[0].levels.noise  # every guess finds other levels
+    if _misled(evidence, found, noise):
+        found = found.emptied()
+        evidence.set_base(found.base)
     rests = [rest for rest in found.without if rest is not None]
     if rests and all(_trust(found, rest) < LIKELY for rest in rests):
         bare = _without_effects(evidence, found)
@@ -366,6 +369,19 @@ def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
             return bare, alone
         evidence.set_base(beside.judged)
     return found, beside
+
+
+def _misled(evidence: Evidence, found: Found, noise: np.ndarray) -> bool:
+    """Whether free runs are clearly better without a calibration and all that is beside it.
+
+    Some sixty numbers can follow from reading to reading what a law does that the model lacks; the
+    machine that they describe then runs away.
+    """
+    if all(h.name != CALIBRATION for h in found.guess.hypotheses):
+        return False
+    bare, own = (open_loop(evidence, evidence.runs, j, noise) for j in (found.base, found.judged))
+    clearly = OpenLoop(*(own_error / _WORSE for own_error in own))
+    return better_ahead(bare, clearly)
 
 
 def _without_effects(evidence: Evidence, found: Found) -> Found:

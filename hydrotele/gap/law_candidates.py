@@ -164,8 +164,11 @@ def see(data: Dataset, judged: Judged, track: Track) -> Seen:
         values[axis] = own
     plain = {axis: dict(own) for axis, own in values.items()}
     for axis, own in values.items():
-        own |= {f"{name}.{other}": column for other, columns in plain.items() if other != axis
-                for name, column in columns.items() if name in OF_A_DRIVE}  # fmt: skip
+        own |= {
+            f"{name}.{other}": column for other, columns in plain.items() if other != axis
+            for name, column in columns.items()
+            if name in OF_A_DRIVE and (name != "force" or machine.axes[other].hydraulic)
+        }  # fmt: skip
     known = np.isfinite(states.sum(axis=1))
     known[: min(round(0.5 / track.run.period), len(states) // 4)] = False
     if track.run.valid is not None:

@@ -32,6 +32,7 @@ from hydrotele.gap.calibrating import (
     polished,
     promoted,
     strained,
+    taken_back,
     uncalibrated,
     widened,
 )
@@ -140,6 +141,7 @@ def search(
     if grown.fit and mostly_right(grown.now.guess, grown.fit):
         grown = _sparse(evidence, base, grown, candidates, tell)
     grown = _by_number(evidence, _plain(evidence, grown, candidates), candidates)
+    grown = _given_back(evidence, grown)
     return _compared(evidence, base, grown, tell)
 
 
@@ -439,6 +441,27 @@ def _replaced(
     guess = let_out(evidence, Guess(tuple(parts)), place - (index < place), known)
     now, fit = fit_until_settled(evidence, evidence.judged(guess))
     return replace(grown, now=now, fit=fit)
+
+
+def _given_back(evidence: Evidence, grown: _Grown) -> _Grown:
+    """Effects that are uncertain numbers, and moved no further than these are uncertain.
+
+    Before all effects were found, one of them may have moved so far that it became an effect. With
+    the others in place it is back within what the machine file states: it is calibrated again
+    unless it brings what an effect must.
+    """
+    if calibration_of(grown.now.guess) is None or grown.fit is None:
+        return grown
+    for index in range(len(grown.now.guess.parts)):
+        guess = taken_back(grown.now.guess, evidence.data.machine, index)
+        if guess is None:
+            continue
+        now, fit = fit_until_settled(evidence, evidence.judged(guess))
+        other = replace(grown, now=now, fit=fit)
+        if _total(other) < _total(grown) + ENTER:
+            return _given_back(evidence, other)
+        evidence.set_base(grown.now)
+    return grown
 
 
 def _total(grown: _Grown) -> float:

@@ -228,7 +228,9 @@ def terms_of(machine: Machine) -> np.ndarray:
     """The machine's terms as compiled code reads them, see `terms.table.terms_table`."""
     names, first = extra_state_names(machine), 4 * len(machine.hydraulic_axes)
     own = [k for k, name in enumerate(names) if name.startswith("memory.")]
-    return terms_table(machine.terms, actuator_order(machine), first + own[0] if own else 0)
+    areas = {name: machine.axes[name].hydraulic_drive.areas for name in machine.hydraulic_axes}
+    at = first + own[0] if own else 0
+    return terms_table(machine.terms, actuator_order(machine), at, areas)
 
 
 def longest_step(machine: Machine, name: str) -> float:

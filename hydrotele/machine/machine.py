@@ -351,7 +351,8 @@ def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply 
         memory = term.play or term.switch
         if memory and not any(axis.hydraulic for axis in axes.values()):
             raise ValueError(f"terms.{k}: a memory needs a machine with hydraulic axes")
-        if memory and memory.variable == "force" and not axes[term.axis].hydraulic:
+        pushed = axes[term.of.get("force", term.axis)]
+        if memory and memory.variable == "force" and not pushed.hydraulic:
             raise ValueError(f"terms.{k}: a memory of the force is one of a hydraulic axis")
         key = (term.name, term.axis, term.balance)
         if key in seen:

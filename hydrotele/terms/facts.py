@@ -13,7 +13,7 @@ BALANCES = ("force", "flow_head", "flow_rod", "command", "flow_supply")
 Balance = Literal["force", "flow_head", "flow_rod", "command", "flow_supply"]
 OF_A_DRIVE = (
     "position", "velocity", "spool", "spool_rate", "pump_speed", "pressure_load", "pressure_head",
-    "pressure_rod", "command",
+    "pressure_rod", "command", "force",
 )  # fmt: skip
 """Variables that a law may see of another drive than the one that it adds to."""
 

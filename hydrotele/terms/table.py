@@ -10,7 +10,7 @@ do not agree, as in a file of another process, the term adds nothing.
 
 import threading
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from llvmlite import binding, ir
@@ -50,6 +50,7 @@ COUNT = 1  # place of the number of terms, after the marker
 PLAY, SWITCH = 1, 2  # ways in which a term has a memory, 0 for none
 _BAND = 0.1  # of what lies between a switch's thresholds, over which it comes about
 _HEAD = 2
+_OTHER = 4  # numbers of a variable of another drive: variable, drive, and the drive's two areas
 _MOST = 1024  # laws in a process
 _EDGE = 0.1  # s, in which a term with a window comes and goes
 _ALWAYS = (-1.0e18, 1.0e18)  # s, finite, as models keep numbers as text
@@ -125,7 +126,10 @@ def _compiled_anew(function):
     return njit(error_model="numpy", nogil=True)(function)
 
 
-def terms_table(terms: Sequence[Term], order: Sequence[str], memory: int = 0) -> np.ndarray:
+def terms_table(
+    terms: Sequence[Term], order: Sequence[str], memory: int = 0,
+    areas: Mapping[str, Sequence[float]] | None = None,
+) -> np.ndarray:  # fmt: skip
     """Terms as the numbers that compiled code reads.
 
     Args:
@@ -133,6 +137,8 @@ def terms_table(terms: Sequence[Term], order: Sequence[str], memory: int = 0) ->
         order: axis names in actuator order.
         memory: place, among the activations, of what the first term with a memory remembers; the
             others' follow. 0 where nothing keeps it: what those terms see has then not moved yet.
+        areas: hydraulic axis -> (2,) areas on which its head- and rod-side pressures act [m^2] or
+            [m^3/rad], for terms that see the force of another drive.
 
     Returns:
         (n,) numbers, none where there are no terms: marker, count, a row per term, then the laws'
@@ -155,7 +161,10 @@ def terms_table(terms: Sequence[Term], order: Sequence[str], memory: int = 0) ->
             at + len(numbers), len(term.domain), len(term.of), *(term.window or _ALWAYS),
             *_memory_numbers(term, places.get(id(term), 0)),
         ]  # fmt: skip
-        others = [x for name, axis in term.of.items() for x in (VARIABLES[name], order.index(axis))]
+        others = [
+            x for name, axis in term.of.items()
+            for x in (VARIABLES[name], order.index(axis), *(areas or {}).get(axis, (0.0, 0.0)))
+        ]  # fmt: skip
         back += [*numbers, *ranges, *others]
     return np.array([MARKER, len(terms), *rows, *back], float)
 
@@ -221,9 +230,9 @@ def _seen(terms, at, k, value, s, drives):
     """A variable as the law of a term sees it: of the drive that it names, inside its domain."""
     first = int(terms[at + _DOMAIN])
     last = first + 3 * int(terms[at + _RANGES])
-    for j in range(last, last + 2 * int(terms[at + _OTHERS]), 2):
+    for j in range(last, last + _OTHER * int(terms[at + _OTHERS]), _OTHER):
         if int(terms[j]) == k:
-            value = _of_drive(int(terms[j + 1]), k, s, drives)
+            value = _of_drive(terms, j, s, drives)
     for j in range(first, last, 3):
         if int(terms[j]) == k:
             value = min(terms[j + 2], max(terms[j + 1], value))
@@ -242,9 +251,9 @@ def _value(terms, at, s, drives):
     """The variable of a term's memory as it is now, of the drive that it is of [its unit]."""
     k = int(terms[at + _REMEMBERED])
     last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
-    for j in range(last, last + 2 * int(terms[at + _OTHERS]), 2):
+    for j in range(last, last + _OTHER * int(terms[at + _OTHERS]), _OTHER):
         if int(terms[j]) == k:
-            return _of_drive(int(terms[j + 1]), k, s, drives)
+            return _of_drive(terms, j, s, drives)
     return s[k]
 
 
@@ -297,15 +306,16 @@ def memory_of(terms, term):
     at = _HEAD + _ROW * term
     axis, k = int(terms[at + _AXIS]), int(terms[at + _REMEMBERED])
     last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
-    for j in range(last, last + 2 * int(terms[at + _OTHERS]), 2):
+    for j in range(last, last + _OTHER * int(terms[at + _OTHERS]), _OTHER):
         if int(terms[j]) == k:
             axis = int(terms[j + 1])
     return int(terms[at + _PLACE]), axis, k
 
 
 @allocation_free
-def _of_drive(i, k, s, drives):
-    """Variable k of drive i; what all drives share is that of the state."""
+def _of_drive(terms, j, s, drives):
+    """A variable of another drive, as entry j says; what all drives share is that of the state."""
+    k, i = int(terms[j]), int(terms[j + 1])
     if i < 0 or i >= len(drives.velocity):
         return 0.0
     if k == 1:
@@ -316,6 +326,10 @@ def _of_drive(i, k, s, drives):
         return drives.command[i] if drives.command[i] == drives.command[i] else 0.0
     if 3 <= k <= 6:
         return drives.act[4 * i + k - 3] if i < drives.count else 0.0
+    if k == 9:
+        if i >= drives.count:
+            return 0.0
+        return terms[j + 2] * drives.act[4 * i + 2] - terms[j + 3] * drives.act[4 * i + 3]
     return s[k]
 
 

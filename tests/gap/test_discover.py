@@ -140,6 +140,7 @@ def test_two_laws_of_one_balance_are_written_and_read(tmp_path):
 NAMES = (
     "time", "position", "velocity", "spool", "command", "force", "pressure_head", "pressure_rod",
     "pressure_supply", "velocity.swing", "spool.swing", "command.stick",
+    "force.stick",
 )  # fmt: skip
 
 
@@ -163,7 +164,7 @@ def test_every_table_is_a_term_that_adds_what_its_columns_say(made_up):
         table = Table(*table)
         entries = rng.normal(size=table.size)
         term = Term(name="law", axis="boom", balance="force", **table.law(entries))
-        written = terms_table([term], order)
+        written = terms_table([term], order, areas={"stick": (1.0, 0.5)})
         columns = table.columns(made_up)
         assert columns.shape == (400, table.size)
         for row in rng.integers(400, size=20):
@@ -171,6 +172,7 @@ def test_every_table_is_a_term_that_adds_what_its_columns_say(made_up):
             swing, stick = made_up["velocity.swing"][row], made_up["command.stick"][row]
             act = np.zeros(12)
             act[0] = made_up["spool.swing"][row]
+            act[10:] = made_up["force.stick"][row] * np.array([2.0, 2.0])
             drives = Drives(3, act, np.zeros(3), np.array([swing, 0, 0]), np.array([0, 0, stick]))
             got = added(
                 written, FORCE, 1, DriveState(**own, spool_rate=0.0, played=0.0, ahead=0.0), drives
@@ -365,7 +367,7 @@ def test_one_lost_window_says_little_and_what_is_below_noise_nothing(monkeypatch
     )
     judged: Any = SimpleNamespace(guess=SimpleNamespace(machine=lambda machine: machine))
     run: Any = None
-    ahead = discover._open_loop(evidence, [run], judged, np.ones(2))
+    ahead = discover.open_loop(evidence, [run], judged, np.ones(2))
     assert ahead.usual == pytest.approx(1000.0**0.1) and ahead.rms == np.inf
     assert np.isnan(ahead.far)
 
@@ -426,7 +428,7 @@ def test_a_choice_that_only_the_own_run_would_make_predicts_nothing():
 ])  # fmt: skip
 def test_as_many_laws_are_kept_as_help_the_held_out_run(monkeypatch, errors, good):
     monkeypatch.setattr(
-        discover, "_open_loop", lambda e, runs, stage, noise: OpenLoop(*3 * [stage])
+        discover, "open_loop", lambda e, runs, stage, noise: OpenLoop(*3 * [stage])
     )
     evidence: Any = SimpleNamespace(data=SimpleNamespace(heldout=None))
     stages: Any = errors

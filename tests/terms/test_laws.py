@@ -182,8 +182,18 @@ def test_a_law_may_see_variables_of_another_drive():
     assert added_with_slope(table, FORCE, 0, STATE, drives)[1] == 0.0, "not its own velocity"
     lone = force_term(*law_, of={"velocity": "b"})
     assert added(terms_table([lone], ["a", "b"]), FORCE, 0, STATE, NO_DRIVES) == 4.0 + 4.3
-    with pytest.raises(ValidationError, match="of: 'force'"):
-        force_term(*law_, of={"force": "b"})
+    with pytest.raises(ValidationError, match="of: 'time'"):
+        force_term(*law_, of={"time": "b"})
+
+
+def test_a_law_may_see_the_force_of_another_drive():
+    term = force_term("formula", {"force": 2.0}, of={"force": "b"})
+    act = np.array([0.0, 0.0, 9e6, 9e6, 0.0, 0.0, 3e6, 1e6])
+    drives = Drives(2, act, np.zeros(2), np.zeros(2), np.zeros(2))
+    table = terms_table([term], ["a", "b"], areas={"a": (1.0, 1.0), "b": (0.01, 0.006)})
+    assert added(table, FORCE, 0, STATE, drives) == pytest.approx(2.0 * (30e3 - 6e3))
+    none = drives._replace(count=1)
+    assert added(table, FORCE, 0, STATE, none) == 0.0, "b has no chambers"
 
 
 def carried(term, values):
