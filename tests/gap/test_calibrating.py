@@ -1,12 +1,22 @@
 """Numbers of a calibration that stop at the end of their range."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from hydrotele.effects import Parameter
-from hydrotele.estimate.calibration import CALIBRATION
-from hydrotele.estimate.hypothesis import Guess, Hypothesis
-from hydrotele.gap.calibrating import _further, _gain_of_freedom, ended, given_again
+from hydrotele.estimate.calibration import CALIBRATION, calibration
+from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.gap.calibrating import (
+    _further,
+    _gain_of_freedom,
+    ended,
+    given_again,
+    let_out,
+    taken_back,
+)
+from hydrotele.machine.machine_file import load_machine
 
 
 def number(name: str, high: float = 6.0) -> Hypothesis:
@@ -73,3 +83,40 @@ def test_numbers_of_an_axis_are_given_again_and_those_of_others_and_effects_stay
     again = given_again(guess, ["boom"])
     assert again.hypotheses == guess.hypotheses
     np.testing.assert_array_equal(again.deviation, [1.0, 0.0, 3.0, 4.0])
+
+
+class Given:
+    """Evidence of a machine alone."""
+
+    data = SimpleNamespace(machine=load_machine("cat215"))
+
+
+@pytest.mark.parametrize(("sizes", "back"), [
+    (-0.97, True),  # a valve's gain 4.9 % below the model's, which is uncertain by 5 %
+    (-3.1, False),  # more than three times what is stated
+])  # fmt: skip
+def test_an_effect_that_a_calibration_let_out_is_taken_back_as_it_was(sizes, back):
+    machine = Given.data.machine
+    group = calibration(machine)
+    deviation = 0.1 * np.arange(group.size) / group.size
+    deviation[list(group.parameters).index("valve_gain.swing.ratio")] = sizes
+    guess = Guess(((group, deviation),))
+    gain = next(h for h in hypotheses(machine) if h.key == ("valve_gain", "swing"))
+    out = let_out(Given(), guess, 0, gain)
+    assert out.hypotheses[0].size == group.size - 1
+    again = taken_back(out, machine, 1)
+    if not back:
+        assert again is None
+        return
+    assert [h.parameters for h in again.hypotheses] == [group.parameters]
+    np.testing.assert_allclose(again.deviation, deviation, rtol=0.0, atol=1e-12)
+
+
+def test_what_no_calibration_knows_is_not_taken_back():
+    machine = Given.data.machine
+    group = calibration(machine)
+    offset = next(h for h in hypotheses(machine) if h.name == "command_offset")
+    guess = Guess(((group, np.zeros(group.size)), (offset, np.array([0.1]))))
+    assert taken_back(guess, machine, 1) is None
+    assert taken_back(guess, machine, 0) is None, "the calibration itself"
+    assert taken_back(Guess(((offset, np.array([0.1])),)), machine, 0) is None, "none there"

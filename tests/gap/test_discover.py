@@ -427,9 +427,7 @@ def test_a_choice_that_only_the_own_run_would_make_predicts_nothing():
     ((9.0, 10.0, 11.0), 0),
 ])  # fmt: skip
 def test_as_many_laws_are_kept_as_help_the_held_out_run(monkeypatch, errors, good):
-    monkeypatch.setattr(
-        discover, "open_loop", lambda e, runs, stage, noise: OpenLoop(*3 * [stage])
-    )
+    monkeypatch.setattr(discover, "open_loop", lambda e, runs, stage, noise: OpenLoop(*3 * [stage]))
     evidence: Any = SimpleNamespace(data=SimpleNamespace(heldout=None))
     stages: Any = errors
     kept, last, first = discover._held_out(evidence, stages, np.ones(1))

@@ -4,6 +4,7 @@ Half of every fitted run is enough to tell what is asserted here; all ten whole 
 `tools/open_cases.py` (docs/results/open_cases.md).
 """
 
+import dataclasses
 import shutil
 from types import SimpleNamespace
 from typing import Any
@@ -12,9 +13,9 @@ import numpy as np
 import pytest
 import yaml
 
-from hydrotele.estimate.calibration import calibration
+from hydrotele.estimate.calibration import CALIBRATION, calibration
 from hydrotele.estimate.evidence import Judged
-from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.gap import find
 from hydrotele.gap.discover import Discovery, OpenLoop
 from hydrotele.gap.find import find_gap, without_details
@@ -187,7 +188,7 @@ def learned(
     monkeypatch.setattr(find, "discover", Learning(beside, alone))
     none = discovery(search, False, 1000.0, None, *BARE)
     monkeypatch.setattr(find, "relearned", lambda evidence, judged, noise, laws: again or none)
-    evidence: Any = SimpleNamespace(set_base=lambda base: base)
+    evidence: Any = SimpleNamespace(set_base=lambda base: base, runs=())
     found, taken = find._learned(evidence, search)
     return bool(found.guess.parts), taken
 
@@ -250,6 +251,32 @@ def test_laws_alone_are_not_tried_where_an_effect_does_most(monkeypatch, without
     stays, taken = learned(monkeypatch, search, beside, discovery(search, False, left, 0.0, *GOOD))
     assert stays
     assert taken is beside
+
+
+@pytest.mark.parametrize(("calibrated", "errors", "emptied"), [
+    (True, 1.2, True),  # with sixty numbers moved free runs are a fifth worse than as given
+    (True, 1.02, False),  # as good as it matters
+    (True, 0.5, False),
+    (False, 1.2, False),  # effects alone are judged on the held-out run
+])  # fmt: skip
+def test_laws_are_learned_without_a_calibration_whose_machine_runs_away(
+    monkeypatch, calibrated, errors, emptied
+):
+    search = searched(500.0)
+    if calibrated:
+        group = Hypothesis(CALIBRATION, "all", {}, None)
+        guess = search.judged.guess.plus(group, np.zeros(0))
+        search = dataclasses.replace(
+            search, judged=dataclasses.replace(search.judged, guess=guess),
+            charges=(5.0, 0.0), without=(search.base, None), rivals=((), ()),
+        )  # fmt: skip
+    monkeypatch.setattr(
+        find, "open_loop",
+        lambda evidence, runs, judged, noise: OpenLoop(*[errors if judged.guess.parts else 1.0] * 3)
+    )  # fmt: skip
+    beside = discovery(search, True, 50.0, None, *NEAR)
+    stays, _ = learned(monkeypatch, search, beside, discovery(search, False, 20.0, 1.0, *GOOD))
+    assert stays is not emptied
 
 
 def test_truth_columns_change_nothing(tmp_path):
