@@ -14,7 +14,11 @@ from hydrotele.estimate.inputs import input_sizes, input_units
 from hydrotele.estimate.levels import rippled, stated_jitter
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances
-from hydrotele.gap.calibrating import calibrate_freely, fit_until_settled
+from hydrotele.gap.calibrating import (
+    FreeCalibration,
+    calibrate_freely,
+    fit_until_settled,
+)
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
@@ -107,23 +111,30 @@ def find_gap(
         found = search(evidence, candidates, progress)
         discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
+            if found.guess.parts and _worse_held_out(evidence, found.judged):
+                notes.append(_REJECTED.format("the"))
+                found = found.emptied()
+                evidence.set_base(found.base)
             tell("learn laws of what no effect explains", 0.93)
             found, discovery = _learned(evidence, found)
             if discovery.refused:
                 notes.append(_REFUSED)
         tell("judge on the held-out run", 0.96)
-        judge = _Judge(data, discovery.judged)
-        nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)
-        machines = [nominal, *([patched] if patched is not nominal else [])]
-        before, *others = judge.tracks(machines + ([given] if opened else []), evidence.map)
-        asked = others.pop() if opened else before
-        after = others[0] if others else before
-        undone = opened is not None and opened.undone_by(data, patched, jobs)
-        if undone or not rms(after[:1]) <= _WORSE * rms(before[:1]):
-            notes.append(_REJECTED.format("free runs of the" if undone else "the"))
-            found, discovery = found.emptied(), Discovery(found.base, ())
-            patched, after = nominal, before
-        before = asked
+        outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
+        if outcome.worse:
+            notes.append(_REJECTED.format(outcome.worse))
+            misleading, found = bool(found.guess.parts), found.emptied()
+            discovery = Discovery(found.base, ())
+            if misleading and not effects:
+                tell("learn laws of the given machine", 0.96)
+                evidence.set_base(found.base)
+                discovery = discover(evidence, found.base, found.base.tracks[0].levels.noise)
+            outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
+            if outcome.worse:
+                discovery = Discovery(found.base, ())
+                outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
+        nominal, patched, judge = data.machine, outcome.patched, outcome.judge
+        before, after = outcome.asked, outcome.after
         tests, floor = judge.tests(evidence, discovery.judged, patched, after)
         # Numbers of effects were found before the laws, and so were their intervals.
         told = found.judged if discovery.laws else discovery.judged
@@ -255,6 +266,56 @@ class _Judge:
         guess = discovery.judged.guess
         found = each(share, range(len(guess.parts)))
         return {h.key: s for h, s in zip(guess.hypotheses, found, strict=True)}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Outcome:
+    """What a patched machine makes of the runs, the held-out one first.
+
+    Attributes:
+        judge: with the noise that was found.
+        patched: the machine.
+        asked: tracks of the machine that the user gave.
+        after: of the patched one.
+        worse: in what the held-out run is worse than that of the machine that the search began
+            with, as `_REJECTED` says it; empty if it is not.
+    """
+
+    judge: _Judge
+    patched: Machine
+    asked: tuple[Track, ...]
+    after: tuple[Track, ...]
+    worse: str
+
+    @classmethod
+    def of(
+        cls, evidence: Evidence, discovery: Discovery, opened: FreeCalibration | None,
+        given: Machine, jobs: int,
+    ) -> "_Outcome":  # fmt: skip
+        """What a guess and its laws make of them; `opened` where free runs calibrated `given`."""
+        data, judge = evidence.data, _Judge(evidence.data, discovery.judged)
+        nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)
+        machines = [nominal, *([patched] if patched is not nominal else [])]
+        before, *others = judge.tracks(machines + ([given] if opened else []), evidence.map)
+        asked = others.pop() if opened else before
+        after = others[0] if others else before
+        worse = "the" if _worse(before, after) else ""
+        if opened and patched is not nominal and opened.undone_by(data, patched, jobs):
+            worse = "free runs of the"
+        return cls(judge, patched, asked, after, worse)
+
+
+def _worse(before: Sequence[Track], after: Sequence[Track]) -> bool:
+    """Whether the first run, the held-out one, is predicted worse than before."""
+    return not rms(after[:1]) <= _WORSE * rms(before[:1])
+
+
+def _worse_held_out(evidence: Evidence, judged: Judged) -> bool:
+    """Whether a guess predicts the held-out run worse than the given machine does."""
+    data = evidence.data
+    machines = [data.machine, judged.guess.machine(data.machine)]
+    tracks = _Judge(data, judged).tracks(machines, evidence.map, (data.heldout,))
+    return _worse(*tracks)
 
 
 def _failed(tests: Mapping, before: float, after: float, floor: float | None) -> bool:

@@ -58,8 +58,9 @@ _MOVED = 2  # times by each of these
 _FINER = (0.8, 0.4, 0.2, 0.1)  # of a memory's width, by which it is changed
 _PAIRS = 4  # tables over two variables that are looked at closely, for each lack
 _TRIED = 2  # laws that are put into the machine, of all that the regression finds
+_PUMP_LAWS = 3  # of the pump's, whose lack is read off readings without knowing what it does
 _OTHERS = 3  # of other balances, one by one, where free runs get better by none of these
-_MOSTLY = 0.5  # of the square of what a pump lacks that a law must predict to be tried
+_PARTLY = 0.2  # of the square of what a pump lacks that a law must predict to be tried
 _SHORT_ROWS = 20  # of a run in which its pump is short that it takes to be read
 _PLAINER = 0.9  # of the best law's fall that one of a single variable needs to go before it
 _MOVES = (-0.25, -0.1, 0.0, 0.1, 0.25)  # s, by which a window's ends are moved
@@ -296,7 +297,7 @@ def candidate_laws(
             looked += possible_laws(lacks, (i, THROUGH), rank < _COUPLED, taken)
     ranked, pump = _best_first(looked), []
     if not any(balance == SUPPLY for balance, _ in hopeless):
-        pump = _pump_laws(lacks)[:1]
+        pump = _pump_laws(lacks)[:_PUMP_LAWS]
     best = ranked[:_TRIED] + pump
     for size in (1, 2):  # what one remembers may be chance
         plain = [p for p in ranked if not p[0][2].memory and len(p[0][2].variables) == size][:1]
@@ -453,7 +454,7 @@ def _pump_laws(lacks: Lacks) -> list[tuple[Case, Regression]]:
             return lack_regression(table, parts)
 
         found = zip(tables, evidence.map(fitted, tables), strict=True)
-        return [((own, SUPPLY, t), fit) for t, (fit, share) in found if share > _MOSTLY]
+        return [((own, SUPPLY, t), fit) for t, (fit, share) in found if share > _PARTLY]
 
     speed = _smoothing(machine, own.axis)
     window = busy_window([(_clock(seen[k]), rows[k], told[k][0]) for k in used])

@@ -28,6 +28,8 @@ THROUGH = "flow_through"
 _POINTS = 14  # of a table over one variable; what keeps them alike is in the regression
 _PAIR_POINTS = 10  # over each of two
 _TIMES = 10  # over time: what acts for a while begins and ends somewhere
+_STEEP = 0.3  # precision of first differences, in units of the lack: beyond what the data tell a
+# law goes on as it is there, not as steeply as it was
 _SHRINK = 0.1  # precision of an entry, in units of the lack: what no data tells is nothing
 _OWN = (
     "velocity", "position", "command", "force", "pressure_head", "pressure_rod", "spool",
@@ -159,8 +161,10 @@ class Table(NamedTuple):
         return entries, weights
 
     def precision(self, smoothness: float) -> np.ndarray:
-        """(K, K) prior precision of the entries: of their second differences, and of each."""
-        return smoothness * _bending(tuple(map(len, self.points))) + _SHRINK * np.eye(self.size)
+        """(K, K) prior precision of the entries: of their differences, and of each."""
+        counts = tuple(map(len, self.points))
+        bent, steep = (_differences(counts, order) for order in (2, 1))
+        return smoothness * bent + _STEEP * steep + _SHRINK * np.eye(self.size)
 
     def law(self, entries: np.ndarray) -> dict[str, Any]:
         """Law, parameters, variables and window of a term with some entries (K,)."""
@@ -179,12 +183,17 @@ class Table(NamedTuple):
 
 
 @functools.cache
-def _bending(counts: tuple[int, ...]) -> np.ndarray:
-    """(K, K) products of second differences of entries with so many points of each variable."""
+def _differences(counts: tuple[int, ...], order: int) -> np.ndarray:
+    """(K, K) products of differences of entries with so many points of each variable.
+
+    Args:
+        counts: of points.
+        order: of the differences.
+    """
     found = np.zeros((1, 1))
     for count in counts:
-        bends = np.diff(np.eye(count), 2, axis=0)
-        own = np.kron(np.eye(len(found)), bends.T @ bends)
+        each = np.diff(np.eye(count), order, axis=0)
+        own = np.kron(np.eye(len(found)), each.T @ each)
         found = np.kron(found, np.eye(count)) + own
     return found
 
