@@ -180,6 +180,18 @@ def test_every_table_is_a_term_that_adds_what_its_columns_say(made_up):
             assert got == pytest.approx(columns[row] @ entries, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.parametrize("smoothness", [0.1, 1.0, 10.0])
+def test_a_law_does_not_rise_beyond_what_the_data_tell(smoothness):
+    """Told on half of its points, where it rises by 2 per metre; straight on would be 2 at last."""
+    table = Table(("position",), (tuple(np.linspace(0.0, 1.0, 11)),))
+    place = np.linspace(0.0, 0.5, 400)
+    shares = 10.0 * table.columns({"position": place})
+    told = shares.T @ (10.0 * 2.0 * place)
+    entries = np.linalg.solve(shares.T @ shares + table.precision(smoothness), told)
+    assert entries[:6] == pytest.approx(2.0 * np.array(table.points[0][:6]), abs=0.01)  # its prior
+    assert 0.0 < entries[-1] < 1.0 and entries.max() < 1.1
+
+
 _OF_MEMORIES = ("velocity", "command.stick")
 
 

@@ -279,6 +279,34 @@ def test_laws_are_learned_without_a_calibration_whose_machine_runs_away(
     assert stays is not emptied
 
 
+@pytest.mark.parametrize("after_laws", [False, True])
+def test_effects_that_make_the_held_out_run_worse_are_taken_back_and_laws_learned_without(
+    monkeypatch, after_laws
+):
+    learned_of = []
+
+    def searched(evidence, candidates, progress):
+        base = evidence.set_base(Guess())
+        effect = next(h for h in candidates if h.key == ("valve_gain", "boom"))
+        wrong = evidence.judged(Guess(((effect, np.array([4.0])),)), reopened=True)
+        return Found(base, wrong, None, (), (0.0,), (base,), ((),), None)
+
+    def learnt(evidence, judged, noise):
+        learned_of.append(judged.guess.names)
+        return Discovery(judged, ())
+
+    monkeypatch.setattr(find, "search", searched)
+    monkeypatch.setattr(find, "discover", learnt)
+    if after_laws:  # as if only the laws beside it made it worse
+        monkeypatch.setattr(find, "_worse_held_out", lambda evidence, judged: False)
+    gap = find_gap(half(MEASURED / "open_04", 20.0))
+    assert gap.verdict == "no_gap" and not gap.effects
+    assert sum("held-out run worse" in note for note in gap.notes) == 1
+    gain = ["valve_gain.boom.ratio"]  # which cannot be believed: laws are tried without it, too
+    assert learned_of == ([[], gain, []] if after_laws else [[]])
+    assert gap.patched == gap.machine
+
+
 def test_truth_columns_change_nothing(tmp_path):
     """The search sees measured channels only."""
     shutil.copytree(MEASURED / "open_04", tmp_path / "logs")
