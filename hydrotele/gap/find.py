@@ -122,7 +122,8 @@ def find_gap(
         tell("judge on the held-out run", 0.96)
         outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
         if outcome.worse:
-            notes.append(_REJECTED.format(outcome.worse))
+            if (note := _REJECTED.format(outcome.worse)) not in notes:
+                notes.append(note)
             misleading, found = bool(found.guess.parts), found.emptied()
             discovery = Discovery(found.base, ())
             if misleading and not effects:
