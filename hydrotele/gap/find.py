@@ -111,8 +111,8 @@ def find_gap(
         found = search(evidence, candidates, progress)
         discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
-            if found.guess.parts and _worse_held_out(evidence, found.judged):
-                notes.append(_REJECTED.format("the"))
+            if worse := _worse_held_out(evidence, found.judged, opened, jobs):
+                notes.append(_REJECTED.format(worse))
                 found = found.emptied()
                 evidence.set_base(found.base)
             tell("learn laws of what no effect explains", 0.93)
@@ -300,23 +300,30 @@ class _Outcome:
         before, *others = judge.tracks(machines + ([given] if opened else []), evidence.map)
         asked = others.pop() if opened else before
         after = others[0] if others else before
-        worse = "the" if _worse(before, after) else ""
-        if opened and patched is not nominal and opened.undone_by(data, patched, jobs):
-            worse = "free runs of the"
+        worse = _worse(data, patched, before, after, opened, jobs)
         return cls(judge, patched, asked, after, worse)
 
 
-def _worse(before: Sequence[Track], after: Sequence[Track]) -> bool:
-    """Whether the first run, the held-out one, is predicted worse than before."""
-    return not rms(after[:1]) <= _WORSE * rms(before[:1])
+def _worse(
+    data: Dataset, patched: Machine, before: Sequence[Track], after: Sequence[Track],
+    opened: FreeCalibration | None, jobs: int,
+) -> str:  # fmt: skip
+    """In what a patched machine is worse on the first run, the held-out one; empty if it is not."""
+    if opened and patched is not data.machine and opened.undone_by(data, patched, jobs):
+        return "free runs of the"
+    return "" if rms(after[:1]) <= _WORSE * rms(before[:1]) else "the"
 
 
-def _worse_held_out(evidence: Evidence, judged: Judged) -> bool:
-    """Whether a guess predicts the held-out run worse than the given machine does."""
-    data = evidence.data
-    machines = [data.machine, judged.guess.machine(data.machine)]
-    tracks = _Judge(data, judged).tracks(machines, evidence.map, (data.heldout,))
-    return _worse(*tracks)
+def _worse_held_out(
+    evidence: Evidence, judged: Judged, opened: FreeCalibration | None, jobs: int
+) -> str:
+    """In what a guess is worse on the held-out run than the given machine; empty if it is not."""
+    if not judged.guess.parts:
+        return ""
+    data, patched = evidence.data, judged.guess.machine(evidence.data.machine)
+    judge = _Judge(data, judged)
+    before, after = judge.tracks([data.machine, patched], evidence.map, (data.heldout,))
+    return _worse(data, patched, before, after, opened, jobs)
 
 
 def _failed(tests: Mapping, before: float, after: float, floor: float | None) -> bool:

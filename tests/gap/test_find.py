@@ -298,7 +298,7 @@ def test_effects_that_make_the_held_out_run_worse_are_taken_back_and_laws_learne
     monkeypatch.setattr(find, "search", searched)
     monkeypatch.setattr(find, "discover", learnt)
     if after_laws:  # as if only the laws beside it made it worse
-        monkeypatch.setattr(find, "_worse_held_out", lambda evidence, judged: False)
+        monkeypatch.setattr(find, "_worse_held_out", lambda *_: "")
     gap = find_gap(half(MEASURED / "open_04", 20.0))
     assert gap.verdict == "no_gap" and not gap.effects
     assert sum("held-out run worse" in note for note in gap.notes) == 1
