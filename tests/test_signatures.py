@@ -7,16 +7,6 @@ PACKAGE = Path(__file__).resolve().parent.parent / "hydrotele"
 MOST = 10
 # Functions of `cli` have one argument per option of a command and are not looked at.
 LONGER = {
-    # Inlined into MuJoCo's callbacks, which cross these a million times a second with numbers that
-    # lie in different structs of MuJoCo; the reduced model passes them from arrays of its own.
-    "hydraulics/circuit.py:_flows_of_terms",
-    "hydraulics/circuit.py:_delivery_of_terms",
-    "hydraulics/circuit.py:step_circuit",
-    "hydraulics/circuit.py:add_to_commands",
-    "simulate/native.py:_state",
-    "simulate/native.py:_advance_with_memory",
-    # Filter and smoother of one run: the arguments of `track`, of which it is the second half.
-    "estimate/track.py:_cross",
     # Options of an optimiser by keyword, as SciPy's function of that name has them.
     "calibrate/estimation.py:least_squares",
 }

@@ -173,10 +173,8 @@ def add_commands(model, sp, h):
         Nothing.
     """
     drive = sp.drive
-    add_to_commands(
-        model.user, model.terms, model.hydraulic, sp.act, drive[COMMAND], drive[X], drive[V], h,
-        sp.time[0], sp.scratch, drive[GIVEN],
-    )  # fmt: skip
+    drives = Drives(model.hydraulic, sp.act, drive[X], drive[V], drive[COMMAND])
+    add_to_commands(model.user, model.terms, drives, h, sp.time[0], sp.scratch, drive[GIVEN])
 
 
 @allocation_free
@@ -538,9 +536,10 @@ def advance(model, sp, z, command, row, period, steps, trail):
                 add_commands(model, sp, h)
                 given = GIVEN
             first = np.int64(0)  # numba compiles a function anew for a written number
+            drives = Drives(count, act, drive[X], drive[V], drive[given])
             _, supply = step_circuit(
-                model.user, first, count, act, drive[given], drive[X], drive[V], h, sp.act_dot,
-                sp.scratch, model.terms, sp.time[0], model.memory,
+                model.user, first, drives, h, sp.act_dot, sp.scratch, model.terms, sp.time[0],
+                model.memory,
             )  # fmt: skip
             if model.memory >= 0 and len(model.terms) > 0:
                 drives = Drives(count, act, drive[X], drive[V], drive[COMMAND])

@@ -7,6 +7,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import fminbound
@@ -396,6 +397,7 @@ def track_run(
     if kept is not None:
         levels, columns = kept.levels, _for_states(kept, names)
     levels = levels or Levels(data.noise)
+    trial = _Trial(machine, model, data, levels, step)
     noise = row_variances(levels, run) if kept is None else np.zeros((0, len(data.channels)))
     if columns is None:
         columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
@@ -407,16 +409,13 @@ def track_run(
         rows = min(max(2, round(_LOOK / run.period)), len(run.command))
         first, part = run.part(0, rows), columns[:rows]
         rest = find_rest(
-            lambda r: (
-                _cross(machine, model, data, first, None, step, r, levels, part, noise[:rows]).loss
-            ),
+            lambda r: _cross(trial, first, None, r, part, noise[:rows]).loss,
             play,
         )
     elif rest is None or not known:
         rest = np.zeros(len(play))
     rest = np.where(play, rest, np.nan)
-    return _cross(machine, model, data, run, kept, step, rest, levels, columns, noise, linearise,
-                  flow)  # fmt: skip
+    return _cross(trial, run, kept, rest, columns, noise, linearise, flow)
 
 
 def following_model(machine: Machine, data: Dataset) -> Model:
@@ -447,11 +446,21 @@ def _for_states(kept: Track, names: list[str]) -> np.ndarray:
     return columns
 
 
+class _Trial(NamedTuple):
+    """A machine that is tried on the runs of a dataset."""
+
+    machine: Machine
+    model: Model
+    data: Dataset
+    levels: Levels
+    step: float
+
+
 def _cross(
-    machine: Machine, model: Model, data: Dataset, run: RunData, kept: Track | None, step: float,
-    rest: np.ndarray, levels: Levels, columns: np.ndarray, noise: np.ndarray,
-    linearise: bool = False, given: np.ndarray | None = None,
+    trial: _Trial, run: RunData, kept: Track | None, rest: np.ndarray, columns: np.ndarray,
+    noise: np.ndarray, linearise: bool = False, given: np.ndarray | None = None,
 ) -> Track:  # fmt: skip
+    machine, model, data, levels, step = trial
     fine, coarse = (steps_per_row(machine, run.period, s) for s in (step, _TANGENT))
     space = model_space(model)
     space.time[1] = run.start

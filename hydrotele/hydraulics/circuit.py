@@ -55,7 +55,7 @@ from hydrotele.hydraulics.supply import (
     with_added,
 )
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
-from hydrotele.terms.law import VARIABLES, Drives, DriveState
+from hydrotele.terms.law import VARIABLES, DriveState
 from hydrotele.terms.table import (
     ANY,
     COMMAND,
@@ -175,20 +175,22 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
 
 
 @allocation_free
-def _flows_of_terms(
-    terms, i, user, time, x, v, spool, rate, p_head, p_rod, supply, command, drives
-):
-    """What the terms add to the flows of an axis, see `terms.table.added_flows`."""
+def _flows_of_terms(terms, i, user, time, x, oil, supply, drives):
+    """What the terms add to the flows of an axis, see `terms.table.added_flows`.
+
+    `oil` is its spool, spool rate and pressures.
+    """
     if not (acts_on(terms, FLOW_HEAD, i) or acts_on(terms, FLOW_ROD, i)):
         return _NO_FLOWS
-    u = i * SLOTS
-    force = user[u + _AH] * p_head - user[u + _AR] * p_rod
-    s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command[i], force, 0.0, 0.0)
+    spool, rate, p_head, p_rod = oil
+    v, command = drives.velocity[i], drives.command[i]
+    force = user[i * SLOTS + _AH] * p_head - user[i * SLOTS + _AR] * p_rod
+    s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command, force, 0.0, 0.0)
     return added_flows(terms, i, s, drives)
 
 
 @allocation_free
-def _delivery_of_terms(user, first, count, terms, act, length, velocity, command, time, supply, dt):
+def _delivery_of_terms(user, first, drives, terms, time, supply, dt):
     """Share of the pump's largest flow that the terms add after a step, scalar [1].
 
     The pump follows the terms, as they are at the step's start, by the exact exponential.
@@ -196,15 +198,14 @@ def _delivery_of_terms(user, first, count, terms, act, length, velocity, command
     at = int(user[first * SLOTS + _ADDED])
     if at == 0:
         return 0.0
-    total, drives = 0.0, Drives(count, act, length, velocity, command)
+    total, act = 0.0, drives.act
     if acts_on(terms, FLOW_SUPPLY, ANY):
-        for i in range(count):
-            u, a = (first + i) * SLOTS, 4 * i
+        for i in range(drives.count):
+            u, a, v = (first + i) * SLOTS, 4 * i, drives.velocity[first + i]
             force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
             s = DriveState(
-                time, length[first + i] - dt * velocity[first + i], velocity[first + i],
-                act[a], act[a + 1], act[a + 2], act[a + 3], supply, command[first + i], force,
-                0.0, 0.0,
+                time, drives.position[first + i] - dt * v, v, act[a], act[a + 1], act[a + 2],
+                act[a + 3], supply, drives.command[first + i], force, 0.0, 0.0,
             )  # fmt: skip
             total += added(terms, FLOW_SUPPLY, first + i, s, drives)
     wanted = total / user[first * SLOTS + _PUMP]
@@ -212,9 +213,7 @@ def _delivery_of_terms(user, first, count, terms, act, length, velocity, command
 
 
 @allocation_free
-def step_circuit(
-    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time, memory
-):
+def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory):
     """Advance spools and chamber pressures of all axes that share a supply by one step.
 
     Spools follow their exact exponential; pressures take one step of the L-stable second-order
@@ -229,16 +228,14 @@ def step_circuit(
     Args:
         user: (nu * SLOTS,) actuator numbers.
         first: index of the first hydraulic actuator.
-        count: number of hydraulic actuators, <= MAX_AXES.
-        act: (>= 4 count,) spool [1], spool rate [1/s] and pressures [Pa] at the start of the step,
-            then what is remembered, see `parameters.extra_state_names`.
-        command: (nu,) valve commands, clipped here to [-1, 1] [1].
-        length: (nu,) piston displacements x at the end of the step, where MuJoCo's leapfrog has
-            them [m] (joint angle for a motor).
-        velocity: (nu,) piston velocities [m/s] or [rad/s].
+        drives: Drives: number of hydraulic actuators, <= MAX_AXES; spool [1], spool rate [1/s] and
+            pressures [Pa] of these at the start of the step, then what is remembered, see
+            `parameters.extra_state_names`; of all actuators the positions at the end of the step,
+            where MuJoCo's leapfrog has them [m] or [rad], the velocities over it [m/s] or [rad/s],
+            and the commands, clipped here to [-1, 1] [1].
         dt: step, scalar [s].
-        act_dot: (>= 4 count,) written: mean rates over the step, in the unit of `act` per [s]; of
-            what is remembered, the pump's alone.
+        act_dot: (>= 4 count,) written: mean rates over the step, in the unit of `drives.act` per
+            [s]; of what is remembered, the pump's alone.
         scratch: (SCRATCH,) work space.
         terms: (n,) table of the machine's terms, `NO_TERMS` for none [SI].
         time: at the start of the step, scalar [s]; only terms see it.
@@ -251,7 +248,7 @@ def step_circuit(
     Source: nominal model; ROS2: Verwer et al. 1999, SIAM J. Sci. Comput. 20(4), Eq. 2.6.
     """
     gamma_h = _ROS2 * dt
-    drives = Drives(count, act, length, velocity, command)
+    count, act, length, velocity, command = drives
     for i in range(count):
         u, a = (first + i) * SLOTS, 4 * i
         bounded = min(1.0, max(-1.0, command[first + i]))
@@ -271,9 +268,7 @@ def step_circuit(
     p_start = circuit_supply(user, first, count, scratch, held)
     if memory >= 0:
         begun = demanded_share(user, first, count, scratch)
-        more_delivered = _delivery_of_terms(
-            user, first, count, terms, act, length, velocity, command, time, p_start, dt
-        )
+        more_delivered = _delivery_of_terms(user, first, drives, terms, time, p_start, dt)
         share = pump_response(user, first, begun, own_share(user, first, act), dt)
         share = with_added(share, more_delivered)
     for i in range(count):
@@ -283,10 +278,8 @@ def step_circuit(
             scratch[a + 3] = switched_speed(act[a], act_dot[a])
         more = _NO_FLOWS
         if len(terms) > 0:
-            more = _flows_of_terms(
-                terms, first + i, user, time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3],
-                p_start, command, drives,
-            )  # fmt: skip
+            oil = (act[a], act[a + 1], act[a + 2], act[a + 3])
+            more = _flows_of_terms(terms, first + i, user, time, x, oil, p_start, drives)
         head, rod, j_head, j_rod = pressure_rates(
             user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3], x, v, dt, more,
         )  # fmt: skip
@@ -321,10 +314,8 @@ def step_circuit(
         p_head, p_rod = act[a + 2] + dt * act_dot[a + 2], act[a + 3] + dt * act_dot[a + 3]
         more = _NO_FLOWS
         if len(terms) > 0:
-            more = _flows_of_terms(
-                terms, first + i, user, time + dt, x, v, act_dot[a], act_dot[a + 1], p_head,
-                p_rod, p_end, command, drives,
-            )  # fmt: skip
+            oil = (act_dot[a], act_dot[a + 1], p_head, p_rod)
+            more = _flows_of_terms(terms, first + i, user, time + dt, x, oil, p_end, drives)
         head, rod, _, _ = pressure_rates(
             user, u, scratch[a + 3], p_end, p_head, p_rod, x, v, 0.0, more,
         )  # fmt: skip
@@ -593,7 +584,7 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
 
 
 @allocation_free
-def add_to_commands(user, terms, count, act, command, length, velocity, dt, time, scratch, out):
+def add_to_commands(user, terms, drives, dt, time, scratch, out):
     """Commands of the valves with their terms, at the middle of a step.
 
     Positions and time are those of the middle; spools and pressures those of the start, before the
@@ -602,11 +593,8 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
     Args:
         user: (nu * SLOTS,) actuator numbers.
         terms: (n,) table of terms [SI].
-        count: number of hydraulic axes, which come first.
-        act: (>= 4 count,) activations [SI] at the start of the step.
-        command: (>= count,) commands that arrive [1].
-        length: (>= count,) drive positions at the end of the step [m] or [rad].
-        velocity: (>= count,) drive velocities [m/s] or [rad/s].
+        drives: Drives with the activations at the start of the step, positions at its end and
+            velocities over it, and the commands that arrive [SI, commands in 1].
         dt: step, scalar [s].
         time: at the start of the step, scalar [s].
         scratch: (SCRATCH,) work space.
@@ -617,6 +605,7 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
 
     Source: docs/effects.md, laws of one's own: the balance `command`.
     """
+    count, act, length, velocity, command = drives
     if not acts_on(terms, COMMAND, ANY):
         for i in range(count):
             out[i] = command[i]
@@ -624,7 +613,6 @@ def add_to_commands(user, terms, count, act, command, length, velocity, dt, time
     open_ports(user, act, act, scratch, 0, count, 0.0, act)
     supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
     middle = time + 0.5 * dt
-    drives = Drives(count, act, length, velocity, command)
     for i in range(count):
         x = length[i] - 0.5 * dt * velocity[i]
         s = drive_state(user, i, count, act, supply, middle, x, velocity[i], command[i], 0.0)

@@ -15,6 +15,7 @@ machine stand in custom numbers of its model, which may differ between the model
 
 import ctypes
 import functools
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -119,21 +120,30 @@ def _terms_of(m, m_nnumeric, m_adr, m_size, m_data):
     return floats(m, 0)
 
 
+class _Fields(NamedTuple):
+    """Offsets of fields of mjData [bytes]."""
+
+    time: int
+    ctrl: int
+    act: int
+    act_dot: int
+    length: int
+    velocity: int
+
+
 @compiled
-def _state(
-    d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, d_velocity, nu, scratch
-):
+def _state(d, at, i, user, gain, dt, nu, scratch):
     """State of a drive with the pressures at the end of the step, and all drives' variables."""
     count, act = int(user[_COUNT]), floats(d, 0)
-    lengths = floats(carray(pointer(d + d_length), (1,), np.int64)[0], nu)
-    velocities = floats(carray(pointer(d + d_velocity), (1,), np.int64)[0], nu)
-    commands = floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu)
+    lengths = floats(carray(pointer(d + at.length), (1,), np.int64)[0], nu)
+    velocities = floats(carray(pointer(d + at.velocity), (1,), np.int64)[0], nu)
+    commands = floats(carray(pointer(d + at.ctrl), (1,), np.int64)[0], nu)
     x, velocity, command = lengths[i], velocities[i], _given(commands, i)
-    time, supply = floats(d + d_time, 1)[0], 0.0
+    time, supply = floats(d + at.time, 1)[0], 0.0
     if count > 0:
         size = 4 * count + int(user[_MEMORY])
-        start = floats(carray(pointer(d + d_act), (1,), np.int64)[0], size)
-        rate = floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0], size)
+        start = floats(carray(pointer(d + at.act), (1,), np.int64)[0], size)
+        rate = floats(carray(pointer(d + at.act_dot), (1,), np.int64)[0], size)
         act = scratch[SCRATCH:]
         for k in range(size):
             act[k] = start[k] + dt * rate[k]
@@ -151,22 +161,19 @@ def _advance_force_drive(user, u, act, rate, velocity, command, low, high, dt):
 
 
 @allocation_free
-def _advance_with_memory(
-    user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time, arrived
-):
+def _advance_with_memory(user, first, drives, dt, act_dot, scratch, terms, time, arrived):
     """`step_circuit` of what remembers, and the rates of bristles and of terms' memories."""
-    _, supply = step_circuit(
-        user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms, time,
-        len(act) - 4 * count,
-    )  # fmt: skip
+    count, act, length, velocity, _ = drives
+    memory = len(act) - 4 * count
+    _, supply = step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
     for i in range(first, first + count):
         u = i * SLOTS
         if user[u + _STIFFNESS] > 0.0:
             at = int(user[u + _BRISTLE])
             act_dot[at] = bristle_rate(user, u, act[at], velocity[i], user[u + _FELT], dt)
     if len(terms) > 0 and first == 0:
-        drives = Drives(count, act, length, velocity, arrived)
-        advance_memories(user, terms, drives, act_dot, dt, time, supply)
+        begun = Drives(count, act, length, velocity, arrived)
+        advance_memories(user, terms, begun, act_dot, dt, time, supply)
 
 
 @allocation_free
@@ -305,20 +312,17 @@ def _callbacks(remembers):
         if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
             terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
         if len(terms) > 0 and first == 0:
-            add_to_commands(
-                user, terms, count, act, command, length, velocity, dt, time, scratch, given
-            )
+            drives = Drives(count, act, length, velocity, command)
+            add_to_commands(user, terms, drives, dt, time, scratch, given)
             command = given
+        drives = Drives(count, act, length, velocity, command)
         if not remembers:
             step_circuit(
-                user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms,
-                time, np.int64(NO_MEMORY),  # numba compiles anew for a written number
+                user, first, drives, dt, act_dot, scratch, terms, time,
+                np.int64(NO_MEMORY),  # numba compiles anew for a written number
             )  # fmt: skip
         else:
-            _advance_with_memory(
-                user, first, count, act, command, length, velocity, dt, act_dot, scratch, terms,
-                time, arrived,
-            )  # fmt: skip
+            _advance_with_memory(user, first, drives, dt, act_dot, scratch, terms, time, arrived)
         return 0.0
 
     @callback(_SIGNATURE)
@@ -363,10 +367,9 @@ def _callbacks(remembers):
                 terms = floats(m, 0)
         commanded = gain != 0.0 and acts_on(terms, COMMAND, i)
         if commanded or acts_on(terms, FORCE, i):
-            s, drives = _state(
-                d, i, user, gain, dt, d_time, d_ctrl, d_act, d_act_dot, d_length, d_velocity, nu,
-                carray(_stack(0), (2 * SCRATCH,), np.float64),
-            )  # fmt: skip
+            at = _Fields(d_time, d_ctrl, d_act, d_act_dot, d_length, d_velocity)
+            scratch = carray(_stack(0), (2 * SCRATCH,), np.float64)
+            s, drives = _state(d, at, i, user, gain, dt, nu, scratch)
             more, steep = added_with_slope(terms, FORCE, i, s, drives)
             if commanded:
                 extra, slope = added_with_slope(terms, COMMAND, i, s, drives)

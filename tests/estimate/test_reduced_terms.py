@@ -9,6 +9,7 @@ from hydrotele.effects import Term, changed, with_terms
 from hydrotele.estimate.reduced_dynamics import simulate_rows
 from hydrotele.hydraulics.circuit import NO_MEMORY, circuit_scratch, step_circuit
 from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters
+from hydrotele.terms.law import Drives
 from hydrotele.terms.table import terms_table
 
 PERIOD = 0.02
@@ -95,10 +96,8 @@ def still_circuit(machine, terms, pressures, dt, end):
     zeros, table = np.zeros(count), terms_table(terms, order)
     x = np.full(count, 0.5)
     for k in range(round(end / dt)):
-        step_circuit(
-            user, 0, count, act, zeros, x, zeros, dt, rate, circuit_scratch(), table, k * dt,
-            NO_MEMORY,
-        )  # fmt: skip
+        drives = Drives(count, act, x, zeros, zeros)
+        step_circuit(user, 0, drives, dt, rate, circuit_scratch(), table, k * dt, NO_MEMORY)
         act += dt * rate
     return act.reshape(-1, 4)[:, 2:]
 

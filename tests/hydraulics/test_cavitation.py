@@ -23,6 +23,7 @@ from hydrotele.hydraulics.laws import (
 )
 from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.terms.law import Drives
 from hydrotele.terms.table import NO_TERMS
 
 BOOM = 1
@@ -44,7 +45,8 @@ def run(user, motion, dt, seconds, command=CLOSED, start=(1.0e6, 1.0e6)):
     for k in range(round(seconds / dt)):
         before, after = motion(k * dt)[0], motion((k + 1) * dt)[0]
         x, v = np.array([after]), np.array([(after - before) / dt])
-        step_circuit(user, 0, 1, act, command, x, v, dt, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
+        drives = Drives(1, act, x, v, command)
+        step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
         act += dt * rate
         states.append(act[2:].copy())
     return np.array(states)
@@ -203,7 +205,8 @@ def test_axes_that_share_a_supply_stay_sound_while_one_of_them_is_empty():
     least = []
     for _ in range(1500):
         x = x + 1e-3 * v
-        step_circuit(user, 0, 3, act, command, x, v, 1e-3, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
+        drives = Drives(3, act, x, v, command)
+        step_circuit(user, 0, drives, 1e-3, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
         act = act + 1e-3 * rate
         least.append(act[4 * BOOM + 2])
         assert np.isfinite(act).all()

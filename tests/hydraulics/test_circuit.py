@@ -19,6 +19,7 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.hydraulics.laws import port_flow
 from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.terms.law import Drives
 from hydrotele.terms.table import NO_TERMS
 
 SWING, BOOM, STICK = range(3)
@@ -38,10 +39,8 @@ def run(user, act, command, x, v, dt, steps, count=3):
     act, x, v = np.array(act, float), np.array(x, float), np.array(v, float)
     states, rate, scratch = [act.copy()], np.zeros_like(act), circuit_scratch()
     for k in range(steps):
-        step_circuit(
-            user, 0, count, act, command, x + (k + 1) * dt * v, v, dt, rate, scratch, NO_TERMS, 0.0,
-            NO_MEMORY,
-        )  # fmt: skip
+        drives = Drives(count, act, x + (k + 1) * dt * v, v, command)
+        step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
         act = act + dt * rate
         states.append(act)
     return np.array(states)

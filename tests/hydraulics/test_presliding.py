@@ -25,6 +25,7 @@ from hydrotele.hydraulics.parameters import actuator_parameters, extra_state_nam
 from hydrotele.machine.drives import Axis, Friction
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.terms.law import Drives
 from hydrotele.terms.table import NO_TERMS
 
 COULOMB, STRIBECK, SLOW, UNEQUAL = 150.0, 50.0, 0.02, 0.2
@@ -201,10 +202,8 @@ def test_the_pump_follows_by_its_exponential_and_arrives_at_todays_pressure():
     shares = []
     for _ in range(400):
         act[:4] = 0.6, 0.0, 2e6, 2e6
-        step_circuit(
-            user, 0, 1, act, np.array([0.62]), np.zeros(1), np.zeros(1), dt, rates, scratch,
-            NO_TERMS, 0.0, 1,
-        )  # fmt: skip
+        drives = Drives(1, act, np.zeros(1), np.zeros(1), np.array([0.62]))
+        step_circuit(user, 0, drives, dt, rates, scratch, NO_TERMS, 0.0, 1)
         act[4] += dt * rates[4]
         shares.append(act[4])
     # the pressures move a little within every step, and the wanted flow with them

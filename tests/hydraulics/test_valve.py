@@ -21,6 +21,7 @@ from hydrotele.hydraulics.parameters import Slot, actuator_parameters
 from hydrotele.hydraulics.valve import axis_opening, chamber_flows
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.terms.law import Drives
 from hydrotele.terms.table import NO_TERMS
 
 CAT = load_machine("cat215", "none")
@@ -148,8 +149,8 @@ def test_a_held_load_comes_down_as_fast_as_the_pilot_allows():
     user[Slot.LEAKAGE], v = 0.0, -speed(p_rod)
     act, rate = np.array([-0.5, 0.0, p_head, p_rod]), np.zeros(4)
     # both chambers must be in balance: no rate, within rounding of beta / V times the flow
-    step_circuit(user, 0, 1, act, np.array([-0.5]), np.array([0.5 + 1e-4 * v]), np.array([v]), 1e-4,
-                 rate, circuit_scratch(), NO_TERMS, 0.0, NO_MEMORY)  # fmt: skip
+    drives = Drives(1, act, np.array([0.5 + 1e-4 * v]), np.array([v]), np.array([-0.5]))
+    step_circuit(user, 0, drives, 1e-4, rate, circuit_scratch(), NO_TERMS, 0.0, NO_MEMORY)
     stiff = user[Slot.BULK_MODULUS] / user[Slot.VOLUME_HEAD] * head * abs(v)
     assert np.abs(rate[2:]).max() < 1e-9 * stiff
 
@@ -194,10 +195,8 @@ def test_the_step_converges_with_second_order_where_everything_is_in_it():
         act, rate, scratch = np.array(start), np.zeros(4), circuit_scratch()
         for n in range(round(0.032 / dt)):
             x = np.array([x0 + (n + 1) * dt * v])
-            step_circuit(
-                user, 0, 1, act, np.array([command]), x, np.array([v]), dt, rate, scratch, NO_TERMS,
-                0.0, NO_MEMORY,
-            )  # fmt: skip
+            drives = Drives(1, act, x, np.array([v]), np.array([command]))
+            step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
             act = act + dt * rate
         errors.append(np.abs(act - exact)[2:].max())
     # 2 in the limit; a kink of the curve or the compensator inside a step costs some of it
@@ -328,8 +327,8 @@ def test_chambers_keep_their_volume_beyond_the_ends():
     for x, v in ((-0.3, -0.2), (1.35, 0.2)):  # far enough to empty a chamber of 4 litres
         act, rate = np.array([0.0, 0.0, 4e6, 4e6]), np.zeros(4)
         for _ in range(200):
-            step_circuit(user, 0, 1, act, np.zeros(1), np.array([x]), np.array([v]), 1e-3, rate,
-                         circuit_scratch(), NO_TERMS, 0.0, NO_MEMORY)  # fmt: skip
+            drives = Drives(1, act, np.array([x]), np.array([v]), np.zeros(1))
+            step_circuit(user, 0, drives, 1e-3, rate, circuit_scratch(), NO_TERMS, 0.0, NO_MEMORY)
             act = act + 1e-3 * rate
         assert np.isfinite(act).all()
         squeezed = act[2] if v < 0 else act[3]

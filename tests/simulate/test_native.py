@@ -22,6 +22,7 @@ from hydrotele.hydraulics.circuit import (
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.simulate.plant import build_plant, rest_state
+from hydrotele.terms.law import Drives
 from hydrotele.terms.table import NO_TERMS
 
 HOLD = 20  # steps of one command
@@ -44,10 +45,8 @@ def test_step_is_the_pure_circuit_bit_for_bit(plant_of, tool):
             mujoco.mj_fwdPosition(model, data)
             mujoco.mj_fwdVelocity(model, data)
             act, velocity = data.act.copy(), data.actuator_velocity.copy()
-            step_circuit(
-                user, 0, plant.hydraulic, act, data.ctrl, data.actuator_length, velocity, dt, rate,
-                scratch, NO_TERMS, 0.0, NO_MEMORY,
-            )  # fmt: skip
+            drives = Drives(plant.hydraulic, act, data.actuator_length, velocity, data.ctrl)
+            step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
             mujoco.mj_step(model, data)
             assert np.array_equal(data.act, act + dt * rate)
             ends = (act + dt * rate).reshape(-1, ACTIVATIONS)
