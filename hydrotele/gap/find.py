@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.calibration import CALIBRATION
@@ -79,6 +80,9 @@ _FAR = 3.0  # stated uncertainties, by which a calibrated number must
 Progress = Callable[[str, float], None]
 
 
+# The search's own workers take the processors; threads of BLAS beside them wait for one another,
+# and products of matrices then take ten times as long. Nor may results depend on their number.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def find_gap(
     data: Dataset,
     progress: Progress | None = None,
