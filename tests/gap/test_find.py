@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from threadpoolctl import threadpool_info
 
 from hydrotele.estimate.calibration import CALIBRATION, calibration
 from hydrotele.estimate.evidence import Judged
@@ -346,3 +347,23 @@ def test_what_may_only_make_up_for_something_else_is_a_detail():
     assert without_details((hose, air), False, axes) == ((hose,), (air,))  # trial 0006 of seed 780
     slow = effect("pressure_lag", "stick", 0.007)  # as in a library trial
     assert without_details((air, slow, teeth), False, axes, perfect=True)[0] == (air, slow, teeth)
+
+
+def test_the_search_holds_blas_to_one_thread(monkeypatch):
+    """Its workers take the processors; more threads would wait for one another."""
+
+    class Stopped(Exception):
+        pass
+
+    def stop(*_):
+        raise Stopped(*(pool["num_threads"] for pool in blas()))
+
+    def blas():
+        return [pool for pool in threadpool_info() if pool["user_api"] == "blas"]
+
+    before = [pool["num_threads"] for pool in blas()]
+    monkeypatch.setattr(find, "calibrate_freely", stop)
+    with pytest.raises(Stopped) as caught:
+        find_gap(SimpleNamespace(machine=None))  # type: ignore[arg-type]
+    assert before and set(caught.value.args) == {1}
+    assert [pool["num_threads"] for pool in blas()] == before
