@@ -66,7 +66,9 @@ def inlined(function):
 
 def _compile(function, **options):
     with _caching(function.__module__) as cache:
-        made: Any = njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
+        made: Any = njit(
+            cache=cache, error_model="numpy", nogil=True, no_cfunc_wrapper=True, **options
+        )(function)  # the wrapper for calls by address, a fifth of the time, has `callback`
         if cache:
             made._cache = _SharedCache(function)
         return made
@@ -83,10 +85,14 @@ class Callback:
     def __init__(self, function, signature) -> None:
         self._function, self._signature = function, signature
 
-    def compile_elsewhere(self) -> None:
-        """Begin to compile in a process beside this one, see the function of that name."""
+    def compile_elsewhere(self, then: str = "") -> None:
+        """Begin to compile in a process beside this one, see the function of that name.
+
+        Args:
+            then: Python code that the process runs afterwards.
+        """
         module, name = self._function.__module__, self._function.__name__
-        compile_elsewhere(self._function, f"from {module} import {name}; {name}.address")
+        compile_elsewhere(self._function, f"from {module} import {name}; {name}.address; {then}")
 
     @functools.cached_property
     def _compiled(self) -> Any:

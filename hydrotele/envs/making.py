@@ -59,6 +59,7 @@ _STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 _TYPES: dict[str, TypeAdapter] = {
     name: TypeAdapter(hint, config=_STRICT) for name, hint in get_type_hints(Options).items()
 }
+_LOOPS = "from hydrotele.multibody.closures import compile_openings; compile_openings()"
 AUTORESET = {"NextStep": NEXT_STEP, "SameStep": SAME_STEP, "Disabled": DISABLED}
 
 
@@ -85,7 +86,7 @@ def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode
         name = sorted(strange)[0]
         raise InputError(f"environment option {name!r}", suggest(name, known))
     options = _options(choices)
-    advance.compile_elsewhere()  # while the plant's own code is compiled here
+    advance.compile_elsewhere(_LOOPS)  # while the plant's own code is compiled here
     return TaskCore(TASKS[task], options, count, threads, mode)
 
 

@@ -11,11 +11,12 @@ a platform give those of its drives.
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
-from hydrotele.multibody.chain import Chain, Tree
+from hydrotele.multibody.chain import Chain, Tree, load_chain
 from hydrotele.multibody.tree_motion import (
     Frames,
     add,
@@ -219,6 +220,14 @@ def _openings(tree, q):
     move_tree(tree, q, still, still, np.zeros(3), frames)
     loop_errors(tree, frames, gap, slope)
     return gap, slope
+
+
+def compile_openings() -> None:
+    """Compile what `close_from` and `motion_basis` call, by a pendulum."""
+    body = '<body><joint name="hinge"/><geom size="1"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    tree = load_chain(model).tree
+    _openings(tree, np.zeros_like(tree.zero))
 
 
 def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.ndarray:

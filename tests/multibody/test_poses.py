@@ -5,6 +5,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
+from hydrotele.multibody import closures
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.closures import assemblies, jacobian, joint_positions
 
@@ -74,3 +75,10 @@ def test_refusals(chain):
         joint_positions(chain, POSE, np.full((1, 6), np.nan))
     with pytest.raises(InputError, match="row 0: the loops of palida cannot be closed"):
         joint_positions(chain, chain.drives, np.full((1, 6), 0.05))
+
+
+def test_a_pendulum_compiles_what_machines_need(chain):
+    closures.compile_openings()
+    count = len(closures._openings.signatures)  # one kind of arguments, for all trees
+    closures.close_from(chain.tree, np.array(chain.start), np.arange(3), 1e-9, 1.0)
+    assert len(closures._openings.signatures) == count == 1
