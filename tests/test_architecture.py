@@ -47,7 +47,7 @@ ONLY = {
 }
 
 HEAVY = {"rerun": {"show", "envs"}, "matplotlib": {"show", "envs"}, "gymnasium": {"show", "envs"}}
-MAX_LINES = 750
+MAX_LINES = 1000
 UNFINISHED = re.compile(r"\b(?:TODO|FIXME|XXX|HACK)\b")
 MACHINE_PATH = re.compile(r"(?<![\w.:/~$}-])/(?:work|home|root|Users|mnt|srv|tmp)/\w")
 

@@ -6,7 +6,7 @@
     python tools/arm_calibration.py speed
 
 Each prints a Markdown section; `--out FILE` writes it. Truth, noise and corruption are simulated by
-`hydrotele.experiments.calibrator`; the identification sees readings only.
+`hydrotele.experiments.khoshzaban1992`; the identification sees readings only.
 """
 
 import argparse
@@ -15,13 +15,12 @@ import time
 
 import numpy as np
 
-from hydrotele.calibrate.arm import identify_arm, identify_jointly
-from hydrotele.calibrate.arm_machine import machine_with_loop
+from hydrotele.calibrate.arm import identify_arm, identify_jointly, machine_with_loop
 from hydrotele.calibrate.arm_poses import with_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
 from hydrotele.calibrate.design import STILL, SWEEPS, sweep_poses
 from hydrotele.calibrate.loop import loop_of, unit_of
-from hydrotele.experiments.calibrator import perturbed, readings, tip_errors, true_numbers
+from hydrotele.experiments.khoshzaban1992 import perturbed, readings, tip_errors, true_numbers
 from hydrotele.machine.machine_file import load_machine
 
 TRUTH = 1992  # seed of the machine whose noise is studied

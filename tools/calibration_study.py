@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.calibrate.mukca import Options, calibrate_sockets, judge
-from hydrotele.calibrate.robot_simulation import Errors, robot_with_errors, simulated_sockets
+from hydrotele.calibrate.sockets import Errors, robot_with_errors, simulated_sockets
 from hydrotele.identify.identifiability import COMBINATION, FULL
-from hydrotele.kinematics.robot_file import load_robot
+from hydrotele.kinematics.serial_robot import load_robot
 
 PLACES = {
     "left": (0.45, 0.25, 0.05), "right": (0.45, -0.30, 0.05), "front": (0.60, 0.0, 0.05),

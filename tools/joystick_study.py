@@ -28,7 +28,7 @@ from hydrotele.teleop.levitation import (
     simulate_levitation,
 )
 from hydrotele.teleop.master import master, master_step
-from hydrotele.teleop.sampled_handle import (
+from hydrotele.teleop.sampled import (
     largest_damping,
     least_inertia,
     slowest_decay,

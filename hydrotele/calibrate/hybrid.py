@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.stats
 
+from hydrotele.calibrate.design import Criterion, select_poses
 from hydrotele.calibrate.estimation import ParameterFit, Prior, identifiable, least_squares
 from hydrotele.calibrate.hybrid_data import Measurement
-from hydrotele.calibrate.poses import Criterion, select_poses
 from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import COMBINATION, FULL, Identifiability
 from hydrotele.kinematics.hybrid import (

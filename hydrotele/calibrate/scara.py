@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hydrotele.calibrate.design import Selection, leave_one_out, select_poses
 from hydrotele.calibrate.estimation import ParameterFit, least_squares
-from hydrotele.calibrate.poses import Selection, leave_one_out, select_poses
 from hydrotele.core.datafile import Facts, Positive, parse, read_yaml
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text

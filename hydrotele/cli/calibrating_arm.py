@@ -7,9 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import hydrotele
-from hydrotele.calibrate.arm import ArmFit, identify_arm, identify_jointly, stage_residuals
+from hydrotele.calibrate.arm import (
+    ArmFit,
+    calibrated_machine,
+    identify_arm,
+    identify_jointly,
+    stage_residuals,
+)
 from hydrotele.calibrate.arm_data import held_out, read_stages, strokes_of
-from hydrotele.calibrate.arm_machine import calibrated_machine
 from hydrotele.calibrate.arm_poses import Poses, with_drift
 from hydrotele.calibrate.bad_data import Region, identify_without_bad_data
 from hydrotele.calibrate.linkage import (

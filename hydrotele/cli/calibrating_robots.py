@@ -36,8 +36,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.identify.identifiability import FULL
-from hydrotele.kinematics.robot_file import corrected_urdf, load_robot, robot_yaml
-from hydrotele.kinematics.serial_robot import Robot
+from hydrotele.kinematics.serial_robot import Robot, corrected_urdf, load_robot, robot_yaml
 
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "*.urdf", "*.xml")
 _EXAMPLE = ScaraFacts(length_a=0.4, length_b=0.3)

@@ -18,10 +18,9 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.core.output import check_target, whole_folder
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.customary import in_customary_units
 from hydrotele.gap.description import effect_title, headline, verdict_words
 from hydrotele.gap.patched import add_head, has_patch, write_effects, write_patch
-from hydrotele.gap.result import Gap, finite, gap_document
+from hydrotele.gap.result import Gap, finite, gap_document, in_customary_units
 from hydrotele.identify.mechanism import Mechanism, load_mechanism, mechanism_records
 from hydrotele.identify.motion import Processing, joint_motion, resolution
 from hydrotele.logs.dataset import Dataset, load_dataset

@@ -21,7 +21,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from hydrotele.control.recursive import RecursiveLeastSquares
 from hydrotele.control.state_filter import (
     CHANGE,
     LAST,
@@ -33,6 +32,7 @@ from hydrotele.control.state_filter import (
     filtered,
     noise_gains,
 )
+from hydrotele.control.task_impedance import RecursiveLeastSquares
 from hydrotele.control.tip_balance import (
     arm_joints,
     arm_of,
@@ -52,8 +52,8 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.noise import noise_rms
 from hydrotele.machine.sensors import SensorSet
+from hydrotele.machine.signals import noise_rms
 
 _NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
 _GRID = 9  # poses per joint to which the masses' torques are fitted

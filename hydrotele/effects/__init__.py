@@ -31,8 +31,7 @@ from pathlib import Path
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.effects._own import add_from_environment, add_plugins, read_effects
-from hydrotele.effects._terms import term_number, with_terms
-from hydrotele.effects.effect import Effect, Parameter, changed
+from hydrotele.effects.effect import Effect, Parameter, changed, term_number, with_terms
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Term
 from hydrotele.terms.law import DriveState, Numbers, Variable, law

@@ -5,7 +5,6 @@ Leakage through a gap so short that its flow is turbulent: a torn seal, a cracke
 
 import math
 
-from hydrotele.effects._terms import term_number, with_terms
 from hydrotele.effects.effect import (
     Effect,
     Parameter,
@@ -13,7 +12,9 @@ from hydrotele.effects.effect import (
     changed,
     drive_kind,
     hydraulics,
+    term_number,
     valves,
+    with_terms,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Term

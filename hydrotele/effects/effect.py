@@ -1,15 +1,18 @@
 """What an effect is: a name, a sentence, places, parameters, and the change of the Machine.
 
 Sizes of a machine that make the sizes of an effect relative to it.
+
+Terms that an effect puts into a machine, found again by the effect's name.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
 
 from hydrotele.machine.machine import Machine
+from hydrotele.terms.facts import Balance, Term
 
 Law = Literal["force", "flow", "valve", "supply", "geometry", "timing", "sensor"]
 Values = Mapping[str, float]
@@ -218,3 +221,46 @@ def link_size(machine: Machine, link: str) -> float:
     point = outboard_point(machine, link)
     far = 0.0 if point is None else float(np.linalg.norm(point))
     return max(far, float(np.linalg.norm(machine.links[link].com)), 1.0e-3)
+
+
+def term_number(
+    machine: Machine, name: str, axis: str, balance: Balance, parameter: str, absent: float
+) -> float:
+    """A parameter of the term that an effect put onto a drive.
+
+    Args:
+        machine: the machine.
+        name: of the effect.
+        axis: of the drive.
+        balance: of the term.
+        parameter: of its law.
+        absent: what to return where there is no such term.
+
+    Returns:
+        Its value.
+    """
+    for term in machine.terms:
+        if (term.name, term.axis, term.balance) == (name, axis, balance):
+            value = term.parameters[parameter]
+            assert isinstance(value, float)
+            return value
+    return absent
+
+
+def with_terms(
+    machine: Machine, name: str, terms: Iterable[Term], axes: Iterable[str] | None = None
+) -> Machine:
+    """A machine whose terms of a name are these, in place of those of that name.
+
+    Args:
+        machine: the machine.
+        name: of the effect.
+        terms: the new ones, none to take the effect out.
+        axes: of which terms are replaced; None for all.
+
+    Returns:
+        The changed machine.
+    """
+    where = set(machine.axes if axes is None else axes)
+    kept = [term for term in machine.terms if term.name != name or term.axis not in where]
+    return machine.model_copy(update={"terms": (*kept, *terms)})

@@ -1,6 +1,5 @@
 """Forces on a drive that the model lacks: constant, for a while, or growing with the speed."""
 
-from hydrotele.effects._terms import term_number, with_terms
 from hydrotele.effects.effect import (
     Effect,
     Parameter,
@@ -9,7 +8,9 @@ from hydrotele.effects.effect import (
     force_unit,
     largest_force,
     speed_unit,
+    term_number,
     usual_speed,
+    with_terms,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Term

@@ -7,7 +7,6 @@ Dry friction that is a spring below breakaway: the bristles of a drive's seals a
 
 import math
 
-from hydrotele.effects._terms import term_number, with_terms
 from hydrotele.effects.effect import (
     Effect,
     Parameter,
@@ -19,7 +18,9 @@ from hydrotele.effects.effect import (
     force_unit,
     largest_force,
     speed_unit,
+    term_number,
     usual_speed,
+    with_terms,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Term

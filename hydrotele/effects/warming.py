@@ -1,7 +1,6 @@
 """Oil and grease that warm up during a run: less viscous friction, more leakage."""
 
-from hydrotele.effects._terms import with_terms
-from hydrotele.effects.effect import Effect, Parameter, Values
+from hydrotele.effects.effect import Effect, Parameter, Values, with_terms
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import Term
 

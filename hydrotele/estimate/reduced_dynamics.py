@@ -36,7 +36,7 @@ from hydrotele.hydraulics.circuit import (
 )
 from hydrotele.hydraulics.laws import pressure_with_air, pressure_without_air
 from hydrotele.hydraulics.parameters import SLOTS, Slot
-from hydrotele.machine.noise import first_order
+from hydrotele.machine.signals import first_order
 from hydrotele.multibody.reduced_closures import (
     close_chains,
     drift_chains,

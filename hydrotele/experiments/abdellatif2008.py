@@ -33,12 +33,11 @@ from hydrotele.experiments.palida import (
     square,
     track,
 )
-from hydrotele.identify.estimation import Estimate, estimate
+from hydrotele.identify.estimation import Estimate, Reduction, estimate, reduce_parameters
 from hydrotele.identify.excitation import Excitation, information
 from hydrotele.identify.mechanism import ColumnMapping, in_coordinates, load_mechanism
 from hydrotele.identify.motion import Processing, joint_motion, resolution
 from hydrotele.identify.record import IdentificationRecord
-from hydrotele.identify.reduction import Reduction, reduce_parameters
 from hydrotele.multibody.inverse_dynamics import project
 
 _PERIODS = 4  # of the motion in one experiment

@@ -7,14 +7,14 @@ one per seed; a claim has to hold for all of them.
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from hydrotele.experiments import zhu_false_force, zhu_felling, zhu_forces, zhu_motion
+from hydrotele.experiments import zhu_felling, zhu_forces, zhu_motion
 from hydrotele.experiments.finding import Changes, Experiment, Finding, Progress, Sample, performed
 
 EXPERIMENTS: tuple[Experiment, ...] = (
     *zhu_motion.EXPERIMENTS,
     *zhu_forces.EXPERIMENTS,
     *zhu_felling.EXPERIMENTS,
-    *zhu_false_force.EXPERIMENTS,
+    *zhu_forces.FALSE_FORCE,
 )
 
 

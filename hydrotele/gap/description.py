@@ -10,9 +10,7 @@ import numpy as np
 
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.inputs import SUPPLY, Input, input_units
-from hydrotele.gap.customary import amount, in_customary_units
-from hydrotele.gap.discover import Discovery
-from hydrotele.gap.law_candidates import Learned
+from hydrotele.gap.discover import Discovery, Learned
 from hydrotele.gap.law_tables import AHEAD, PLAYED, THROUGH, Memory
 from hydrotele.gap.result import (
     LIKELY,
@@ -27,6 +25,8 @@ from hydrotele.gap.result import (
     NamedEffect,
     Prediction,
     Unknown,
+    amount,
+    in_customary_units,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.facts import OF_A_DRIVE

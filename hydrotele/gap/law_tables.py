@@ -5,8 +5,8 @@ It may see a variable through a play, or be switched by one, as a relay with hys
 Regression of prediction errors on the entries of a law's table, judged by parts of runs left out.
 
 The errors are those of a track whose unknown inputs have taken up what they could; how they answer
-to an addition is known to first order (`estimate.responses`). So a reading counts as it does in
-the likelihood, and a law that is faster than the unknown inputs is seen as it is, not as a smoother
+to an addition is known to first order (`estimate.track`). So a reading counts as it does in the
+likelihood, and a law that is faster than the unknown inputs is seen as it is, not as a smoother
 blurs it. Entries that follow each other are taken to be alike (P-splines, Eilers and Marx 1996).
 """
 
@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.estimate.responses import error_responses
-from hydrotele.estimate.track import Track
+from hydrotele.estimate.track import Track, error_responses
 from hydrotele.terms.facts import OF_A_DRIVE
 from hydrotele.terms.table import PLAY, SWITCH, acting, remembered
 

@@ -16,27 +16,33 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.gap.description import channel_words, lack_words
 from hydrotele.gap.find import Progress, detail_words, verdict_of, without_details
-from hydrotele.gap.mechanism_columns import Columns, build_columns, common_band, separate_setup
-from hydrotele.gap.mechanism_effects import (
+from hydrotele.gap.mechanism_columns import (
     SENTENCES,
+    Columns,
     Key,
     MechanismEffect,
+    build_columns,
+    common_band,
     mechanism_effects,
+    separate_setup,
     undone,
 )
 from hydrotele.gap.mechanism_evidence import (
     Evidence,
     Fitted,
+    Left,
     Noise,
     effects_by_part,
+    find_left,
     find_noise,
     gather_evidence,
+    loud_windows,
     noise_of,
     possible_errors,
     row_weights,
     whitened,
+    with_variation,
 )
-from hydrotele.gap.mechanism_lack import Left, find_left, loud_windows, with_variation
 from hydrotele.gap.patched import (
     COLUMNS_FILE,
     MJCF_FILE,

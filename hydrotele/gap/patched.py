@@ -12,11 +12,16 @@ import mujoco
 import numpy as np
 import yaml
 
-from hydrotele.gap.customary import in_customary_units
 from hydrotele.gap.description import effect_title, learned_title, number_title
-from hydrotele.gap.mechanism_columns import STRIBECK, tilted
-from hydrotele.gap.mechanism_effects import MechanismEffect
-from hydrotele.gap.result import Estimate, Gap, effect_document, finite, gap_document
+from hydrotele.gap.mechanism_columns import STRIBECK, MechanismEffect, tilted
+from hydrotele.gap.result import (
+    Estimate,
+    Gap,
+    effect_document,
+    finite,
+    gap_document,
+    in_customary_units,
+)
 from hydrotele.identify.mechanism import ColumnMapping
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
 from hydrotele.machine.sensors import SensorError

@@ -1,15 +1,35 @@
-"""What a haptic device is to its server: read the handle, write a wrench. One of them is simulated.
+"""What a haptic device is to its server: read the handle, write a wrench; and three of them.
 
 The simulated device is a handle of six axes with a mass and a light friction, stops at the ends of
 its travel, and a hand on it: a mass that a spring and a damper pull to where the person wants it.
+
+Force Dimension devices (omega, delta, sigma, lambda) through the DHD library.
+
+The Python package `forcedimension-core` binds the vendor's SDK, which the vendor gives to owners of
+a device; neither is needed unless such a device is asked for. Not tried with hardware here: the
+adapter is tested against a stand-in of the package that records the calls.
+
+Haption devices (Virtuose) through the vendor's VirtuoseAPI, bound by ctypes.
+
+The library `libVirtuoseAPI` comes from the vendor with a device and is not needed unless such a
+device is asked for. Not tried with hardware here: the adapter is tested against a library of the
+same functions that records the calls. Functions, their arguments and codes are those of the
+vendor's header as public programs use it; axes and limits come at second hand, too.
+
+Its place is counted from its foot, so that the centre of the handle is where it is when the server
+starts. Axes of devices of both vendors: x towards the user, y to the right, z up.
 """
 
+import ctypes
+import ctypes.util
+import os
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
 
 _HESITATION = 1.0  # s from when a machine is in control until the simulated person moves
 _FINE = 4  # steps of the simulated handle per period: its stops turn over in 6 ms
@@ -195,3 +215,238 @@ def _move(numbers, wanted, wrench, period, state):
             v += step * force / own
             state[1, i] = v
             state[0, i] = x + step * v
+
+
+_FORCE_DIMENSION = "--kind force-dimension"
+_FROM_DHD = np.diag([-1.0, -1.0, 1.0])  # half a turn about z
+# DHD's name of a device contains: travel [m], rotation [rad], force [N], torque [N m]. Forces and
+# torques of omega.7 and sigma.7 are those in CHAI3D's driver for them, the rest are assumptions;
+# none was checked against the vendor's data sheets.
+_DHD_DEVICES = {
+    "omega.3": Abilities(0.055, 0.0, 12.0, 0.0),
+    "omega.6": Abilities(0.055, 0.0, 12.0, 0.0),  # its wrist gives no torque
+    "omega.7": Abilities(0.055, 0.0, 12.0, 0.0),
+    "delta.3": Abilities(0.13, 0.0, 20.0, 0.0),
+    "sigma.7": Abilities(0.065, 0.6, 12.0, 0.2),
+    "lambda.7": Abilities(0.085, 0.6, 20.0, 0.4),
+}
+_DHD_LEAST = Abilities(0.05, 0.0, 8.0, 0.0)  # of a device that is none of these
+
+
+class ForceDimension:
+    """The first Force Dimension device that is connected."""
+
+    def __init__(self, dhd: Any = None) -> None:
+        """Open it, with its gravity compensation and forces on.
+
+        Args:
+            dhd: the binding's module `dhd`; imported by default.
+
+        Raises:
+            InputError: package or SDK are missing, or no device is connected.
+        """
+        self._dhd = dhd = dhd or _dhd_module()
+        if dhd.open() < 0:
+            why = dhd.errorGetLastStr()
+            raise InputError(
+                _FORCE_DIMENSION, f"no device can be opened ({why}): connect it, switch it on"
+            )
+        name = str(dhd.getSystemName() or "").lower()
+        known = [a for key, a in _DHD_DEVICES.items() if key in name]
+        self.abilities = known[0] if known else _DHD_LEAST
+        dhd.setGravityCompensation(True)
+        dhd.enableForce(True)
+        self._place, self._turn = [0.0] * 3, [[0.0] * 3 for _ in range(3)]
+
+    def read(self) -> HandlePose:
+        """Where the handle is now.
+
+        Raises:
+            OSError: the device does not answer.
+        """
+        # 0 or a positive code is success (the device tells that nothing is new), -1 is failure
+        if self._dhd.getPositionAndOrientationFrame(self._place, self._turn) < 0:
+            raise OSError(self._dhd.errorGetLastStr())
+        turn = _FROM_DHD @ np.array(self._turn) @ _FROM_DHD.T
+        buttons = int(self._dhd.getButtonMask())
+        return HandlePose(_FROM_DHD @ np.array(self._place), _quaternion(turn), buttons)
+
+    def write(self, wrench: np.ndarray, on: bool) -> None:
+        """Put a wrench on the handle.
+
+        Raises:
+            OSError: the device does not answer.
+        """
+        force, torque = _FROM_DHD.T @ wrench[:3], _FROM_DHD.T @ wrench[3:]
+        if self._dhd.setForceAndTorque(force.tolist(), torque.tolist()) < 0:
+            raise OSError(self._dhd.errorGetLastStr())
+
+    def close(self) -> None:
+        """Take the force off and let go of it."""
+        self._dhd.enableForce(False)
+        self._dhd.close()
+
+
+def _dhd_module() -> Any:
+    """The module `dhd` of the binding."""
+    try:
+        from forcedimension_core import dhd  # pyright: ignore[reportMissingImports] - optional
+    except ImportError as error:
+        message = (
+            "needs the Force Dimension SDK and its Python package: install the SDK, set FDSDK to"
+            f" its folder, then pip install forcedimension-core ({error})"
+        )
+        raise InputError(_FORCE_DIMENSION, message) from None
+    return dhd
+
+
+def _quaternion(turn: np.ndarray) -> np.ndarray:
+    """(4,), scalar first, of a rotation matrix."""
+    import mujoco
+
+    out = np.empty(4)
+    mujoco.mju_mat2Quat(out, np.ascontiguousarray(turn).ravel())
+    return out
+
+
+_HAPTION = "--kind haption"
+LIBRARY = "VIRTUOSE_API"  # environment variable with the library's file
+ADDRESS = "127.0.0.1#53210"  # where the vendor's service listens on the same computer
+_IMPEDANCE, _NO_INDEXING = 3, 2  # COMMAND_TYPE_IMPEDANCE, INDEXING_NONE
+_BUTTONS = (1, 2)
+_FROM_VIRTUOSE = np.array([-1.0, -1.0, 1.0])  # half a turn about z
+# CHAI3D's driver has 30 N, 3 N m and 0.45 m for a Virtuose 6D. A third of it is what is given here
+# for hours: an assumption, not checked against a data sheet, as is the turning.
+_ABILITIES = Abilities(travel=0.15, rotation=0.6, force=10.0, torque=1.0)
+_ARGUMENTS = {
+    "virtOpen": (ctypes.c_char_p,), "virtClose": (ctypes.c_void_p,),
+    "virtGetErrorCode": (ctypes.c_void_p,), "virtGetErrorMessage": (ctypes.c_int,),
+    "virtSetIndexingMode": (ctypes.c_void_p, ctypes.c_int),
+    "virtSetForceFactor": (ctypes.c_void_p, ctypes.c_float),
+    "virtSetSpeedFactor": (ctypes.c_void_p, ctypes.c_float),
+    "virtSetTimeStep": (ctypes.c_void_p, ctypes.c_float),
+    "virtSetBaseFrame": (ctypes.c_void_p, ctypes.POINTER(ctypes.c_float)),
+    "virtSetObservationFrame": (ctypes.c_void_p, ctypes.POINTER(ctypes.c_float)),
+    "virtSetCommandType": (ctypes.c_void_p, ctypes.c_int),
+    "virtSetPowerOn": (ctypes.c_void_p, ctypes.c_int),
+    "virtGetPosition": (ctypes.c_void_p, ctypes.POINTER(ctypes.c_float)),
+    "virtGetButton": (ctypes.c_void_p, ctypes.c_int, ctypes.POINTER(ctypes.c_int)),
+    "virtSetForce": (ctypes.c_void_p, ctypes.POINTER(ctypes.c_float)),
+}  # fmt: skip
+
+
+class Haption:
+    """A Haption device at an address."""
+
+    abilities = _ABILITIES
+
+    def __init__(self, period: float, address: str = ADDRESS, library: Any = None) -> None:
+        """Open it, with its forces on.
+
+        Args:
+            period: of the server [s].
+            address: of the vendor's service or of the device, `HOST#PORT`.
+            library: the vendor's library; the one that VIRTUOSE_API names by default.
+
+        Raises:
+            InputError: the library is missing, or no device answers there.
+        """
+        self._api = api = _bound(library or _virtuose())
+        self._device = api.virtOpen(address.encode())
+        if not self._device:
+            message = f"no device answers at {address} ({self._why(None)}): start its service"
+            raise InputError(_HAPTION, f"{message}, or name it with --kind haption:HOST#PORT")
+        self._seven, self._six = (ctypes.c_float * 7)(), (ctypes.c_float * 6)()
+        self._pressed = ctypes.c_int()
+        frame = (ctypes.c_float * 7)(0, 0, 0, 0, 0, 0, 1)
+        try:
+            for name, value in (
+                ("IndexingMode", _NO_INDEXING), ("ForceFactor", 1.0), ("SpeedFactor", 1.0),
+                ("TimeStep", period), ("BaseFrame", frame), ("ObservationFrame", frame),
+                ("CommandType", _IMPEDANCE), ("PowerOn", 1),
+            ):  # fmt: skip
+                self._done(getattr(api, f"virtSet{name}")(self._device, value))
+            self._centre, self._turned = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+            begun = self.read()
+        except OSError as error:
+            api.virtClose(self._device)
+            raise InputError(_HAPTION, f"does not take its settings ({error})") from None
+        self._centre, self._turned = begun.place, begun.quaternion * [1.0, -1.0, -1.0, -1.0]
+
+    def read(self) -> HandlePose:
+        """Where the handle is now.
+
+        Raises:
+            OSError: the device does not answer.
+        """
+        api, device = self._api, self._device
+        self._done(api.virtGetPosition(device, self._seven))
+        seven, buttons = np.array(self._seven), 0
+        for bit, number in enumerate(_BUTTONS):
+            self._done(api.virtGetButton(device, number, ctypes.byref(self._pressed)))
+            buttons |= (self._pressed.value != 0) << bit
+        x, y, z, w = seven[3:]  # the vendor's order: scalar last
+        turn = np.array([w, *(_FROM_VIRTUOSE * (x, y, z))])
+        return HandlePose(
+            _FROM_VIRTUOSE * seven[:3] - self._centre, _product(turn, self._turned), buttons
+        )
+
+    def write(self, wrench: np.ndarray, on: bool) -> None:
+        """Put a wrench on the handle.
+
+        Raises:
+            OSError: the device does not answer.
+        """
+        self._six[:3], self._six[3:] = _FROM_VIRTUOSE * wrench[:3], _FROM_VIRTUOSE * wrench[3:]
+        self._done(self._api.virtSetForce(self._device, self._six))
+
+    def close(self) -> None:
+        """Take the force off and let go of it."""
+        self._six[:] = [0.0] * 6
+        self._api.virtSetForce(self._device, self._six)
+        self._api.virtSetPowerOn(self._device, 0)
+        self._api.virtClose(self._device)
+
+    def _done(self, code: int) -> None:
+        if code != 0:
+            raise OSError(self._why(self._device))
+
+    def _why(self, device: int | None) -> str:
+        message = self._api.virtGetErrorMessage(self._api.virtGetErrorCode(device))
+        return message.decode(errors="replace") if message else "no reason given"
+
+
+def _virtuose() -> Any:
+    """The vendor's library."""
+    name = os.environ.get(LIBRARY) or ctypes.util.find_library("VirtuoseAPI")
+    if not name:
+        message = f"needs the vendor's libVirtuoseAPI: install it, or set {LIBRARY} to its file"
+        raise InputError(_HAPTION, message)
+    try:
+        return ctypes.CDLL(name)
+    except OSError as error:
+        raise InputError(_HAPTION, f"cannot load the vendor's library ({error})") from None
+
+
+def _bound(library: Any) -> Any:
+    """The library with the types of what is used."""
+    for name, arguments in _ARGUMENTS.items():
+        try:
+            function = getattr(library, name)
+        except AttributeError:
+            raise InputError(_HAPTION, f"the library has no {name}: is it VirtuoseAPI?") from None
+        function.argtypes = list(arguments)
+        function.restype = {
+            "virtOpen": ctypes.c_void_p,
+            "virtGetErrorMessage": ctypes.c_char_p,
+        }.get(name, ctypes.c_int)
+    return library
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Product (4,) of two quaternions, scalar first."""
+    import mujoco
+
+    out = np.empty(4)
+    mujoco.mju_mulQuat(out, np.asarray(a, float), np.asarray(b, float))
+    return out

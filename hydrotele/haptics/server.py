@@ -19,7 +19,14 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.device import HapticDevice, SimulatedDevice, within_limits
+from hydrotele.haptics.device import (
+    ADDRESS,
+    ForceDimension,
+    HapticDevice,
+    Haption,
+    SimulatedDevice,
+    within_limits,
+)
 from hydrotele.haptics.packets import (
     ABLE,
     ANSWERED,
@@ -301,12 +308,8 @@ def open_haptic(kind: str, period: float) -> HapticDevice:
     if kind == "simulated":
         return SimulatedDevice(period)
     if kind == "force-dimension":
-        from hydrotele.haptics.force_dimension import ForceDimension
-
         return ForceDimension()
     name, _, address = kind.partition(":")
     if name == "haption":
-        from hydrotele.haptics.haption import ADDRESS, Haption
-
         return Haption(period, address or ADDRESS)
     raise InputError(f"--kind {kind}", f"is no haptic device; valid: {', '.join(KINDS)}")

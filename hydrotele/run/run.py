@@ -25,7 +25,7 @@ from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.noise import sensor_set
+from hydrotele.machine.signals import sensor_set
 from hydrotele.run.session import PreparedRun, Session, compile_ahead
 from hydrotele.scenario.scenario import Scenario, own_machine
 from hydrotele.scenario.teleoperation import TeleopPilot

@@ -25,7 +25,7 @@ from hydrotele.core.files import scenarios_folder
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.noise import sensor_set
+from hydrotele.machine.signals import sensor_set
 from hydrotele.run.sweep_runs import Inputs
 from hydrotele.scenario.scenario import (
     Scenario,

@@ -16,7 +16,6 @@ import yaml
 import hydrotele
 from hydrotele.core.units import axis_unit, customary
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.customary import amount, in_customary_units
 from hydrotele.gap.description import (
     channel_words,
     effect_title,
@@ -33,7 +32,16 @@ from hydrotele.gap.description import (
     verdict_words,
 )
 from hydrotele.gap.patched import has_patch
-from hydrotele.gap.result import Candidate, Estimate, Gap, LearnedLaw, Prediction, finite
+from hydrotele.gap.result import (
+    Candidate,
+    Estimate,
+    Gap,
+    LearnedLaw,
+    Prediction,
+    amount,
+    finite,
+    in_customary_units,
+)
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import usual_unit
 from hydrotele.show import report_html

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import hydrotele
-from hydrotele.gap.customary import amount, in_customary_units
-from hydrotele.gap.result import Estimate
+from hydrotele.gap.result import Estimate, amount, in_customary_units
 from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.hydraulic import Hydraulics
 from hydrotele.identify.result import (

@@ -7,6 +7,14 @@ him. He decides fifty times a second; by sight he steers as `teleop.manual_contr
 stands in `teleop.operator_parameters`.
 
 Muscles of the simulated operator: from a wanted displacement to forces on the handle.
+
+What a hand feels: force, displacement and stiffness, each as well as a person can tell it.
+
+A force or a displacement is felt with an error in proportion to its size (Weber's law). Putting
+both together to a stiffness adds an error of its own: people resolve compliance by 22 % when they
+cannot use work or terminal force (Tan, Durlach, Beauregard and Srinivasan 1995, Perception &
+Psychophysics 57), though force alone by some 7 % (Pang, Tan and Durlach 1991, ibid. 49) and limb
+movement by 8 % (Jones, Hunter and Irwin 1992, ibid. 52). One exploration gives one impression.
 """
 
 import math
@@ -47,7 +55,6 @@ from hydrotele.teleop.axis_table import (
     flattened,
     split,
 )
-from hydrotele.teleop.haptic_perception import feeling, felt_stiffness
 from hydrotele.teleop.manual_control import (
     BELIEVED_GAIN,
     GAIN,
@@ -60,6 +67,60 @@ from hydrotele.teleop.manual_control import (
 )
 from hydrotele.teleop.master import Master
 from hydrotele.teleop.operator_parameters import Operator, perceiving
+
+
+class Feeling(NamedTuple):
+    """Errors of what a hand feels, by decision; n decisions.
+
+    Attributes:
+        force: (n,) factor on a felt force.
+        displacement: (n,) factor on a felt displacement.
+        stiffness: (n,) factor of putting both together.
+        share: standard deviation of a felt stiffness, of which he knows [1].
+    """
+
+    force: np.ndarray
+    displacement: np.ndarray
+    stiffness: np.ndarray
+    share: float
+
+
+def feeling(him: Operator, rng: np.random.Generator, count: int, step: float) -> Feeling:
+    """Impressions of a run, one per exploration.
+
+    Args:
+        him: the operator, with his Weber fractions; an exploration lasts his `dwell`.
+        rng: of the impressions.
+        count: number of decisions.
+        step: between them [s].
+
+    Returns:
+        The errors.
+    """
+    exploration = (step * np.arange(count) / him.dwell).astype(int)
+    drawn = rng.standard_normal((exploration[-1] + 1, 3))[exploration]
+    weber = np.array([him.force_weber, him.position_weber, him.integration_weber])
+    errors = np.exp(weber * drawn)
+    return Feeling(*errors.T, share=math.hypot(*weber))
+
+
+def felt_stiffness(
+    force: float, displacement: float, errors: Feeling, number: int
+) -> float:  # fmt: skip
+    """Stiffness that a hand feels in a spring.
+
+    Args:
+        force: on the hand [N].
+        displacement: of the hand [m], not 0.
+        errors: of what he feels.
+        number: of the decision.
+
+    Returns:
+        The felt stiffness [N/m].
+    """
+    felt = force * errors.force[number] / (displacement * errors.displacement[number])
+    return float(felt * errors.stiffness[number])
+
 
 _THROUGH = 1.15  # times the force at a notch's edge, to get over it
 _FINE, _FINE_TURN = 4e-4, 4e-3  # m, rad: a larger gap is a way to go, nothing to learn from

@@ -18,9 +18,8 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.machine.joystick import HandFacts
 from hydrotele.teleop.axis_table import flattened
-from hydrotele.teleop.haptic_perception import Feeling, feeling, felt_stiffness
 from hydrotele.teleop.manual_control import neuromuscular_matrix
-from hydrotele.teleop.operator_model import REFLEX, Muscles, pull
+from hydrotele.teleop.operator_model import REFLEX, Feeling, Muscles, feeling, felt_stiffness, pull
 from hydrotele.teleop.operator_parameters import Operator
 
 _LEVELS = {

@@ -6,7 +6,6 @@ from typing import Literal
 from pydantic import model_validator
 
 from hydrotele.core.datafile import Facts, Name, NonNegative, Positive, suggest
-from hydrotele.terms import laws as _laws  # noqa: F401 - puts the laws of this package into LAWS
 from hydrotele.terms.law import LAWS, VARIABLES, Value
 
 BALANCES = ("force", "flow_head", "flow_rod", "command", "flow_supply")

@@ -9,8 +9,23 @@ compiles the function when a machine that uses it is simulated, so that it may u
 and other compiled functions only. A parameter is a number; annotated as `Variable` it is the name
 of a variable of the state and arrives as its index; annotated as `Numbers` it is a list and arrives
 as an array. A value that is left out is the default of the argument.
+
+The laws of this package that terms can use; numba compiles them, each by itself.
+
+Every law is a function of a `DriveState` s and of its parameters, and returns what it adds to the
+balance of its term: force [N] or [N m], flow into a chamber [m^3/s], or command. The unit of a
+parameter follows from that.
+
+Formulas in machine files: products of basic functions, each with its coefficient.
+
+    parameters: {"1": 40.0, "velocity * abs(velocity)": -310.0,
+                 "bump(position, 0.4, 0.05) * sign(velocity, 0.005)": -900.0}
+
+A product has factors joined by `*`, each may carry a power up to `** 6`. A factor is an argument or
+a function of one; an argument is a variable of `DriveState` or a difference of two of them.
 """
 
+import ast
 import inspect
 import math
 from collections.abc import Callable, Mapping
@@ -170,7 +185,7 @@ def _values(law: str, name: str, kind: type, value: Any) -> list[float]:
 
 
 LAWS: dict[str, Law] = {}
-"""Laws by name: those of `hydrotele.terms.laws`, and what users' files and plug-ins define."""
+"""Laws by name: those of `hydrotele.terms.law`, and what users' files and plug-ins define."""
 
 _reading: list[str] = []  # what defines laws at the moment: the last entry
 
@@ -222,3 +237,338 @@ class defined_by:  # noqa: N801 - a context manager, named as it is read
 
     def __exit__(self, *_: object) -> None:
         _reading.pop()
+
+
+FUNCTIONS = {
+    "abs": (1, 0, "abs(e) = |e|"),
+    "sign": (2, 1, "sign(e, w) = tanh(e / w)"),
+    "root": (3, 1, "root(e, d) = e / (e^2 + d^2)^(1/4), the root of |e| with the sign of e"),
+    "bump": (4, 2, "bump(e, c, w) = exp(-(e - c)^2 / (2 w^2))"),
+    "above": (5, 1, "above(e, a) = max(0, e - a)"),
+    "below": (6, 1, "below(e, a) = max(0, a - e)"),
+    "rise": (7, 1, "rise(e, T) = 1 - exp(-e / T)"),
+    "sin": (8, 1, "sin(e, L) = sin(2 pi e / L)"),
+    "cos": (9, 1, "cos(e, L) = cos(2 pi e / L)"),
+}
+"""Basic function -> (its code, number of constants, what it is)."""
+
+_DIVIDES = {"sign": 0, "root": 0, "bump": 1, "rise": 0, "sin": 0, "cos": 0}
+_PLAIN, _NONE, _HIGHEST = 0, -1, 6
+
+
+def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]:
+    """A formula as numbers for the law `formula`.
+
+    Args:
+        parameters: product -> coefficient.
+
+    Returns:
+        `numbers`: count of products, then of each its coefficient, the count of its factors and of
+        each of these: function, variable, variable to subtract or -1, two constants, power.
+
+    Raises:
+        ValueError: a product is no such product; says what is allowed.
+
+    >>> formula_arguments({"velocity ** 2": 3.0})["numbers"]
+    [1, 3.0, 1, 0, 2, -1, 0.0, 0.0, 2]
+    """
+    if not parameters:
+        raise ValueError("law formula needs at least one product, such as '1' or 'velocity'")
+    numbers: list[float] = [len(parameters)]
+    for text, coefficient in parameters.items():
+        if isinstance(coefficient, bool) or not isinstance(coefficient, int | float):
+            raise ValueError(f"formula {text!r}: the coefficient {coefficient!r} is no number")
+        factors = _factors(text)
+        numbers += [coefficient, len(factors)]
+        for factor in factors:
+            numbers += factor
+    return {"numbers": numbers}
+
+
+def _factors(text: str) -> list[list[float]]:
+    try:
+        node = ast.parse(text.strip(), mode="eval").body
+    except SyntaxError:
+        raise _wrong(text, "it cannot be read") from None
+    if isinstance(node, ast.Constant) and node.value == 1:
+        return []
+    return [_factor(text, part) for part in _parts(node)]
+
+
+def _parts(node: ast.expr) -> list[ast.expr]:
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
+        return [*_parts(node.left), *_parts(node.right)]
+    return [node]
+
+
+def _factor(text: str, node: ast.expr) -> list[float]:
+    power = 1
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
+        exponent = node.right
+        if not (isinstance(exponent, ast.Constant) and exponent.value in range(1, _HIGHEST + 1)):
+            raise _wrong(text, f"a power must be a whole number from 1 to {_HIGHEST}")
+        node, power = node.left, int(str(exponent.value))
+    if not isinstance(node, ast.Call):
+        return [_PLAIN, *_argument(text, node), 0.0, 0.0, power]
+    name = node.func.id if isinstance(node.func, ast.Name) else "?"
+    if name not in FUNCTIONS:
+        raise _wrong(text, f"{name!r} is no function; {suggest(name, FUNCTIONS)}")
+    code, count, words = FUNCTIONS[name]
+    if len(node.args) != 1 + count or node.keywords:
+        raise _wrong(text, f"the function is {words}")
+    constants = [_number(text, argument) for argument in node.args[1:]]
+    if name in _DIVIDES and constants[_DIVIDES[name]] <= 0.0:
+        raise _wrong(text, f"a width, length or time must be positive: {words}")
+    constants += [0.0] * (2 - count)
+    return [code, *_argument(text, node.args[0]), *constants, power]
+
+
+def _argument(text: str, node: ast.expr) -> list[int]:
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
+        return [_variable(text, node.left), _variable(text, node.right)]
+    return [_variable(text, node), _NONE]
+
+
+def _variable(text: str, node: ast.expr) -> int:
+    name = node.id if isinstance(node, ast.Name) else ast.unparse(node)
+    if name not in VARIABLES:
+        raise _wrong(text, f"{name!r} is no variable; {suggest(name, VARIABLES)}")
+    return VARIABLES[name]
+
+
+def _number(text: str, node: ast.expr) -> float:
+    try:
+        value = ast.literal_eval(node)
+    except ValueError:
+        value = None
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise _wrong(text, f"{ast.unparse(node)!r} is no number")
+    return float(value)
+
+
+def _wrong(text: str, why: str) -> ValueError:
+    return ValueError(
+        f"formula {text!r}: {why}; write '1' or a product such as 'velocity * abs(velocity)' of"
+        f" variables and of {', '.join(FUNCTIONS)}"
+    )
+
+
+@law
+def constant(s: DriveState, value: float) -> float:
+    """A constant value."""
+    return value
+
+
+@law
+def pulse(s: DriveState, size: float, start: float, duration: float, edge: float = 0.1) -> float:
+    """A value from `start` [s] for a `duration` [s].
+
+    Its edges are half waves of a cosine, `edge` of the duration long and centred on its ends, so
+    that a derivative with respect to every parameter exists.
+
+    >>> state = DriveState(*[0.0] * 12)
+    >>> [pulse(state._replace(time=t), 8.0, 1.0, 2.0) for t in (0.8, 1.0, 2.0, 3.0, 3.2)]
+    [0.0, 4.0, 8.0, 4.0, 0.0]
+    """
+    if duration <= 0.0:
+        return 0.0
+    half = max(0.5 * edge * duration, 1.0e-9)
+    inside = 0.5 * duration - abs(s.time - start - 0.5 * duration)  # from the nearer end [s]
+    if inside >= half:
+        return size
+    if inside <= -half:
+        return 0.0
+    return size * 0.5 * (1.0 + math.sin(0.5 * math.pi * inside / half))
+
+
+@law
+def ramp(s: DriveState, rate: float, start: float = 0.0) -> float:
+    """A value that grows by `rate` per second from `start` [s] on."""
+    return rate * max(0.0, s.time - start)
+
+
+@law
+def exponential_drift(s: DriveState, value: float, time_constant: float) -> float:
+    """A value that is approached from zero as `1 - exp(-t / time_constant)`."""
+    return value * (1.0 - math.exp(-s.time / time_constant))
+
+
+def _check_points(given: Parameters, *names: str) -> None:
+    for name in names:
+        points = list(given[name])
+        if len(points) < 2 or any(b <= a for a, b in zip(points, points[1:], strict=False)):
+            raise ValueError(f"{name} must be at least two numbers that rise, not {points}")
+
+
+def _flat(values: Any) -> list[float]:
+    return [x for row in values for x in (row if isinstance(row, list | tuple) else [row])]
+
+
+def _check_table(given: Parameters) -> None:
+    _check_points(given, "points")
+    if len(given["values"]) != len(given["points"]):
+        raise ValueError(f"{len(given['points'])} points need as many values")
+
+
+def _check_table2(given: Parameters) -> None:
+    _check_points(given, "row_points", "column_points")
+    rows, columns = len(given["row_points"]), len(given["column_points"])
+    if len(_flat(given["values"])) != rows * columns:
+        raise ValueError(f"values must be {rows} rows of {columns} numbers")
+
+
+@law(check=_check_table)
+def linear_table(s: DriveState, variable: Variable, points: Numbers, values: Numbers) -> float:
+    """Linear interpolation in one variable, constant beyond the first and the last point.
+
+    >>> import numpy as np
+    >>> state = DriveState(*[0.0] * 12)._replace(velocity=0.15)
+    >>> float(linear_table(state, 2, np.array([0.0, 0.1, 0.2]), np.array([0.0, 10.0, 30.0])))
+    20.0
+    """
+    x, last = s[variable], len(points) - 1
+    if x <= points[0]:
+        return values[0]
+    if x >= points[last]:
+        return values[last]
+    low, high = 0, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        if points[middle] <= x:
+            low = middle
+        else:
+            high = middle
+    part = (x - points[low]) / (points[high] - points[low])
+    return values[low] + part * (values[high] - values[low])
+
+
+@law(check=_check_table2)
+def table2(
+    s: DriveState, row_variable: Variable, column_variable: Variable, row_points: Numbers,
+    column_points: Numbers, values: Numbers,
+) -> float:  # fmt: skip
+    """Bilinear interpolation in two variables, constant beyond the outer points.
+
+    `values` has a row for each of the `row_points`.
+
+    >>> import numpy as np
+    >>> state = DriveState(*[0.0] * 12)._replace(position=0.5, velocity=9.0)
+    >>> axis = np.array([0.0, 1.0])
+    >>> float(table2(state, 1, 2, axis, axis, np.array([0.0, 1.0, 10.0, 21.0])))
+    11.0
+    """
+    x, y = s[row_variable], s[column_variable]
+    columns = len(column_points)
+    i, j = 0, 0
+    while i < len(row_points) - 2 and x >= row_points[i + 1]:
+        i += 1
+    while j < columns - 2 and y >= column_points[j + 1]:
+        j += 1
+    a = (x - row_points[i]) / (row_points[i + 1] - row_points[i])
+    b = (y - column_points[j]) / (column_points[j + 1] - column_points[j])
+    a, b = min(1.0, max(0.0, a)), min(1.0, max(0.0, b))
+    k = i * columns + j
+    low = values[k] + b * (values[k + 1] - values[k])
+    k += columns
+    high = values[k] + b * (values[k + 1] - values[k])
+    return low + a * (high - low)
+
+
+@law(translate=formula_arguments)
+def formula(s: DriveState, numbers: Numbers) -> float:
+    """A sum of coefficients times products of basic functions; see `hydrotele.terms.law`.
+
+    >>> import numpy as np
+    >>> state = DriveState(*[0.0] * 12)._replace(velocity=-2.0)
+    >>> coded = formula_arguments({"1": 5.0, "velocity * abs(velocity)": 3.0})
+    >>> float(formula(state, np.array(coded["numbers"])))
+    -7.0
+    """
+    at, total = 1, 0.0
+    for _ in range(int(numbers[0])):
+        product, factors = numbers[at], int(numbers[at + 1])
+        at += 2
+        for _ in range(factors):
+            e = s[int(numbers[at + 1])]
+            if numbers[at + 2] >= 0.0:
+                e -= s[int(numbers[at + 2])]
+            code, a, b = int(numbers[at]), numbers[at + 3], numbers[at + 4]
+            if code == 1:
+                e = abs(e)
+            elif code == 2:
+                e = math.tanh(e / a)
+            elif code == 3:
+                e = e / math.sqrt(math.sqrt(e * e + a * a))
+            elif code == 4:
+                e = math.exp(-0.5 * ((e - a) / b) ** 2)
+            elif code == 5:
+                e = max(0.0, e - a)
+            elif code == 6:
+                e = max(0.0, a - e)
+            elif code == 7:
+                e = 1.0 - math.exp(-e / a)
+            elif code == 8:
+                e = math.sin(2.0 * math.pi * e / a)
+            elif code == 9:
+                e = math.cos(2.0 * math.pi * e / a)
+            for _ in range(int(numbers[at + 5])):
+                product *= e
+            at += 6
+        total += product
+    return total
+
+
+@law
+def quadratic_drag(s: DriveState, coefficient: float) -> float:
+    """Resistance that grows with the square of the speed, `-c v |v|`."""
+    return -coefficient * s.velocity * abs(s.velocity)
+
+
+@law
+def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) -> float:
+    """Dry friction in proportion to the load, `-c |F| tanh(v / v0)`: seals and guides under load.
+
+    Source: Armstrong-Helouvry, Dupont and Canudas de Wit 1994, Automatica 30(7), load dependence.
+    """
+    return -coefficient * abs(s.force) * math.tanh(s.velocity / smoothing_velocity)
+
+
+@law
+def friction_bump(
+    s: DriveState, coulomb: float, centre: float, width: float, smoothing_velocity: float
+) -> float:
+    """Dry friction at one place of the travel, `-F exp(-(x - c)^2 / (2 w^2)) tanh(v / v0)`."""
+    far = (s.position - centre) / width
+    return -coulomb * math.exp(-0.5 * far * far) * math.tanh(s.velocity / smoothing_velocity)
+
+
+@law
+def orifice_leakage(s: DriveState, flow_gain: float, smoothing: float) -> float:
+    """Turbulent flow into the rod-side chamber, `k sgn(dp) sqrt(|dp|)` made smooth through zero.
+
+    With a negative `flow_gain` it is the flow into the head-side chamber.
+
+    Source: as `hydraulics.laws.orifice`.
+    """
+    drop = s.pressure_head - s.pressure_rod
+    return flow_gain * drop / math.sqrt(math.sqrt(drop * drop + smoothing * smoothing))
+
+
+@law
+def viscous_drift(s: DriveState, viscous: float, ratio: float, time_constant: float) -> float:
+    """Change of viscous friction b v with the oil's viscosity, `-b (m(t) - 1) v`.
+
+    The viscosity is m(t) times the first one, `m = 1 + (r - 1)(1 - exp(-t / T))`.
+    """
+    change = (ratio - 1.0) * (1.0 - math.exp(-s.time / time_constant))
+    return -viscous * change * s.velocity
+
+
+@law
+def leakage_drift(s: DriveState, leakage: float, ratio: float, time_constant: float) -> float:
+    """Change of the laminar leakage into the rod-side chamber, `k (1 / m(t) - 1) (p_A - p_B)`.
+
+    With a negative `leakage` it is the flow into the head-side chamber; m as in `viscous_drift`.
+    """
+    viscosity = 1.0 + (ratio - 1.0) * (1.0 - math.exp(-s.time / time_constant))
+    return leakage * (1.0 / viscosity - 1.0) * (s.pressure_head - s.pressure_rod)

@@ -5,9 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hydrotele.calibrate.arm import identify_arm, identify_jointly
+from hydrotele.calibrate.arm import (
+    calibrated_machine,
+    identify_arm,
+    identify_jointly,
+    machine_with_loop,
+)
 from hydrotele.calibrate.arm_data import moving_link, stage_of, strokes_of
-from hydrotele.calibrate.arm_machine import calibrated_machine, machine_with_loop
 from hydrotele.calibrate.arm_poses import with_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
 from hydrotele.calibrate.design import STILL, sweep_poses
@@ -19,8 +23,7 @@ from hydrotele.calibrate.linkage import (
 )
 from hydrotele.calibrate.loop import ball_from, closure, loop_of
 from hydrotele.core.errors import InputError
-from hydrotele.experiments.calibrator import perturbed, readings, true_numbers
-from hydrotele.experiments.khoshzaban1992 import LISTS, TABLE_2
+from hydrotele.experiments.khoshzaban1992 import LISTS, TABLE_2, perturbed, readings, true_numbers
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.logs.log import Log

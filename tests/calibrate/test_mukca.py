@@ -13,17 +13,16 @@ from hydrotele.calibrate.mukca import (
     judge,
     leave_out,
 )
-from hydrotele.calibrate.robot_simulation import (
+from hydrotele.calibrate.sockets import (
     Errors,
+    load_sockets,
     robot_with_errors,
     save_sockets,
     simulated_sockets,
 )
-from hydrotele.calibrate.sockets import load_sockets
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.robot_file import load_robot
-from hydrotele.kinematics.serial_robot import deflection_names
+from hydrotele.kinematics.serial_robot import deflection_names, load_robot
 from tests.measured import REAL, needs_real
 
 PLACES = {"left": (0.4, 0.3, 0.1), "right": (0.45, -0.3, 0.1), "front": (0.55, 0.0, 0.1)}

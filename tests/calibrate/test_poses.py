@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from hydrotele.calibrate.poses import observability, select_poses
+from hydrotele.calibrate.design import observability, select_poses
 from hydrotele.core.errors import InputError
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.estimate.linear_run import LinearRun, smooth
+from hydrotele.estimate.levels import LinearRun, smooth
 
 ROWS, CHANNELS, SIZE = 40, 2, 3
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.signal import lsim, lti
 
 from hydrotele.estimate.reduced_dynamics import advance, follow_channel, simulate_rows
-from hydrotele.machine.noise import first_order
 from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.signals import first_order
 
 
 @pytest.mark.parametrize("ratio", [1e-9, 1e-3, 0.3, 1.0, 50.0])

@@ -6,8 +6,7 @@ import numpy as np
 
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.description import describe, learned_laws
-from hydrotele.gap.discover import Discovery
-from hydrotele.gap.law_candidates import Learned
+from hydrotele.gap.discover import Discovery, Learned
 from hydrotele.gap.law_tables import Table
 from hydrotele.gap.result import Lack, Prediction
 from hydrotele.machine.machine_file import load_machine

@@ -16,12 +16,10 @@ from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import columns_of, find_levels
-from hydrotele.estimate.responses import error_responses
-from hydrotele.estimate.track import track_run
+from hydrotele.estimate.track import error_responses, track_run
 from hydrotele.gap import discover
-from hydrotele.gap.discover import OpenLoop, better_ahead
+from hydrotele.gap.discover import Lacks, OpenLoop, Seen, better_ahead, learned_law, see
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.law_candidates import Lacks, Seen, learned_law, see
 from hydrotele.gap.law_tables import (
     Ground,
     Memory,

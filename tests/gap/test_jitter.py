@@ -14,7 +14,7 @@ from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.noise import noise_rms, sensor_set
+from hydrotele.machine.signals import noise_rms, sensor_set
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.feedback import measure

@@ -9,7 +9,7 @@ from hydrotele.estimate.calibration import CALIBRATION, calibration
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.track import STEP
-from hydrotele.gap.without_inputs import without_inputs
+from hydrotele.gap.search import without_inputs
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
 

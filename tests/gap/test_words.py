@@ -6,9 +6,15 @@ import math
 import pytest
 
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.customary import amount, in_customary_units
 from hydrotele.gap.description import effect_title, gap_closed, headline, verdict_words
-from hydrotele.gap.result import Alternative, Estimate, GapSize, NamedEffect
+from hydrotele.gap.result import (
+    Alternative,
+    Estimate,
+    GapSize,
+    NamedEffect,
+    amount,
+    in_customary_units,
+)
 from hydrotele.machine.machine_file import load_machine
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.force_dimension import ForceDimension
+from hydrotele.haptics.device import ForceDimension
 from hydrotele.haptics.server import open_haptic
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.haption import LIBRARY, Haption
+from hydrotele.haptics.device import LIBRARY, Haption
 from hydrotele.haptics.server import open_haptic
 
 CONTEXT, INT, FLOAT = ctypes.c_void_p, ctypes.c_int, ctypes.c_float

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hydrotele.gap.balance_laws import chamber_residuals
+from hydrotele.gap.balances import chamber_residuals
 from hydrotele.hydraulics.circuit import (
     NO_MEMORY,
     SLOTS,

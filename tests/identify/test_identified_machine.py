@@ -10,7 +10,10 @@ from hydrotele.identify.consistent import Freedom, consistent
 from hydrotele.identify.estimation import Estimate
 from hydrotele.identify.identifiability import identifiability
 from hydrotele.identify.identified_machine import identified_machine
-from hydrotele.identify.result import Forces, Identification
+from hydrotele.identify.result import (
+    Forces,
+    Identification,
+)
 from hydrotele.identify.setup import cylinder_bars, machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain

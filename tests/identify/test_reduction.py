@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.reduction import reduce_parameters
+from hydrotele.identify.estimation import reduce_parameters
 
 NAMES = ("mass", "a1", "a2", "a3", "b1", "b2", "b3")
 KINDS = (("a1", "a2", "a3"), ("b1", "b2", "b3"))

@@ -4,22 +4,20 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.robot_file import (
-    corrected_urdf,
-    load_robot,
-    robot_yaml,
-    shipped_robots,
-)
 from hydrotele.kinematics.serial_chain import forward
 from hydrotele.kinematics.serial_robot import (
     corrected_robot,
+    corrected_urdf,
     deflection_names,
     deflections,
     frame,
     joints_for_places,
+    load_robot,
     robot_chain,
     robot_poses,
+    robot_yaml,
     rpy_of,
+    shipped_robots,
 )
 
 URDF = """<robot name="two">

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.control.recursive import RecursiveLeastSquares
+from hydrotele.control.task_impedance import RecursiveLeastSquares
 from hydrotele.core.errors import InputError
 from tools.handle_laws import Detent, StiffnessFeedback
 

@@ -9,7 +9,7 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.teleop.axis_table import DAMPING, NOMINAL
 from hydrotele.teleop.master import master, master_step
-from hydrotele.teleop.sampled_handle import (
+from hydrotele.teleop.sampled import (
     Body,
     largest_damping,
     least_inertia,

@@ -9,10 +9,17 @@ from pydantic import ValidationError
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine, Supply
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.terms import laws
+from hydrotele.terms import law as laws
 from hydrotele.terms.facts import Play, Term
-from hydrotele.terms.law import LAWS, NO_DRIVES, VARIABLES, Drives, DriveState, law
-from hydrotele.terms.laws import formula_arguments
+from hydrotele.terms.law import (
+    LAWS,
+    NO_DRIVES,
+    VARIABLES,
+    Drives,
+    DriveState,
+    formula_arguments,
+    law,
+)
 from hydrotele.terms.table import (
     ANY,
     COMMAND,

@@ -33,7 +33,7 @@ from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.machine import Machine as Facts
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.noise import noise_rms, sensor_set
+from hydrotele.machine.signals import noise_rms, sensor_set
 from tools.blind.score import share
 from tools.blind.spreads import SIZES
 from tools.blind.trials import Place, write_json
