@@ -29,8 +29,7 @@ from eha_runs import (
 from scipy.optimize import least_squares
 
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.reduced_dynamics import simulate_rows
-from hydrotele.estimate.reduced_model import model_space, reduced_model, state_names
+from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 

@@ -12,8 +12,13 @@ from hydrotele.calibrate.hybrid import Equations, calibrate, equations, informat
 from hydrotele.calibrate.hybrid_data import measurement_of_wires
 from hydrotele.calibrate.posterior import sample_posterior
 from hydrotele.experiments.wang2012 import NOISE, trial, unused_errors
-from hydrotele.kinematics.hybrid import forward, load_hybrid
-from hydrotele.kinematics.hybrid_errors import corrected, document_parameters, error_model
+from hydrotele.kinematics.hybrid import (
+    corrected,
+    document_parameters,
+    error_model,
+    forward,
+    load_hybrid,
+)
 from hydrotele.kinematics.wires import wire_lengths
 from hydrotele.simulate.hybrid import (
     manufactured_errors,

@@ -15,8 +15,13 @@ import numpy as np
 
 from hydrotele.identify.identifiability import identifiability
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import FrictionTerm, Regressor, pin_friction, regressor
+from hydrotele.multibody.inverse_dynamics import (
+    FrictionTerm,
+    Regressor,
+    pin_friction,
+    project,
+    regressor,
+)
 from hydrotele.simulate.closure import closed_chain
 from tools.study import options, publish
 

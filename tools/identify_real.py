@@ -22,7 +22,7 @@ from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import Chain, load_chain
-from hydrotele.multibody.regressor import FrictionTerm
+from hydrotele.multibody.inverse_dynamics import FrictionTerm
 from hydrotele.simulate.closure import closed_chain
 
 HELD_OUT = 0.25

@@ -25,8 +25,7 @@ from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import regressor
+from hydrotele.multibody.inverse_dynamics import project, regressor
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.closure import closed_chain

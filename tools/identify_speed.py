@@ -20,8 +20,7 @@ import numpy as np
 from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import regressor
+from hydrotele.multibody.inverse_dynamics import project, regressor
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.closure import closed_chain

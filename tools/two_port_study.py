@@ -9,7 +9,7 @@ import numpy as np
 from study import options, publish, side_by_side
 
 from hydrotele.teleop.analysis import Case, load_teleop_case
-from hydrotele.teleop.confirm import agreement, sweep
+from hydrotele.teleop.findings import agreement, sweep
 from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance
 
 SPREAD = 0.5  # decades by which every number of the shipped case is varied, up and down

@@ -23,17 +23,15 @@ from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import COMBINATION, FULL, Identifiability
 from hydrotele.kinematics.hybrid import (
     LEGS,
-    Hybrid,
-    Unreachable,
-    forward,
-    pose_difference,
-)
-from hydrotele.kinematics.hybrid_errors import (
     ErrorModel,
+    Hybrid,
     Kind,
+    Unreachable,
     corrected,
     document_parameters,
     error_model,
+    forward,
+    pose_difference,
     predicted_readings,
 )
 

@@ -38,8 +38,7 @@ from hydrotele.kinematics.hybrid import (
     rotation_of_euler,
 )
 from hydrotele.kinematics.wires import NoIntersection, Wires, pose_covariance, pose_of_wires
-from hydrotele.logs.log import read_table
-from hydrotele.logs.log_checks import Table
+from hydrotele.logs.log import Table, read_table
 
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 COVARIANCE = tuple(f"covariance.{a}.{b}" for a, b in combinations_with_replacement(COORDINATES, 2))

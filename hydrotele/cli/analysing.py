@@ -43,8 +43,8 @@ from hydrotele.teleop.findings import (
     why_unstable,
 )
 from hydrotele.teleop.linear_case import joystick_of, scenario_case
-from hydrotele.teleop.network import load_delays
 from hydrotele.teleop.robust import robustness, spread_of
+from hydrotele.teleop.round_trip import load_delays
 from hydrotele.teleop.sampled import SAMPLED_STRUCTURES, PacketAges, jittering_line, steady_line
 from hydrotele.teleop.switching import Spring
 from hydrotele.teleop.two_port import STRUCTURES

@@ -10,8 +10,7 @@ from hydrotele.identify.setup import machine_setup
 from hydrotele.identify.smoothing import Smoothed, zero_phase
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import regressor
+from hydrotele.multibody.inverse_dynamics import project, regressor
 from hydrotele.scenario.scenario import Servo
 from hydrotele.simulate.closure import closed_chain
 

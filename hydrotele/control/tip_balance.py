@@ -12,8 +12,7 @@ from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record, floats, integers, rows_of
-from hydrotele.estimate.reduced_dynamics import place_mechanism
-from hydrotele.estimate.reduced_model import model_space, reduced_model, state_size
+from hydrotele.estimate.reduced_model import model_space, place_mechanism, reduced_model, state_size
 from hydrotele.hydraulics.circuit import actuator_friction
 from hydrotele.hydraulics.parameters import SLOTS, Slot
 from hydrotele.kinematics.task import task_jacobian
@@ -171,7 +170,7 @@ def dynamic_balance(arm, outside):
     Returns:
         Nothing.
 
-    Source: Zhu 1994, 6.2, with the projection of `estimate.reduced_dynamics`.
+    Source: Zhu 1994, 6.2, with the projection of `estimate.reduced_model`.
     """
     model, m = arm.model, arm.space.motion
     n, nt = len(outside), m.joint.shape[1]

@@ -16,7 +16,7 @@ TASK_NAMES = (
 for _name in TASK_NAMES:
     register(
         id=f"hydrotele/{_name}-v0",
-        entry_point="hydrotele.envs.single:MachineEnv",
-        vector_entry_point="hydrotele.envs.vector:MachineVectorEnv",
+        entry_point="hydrotele.envs.making:MachineEnv",
+        vector_entry_point="hydrotele.envs.making:MachineVectorEnv",
         kwargs={"task": _name},
     )

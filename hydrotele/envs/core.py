@@ -24,9 +24,9 @@ from hydrotele.envs.episode import (
 )
 from hydrotele.envs.facts import TaskSetup, make_facts, timing
 from hydrotele.envs.loop import advance
-from hydrotele.envs.observation import machine_fields
 from hydrotele.envs.task import Options, Task
 from hydrotele.envs.variants import make_variants
+from hydrotele.envs.world import machine_fields
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.fleet import Fleet
 from hydrotele.simulate.native import stop_profiling_clock

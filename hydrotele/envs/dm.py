@@ -12,8 +12,8 @@ from dm_env import specs
 
 from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.making import info_of, make_core
-from hydrotele.envs.observation import Field
 from hydrotele.envs.stage import FREE, Camera, Stage
+from hydrotele.envs.world import Field
 
 FLAT = "observations"  # dm_control's name of the one array
 

@@ -14,9 +14,9 @@ from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.envs import force, grade, line, place, reach, track
 from hydrotele.envs.episode import ACTIONS, TASK_PARAMETERS, VALVE
-from hydrotele.envs.observation import Field
 from hydrotele.envs.task import REAL, Options, Task
 from hydrotele.envs.variants import Variants, channels
+from hydrotele.envs.world import Field
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorSet

@@ -14,7 +14,6 @@ from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.memory import field
 from hydrotele.envs.episode import uniform_between
-from hydrotele.envs.observation import Field
 from hydrotele.envs.task import Task, draw_start
 from hydrotele.envs.world import (
     BEGIN,
@@ -22,6 +21,7 @@ from hydrotele.envs.world import (
     REWARD,
     TASK_CODE,
     TICK,
+    Field,
     episodes,
     observed,
     parameters_at,

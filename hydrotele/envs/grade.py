@@ -18,7 +18,6 @@ import numpy as np
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ARM, PARAMETERS, uniform, uniform_between
-from hydrotele.envs.observation import Field, reach
 from hydrotele.envs.task import Task, draw_start
 from hydrotele.envs.world import (
     BEGIN,
@@ -26,9 +25,11 @@ from hydrotele.envs.world import (
     REWARD,
     TASK_CODE,
     TICK,
+    Field,
     episodes,
     observed,
     parameters_at,
+    reach,
     rewarded,
     world,
 )

@@ -10,16 +10,18 @@ import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import ARM, uniform, uniform_between
-from hydrotele.envs.observation import Field, pose_fields, reach
 from hydrotele.envs.task import Task, draw_start, path_effort, pose_read, turned
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
     TASK_CODE,
+    Field,
     episodes,
     observed,
     parameters_at,
+    pose_fields,
+    reach,
     rewarded,
     world,
 )

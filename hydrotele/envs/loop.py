@@ -30,7 +30,6 @@ from hydrotele.envs.episode import (
     VALVE,
     uniform,
 )
-from hydrotele.envs.observation import observe_machine
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
@@ -38,6 +37,7 @@ from hydrotele.envs.world import (
     TICK,
     call_task,
     episodes,
+    observe_machine,
     parameters_at,
     world,
 )

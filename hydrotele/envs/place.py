@@ -17,7 +17,6 @@ import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import ARM, uniform, uniform_between
-from hydrotele.envs.observation import Field, reach
 from hydrotele.envs.task import Task, draw_start
 from hydrotele.envs.world import (
     BEGIN,
@@ -25,9 +24,11 @@ from hydrotele.envs.world import (
     REWARD,
     TASK_CODE,
     TICK,
+    Field,
     episodes,
     observed,
     parameters_at,
+    reach,
     rewarded,
     world,
 )

@@ -15,7 +15,7 @@ from hydrotele.control.resolved_motion import arm_facts
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ACTIONS, ARM
-from hydrotele.envs.observation import Field
+from hydrotele.envs.world import Field
 from hydrotele.kinematics.task import REACHED, task_forward, task_inverse, task_rates
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo, SurroundingObject

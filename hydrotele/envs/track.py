@@ -10,15 +10,17 @@ import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import ARM, AXES, uniform, uniform_between
-from hydrotele.envs.observation import Field, position_field, rate_field
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
     TASK_CODE,
+    Field,
     episodes,
     observed,
     parameters_at,
+    position_field,
+    rate_field,
     rewarded,
     world,
 )

@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import allocation_free, compiled
-from hydrotele.estimate.reduced_dynamics import (
+from hydrotele.estimate.reduced_model import (
+    Model,
     advance,
     follow_channel,
     load_position,
@@ -26,7 +27,6 @@ from hydrotele.estimate.reduced_dynamics import (
     read_channels,
     supply_of,
 )
-from hydrotele.estimate.reduced_model import Model
 from hydrotele.hydraulics.laws import softening
 from hydrotele.hydraulics.parameters import SLOTS, Kind, Slot
 from hydrotele.hydraulics.pump import STALLED

@@ -14,8 +14,14 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.estimate.reduced_dynamics import advance, follow_trail, read_channels
-from hydrotele.estimate.reduced_model import Model, model_space, reduced_model
+from hydrotele.estimate.reduced_model import (
+    Model,
+    advance,
+    follow_trail,
+    model_space,
+    read_channels,
+    reduced_model,
+)
 from hydrotele.estimate.track import DRIFT_TIME, STEP, Levels, steps_per_row, track_run
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine

@@ -1,11 +1,24 @@
-"""A hypothesis: an effect at a place, its numbers counted in typical deviations from nominal."""
+"""A hypothesis: an effect at a place, its numbers counted in typical deviations from nominal.
+
+The uncertain numbers of a machine, fitted together before and beside any effect.
+
+A real machine is off everywhere: masses, areas, frictions, valve gains are known to some per cent.
+Each is a number with a prior, a normal distribution about the given value; `uncertainty` of the
+machine file states its relative standard deviation by kind (`mass: 0.03`), by kind and place
+(`mass.boom: 0.1`), by kind, place and parameter (`motor_drag.piston.breakaway: 0.5`) or for all
+(`default: 0.05`). A number of any effect that it names is uncertain; one that is 0, as losses are
+that a data sheet leaves out, counts relative to the effect's typical size. An effect is what
+remains after that.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from hydrotele.effects import EFFECTS, Parameter
+from hydrotele.effects import EFFECTS, Effect, Parameter
+from hydrotele.effects.effect import across, changed, linkages
 from hydrotele.machine.machine import Machine
 
 _CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
@@ -215,3 +228,205 @@ class Guess:
         for hypothesis, deviation in self.parts:
             nominal = hypothesis.machine(nominal, deviation)
         return nominal
+
+
+CALIBRATION = "calibration"
+"""Name of the hypothesis that holds all uncertain numbers."""
+
+# Relative standard deviation of what a data sheet, a drawing or a workshop says.
+UNCERTAINTY: dict[str, float] = {
+    "mass": 0.05, "inertia_error": 0.05, "com_offset": 0.02, "link_length": 0.002,
+    "pin_offset": 0.002, "area": 0.02, "displacement": 0.02, "dead_volume": 0.1,
+    "coulomb_friction": 0.1, "viscous_friction": 0.1, "stribeck_friction": 0.1,
+    "internal_leakage": 0.2, "valve_gain": 0.05, "valve_deadband": 0.1, "spool_lag": 0.1,
+    "bulk_modulus": 0.1, "pump_flow_limit": 0.05, "relief_pressure": 0.03, "drive_gain": 0.02,
+    "valve_damping": 0.1, "pump_displacement": 0.02, "pump_leakage": 0.3, "pump_torque_loss": 0.1,
+    "tank_pressure": 0.2, "motor_constant": 0.05, "motor_inertia": 0.1, "motor_drag": 0.1,
+    "motor_viscous_drag": 0.1, "line_compliance": 0.2, "accumulator_pressure": 0.05,
+    "load_relief": 0.03, "load_friction": 0.1,
+}  # fmt: skip
+_LENGTHS = ("com_offset", "link_length", "pin_offset")  # relative to the size that they refer to
+_WIDEST = 6.0  # standard deviations to which a number may go; beyond, it is an effect
+_PLAIN = 3.0  # the same of a number that is none of an effect: what it takes at six is another's
+
+
+@dataclass(frozen=True)
+class Number:
+    """An uncertain number of a machine.
+
+    Attributes:
+        key: kind, place and parameter, such as `valve_gain.boom.ratio`.
+        share: its relative standard deviation.
+        parameter: its nominal value, range, and prior as `scale`.
+        effect: the library's effect (name, location, parameter) that changes the same number, or
+            None.
+        change: machine with another value.
+    """
+
+    key: str
+    share: float
+    parameter: Parameter
+    effect: tuple[str, str, str] | None
+    change: Callable[[Machine, float], Machine]
+
+
+def numbers(machine: Machine) -> dict[str, Number]:
+    """All uncertain numbers of a machine, by key."""
+    found = [*_of_effects(machine), *_of_facts(machine)]
+    return {number.key: number for number in found}
+
+
+def calibration(machine: Machine, without: frozenset[str] = frozenset()) -> Hypothesis:
+    """The hypothesis that all numbers are uncertain, but for some keys."""
+    table = {k: n for k, n in numbers(machine).items() if k not in without}
+
+    def change(nominal: Machine, values: Mapping[str, float]) -> Machine:
+        for key, value in values.items():
+            number = table[key]
+            if value != number.parameter.nominal:
+                nominal = number.change(nominal, value)
+        return nominal
+
+    parameters = {key: number.parameter for key, number in table.items()}
+    return Hypothesis(CALIBRATION, "all", parameters, change)
+
+
+def _share(machine: Machine, kind: str, place: str, own: str = "") -> float:
+    """Relative standard deviation stated for a number itself, its place, its kind, or all."""
+    stated = machine.uncertainty
+    for key in (own, f"{kind}.{place}", kind, "default"):
+        if key in stated:
+            return stated[key]
+    return UNCERTAINTY.get(kind, 0.0)
+
+
+def _states(machine: Machine, kind: str) -> bool:
+    """Whether a machine file names the uncertainty of a kind of number."""
+    return any(key.partition(".")[0] == kind for key in machine.uncertainty)
+
+
+def _narrow(p: Parameter, scale: float, widest: float = _WIDEST) -> Parameter:
+    low, high = p.nominal - widest * scale, p.nominal + widest * scale
+    return replace(p, low=max(p.low, low), high=min(p.high, high), scale=scale, starts=())
+
+
+def _of_effects(machine: Machine) -> list[Number]:
+    found = []
+    for name, effect in EFFECTS.items():
+        stated = _states(machine, name)
+        if name not in UNCERTAINTY and not stated:
+            continue
+        for location in effect.locations(machine):
+            for key, p in effect.parameters(machine, location).items():
+                share = _share(machine, name, location, f"{name}.{location}.{key}")
+                if p.optional:
+                    continue
+                size = abs(p.nominal)
+                if stated and size == 0.0:
+                    size = p.scale
+                if name in _LENGTHS:
+                    size = (p.high - p.low) / (0.6 if name == "com_offset" else 0.1)
+                    size = size if name != "link_length" else 0.5 * size
+                if size > 0.0 and share > 0.0:
+                    found.append(Number(
+                        f"{name}.{location}.{key}", share, _narrow(p, share * size),
+                        (name, location, key), partial(_apply, effect, location, key),
+                    ))  # fmt: skip
+    return found
+
+
+def _apply(effect: Effect, location: str, key: str, machine: Machine, value: float) -> Machine:
+    """One parameter of an effect; the others stay as they are."""
+    others = {k: p.nominal for k, p in effect.parameters(machine, location).items()}
+    return effect.apply(machine, location, {**others, key: value})
+
+
+def _of_facts(machine: Machine) -> list[Number]:
+    places: list[tuple[str, str, str, str, float]] = []
+    for name, link in machine.links.items():
+        if _moves(machine, name):
+            places.append(("mass", name, f"links.{name}.mass", "kg", link.mass))
+    for name, axis in machine.axes.items():
+        if axis.cylinder:
+            path = f"axes.{name}.cylinder"
+            for side in ("area_head", "area_rod"):
+                size = getattr(axis.cylinder, side)
+                places.append(("area", f"{name}.{side}", f"{path}.{side}", "m^2", size))
+            for part, bar in (("tube", axis.cylinder.tube), ("rod", axis.cylinder.rod)):
+                places.append(("mass", f"{name}.{part}", f"{path}.{part}.mass", "kg", bar.mass))
+        if axis.motor:
+            path = f"axes.{name}.motor.displacement"
+            size = axis.motor.displacement
+            places.append(("displacement", name, path, "m^3/rad", size))
+        if axis.hydraulic:
+            kind = "cylinder" if axis.cylinder else "motor"
+            path = f"axes.{name}.{kind}.dead_volume"
+            size = axis.hydraulic_drive.dead_volume
+            places.append(("dead_volume", name, path, "m^3", size))
+        if axis.valve:
+            path = f"axes.{name}.valve.damping"
+            places.append(("valve_damping", name, path, "1", axis.valve.damping))
+        if axis.force:
+            path = f"axes.{name}.force.gain"
+            places.append(("drive_gain", name, path, "N", axis.force.gain))
+    if machine.supply:
+        value = machine.supply.tank_pressure
+        places.append(("tank_pressure", "supply", "supply.tank_pressure", "Pa", value))
+    found = _of_rods(machine)
+    for kind, place, path, unit, value in places:
+        share = _share(machine, kind, place)
+        if share <= 0.0 or value == 0.0:
+            continue
+        p = Parameter(unit, value, 0.2 * value, 5.0 * value, share * abs(value), 0.0)
+        if value < 0.0:
+            p = replace(p, low=5.0 * value, high=0.2 * value)
+        p = _narrow(p, p.scale, _PLAIN)
+        found.append(Number(f"{kind}.{place}", share, p, None, partial(_set, path)))
+    return found
+
+
+def _of_rods(machine: Machine) -> list[Number]:
+    """Where rods end: their pins, and the closed lengths that their extensions count from."""
+    found = []
+    for name in linkages(machine):
+        cylinder = machine.axes[name].cylinder
+        assert cylinder
+        size, pin = cylinder.closed_length, cylinder.rod_pin.position
+        places: list[tuple[str, float, float, Callable]] = [(
+            f"closed_length.{name}", size, 0.2,
+            partial(_set, f"axes.{name}.cylinder.closed_length"),
+        )]  # fmt: skip
+        for way in across(machine, name):
+            index = "xyz".index(way)
+            change = partial(_set_rod_pin, name, index)
+            places.append((f"rod_pin.{name}.{way}", pin[index], 0.1, change))
+        for key, at, reach, change in places:
+            share = _share(machine, "pin_offset", name, key)
+            if share > 0.0:
+                p = Parameter("m", at, at - reach * size, at + reach * size, share * size, 0.0)
+                p = _narrow(p, p.scale, _PLAIN)
+                found.append(Number(key, share, p, None, change))
+    return found
+
+
+def _set_rod_pin(axis: str, index: int, machine: Machine, value: float) -> Machine:
+    """One coordinate of a rod's pin; the others stay."""
+    cylinder = machine.axes[axis].cylinder
+    assert cylinder
+    place = list(cylinder.rod_pin.position)
+    place[index] = value
+    return changed(machine, f"axes.{axis}.cylinder.rod_pin.position", tuple(place))
+
+
+def _set(path: str, machine: Machine, value: float) -> Machine:
+    return changed(machine, path, value)
+
+
+def _moves(machine: Machine, name: str) -> bool:
+    """Whether gravity or inertia of a link acts on any axis."""
+    while name != "world":
+        link = machine.links[name]
+        if link.joint:
+            return True
+        name = link.parent
+    return False

@@ -14,8 +14,14 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.reduced_dynamics import accelerate, advance, place
-from hydrotele.estimate.reduced_model import X, model_space, reduced_model
+from hydrotele.estimate.reduced_model import (
+    X,
+    accelerate,
+    advance,
+    model_space,
+    place,
+    reduced_model,
+)
 from hydrotele.hydraulics.laws import air_compliance
 from hydrotele.hydraulics.parameters import (
     ADDED_DELIVERY,
@@ -25,7 +31,7 @@ from hydrotele.hydraulics.parameters import (
 )
 from hydrotele.hydraulics.supply import ADDED_LAG
 from hydrotele.machine.machine import Machine
-from hydrotele.multibody.reduced_closures import solve
+from hydrotele.multibody.reduced_mechanism import solve
 from hydrotele.terms.facts import Term
 
 MEMORY = 0.3  # s, correlation time: longer than a valve's lag, shorter than a motion

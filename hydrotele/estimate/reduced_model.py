@@ -1,11 +1,34 @@
-"""The reduced model of a Machine: its mechanism, drives, delays and sensors as flat arrays."""
+"""The reduced model of a Machine: its mechanism, drives, delays and sensors as flat arrays.
 
+In time: kick, drift, kick, with the circuit of the MuJoCo plant between.
+
+Also what its sensors show along a row of a log: late, or behind a first-order lag.
+"""
+
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.hydraulics.circuit import NO_MEMORY, SCRATCH
+from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate
+from hydrotele.hydraulics.circuit import (
+    NO_MEMORY,
+    SCRATCH,
+    actuator_stop,
+    add_to_commands,
+    advance_memories,
+    circuit_supply,
+    delivered_share,
+    drive_state,
+    force_after_friction,
+    open_ports,
+    step_circuit,
+)
+from hydrotele.hydraulics.laws import pressure_with_air, pressure_without_air
 from hydrotele.hydraulics.parameters import (
+    SLOTS,
+    Slot,
     actuator_order,
     actuator_parameters,
     extra_state_names,
@@ -13,14 +36,37 @@ from hydrotele.hydraulics.parameters import (
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import parse_channel
+from hydrotele.machine.signals import first_order, parse_channel
 from hydrotele.multibody.reduced_mechanism import (
+    BAR,
+    BIAS,
+    CLOSED,
+    DAMPING,
+    DRIFT,
+    JOINT,
+    LENGTH_ROW,
+    RATE,
+    Q,
     ReducedMechanism,
     ReducedMotion,
+    close_chains,
     coordinate_names,
+    drift_chains,
+    factorise,
+    gather_forces,
     mechanism,
     motion_space,
+    move_bars,
+    move_links,
+    place_bars,
+    place_links,
+    solve,
 )
+from hydrotele.multibody.reduced_mechanism import LENGTH as BAR_LENGTH
+from hydrotele.terms.law import Drives
+from hydrotele.terms.table import COMMAND as ON_COMMAND
+from hydrotele.terms.table import FORCE as ON_FORCE
+from hydrotele.terms.table import acts_on, added_with_slope
 
 POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)
 _KINDS = {
@@ -181,3 +227,618 @@ def state_names(machine: Machine) -> list[str]:
         kinds = ("speed", "pressure_load") if axis.pump else ("spool", "spool_rate")
         out += [f"{k}.{name}" for k in (*kinds, "pressure_head", "pressure_rod")]
     return out + extra_state_names(machine)
+
+
+_AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
+
+
+@allocation_free
+def set_activations(model, sp, z):
+    """Write the activations of a state with the pressures that are felt into `sp.act`.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state.
+
+    Returns:
+        Nothing.
+
+    Source: `laws.pressure_with_air`.
+    """
+    first = 2 * (len(model.mech.free) + len(model.transmission))
+    for k in range(len(sp.act)):
+        sp.act[k] = z[first + k]
+    for i in range(model.hydraulic):
+        release, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
+        for k in range(4 * i + 2, 4 * i + 4):
+            sp.act[k] = pressure_with_air(sp.act[k], release, onset)
+
+
+@allocation_free
+def store_activations(model, sp, z):
+    """Write `sp.act` back into a state, the inverse of `set_activations`.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state, of which the activations are written.
+
+    Returns:
+        Nothing.
+
+    Source: `laws.pressure_without_air`.
+    """
+    first = 2 * (len(model.mech.free) + len(model.transmission))
+    for k in range(len(sp.act)):
+        z[first + k] = sp.act[k]
+    for i in range(model.hydraulic):
+        release, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
+        for k in range(4 * i + 2, 4 * i + 4):
+            z[first + k] = pressure_without_air(sp.act[k], release, onset)
+
+
+@allocation_free
+def supply_of(model, sp, z):
+    """Supply pressure in a state, scalar [Pa]; `sp.act` is written, see `set_activations`.
+
+    Source: nominal model, "Supply".
+    """
+    user, count, act = model.user, model.hydraulic, sp.act
+    set_activations(model, sp, z)
+    open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
+    share = 1.0 if model.memory < 0 else delivered_share(user, 0, act)
+    return circuit_supply(user, 0, count, sp.scratch, share)
+
+
+@allocation_free
+def term_force(model, sp, z, i, velocity):
+    """Force that the terms add to a drive, and its slope with respect to the drive's velocity.
+
+    Args:
+        model: Model.
+        sp: Space after `place`; its time, positions, pressures and commands.
+        z: (nz,) state.
+        i: index of the drive.
+        velocity: of the drive, scalar [m/s] or [rad/s].
+
+    Returns:
+        (force [N] or [N m], d force / d velocity); of a force drive with the terms of its command.
+    """
+    count = model.hydraulic
+    commanded = i >= count and acts_on(model.terms, ON_COMMAND, i)
+    if not (commanded or acts_on(model.terms, ON_FORCE, i)):
+        return 0.0, 0.0
+    supply = supply_of(model, sp, z) if count > 0 else 0.0
+    s = drive_state(
+        model.user, i, count, sp.act, supply, sp.time[0], sp.drive[X, i], velocity,
+        sp.drive[COMMAND, i], model.gain[i],
+    )  # fmt: skip
+    drives = Drives(count, sp.act, sp.drive[X], sp.drive[V], sp.drive[COMMAND])
+    force, slope = added_with_slope(model.terms, ON_FORCE, i, s, drives)
+    if commanded:
+        more, steep = added_with_slope(model.terms, ON_COMMAND, i, s, drives)
+        force += model.gain[i] * more
+        slope += model.gain[i] * steep
+    return force, slope
+
+
+@allocation_free
+def add_commands(model, sp, h):
+    """Write the commands that the valves are given: what arrives and what the terms add.
+
+    Args:
+        model: Model.
+        sp: Space with positions at the end of the step, velocities over it, time and activations
+            at its start.
+        h: step, scalar [s].
+
+    Returns:
+        Nothing.
+    """
+    drive = sp.drive
+    drives = Drives(model.hydraulic, sp.act, drive[X], drive[V], drive[COMMAND])
+    add_to_commands(model.user, model.terms, drives, h, sp.time[0], sp.scratch, drive[GIVEN])
+
+
+@allocation_free
+def is_lagged(model, c):
+    """Whether a channel shows the past: through a delay or a first-order lag.
+
+    Args:
+        model: Model.
+        c: channel.
+
+    Returns:
+        bool.
+
+    Source: nominal model, "Sensors".
+    """
+    return model.lag[c] > 0.0 or model.time_constant[c] > 0.0
+
+
+@allocation_free
+def follow_channel(trail, c, ratio, shown):
+    """Replace what an ideal sensor shows over a row by what one with a first-order lag shows.
+
+    Args:
+        trail: (k + 1, c) as `advance` writes it, of k steps; column c is replaced
+            [channel's unit].
+        c: channel.
+        ratio: length of a step over the time constant, scalar [1].
+        shown: what the sensor shows at the row's start, scalar [channel's unit].
+
+    Returns:
+        What it shows at the row's end, scalar [channel's unit].
+
+    Source: `noise.first_order`, between steps straight.
+    """
+    before = trail[0, c]
+    trail[0, c] = shown
+    for k in range(1, len(trail)):
+        now = trail[k, c]
+        shown = first_order(shown, before, now, ratio)
+        trail[k, c] = shown
+        before = now
+    return shown
+
+
+@allocation_free
+def follow_trail(model, trail, h, shown):
+    """`follow_channel` for every channel with a first-order lag.
+
+    Args:
+        model: Model.
+        trail: (k + 1, c) as `advance` writes it, of k steps; changed in place.
+        h: step, scalar [s].
+        shown: (c,) what the sensors show at the row's start, then at its end; changed in place.
+
+    Returns:
+        Nothing.
+
+    Source: `follow_channel`.
+    """
+    for c in range(len(model.time_constant)):
+        if model.time_constant[c] > 0.0:
+            shown[c] = follow_channel(trail, c, h / model.time_constant[c], shown[c])
+
+
+_AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
+_BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
+
+
+@allocation_free
+def place(model, sp, z):
+    """Put mechanism and drives at a state: `place_mechanism`, and the pressures that are felt.
+
+    Args:
+        model: Model.
+        sp: Space; what `place_mechanism` says and `act` are written.
+        z: (nz,) state.
+
+    Returns:
+        Nothing.
+
+    Source: `place_mechanism`, `set_activations`.
+    """
+    place_mechanism(model, sp, z)
+    set_activations(model, sp, z)
+
+
+@allocation_free
+def place_mechanism(model, sp, z):
+    """Put the mechanism at a state: frames, drive positions and their Jacobian rows.
+
+    Args:
+        model: Model.
+        sp: Space; `motion`, `row` and X of `drive` are written. X of a drive with a transmission
+            is its own position, not the load's.
+        z: (nz,) state.
+
+    Returns:
+        Nothing.
+
+    Source: kinematics of the closed chains.
+    """
+    mech, m = model.mech, sp.motion
+    n, t, nt = len(mech.free), len(model.transmission), m.joint.shape[1]
+    for f in range(n):
+        m.joint[RATE, mech.free[f]] = z[n + t + f]
+    if nt > n:
+        close_chains(mech, m, z)
+    else:
+        for f in range(n):
+            m.joint[Q, f] = z[f]
+        place_links(mech.tree, mech.shape, mech.links, m.joint, m.frame, m.jacobian)
+    move_links(mech.tree, mech.links, m.joint, m.frame, m.jacobian)
+    if nt > n:
+        drift_chains(mech, m)
+    place_bars(mech.tree, mech.shape, 1 + mech.links, m.frame, m.jacobian, m.bar)
+    move_bars(mech.tree, 1 + mech.links, m.frame, m.bar)
+    for i in range(len(model.gear)):
+        bar, joint = mech.drive[i, BAR], mech.drive[i, JOINT]
+        for f in range(n):
+            if bar < 0:
+                sp.row[i, f] = m.basis[joint, f]
+            elif nt == n:
+                sp.row[i, f] = m.bar[bar, LENGTH_ROW + f]
+            else:
+                total = 0.0
+                for k in range(nt):
+                    total += m.bar[bar, LENGTH_ROW + k] * m.basis[k, f]
+                sp.row[i, f] = total
+        gear = model.gear[i]
+        sp.drive[X, i] = load_position(model, sp, i) if gear < 0 else z[n + gear]
+
+
+@allocation_free
+def load_position(model, sp, i):
+    """Position of a drive's load side, scalar [m] or [rad], at the state of the last `place`.
+
+    Source: kinematics of the closed chains.
+    """
+    mech, bar = model.mech, model.mech.drive[i, BAR]
+    if bar < 0:
+        return sp.motion.joint[Q, mech.drive[i, JOINT]]
+    return sp.motion.bar[bar, BAR_LENGTH] - mech.shape[1 + mech.links + 2 * bar, CLOSED]
+
+
+@allocation_free
+def accelerate(model, sp, z, dt):
+    """Linearly implicit acceleration over a kick; leaves the mechanism where `place` put it.
+
+    `a = (M + dt/2 D + dt^2/4 K)^-1 (sum J' F - h)` with the slope D of friction and dampers and the
+    stiffness K of end stops and of friction's bristles, which is of second order and stable however
+    steep these are.
+
+    Args:
+        model: Model.
+        sp: Space after `place`; `force` receives the (n + t,) acceleration.
+        z: (nz,) state, whose rates act; pressures are those of `sp`.
+        dt: length of the kick, scalar [s]; 0 gives the acceleration itself.
+
+    Returns:
+        Nothing.
+
+    Source: linearly implicit midpoint rule.
+    """
+    mech, m, user = model.mech, sp.motion, model.user
+    n, t, half = len(mech.free), len(model.transmission), 0.5 * dt
+    gather_forces(mech, m)
+    _project(mech.joint, m.mass, m.joint, m.basis, half, n, sp.mass, sp.force)
+    first = n + t  # of the rates
+    if len(model.terms) > 0:
+        for i in range(len(model.gear)):
+            sp.drive[V, i] = _drive_velocity(model, sp, z, i)
+    for i in range(len(model.gear)):
+        u, gear = i * SLOTS, model.gear[i]
+        if i < model.hydraulic:
+            push = user[u + _AH] * sp.act[4 * i + 2] - user[u + _AR] * sp.act[4 * i + 3]
+        else:
+            push = model.gain[i] * sp.drive[COMMAND, i] - user[u + _OFFSET]
+        v = 0.0
+        for f in range(n):
+            v += sp.row[i, f] * z[first + f]
+        own = v if gear < 0 else z[first + n + gear]
+        act, more, steep = sp.act[4 * i :], 0.0, 0.0
+        if len(model.terms) > 0:
+            more, steep = term_force(model, sp, z, i, own)
+        slope, plain = 0.0, True
+        if model.memory >= 0:
+            if user[u + _BRISTLE_STIFFNESS] > 0.0:
+                plain, moved = False, _inertia(model, sp, i)
+                sp.drive[INERTIA, i] = moved
+                share = sp.act[int(user[u + _BRISTLE])]
+                rubbing, damping, stiff = bristle_friction(user, u, share, own, moved, dt)
+                push += more - rubbing
+                slope = half * (damping + half * stiff - steep)
+        if plain:
+            push, damping = force_after_friction(user, u, push, more, act, own, dt)
+            push += more
+            slope = half * (damping - steep)
+        if gear >= 0:
+            damping = model.transmission[gear, GEAR_DAMPING]
+            free = 0.5 * model.transmission[gear, BACKLASH]
+            twist = z[n + gear] - load_position(model, sp, i)
+            twist -= min(free, max(-free, twist))
+            spring = model.transmission[gear, STIFFNESS] * twist + damping * (own - v)
+            sp.force[n + gear] += push - spring
+            inertia = model.transmission[gear, GEAR_INERTIA]
+            sp.mass[n + gear, n + gear] += inertia + slope + half * damping
+            push, slope = spring, half * damping
+            for f in range(n):
+                sp.mass[n + gear, f] -= slope * sp.row[i, f]
+        at = sp.drive[X, i] if gear < 0 else load_position(model, sp, i)
+        stop, stiff, damped = actuator_stop(user, u, at, v)
+        push += stop
+        slope += half * (damped + half * stiff)
+        for f in range(n):
+            sp.force[f] += sp.row[i, f] * push
+            for g in range(f + 1):
+                sp.mass[f, g] += slope * sp.row[i, f] * sp.row[i, g]
+    factorise(sp.mass)
+    solve(sp.mass, sp.force)
+
+
+@allocation_free
+def _drive_velocity(model, sp, z, i):
+    """Velocity of a drive, its own where it has a transmission, scalar [m/s] or [rad/s]."""
+    n, first = len(model.mech.free), len(model.mech.free) + len(model.transmission)
+    if model.gear[i] >= 0:
+        return z[first + n + model.gear[i]]
+    v = 0.0
+    for f in range(n):
+        v += sp.row[i, f] * z[first + f]
+    return v
+
+
+@allocation_free
+def _inertia(model, sp, i):
+    """Inertia that a drive moves while the others rest, scalar [kg] or [kg m^2]."""
+    if model.gear[i] >= 0:
+        return model.transmission[model.gear[i], GEAR_INERTIA]
+    least = math.inf
+    for f in range(len(model.mech.free)):
+        lever = sp.row[i, f]
+        if lever != 0.0:
+            least = min(least, sp.mass[f, f] / (lever * lever))
+    return least
+
+
+@allocation_free
+def _project(facts, tree_mass, joint, basis, half, n, mass, force):
+    """Mass matrix and forces of the tree with its dampers, in independent coordinates."""
+    nt = len(tree_mass)
+    for f in range(len(force)):
+        force[f] = 0.0
+        for g in range(f + 1):
+            mass[f, g] = 0.0
+    for j in range(nt):
+        tree_mass[j, j] += half * facts[DAMPING, j]
+        joint[BIAS, j] += facts[DAMPING, j] * joint[RATE, j]
+    if nt == n:
+        for f in range(n):
+            force[f] = -joint[BIAS, f]
+            for g in range(f + 1):
+                mass[f, g] = tree_mass[f, g]
+        return
+    for j in range(nt):
+        bias = joint[BIAS, j]
+        for k in range(nt):
+            bias += tree_mass[j, k] * joint[DRIFT, k]
+        for f in range(n):
+            force[f] -= basis[j, f] * bias
+        for g in range(n):
+            total = 0.0
+            for k in range(nt):
+                total += tree_mass[j, k] * basis[k, g]
+            for f in range(g, n):
+                mass[f, g] += basis[j, f] * total
+
+
+@allocation_free
+def arriving(command, row, begin, end, period, delay):
+    """Mean of a held and delayed command over part of a row.
+
+    Args:
+        command: (n,) commands, each held for a period [1].
+        row: index of the row.
+        begin: start of the part within the row, scalar [s].
+        end: end of the part, scalar [s].
+        period: scalar [s].
+        delay: scalar [s].
+
+    Returns:
+        Mean command, scalar [1]; before the first row the first command is held.
+
+    Source: pure transport delay of a zero-order hold.
+
+    >>> import numpy as np
+    >>> arriving(np.array([0.0, 1.0]), 1, 0.0, 0.5, 1.0, 0.25)
+    0.5
+    """
+    if delay == 0.0:
+        return command[row]
+    place = row + (begin - delay) / period
+    stop = row + (end - delay) / period
+    total, here = 0.0, place
+    while here < stop - 1e-9:
+        k = math.floor(here + 1e-9)
+        there = min(stop, k + 1.0)
+        total += command[min(len(command) - 1, max(0, k))] * (there - here)
+        here = there
+    return total / (stop - place)
+
+
+@allocation_free
+def advance(model, sp, z, command, row, period, steps, trail):
+    """Advance a state over one row of a log.
+
+    Positions and pressures stand at the whole steps, rates half-way between them; at both ends of
+    the row all are brought to equal times.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state, advanced in place.
+        command: (n, nu) commands, held from row to row.
+        row: index of the row to cross.
+        period: length of a row, scalar [s].
+        steps: steps per row.
+        trail: (>= steps + 1, c) written: what the late channels would show at every step of the
+            row if they were not; (0, c) keeps nothing.
+
+    Returns:
+        Nothing.
+
+    Source: velocity Verlet; circuit: `hydraulics.circuit.step_circuit`.
+    """
+    total = len(model.mech.free) + len(model.transmission)
+    nu, count, h = len(model.gear), model.hydraulic, period / steps
+    act, drive, given = sp.act, sp.drive, COMMAND
+    sp.time[0] = sp.time[1] + row * period
+    _take_commands(model, drive, command, row, 0.0, h, period)
+    place(model, sp, z)
+    if len(trail) > 0:
+        write_trail(model, sp, z, trail[0])
+    accelerate(model, sp, z, 0.5 * h)
+    for f in range(total):
+        z[total + f] += 0.5 * h * sp.force[f]
+    for step in range(steps):
+        _take_commands(model, drive, command, row, step * h, (step + 1) * h, period)
+        for i in range(nu):
+            drive[V, i] = drive[X, i]
+        for f in range(total):
+            z[f] += h * z[total + f]
+        place(model, sp, z)
+        for i in range(nu):
+            drive[V, i] = (drive[X, i] - drive[V, i]) / h
+        if model.memory >= 0:
+            _bend(model.user, act, drive, h, sp.act_dot)
+        if count > 0:
+            if len(model.terms) > 0:
+                add_commands(model, sp, h)
+                given = GIVEN
+            first = np.int64(0)  # numba compiles a function anew for a written number
+            drives = Drives(count, act, drive[X], drive[V], drive[given])
+            _, supply = step_circuit(
+                model.user, first, drives, h, sp.act_dot, sp.scratch, model.terms, sp.time[0],
+                model.memory,
+            )  # fmt: skip
+            if model.memory >= 0 and len(model.terms) > 0:
+                drives = Drives(count, act, drive[X], drive[V], drive[COMMAND])
+                advance_memories(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], supply)
+            for k in range(4 * count):
+                act[k] += h * sp.act_dot[k]
+        if model.memory >= 0:
+            for k in range(4 * count, len(sp.act_dot)):
+                act[k] += h * sp.act_dot[k]
+        store_activations(model, sp, z)
+        sp.time[0] = sp.time[1] + row * period + (step + 1) * h
+        kick = h if step < steps - 1 else 0.5 * h
+        accelerate(model, sp, z, kick)
+        for f in range(total):
+            z[total + f] += kick * sp.force[f]
+        if len(trail) > 0:
+            write_trail(model, sp, z, trail[step + 1])
+
+
+@allocation_free
+def _bend(user, act, drive, h, act_dot):
+    """Rates of all bristles over a step in which the drives' velocities are held."""
+    for i in range(drive.shape[1]):
+        u = i * SLOTS
+        if user[u + _BRISTLE_STIFFNESS] > 0.0:
+            at = int(user[u + _BRISTLE])
+            act_dot[at] = bristle_rate(user, u, act[at], drive[V, i], drive[INERTIA, i], h)
+
+
+@allocation_free
+def _take_commands(model, drive, command, row, begin, end, period):
+    """Commands that arrive over part of a row."""
+    for i in range(len(model.delay)):
+        if model.delay[i] == 0.0:
+            drive[COMMAND, i] = command[row, i]
+        else:
+            drive[COMMAND, i] = arriving(command[:, i], row, begin, end, period, model.delay[i])
+
+
+@allocation_free
+def write_trail(model, sp, z, out):
+    """Keep what the late channels would show in a state if they were not, after `place`.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state.
+        out: (c,) written where a channel is late [channel's unit].
+
+    Returns:
+        Nothing.
+
+    Source: nominal model, "Sensors".
+    """
+    for c in range(len(model.kind)):
+        if is_lagged(model, c):
+            out[c] = _shown(model, sp, z, c)
+
+
+@allocation_free
+def _shown(model, sp, z, c):
+    """What an ideal sensor of a channel shows, after `place`."""
+    kind, i = model.kind[c], model.drive[c]
+    if kind == POSITION:
+        return sp.motion.joint[Q, model.mech.drive[i, JOINT]]
+    if kind == LENGTH:
+        return sp.drive[X, i]
+    if kind == SUPPLY:
+        return supply_of(model, sp, z)
+    return sp.act[4 * i + kind]
+
+
+@allocation_free
+def read_channels(model, sp, z, row, steps, h, trail, out):
+    """What the sensors show in a state, without noise.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state.
+        row: index of the row, for late channels.
+        steps: steps per row.
+        h: step, scalar [s].
+        trail: as `advance` writes it and `follow_trail` changes it, of all rows so far; (0, c)
+            shows late channels as if they were not.
+        out: (c,) written [channel's unit].
+
+    Returns:
+        Nothing.
+
+    Source: nominal model, "Sensors".
+    """
+    place(model, sp, z)
+    for c in range(len(model.kind)):
+        if len(trail) > 0 and is_lagged(model, c):
+            back = max(0.0, row * steps - model.lag[c] / h)
+            low = int(math.floor(back))
+            part = back - low
+            value = trail[low, c]
+            if part > 0.0:
+                value += part * (trail[low + 1, c] - value)
+        else:
+            value = _shown(model, sp, z, c)
+        out[c] = model.scale[c] * value + model.offset[c]
+
+
+@compiled
+def simulate_rows(model, sp, z, command, period, steps, out, states):
+    """Free run from a state over all rows of a log.
+
+    Args:
+        model: Model.
+        sp: Space.
+        z: (nz,) state at the first row, advanced in place to the last.
+        command: (n, nu) commands.
+        period: scalar [s].
+        steps: steps per row.
+        out: (n, c) written: what the sensors show [channel's unit].
+        states: (n, nz) written.
+
+    Returns:
+        Nothing.
+
+    Source: `advance`.
+    """
+    rows = len(command)
+    trail = np.zeros((rows * steps + 1, len(model.kind)))
+    place(model, sp, z)
+    write_trail(model, sp, z, trail[0])
+    shown = trail[0].copy()
+    for row in range(rows):
+        read_channels(model, sp, z, row, steps, period / steps, trail, out[row])
+        for s in range(len(z)):
+            states[row, s] = z[s]
+        if row < rows - 1:
+            ahead = trail[row * steps : (row + 1) * steps + 1]
+            advance(model, sp, z, command, row, period, steps, ahead)
+            follow_trail(model, ahead, period / steps, shown)

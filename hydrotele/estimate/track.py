@@ -34,11 +34,12 @@ from hydrotele.estimate.filter import (
     late_readings,
 )
 from hydrotele.estimate.inputs import Input, decay, input_drift
-from hydrotele.estimate.reduced_dynamics import load_position, place
 from hydrotele.estimate.reduced_model import (
     BACKLASH,
     Model,
+    load_position,
     model_space,
+    place,
     reduced_model,
     state_names,
 )

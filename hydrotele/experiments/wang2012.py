@@ -25,22 +25,20 @@ from hydrotele.calibrate.hybrid_data import Measurement, measurement_of_wires
 from hydrotele.calibrate.posterior import Evolution, Posterior, evolve, sample_posterior
 from hydrotele.experiments.finding import Finding, Marginals, Panel, Progress, performed
 from hydrotele.kinematics.hybrid import (
+    ErrorModel,
     Hybrid,
     Pose,
     carriage_pose,
+    corrected,
+    document_parameters,
+    error_model,
+    first_order,
     forward,
     forward_evolution,
     inverse,
     leg_readings,
     load_hybrid,
     pose_difference,
-)
-from hydrotele.kinematics.hybrid_errors import (
-    ErrorModel,
-    corrected,
-    document_parameters,
-    error_model,
-    first_order,
 )
 from hydrotele.kinematics.wires import pose_covariance, pose_of_wires, wire_lengths
 from hydrotele.simulate.hybrid import (

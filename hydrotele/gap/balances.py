@@ -17,8 +17,14 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from hydrotele.core.compiled import compiled
-from hydrotele.estimate.reduced_dynamics import arriving, load_position, place
-from hydrotele.estimate.reduced_model import X, model_space, reduced_model
+from hydrotele.estimate.reduced_model import (
+    X,
+    arriving,
+    load_position,
+    model_space,
+    place,
+    reduced_model,
+)
 from hydrotele.hydraulics.circuit import (
     SLOTS,
     Slot,

@@ -22,10 +22,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.calibration import CALIBRATION, calibration, numbers
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
-from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration, numbers
 from hydrotele.estimate.output_error import (
     DIRECTIONS,
     LEAD,

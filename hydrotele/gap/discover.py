@@ -1,17 +1,13 @@
 """Laws of what no effect explains: located, estimated, fitted, and written into the machine.
 
 The filter's unknown inputs (`estimate.inputs`) say which balance lacks something, where and when;
-in their places tables over one or two physical variables of this drive or another are tried
-(`law_candidates`). What predicts best parts of runs that it was not fitted to is put into the
-machine, looked for again there, where the filter sees clearer, and kept if it is worth its entries
-and makes free runs better. It is a term of the patched machine (`hydrotele.terms`), which every
-simulator calculates.
+in the place of each of the largest inputs every form of a law (`law_tables`) over one or two
+physical variables of this drive or another is glanced at; the likeliest are regressed on the
+prediction errors and ranked by what they predict in parts of runs that are left out. The best is
+put into the machine, looked for again there, where the filter sees clearer, and kept if it is worth
+its entries and makes free runs better. It is a term of the patched machine (`hydrotele.terms`),
+which every simulator calculates.
 
-Laws that may be what a guess lacks: looked for in the places of the filter's unknown inputs.
-
-In the place of each of the largest inputs every form of a law (`law_tables`) is glanced at; the
-likeliest are regressed on the prediction errors and ranked by what they predict in parts of runs
-that are left out.
 What the pump lacks is read off the supply's balance (`balances.pump_lack`).
 """
 
@@ -24,14 +20,12 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import Evidence, Judged, flat
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
-from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.estimate.inputs import SUPPLY, Input, input_sizes
 from hydrotele.estimate.levels import columns_of, smoothed, smoothed_inputs
-from hydrotele.estimate.reduced_dynamics import place, supply_of
-from hydrotele.estimate.reduced_model import X, model_space
+from hydrotele.estimate.reduced_model import X, model_space, place, supply_of
 from hydrotele.estimate.track import Track, error_responses, following_model
 from hydrotele.gap.balances import pump_lack
 from hydrotele.gap.law_tables import (

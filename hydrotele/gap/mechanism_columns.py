@@ -30,8 +30,7 @@ from hydrotele.identify.record import IdentificationRecord, trimmed, without_err
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import Chain
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import BODY_PARAMETERS
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, project
 
 STRIBECK = (0.03, 0.1, 0.3)  # of a joint's RMS rate: Stribeck velocities that are tried
 _DRY = ("coulomb", "stribeck")  # terms of dry friction

@@ -23,7 +23,7 @@ from scipy.stats import chi2
 from hydrotele.gap.mechanism_columns import TYPICAL, Columns, MechanismEffect, strengths
 from hydrotele.identify.estimation import autoregression, find_doubtful, weights
 from hydrotele.identify.mechanism import Mechanism
-from hydrotele.multibody.regressor import BODY_PARAMETERS
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
 
 _POINTS, _FINE, _GRID = 10, 40, 7  # of hat functions along one variable; of a grid of two
 _RIDGE = 1e-3

@@ -26,7 +26,7 @@ from hydrotele.identify.mechanism import ColumnMapping
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import Chain, body_inertia
-from hydrotele.multibody.regressor import BODY_PARAMETERS
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
 
 EFFECTS_FILE = "effects.yaml"
 

@@ -27,11 +27,9 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import Evidence
-from hydrotele.estimate.hypothesis import Guess
-from hydrotele.estimate.reduced_dynamics import simulate_rows
-from hydrotele.estimate.reduced_model import model_space, reduced_model, state_size
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess
+from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_size
 from hydrotele.estimate.track import STEP, Track, track_run
 from hydrotele.gap.result import LearnedLaw, NamedEffect
 from hydrotele.logs.dataset import Dataset, RunData

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.estimate.calibration import CALIBRATION
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
-from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.estimate.levels import undisturbed_loss
 from hydrotele.gap.calibrating import (
     fit_until_settled,

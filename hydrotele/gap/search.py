@@ -18,9 +18,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.estimate.calibration import CALIBRATION, calibration, numbers
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
-from hydrotele.estimate.hypothesis import Guess, Hypothesis, with_shape
+from hydrotele.estimate.hypothesis import (
+    CALIBRATION,
+    Guess,
+    Hypothesis,
+    calibration,
+    numbers,
+    with_shape,
+)
 from hydrotele.estimate.levels import input_excess, noise_prior
 from hydrotele.estimate.track import COARSE, Levels, Track, track_run
 from hydrotele.gap.calibrating import (

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hydrotele.identify.result import Identification
-from hydrotele.multibody.regressor import BODY_PARAMETERS, FRICTION_TERMS
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS
 
 _USUAL = 0.3  # deformation that counts as one standard deviation: masses to 60 %, sizes to 30 %
 _THIN = 1e-4  # of the largest second moment, that a body has at least in every direction

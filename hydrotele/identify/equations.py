@@ -21,8 +21,7 @@ from hydrotele.identify.motion import (
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.identify.smoothing import Smoothed, error_draws, smooth
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import Regressor, sign_uncertainty
+from hydrotele.multibody.inverse_dynamics import Regressor, project, sign_uncertainty
 
 _TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
 _KAISER = 5.0  # its ripple is 50 dB down

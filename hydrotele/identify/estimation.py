@@ -28,7 +28,7 @@ from hydrotele.identify.identifiability import (
     reference_sizes,
 )
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.regressor import FRICTION_TERMS, Regressor
+from hydrotele.multibody.inverse_dynamics import FRICTION_TERMS, Regressor
 
 _ESTIMATE = "estimate"
 _NORMAL95 = 1.959964

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.regressor import BODY_PARAMETERS, Regressor
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor
 
 UNIDENTIFIABLE, COMBINATION, FULL = "unidentifiable", "combination", "full"
 WEAK = "weak"  # an effect below the noise

@@ -46,7 +46,7 @@ from hydrotele.identify.record import IdentificationRecord, beginning, check_rep
 from hydrotele.identify.result import Forces, HeldOut, Identification
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.identify.smoothing import Smoothed, smooth
-from hydrotele.multibody.regressor import Regressor
+from hydrotele.multibody.inverse_dynamics import Regressor
 
 _SLOPES = 8000  # rows of a run that are asked for the forces' slopes
 _BLOCK = 4  # parameters at a time, so that long logs need little memory

@@ -23,7 +23,7 @@ from hydrotele.logs.rows import fit_clock
 from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.closures import joint_positions
-from hydrotele.multibody.regressor import BODY_PARAMETERS, FRICTION_TERMS
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS
 
 _FITTED = 2.0 / 3.0  # of a single run; the rest judges
 _POSITIONS = ("position.{joint}", "angle.{joint}", "{joint}")

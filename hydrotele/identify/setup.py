@@ -11,8 +11,13 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine.drives import Friction
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.chain import Chain
-from hydrotele.multibody.inverse_dynamics import Projection
-from hydrotele.multibody.regressor import FrictionTerm, Regressor, pin_friction, regressor
+from hydrotele.multibody.inverse_dynamics import (
+    FrictionTerm,
+    Projection,
+    Regressor,
+    pin_friction,
+    regressor,
+)
 
 
 def drive_friction(machine: Machine, chain: Chain) -> list[FrictionTerm]:

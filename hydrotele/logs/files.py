@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hydrotele.core.errors import InputError
-from hydrotele.logs.log import Log, load_log
-from hydrotele.logs.log_checks import CommandRange
+from hydrotele.logs.log import CommandRange, Log, load_log
 from hydrotele.machine.machine import Machine
 
 MEASURED = "measured"  # stem of the log in a run folder, beside `truth`

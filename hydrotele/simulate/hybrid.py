@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from hydrotele.kinematics.hybrid import (
     LEGS,
     REVOLUTE,
+    ErrorModel,
     Hybrid,
     Pose,
     Unreachable,
@@ -24,7 +25,6 @@ from hydrotele.kinematics.hybrid import (
     rotation_of_euler,
     zero_frames,
 )
-from hydrotele.kinematics.hybrid_errors import ErrorModel
 from hydrotele.kinematics.wires import Wires, pose_covariance, wire_lengths
 
 REACH, TILT = 0.08, 0.25  # m, rad: of the platform about its home, for random poses

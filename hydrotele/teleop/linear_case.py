@@ -42,8 +42,7 @@ from hydrotele.control.resolved_motion import COORDINATES, arm_axes, pose_to_joi
 from hydrotele.control.state_filter import butterworth
 from hydrotele.control.tip_balance import ArmBalance, arm_tables
 from hydrotele.core.errors import InputError
-from hydrotele.estimate.reduced_dynamics import place_mechanism
-from hydrotele.estimate.reduced_model import X
+from hydrotele.estimate.reduced_model import X, place_mechanism
 from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.joystick import AXES, Joystick

@@ -36,7 +36,7 @@ from scipy.linalg import expm
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import Case
-from hydrotele.teleop.network import ages_of, in_periods
+from hydrotele.teleop.round_trip import ages_of, in_periods
 from hydrotele.teleop.two_port import RATE_STRUCTURES, STRUCTURES, Impedance
 
 WAVE, PASSIVITY = "wave_variables", "passivity_control"

@@ -14,7 +14,6 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.teleop.analysis import Case
-from hydrotele.teleop.network import ages_of, in_periods
 from hydrotele.teleop.passive_line import (
     END,
     ENERGY,
@@ -24,6 +23,7 @@ from hydrotele.teleop.passive_line import (
     wave_master,
     wave_slave,
 )
+from hydrotele.teleop.round_trip import ages_of, in_periods
 from hydrotele.teleop.sampled import PASSIVITY, WAVE, wave_impedance
 from hydrotele.teleop.two_port import RATE_STRUCTURES, Impedance
 

@@ -43,7 +43,6 @@ from hydrotele.teleop.master import (
     master,
     push_back,
 )
-from hydrotele.teleop.network import arrivals, in_periods, load_delays
 from hydrotele.teleop.operator_model import Hand, OperatorModel
 from hydrotele.teleop.operator_parameters import held_joystick
 from hydrotele.teleop.round_trip import (
@@ -51,6 +50,9 @@ from hydrotele.teleop.round_trip import (
     SHARE,
     STATION,
     Line,
+    arrivals,
+    in_periods,
+    load_delays,
 )
 from hydrotele.teleop.slave import (
     BLOCKED,

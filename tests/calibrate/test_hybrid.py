@@ -21,8 +21,7 @@ from hydrotele.calibrate.posterior import (
 )
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.wang2012 import covered, trial, unused_errors
-from hydrotele.kinematics.hybrid import load_hybrid
-from hydrotele.kinematics.hybrid_errors import document_parameters, error_model
+from hydrotele.kinematics.hybrid import document_parameters, error_model, load_hybrid
 
 IWR = load_hybrid("iwr")
 DOCUMENT = document_parameters(error_model(IWR, "dh"))

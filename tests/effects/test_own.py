@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import hydrotele
+from hydrotele import effects as own
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect, load_effects
-from hydrotele.effects import _own as own
 from hydrotele.effects.effect import Effect
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario

@@ -9,8 +9,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.envs.dm import load
-from hydrotele.envs.single import MachineEnv
-from hydrotele.envs.vector import MachineVectorEnv
+from hydrotele.envs.making import MachineEnv, MachineVectorEnv
 
 TASK = "TrackTrajectory"
 

@@ -15,9 +15,8 @@ from gymnasium.wrappers import AddRenderObservation, RenderCollection
 
 import hydrotele.envs
 from hydrotele.core.errors import InputError
-from hydrotele.envs.single import MachineEnv
+from hydrotele.envs.making import MachineEnv, MachineVectorEnv
 from hydrotele.envs.stage import Stage, goal_markers
-from hydrotele.envs.vector import MachineVectorEnv
 from hydrotele.show.canvas import Canvas
 
 SMALL = {"width": 80, "height": 60, "variants": 2, "duration": 0.2}
@@ -235,7 +234,7 @@ def test_a_window_without_a_screen_is_refused(monkeypatch):
 def test_no_driver_says_what_to_install():
     """In a process of its own, whose OpenGL is one that Linux does not have."""
     code = (
-        "from hydrotele.envs.single import MachineEnv\n"
+        "from hydrotele.envs.making import MachineEnv\n"
         "env = MachineEnv('TrackTrajectory', 'rgb_array', variants=1); env.reset(seed=1)\n"
         "try:\n env.render()\nexcept ValueError as error: print(error)"
     )
@@ -251,7 +250,7 @@ def test_no_driver_says_what_to_install():
 def test_nothing_is_drawn_unasked():
     """An environment that is stepped without pictures brings no OpenGL along."""
     code = (
-        "import sys\nfrom hydrotele.envs.single import MachineEnv\n"
+        "import sys\nfrom hydrotele.envs.making import MachineEnv\n"
         "env = MachineEnv('TrackTrajectory', variants=1)\nenv.reset(seed=1)\n"
         "env.step(env.action_space.sample())\nprint('OpenGL' in sys.modules)"
     )

@@ -5,9 +5,8 @@ import pytest
 
 from hydrotele.effects import EFFECTS
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.calibration import calibration, numbers
 from hydrotele.estimate.evidence import Evidence
-from hydrotele.estimate.hypothesis import Guess
+from hydrotele.estimate.hypothesis import Guess, calibration, numbers
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.estimate.reduced_dynamics import simulate_rows
 from hydrotele.estimate.reduced_model import (
     model_space,
     predicted_channels,
     reduced_model,
+    simulate_rows,
     state_names,
 )
 from hydrotele.estimate.track import steps_per_row, track_run

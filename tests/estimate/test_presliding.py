@@ -8,8 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hydrotele.effects import apply_effect, changed
-from hydrotele.estimate.reduced_dynamics import simulate_rows
-from hydrotele.estimate.reduced_model import predicted_channels, state_names
+from hydrotele.estimate.reduced_model import predicted_channels, simulate_rows, state_names
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.replay import replay_log
 from hydrotele.run.run import run_scenario

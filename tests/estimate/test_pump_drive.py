@@ -8,8 +8,7 @@ import pytest
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.inputs import Input, input_columns
 from hydrotele.estimate.levels import rough_noise
-from hydrotele.estimate.reduced_dynamics import simulate_rows
-from hydrotele.estimate.reduced_model import model_space, reduced_model, state_names
+from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.estimate.track import STEP, steps_per_row, track_run
 from hydrotele.hydraulics.parameters import longest_step
 from hydrotele.logs.dataset import Dataset, RunData

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.estimate.reduced_dynamics import simulate_rows
-from hydrotele.estimate.reduced_model import predicted_channels, state_names
+from hydrotele.estimate.reduced_model import predicted_channels, simulate_rows, state_names
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.parameters import SLOTS, Slot
 from hydrotele.machine.drives import EndStop

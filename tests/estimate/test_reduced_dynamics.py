@@ -9,17 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.reduced_dynamics import (
+from hydrotele.estimate.reduced_model import (
     accelerate,
     advance,
     arriving,
     place,
+    predicted_channels,
     read_channels,
     simulate_rows,
+    state_names,
     supply_of,
     write_trail,
 )
-from hydrotele.estimate.reduced_model import predicted_channels, state_names
 from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
 from hydrotele.logs.log import load_log
 from hydrotele.machine.sensors import SensorError

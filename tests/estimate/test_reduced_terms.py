@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import Term, changed, with_terms
-from hydrotele.estimate.reduced_dynamics import simulate_rows
+from hydrotele.estimate.reduced_model import simulate_rows
 from hydrotele.hydraulics.circuit import NO_MEMORY, circuit_scratch, step_circuit
 from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters
 from hydrotele.terms.law import Drives

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim, lti
 
-from hydrotele.estimate.reduced_dynamics import advance, follow_channel, simulate_rows
+from hydrotele.estimate.reduced_model import advance, follow_channel, simulate_rows
 from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import first_order
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.reduced_dynamics import advance, read_channels
 from hydrotele.estimate.reduced_model import (
+    advance,
     model_space,
     predicted_channels,
+    read_channels,
     reduced_model,
     state_names,
     state_size,

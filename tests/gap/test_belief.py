@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects.effect import Parameter
-from hydrotele.estimate.calibration import CALIBRATION
-from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.gap.residuals import believed, believed_part, has_sizes
 from hydrotele.gap.result import LearnedLaw, NamedEffect
 

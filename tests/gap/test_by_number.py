@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hydrotele.estimate.calibration import CALIBRATION, calibration
 from hydrotele.estimate.evidence import Fit, Judged
-from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, calibration, hypotheses
 from hydrotele.gap import search
 from hydrotele.machine.machine_file import load_machine
 

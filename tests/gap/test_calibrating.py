@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import Parameter
-from hydrotele.estimate.calibration import CALIBRATION, calibration
-from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration, hypotheses
 from hydrotele.gap.calibrating import (
     _further,
     _gain_of_freedom,

@@ -14,9 +14,8 @@ import pytest
 import yaml
 from threadpoolctl import threadpool_info
 
-from hydrotele.estimate.calibration import CALIBRATION, calibration
 from hydrotele.estimate.evidence import Judged
-from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration, hypotheses
 from hydrotele.gap import find
 from hydrotele.gap.discover import Discovery, OpenLoop
 from hydrotele.gap.find import find_gap, without_details

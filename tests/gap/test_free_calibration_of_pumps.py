@@ -3,7 +3,7 @@
 import numpy as np
 
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.calibration import numbers
+from hydrotele.estimate.hypothesis import numbers
 from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from hydrotele.cli.main import app
 from hydrotele.effects import apply_effect
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.calibration import numbers
+from hydrotele.estimate.hypothesis import numbers
 from hydrotele.estimate.levels import rough_noise
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.find import find_gap

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hydrotele.estimate.calibration import calibration
 from hydrotele.estimate.evidence import Fit, Judged
-from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.hypothesis import Guess, calibration, hypotheses
 from hydrotele.estimate.inputs import Input
 from hydrotele.gap import rivals, search
 from hydrotele.gap.rivals import Rival, better, weights

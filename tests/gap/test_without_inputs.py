@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 
 from hydrotele.effects import apply_effect
-from hydrotele.estimate.calibration import CALIBRATION, calibration
 from hydrotele.estimate.evidence import Evidence
-from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, calibration, hypotheses
 from hydrotele.estimate.track import STEP
 from hydrotele.gap.search import without_inputs
 from hydrotele.machine.machine_file import load_machine

@@ -8,8 +8,7 @@ import pytest
 from hydrotele.identify.identifiability import COMBINATION, FULL, UNIDENTIFIABLE, identifiability
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import FrictionTerm, pin_friction, regressor
+from hydrotele.multibody.inverse_dynamics import FrictionTerm, pin_friction, project, regressor
 from hydrotele.simulate.plant import build_plant, rest_state
 from tests.multibody.test_inverse_dynamics import panda
 

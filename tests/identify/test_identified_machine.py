@@ -17,8 +17,7 @@ from hydrotele.identify.result import (
 from hydrotele.identify.setup import cylinder_bars, machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import BODY_PARAMETERS, regressor
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, project, regressor
 from hydrotele.simulate.plant import build_plant, rest_state
 
 

@@ -11,6 +11,10 @@ from hydrotele.kinematics.hybrid import (
     Unreachable,
     batch_readings,
     carriage_pose,
+    corrected,
+    document_parameters,
+    error_model,
+    first_order,
     forward,
     forward_evolution,
     home_pose,
@@ -19,16 +23,10 @@ from hydrotele.kinematics.hybrid import (
     leg_readings,
     load_hybrid,
     pose_difference,
+    predicted_readings,
     rotation_of_euler,
     save_hybrid,
     with_axes,
-)
-from hydrotele.kinematics.hybrid_errors import (
-    corrected,
-    document_parameters,
-    error_model,
-    first_order,
-    predicted_readings,
 )
 from hydrotele.kinematics.wires import (
     NoIntersection,

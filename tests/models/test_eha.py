@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.reduced_dynamics import simulate_rows
-from hydrotele.estimate.reduced_model import model_space, reduced_model, state_names
+from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine

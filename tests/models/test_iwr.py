@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 
 from hydrotele.core.files import models_folder
-from hydrotele.kinematics.hybrid import Pose, Unreachable, forward, load_hybrid, pose_difference
-from hydrotele.kinematics.hybrid_errors import corrected, error_model
+from hydrotele.kinematics.hybrid import (
+    Pose,
+    Unreachable,
+    corrected,
+    error_model,
+    forward,
+    load_hybrid,
+    pose_difference,
+)
 from hydrotele.simulate.closure import pin_opening
 from hydrotele.simulate.hybrid import (
     hybrid_mechanism,

@@ -5,7 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hydrotele.estimate.reduced_dynamics import place
+from hydrotele.estimate.reduced_model import place
 from hydrotele.multibody.inverse_dynamics import project
 from hydrotele.multibody.reduced_mechanism import (
     BIAS,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.estimate.reduced_dynamics import place
+from hydrotele.estimate.reduced_model import place
 from hydrotele.multibody.reduced_mechanism import (
     ACCELERATION,
     DRIFT,

@@ -14,8 +14,7 @@ from hydrotele.identify.identifiability import identifiability, reference_sizes
 from hydrotele.identify.setup import drive_friction, machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.multibody.regressor import FrictionTerm, pin_friction, regressor
+from hydrotele.multibody.inverse_dynamics import FrictionTerm, pin_friction, project, regressor
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 

@@ -17,8 +17,15 @@ from hydrotele.teleop.analysis import (
     loop_gain,
     stability_map,
 )
-from hydrotele.teleop.confirm import impulse_response, is_growing, simulate_sine, step_of
-from hydrotele.teleop.findings import find, findings_document, why_unstable
+from hydrotele.teleop.findings import (
+    find,
+    findings_document,
+    impulse_response,
+    is_growing,
+    simulate_sine,
+    step_of,
+    why_unstable,
+)
 from hydrotele.teleop.switching import Spring, worst_growth
 from hydrotele.teleop.two_port import (
     STRUCTURES,

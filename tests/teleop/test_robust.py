@@ -7,7 +7,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import Case, analyse, load_teleop_case
-from hydrotele.teleop.confirm import impulse_response, is_growing
+from hydrotele.teleop.findings import impulse_response, is_growing
 from hydrotele.teleop.robust import (
     Spread,
     absolutely_stable,

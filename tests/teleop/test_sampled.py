@@ -10,7 +10,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import gain_margin, load_teleop_case
-from hydrotele.teleop.network import ages_of, arrivals, load_delays
+from hydrotele.teleop.round_trip import ages_of, arrivals, load_delays
 from hydrotele.teleop.sampled import (
     PASSIVITY,
     SAMPLED_STRUCTURES,

@@ -7,7 +7,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import Case
-from hydrotele.teleop.confirm import agreement, impulse_response, is_growing, simulate_sine
+from hydrotele.teleop.findings import agreement, impulse_response, is_growing, simulate_sine
 from hydrotele.teleop.two_port import (
     STRUCTURES,
     Gains,

@@ -10,8 +10,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.estimate.reduced_dynamics import simulate_rows
-from hydrotele.estimate.reduced_model import model_space, reduced_model
+from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log, save_log

@@ -2,8 +2,14 @@
 
 import numpy as np
 
-from hydrotele.estimate.reduced_dynamics import advance, place, read_channels, write_trail
-from hydrotele.estimate.reduced_model import model_space, reduced_model
+from hydrotele.estimate.reduced_model import (
+    advance,
+    model_space,
+    place,
+    read_channels,
+    reduced_model,
+    write_trail,
+)
 from hydrotele.estimate.track import STEP, steps_per_row, track_run
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine

@@ -17,7 +17,7 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.effects.mass import PAYLOAD
-from hydrotele.estimate.calibration import numbers as uncertain_numbers
+from hydrotele.estimate.hypothesis import numbers as uncertain_numbers
 from hydrotele.machine.machine import Machine as Facts
 from hydrotele.machine.machine_file import load_machine
 from tools.blind.forms import FORMS
