@@ -21,8 +21,8 @@ from typing import Annotated
 import typer
 
 from hydrotele.cli.calibrating import app as calibrate_app
-from hydrotele.cli.console import HelpGroup
-from hydrotele.cli.identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
+from hydrotele.cli.help_page import HelpGroup
+from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
 from hydrotele.cli.option_values import chosen, numbers_of, overrides_of
 from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
 from hydrotele.core.errors import InputError

@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hydrotele
-from hydrotele.cli import console
+from hydrotele.cli import help_page
 from hydrotele.cli import main as cli
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder, scenarios_folder
@@ -105,7 +105,7 @@ def test_help_imports_nothing_heavy():
         sys.argv = ["hydrotele", "--help"]
         main()
     """
-    env = {name: value for name, value in os.environ.items() if name not in console.SETTINGS}
+    env = {name: value for name, value in os.environ.items() if name not in help_page.SETTINGS}
     found = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True,
         env=env,

@@ -6,7 +6,7 @@ from rich.text import Text
 from typer import rich_utils
 from typer.core import TyperGroup
 
-from hydrotele.cli import console
+from hydrotele.cli import help_page
 from hydrotele.cli.main import app
 
 ROOT = typer.main.get_command(app)
@@ -15,7 +15,7 @@ GROUPS = {"hydrotele": ROOT, **{n: c for n, c in ROOT.commands.items() if hasatt
 
 @pytest.fixture(autouse=True)
 def no_settings(monkeypatch):
-    for name in console.SETTINGS:
+    for name in help_page.SETTINGS:
         monkeypatch.delenv(name, raising=False)
 
 
@@ -43,7 +43,7 @@ def test_page_is_typers(name, monkeypatch, capsys):
     drawn = 0
     for width in (40, 62, 80, 97, 120, 200):
         monkeypatch.setenv("COLUMNS", str(width))
-        page = console.help_page(GROUPS[name], context(name), width)
+        page = help_page.help_page(GROUPS[name], context(name), width)
         assert page is not None or width < 80
         drawn += page is not None
         GROUPS[name].format_help(context(name), None)
@@ -56,17 +56,17 @@ def test_styles_are_typers(name, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "90")
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setattr(rich_utils, "FORCE_TERMINAL", True)
-    page = console.help_page(GROUPS[name], context(name), 90)
+    page = help_page.help_page(GROUPS[name], context(name), 90)
     assert page and cells(page) == cells(by_typer(name, capsys))
 
 
-@pytest.mark.parametrize("setting", console.SETTINGS)
+@pytest.mark.parametrize("setting", help_page.SETTINGS)
 def test_typer_draws_what_settings_ask_for(setting, monkeypatch):
     monkeypatch.setenv(setting, "1")
-    monkeypatch.setattr(console, "help_page", None)  # must not be reached
+    monkeypatch.setattr(help_page, "help_page", None)  # must not be reached
     GROUPS["hydrotele"].format_help(context("hydrotele"), None)
 
 
 def test_a_page_with_what_is_not_drawn_is_typers():
     group = TyperGroup(name="a", help="one\n\ntwo", commands={})
-    assert console.help_page(group, typer.Context(group), 80) is None
+    assert help_page.help_page(group, typer.Context(group), 80) is None

@@ -1,0 +1,390 @@
+"""`hydrotele calibrate arm`, `linkage` and `design`: from logs to results in words, JSON, files."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import hydrotele
+from hydrotele.calibrate.arm import (
+    ArmFit,
+    calibrated_machine,
+    identify_arm,
+    identify_jointly,
+    stage_residuals,
+)
+from hydrotele.calibrate.arm_data import held_out, read_stages, strokes_of
+from hydrotele.calibrate.arm_poses import Poses, with_drift
+from hydrotele.calibrate.bad_data import Region, identify_without_bad_data
+from hydrotele.calibrate.linkage import (
+    NAMES,
+    LinkageFit,
+    Strokes,
+    identified_angles,
+    identify_linkage,
+    machine_with_linkage,
+    values_of,
+)
+from hydrotele.calibrate.loop import Loop, loop_of, unit_of
+from hydrotele.cli.console import out, plain, print_json, table, write_json
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import check_target, whole_folder
+from hydrotele.logs.log import load_logs
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, save_machine
+
+_MISFIT = 1.5  # times what the sensors explain, from which on a note says so
+
+
+class ArmChoices(NamedTuple):
+    """What a user may choose.
+
+    Attributes:
+        method: `joint` or `hierarchical`.
+        poses: to take of each log.
+        accuracy_deg: standard deviation of an angle sensor [deg], None for what the log says.
+        bad_data: whether corrupted readings are looked for and left out.
+        drift: whether the arm's own sensors show how held links drift.
+        heldout: every how many poses are judged on, as text.
+    """
+
+    method: str = "joint"
+    poses: int = 300
+    accuracy_deg: float | None = None
+    bad_data: bool = True
+    drift: bool = True
+    heldout: str | None = None
+
+
+class ArmResult(NamedTuple):
+    """What `calibrate arm` found: nominal machine, fit, poses, bad data, judgement, machine."""
+
+    machine: Machine
+    fit: ArmFit
+    stages: list[Poses]
+    regions: list[Region]
+    judged: Mapping[str, Any]
+    calibrated: Machine
+
+
+def calibrate_arm(
+    data: Path, machine: str, choices: ArmChoices, target: Path | None, as_json: bool
+) -> ArmResult:
+    """Calibrate an arm from a folder of logs; print and write what was found.
+
+    Raises:
+        InputError: the logs or the choices are of no use.
+    """
+    if choices.method not in ("joint", "hierarchical"):
+        raise InputError("--method", f"{choices.method!r} is none; valid: joint, hierarchical")
+    every = _every(choices.heldout)
+    if target:
+        check_target(target, "arm calibration")
+    nominal = load_machine(machine)
+    result = arm_result(nominal, data, choices, every)
+    said = arm_as_data(result)
+    if target:
+        _write(target, said, result.calibrated, lambda folder: _arm_report(folder, result))
+    if as_json:
+        print_json(said)
+    else:
+        _print_arm(said)
+        _print_target(target)
+    return result
+
+
+def _every(text: str | None) -> int:
+    if text is None:
+        return 5
+    if not text.isdigit():
+        raise InputError("--heldout", f"{text!r}: give a whole number N; every N-th pose is judged")
+    return int(text)
+
+
+def arm_result(nominal: Machine, data: Path, choices: ArmChoices, every: int) -> ArmResult:
+    """The calibration itself, without printing.
+
+    Raises:
+        InputError: as `calibrate_arm`.
+    """
+    loop = loop_of(nominal)
+    accuracy = None if choices.accuracy_deg is None else float(np.radians(choices.accuracy_deg))
+    stages = read_stages(data, nominal, loop, choices.poses, accuracy)
+    if choices.drift:
+        stages = [with_drift(loop, poses) for poses in stages]
+    regions: list[Region] = []
+    kept = stages
+    if choices.bad_data:
+        cleaned = identify_without_bad_data(loop, stages)
+        regions, kept = cleaned.regions, cleaned.stages
+    fitted, judged = held_out(kept, every)
+    fit = identify_arm(loop, fitted)
+    if choices.method == "joint":
+        fit = identify_jointly(fit, fitted)
+    made = calibrated_machine(nominal, fit, fitted)
+    return ArmResult(nominal, fit, fitted, regions, _judged(loop, fit, judged), made)
+
+
+def _judged(loop: Loop, fit: ArmFit, judged: list[Poses]) -> dict[str, Any]:
+    """Closure of poses that were not fitted, with nominal and identified parameters."""
+    if not judged:
+        return {}
+    from hydrotele.calibrate.arm import Equations
+
+    rows: dict[str, list] = {"nominal": [], "identified": []}
+    chi = []
+    for poses in judged:
+        equations = Equations(loop, poses)
+        for name, numbers in (("nominal", fit.start), ("identified", fit.numbers)):
+            error = equations.residual(numbers)
+            rows[name].append(error - error.mean(axis=0) if name == "nominal" else error)
+        chi.append(stage_residuals(loop, poses, fit.numbers))
+    rms = {f"rms_{k}_mm": 1e3 * float(np.sqrt(np.mean(np.concatenate(v) ** 2)))
+           for k, v in rows.items()}  # fmt: skip
+    return {"poses": sum(map(len, judged)), **rms,
+            "chi": float(np.sqrt(np.mean(np.concatenate(chi) ** 2)))}  # fmt: skip
+
+
+def arm_as_data(result: ArmResult) -> dict[str, Any]:
+    """What `--json` prints and `calibration.json` holds; SI units."""
+    fit = result.fit
+    rows = [
+        {
+            "name": name, "unit": unit_of(name), "nominal": fit.start[name],
+            "value": float(value), "standard_deviation": float(deviation),
+            "interval": [float(low), float(high)],
+        }
+        for name, value, deviation, (low, high) in zip(
+            fit.names, fit.values, fit.deviations, fit.intervals, strict=True
+        )
+    ]  # fmt: skip
+    stages = [
+        {
+            "link": s.link, "poses": s.poses, "iterations": s.iterations, "rms_mm": 1e3 * s.rms,
+            "chi": s.chi, "condition": s.condition, "identified": list(s.names),
+            "not_identified": dict(s.fixed),
+        }
+        for s in fit.stages
+    ]  # fmt: skip
+    regions = [
+        {
+            "link": r.link, "first_pose": r.first, "last_pose": r.last,
+            "joint": r.joint or f"{r.link} (the arm's own sensor)", "possible": list(r.possible),
+            "size_deg": float(np.degrees(r.size)), "left_out": bool(r.joint),
+        }
+        for r in result.regions
+    ]  # fmt: skip
+    return plain({
+        "machine": fit.nominal.machine, "method": fit.method, "parameters": rows,
+        "stages": stages, "bad_data": regions, "heldout": dict(result.judged),
+        "links_without_log": _unmoved(fit), "notes": _notes(fit),
+    })  # fmt: skip
+
+
+def _unmoved(fit: ArmFit) -> dict[str, list[str]]:
+    """Links that no log moves, with the parameters that stay unknown."""
+    moved = {stage.link for stage in fit.stages}
+    return {
+        link: [f"{kind}.{link}" for kind in ("alpha", "a", "beta" if parallel else "d")]
+        for link, parallel in zip(
+            fit.nominal.links[: fit.nominal.moved], fit.nominal.parallel, strict=False
+        )
+        if link not in moved
+    }  # fmt: skip
+
+
+def _notes(fit: ArmFit) -> list[str]:
+    said = [
+        f"residuals of {s.link} are {s.chi:.1f} times what its sensors explain: held links move,"
+        " joints bend, or a sensor is worse than stated; intervals are wider by as much"
+        for s in fit.stages
+        if s.chi > _MISFIT
+    ]
+    for link, names in _unmoved(fit).items():
+        said.append(f"no log moves {link}: {', '.join(names)} stay nominal")
+    return said
+
+
+def _print_arm(said: Mapping[str, Any]) -> None:
+    shown = table(f"{said['machine']}: {said['method']} identification", "parameter", "nominal",
+                  "identified", "+-", "unit")  # fmt: skip
+    for row in said["parameters"]:
+        degrees = row["unit"] == "rad"
+        scale = np.degrees(1.0) if degrees else 1.0
+        shown.add_row(
+            row["name"], f"{scale * row['nominal']:.4f}", f"{scale * row['value']:.4f}",
+            f"{1.96 * scale * row['standard_deviation']:.4f}", "deg" if degrees else "m",
+        )  # fmt: skip
+    out.print(shown)
+    for stage in said["stages"]:
+        out.print(f"{stage['link']}: {stage['poses']} poses, {stage['iterations']} iterations, RMS"
+                  f" {stage['rms_mm']:.2f} mm, {stage['chi']:.2f} times the sensors'")  # fmt: skip
+        for name, reason in stage["not_identified"].items():
+            out.print(f"  {name} {reason}", style="dim")
+    for region in said["bad_data"]:
+        out.print(f"[yellow]bad data[/] {region['link']}, poses {region['first_pose']} to"
+                  f" {region['last_pose']}: {region['joint']}, {region['size_deg']:.2f} deg"
+                  )  # fmt: skip
+    if said["heldout"]:
+        held = said["heldout"]
+        out.print(f"{held['poses']} poses not fitted: closure {held['rms_nominal_mm']:.1f} mm RMS"
+                  f" nominal, {held['rms_identified_mm']:.2f} mm identified")  # fmt: skip
+    for note in said["notes"]:
+        out.print(note)
+
+
+def _print_target(target: Path | None) -> None:
+    if target:
+        out.print(
+            f"written to [bold]{target}[/]; the calibrated machine is {target}/{MACHINE_FILE}"
+        )
+
+
+def _write(target: Path, said: Mapping[str, Any], machine: Machine, report) -> None:
+    with whole_folder(target, "arm calibration") as folder:
+        write_json(folder / "calibration.json", said)
+        save_machine(machine, folder / MACHINE_FILE)
+        report(folder)
+        summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
+        write_json(folder / "summary.json", summary)
+
+
+def _arm_report(folder: Path, result: ArmResult) -> None:
+    from hydrotele.show.calibration_report import write_arm_report
+
+    write_arm_report(result.fit, result.stages, result.regions, folder / "report.html")
+
+
+def calibrate_linkage(
+    data: Path, machine: str, angles: str, target: Path | None, as_json: bool
+) -> list[LinkageFit]:
+    """Calibrate the cylinder linkages that move in a folder of logs.
+
+    Raises:
+        InputError: no linkage moves, or the logs are of no use.
+    """
+    if angles not in ("measured", "identified"):
+        raise InputError("--angles", f"{angles!r} is none; valid: measured, identified")
+    if target:
+        check_target(target, "arm calibration")
+    nominal = load_machine(machine)
+    fits = linkage_fits(nominal, data, angles)
+    said = plain({"machine": nominal.name, "angles": angles, "axes": {
+        found.axis: _linkage_as_data(found) for found in fits}})  # fmt: skip
+    made = nominal
+    for found in fits:
+        made = machine_with_linkage(made, found)
+    if target:
+        from hydrotele.show.calibration_report import write_linkage_report
+
+        _write(target, said, made, lambda f: write_linkage_report(fits, f / "report.html"))
+    if as_json:
+        print_json(said)
+    else:
+        _print_linkages(said)
+        _print_target(target)
+    return fits
+
+
+def linkage_fits(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
+    """The calibration of the linkages itself, without printing.
+
+    Raises:
+        InputError: as `calibrate_linkage`.
+    """
+    axes = [name for name, axis in nominal.axes.items() if axis.cylinder and not axis.four_bar]
+    logs = load_logs(data)
+    for log in logs:
+        if (of := log.metadata.get("machine", nominal.name)) != nominal.name:
+            message = f"is a log of machine {of}, not of {nominal.name}: name it with --machine"
+            raise InputError(log.source, message)
+    strokes = [s for log in logs for s in strokes_of(log, nominal, axes)]
+    if angles == "identified":
+        loop = loop_of(nominal)
+        stages = read_stages(data, nominal, loop)
+        fit = identify_jointly(identify_arm(loop, stages), stages)
+        by_source = {log.source: log for log in logs}
+        strokes = []
+        for poses in stages:
+            log = by_source[poses.source]
+            known = strokes_of(log, nominal, [poses.link])
+            if not known or poses.rows is None:
+                continue
+            strokes.append(Strokes(
+                poses.link, identified_angles(fit, poses), log[f"length.{poses.link}"][poses.rows],
+                float(poses.sigma.max()) * 2.0, known[0].length_sigma, "identified", log.source,
+            ))  # fmt: skip
+    if not strokes:
+        names = ", ".join(f"angle.{a} and length.{a}" for a in axes)
+        message = f"no cylinder moves by 5 deg or more: log {names} while one moves"
+        raise InputError(data, message)
+    longest = {s.axis: s for s in sorted(strokes, key=lambda s: np.ptp(s.angle))}
+    return [identify_linkage(nominal, s) for s in longest.values()]
+
+
+def _linkage_as_data(found: LinkageFit) -> dict[str, Any]:
+    deviations = dict(zip(found.fit.names, found.fit.deviations, strict=True))
+    return {
+        "parameters": [
+            {"name": name, "unit": "rad" if name == "theta_off" else "m", "nominal": nominal,
+             "value": value, "standard_deviation": deviations.get(name),
+             "held": name in found.fixed}
+            for name, nominal, value in zip(NAMES, found.nominal, values_of(found), strict=True)
+        ],
+        "heldout": {"rms_m": found.rms, "vaf_percent": found.vaf,
+                    "rms_nominal_m": found.rms_before},
+        "samples": found.samples,
+    }  # fmt: skip
+
+
+def _print_linkages(said: Mapping[str, Any]) -> None:
+    for axis, found in said["axes"].items():
+        shown = table(
+            f"{axis}: {said['angles']} angles", "parameter", "nominal", "identified", "+-"
+        )
+        for row in found["parameters"]:
+            scale = np.degrees(1.0) if row["unit"] == "rad" else 1.0
+            wide = "held" if row["held"] else f"{1.96 * scale * row['standard_deviation']:.4f}"
+            shown.add_row(row["name"], f"{scale * row['nominal']:.4f}",
+                          f"{scale * row['value']:.4f}", wide)  # fmt: skip
+        out.print(shown)
+        held = found["heldout"]
+        out.print(f"samples not fitted: RMS {1e3 * held['rms_m']:.2f} mm (nominal"
+                  f" {1e3 * held['rms_nominal_m']:.2f} mm), VAF {held['vaf_percent']:.3f} %"
+                  )  # fmt: skip
+
+
+def design_calibrator(
+    machine: str, accuracy_deg: float, target: Path | None, as_json: bool
+) -> None:
+    """Look over designs of a calibrator; print the best and write the picture."""
+    from hydrotele.calibrate.design import best_design, look_over_designs
+
+    if target:
+        check_target(target, "arm calibration")
+    nominal = load_machine(machine)
+    loop = loop_of(nominal)
+    survey = look_over_designs(loop, float(np.radians(accuracy_deg)))
+    best = best_design(loop, survey, float(np.radians(accuracy_deg)))
+    said = plain({
+        "machine": machine, "present": survey.present._asdict(), "best": best._asdict(),
+        "designs": [d._asdict() for d in survey.designs],
+    })  # fmt: skip
+    if target:
+        from hydrotele.show.calibration_report import draw_designs
+
+        with whole_folder(target, "arm calibration") as folder:
+            (folder / "design.png").write_bytes(draw_designs(survey, best))
+            write_json(folder / "calibration.json", said)
+            summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
+            write_json(folder / "summary.json", summary)
+    if as_json:
+        print_json(said)
+        return
+    for name, one in (("present", survey.present), ("best", best)):
+        out.print(f"{name}: arm {one.arm:.2f} m, forearm {one.forearm:.2f} m, ball joint"
+                  f" {one.ball_x:.2f} m"
+                  f" in front and {one.ball_z:+.2f} m: tip of the arm known to"
+                  f" {1e3 * one.tip_error:.1f} mm, {100 * one.reached:.0f} % of the poses reached"
+                  )  # fmt: skip

@@ -1,0 +1,90 @@
+"""`hydrotele identify-operator`: parameters of the operator model from a record of tracking."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+IDENTIFY_OPERATOR_EPILOG = """\b
+Examples:  hydrotele identify-operator tracking.csv --out operator_7
+           hydrotele identify-operator trial.csv --hand "stick [deg]" --target "command [deg]"
+
+\b
+The record is a CSV or Parquet file with columns time, target, response and hand (or force, for a
+stick that does not move): compensatory tracking, in which the error of target and response is
+displayed. At least 20 s with 10 samples per second; two minutes or more for close intervals.
+The written operator.yaml is for scenarios: pilot: {perception: {file: operator_7/operator.yaml}}.
+"""
+_KIND = "operator identification"
+
+
+def identify_operator(
+    file: Annotated[Path, typer.Argument(help="Record of tracking, .csv or .parquet.")],
+    time: Annotated[str | None, typer.Option(help="Column of the time; default time.")] = None,
+    target: Annotated[str | None, typer.Option(help="Column of the target.")] = None,
+    response: Annotated[str | None, typer.Option(help="Column of the response.")] = None,
+    hand: Annotated[str | None, typer.Option(help="Column of the hand's position.")] = None,
+    equalisation: Annotated[
+        str | None, typer.Option(help="gain, lead, lag or integral; default what fits best.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for operator.yaml and fit.json.")
+    ] = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
+    ] = False,
+) -> None:
+    """Fit the operator model to a person's tracking: delay, margins, neuromuscular lag, remnant."""
+    import hydrotele
+    from hydrotele.cli.console import notes, plain, print_json, write_json
+    from hydrotele.core.output import check_target, whole_folder
+    from hydrotele.teleop.operator_identification import (
+        identify_operator,
+        operator_file_of,
+        read_tracking,
+    )
+
+    if out:
+        check_target(out, _KIND)
+    given = {"time": time, "target": target, "response": response, "hand": hand}
+    record, said = read_tracking(file, {key: name for key, name in given.items() if name})
+    fit = identify_operator(record, equalisation, source=str(file))
+    fit = fit._replace(notes=(*said, *fit.notes))
+    document = plain({
+        "file": file.name, "equalisation": fit.equalisation, "controlled_element": fit.element,
+        "explained": fit.explained, "rate_hz": fit.rate, "duration": fit.duration,
+        "estimates": {name: one._asdict() for name, one in fit.estimates.items()},
+        "notes": list(fit.notes),
+    })  # fmt: skip
+    if out:
+        text = operator_file_of(fit, "identified", file.name)
+        with whole_folder(out, _KIND) as folder:
+            (folder / "operator.yaml").write_text(text, encoding="utf-8")
+            write_json(folder / "fit.json", document)
+            summary = {"kind": _KIND, "name": file.name, "hydrotele": hydrotele.__version__}
+            write_json(folder / "summary.json", summary)
+    if json:
+        print_json(document)
+        return
+    _print(fit, file)
+    for note in fit.notes:
+        notes.print(f"[yellow]note[/] {note}")
+    if out:
+        notes.print(f"written to [bold]{out}[/]: operator.yaml, fit.json")
+
+
+def _print(fit, file: Path) -> None:
+    from hydrotele.cli.console import out, table
+
+    element = f", controlled element {fit.element}" if fit.element else ""
+    title = (
+        f"{file.name}: {fit.duration:.0f} s at {fit.rate:.3g} Hz, equalisation {fit.equalisation}"
+        f"{element}; {100 * fit.explained:.0f} % of the hand's motion come from the target"
+    )
+    rows = table(title, "parameter", "estimate", "95 % interval", "unit", "")
+    for name, one in fit.estimates.items():
+        rows.add_row(
+            name.replace("_", " "), f"{one.value:.4g}", f"{one.low:.4g} to {one.high:.4g}",
+            one.unit, "" if one.identified else "[yellow]not identified[/]",
+        )  # fmt: skip
+    out.print(rows)
