@@ -47,7 +47,7 @@ def passed_by(words: list[str]) -> tuple[Counter[str], int]:
 
     def count(frame, event, _):
         name = frame.f_code.co_filename
-        if event == "call" and name.startswith(prefix):
+        if event == "call" and name.startswith(prefix) and name.endswith(".py"):
             caller = frame
             while caller and name not in passed:
                 if caller.f_code.co_name == "<module>" and caller.f_code.co_filename != __file__:
