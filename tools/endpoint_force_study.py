@@ -23,9 +23,8 @@ from hydrotele.control.endpoint_force import (
     identify_gravity,
 )
 from hydrotele.control.state_filter import LOW, filter_delay, filter_table, filtered
-from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine import Machine, sensor_set
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import sensor_set
 from hydrotele.run.run import Run, prepare, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
 from hydrotele.simulate.record import begin_leapfrog

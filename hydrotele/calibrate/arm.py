@@ -22,8 +22,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import changed
 from hydrotele.identify.identifiability import Identifiability
 from hydrotele.kinematics.serial_chain import forward, joint_axes
-from hydrotele.machine.machine import Closure, Machine
-from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.machine import Closure, Machine, SensorError
 
 SIZES = {"m": 0.1, "rad": np.radians(5.0)}
 """How far a parameter may be from nominal, by unit: what a tape and a protractor leave."""

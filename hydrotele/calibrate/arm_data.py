@@ -11,8 +11,7 @@ from hydrotele.calibrate.linkage import Strokes
 from hydrotele.calibrate.loop import Loop
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log, load_logs
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import IDEAL, noise_rms, sensor_set
+from hydrotele.machine.machine import IDEAL, Machine, noise_rms, sensor_set
 
 POSES = 300
 """Poses that are taken of a log, evenly spread; Khoshzaban's figures show 300 to 400."""

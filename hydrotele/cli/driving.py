@@ -32,8 +32,7 @@ from hydrotele.run.live import (
     further_axes,
     haptic_address,
 )
-from hydrotele.run.run import Run, scenario_machine
-from hydrotele.run.session import Session
+from hydrotele.run.run import Run, Session, scenario_machine
 from hydrotele.scenario.scenario import Scenario, load_scenario
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.native import stop_profiling_clock

@@ -26,12 +26,11 @@ from hydrotele.cli.console import (
 from hydrotele.cli.opening import data_name, machine_of
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, replacing, whole_folder
-from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.excitation import MachineLimits, design_motion, informative_base
 from hydrotele.identify.hydraulic import Hydraulics, identify_hydraulics
 from hydrotele.identify.identification import identify_with_shapes
-from hydrotele.identify.identified_machine import identified_machine, identify_document
+from hydrotele.identify.identified_machine import Consistent, identified_machine, identify_document
 from hydrotele.identify.mechanism import load_mechanism, mechanism_records
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import force_noise, records

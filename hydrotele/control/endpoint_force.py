@@ -51,9 +51,7 @@ from hydrotele.core.memory import address_record, floats, integers, rows_of
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorSet
-from hydrotele.machine.signals import noise_rms
+from hydrotele.machine.machine import Machine, SensorSet, noise_rms
 
 _NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
 _GRID = 9  # poses per joint to which the masses' torques are fitted

@@ -40,8 +40,7 @@ from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import Effect, Parameter, changed, term_number, with_terms
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.facts import Term
-from hydrotele.terms.law import LAWS, DriveState, Numbers, Variable, defined_by, law
+from hydrotele.terms.law import LAWS, DriveState, Numbers, Term, Variable, defined_by, law
 
 GROUP = "hydrotele.effects"
 ENVIRONMENT = "HYDROTELE_EFFECTS"

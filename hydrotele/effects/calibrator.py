@@ -7,8 +7,7 @@ calibration most; backlash and looseness less.
 import math
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.machine import Machine, SensorError
 
 
 def _joints(machine: Machine) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from hydrotele.effects.effect import (
     with_terms,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
 
 _SOFTEST = 1.0e7  # Pa, oil full of air: the lowest bulk modulus that a machine may state
 

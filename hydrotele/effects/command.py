@@ -5,7 +5,7 @@ A command that arrives with an offset: a valve's or an amplifier's zero is off.
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed, term_number, with_terms
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
 
 ALL = "all"
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.facts import Balance, Term
+from hydrotele.terms.law import Balance, Term
 
 Law = Literal["force", "flow", "valve", "supply", "geometry", "timing", "sensor"]
 Values = Mapping[str, float]

@@ -13,7 +13,7 @@ from hydrotele.effects.effect import (
     with_terms,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
 
 CONSTANT, PULSE, DRAG = "external_force", "force_pulse", "speed_dependent_force"
 _BEGIN, _LENGTH = 5.0, 5.0  # s, of a pulse of no size, from which a search starts

@@ -23,7 +23,7 @@ from hydrotele.effects.effect import (
     with_terms,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
 
 
 def _numbers(field: str, scale: float, high: float):

@@ -3,8 +3,7 @@
 import math
 
 from hydrotele.effects.effect import Effect, Parameter, Values, axes, hydraulics, linkages
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.machine import Machine, SensorError
 
 _PERFECT = SensorError()
 _SIDES = ("head", "rod")

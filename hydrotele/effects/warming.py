@@ -2,7 +2,7 @@
 
 from hydrotele.effects.effect import Effect, Parameter, Values, with_terms
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
 
 NAME, ALL = "warming", "all"
 _SLOW = 300.0  # s, in which a tank of some hundred litres warms up

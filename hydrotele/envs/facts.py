@@ -18,9 +18,7 @@ from hydrotele.envs.task import REAL, Options, Task
 from hydrotele.envs.variants import Variants, channels
 from hydrotele.envs.world import Field
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorSet
-from hydrotele.machine.signals import channel_sensor, converter, sensor_set
+from hydrotele.machine.machine import Machine, SensorSet, channel_sensor, converter, sensor_set
 from hydrotele.simulate.feedback import samples_every
 from hydrotele.simulate.layout import field_offsets, function_address, verify_layout
 from hydrotele.simulate.mechanism import TIP_SITE

@@ -18,8 +18,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.envs.episode import AXES, CHANNELS
 from hydrotele.envs.task import Options, Task
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.machine import Machine, SensorError
 from hydrotele.scenario.scenario import SurroundingObject
 from hydrotele.simulate.fleet import STATE
 from hydrotele.simulate.mechanism import TIP_SITE

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
+from hydrotele.estimate.filter import MEMORY
 from hydrotele.estimate.hypothesis import Guess
-from hydrotele.estimate.inputs import MEMORY
 from hydrotele.estimate.levels import find_levels, with_jitter
 from hydrotele.estimate.track import (
     COARSE,

@@ -1,6 +1,6 @@
 """Noise levels from the data: of every channel's readings, and of what the model lacks.
 
-What a model lacks is counted as unknown inputs of its balances (`estimate.inputs`): force, flow
+What a model lacks is counted as unknown inputs of its balances (`estimate.filter`): force, flow
 into the chambers, command. All levels are those of the largest likelihood (Kristensen, Madsen and
 Jorgensen 2004, Automatica 40(2), section 3: grey-box models whose diffusion terms show where they
 lack something). An accuracy that a machine states is a prior for its channel. So likelihoods and
@@ -25,7 +25,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from hydrotele.core.compiled import compiled
-from hydrotele.estimate.inputs import Input, decay, input_columns, input_sizes, possible_inputs
+from hydrotele.estimate.filter import Input, decay, input_columns, input_sizes, possible_inputs
 from hydrotele.estimate.reduced_model import state_names
 from hydrotele.estimate.track import (
     DRIFT,
@@ -40,8 +40,7 @@ from hydrotele.estimate.track import (
     track_run,
 )
 from hydrotele.logs.dataset import Dataset, RunData, busiest_rows
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import channel_sensor, converter
+from hydrotele.machine.machine import Machine, channel_sensor, converter
 
 
 class LinearRun(NamedTuple):

@@ -34,9 +34,8 @@ from hydrotele.hydraulics.parameters import (
     extra_state_names,
     terms_of,
 )
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import first_order, parse_channel
+from hydrotele.machine.machine import Machine, SensorError, first_order
+from hydrotele.machine.signals import parse_channel
 from hydrotele.multibody.reduced_mechanism import (
     BAR,
     BIAS,

@@ -25,15 +25,17 @@ from hydrotele.effects.transmission import ringing
 from hydrotele.estimate.filter import (
     Crossing,
     Gains,
+    Input,
     InputEffect,
     Linearisation,
     MeasuredRun,
     Steps,
     Variances,
+    decay,
     filter_run,
+    input_drift,
     late_readings,
 )
-from hydrotele.estimate.inputs import Input, decay, input_drift
 from hydrotele.estimate.reduced_model import (
     BACKLASH,
     Model,
@@ -569,7 +571,7 @@ def error_responses(
     Args:
         track: linearised, with n rows and c channels.
         column: (n, nz) what a unit of the addition, held over a row, adds to the model's states, as
-            `inputs.input_columns` has it [state's unit per unit of the addition].
+            `filter.input_columns` has it [state's unit per unit of the addition].
         values: (n, p) the additions in every row.
         rows: some of the track's, n of which there are values.
 

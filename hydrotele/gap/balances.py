@@ -48,9 +48,8 @@ from hydrotele.kinematics.linkages import LoopOpen
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.logs.rows import fit_clock
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import noise_rms, parse_channel, sensor_set, usual_unit
+from hydrotele.machine.machine import Machine, SensorError, noise_rms, sensor_set
+from hydrotele.machine.signals import parse_channel, usual_unit
 from hydrotele.multibody.reduced_mechanism import (
     BAR,
     BIAS,

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.estimate.inputs import SUPPLY, Input, input_units
+from hydrotele.estimate.filter import SUPPLY, Input, input_units
 from hydrotele.gap.discover import Discovery, Learned
 from hydrotele.gap.law_tables import AHEAD, PLAYED, THROUGH, Memory
 from hydrotele.gap.result import (
@@ -29,7 +29,7 @@ from hydrotele.gap.result import (
     in_customary_units,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.facts import OF_A_DRIVE
+from hydrotele.terms.law import OF_A_DRIVE
 from hydrotele.terms.table import SWITCH
 
 _PLAYED, _AHEAD = "played ", "lead of the "  # of a variable and its play

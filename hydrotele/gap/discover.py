@@ -1,6 +1,6 @@
 """Laws of what no effect explains: located, estimated, fitted, and written into the machine.
 
-The filter's unknown inputs (`estimate.inputs`) say which balance lacks something, where and when;
+The filter's unknown inputs (`estimate.filter`) say which balance lacks something, where and when;
 in the place of each of the largest inputs every form of a law (`law_tables`) over one or two
 physical variables of this drive or another is glanced at; the likeliest are regressed on the
 prediction errors and ranked by what they predict in parts of runs that are left out. The best is
@@ -21,9 +21,9 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.estimate.evidence import Evidence, Judged, flat
+from hydrotele.estimate.filter import SUPPLY, Input, input_sizes
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
-from hydrotele.estimate.inputs import SUPPLY, Input, input_sizes
 from hydrotele.estimate.levels import columns_of, smoothed, smoothed_inputs
 from hydrotele.estimate.reduced_model import X, model_space, place, supply_of
 from hydrotele.estimate.track import Track, error_responses, following_model
@@ -50,7 +50,7 @@ from hydrotele.gap.search import lacking
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.facts import OF_A_DRIVE, Term
+from hydrotele.terms.law import OF_A_DRIVE, Term
 
 LEARNED = "learned"
 """First part of the name of a hypothesis that holds a learned law."""

@@ -9,8 +9,8 @@ from threadpoolctl import threadpool_limits
 
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
+from hydrotele.estimate.filter import input_sizes, input_units
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses
-from hydrotele.estimate.inputs import input_sizes, input_units
 from hydrotele.estimate.levels import rippled, stated_jitter
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances

@@ -19,7 +19,7 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.estimate.track import Track, error_responses
-from hydrotele.terms.facts import OF_A_DRIVE
+from hydrotele.terms.law import OF_A_DRIVE
 from hydrotele.terms.table import PLAY, SWITCH, acting, remembered
 
 THROUGH = "flow_through"

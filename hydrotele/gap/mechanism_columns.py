@@ -28,7 +28,7 @@ from hydrotele.identify.mechanism import Mechanism, in_coordinates
 from hydrotele.identify.motion import Processing, joint_motion, resolution
 from hydrotele.identify.record import IdentificationRecord, trimmed, without_error
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.machine import SensorError
 from hydrotele.multibody.chain import Chain
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, project
 

@@ -21,8 +21,8 @@ from scipy.optimize import OptimizeResult, lsq_linear, minimize
 
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.evidence import Evidence, Judged
+from hydrotele.estimate.filter import Input
 from hydrotele.estimate.hypothesis import WIDE, Guess, Hypothesis
-from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import noise_prior, rippled_at, smoothed_inputs
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, track_run
 from hydrotele.logs.dataset import RunData

@@ -29,6 +29,8 @@ from hydrotele.hydraulics.actuator import (
 )
 from hydrotele.hydraulics.laws import (
     air_compliance,
+    axis_opening,
+    chamber_flows,
     port_flow,
     pressure_with_air,
     pressure_without_air,
@@ -54,7 +56,6 @@ from hydrotele.hydraulics.supply import (
     supply_pressure,
     with_added,
 )
-from hydrotele.hydraulics.valve import axis_opening, chamber_flows
 from hydrotele.terms.law import VARIABLES, DriveState
 from hydrotele.terms.table import (
     ANY,

@@ -6,8 +6,8 @@ Flat arrays are laid out as in `circuit`; `ports` holds four numbers per axis, s
 import math
 
 from hydrotele.core.compiled import allocation_free, inlined
+from hydrotele.hydraulics.laws import axis_opening, inlet_flow, inlet_gain
 from hydrotele.hydraulics.parameters import SLOTS, Kind, Slot
-from hydrotele.hydraulics.valve import axis_opening, inlet_flow, inlet_gain
 
 _NEWTON_STEPS = 60
 _FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the flow balance of 1e-6 that is promised

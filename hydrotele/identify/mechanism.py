@@ -20,7 +20,7 @@ from hydrotele.identify.record import IdentificationRecord, trimmed, without_err
 from hydrotele.identify.setup import RegressorSetup, mechanism_setup
 from hydrotele.logs.log import LEFT_OUT, Log, load_log, read_table
 from hydrotele.logs.rows import fit_clock
-from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.machine import SensorError
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.closures import joint_positions
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS

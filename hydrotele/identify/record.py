@@ -10,9 +10,7 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import DriveLinkage, axis_linkage
 from hydrotele.kinematics.linkages import LoopOpen
 from hydrotele.logs.dataset import Dataset, RunData
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import noise_rms, sensor_set
+from hydrotele.machine.machine import Machine, SensorError, noise_rms, sensor_set
 
 _WHERE = "identification"
 _DRIFT = 0.5  # rows by which a cycle may move away from the rows over a whole record

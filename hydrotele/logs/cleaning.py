@@ -26,9 +26,7 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.logs import cleaning as value_range
 from hydrotele.logs.rows import Rows
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import Sensor, SensorSet
-from hydrotele.machine.signals import channel_sensor, converter
+from hydrotele.machine.machine import Machine, Sensor, SensorSet, channel_sensor, converter
 
 _ANGLE_PLAY = 0.35  # [rad] beyond a joint's range; zeros are set worse than ranges are known
 _LENGTH_PLAY = 0.2  # of the stroke or the range, likewise

@@ -23,9 +23,15 @@ from hydrotele.logs.cleaning import check_range, remove_faults
 from hydrotele.logs.files import RunFiles, check_commands, read_runs
 from hydrotele.logs.log import Log
 from hydrotele.logs.rows import Masked, Rows, averaged, check_runs, cut, read_mask, run_rows
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorSet
-from hydrotele.machine.signals import IDEAL, channel_sensor, noise_rms, parse_channel, sensor_set
+from hydrotele.machine.machine import (
+    IDEAL,
+    Machine,
+    SensorSet,
+    channel_sensor,
+    noise_rms,
+    sensor_set,
+)
+from hydrotele.machine.signals import parse_channel
 
 _MOVES = 10.0  # standard deviations of a reading that a motion must amount to
 _UNSTATED = ("none", "", IDEAL)  # what logs with true values say of their sensors

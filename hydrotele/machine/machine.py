@@ -3,18 +3,102 @@
 The numbers stand in `models/<machine>/machine.yaml`, the tree and the shapes in its MJCF. A link's
 position and inertia may stand in either of them, never in both.
 
-Which joints of a machine's links follow from its closures.
+Also which joints of its links follow from its closures, and how its sensors read: which sensor a
+channel has, its lag, its converter, its noise.
 """
 
-from typing import Annotated, Literal
+import math
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from hydrotele.core.compiled import compiled
 from hydrotele.core.datafile import Facts, Name, NonNegative, Positive, Vector, suggest
+from hydrotele.core.errors import InputError
 from hydrotele.machine.drives import Axis, EndStop, LoadCylinder, Pin
-from hydrotele.machine.sensors import SensorError, SensorSet
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
+
+
+class Sensor(Facts):
+    """A random error, then 2^bits equal steps of the span; `None` = no such defect.
+
+    The error is uniform in +-`accuracy`, or normal with `standard_deviation`. With neither the
+    sensor is ideal to the simulator, and of unknown noise to whoever learns from its readings.
+    """
+
+    accuracy: NonNegative = 0.0
+    standard_deviation: NonNegative = 0.0
+    bits: Annotated[int, Field(ge=1, le=32)] | None = None
+    span: Positive | None = None
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.accuracy and self.standard_deviation:
+            raise ValueError(
+                "give accuracy (the bound of a uniform error) or standard_deviation, not both"
+            )
+        return self
+
+    @property
+    def error_rms(self) -> float:
+        """Standard deviation of the random error [channel's unit]; 0 where none is stated."""
+        return self.standard_deviation or self.accuracy / math.sqrt(3.0)
+
+
+class SensorSet(Facts):
+    """Sensors of a machine by kind of channel, sampled at `rate` [Hz].
+
+    The log's rows are read at instants that are off by `jitter` [s], normal, of all channels alike.
+    What `channels` says of a channel, such as `pressure_head.boom`, holds there in place of its
+    kind; an empty entry says that nothing is known of it.
+    """
+
+    rate: Positive = 50.0
+    jitter: NonNegative = 0.0
+    angle: Sensor = Sensor()
+    position: Sensor = Sensor()
+    length: Sensor = Sensor()
+    pressure: Sensor = Sensor()
+    channels: dict[str, Sensor] = {}
+
+    @model_validator(mode="after")
+    def _check(self):
+        kinds = {kind: getattr(self, kind) for kind in ("angle", "position", "pressure")}
+        others = {n: s for n, s in self.channels.items() if not n.startswith("length.")}
+        for name, sensor in (kinds | others).items():
+            if sensor.bits is not None and sensor.span is None:
+                raise ValueError(
+                    f"{name}: {sensor.bits} bits need a span (only length has its own)"
+                )
+        return self
+
+
+class SensorError(Facts):
+    """A defect of one channel: it reads `scale * y(t - delay) + offset`, delay in [s].
+
+    y follows the true value with a first-order lag, `time_constant dy/dt = value - y` [s]; without
+    a time constant it is the true value. The coupling of an undriven joint's sensor may be tilted
+    against its axis by `tilt` [rad], as a universal joint is, `tan(shown) = tan(y) cos(tilt)`, and
+    have a play of `backlash` [rad].
+    """
+
+    offset: float = 0.0
+    scale: Positive = 1.0
+    delay: NonNegative = 0.0
+    time_constant: NonNegative = 0.0
+    tilt: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
+    backlash: NonNegative = 0.0
+
+    @property
+    def coupled(self) -> bool:
+        """Whether the sensor's coupling has a tilt or a play."""
+        return self.tilt > 0.0 or self.backlash > 0.0
+
+    @property
+    def late(self) -> bool:
+        """Whether it shows anything but the present value."""
+        return self.delay > 0.0 or self.time_constant > 0.0
 
 
 class Joint(Facts):
@@ -406,3 +490,96 @@ def links_of_loop(machine: Machine, a: str, b: str) -> list[str]:
             link = machine.links[link].parent
         chains.append(chain)
     return [x for x in chains[0] + chains[1] if not (x in chains[0] and x in chains[1])]
+
+
+IDEAL = "ideal"
+
+_KINDS = {
+    "angle": "angle",
+    "position": "position",
+    "length": "length",
+    "pressure_head": "pressure",
+    "pressure_rod": "pressure",
+    "pressure_supply": "pressure",
+}
+
+
+def sensor_set(machine: Machine, name: str) -> SensorSet | None:
+    """A machine's sensors by name; None for ideal ones.
+
+    Raises:
+        InputError: the machine has no such sensors; lists those it has.
+    """
+    if name == IDEAL:
+        return None
+    if name not in machine.sensors:
+        raise InputError(
+            f"sensors {name!r}",
+            f"machine {machine.name} has none; {suggest(name, [IDEAL, *machine.sensors])}",
+        )
+    return machine.sensors[name]
+
+
+def channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) -> Sensor:
+    """Sensor of a channel with its span filled in: a length spans its cylinder's stroke."""
+    if sensors is None:
+        return Sensor()
+    kind, _, axis = channel.partition(".")
+    of_kind: Sensor = getattr(sensors, _KINDS[kind])
+    sensor = sensors.channels.get(channel, of_kind)
+    if kind == "length" and sensor.bits and sensor.span is None:
+        cylinder = machine.axes[axis].cylinder
+        assert cylinder
+        return sensor.model_copy(update={"span": cylinder.stroke})
+    return sensor
+
+
+class Converter(NamedTuple):
+    """An analogue-to-digital converter: nearest step, kept inside low .. high [channel's unit].
+
+    A step of 0 passes everything unchanged.
+    """
+
+    step: float
+    low: float
+    high: float
+
+
+def converter(sensor: Sensor, channel: str) -> Converter:
+    """Converter of a channel: 2^bits steps of the span; lengths and pressures end at 0 and span."""
+    if sensor.bits is None or sensor.span is None:
+        return Converter(0.0, -math.inf, math.inf)
+    step = sensor.span / 2.0**sensor.bits
+    if channel.startswith(("angle", "position")):
+        return Converter(step, -math.inf, math.inf)
+    return Converter(step, 0.0, sensor.span)
+
+
+def noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
+    """Standard deviation of one reading [channel's unit]: random error plus converter."""
+    sensor = channel_sensor(machine, sensors, channel)
+    return math.sqrt(sensor.error_rms**2 + converter(sensor, channel).step ** 2 / 12.0)
+
+
+@compiled
+def first_order(shown, before, now, ratio):
+    """What a first-order lag shows after a step over which its input runs straight.
+
+    `T dy/dt = x - y` with `x` from `before` to `now`, integrated exactly.
+
+    Args:
+        shown: y at the step's start, scalar or array [channel's unit].
+        before: input at the step's start, alike.
+        now: input at the step's end, alike.
+        ratio: length of the step over the time constant T, scalar, positive [1].
+
+    Returns:
+        y at the step's end, as `shown`.
+
+    Source: step and ramp response of the first-order lag.
+
+    >>> float(round(first_order(0.0, 1.0, 1.0, 1.0), 6))
+    0.632121
+    """
+    gone = -np.expm1(-ratio)
+    return shown + gone * (before - shown) + (1.0 - gone / ratio) * (now - before)

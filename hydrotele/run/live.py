@@ -18,8 +18,7 @@ from hydrotele.haptics.server import PORT
 from hydrotele.machine.joystick import AXES
 from hydrotele.machine.machine import Machine
 from hydrotele.run.devices import Device, Reading, Switches
-from hydrotele.run.run import Run, begin, finished
-from hydrotele.run.session import Session
+from hydrotele.run.run import Run, Session, begin, finished
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Button, Follow, Live, TeleopPilot
 from hydrotele.simulate.record import contact_force, surrounding_bodies

@@ -11,9 +11,8 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import json_value
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import noise_rms, sensor_set, usual_unit
+from hydrotele.machine.machine import Machine, SensorError, noise_rms, sensor_set
+from hydrotele.machine.signals import usual_unit
 from hydrotele.simulate.feedback import apply_sensor_errors
 from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, initial_state

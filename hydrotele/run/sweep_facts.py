@@ -23,9 +23,8 @@ from hydrotele.core.datafile import Facts, Name, parse, read_yaml, suggest
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import scenarios_folder
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine import Machine, sensor_set
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import sensor_set
 from hydrotele.run.sweep_runs import Inputs
 from hydrotele.scenario.scenario import (
     Scenario,

@@ -11,8 +11,8 @@ import numpy as np
 
 import hydrotele
 from hydrotele.gap.result import Estimate, amount, in_customary_units
-from hydrotele.identify.consistent import Consistent
 from hydrotele.identify.hydraulic import Hydraulics
+from hydrotele.identify.identified_machine import Consistent
 from hydrotele.identify.result import (
     MEANING,
     Forces,

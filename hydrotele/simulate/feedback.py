@@ -14,9 +14,14 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import Sensor, SensorError, SensorSet
-from hydrotele.machine.signals import channel_sensor, converter
+from hydrotele.machine.machine import (
+    Machine,
+    Sensor,
+    SensorError,
+    SensorSet,
+    channel_sensor,
+    converter,
+)
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import sensed_channels
 from hydrotele.simulate.stepping import Stepper, delayed_values, true_values

@@ -16,9 +16,7 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.memory import address_record, floats, integers, rows_of
 from hydrotele.hydraulics.circuit import SCRATCH, SLOTS
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import first_order
+from hydrotele.machine.machine import Machine, SensorError, first_order
 from hydrotele.simulate.layout import call_step, function_address
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import sensed_channels, split_delay, state_supply

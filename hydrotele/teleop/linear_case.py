@@ -46,8 +46,7 @@ from hydrotele.estimate.reduced_model import X, place_mechanism
 from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.joystick import AXES, Joystick
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import sensor_set
+from hydrotele.machine.machine import Machine, sensor_set
 from hydrotele.multibody.reduced_mechanism import gather_forces
 from hydrotele.scenario.scenario import Plate, Scenario, Servo
 from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track

@@ -23,9 +23,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.joystick import AXES, load_joystick
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorSet
-from hydrotele.machine.signals import sensor_set
+from hydrotele.machine.machine import Machine, SensorSet, sensor_set
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Channel, Fault, TeleopPilot
 from hydrotele.simulate.feedback import Feedback

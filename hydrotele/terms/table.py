@@ -20,8 +20,7 @@ from numba.extending import intrinsic
 
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
-from hydrotele.terms.facts import BALANCES, Term
-from hydrotele.terms.law import LAWS, VARIABLES, DriveState, Law, Numbers, Variable
+from hydrotele.terms.law import BALANCES, LAWS, VARIABLES, DriveState, Law, Numbers, Term, Variable
 
 # numpy's integers, since numba compiles a function anew for each of Python's that it is called with
 FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = np.arange(len(BALANCES), dtype=np.int64)

@@ -11,8 +11,8 @@ from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry, jacobian
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.logs.log import Log
+from hydrotele.machine.machine import sensor_set
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import sensor_set
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.plant import build_plant, rest_state

@@ -146,11 +146,11 @@ def test_what_a_process_beside_has_compiled_is_loaded_and_is_not_compiled_again(
 def test_a_teleoperated_run_finds_what_was_compiled_ahead(tmp_path):
     """Its arguments are of the types that `compile_ticks` says: nothing is compiled again."""
     code = """
-from hydrotele.run import session
+from hydrotele.run import run
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-session.compile_ticks()
+run.compile_ticks()
 run_scenario(load_scenario("press_stiffness", {"duration": "0.2"}))
-print(len(session.teleoperated_ticks.signatures))
+print(len(run.teleoperated_ticks.signatures))
 """
     assert _run(ROOT, os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), code)[0] == ["1"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects.effect import changed
-from hydrotele.estimate.inputs import Input, input_columns
+from hydrotele.estimate.filter import Input, input_columns
 from hydrotele.estimate.levels import rough_noise
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.estimate.track import STEP, steps_per_row, track_run
@@ -15,7 +15,7 @@ from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.logs.rows import Rows, averaged
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
 
 CHANNELS = ("position.piston", "pressure_head.piston", "pressure_rod.piston")
 NOISE = np.array([1.0e-5, 2.0e4, 5.0e4])

@@ -13,7 +13,7 @@ from hydrotele.machine.drives import EndStop
 from hydrotele.machine.machine_file import save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
 
 ROWS, PERIOD = 60, 0.02
 ANGLE, LENGTH, PRESSURE = np.radians(0.01), 0.2e-3, 0.1 * 25 * 6894.757

@@ -23,7 +23,7 @@ from hydrotele.estimate.reduced_model import (
 )
 from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
 from hydrotele.logs.log import load_log
-from hydrotele.machine.sensors import SensorError
+from hydrotele.machine.machine import SensorError
 from hydrotele.multibody.reduced_mechanism import (
     BIAS,
     COM,

@@ -5,8 +5,7 @@ import pytest
 from scipy.signal import lsim, lti
 
 from hydrotele.estimate.reduced_model import advance, follow_channel, simulate_rows
-from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import first_order
+from hydrotele.machine.machine import SensorError, first_order
 
 
 @pytest.mark.parametrize("ratio", [1e-9, 1e-3, 0.3, 1.0, 50.0])

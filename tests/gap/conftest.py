@@ -22,7 +22,7 @@ from hydrotele.logs.dataset import RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.signals import usual_unit
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
 
 NOISE = {"angle": 1.0e-3, "length": 1.2e-3, "pressure_head": 1e5, "pressure_rod": 1e5}
 _PERIOD, _ROWS, _LOUD = 0.02, 400, slice(150, 230)

@@ -20,11 +20,11 @@ from hydrotele.gap.balances import balances, peak_lag, pump_lack, window_lags
 from hydrotele.gap.law_tables import Table, lack_regression
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.drives import Transmission
+from hydrotele.machine.machine import SensorError, noise_rms, sensor_set
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import noise_rms, sensor_set, usual_unit
+from hydrotele.machine.signals import usual_unit
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.terms.facts import Term
+from hydrotele.terms.law import Term
 from tests.estimate.test_filter import machine_data
 from tests.measured import MEASURED
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from hydrotele.estimate.evidence import Evidence, Judged
+from hydrotele.estimate.filter import Input
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.hypothesis import Guess, hypotheses
-from hydrotele.estimate.inputs import Input
 from hydrotele.estimate.levels import columns_of, find_levels
 from hydrotele.estimate.track import error_responses, track_run
 from hydrotele.gap import discover
@@ -39,8 +39,7 @@ from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.terms.facts import Term
-from hydrotele.terms.law import Drives, DriveState
+from hydrotele.terms.law import Drives, DriveState, Term
 from hydrotele.terms.table import FORCE, PLAY, SWITCH, added, remember, terms_table
 from tests.estimate.test_filter import machine_data
 

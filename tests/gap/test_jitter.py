@@ -13,8 +13,8 @@ from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import Log, save_log
+from hydrotele.machine.machine import noise_rms, sensor_set
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import noise_rms, sensor_set
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.feedback import measure

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hydrotele.estimate.evidence import Fit, Judged
+from hydrotele.estimate.filter import Input
 from hydrotele.estimate.hypothesis import Guess, calibration, hypotheses
-from hydrotele.estimate.inputs import Input
 from hydrotele.gap import rivals, search
 from hydrotele.gap.rivals import Rival, better, weights
 from hydrotele.machine.machine_file import load_machine

@@ -16,9 +16,15 @@ from hydrotele.hydraulics.circuit import (
     step_circuit,
     supply_coupling,
 )
-from hydrotele.hydraulics.laws import holding_share, spool_step, stop_force, valve_opening
+from hydrotele.hydraulics.laws import (
+    axis_opening,
+    chamber_flows,
+    holding_share,
+    spool_step,
+    stop_force,
+    valve_opening,
+)
 from hydrotele.hydraulics.parameters import Slot, actuator_parameters
-from hydrotele.hydraulics.valve import axis_opening, chamber_flows
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms.law import Drives

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from hydrotele.effects.effect import changed
-from hydrotele.identify.consistent import Freedom, consistent
 from hydrotele.identify.estimation import Estimate
 from hydrotele.identify.identifiability import identifiability
-from hydrotele.identify.identified_machine import identified_machine
+from hydrotele.identify.identified_machine import Freedom, consistent, identified_machine
 from hydrotele.identify.result import (
     Forces,
     Identification,

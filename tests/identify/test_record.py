@@ -11,8 +11,8 @@ from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log
+from hydrotele.machine.machine import SensorError
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.sensors import SensorError
 from hydrotele.machine.signals import usual_unit
 
 ROWS = 600

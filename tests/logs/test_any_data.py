@@ -11,8 +11,8 @@ from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log, save_log
 from hydrotele.logs.rows import Masked, Rows, averaged, fit_clock, read_mask
+from hydrotele.machine.machine import Sensor, SensorSet
 from hydrotele.machine.machine_file import load_machine, save_machine
-from hydrotele.machine.sensors import Sensor, SensorSet
 
 RIG = load_machine("rig")
 STATED = {"machine": "rig", "sensors": "laboratory"}

@@ -15,8 +15,9 @@ from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log, load_log, save_log
 from hydrotele.logs.rows import clock_offset, fit_clock
+from hydrotele.machine.machine import IDEAL, noise_rms
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import IDEAL, noise_rms, usual_unit
+from hydrotele.machine.signals import usual_unit
 from hydrotele.simulate.feedback import measure
 from tests.measured import MEASURED, REAL, needs_real
 

@@ -7,9 +7,8 @@ import pytest
 from scipy import stats
 
 from hydrotele.core.errors import InputError
+from hydrotele.machine.machine import Sensor, channel_sensor, converter, noise_rms, sensor_set
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.sensors import Sensor
-from hydrotele.machine.signals import channel_sensor, converter, noise_rms, sensor_set
 from hydrotele.run.run import prepare, run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.feedback import _convert_all, measure, sensor_errors

@@ -10,13 +10,14 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine, Supply
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms import law as laws
-from hydrotele.terms.facts import Play, Term
 from hydrotele.terms.law import (
     LAWS,
     NO_DRIVES,
     VARIABLES,
     Drives,
     DriveState,
+    Play,
+    Term,
     formula_arguments,
     law,
 )

@@ -32,8 +32,8 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.machine import Machine as Facts
+from hydrotele.machine.machine import noise_rms, sensor_set
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import noise_rms, sensor_set
 from tools.blind.score import share
 from tools.blind.spreads import SIZES
 from tools.blind.trials import Place, write_json

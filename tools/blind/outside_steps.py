@@ -8,8 +8,7 @@ change the actuators' numbers, activations or applied forces, and no code of the
 import math
 
 from hydrotele.hydraulics.circuit import Slot, circuit_scratch
-from hydrotele.hydraulics.laws import orifice
-from hydrotele.hydraulics.valve import axis_opening
+from hydrotele.hydraulics.laws import axis_opening, orifice
 from hydrotele.simulate.record import state_supply
 
 _WARM_UP = 40.0  # s

@@ -11,9 +11,7 @@ from scipy.signal import lsim, lti
 from hydrotele.hydraulics.circuit import circuit_scratch
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import sensor_set
+from hydrotele.machine.machine import Machine, SensorError, sensor_set
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import PlantedEffect, Scenario
 from hydrotele.simulate.feedback import measure

@@ -11,9 +11,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine
-from hydrotele.machine.sensors import SensorError
-from hydrotele.machine.signals import noise_rms, sensor_set
+from hydrotele.machine.machine import Machine, SensorError, noise_rms, sensor_set
 from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.record import Recorder, begin_leapfrog, true_channels

@@ -9,8 +9,7 @@ import math
 import numpy as np
 
 from hydrotele.machine.machine import Machine as Facts
-from hydrotele.machine.sensors import SensorError, SensorSet
-from hydrotele.machine.signals import channel_sensor, converter
+from hydrotele.machine.machine import SensorError, SensorSet, channel_sensor, converter
 from tools.blind.world import Added, Drives, Forms, Machine, Mechanism, Sensors
 
 

@@ -9,7 +9,7 @@ from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.log import Log
 from hydrotele.machine import signals
 from hydrotele.machine.machine import Machine as Facts
-from hydrotele.machine.signals import noise_rms, sensor_set
+from hydrotele.machine.machine import noise_rms, sensor_set
 from tools.blind.motions import RATE, motions
 from tools.blind.world import (
     PA,
