@@ -25,8 +25,6 @@ Formulas in machine files: products of basic functions, each with its coefficien
 
 A product has factors joined by `*`, each may carry a power up to `** 6`. A factor is an argument or
 a function of one; an argument is a variable of `DriveState` or a difference of two of them.
-
-A term of a machine: which law adds to which balance of which drive.
 """
 
 import ast
