@@ -1,1 +1,1 @@
-"""Published experiments, repeated in simulation: what was seen then, and what is seen here."""
+"""Published experiments repeated in simulation, one module or more per document."""

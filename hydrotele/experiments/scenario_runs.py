@@ -1,0 +1,35 @@
+"""Runs of shipped scenarios for experiments, and figures of their logs."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from hydrotele.run.run import Run, run_scenario
+from hydrotele.scenario.scenario import Scenario, load_scenario
+
+
+def run_shipped(name: str, overrides: Mapping[str, str] | None = None) -> tuple[Scenario, Run]:
+    """Run a shipped scenario with some of its values changed."""
+    scenario = load_scenario(name, dict(overrides or {}))
+    return scenario, run_scenario(scenario)
+
+
+def true_channel(run: Run, channel: str) -> np.ndarray:
+    """(n,) of a true channel; zeros where nothing of the kind happened."""
+    return run.truth.columns.get(channel, np.zeros(len(run.truth.time)))
+
+
+def cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
+    """True pose of the tip: r, z [m], theta, attitude [rad], (n,) each."""
+    x, y, z = (true_channel(run, f"truth.tip.{c}") for c in "xyz")
+    arm = run.plant.machine.arm
+    assert arm is not None
+    axes = {axis.joint: name for name, axis in run.plant.machine.axes.items()}
+    bends = [true_channel(run, f"angle.{axes[j]}") for j in (arm.boom, arm.stick, arm.tool) if j]
+    return {"r": np.hypot(x, y), "theta": np.unwrap(np.arctan2(y, x)), "z": z,
+            "attitude": np.sum(bends, axis=0)}  # fmt: skip
+
+
+def operator_changes(seed: int) -> dict[str, str]:
+    """Changes of a scenario: an operator of the published population, and a seed for noise."""
+    return {"seed": str(seed), "pilot.perception.drawn": str(seed)}
