@@ -6,7 +6,7 @@
     python tools/arm_calibration.py speed
 
 Each prints a Markdown section; `--out FILE` writes it. Truth, noise and corruption are simulated by
-`hydrotele.experiments.khoshzaban1992`; the identification sees readings only.
+`hydrotele.experiments.calibrator_readings`; the identification sees readings only.
 """
 
 import argparse
@@ -20,7 +20,12 @@ from hydrotele.calibrate.arm_poses import with_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
 from hydrotele.calibrate.design import STILL, SWEEPS, sweep_poses
 from hydrotele.calibrate.loop import loop_of, unit_of
-from hydrotele.experiments.khoshzaban1992 import perturbed, readings, tip_errors, true_numbers
+from hydrotele.experiments.calibrator_readings import (
+    perturb_loop,
+    simulate_readings,
+    tip_errors,
+    true_numbers,
+)
 from hydrotele.machine.machine_file import load_machine
 
 TRUTH = 1992  # seed of the machine whose noise is studied
@@ -29,13 +34,13 @@ TRUTH = 1992  # seed of the machine whose noise is studied
 def noise(seeds: int) -> str:
     """Bias, spread and coverage of both identifications over seeds of sensor noise."""
     nominal = loop_of(load_machine("calibrator"))
-    true = perturbed(nominal, np.random.default_rng(TRUTH))
+    true = perturb_loop(nominal, np.random.default_rng(TRUTH))
     clean = [sweep_poses(true, link, sweep) for link, sweep in STILL.items()]
     errors, inside, spreads = [], [], []
     names: tuple[str, ...] = ()
     for seed in range(seeds):
         rng = np.random.default_rng([TRUTH, seed])
-        stages = [readings(true, one, rng) for one in clean]
+        stages = [simulate_readings(true, one, rng) for one in clean]
         one = identify_arm(nominal, stages)
         both = [one, identify_jointly(one, stages)]
         names = one.names
@@ -104,19 +109,19 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
         alarms[word] = 0
         for trial in range(clean_trials // 2):
             rng = np.random.default_rng([1, trial])
-            true = perturbed(nominal, rng)
+            true = perturb_loop(nominal, rng)
             clean = [sweep_poses(true, n, s._replace(poses=poses), trial)
                      for n, s in sweeps.items()]  # fmt: skip
-            stages = [with_drift(nominal, readings(true, c, rng)) for c in clean]
+            stages = [with_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
             alarms[word] += bool(identify_without_bad_data(nominal, stages).regions)
     places = joints = possible = 0
     before, after = [], []
     misses = []
     for trial in range(trials):
         rng = np.random.default_rng([2, trial])
-        true = perturbed(nominal, rng)
+        true = perturb_loop(nominal, rng)
         clean = [sweep_poses(true, n, s._replace(poses=poses), trial) for n, s in STILL.items()]
-        stages = [with_drift(nominal, readings(true, c, rng)) for c in clean]
+        stages = [with_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
         which, joint = int(rng.integers(len(stages))), int(rng.integers(4))
         theta, region = corrupted(stages[which].theta, rng, joint)
         stages[which] = dataclasses.replace(stages[which], theta=theta)
@@ -182,9 +187,9 @@ def tip(machines: int) -> str:
     for seed in range(machines):
         loop = loop_of(nominal)
         rng = np.random.default_rng([3, seed])
-        true = perturbed(loop, rng, sensors=0.5)
+        true = perturb_loop(loop, rng, sensors=0.5)
         clean = [sweep_poses(true, link, sweep) for link, sweep in STILL.items()]
-        stages = [readings(true, one, rng) for one in clean]
+        stages = [simulate_readings(true, one, rng) for one in clean]
         pairs.append(tip_errors(nominal, machine_with_loop(nominal, loop, true), true, stages))
         rows.append(f"| {seed} | {1e3 * pairs[-1][0]:.1f} | {1e3 * pairs[-1][1]:.1f} |")
     one, two = np.sqrt(np.mean(np.square(pairs), axis=0))
@@ -196,12 +201,12 @@ def tip(machines: int) -> str:
 def speed() -> str:
     """Time of the hierarchical and the joint identification over the number of poses."""
     nominal = loop_of(load_machine("calibrator"))
-    true = perturbed(nominal, np.random.default_rng(TRUTH))
+    true = perturb_loop(nominal, np.random.default_rng(TRUTH))
     rows = ["CPU time of one process with one thread.", ""]
     rows += ["| poses | hierarchical [s] | joint, from there [s] |", "| --- | --- | --- |"]
     for poses in (100, 200, 400, 800):
         rng = np.random.default_rng(5)
-        stages = [readings(true, sweep_poses(true, n, s._replace(poses=poses)), rng)
+        stages = [simulate_readings(true, sweep_poses(true, n, s._replace(poses=poses)), rng)
                   for n, s in STILL.items()]  # fmt: skip
         times = []
         for _ in range(3):

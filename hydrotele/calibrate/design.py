@@ -27,7 +27,7 @@ from hydrotele.kinematics.serial_chain import forward_and_rates
 
 
 class Sweep(NamedTuple):
-    """How one link is moved, there and back once, while the others are held [deg, K's signs].
+    """How one link is moved there and back while the others are held [deg, K's signs].
 
     Attributes:
         moving: range of the moving link.
@@ -35,6 +35,8 @@ class Sweep(NamedTuple):
         drift: link -> by how much it has drifted when the last pose is taken.
         wander: by how much the grapple is turned about the place where it points at the ball.
         poses: number of poses.
+        cycles: how often the moving link goes there and back.
+        phase: of the first pose within a cycle, 0 at the lower end [rad].
     """
 
     moving: tuple[float, float]
@@ -42,6 +44,8 @@ class Sweep(NamedTuple):
     drift: Mapping[str, float]
     wander: float = 20.0
     poses: int = 300
+    cycles: float = 1.0
+    phase: float = 0.0
 
 
 SWEEPS: Mapping[str, Sweep] = {
@@ -93,7 +97,8 @@ def sweep_poses(loop: Loop, link: str, sweep: Sweep, seed: int = 0) -> Clean:
     for name, angle in sweep.held.items():
         theta[:, loop.links.index(name)] = np.radians(angle + sweep.drift.get(name, 0.0) * u)
     moving = loop.links.index(link)
-    theta[:, moving] = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(2.0 * np.pi * u)
+    turn = 2.0 * np.pi * sweep.cycles * u + sweep.phase
+    theta[:, moving] = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(turn)
     pointing = _pointing(loop, theta)
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     wave = sum(

@@ -23,7 +23,12 @@ from hydrotele.calibrate.linkage import (
 )
 from hydrotele.calibrate.loop import ball_from, closure, loop_of
 from hydrotele.core.errors import InputError
-from hydrotele.experiments.khoshzaban1992 import LISTS, TABLE_2, perturbed, readings, true_numbers
+from hydrotele.experiments.calibrator_readings import (
+    perturb_loop,
+    simulate_readings,
+    true_numbers,
+)
+from hydrotele.experiments.khoshzaban_arm import LISTS, TABLE_2
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.logs.log import Log
@@ -31,7 +36,7 @@ from hydrotele.machine.machine_file import load_machine
 
 MACHINE = load_machine("calibrator")
 LOOP = loop_of(MACHINE)
-TRUE = perturbed(LOOP, np.random.default_rng(11))
+TRUE = perturb_loop(LOOP, np.random.default_rng(11))
 POSES = 120
 
 
@@ -44,7 +49,7 @@ def clean():
 @pytest.fixture(scope="module")
 def exact(clean):
     """Identified from readings without error."""
-    return identify_arm(LOOP, [readings(TRUE, one, None) for one in clean])
+    return identify_arm(LOOP, [simulate_readings(TRUE, one, None) for one in clean])
 
 
 def test_chain_is_table_2():
@@ -79,7 +84,7 @@ def test_without_error_exact(clean, exact):
     """Rounding only: 1e-9 is asked."""
     truth = true_numbers(TRUE, LOOP, exact.names, clean)
     assert np.abs(exact.values - truth).max() < 1e-9
-    joint = identify_jointly(exact, [readings(TRUE, one, None) for one in clean])
+    joint = identify_jointly(exact, [simulate_readings(TRUE, one, None) for one in clean])
     assert np.abs(joint.values - truth).max() < 1e-9
 
 
@@ -95,7 +100,7 @@ def test_errors_are_as_large_as_said_and_joint_knows_more(clean):
     """28 parameters: RMS of normalised errors of six seeds near 1, within the scatter of 168."""
     scores, fits = [], None
     for seed in range(6):
-        stages = [readings(TRUE, one, np.random.default_rng(seed)) for one in clean]
+        stages = [simulate_readings(TRUE, one, np.random.default_rng(seed)) for one in clean]
         one = identify_arm(LOOP, stages)
         fits = one, identify_jointly(one, stages)
         truth = true_numbers(TRUE, LOOP, one.names, clean)
@@ -110,7 +115,7 @@ def test_errors_are_as_large_as_said_and_joint_knows_more(clean):
 
 def test_corruption_is_found_and_left_out(clean):
     rng = np.random.default_rng(4)
-    stages = [with_drift(LOOP, readings(TRUE, one, rng)) for one in clean]
+    stages = [with_drift(LOOP, simulate_readings(TRUE, one, rng)) for one in clean]
     assert identify_without_bad_data(LOOP, stages).regions == []
     wrong = stages[1].theta.copy()
     wrong[40:70, 1] += np.radians(2.5)
@@ -132,7 +137,7 @@ def test_corruption_is_found_and_left_out(clean):
 
 def test_calibrated_machine_has_the_chain(clean, exact):
     """Lengths and twists in links and axes, offsets in the sensors."""
-    made = calibrated_machine(MACHINE, exact, [readings(TRUE, one, None) for one in clean])
+    made = calibrated_machine(MACHINE, exact, [simulate_readings(TRUE, one, None) for one in clean])
     again = loop_of(made)
     np.testing.assert_allclose(again.values[:3, 1:], TRUE.values[:3, 1:], atol=1e-9)
     np.testing.assert_allclose(again.ball, TRUE.ball, atol=1e-9)
@@ -183,7 +188,7 @@ def test_which_link_moved():
 
 def test_unusable_data_say_why(clean):
     """Too few poses, one pose again and again, another machine, NaN, nothing moves."""
-    stages = [readings(TRUE, one, None) for one in clean]
+    stages = [simulate_readings(TRUE, one, None) for one in clean]
     with pytest.raises(InputError, match="3 poses of pitch are too few"):
         identify_arm(LOOP, [stages[0].only(np.arange(3) * 40)])
     with pytest.raises(InputError, match="one pose of pitch again and again"):
