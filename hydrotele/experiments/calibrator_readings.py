@@ -79,8 +79,9 @@ def draw_sweeps(
 
 
 def bend_level_joints(
-    loop: Loop, clean: Clean, rng: np.random.Generator, degrees: float = 1.0, share: float = 0.35
-) -> np.ndarray:
+    loop: Loop, clean: Clean, rng: np.random.Generator, degrees: float = 1.0, share: float = 0.35,
+    lasting: bool = False,
+) -> np.ndarray:  # fmt: skip
     """Draw errors of bent joints as Khoshzaban 1992 section 3.7.3 (p. 61) makes them.
 
     N(0, 1 deg) is added to grapple and yoke where gravity bends them most: in the poses in which
@@ -92,6 +93,7 @@ def bend_level_joints(
         rng: of the errors.
         degrees: their standard deviation.
         share: of the poses that are bent; the document gives none.
+        lasting: whether a joint has one error in all bent poses, instead of one in each.
 
     Returns:
         (M, N) errors [rad].
@@ -101,7 +103,8 @@ def bend_level_joints(
     bent = slope <= np.quantile(slope, share)
     extra = np.zeros_like(clean.theta)
     places = [loop.moved, loop.moved + 1]
-    extra[np.ix_(bent, places)] = np.radians(degrees) * rng.standard_normal((bent.sum(), 2))
+    drawn = rng.standard_normal((1 if lasting else bent.sum(), 2))
+    extra[np.ix_(bent, places)] = np.radians(degrees) * drawn
     return extra
 
 
