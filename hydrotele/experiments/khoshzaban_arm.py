@@ -320,8 +320,8 @@ def judge_flexible(samples: Sequence[Sample]) -> Judgement:
     twists = root_mean_square(np.degrees(collect(samples, "lasting.twists")))
     return Judgement(
         checks,
-        "errors that are drawn anew in every pose average out over 300 poses; where each joint keeps"
-        f" one draw in a stage, {lasting.describe()} and alpha and beta err by {twists:.1f} deg",
+        "errors that are drawn anew in every pose average out over 300 poses; where each joint"
+        f" keeps one draw in a stage, {lasting.describe()} and alpha and beta err by {twists:.1f} deg",
         describe_lengths(samples, "flexible"),
     )
 
@@ -462,8 +462,8 @@ EXPERIMENTS = (
         ),
         Claim(
             "drift and joints that stay bent",
-            "where each joint keeps one draw of N(0, 1 deg) in the bent poses of a stage, the largest"
-            " error grows as in Table 6",
+            "where each joint keeps one draw of N(0, 1 deg) in the bent poses of a stage, the"
+            " largest error grows as in Table 6",
             "Table 6, section 3.7.3, pp. 61-62", "additional", judge_lasting, {"bend": 0.0},
             "joints do not bend",
         ),

@@ -28,7 +28,8 @@ from hydrotele.experiments.calibrator_readings import (
     simulate_readings,
     true_numbers,
 )
-from hydrotele.experiments.khoshzaban_arm import LISTS, TABLE_2
+from hydrotele.experiments.khoshzaban_arm import LISTS
+from hydrotele.experiments.khoshzaban_machine import TABLE_2
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.logs.log import Log
