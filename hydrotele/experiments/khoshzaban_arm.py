@@ -321,7 +321,8 @@ def judge_flexible(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         checks,
         "errors that are drawn anew in every pose average out over 300 poses; where each joint"
-        f" keeps one draw in a stage, {lasting.describe()} and alpha and beta err by {twists:.1f} deg",
+        f" keeps one draw in a stage, {lasting.describe()} and alpha and beta err by"
+        f" {twists:.1f} deg",
         describe_lengths(samples, "flexible"),
     )
 

@@ -2,7 +2,8 @@
 
 Truth is the nominal machine, as in the thesis: "we consider the nominal model to behave like the
 actual system" (p. 67). The calibrator's joints 5 and 6 bend where the stick is pulled in (p. 69);
-by how much is not printed. Poses with bent joints are found without an observer and left out.
+by how much is not printed. As in the thesis, poses in which the readings differ visibly from those
+of the nominal model are left out before the arm is identified again.
 """
 
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hydrotele.calibrate.arm import ArmFit, identify_arm
+from hydrotele.calibrate.arm import ArmFit, identify_arm, start_numbers
 from hydrotele.calibrate.arm_poses import Poses, with_drift
 from hydrotele.calibrate.bad_data import Cleaned, identify_without_bad_data, predicted_readings
 from hydrotele.calibrate.design import Clean, sweep_poses
@@ -22,7 +23,7 @@ from hydrotele.calibrate.linkage import (
     identify_linkage,
     values_of,
 )
-from hydrotele.calibrate.loop import Loop, link_chain, loop_of
+from hydrotele.calibrate.loop import Loop, closure, frame_of, link_chain, loop_of
 from hydrotele.experiments.calibrator_readings import (
     RESOLVER,
     bend_pulled_in_joints,
@@ -62,6 +63,9 @@ ENDS = {"stick": 3, "grapple": 5}
 """End point -> number of links up to it."""
 
 SIDES = ("manipulator", "calibrator")
+VISIBLE = np.radians(1.0)
+"""Difference at the yoke from which on a pose is left out; the axes of Fig. 20 span 30 deg."""
+
 _TAPED = 19  # distances that are measured, p. 65
 
 
@@ -88,7 +92,8 @@ class Calibration(NamedTuple):
         clean: true poses of every stage.
         inside: whether joints bend, (M,) of the stick's stage.
         stages: readings of every stage, with the drift of held links.
-        cleaned: found regions with the poses that are left.
+        kept: readings without the poses that are left out.
+        cleaned: what the automatic search for bad poses finds.
         fits: `identified` and `reidentified`.
     """
 
@@ -97,6 +102,7 @@ class Calibration(NamedTuple):
     clean: list[Clean]
     inside: np.ndarray
     stages: list[Poses]
+    kept: list[Poses]
     cleaned: Cleaned
     fits: dict[str, ArmFit]
 
@@ -118,14 +124,29 @@ def simulate_calibration(
         readings = simulate_readings(true, one, rng, chosen["accuracy"], extra)
         stages.append(with_drift(loop, readings))
         inside = bent if one.link == "stick" else inside
-    cleaned = identify_without_bad_data(loop, stages)
-    used = {"identified": stages, "reidentified": cleaned.stages if chosen["removal"] else stages}
+    kept = [leave_out_visible(loop, one) for one in stages] if chosen["removal"] else stages
+    used = {"identified": stages, "reidentified": kept}
     fits = {
         name: identify_arm(loop, [replace(s, drift=None) for s in poses], weighted=False,
                            chosen=IDENTIFIED)
         for name, poses in used.items()
     }  # fmt: skip
-    return Calibration(loop, true, clean, inside, stages, cleaned, fits)
+    cleaned = identify_without_bad_data(loop, stages)
+    return Calibration(loop, true, clean, inside, stages, kept, cleaned, fits)
+
+
+def leave_out_visible(loop: Loop, stage: Poses) -> Poses:
+    """The poses in which all sensors agree with the nominal model to 1 deg at the yoke.
+
+    The chain's gap is compared with what a turn of the yoke moves at the ball. In the stage of
+    joint 4, which has no sensor, every pose is kept.
+    """
+    if stage.link not in MOVED:
+        return stage
+    theta = _angles(loop, Model(loop.values, loop.ball, float(loop.home[3])), stage)
+    gap = np.linalg.norm(closure(loop, theta)[0], axis=1)
+    place, _ = frame_of(loop, ENDS["grapple"], theta)
+    return stage.only(gap < VISIBLE * np.linalg.norm(loop.ball - place, axis=1))
 
 
 def measure_calibration(seed: int, changes: Changes) -> Sample:
@@ -167,7 +188,7 @@ def _compare_sensors(done: Calibration) -> Sample:
     """Compare the calibrator's readings with those that the manipulator's side predicts."""
     loop, inside = done.loop, done.inside
     stage = next(one for one in done.stages if one.link == "stick")
-    predicted = predicted_readings(loop, stage, done.cleaned.fit.numbers)
+    predicted = predicted_readings(loop, stage, _nominal_numbers(loop, stage))
     difference = np.degrees(stage.theta - predicted)
     pose = np.arange(len(stage), dtype=float)
     values, panels = (
@@ -194,7 +215,25 @@ def _compare_sensors(done: Calibration) -> Sample:
             marked[region.first : region.last + 1] = True
     values["overlap"] = float((marked & inside).sum() / max(1, (marked | inside).sum()))
     values["blamed"] = float(bool(joints) and joints <= set(loop.links[loop.moved :][:2]))
+    kept = next(one for one in done.kept if one.link == "stick")
+    left_out = np.ones(len(stage), bool)
+    left_out[np.arange(len(stage)) if kept.rows is None else kept.rows] = False
+    values["left out inside"] = float(left_out[inside].mean())
+    values["left out outside"] = float(left_out[~inside].mean())
     return Sample(values, tuple(panels))
+
+
+def _nominal_numbers(loop: Loop, stage: Poses) -> dict[str, float]:
+    """Numbers of a stage's equations by the nominal chain and the manipulator's own sensors."""
+    theta = loop.home[None].copy()
+    place = loop.links.index(stage.link)
+    for k, link in enumerate(loop.links[:place]):
+        theta[0, k] = float(np.median(stage.manipulator[link])) + loop.values[k, 0]
+    origin, turn = frame_of(loop, place, theta)
+    ball = turn[0].T @ (loop.ball - origin[0])
+    numbers = start_numbers(loop, [stage])
+    return numbers | {f"p_xy.{stage.link}": float(np.hypot(*ball[:2])),
+                      f"p_z.{stage.link}": float(ball[2])}  # fmt: skip
 
 
 def _model_of(done: Calibration, name: str) -> Model:
@@ -237,7 +276,7 @@ def end_place(model: Model, theta: np.ndarray, side: str, links: int) -> np.ndar
 def _compare_ends(done: Calibration) -> Sample:
     """Compare end points with identified parameters and with the nominal ones."""
     nominal, values, panels = _model_of(done, "nominal"), {}, []
-    used = {"identified": done.stages, "reidentified": done.cleaned.stages}
+    used = {"identified": done.stages, "reidentified": done.kept}
     for name, stages in used.items():
         model = _model_of(done, name)
         stages = [stage for stage in stages if stage.link in MOVED]
@@ -301,7 +340,7 @@ def _identify_minor_links(
     transducer, accuracy = chosen["transducer"], chosen["accuracy"]
     sigma = max(accuracy, 1e-9) / np.sqrt(3.0), max(transducer, 1e-9) / np.sqrt(3.0)
     for axis in ("boom", "stick"):
-        stage = next(one for one in done.cleaned.stages if one.link == axis)
+        stage = next(one for one in done.kept if one.link == axis)
         clean = next(one for one in done.clean if one.link == axis)
         place = done.loop.links.index(axis)
         rows = np.arange(len(clean.theta)) if stage.rows is None else stage.rows

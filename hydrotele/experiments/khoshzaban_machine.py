@@ -125,8 +125,8 @@ def judge_masses(samples: Sequence[Sample]) -> Judgement:
                                       "m"))  # fmt: skip
     return Judgement(
         tuple(checks),
-        note="inertias are the model's own: printed are 15400 and 600 kg m2, 3.7 and 3.2 times those"
-        " of slender rods about their centres",
+        note="inertias are the model's own: printed are 15400 and 600 kg m2, 3.7 and 3.2 times"
+        " those of slender rods about their centres",
     )
 
 
