@@ -6,6 +6,7 @@ removal of bad data makes.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -117,7 +118,8 @@ def measure_printed(seed: int, changes: Changes) -> Sample:
         for end, links in ENDS.items():
             for side in SIDES:
                 angles = shifted if side == "calibrator" else theta
-                error = end_place(printed, angles, side, links) - end_place(nominal, theta, side, links)
+                true = end_place(nominal, theta, side, links)
+                error = end_place(printed, angles, side, links) - true
                 size = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
                 values[f"{model}.{side}.{end}"] = size
     return Sample(values)
@@ -204,8 +206,8 @@ def judge_reidentified(samples: Sequence[Sample]) -> Judgement:
         ratio = abs(after[name] / before[name])
         checks.append(check_rms_ratio(
             f"error of {SHORT[name]} over that of Table 7", samples,
-            (f"reidentified.error.{name}", f"identified.error.{name}"), changed_range(ratio), CHANGE,
-            ratio,
+            (f"reidentified.error.{name}", f"identified.error.{name}"), changed_range(ratio),
+            CHANGE, ratio,
         ))  # fmt: skip
     for kind in ("alpha", "beta"):
         ratio = _printed_twists("reidentified", kind) / _printed_twists("identified", kind)
@@ -276,8 +278,11 @@ END_REASON = "TODO"
 def judge_calibrator_ends(samples: Sequence[Sample]) -> Judgement:
     """Position errors from the calibrator side, pp. 67 and 71."""
     models = ("identified", "reidentified")
-    checks = [check for model in models
-              for check in _check_sizes(samples, model, "calibrator", POSITIONS, _POSITION)]  # fmt: skip
+    checks = [
+        check
+        for model in models
+        for check in _check_sizes(samples, model, "calibrator", POSITIONS, _POSITION)
+    ]
     checks += [
         check_exact(f"largest of the grapple's end, {model}",
                     float(collect(samples, f"{model}.position.calibrator.grapple").max()),
@@ -286,8 +291,16 @@ def judge_calibrator_ends(samples: Sequence[Sample]) -> Judgement:
     ]  # fmt: skip
     stick = [f"{model}.position.calibrator.stick" for model in reversed(models)]
     ratio = 0.373 / 0.542
-    checks.append(check_rms_ratio("stick's end, reidentified over identified", samples,
-                                  (stick[0], stick[1]), changed_range(ratio), CHANGE, ratio))  # fmt: skip
+    checks.append(
+        check_rms_ratio(
+            "stick's end, reidentified over identified",
+            samples,
+            (stick[0], stick[1]),
+            changed_range(ratio),
+            CHANGE,
+            ratio,
+        )
+    )
     return Judgement(
         tuple(checks),
         "from the ball the stick's end depends on links 4 to 8 alone, which Table 9 leaves as they"
@@ -298,10 +311,15 @@ def judge_calibrator_ends(samples: Sequence[Sample]) -> Judgement:
 
 def judge_distances(samples: Sequence[Sample]) -> Judgement:
     """Table 8 and Fig. 19 from the manipulator side."""
-    checks = [check for model in ("nominal", "identified")
-              for check in _check_sizes(samples, model, "manipulator", DISTANCES, _DISTANCE)]  # fmt: skip
+    checks = [
+        check
+        for model in ("nominal", "identified")
+        for check in _check_sizes(samples, model, "manipulator", DISTANCES, _DISTANCE)
+    ]
     for end in ENDS:
-        ratio = DISTANCES["identified", "manipulator"][end] / DISTANCES["nominal", "manipulator"][end]
+        ratio = (
+            DISTANCES["identified", "manipulator"][end] / DISTANCES["nominal", "manipulator"][end]
+        )
         checks.append(check_rms_ratio(
             f"{end}'s end, identified over nominal", samples,
             (f"identified.manipulator.{end}.rms", f"nominal.manipulator.{end}.rms"),
@@ -320,17 +338,20 @@ DISTANCE_REASON = "TODO"
 
 def _describe_vaf(samples: Sequence[Sample], side: str) -> str:
     """Mean variance accounted for of all models, stick and grapple, as text."""
-    parts = [
-        f"{model} {', '.join(f'{collect(samples, f"{model}.{side}.{end}.vaf").mean():.2f}' for end in ENDS)}"
-        for model in ("nominal", "identified", "reidentified")
-    ]
+    parts = []
+    for model in ("nominal", "identified", "reidentified"):
+        means = [collect(samples, f"{model}.{side}.{end}.vaf").mean() for end in ENDS]
+        parts.append(f"{model} {', '.join(f'{mean:.2f}' for mean in means)}")
     return f"VAF in %: {'; '.join(parts)}"
 
 
 def judge_calibrator_distances(samples: Sequence[Sample]) -> Judgement:
     """Table 8 from the calibrator side."""
-    checks = [check for model in ("nominal", "identified")
-              for check in _check_sizes(samples, model, "calibrator", DISTANCES, _DISTANCE)]  # fmt: skip
+    checks = [
+        check
+        for model in ("nominal", "identified")
+        for check in _check_sizes(samples, model, "calibrator", DISTANCES, _DISTANCE)
+    ]
     stick = 0.021 / 0.026
     checks.append(check_rms_ratio(
         "stick's end, identified over nominal", samples,
@@ -459,8 +480,8 @@ def judge_closer(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         tuple(checks),
         "with measured angles four parameters are free, of which only three combinations are"
-        " well determined, with computed ones the longest length is held; the printed lengths of the"
-        " stick themselves contradict the sentence",
+        " well determined, with computed ones the longest length is held; the printed lengths of"
+        " the stick themselves contradict the sentence",
     )
 
 
@@ -469,13 +490,14 @@ def judge_minor_fit(samples: Sequence[Sample], kind: str) -> Judgement:
     checks = [
         check_statistic(f"RMS error of the {axis}", 1e3 * collect(samples, f"{axis}.{kind}.rms"),
                         root_mean_square, (0.5e3 * published, 2e3 * published),
-                        "a factor of 2 around one measurement", unit="mm", published=1e3 * published)
+                        "a factor of 2 around one measurement", unit="mm",
+                        published=1e3 * published)
         for axis in ("boom", "stick") for published in (_MINOR_RMS[axis, kind],)
     ]  # fmt: skip
     ratio = _MINOR_RMS["stick", kind] / _MINOR_RMS["boom", kind]
     checks.append(check_rms_ratio("stick over boom", samples,
                                   (f"stick.{kind}.rms", f"boom.{kind}.rms"), (0.5 * ratio, np.inf),
-                                  '"an order of magnitude worse": at least half of the printed ratio',
+                                  '"an order of magnitude worse": at least half the printed ratio',
                                   ratio))  # fmt: skip
     if kind == "identified":
         for axis in ("boom", "stick"):
@@ -485,7 +507,9 @@ def judge_minor_fit(samples: Sequence[Sample], kind: str) -> Judgement:
                 (f"{axis}.identified.rms", f"{axis}.measured.rms"), (0.5 * ratio, 2.0 * ratio),
                 "a factor of 2 around one measurement", ratio,
             ))  # fmt: skip
-    vaf = [f"{axis} {collect(samples, f'{axis}.{kind}.vaf').mean():.3f}" for axis in ("boom", "stick")]
+    vaf = [
+        f"{axis} {collect(samples, f'{axis}.{kind}.vaf').mean():.3f}" for axis in ("boom", "stick")
+    ]
     return Judgement(tuple(checks), FIT_REASON[kind], f"VAF in %: {', '.join(vaf)}")
 
 
@@ -497,9 +521,9 @@ EXPERIMENTS = (
     Experiment("printed parameters", measure_printed, (
         Claim(
             "end points with the printed parameters",
-            "RMS position errors relative to the nominal model: Table 7 0.212 m (stick) and 0.256 m"
-            " (grapple) from the manipulator side, 0.542 and 0.000 m from the calibrator side; Table"
-            " 9 0.153, 0.205, 0.373 and 0.000 m",
+            "RMS position errors relative to the nominal model: Table 7 0.212 m (stick) and 0.256"
+            " m (grapple) from the manipulator side, 0.542 and 0.000 m from the calibrator side;"
+            " Table 9 0.153, 0.205, 0.373 and 0.000 m",
             "Tables 7 and 9, pp. 63, 66-67, 70-71", "document", judge_printed,
             {"table_9": "identified"}, "Table 7's parameters take the place of Table 9's",
         ),
@@ -516,8 +540,8 @@ EXPERIMENTS = (
         ),
         Claim(
             "re-identified parameters",
-            '"The error in a has been largely reduced while the error in" beta "has increased"; "the'
-            ' errors in a1 and d2 have considerably been reduced": a1 0.401, a2 5.312, d0 0.699, d2'
+            "the error in alpha has been largely reduced while the error in beta has increased; the"
+            " errors in a1 and d2 have considerably been reduced: a1 0.401, a2 5.312, d0 0.699, d2"
             " -0.059 m",
             "Table 9, section 3.8.2, p. 70", "document", judge_reidentified, {"removal": False},
             "no pose is left out", (),
@@ -579,15 +603,16 @@ EXPERIMENTS = (
         Claim(
             "cylinder triangles from measured angles",
             "boom: l_l 0.658, l_c 1.434, l_u 1.974 m; stick: 2.725, 2.116, 0.724 m; by tape 0.625,"
-            " 1.447, 2.000 and 2.444, 1.799, 0.720 m; offsets -78.6 and 10.3 deg, not known by tape",
-            "Table 11, section 3.8.3, p. 76", "document", lambda s: judge_minor(s, "measured"),
+            " 1.447, 2.000 and 2.444, 1.799, 0.720 m; offsets -78.6 and 10.3 deg, which no tape"
+            " gives",
+            "Table 11, section 3.8.3, p. 76", "document", partial(judge_minor, kind="measured"),
             {"transducer": 1e-5, "accuracy": 1e-5}, "sensors without error", (),
         ),
         Claim(
             "cylinder triangles from computed angles",
             "boom: l_l 0.545, l_c 1.210 m, l_u held; stick: l_l held, l_c 1.801, l_u 0.766 m;"
             " offsets -56.9 and 5.0 deg",
-            "Table 11, section 3.8.3, p. 76", "document", lambda s: judge_minor(s, "identified"),
+            "Table 11, section 3.8.3, p. 76", "document", partial(judge_minor, kind="identified"),
             _NO_FAULTS, "joints do not bend and held links do not drift", (),
         ),
         Claim(
@@ -601,14 +626,14 @@ EXPERIMENTS = (
             "displacement from measured angles",
             "RMS 0.4 mm and VAF 99.99 % (boom), 2 mm and 99.98 % (stick); the stick's is \"an order"
             ' of magnitude worse"',
-            "Table 12, p. 77", "document", lambda s: judge_minor_fit(s, "measured"),
+            "Table 12, p. 77", "document", partial(judge_minor_fit, kind="measured"),
             {"transducer": 0.02}, "linear transducers err ten times as much",
             ("boom: error of the displacement [mm]", "stick: error of the displacement [mm]"),
         ),
         Claim(
             "displacement from computed angles",
             "RMS 3 mm and VAF 99.91 % (boom), 27 mm and 97.12 % (stick)",
-            "Table 12, p. 77", "document", lambda s: judge_minor_fit(s, "identified"), _NO_FAULTS,
+            "Table 12, p. 77", "document", partial(judge_minor_fit, kind="identified"), _NO_FAULTS,
             "joints do not bend and held links do not drift",
             ("boom: error of the displacement [mm]", "stick: error of the displacement [mm]"),
         ),
