@@ -59,6 +59,9 @@ tape measure (an assumption) and bound of the linear transducers' errors (p. 21)
 deviation of the true machine's lengths from nominal [m], with 1 deg per 30 mm for its angles; share
 of the poses."""
 
+NO_FAULTS = {"bend": (0.0, 0.0), "drift": False}
+"""Changes with which only the sensors err."""
+
 ENDS = {"stick": 3, "grapple": 5}
 """End point -> number of links up to it."""
 
