@@ -14,7 +14,7 @@ import numpy as np
 
 from hydrotele.calibrate.arm import ArmFit, identify_arm, start_numbers
 from hydrotele.calibrate.arm_poses import Poses, with_drift
-from hydrotele.calibrate.bad_data import Cleaned, identify_without_bad_data, predicted_readings
+from hydrotele.calibrate.bad_data import identify_without_bad_data, predicted_readings
 from hydrotele.calibrate.design import Clean, sweep_poses
 from hydrotele.calibrate.linkage import (
     NAMES,
@@ -96,8 +96,7 @@ class Calibration(NamedTuple):
         inside: whether joints bend, (M,) of the stick's stage.
         stages: readings of every stage, with the drift of held links.
         kept: readings without the poses that are left out.
-        cleaned: what the automatic search for bad poses finds.
-        fits: `identified` and `reidentified`.
+        fits: `identified` and `reidentified`, once they are identified.
     """
 
     loop: Loop
@@ -106,14 +105,11 @@ class Calibration(NamedTuple):
     inside: np.ndarray
     stages: list[Poses]
     kept: list[Poses]
-    cleaned: Cleaned
-    fits: dict[str, ArmFit]
+    fits: Mapping[str, ArmFit] = {}
 
 
-def simulate_calibration(
-    seed: int, chosen: Mapping[str, Any], rng: np.random.Generator
-) -> Calibration:
-    """Simulate the readings of all stages and identify the arm from them."""
+def simulate_stages(seed: int, chosen: Mapping[str, Any], rng: np.random.Generator) -> Calibration:
+    """Simulate the readings of all stages."""
     loop = loop_of(load_machine("calibrator"))
     built = chosen["built"]
     true = perturb_loop(loop, rng, built, built / 0.03) if built else loop
@@ -128,14 +124,17 @@ def simulate_calibration(
         stages.append(with_drift(loop, readings))
         inside = bent if one.link == "stick" else inside
     kept = [leave_out_visible(loop, one) for one in stages] if chosen["removal"] else stages
-    used = {"identified": stages, "reidentified": kept}
-    fits = {
-        name: identify_arm(loop, [replace(s, drift=None) for s in poses], weighted=False,
+    return Calibration(loop, true, clean, inside, stages, kept)
+
+
+def identify_twice(done: Calibration) -> dict[str, ArmFit]:
+    """Identify the arm from all poses and from those that are kept."""
+    used = {"identified": done.stages, "reidentified": done.kept}
+    return {
+        name: identify_arm(done.loop, [replace(s, drift=None) for s in poses], weighted=False,
                            chosen=IDENTIFIED)
         for name, poses in used.items()
     }  # fmt: skip
-    cleaned = identify_without_bad_data(loop, stages)
-    return Calibration(loop, true, clean, inside, stages, kept, cleaned, fits)
 
 
 def leave_out_visible(loop: Loop, stage: Poses) -> Poses:
@@ -156,7 +155,8 @@ def measure_calibration(seed: int, changes: Changes) -> Sample:
     """Calibrate the machine, remove bent poses, calibrate again, and compare end points."""
     chosen = choose_settings(SETTINGS, changes)
     rng = np.random.default_rng([38, seed])
-    done = simulate_calibration(seed, chosen, rng)
+    done = simulate_stages(seed, chosen, rng)
+    done = done._replace(fits=identify_twice(done))
     values, panels = {}, []
     for name, fit in done.fits.items():
         values |= _parameter_errors(done, name, fit)
@@ -166,6 +166,28 @@ def measure_calibration(seed: int, changes: Changes) -> Sample:
         values |= part.values
         panels += part.panels
     return Sample(values, tuple(panels))
+
+
+def measure_search(seed: int, changes: Changes) -> Sample:
+    """Search the readings for bent joints by the equations alone, and by the nominal model."""
+    chosen = choose_settings(SETTINGS, changes)
+    done = simulate_stages(seed, chosen, np.random.default_rng([38, seed]))
+    cleaned = identify_without_bad_data(done.loop, done.stages)
+    marked, joints = np.zeros(len(done.inside), bool), set()
+    for region in cleaned.regions:
+        joints.add(region.joint)
+        if region.link == "stick":
+            marked[region.first : region.last + 1] = True
+    kept = next(one for one in done.kept if one.link == "stick")
+    left_out = np.zeros(len(done.inside), bool)
+    if kept.rows is not None:
+        left_out[:] = True
+        left_out[kept.rows] = False
+    both = (marked & done.inside).sum() / max(1, (marked | done.inside).sum())
+    return Sample({
+        "overlap": float(both), "blamed": float(bool(joints) and joints <= set(chosen["bent"])),
+        "left out": float(left_out[done.inside].mean()),
+    })  # fmt: skip
 
 
 def _parameter_errors(done: Calibration, model: str, fit: ArmFit) -> dict[str, float]:
@@ -211,18 +233,6 @@ def _compare_sensors(done: Calibration) -> Sample:
             "pose", errors={"sensor less prediction": difference[:, k]},
             error_label="difference [deg]",
         ))  # fmt: skip
-    marked, joints = np.zeros(len(stage), bool), set()
-    for region in done.cleaned.regions:
-        joints.add(region.joint)
-        if region.link == "stick":
-            marked[region.first : region.last + 1] = True
-    values["overlap"] = float((marked & inside).sum() / max(1, (marked | inside).sum()))
-    values["blamed"] = float(bool(joints) and joints <= set(loop.links[loop.moved :][:2]))
-    kept = next(one for one in done.kept if one.link == "stick")
-    left_out = np.ones(len(stage), bool)
-    left_out[np.arange(len(stage)) if kept.rows is None else kept.rows] = False
-    values["left out inside"] = float(left_out[inside].mean())
-    values["left out outside"] = float(left_out[~inside].mean())
     return Sample(values, tuple(panels))
 
 
