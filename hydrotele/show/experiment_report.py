@@ -125,8 +125,9 @@ def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
 def _draw_curves(place: "Axes", panel: Panel, error: bool) -> None:
     curves = panel.errors if error else panel.curves
     every = max(1, len(panel.x) // _MAX_POINTS)
-    for (label, curve), style in zip(curves.items(), _STYLES, strict=False):
-        colour, line, marker = style
+    order = list(dict.fromkeys([*panel.curves, *panel.errors]))
+    for label, curve in curves.items():
+        colour, line, marker = _STYLES[order.index(label) % len(_STYLES)]
         look = (
             {"ls": "none", "marker": marker, "ms": 4.0, "mfc": "none"} if panel.discrete
             else {"ls": line, "lw": 1.2}
