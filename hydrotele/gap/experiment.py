@@ -365,6 +365,7 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "valve_deadband": ("steps", "reversals"),
     "valve_gain": ("steps",),
     "internal_leakage": ("holds",),
+    "tank_leakage": ("holds",),
     "hose_compliance": ("stairs",),
     "bulk_modulus": ("stairs",),
     "entrained_air": ("stairs",),
