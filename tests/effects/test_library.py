@@ -25,7 +25,7 @@ PLACES = {
     "friction_asymmetry": ARM, "backlash": {"swing"}, "joint_flexibility": ARM, "com_offset": ARM,
     "inertia_error": ARM, "base_tilt": {"base"}, "link_length": {"boom", "stick"},
     "pin_offset": {"boom", "stick"}, "valve_deadband": ARM, "valve_gain": ARM, "spool_lag": ARM,
-    "internal_leakage": ARM, "hose_compliance": ARM, "bulk_modulus": {"all"},
+    "internal_leakage": ARM, "tank_leakage": ARM, "hose_compliance": ARM, "bulk_modulus": {"all"},
     "entrained_air": {"all"},
     "pump_flow_limit": {"supply"}, "relief_pressure": {"supply"}, "command_delay": {"all", *ARM},
     "angle_offset": ARM, "angle_scale": ARM, "angle_delay": ARM, "length_offset": {"boom", "stick"},

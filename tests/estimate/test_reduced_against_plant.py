@@ -40,6 +40,10 @@ CASES = {
         ("load_dependent_friction", "boom", {"coefficient": 0.05}),
         ("position_dependent_friction", "stick", {"coulomb": 1e4, "centre": 0.6, "width": 0.1}),
     ),
+    "tank_leakage": (
+        ("tank_leakage", "boom", {"leakage": 2e-11}),
+        ("tank_leakage", "swing", {"leakage": 1e-11}),
+    ),
     "flows of terms": (
         ("orifice_leakage", "boom", {"flow": 4e-4}),
         ("warming", "all", {"ratio": 0.2, "time_constant": 2.0}),
