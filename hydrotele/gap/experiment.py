@@ -353,6 +353,7 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "link_length": ("sweeps", "poses"),
     "pin_offset": ("sweeps",),
     "angle_offset": ("sweeps",),
+    "angle_drift": ("sweeps",),
     "angle_scale": ("sweeps",),
     "length_offset": ("sweeps",),
     "angle_delay": ("steps",),

@@ -133,7 +133,9 @@ def test_a_counterbalance_valve_holds_back_what_the_spool_leaks():
     held = {"head": {"setting": 24e6, "pilot_ratio": 3.0, "override": 0.25}}
     user = record(load_holding=held, valve={"tank_leakage": 1e-13})
     assert chamber_flows(user, 0, 0.0, 20e6, 12e6, TANK)[0] == 0.0
-    assert chamber_flows(user, 0, 0.0, 20e6, 12e6, 5e6)[0] == pytest.approx(-0.5e-13 * (12e6 - TANK))
+    assert chamber_flows(user, 0, 0.0, 20e6, 12e6, 5e6)[0] == pytest.approx(
+        -0.5e-13 * (12e6 - TANK)
+    )
     assert chamber_flows(user, 0, 0.0, 20e6, 0.1e6, TANK)[0] > 0, "its check lets oil in"
 
 
