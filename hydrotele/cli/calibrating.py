@@ -71,6 +71,32 @@ def linkage(
     calibrate_linkage(data, machine, angles, out, json)
 
 
+@app.command(
+    epilog="Example:  hydrotele calibrate machine --data poses --dynamics motions --out calibrated"
+)
+def machine(
+    data: Data,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    dynamics: Annotated[
+        list[Path] | None,
+        typer.Option(help="Logs for the dynamic step, more than one allowed; default --data."),
+    ] = None,
+    heldout: Annotated[
+        str | None, typer.Option(help="Run of the dynamic logs to judge on, not fitted.")
+    ] = None,
+    json: Json = False,
+    machine: MachineName = "calibrator",
+) -> None:
+    """Arm, cylinder linkages, masses and friction, one after the other (Khoshzaban 1992, p. 125).
+
+    --data holds one log per link that moved under the calibrator. The dynamic step uses the
+    calibrated kinematics; its logs need the pressures of the same machine.
+    """
+    from hydrotele.cli.calibrating_machine import calibrate_machine
+
+    calibrate_machine(data, dynamics or [], machine, heldout, out, json)
+
+
 @app.command(epilog="Example:  hydrotele calibrate design --out design")
 def design(
     out: Out = None, json: Json = False, machine: MachineName = "calibrator",

@@ -85,7 +85,7 @@ def calibrate_arm(
     result = arm_result(nominal, data, choices, every)
     said = arm_as_data(result)
     if target:
-        _write(target, said, result.calibrated, lambda folder: _arm_report(folder, result))
+        _write(target, said, result.calibrated, lambda folder: write_arm_report(folder, result))
     if as_json:
         print_json(said)
     else:
@@ -250,10 +250,12 @@ def _write(target: Path, said: Mapping[str, Any], machine: Machine, report) -> N
         write_json(folder / "summary.json", summary)
 
 
-def _arm_report(folder: Path, result: ArmResult) -> None:
-    from hydrotele.show.calibration_report import write_arm_report
+def write_arm_report(folder: Path, result: ArmResult) -> None:
+    """Write `report.html` of an arm's calibration into a folder."""
+    from hydrotele.show import calibration_report
 
-    write_arm_report(result.fit, result.stages, result.regions, folder / "report.html")
+    path = folder / "report.html"
+    calibration_report.write_arm_report(result.fit, result.stages, result.regions, path)
 
 
 def calibrate_linkage(
@@ -271,7 +273,7 @@ def calibrate_linkage(
     nominal = load_machine(machine)
     fits = linkage_fits(nominal, data, angles)
     said = plain({"machine": nominal.name, "angles": angles, "axes": {
-        found.axis: _linkage_as_data(found) for found in fits}})  # fmt: skip
+        found.axis: linkage_as_data(found) for found in fits}})  # fmt: skip
     made = nominal
     for found in fits:
         made = machine_with_linkage(made, found)
@@ -323,7 +325,8 @@ def linkage_fits(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
     return [identify_linkage(nominal, s) for s in longest.values()]
 
 
-def _linkage_as_data(found: LinkageFit) -> dict[str, Any]:
+def linkage_as_data(found: LinkageFit) -> dict[str, Any]:
+    """A linkage as `--json` prints it; SI units."""
     deviations = dict(zip(found.fit.names, found.fit.deviations, strict=True))
     return {
         "parameters": [
