@@ -131,7 +131,7 @@ def _write(folder: Path, result: SequenceResult, data: Sequence[Path]) -> None:
 
 
 def _print(result: SequenceResult) -> None:
-    shown = table("held-out errors", "step", "given machine", "calibrated", "unit")
+    shown = table("held-out errors of each step", "quantity", "before", "after", "unit")
     closure = result.arm.judged
     if closure:
         shown.add_row("closure of the arm (poses)", f"{closure['rms_nominal_mm']:.2f}",
