@@ -39,6 +39,9 @@ def arm(
     drift: Annotated[
         bool, typer.Option(help="Use the arm's own sensors for how held links drift.")
     ] = True,
+    flexibility: Annotated[
+        bool, typer.Option(help="Estimate how much the calibrator's joints bend under load.")
+    ] = True,
 ) -> None:  # fmt: skip
     """Links of an arm from logs of the external calibrator (Khoshzaban 1992).
 
@@ -47,9 +50,8 @@ def arm(
     """
     from hydrotele.cli.calibrating_arm import ArmChoices, calibrate_arm
 
-    calibrate_arm(
-        data, machine, ArmChoices(method, poses, accuracy_deg, bad_data, drift, heldout), out, json
-    )
+    choices = ArmChoices(method, poses, accuracy_deg, bad_data, drift, heldout, flexibility)
+    calibrate_arm(data, machine, choices, out, json)
 
 
 @app.command(epilog="Example:  hydrotele calibrate linkage --data logs --json")
