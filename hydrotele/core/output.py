@@ -26,6 +26,8 @@ OURS = {
     "robot calibration": ("calibration.json", "report.html", "*.png", "calibrated.yaml",
                           "calibrated.urdf"),
     "arm calibration": ("calibration.json", "report.html", "machine.yaml", "*.png"),
+    "machine calibration": ("calibration.json", "identify.json", "report.html", "kinematics/*",
+                            "identified/machine.*", "identified/machine_assets/*"),
     "identify": ("identify.json", "report.html", "identified/machine.*",
                  "identified/machine_assets/*"),
     "experiments": ("experiments.json", "table.md", "report.html", "figures/*"),
