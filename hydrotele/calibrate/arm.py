@@ -35,7 +35,6 @@ TRUNCATION = (0.05, 0.01, 1.0e-3, 1.0e-5)
 
 _CRITICAL = 1.959964
 _ROUNDS = 3  # of weights that depend on the parameters; the second already changes nothing by 1e-3
-_FLOOR = 1.0e-4  # m: no pose counts as known better than this, where readings do not show at all
 _FEWEST = 2  # equations per parameter
 _STILL = np.radians(2.0)  # of a sensor: it has to move by more while a link moves
 
@@ -170,6 +169,9 @@ def size_of(loop: Loop, name: str) -> float:
 class Equations:
     """The two equations per pose of one stage."""
 
+    FLOOR = 1.0e-4
+    """Standard deviation [m] below which no pose counts, where its readings do not show at all."""
+
     def __init__(self, loop: Loop, poses: Poses) -> None:
         self.loop, self.poses = loop, poses
         self.place = loop.links.index(poses.link)
@@ -239,8 +241,8 @@ class Equations:
 
     def whitening(self, sensed: np.ndarray) -> np.ndarray:
         """(M, 2, 2) upper factors that give both equations of a pose unit covariance."""
-        spread = sensed * self.poses.sigma
-        covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(2)
+        spread = sensed * self.poses.sigma[..., None, :]
+        covariance = spread @ spread.transpose(0, 2, 1) + self.FLOOR**2 * np.eye(2)
         return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
 
 

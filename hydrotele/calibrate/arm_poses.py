@@ -29,7 +29,7 @@ class Poses:
     Attributes:
         link: the moving link.
         theta: (M, S) readings of the calibrator's sensors, without offsets [rad].
-        sigma: (S,) standard deviation of a reading [rad].
+        sigma: (S,), or (M, S) where it depends on the pose: standard deviation of a reading [rad].
         manipulator: link -> (M,) reading of the manipulator's own joint sensor, where there is one
             [rad]; the identification itself does not use it.
         manipulator_sigma: standard deviation of such a reading [rad].
@@ -57,8 +57,9 @@ class Poses:
         drift = self.drift and Drift(
             {name: values[kept] for name, values in self.drift.held.items()}, self.drift.ball[kept]
         )
+        sigma = self.sigma[kept] if self.sigma.ndim == 2 else self.sigma
         return replace(
-            self, theta=self.theta[kept], rows=rows[kept], drift=drift,
+            self, theta=self.theta[kept], sigma=sigma, rows=rows[kept], drift=drift,
             manipulator={name: values[kept] for name, values in self.manipulator.items()},
         )  # fmt: skip
 

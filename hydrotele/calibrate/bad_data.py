@@ -119,7 +119,7 @@ def misfit(
     equations = Equations(loop, poses)
     error, slopes, sensed = equations.at(numbers)
     own = np.zeros((len(poses), 2))
-    spread = sensed * poses.sigma
+    spread = sensed * poses.sigma[..., None, :]
     covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(2)
     if poses.link in poses.manipulator:
         seen, theta = equations.seen(numbers)
@@ -137,7 +137,7 @@ def misfit(
         error = np.column_stack([error, third])
         sensed = np.concatenate([sensed, turn[:, None]], axis=1)
         own = np.stack([0.0 * reach, 0.0 * reach, reach], axis=1)
-        spread = sensed * poses.sigma
+        spread = sensed * poses.sigma[..., None, :]
         covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(3)
         covariance[:, 2, 2] += (reach * poses.manipulator_sigma) ** 2
     whitening = np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)

@@ -39,6 +39,9 @@ def arm(
     drift: Annotated[
         bool, typer.Option(help="Use the arm's own sensors for how held links drift.")
     ] = True,
+    flexibility: Annotated[
+        bool, typer.Option(help="Estimate how much the calibrator's joints bend under load.")
+    ] = True,
 ) -> None:  # fmt: skip
     """Links of an arm from logs of the external calibrator (Khoshzaban 1992).
 
@@ -47,9 +50,8 @@ def arm(
     """
     from hydrotele.cli.calibrating_arm import ArmChoices, calibrate_arm
 
-    calibrate_arm(
-        data, machine, ArmChoices(method, poses, accuracy_deg, bad_data, drift, heldout), out, json
-    )
+    choices = ArmChoices(method, poses, accuracy_deg, bad_data, drift, heldout, flexibility)
+    calibrate_arm(data, machine, choices, out, json)
 
 
 @app.command(epilog="Example:  hydrotele calibrate linkage --data logs --json")
@@ -69,6 +71,32 @@ def linkage(
     if heldout is not None:
         raise InputError("--heldout", "is not used here: every fifth sample is judged on")
     calibrate_linkage(data, machine, angles, out, json)
+
+
+@app.command(
+    epilog="Example:  hydrotele calibrate machine --data poses --dynamics motions --out calibrated"
+)
+def machine(
+    data: Data,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    dynamics: Annotated[
+        list[Path] | None,
+        typer.Option(help="Logs for the dynamic step, more than one allowed; default --data."),
+    ] = None,
+    heldout: Annotated[
+        str | None, typer.Option(help="Run of the dynamic logs to judge on, not fitted.")
+    ] = None,
+    json: Json = False,
+    machine: MachineName = "calibrator",
+) -> None:
+    """Arm, cylinder linkages, masses and friction, one after the other (Khoshzaban 1992, p. 125).
+
+    --data holds one log per link that moved under the calibrator. The dynamic step uses the
+    calibrated kinematics; its logs need the pressures of the same machine.
+    """
+    from hydrotele.cli.calibrating_machine import calibrate_machine
+
+    calibrate_machine(data, dynamics or [], machine, heldout, out, json)
 
 
 @app.command(epilog="Example:  hydrotele calibrate design --out design")

@@ -1,6 +1,6 @@
 """`hydrotele calibrate arm`, `linkage` and `design`: from logs to results in words, JSON, files."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,11 @@ from hydrotele.calibrate.arm import (
 from hydrotele.calibrate.arm_data import held_out, read_stages, strokes_of
 from hydrotele.calibrate.arm_poses import Poses, with_drift
 from hydrotele.calibrate.bad_data import Region, identify_without_bad_data
+from hydrotele.calibrate.flexibility import (
+    Flexibility,
+    refit_with_flexibility,
+    with_flexibility,
+)
 from hydrotele.calibrate.linkage import (
     NAMES,
     LinkageFit,
@@ -47,6 +52,7 @@ class ArmChoices(NamedTuple):
         bad_data: whether corrupted readings are looked for and left out.
         drift: whether the arm's own sensors show how held links drift.
         heldout: every how many poses are judged on, as text.
+        flexibility: whether the flexibility of the calibrator's joints is estimated.
     """
 
     method: str = "joint"
@@ -55,10 +61,21 @@ class ArmChoices(NamedTuple):
     bad_data: bool = True
     drift: bool = True
     heldout: str | None = None
+    flexibility: bool = True
 
 
 class ArmResult(NamedTuple):
-    """What `calibrate arm` found: nominal machine, fit, poses, bad data, judgement, machine."""
+    """What `calibrate arm` found.
+
+    Attributes:
+        machine: the nominal machine.
+        fit: of the arm.
+        stages: poses that were fitted.
+        regions: corrupted readings that were left out.
+        judged: errors on poses that were not fitted.
+        calibrated: the machine with the fitted parameters.
+        flexibility: of the calibrator's joints; None where it was not estimated.
+    """
 
     machine: Machine
     fit: ArmFit
@@ -66,6 +83,7 @@ class ArmResult(NamedTuple):
     regions: list[Region]
     judged: Mapping[str, Any]
     calibrated: Machine
+    flexibility: Flexibility | None
 
 
 def calibrate_arm(
@@ -85,7 +103,7 @@ def calibrate_arm(
     result = arm_result(nominal, data, choices, every)
     said = arm_as_data(result)
     if target:
-        _write(target, said, result.calibrated, lambda folder: _arm_report(folder, result))
+        _write(target, said, result.calibrated, lambda folder: write_arm_report(folder, result))
     if as_json:
         print_json(said)
     else:
@@ -119,11 +137,19 @@ def arm_result(nominal: Machine, data: Path, choices: ArmChoices, every: int) ->
         cleaned = identify_without_bad_data(loop, stages)
         regions, kept = cleaned.regions, cleaned.stages
     fitted, judged = held_out(kept, every)
-    fit = identify_arm(loop, fitted)
-    if choices.method == "joint":
-        fit = identify_jointly(fit, fitted)
+
+    def identify(stages: Sequence[Poses]) -> ArmFit:
+        fit = identify_arm(loop, stages)
+        return identify_jointly(fit, stages) if choices.method == "joint" else fit
+
+    fit, flexibility = identify(fitted), None
+    if choices.flexibility:
+        fit, flexibility = refit_with_flexibility(loop, fitted, fit, identify)
+        bend = flexibility.at_full_load
+        judged = [with_flexibility(loop, poses, fit, bend) for poses in judged]
     made = calibrated_machine(nominal, fit, fitted)
-    return ArmResult(nominal, fit, fitted, regions, _judged(loop, fit, judged), made)
+    errors = _judged(loop, fit, judged)
+    return ArmResult(nominal, fit, fitted, regions, errors, made, flexibility)
 
 
 def _judged(loop: Loop, fit: ArmFit, judged: list[Poses]) -> dict[str, Any]:
@@ -175,8 +201,14 @@ def arm_as_data(result: ArmResult) -> dict[str, Any]:
         }
         for r in result.regions
     ]  # fmt: skip
+    bend = result.flexibility
+    flexibility = bend and {
+        "at_full_load_rad": dict(zip(bend.joints, bend.at_full_load.tolist(), strict=True)),
+        "log_likelihood_gain": bend.gain,
+    }  # fmt: skip
     return plain({
         "machine": fit.nominal.machine, "method": fit.method, "parameters": rows,
+        "flexibility": flexibility,
         "stages": stages, "bad_data": regions, "heldout": dict(result.judged),
         "links_without_log": _unmoved(fit), "notes": _notes(fit),
     })  # fmt: skip
@@ -222,6 +254,10 @@ def _print_arm(said: Mapping[str, Any]) -> None:
                   f" {stage['rms_mm']:.2f} mm, {stage['chi']:.2f} times the sensors'")  # fmt: skip
         for name, reason in stage["not_identified"].items():
             out.print(f"  {name} {reason}", style="dim")
+    if said["flexibility"]:
+        bends = said["flexibility"]["at_full_load_rad"].items()
+        text = ", ".join(f"{name} {np.degrees(value):.3f}" for name, value in bends)
+        out.print(f"angle errors of flexible joints at full load, standard deviation [deg]: {text}")
     for region in said["bad_data"]:
         out.print(f"[yellow]bad data[/] {region['link']}, poses {region['first_pose']} to"
                   f" {region['last_pose']}: {region['joint']}, {region['size_deg']:.2f} deg"
@@ -250,10 +286,12 @@ def _write(target: Path, said: Mapping[str, Any], machine: Machine, report) -> N
         write_json(folder / "summary.json", summary)
 
 
-def _arm_report(folder: Path, result: ArmResult) -> None:
-    from hydrotele.show.calibration_report import write_arm_report
+def write_arm_report(folder: Path, result: ArmResult) -> None:
+    """Write `report.html` of an arm's calibration into a folder."""
+    from hydrotele.show import calibration_report
 
-    write_arm_report(result.fit, result.stages, result.regions, folder / "report.html")
+    path = folder / "report.html"
+    calibration_report.write_arm_report(result.fit, result.stages, result.regions, path)
 
 
 def calibrate_linkage(
@@ -271,7 +309,7 @@ def calibrate_linkage(
     nominal = load_machine(machine)
     fits = linkage_fits(nominal, data, angles)
     said = plain({"machine": nominal.name, "angles": angles, "axes": {
-        found.axis: _linkage_as_data(found) for found in fits}})  # fmt: skip
+        found.axis: linkage_as_data(found) for found in fits}})  # fmt: skip
     made = nominal
     for found in fits:
         made = machine_with_linkage(made, found)
@@ -323,7 +361,8 @@ def linkage_fits(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
     return [identify_linkage(nominal, s) for s in longest.values()]
 
 
-def _linkage_as_data(found: LinkageFit) -> dict[str, Any]:
+def linkage_as_data(found: LinkageFit) -> dict[str, Any]:
+    """A linkage as `--json` prints it; SI units."""
     deviations = dict(zip(found.fit.names, found.fit.deviations, strict=True))
     return {
         "parameters": [

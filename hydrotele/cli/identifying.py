@@ -127,7 +127,7 @@ def identify_to_folder(
     if mechanism.found is None and hydraulics is None:
         raise InputError(target, mechanism.lacking)
     with whole_folder(target, "identify") as folder:
-        _write(folder, dataset, mechanism, hydraulics, data, choices)
+        write_identification(folder, dataset, mechanism, hydraulics, data, choices)
     print_result(
         identify_document(mechanism.found, hydraulics, mechanism.best),
         as_json,
@@ -219,10 +219,11 @@ def identify_mechanism(dataset: Dataset, choices: Choices) -> MechanismResult:
     return MechanismResult(found, best, patched)
 
 
-def _write(
+def write_identification(
     folder: Path, dataset: Dataset, mechanism: MechanismResult, hydraulics: Hydraulics | None,
     data: Sequence[Path], choices: Choices,
 ) -> None:  # fmt: skip
+    """Write `identify.json`, `report.html`, the identified machine and `summary.json`."""
     found, patched = mechanism.found, hydraulics.machine if hydraulics else mechanism.machine
     document = plain(identify_document(found, hydraulics, mechanism.best))
     write_json(folder / "identify.json", document)

@@ -221,7 +221,10 @@ def _fourier(plan: Plan, pilot: FourierPilot) -> Plan:
         begin = plan.reference[0, column]
         plan.reference[:, column] = begin + s * (wave - begin)
         plan.rate[:, column] = s * slope + ds * (wave - begin)
-    return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool))
+    closed = np.ones(len(plan.axes), bool)
+    for name in pilot.closed_valves:
+        closed[_column(plan.axes, name, "pilot.closed_valves")] = False
+    return dataclasses.replace(plan, closed=closed)
 
 
 def quintic(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,7 @@
-"""Sensors that read with an offset, another scale, late, or by a clock of their own."""
+"""Sensors that read with an offset, another scale, late, or by a clock of their own.
+
+Position sensors whose offset drifts while they warm up.
+"""
 
 import math
 
@@ -43,6 +46,28 @@ def _set_angle(field: str, parameter: str):
         return _with(machine, _position(machine, location), **{field: values[parameter]})
 
     return apply
+
+
+def _angle_drift(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Sizes in a warm sensor as of an offset; 600 s in which it warms up are an estimate."""
+    error = _error(machine, _position(machine, location))
+    sizes = _angle_offset(machine, location)["offset"]
+    reach = sizes.high - sizes.nominal
+    low, high = error.drift - reach, error.drift + reach
+    return {
+        "drift": Parameter(sizes.unit, error.drift, low, high, sizes.scale, sizes.least),
+        "time_constant": Parameter(
+            "s", error.drift_time_constant, 1.0, 36000.0, 300.0, 30.0, optional=True
+        ),
+    }
+
+
+def _set_angle_drift(machine: Machine, location: str, values: Values) -> Machine:
+    """Without drift its time constant means nothing and is left out."""
+    numbers = {"drift": values["drift"]}
+    if values["drift"] and "time_constant" in values:
+        numbers["drift_time_constant"] = values["time_constant"]
+    return _with(machine, _position(machine, location), **numbers)
 
 
 def _angle_scale(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -182,6 +207,10 @@ EFFECTS = (
     Effect(
         "angle_offset", "a position sensor that is mounted askew", "sensor", axes, _angle_offset,
         _set_angle("offset", "offset"),
+    ),
+    Effect(
+        "angle_drift", "a position sensor whose offset drifts while it warms up", "sensor", axes,
+        _angle_drift, _set_angle_drift,
     ),
     Effect(
         "angle_scale", "a position sensor with another scale", "sensor", axes, _angle_scale,

@@ -195,6 +195,12 @@ def _sensor_tables(plant: Plant, machines: list[Machine]):
     lags, c = np.zeros((*shape, 2)), len(names)
     for v, machine in enumerate(machines):
         defects = [machine.sensor_errors.get(name, SensorError()) for name in names]
+        for name, defect in zip(names, defects, strict=True):
+            if defect.drift:
+                said = (
+                    "drifts in the machine; environments have no drift, give it an offset instead"
+                )
+                raise InputError(f"sensor {name}", said)
         scales[v, :c] = [defect.scale for defect in defects]
         offsets[v, :c] = [defect.offset for defect in defects]
         lags[v, :c], ratios[v, :c] = sensor_delays(machine, names, plant.model.opt.timestep)

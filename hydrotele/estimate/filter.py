@@ -31,6 +31,7 @@ from hydrotele.estimate.reduced_model import (
     Model,
     X,
     accelerate,
+    add_sensor_drift,
     advance,
     follow_channel,
     load_position,
@@ -632,6 +633,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
                 if fresh:
                     slope[row, c, :] = 0.0
                     slope[row, c, size + late.first[c]] = 1.0
+        add_sensor_drift(model, sp.time[1] + row * period, predicted[row])
         delta[:] = 0.0
         for c in range(channels):
             if math.isnan(reading[row, c]):

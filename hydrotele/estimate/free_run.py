@@ -16,6 +16,7 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.reduced_model import (
     Model,
+    add_sensor_drift,
     advance,
     follow_trail,
     model_space,
@@ -349,3 +350,4 @@ def _run_from(model, sp, z, command, first, period, steps, before, out):
         advance(model, sp, z, command, first + k, period, steps, ahead)
         follow_trail(model, ahead, h, shown)
         read_channels(model, sp, z, row + 1, steps, h, trail, out[k])
+        add_sensor_drift(model, sp.time[1] + (first + k + 1) * period, out[k])

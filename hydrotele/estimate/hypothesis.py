@@ -238,12 +238,12 @@ UNCERTAINTY: dict[str, float] = {
     "mass": 0.05, "inertia_error": 0.05, "com_offset": 0.02, "link_length": 0.002,
     "pin_offset": 0.002, "area": 0.02, "displacement": 0.02, "dead_volume": 0.1,
     "coulomb_friction": 0.1, "viscous_friction": 0.1, "stribeck_friction": 0.1,
-    "internal_leakage": 0.2, "valve_gain": 0.05, "valve_deadband": 0.1, "spool_lag": 0.1,
-    "bulk_modulus": 0.1, "pump_flow_limit": 0.05, "relief_pressure": 0.03, "drive_gain": 0.02,
-    "valve_damping": 0.1, "pump_displacement": 0.02, "pump_leakage": 0.3, "pump_torque_loss": 0.1,
-    "tank_pressure": 0.2, "motor_constant": 0.05, "motor_inertia": 0.1, "motor_drag": 0.1,
-    "motor_viscous_drag": 0.1, "line_compliance": 0.2, "accumulator_pressure": 0.05,
-    "load_relief": 0.03, "load_friction": 0.1,
+    "internal_leakage": 0.2, "tank_leakage": 0.3, "valve_gain": 0.05, "valve_deadband": 0.1,
+    "spool_lag": 0.1, "bulk_modulus": 0.1, "pump_flow_limit": 0.05, "relief_pressure": 0.03,
+    "drive_gain": 0.02, "valve_damping": 0.1, "pump_displacement": 0.02, "pump_leakage": 0.3,
+    "pump_torque_loss": 0.1, "tank_pressure": 0.2, "motor_constant": 0.05, "motor_inertia": 0.1,
+    "motor_drag": 0.1, "motor_viscous_drag": 0.1, "line_compliance": 0.2,
+    "accumulator_pressure": 0.05, "load_relief": 0.03, "load_friction": 0.1,
 }  # fmt: skip
 _LENGTHS = ("com_offset", "link_length", "pin_offset")  # relative to the size that they refer to
 _WIDEST = 6.0  # standard deviations to which a number may go; beyond, it is an effect

@@ -34,7 +34,7 @@ from hydrotele.hydraulics.parameters import (
     extra_state_names,
     terms_of,
 )
-from hydrotele.machine.machine import Machine, SensorError, first_order
+from hydrotele.machine.machine import Machine, SensorError, first_order, warming_drift
 from hydrotele.machine.signals import parse_channel
 from hydrotele.multibody.reduced_mechanism import (
     BAR,
@@ -100,6 +100,7 @@ class Model(NamedTuple):
         lag: (c,) sensor delays [s].
         terms: (k,) table of the machine's terms, see `terms.table`.
         time_constant: (c,) time constants of the sensors' first-order lags [s].
+        drift: (c, 2) drifts of the sensors' offsets [channel's unit] and their time constants [s].
         memory: number of states that follow the activations; NO_MEMORY, and not 0, where there are
             none: what needs them is then left out.
     """
@@ -118,6 +119,7 @@ class Model(NamedTuple):
     lag: np.ndarray
     terms: np.ndarray
     time_constant: np.ndarray
+    drift: np.ndarray
     memory: int
 
 
@@ -195,6 +197,7 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         lag=np.array([e.delay for e in errors], float),
         terms=terms_of(machine),
         time_constant=np.array([e.time_constant for e in errors], float),
+        drift=np.array([(e.drift, e.drift_time_constant) for e in errors], float).reshape(-1, 2),
         memory=len(extra_state_names(machine)) or NO_MEMORY,
     )
 
@@ -777,7 +780,7 @@ def _shown(model, sp, z, c):
 
 @allocation_free
 def read_channels(model, sp, z, row, steps, h, trail, out):
-    """What the sensors show in a state, without noise.
+    """What the sensors show in a state, without noise and drift.
 
     Args:
         model: Model.
@@ -809,6 +812,25 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
         out[c] = model.scale[c] * value + model.offset[c]
 
 
+@allocation_free
+def add_sensor_drift(model, time, out):
+    """Add to what the sensors show by how much their offsets have drifted.
+
+    Args:
+        model: Model.
+        time: since the run's beginning, scalar [s].
+        out: (c,) readings, changed in place [channel's unit].
+
+    Returns:
+        Nothing.
+
+    Source: `machine.warming_drift`.
+    """
+    for c in range(len(model.drift)):
+        if model.drift[c, 0] != 0.0:
+            out[c] += warming_drift(time, model.drift[c, 0], model.drift[c, 1])
+
+
 @compiled
 def simulate_rows(model, sp, z, command, period, steps, out, states):
     """Free run from a state over all rows of a log.
@@ -835,6 +857,7 @@ def simulate_rows(model, sp, z, command, period, steps, out, states):
     shown = trail[0].copy()
     for row in range(rows):
         read_channels(model, sp, z, row, steps, period / steps, trail, out[row])
+        add_sensor_drift(model, sp.time[1] + row * period, out[row])
         for s in range(len(z)):
             states[row, s] = z[s]
         if row < rows - 1:

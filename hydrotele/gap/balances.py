@@ -290,7 +290,7 @@ def read_signals(
         if channel.kind not in ("angle", "position", "length") and "pressure" not in channel.kind:
             continue
         error = machine.sensor_errors.get(name, SensorError())
-        on_clock = _corrected(on_clock, error, clock.period)
+        on_clock = _corrected(on_clock, error, time)
         known = on_clock[np.isfinite(on_clock)]
         sigma = told.get(name) or noise_rms(machine, stated, name)
         sigma = sigma / error.scale or None
@@ -367,12 +367,12 @@ def _last_known(values: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
 
 
-def _corrected(values: np.ndarray, error: SensorError, period: float) -> np.ndarray:
-    values = (values - error.offset) / error.scale
+def _corrected(values: np.ndarray, error: SensorError, time: np.ndarray) -> np.ndarray:
+    values = (values - error.offset_at(time)) / error.scale
     if not error.late:
         return values
     # a first-order lag delays motions slower than itself by its time constant
-    rows, lag = np.arange(len(values)), (error.delay + error.time_constant) / period
+    rows, lag = np.arange(len(values)), (error.delay + error.time_constant) / (time[1] - time[0])
     return np.interp(rows + lag, rows, values, right=np.nan)
 
 

@@ -311,7 +311,8 @@ def patched_mapping(given: ColumnMapping, patch: Patch) -> ColumnMapping:
         old = errors.get(channel, SensorError())
         errors[channel] = SensorError(
             offset=old.offset + old.scale * one.offset, scale=old.scale * one.scale,
-            delay=old.delay + one.delay, time_constant=old.time_constant,
+            delay=old.delay + one.delay, time_constant=old.time_constant, drift=old.drift,
+            drift_time_constant=old.drift_time_constant,
         )  # fmt: skip
     keep = () if touched else given.alike
     return given.model_copy(update={

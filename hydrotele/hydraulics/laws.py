@@ -395,7 +395,7 @@ _PA, _BT = int(Slot.METERING_PA), int(Slot.METERING_BT)
 _PB, _AT = int(Slot.METERING_PB), int(Slot.METERING_AT)
 _D, _TANK, _DROP = int(Slot.ORIFICE_SMOOTHING), int(Slot.TANK_PRESSURE), int(Slot.COMPENSATED_DROP)
 _HEAD, _ROD = int(Slot.HOLDING_HEAD), int(Slot.HOLDING_ROD)
-_CURVES = int(Slot.CURVES)
+_CURVES, _TANK_LEAK = int(Slot.CURVES), int(Slot.TANK_LEAKAGE)
 
 
 @inlined
@@ -473,8 +473,22 @@ def inlet_flow(drop, gain, smoothing, compensated):
 
 @inlined
 def _outlet_flow(user, u, holding, gain, pressure, pilot):
-    """Flow out of a chamber to tank, throttled by its counterbalance valve, and its slope."""
+    """Flow out of a chamber through the open edge to tank, and its slope."""
     flow, slope = orifice(pressure - user[u + _TANK], gain, user[u + _D])
+    return _held_flow(user, u, holding, flow, slope, pressure, pilot)
+
+
+@inlined
+def _tank_leakage(user, u, holding, pressure, pilot):
+    """Flow out of a chamber through the spool's clearance to tank, and its slope."""
+    leak = user[u + _TANK_LEAK]
+    flow = leak * (pressure - user[u + _TANK])
+    return _held_flow(user, u, holding, flow, leak, pressure, pilot)
+
+
+@inlined
+def _held_flow(user, u, holding, flow, slope, pressure, pilot):
+    """What the counterbalance valve of a chamber lets out of a flow to tank, and its slope."""
     if user[u + holding] == 0.0 or flow <= 0.0:
         return flow, slope
     share, steep = holding_share(
@@ -488,7 +502,11 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     """Valve flows into both chambers of an axis and their slopes.
 
     With o > 0 the head side is fed through its load check and the rod side drains to tank; with
-    o < 0 the other way round.
+    o < 0 the other way round. From each chamber oil leaks to tank through the spool's radial
+    clearance, `c_t (p - p_t)` with any opening. A concentric spool of diameter d with the clearance
+    c over the overlap L has `c_t = pi d c^3 / (12 mu L)`. The overlap of the spool at rest counts
+    at any opening: an open edge to tank passes some thousand times as much, and where the overlap
+    grows, the pump feeds the chamber. Oil from the pump's gallery does not leak into a chamber.
 
     Args:
         user: (nu * SLOTS,) actuator numbers.
@@ -501,8 +519,19 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     Returns:
         (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]).
 
-    Source: nominal model, "Orifice".
+    Source: nominal model, "Orifice"; Merritt 1967, laminar flow through an annular clearance.
     """
+    q_head, q_rod, slope_head, slope_rod = _edge_flows(user, u, opening, p_supply, p_head, p_rod)
+    if user[u + _TANK_LEAK] == 0.0:
+        return q_head, q_rod, slope_head, slope_rod
+    leak_head, steep_head = _tank_leakage(user, u, _HEAD, p_head, p_rod)
+    leak_rod, steep_rod = _tank_leakage(user, u, _ROD, p_rod, p_head)
+    return q_head - leak_head, q_rod - leak_rod, slope_head - steep_head, slope_rod - steep_rod
+
+
+@inlined
+def _edge_flows(user, u, opening, p_supply, p_head, p_rod):
+    """`chamber_flows` through the open edges of the spool."""
     if opening == 0.0:
         return 0.0, 0.0, 0.0, 0.0
     gain, smoothing, drop = user[u + _K] * abs(opening), user[u + _D], user[u + _DROP]

@@ -73,6 +73,7 @@ class Slot(enum.IntEnum):
     METERING_PB = enum.auto()
     METERING_AT = enum.auto()
     COMPENSATED_DROP = enum.auto()
+    TANK_LEAKAGE = enum.auto()
     HOLDING_HEAD = enum.auto()
     HOLDING_HEAD_RATIO = enum.auto()
     HOLDING_HEAD_RANGE = enum.auto()
@@ -367,6 +368,7 @@ def _write_valve(numbers: np.ndarray, valve: Valve) -> None:
         valve.negative.inlet, valve.negative.outlet
     )  # fmt: skip
     numbers[Slot.COMPENSATED_DROP] = valve.held_drop
+    numbers[Slot.TANK_LEAKAGE] = valve.tank_leakage
     numbers[Slot.ORIFICE_SMOOTHING] = valve.smoothing
     numbers[Slot.PORT_RELIEF] = valve.port_relief
     numbers[Slot.RELIEF_GAIN] = valve.port_relief_gain

@@ -123,7 +123,7 @@ def build_equations(
             record.name, f"{len(record.force)} rows are too few for a band of {band:g} Hz, which"
             f" needs {len(low)}",
         )  # fmt: skip
-    errors = rate_errors or RateErrors(record.axes, motion.rate_std)
+    errors = rate_errors or RateErrors(setup.given, motion.rate_std)
     start, last, parts, doubts, damped = None, None, [], [], []
     weights = np.abs(low) / np.abs(low).sum()
     for first in range(0, count, per_chunk := max(1, _CHUNK // thin)):

@@ -300,23 +300,26 @@ def _reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, 
     """Readings (n,) freed of the sensor defects that the machine states, and their noise."""
     column = dataset.channels.index(channel)
     error = dataset.machine.sensor_errors.get(channel, SensorError())
-    values = without_error(run.reading[:, column], error, run.period)
+    values = without_error(run.reading[:, column], error, run.period, run.start)
     return values, float(dataset.noise_of(run)[column]) / error.scale
 
 
-def without_error(values: np.ndarray, error: SensorError, period: float) -> np.ndarray:
+def without_error(
+    values: np.ndarray, error: SensorError, period: float, start: float = 0.0
+) -> np.ndarray:
     """What a sensor would read without its defect.
 
     Args:
         values: (n,) readings, NaN where missing.
-        error: offset, scale, delay and lag; the lag counts as a delay, which it is of motions that
-            are slower.
+        error: offset, drift, scale, delay and lag; the lag counts as a delay, which it is of
+            motions that are slower.
         period: between rows [s].
+        start: time of the first row since the run's beginning [s].
 
     Returns:
         (n,), NaN where nothing is known: at the end, where the sensor is late.
     """
-    values = (values - error.offset) / error.scale
+    values = (values - error.offset_at(start + period * np.arange(len(values)))) / error.scale
     if error.late:
         rows = np.arange(len(values), dtype=float)
         late = (error.delay + error.time_constant) / period

@@ -15,7 +15,7 @@ from hydrotele.machine.drives import Axis
 from hydrotele.machine.machine import Machine
 
 _PLAY = 2.0e-3  # m: joint ranges are given in whole degrees
-_EXACT = 1.0e-9  # m or 1, by which the closed form of a feller-buncher's arm may be missed
+_EXACT = 1.0e-9  # m or 1: rounding of a 10 m machine, far below any length that matters
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,23 @@ def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
         (float(base @ first), float(base @ second)),
         (float(rod @ first), float(rod @ second)),
         machine.home.get(axis.joint, 0.0),
+        float((rod - base) @ axis_way),
     )
+
+
+def has_ball_ends(machine: Machine, name: str) -> bool:
+    """Return whether an axis' cylinder ends in ball joints, as its pins lie in no common plane.
+
+    Between pins that are parallel to the joint's axis a cylinder moves in one plane across it. Pins
+    that are apart along the axis would bend it.
+
+    Source: Khoshzaban 1992, section 3.4.4 (p. 43).
+    """
+    axis = machine.axes[name]
+    if axis.cylinder is None or axis.four_bar:
+        return False
+    linkage = axis_linkage(machine, name)
+    return isinstance(linkage, TwoBar) and abs(linkage.axial_offset) > _EXACT
 
 
 def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:

@@ -172,20 +172,26 @@ def closing(value: Scalar, low: Scalar, high: Scalar, what: str) -> Scalar:
 class TwoBar:
     """A cylinder across one joint with included angle B = direction * theta + angle_offset.
 
+    Where the pins lie in one plane across the joint's axis, the linkage is a plane triangle. Where
+    they do not, the cylinder ends in ball joints and the triangle is spatial: both pins move on
+    circles about the axis, whose planes are `axial_offset` apart.
+
     Valid for B in (0, pi); at 0 and pi the moment arm is zero and the cylinder cannot hold.
-    Source: Khoshzaban 1992 Eq. 3.26, Zhu 1994 Eq. 6.13.
+    Source: Khoshzaban 1992 Eq. 3.26 and section 3.4.4 (p. 43), Zhu 1994 Eq. 6.13.
 
     Attributes:
-        lower: joint to cylinder pin on the inboard link [m], > 0.
-        upper: joint to cylinder pin on the outboard link [m], > 0.
+        lower: joint axis to cylinder pin on the inboard link [m], > 0.
+        upper: joint axis to cylinder pin on the outboard link [m], > 0.
         angle_offset: included angle at theta = 0 [rad].
         direction: +1 if the cylinder extends as theta grows, -1 if it retracts [-].
+        axial_offset: distance of the pins along the joint's axis [m].
     """
 
     lower: float
     upper: float
     angle_offset: float
     direction: int = 1
+    axial_offset: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse bars without length and a direction that is no sign."""
@@ -197,7 +203,7 @@ class TwoBar:
             raise ValueError(f"two-bar direction must be +1 or -1, got {self.direction}")
 
     def length(self, theta: Scalar) -> Scalar:
-        """Pin-to-pin length c = sqrt((a - b)^2 + 4 a b sin(B/2)^2), the cosine law (K Eq. 3.26).
+        """Pin-to-pin length c = sqrt((a - b)^2 + h^2 + 4 a b sin(B/2)^2), K Eq. 3.26 for h = 0.
 
         Args:
             theta: joint angle, any shape [rad].
@@ -211,7 +217,8 @@ class TwoBar:
         """
         m = library(theta)
         chord = 2 * m.sin(0.5 * (self.direction * theta + self.angle_offset))
-        return m.sqrt((self.lower - self.upper) ** 2 + self.lower * self.upper * chord**2)
+        constant = (self.lower - self.upper) ** 2 + self.axial_offset**2
+        return m.sqrt(constant + self.lower * self.upper * chord**2)
 
     def rate(self, theta: Scalar) -> Scalar:
         """Signed moment arm dc/dtheta = direction a b sin(B) / c (Zhu Eq. 6.13).
@@ -232,10 +239,11 @@ class TwoBar:
     def angle(self, length: Scalar) -> Scalar:
         """Joint angle, theta = direction (B - angle_offset), on the branch B in [0, pi].
 
-        tan(B/2)^2 = (c^2 - (a - b)^2) / ((a + b)^2 - c^2), which needs no arc cosine.
+        tan(B/2)^2 = (p^2 - (a - b)^2) / ((a + b)^2 - p^2) of the length p = sqrt(c^2 - h^2) in the
+        plane across the axis, which needs no arc cosine.
 
         Args:
-            length: pin-to-pin length, any shape [m], in [|a - b|, a + b].
+            length: pin-to-pin length c, any shape [m], with p in [|a - b|, a + b].
 
         Returns:
             Joint angle, shape of length [rad].
@@ -247,10 +255,15 @@ class TwoBar:
         >>> round(math.degrees(boom.angle(2.2575379)), 4)
         27.8
         """
+        if self.axial_offset:
+            square = length * length - self.axial_offset**2
+            length = library(length).sqrt(np.maximum(square, 0.0))
         return self.direction * (apex_angle(self.lower, self.upper, length) - self.angle_offset)
 
 
-def two_bar_from_points(base_pin: Point, rod_pin: Point, working_angle: float = 0.0) -> TwoBar:
+def two_bar_from_points(
+    base_pin: Point, rod_pin: Point, working_angle: float = 0.0, axial_offset: float = 0.0
+) -> TwoBar:
     """Two-bar linkage from its two cylinder pins, seen from the joint.
 
     B = |polar(rod) + theta - polar(base)|; the sign of the difference at the working angle is the
@@ -260,6 +273,7 @@ def two_bar_from_points(base_pin: Point, rod_pin: Point, working_angle: float = 
         base_pin: (x, z) of one cylinder pin in the inboard link's axes, from the joint [m].
         rod_pin: (x, z) of the other cylinder pin in the outboard link's axes, from the joint [m].
         working_angle: any joint angle inside the working range [rad].
+        axial_offset: distance of the pins along the joint's axis [m].
 
     Returns:
         The linkage, with B in (0, pi) at the working angle.
@@ -269,7 +283,7 @@ def two_bar_from_points(base_pin: Point, rod_pin: Point, working_angle: float = 
             open.
 
     >>> two_bar_from_points((-2.0, 0.0), (0.0, 0.5), working_angle=-0.5)
-    TwoBar(lower=2.0, upper=0.5, angle_offset=1.5707963267948966, direction=-1)
+    TwoBar(lower=2.0, upper=0.5, angle_offset=1.5707963267948966, direction=-1, axial_offset=0.0)
     """
     offset = math.atan2(rod_pin[1], rod_pin[0]) - math.atan2(base_pin[1], base_pin[0])
     included = math.remainder(offset + working_angle, math.tau)
@@ -283,6 +297,7 @@ def two_bar_from_points(base_pin: Point, rod_pin: Point, working_angle: float = 
         math.hypot(*rod_pin),
         direction * (included - working_angle),
         direction,
+        axial_offset,
     )
 
 

@@ -178,6 +178,8 @@ class Valve(Facts):
     `slew_limit` [1/s] is the fastest that its spool can move. With `compensation: pressure` the
     drop over the inlet edge never exceeds `compensated_drop` [Pa] (the rated one, if not given), so
     that the flow follows the opening whatever the load, as long as the supply suffices.
+    `tank_leakage` [m^3/(s Pa)] is the laminar leakage from each work port to tank, through the
+    radial clearance of the spool (`hydraulics.laws.chamber_flows`).
     `positive` and `negative` say how the two directions of travel differ; a positive command feeds
     the head side.
     """
@@ -196,6 +198,7 @@ class Valve(Facts):
     smoothing: Positive = 5.0e4
     port_relief_gain: NonNegative = 1.0e-9
     makeup_gain: NonNegative = 5.0e-9
+    tank_leakage: NonNegative = 0.0
 
     @property
     def deadbands(self) -> tuple[float, float]:

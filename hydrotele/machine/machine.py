@@ -80,7 +80,8 @@ class SensorError(Facts):
     y follows the true value with a first-order lag, `time_constant dy/dt = value - y` [s]; without
     a time constant it is the true value. The coupling of an undriven joint's sensor may be tilted
     against its axis by `tilt` [rad], as a universal joint is, `tan(shown) = tan(y) cos(tilt)`, and
-    have a play of `backlash` [rad].
+    have a play of `backlash` [rad]. While the sensor warms up from the run's beginning on, its
+    offset changes by `drift` with the time constant `drift_time_constant` [s] (`warming_drift`).
     """
 
     offset: float = 0.0
@@ -89,6 +90,14 @@ class SensorError(Facts):
     time_constant: NonNegative = 0.0
     tilt: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
     backlash: NonNegative = 0.0
+    drift: float = 0.0
+    drift_time_constant: Positive = 600.0
+
+    def offset_at(self, time: np.ndarray) -> np.ndarray:
+        """Offset with the drift (n,) at times (n,) since the run's beginning [s]."""
+        if self.drift == 0.0:
+            return np.full_like(time, self.offset, dtype=float)
+        return self.offset + warming_drift(time, self.drift, self.drift_time_constant)
 
     @property
     def coupled(self) -> bool:
@@ -559,6 +568,30 @@ def noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> floa
     """Standard deviation of one reading [channel's unit]: random error plus converter."""
     sensor = channel_sensor(machine, sensors, channel)
     return math.sqrt(sensor.error_rms**2 + converter(sensor, channel).step ** 2 / 12.0)
+
+
+@compiled
+def warming_drift(time, drift, time_constant):
+    """Change of a sensor's offset since it was switched on.
+
+    `e (1 - exp(-t / T))`: the sensor warms up as one heat capacity does, and its offset goes with
+    its temperature.
+
+    Args:
+        time: t, scalar or array [s].
+        drift: e, of a warm sensor, scalar [channel's unit].
+        time_constant: T, scalar, positive [s].
+
+    Returns:
+        As `time` [channel's unit].
+
+    Source: Khoshzaban 1992 p. 37 (resolvers drift with temperature, not linearly); Newton's law of
+        cooling.
+
+    >>> float(round(warming_drift(600.0, 1.0, 600.0), 6))
+    0.632121
+    """
+    return -drift * np.expm1(-time / time_constant)
 
 
 @compiled

@@ -107,7 +107,7 @@ def replay_log(
     factor = (log.time[-1] - log.time[0]) / max(clock.perf_counter() - begin, 1e-9)
     values, units = true_channels(plant, record)
     if not any(name.startswith("truth.") for name in log.columns):
-        values |= apply_sensor_errors(machine, values | late_channels(plant, record))
+        values |= apply_sensor_errors(machine, values | late_channels(plant, record), log.time)
     simulated = Log(
         time=log.time, columns=values, units=units, source=f"replay of {log.source}",
         metadata={"machine": machine.name, "tool": machine.tool, "run": f"replay {log.name}"},

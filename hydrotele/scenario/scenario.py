@@ -173,15 +173,22 @@ class Harmonics(Facts):
 
 
 class FourierPilot(Facts):
-    """Fourier references with a common period [s], faded in from the start over `fade` [s]."""
+    """Fourier references with a common period [s], faded in from the start over `fade` [s].
+
+    The servo holds axes without a reference at their start, but those of `closed_valves`: their
+    command is 0 throughout.
+    """
 
     kind: Literal["fourier"]
     period: Positive
     fade: NonNegative = 2.0
     axes: dict[Name, Harmonics]
+    closed_valves: tuple[Name, ...] = ()
 
     @model_validator(mode="after")
     def _check(self):
+        if both := sorted(set(self.closed_valves) & self.axes.keys()):
+            raise ValueError(f"closed_valves: {both[0]} has a reference in axes, too; name it once")
         counts = [max(len(axis.sin), len(axis.cos)) for axis in self.axes.values()]
         _refuse_beyond("HARMONICS", max(counts, default=0))
         return self

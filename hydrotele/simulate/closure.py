@@ -12,6 +12,7 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
+from hydrotele.kinematics.from_machine import has_ball_ends
 from hydrotele.machine import machine as loops
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody import closures
@@ -23,6 +24,7 @@ from hydrotele.simulate.mechanism import (
     lock_drives,
     mjcf_document,
     pin_site,
+    tilt_joint,
 )
 
 _STEP = 0.2  # largest move of an independent joint between two solutions [rad] or [m]
@@ -35,7 +37,8 @@ def following_joints(machine: Machine) -> tuple[str, ...]:
     """Names of the joints that the closures determine: tubes, rods and undriven links in a loop."""
     cylinders = [name for name, axis in machine.axes.items() if axis.cylinder]
     bars = [f"{name}_{part}" for name in cylinders for part in ("tube", "rod")]
-    return (*bars, *loops.following_joints(machine))
+    tilts = [tilt_joint(name) for name in cylinders if has_ball_ends(machine, name)]
+    return (*bars, *tilts, *loops.following_joints(machine))
 
 
 def shaping_joints(machine: Machine) -> list[str]:

@@ -78,7 +78,9 @@ def _convert_all(values, step, low, high):
     return readings
 
 
-def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def apply_sensor_errors(
+    machine: Machine, truth: Mapping[str, np.ndarray], time: np.ndarray
+) -> dict[str, np.ndarray]:
     """What sensors without noise read: `scale * value + offset` of the machine's sensor errors.
 
     Before that, what a tilted or loose coupling makes of the value, see `SensorError`.
@@ -86,13 +88,14 @@ def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray]) -> di
     Args:
         machine: the machine.
         truth: channel -> (n,) values at the times at which they are read.
+        time: (n,) of the rows since the run's beginning [s].
 
     Returns:
         Channel -> (n,) values.
     """
     errors = machine.sensor_errors
     return {
-        c: errors[c].scale * _through_coupling(errors[c], v) + errors[c].offset
+        c: errors[c].scale * _through_coupling(errors[c], v) + errors[c].offset_at(time)
         if c in errors
         else v
         for c, v in truth.items()
@@ -127,7 +130,8 @@ def measure(
         truth: channel -> (n,) true values; where a sensor reads late, those that it reads
             (`record.late_channels`).
         errors: channel -> (n,) errors already drawn; others are drawn here.
-        period: time between rows [s], for instants that jitter; between rows values run straight.
+        period: time between rows [s], for instants that jitter and sensors that drift; between rows
+            values run straight.
 
     Returns:
         Channel -> (n,) readings.
@@ -136,7 +140,8 @@ def measure(
         the machine, ideal sensors have them too) before both.
     """
     readings = {}
-    for channel, values in apply_sensor_errors(machine, truth).items():
+    time = period * np.arange(max((len(values) for values in truth.values()), default=0))
+    for channel, values in apply_sensor_errors(machine, truth, time).items():
         if sensors and sensors.jitter and period:
             rows = np.arange(len(values))
             values = np.interp(rows + _instants(sensors, seed, len(values)) / period, rows, values)
@@ -240,7 +245,7 @@ class FeedbackTable(NamedTuple):
         every: control ticks per sample.
         period: time between samples [s].
         sensors: of c channels.
-        errors: (samples, c) random errors [channel's unit].
+        errors: (samples, c) random errors and drifts [channel's unit].
         readings: sampled and held.
     """
 
@@ -335,6 +340,8 @@ def feedback(
     count = ticks // every + 1  # one after the last tick, which nobody asks for
     errors = {name: sensor_errors(kinds[name], seed, name, count) for name in names}
     defects = [plant.machine.sensor_errors.get(name, SensorError()) for name in names]
+    time = every / control_rate * np.arange(count)
+    changes = [d.offset_at(time) - d.offset for d in defects]
     table = FeedbackTable(
         every,
         every / control_rate,
@@ -342,7 +349,7 @@ def feedback(
             np.array([d.scale for d in defects]), np.array([d.offset for d in defects]),
             *np.array([converter(kinds[name], name) for name in names]).T.copy(),
         ),
-        np.column_stack(list(errors.values())),
+        np.column_stack(list(errors.values())) + np.column_stack(changes),
         Readings(np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(1)),
     )  # fmt: skip
     return Feedback(table, errors)

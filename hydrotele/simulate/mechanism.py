@@ -27,7 +27,12 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import check_assets, read_xml
 from hydrotele.hydraulics.circuit import ACTIVATIONS
 from hydrotele.hydraulics.parameters import SLOTS, Slot, actuator_parameters, terms_of
-from hydrotele.kinematics.from_machine import drive_travel, pin_axis, range_at_drive
+from hydrotele.kinematics.from_machine import (
+    drive_travel,
+    has_ball_ends,
+    pin_axis,
+    range_at_drive,
+)
 from hydrotele.machine.drives import Axis, Cylinder, Pin
 from hydrotele.machine.machine import Link, Machine
 from hydrotele.scenario.scenario import SurroundingObject
@@ -221,6 +226,8 @@ def _completed(
     for name, axis in machine.axes.items():
         if axis.cylinder:
             _write_cylinder(root, name, axis.cylinder, pin_axis(machine, name), timestep)
+            if has_ball_ends(machine, name):
+                _write_ball_end(root, name)
             _write_travel(root, machine, name)
     for name in flexible_axes(machine):
         write_drive_side(root, machine, name)
@@ -294,7 +301,7 @@ def _refuse_foreign_parts(root, machine: Machine) -> None:
     """Refuse what the machine file has to say, or what no log would show."""
     known = set(machine.joints)
     for name, axis in machine.axes.items():
-        known |= {f"{name}_tube", f"{name}_rod"} if axis.cylinder else set()
+        known |= {f"{name}_tube", f"{name}_rod", tilt_joint(name)} if axis.cylinder else set()
     for name, link in machine.links.items():
         body = root.find("body", name)
         if body is not None and link.joint is None:
@@ -392,6 +399,21 @@ def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep:
     _set_inertial(rod, cylinder.rod.mass, (-cylinder.rod.com, 0, 0), cylinder.rod.inertia)
     rod_end = Pin(link=f"{name}_rod", position=(0.0, 0.0, 0.0))
     _connect(root, f"{name}_pin", rod_end, cylinder.rod_pin, timestep)
+
+
+def _write_ball_end(root, name: str) -> None:
+    """Let a tube turn about a second axis at its base, across the first one and itself."""
+    if root.find("joint", tilt_joint(name)) is None:
+        first = root.find("joint", f"{name}_tube")
+        across = np.cross((1.0, 0.0, 0.0), first.axis)
+        root.find("body", f"{name}_tube").add(
+            "joint", name=tilt_joint(name), type="hinge", axis=across / np.linalg.norm(across)
+        )
+
+
+def tilt_joint(axis: str) -> str:
+    """Name of the joint by which a tube with ball ends leaves the plane across its pin."""
+    return f"{axis}_tube_tilt"
 
 
 def _write_travel(root, machine: Machine, name: str) -> None:

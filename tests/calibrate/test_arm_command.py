@@ -8,8 +8,9 @@ from typer.testing import CliRunner
 
 from hydrotele.calibrate.loop import closure, loop_of
 from hydrotele.cli.main import app
+from hydrotele.effects.effect import changed
 from hydrotele.logs.log import save_log
-from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 
@@ -65,6 +66,33 @@ def test_linkage_command(folder):
     assert made.exit_code == 0, made.output
     for axis in json.loads(made.stdout)["axes"].values():
         assert axis["heldout"]["rms_m"] < 2e-3 and axis["heldout"]["vaf_percent"] > 99.9
+
+
+def test_machine_command_calibrates_kinematics_before_dynamics(folder, tmp_path):
+    """A machine file with a stick 30 mm too long and 10 % too heavy a boom gets both back."""
+    machine = load_machine("calibrator")
+    longer = changed(machine, "links.grapple_link.position", (1.83, 0.0, 0.0))
+    heavier = changed(longer, "links.boom.mass", 1.1 * machine.links["boom"].mass)
+    (tmp_path / "given").mkdir()
+    save_machine(heavier, tmp_path / "given" / "machine.yaml")
+    target = tmp_path / "all"
+    made = RUN.invoke(app, [
+        "calibrate", "machine", "--data", str(folder), "--machine", str(tmp_path / "given"),
+        "--heldout", "boom", "--json", "--out", str(target),
+    ])  # fmt: skip
+    assert made.exit_code == 0, made.output
+    said = json.loads(made.stdout)
+    assert (
+        said["arm"]["heldout"]["rms_identified_mm"] < 0.6 * said["arm"]["heldout"]["rms_nominal_mm"]
+    )
+    assert set(said["linkages"]) == {"boom", "stick"}
+    force = said["dynamics"]["heldout"]["boom_rod"]
+    assert force["rms"] < 0.5 * force["nominal_rms"]
+    found = load_machine(target / "identified")
+    tip = np.linalg.norm(found.links["grapple_link"].position)
+    assert abs(tip - 1.8) < 0.01  # five standard deviations of 150 poses of 20 s
+    summary = json.loads((target / "summary.json").read_text())
+    assert summary["kind"] == "machine calibration"
 
 
 def test_unusable_input_is_one_sentence(folder, tmp_path):

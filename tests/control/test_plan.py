@@ -259,3 +259,16 @@ def test_force_drive_commands_keep_their_unit():
     assert np.all(plan.command == 9.5)
     with pytest.raises(InputError, match=r"slide with 10.5, its drive takes -10 .. 10 \[V\]"):
         plan_of({"kind": "constant", "commands": {"slide": 10.5}}, tool=None, machine="emps")
+
+
+def test_closed_valves_are_not_held_by_the_servo():
+    pilot = {"kind": "fourier", "period": 5.0, "axes": {"stick": {"mean": -1.4, "sin": [0.1]}},
+             "closed_valves": ["boom"]}  # fmt: skip
+    plan = plan_of(pilot)
+    assert dict(zip(plan.axes, plan.closed, strict=True)) == {
+        "swing": True, "boom": False, "stick": True, "bucket": True}  # fmt: skip
+    assert not plan.command.any()
+    with pytest.raises(InputError, match="did you mean 'boom'"):
+        plan_of({**pilot, "closed_valves": ["bom"]})
+    with pytest.raises(ValueError, match="stick has a reference"):
+        plan_of({**pilot, "closed_valves": ["stick"]})

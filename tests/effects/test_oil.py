@@ -82,6 +82,18 @@ def test_leakage_flows_from_side_to_side():
     assert rate - nominal == pytest.approx(-stiffness * more * dp, rel=1e-4)
 
 
+def test_spool_leakage_leaves_for_the_tank():
+    """Extra rate = - beta / V times leakage times pressure above tank; 1e-4 as above."""
+    leak = 2e-11
+    leaky = apply_effect(NOMINAL, "tank_leakage", "boom", {"leakage": leak})
+    (rate, x), (nominal, _) = pressure_rate(leaky), pressure_rate(NOMINAL)
+    volume = NOMINAL.axes["boom"].cylinder.volumes(np.array(x))[0]
+    plant = build_plant(NOMINAL, ground=False)
+    above = rest_state(plant).act[ACTIVATIONS * BOOM + 3] - NOMINAL.supply.tank_pressure
+    wanted = -NOMINAL.supply.bulk_modulus / volume * leak * above
+    assert rate - nominal == pytest.approx(wanted, rel=1e-4)
+
+
 def test_hoses_and_oil_soften_the_chamber():
     """dp/dt = - A v / (V / beta + C); 1e-4 as above."""
     v, soft = 0.2, 2e-11

@@ -1,15 +1,17 @@
 """Evidence: errors of guesses at coarse steps, against the same at the full step."""
 
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from hydrotele.effects import EFFECTS, Parameter, apply_effect
+from hydrotele.effects import EFFECTS, Parameter, apply_effect, changed
 from hydrotele.estimate import evidence as evidence_module
 from hydrotele.estimate.evidence import MIDDLE, Evidence, _beyond_dents, _move, _threads
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.estimate.track import COARSE
+from hydrotele.machine.machine import SensorError
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_filter import machine_data
 
@@ -156,3 +158,48 @@ def test_slopes_are_taken_at_a_step_at_which_errors_are_smooth(curve, expected):
         return np.tile(curve(deviation) if step > MIDDLE else deviation, 20)
 
     assert _Errors(errors).slope_step == expected
+
+
+def test_leakage_to_tank_is_recovered_and_not_mistaken_for_leakage_across_the_piston():
+    """Oil lost by both chambers against oil that one loses to the other, on 12 s of motion."""
+    nominal, leak = load_machine("cat215"), 1e-12
+    data, _ = machine_data(nominal, apply_effect(nominal, "tank_leakage", "boom",
+                                                 {"leakage": leak}))  # fmt: skip
+    with closing(Evidence(data, data.fit, 1, 4e-3)) as found:
+        found.set_base(Guess())
+        fits = {}
+        for name in ("tank_leakage", "internal_leakage"):
+            first = guess(found, name, 0.0)
+            fits[name] = found.fit(first, 0.0)
+        spread = float(np.linalg.inv(fits["tank_leakage"].information)[0, 0]) ** 0.5
+        ((part, deviation),) = fits["tank_leakage"].guess.parts
+        scale = part.parameters["leakage"].scale
+        # four standard deviations of the fit, and the known value is as far from none as 100
+        assert deviation[0] * scale == pytest.approx(leak, abs=4.0 * spread * scale)
+        assert leak > 20.0 * spread * scale
+        losses = {k: float(np.sum(found.errors(f.guess, 4e-3) ** 2)) for k, f in fits.items()}
+        nothing = float(np.sum(found.errors(Guess(), 4e-3) ** 2))
+    gained = nothing - losses["tank_leakage"]
+    assert nothing - losses["internal_leakage"] < 0.5 * gained
+
+
+def test_a_drift_is_recovered_and_not_mistaken_for_an_offset():
+    """A sensor that warms up within the 12 s, its time constant known, as in a search."""
+    slow = {"angle.boom": SensorError(drift_time_constant=5.0)}
+    nominal = changed(load_machine("cat215"), "sensor_errors", slow)
+    data, _ = machine_data(nominal, apply_effect(nominal, "angle_drift", "boom", {"drift": 0.02}))
+    losses, best = {}, {}
+    with closing(Evidence(data, data.fit, 1, 4e-3)) as found:
+        found.set_base(Guess())
+        for name in ("angle_drift", "angle_offset"):
+            best[name] = found.fit(guess(found, name, 0.0), 0.0)
+            losses[name] = float(np.sum(found.errors(best[name].guess, 4e-3) ** 2))
+        losses[""] = float(np.sum(found.errors(Guess(), 4e-3) ** 2))
+    ((part, deviation),) = best["angle_drift"].guess.parts
+    scale = part.parameters["drift"].scale
+    spread = float(np.linalg.inv(best["angle_drift"].information)[0, 0]) ** 0.5
+    # four standard deviations of the fit
+    assert deviation[0] * scale == pytest.approx(0.02, abs=4.0 * spread * scale)
+    assert 20.0 * spread * scale < 0.02
+    assert losses["angle_drift"] < losses["angle_offset"] - 100.0  # exp(50) times as likely
+    assert losses["angle_offset"] < losses[""]

@@ -25,6 +25,8 @@ CASES = {
         ("angle_offset", "boom", {"offset": 0.02}),
         ("angle_scale", "stick", {"ratio": 1.01}),
         ("angle_delay", "swing", {"delay": 0.0133}),
+        ("angle_drift", "swing", {"drift": 0.03, "time_constant": 1.0}),
+        ("angle_drift", "boom", {"drift": -0.02, "time_constant": 0.5}),
         ("pressure_offset", "boom.head", {"offset": 60e3}),
         ("pressure_delay", "stick", {"delay": 0.0275}),
     ),
@@ -39,6 +41,10 @@ CASES = {
         ("speed_dependent_force", "swing", {"coefficient": 2e4}),
         ("load_dependent_friction", "boom", {"coefficient": 0.05}),
         ("position_dependent_friction", "stick", {"coulomb": 1e4, "centre": 0.6, "width": 0.1}),
+    ),
+    "tank_leakage": (
+        ("tank_leakage", "boom", {"leakage": 2e-11}),
+        ("tank_leakage", "swing", {"leakage": 1e-11}),
     ),
     "flows of terms": (
         ("orifice_leakage", "boom", {"flow": 4e-4}),

@@ -117,9 +117,31 @@ def test_a_counterbalance_valve_holds_until_the_pilot_opens_it():
     assert chamber_flows(user, 0, -1.0, 20e6, 0.1e6, 5e6)[0] > 0, "its check lets oil in"
 
 
+@pytest.mark.parametrize("spool", [-0.5, 0.0, 0.5])
+def test_a_spool_leaks_to_tank_at_any_opening(spool):
+    leak = 2.7e-14
+    opening = axis_opening(record(), 0, spool)
+    flows = np.array(chamber_flows(record(), 0, opening, 20e6, 12e6, 5e6))
+    leaky = np.array(chamber_flows(record(valve={"tank_leakage": leak}), 0, opening, 20e6, 12e6,
+                                   5e6))  # fmt: skip
+    expected = -leak * np.array([12e6 - TANK, 5e6 - TANK, 1.0, 1.0])
+    # rounding of the flow through the open edge, 3e-3 m^3/s
+    np.testing.assert_allclose(leaky - flows, expected, rtol=1e-9, atol=1e-18)
+
+
+def test_a_counterbalance_valve_holds_back_what_the_spool_leaks():
+    held = {"head": {"setting": 24e6, "pilot_ratio": 3.0, "override": 0.25}}
+    user = record(load_holding=held, valve={"tank_leakage": 1e-13})
+    assert chamber_flows(user, 0, 0.0, 20e6, 12e6, TANK)[0] == 0.0
+    assert chamber_flows(user, 0, 0.0, 20e6, 12e6, 5e6)[0] == pytest.approx(
+        -0.5e-13 * (12e6 - TANK)
+    )
+    assert chamber_flows(user, 0, 0.0, 20e6, 0.1e6, TANK)[0] > 0, "its check lets oil in"
+
+
 def test_slopes_of_the_flows_are_their_derivatives():
     held = {"head": {"setting": 24e6}, "rod": {"setting": 20e6}}
-    drop = {"compensation": "pressure", "compensated_drop": 9e6}
+    drop = {"compensation": "pressure", "compensated_drop": 9e6, "tank_leakage": 1e-10}
     user = record(load_holding=held, valve=drop)
     for opening in (0.7, -0.7):
         for head, rod in ((12e6, 5e6), (9e6, 5.5e6), (4.5e6, 11e6)):

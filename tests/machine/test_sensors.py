@@ -11,7 +11,7 @@ from hydrotele.machine.machine import Sensor, channel_sensor, converter, noise_r
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import prepare, run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.feedback import _convert_all, measure, sensor_errors
+from hydrotele.simulate.feedback import _convert_all, feedback, measure, sensor_errors
 from hydrotele.simulate.stepping import Stepper
 
 
@@ -163,3 +163,19 @@ def test_a_log_faster_than_its_sensors_is_refused():
         prepare(load_scenario("zhu_up", {"log_rate": "200"}))
     with pytest.raises(InputError, match="sample at 50 Hz, which must divide 125 Hz"):
         prepare(load_scenario("zhu_up", {"control_rate": "125", "log_rate": "25"}))
+
+
+def test_a_drifting_sensor_warms_up_in_logs_and_in_what_the_controller_sees():
+    """`e (1 - exp(-t / T))` on top of the true angle, of ideal sensors, to rounding."""
+    given = {"drift": 0.02, "time_constant": 2.0}
+    planted = [{"name": "angle_drift", "location": "boom", "parameters": given}]
+    asked = load_scenario("hold", {"duration": "5", "sensors": "ideal"})
+    run = run_scenario(type(asked).model_validate(asked.model_dump() | {"effects": planted}))
+    time = run.truth.time
+    more = run.measured["angle.boom"] - run.truth["angle.boom"]
+    np.testing.assert_allclose(more, 0.02 * (1.0 - np.exp(-time / 2.0)), atol=1e-15)
+    np.testing.assert_array_equal(run.measured["angle.stick"], run.truth["angle.stick"])
+    seen = feedback(run.plant, None, 1, 250, 50.0).table
+    boom = run.plant.axes.index("boom")
+    shown = seen.sensors.offset[boom] + seen.errors[:250, boom]
+    np.testing.assert_allclose(shown, 0.02 * (1.0 - np.exp(-np.arange(250) / 100.0)), atol=1e-15)

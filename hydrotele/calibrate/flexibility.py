@@ -1,0 +1,130 @@
+"""Flexible calibrator joints as a noise model that is estimated with the arm's parameters.
+
+A loaded joint bends, and its sensor reads another angle than the one between its links. The error
+of joint k has the variance `sigma_k^2 + (f_k l_k)^2`. The load l_k is the horizontal distance from
+the joint to the ball as a fraction of its largest value; the bending moment of the links between
+them is proportional to it. The f_k are those of maximum likelihood.
+
+Source: Khoshzaban 1992, sections 3.7.3 (p. 60) and 5.3 (p. 124), which proposes such a noise model.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+
+from hydrotele.calibrate.arm import ArmFit, Equations
+from hydrotele.calibrate.arm_poses import Poses
+from hydrotele.calibrate.loop import Loop, ball_place, frame_of
+
+_ROUNDS = 3  # of noise model and parameters in turn; the third changes the f_k by less than 1 %
+_MAX_FLEXIBILITY = np.radians(10.0)  # rad at full load: far beyond what a calibrator may bend
+_START = np.radians(0.2)  # rad at full load, where the search starts
+
+Refit = Callable[[Sequence[Poses]], ArmFit]
+
+
+class Flexibility(NamedTuple):
+    """Estimated flexibility of the calibrator's joints.
+
+    Attributes:
+        joints: names, S of them.
+        at_full_load: (S,) standard deviation of the angle error at full load [rad].
+        gain: log likelihood over that of sensors without flexibility [1].
+    """
+
+    joints: tuple[str, ...]
+    at_full_load: np.ndarray
+    gain: float
+
+
+def joint_loads(loop: Loop, poses: Poses, fit: ArmFit) -> np.ndarray:
+    """Loads (M, S) of the calibrator's joints, 0 .. 1, in the poses of a stage."""
+    equations = Equations(loop, poses)
+    chain, theta = equations.seen(fit.numbers)
+    place = equations.place
+    angles = np.tile(loop.home, (len(poses), 1))
+    angles[:, place + 1 :] = theta
+    for k, link in enumerate(loop.links[:place]):
+        if link in poses.manipulator:
+            angles[:, k] = poses.manipulator[link] + loop.values[k, 0]
+    origin, rotation = frame_of(fit.loop, place, angles)
+    ball = np.einsum("mji,mj->mi", rotation, fit.loop.ball - origin)
+    along = ball_place(chain, place, theta)
+    angles[:, place] = np.arctan2(ball[:, 1], ball[:, 0]) - np.arctan2(along[:, 1], along[:, 0])
+    loads = np.empty((len(poses), len(loop) - loop.moved))
+    lengths = np.hypot(chain.values[loop.moved :, 2], chain.values[loop.moved :, 3])
+    for column in range(loads.shape[1]):
+        at, _ = frame_of(chain, loop.moved + column, angles)
+        reach = lengths[column:].sum()
+        loads[:, column] = np.hypot(*(fit.loop.ball - at)[:, :2].T) / reach
+    return np.minimum(loads, 1.0)
+
+
+def with_flexibility(loop: Loop, poses: Poses, fit: ArmFit, flexibility: np.ndarray) -> Poses:
+    """Poses whose sensors have the standard deviations (M, S) of the noise model."""
+    loads = joint_loads(loop, poses, fit)
+    return replace(poses, sigma=np.hypot(poses.sigma, flexibility * loads))
+
+
+def estimate_flexibility(loop: Loop, stages: Sequence[Poses], fit: ArmFit) -> Flexibility:
+    """Maximum likelihood of the joints' flexibility, with the arm's parameters as they are.
+
+    Args:
+        loop: the nominal chain.
+        stages: poses with the sensors' own standard deviations (S,).
+        fit: of these poses.
+
+    Returns:
+        The flexibility; 0 for joints whose errors are those of their sensors.
+    """
+    errors, sensed, loads, sigma = [], [], [], []
+    for poses in stages:
+        equations = Equations(loop, poses)
+        error, _, by = equations.at(fit.numbers)
+        errors.append(error)
+        sensed.append(by)
+        loads.append(joint_loads(loop, poses, fit))
+        sigma.append(np.broadcast_to(poses.sigma, loads[-1].shape))
+    error, by = np.concatenate(errors), np.concatenate(sensed)
+    load, known = np.concatenate(loads), np.concatenate(sigma)
+
+    def cost(x: np.ndarray) -> float:
+        variance = known**2 + (x * load) ** 2
+        c = np.einsum("mis,ms,mjs->mij", by, variance, by) + Equations.FLOOR**2 * np.eye(2)
+        whole = c[:, 0, 0] * c[:, 1, 1] - c[:, 0, 1] ** 2
+        e0, e1 = error[:, 0], error[:, 1]
+        square = (c[:, 1, 1] * e0**2 - 2 * c[:, 0, 1] * e0 * e1 + c[:, 0, 0] * e1**2) / whole
+        return float(0.5 * np.sum(np.log(whole) + square))
+
+    count = load.shape[1]
+    found = scipy.optimize.minimize(
+        lambda u: cost(u * _START), np.ones(count), method="L-BFGS-B",
+        bounds=[(0.0, _MAX_FLEXIBILITY / _START)] * count,
+    )  # fmt: skip
+    at_full_load = found.x * _START
+    gain = cost(np.zeros(count)) - cost(at_full_load)
+    return Flexibility(loop.links[loop.moved :], at_full_load, gain)
+
+
+def refit_with_flexibility(
+    loop: Loop, stages: Sequence[Poses], fit: ArmFit, refit: Refit
+) -> tuple[ArmFit, Flexibility]:
+    """Estimate flexibility and parameters in turn.
+
+    Args:
+        loop: the nominal chain.
+        stages: poses with the sensors' own standard deviations.
+        fit: of these poses, where the search starts.
+        refit: identification of poses, hierarchical or joint.
+
+    Returns:
+        The fit whose equations have the weights of the noise model, and the flexibility.
+    """
+    found = estimate_flexibility(loop, stages, fit)
+    for _ in range(_ROUNDS):
+        fit = refit([with_flexibility(loop, p, fit, found.at_full_load) for p in stages])
+        found = estimate_flexibility(loop, stages, fit)
+    return fit, found

@@ -1,0 +1,151 @@
+"""`hydrotele calibrate machine`: arm, cylinder linkages and dynamics of a machine in sequence."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import hydrotele
+from hydrotele.calibrate.linkage import LinkageFit, machine_with_linkage
+from hydrotele.cli.calibrating_arm import (
+    ArmChoices,
+    ArmResult,
+    arm_as_data,
+    arm_result,
+    linkage_as_data,
+    linkage_fits,
+    write_arm_report,
+)
+from hydrotele.cli.console import out, plain, print_json, stages, table, write_json
+from hydrotele.cli.identifying import (
+    Choices,
+    MechanismResult,
+    identify_mechanism,
+    write_identification,
+)
+from hydrotele.core.errors import InputError
+from hydrotele.core.output import check_target, whole_folder
+from hydrotele.identify.identified_machine import identify_document
+from hydrotele.logs.dataset import Dataset, load_dataset
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, save_machine
+
+_POSES = 5  # every fifth pose is held out
+
+
+class SequenceResult(NamedTuple):
+    """A machine that was calibrated step by step.
+
+    Attributes:
+        arm: links, joint axes and sensor offsets.
+        linkages: cylinder pins and closed lengths, one per axis that moves.
+        skipped: why there are no linkages, or empty.
+        kinematic: the machine after both steps.
+        dataset: logs of the dynamic step, read with that machine.
+        dynamics: bodies and friction, with the final machine.
+    """
+
+    arm: ArmResult
+    linkages: list[LinkageFit]
+    skipped: str
+    kinematic: Machine
+    dataset: Dataset
+    dynamics: MechanismResult
+
+
+def calibrate_machine(
+    kinematics: Path, dynamics: Sequence[Path], machine: str, heldout: str | None, target: Path,
+    as_json: bool,
+) -> SequenceResult:  # fmt: skip
+    """Calibrate kinematics, then identify dynamics with the calibrated kinematics.
+
+    Args:
+        kinematics: folder of logs in which one link moves at a time under the calibrator.
+        dynamics: logs of the same machine with pressures; the kinematic logs where it is empty.
+        machine: the nominal machine with a calibrator, shipped or a folder.
+        heldout: run of the dynamic logs that is not fitted; None to choose.
+        target: folder to write, all or nothing.
+        as_json: print the result as JSON instead of tables.
+
+    Returns:
+        The results of all steps.
+
+    Raises:
+        InputError: logs, machine or target are not usable.
+
+    Source: Khoshzaban 1992, section 5.3 (p. 125), kinematic and dynamic calibration in sequence.
+    """
+    check_target(target, "machine calibration")
+    nominal = load_machine(machine)
+    with stages(f"calibrate {nominal.name}", as_json) as progress:
+        report = progress or (lambda stage, fraction: None)
+        report("links of the arm", 0.0)
+        arm = arm_result(nominal, kinematics, ArmChoices(), _POSES)
+        report("cylinder linkages", 0.2)
+        made, linkages, skipped = arm.calibrated, [], ""
+        try:
+            linkages = linkage_fits(made, kinematics, "measured")
+        except InputError as error:
+            skipped = str(error)
+        for found in linkages:
+            made = machine_with_linkage(made, found)
+        report("bodies and friction", 0.3)
+        dataset = load_dataset(list(dynamics) or [kinematics], made, None, heldout)
+        identified = identify_mechanism(dataset, Choices())
+    result = SequenceResult(arm, linkages, skipped, made, dataset, identified)
+    with whole_folder(target, "machine calibration") as folder:
+        _write(folder, result, list(dynamics) or [kinematics])
+    if as_json:
+        print_json(_as_data(result))
+    else:
+        _print(result)
+        out.print(f"written to [bold]{target}[/]; the machine is {target}/identified")
+    return result
+
+
+def _as_data(result: SequenceResult) -> dict[str, Any]:
+    return plain({
+        "machine": result.arm.machine.name,
+        "arm": arm_as_data(result.arm),
+        "linkages": {found.axis: linkage_as_data(found) for found in result.linkages},
+        "linkages_skipped": result.skipped,
+        "dynamics": identify_document(result.dynamics.found, None, result.dynamics.best),
+    })  # fmt: skip
+
+
+def _write(folder: Path, result: SequenceResult, data: Sequence[Path]) -> None:
+    write_json(folder / "calibration.json", _as_data(result))
+    kinematics = folder / "kinematics"
+    kinematics.mkdir()
+    save_machine(result.kinematic, kinematics / MACHINE_FILE)
+    write_arm_report(kinematics, result.arm)
+    if result.linkages:
+        from hydrotele.show.calibration_report import write_linkage_report
+
+        write_linkage_report(result.linkages, kinematics / "linkages.html")
+    write_identification(folder, result.dataset, result.dynamics, None, data, Choices())
+    summary = {
+        "kind": "machine calibration", "machine": result.arm.machine.name,
+        "heldout": result.dataset.heldout.name, "hydrotele": hydrotele.__version__,
+    }  # fmt: skip
+    write_json(folder / "summary.json", summary)
+
+
+def _print(result: SequenceResult) -> None:
+    shown = table("held-out errors of each step", "quantity", "before", "after", "unit")
+    closure = result.arm.judged
+    if closure:
+        shown.add_row("closure of the arm (poses)", f"{closure['rms_nominal_mm']:.2f}",
+                      f"{closure['rms_identified_mm']:.2f}", "mm RMS")  # fmt: skip
+    for found in result.linkages:
+        shown.add_row(f"displacement of the {found.axis} cylinder",
+                      f"{1e3 * found.rms_before:.2f}", f"{1e3 * found.rms:.2f}",
+                      "mm RMS")  # fmt: skip
+    identified = result.dynamics.found
+    for drive, held in (identified.heldout if identified else {}).items():
+        shown.add_row(f"force of {drive}", f"{held.nominal_rms:.4g}", f"{held.rms:.4g}",
+                      f"{held.unit} RMS")  # fmt: skip
+    out.print(shown)
+    if result.skipped:
+        out.print(f"[yellow]note[/] cylinder linkages keep their given numbers: {result.skipped}")
+    if identified:
+        out.print(f"dynamics: {identified.status}")

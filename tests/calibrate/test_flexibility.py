@@ -1,0 +1,88 @@
+"""Flexibility of a calibrator's joints is found from residuals and improves the parameters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hydrotele.calibrate.arm import identify_arm
+from hydrotele.calibrate.arm_poses import Poses
+from hydrotele.calibrate.design import STILL, sweep_poses
+from hydrotele.calibrate.flexibility import (
+    estimate_flexibility,
+    joint_loads,
+    refit_with_flexibility,
+)
+from hydrotele.calibrate.loop import loop_of
+from hydrotele.machine.machine_file import load_machine
+
+ACCURACY = np.radians(0.1)
+BEND = np.radians([0.8, 0.5, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return loop_of(load_machine("calibrator"))
+
+
+@pytest.fixture(scope="module")
+def clean(loop):
+    made = []
+    for link in ("stick", "boom", "swing"):
+        true = sweep_poses(loop, link, STILL[link])
+        sensors = (true.theta - loop.values[:, 0])[:, loop.moved :]
+        sigma = np.full(sensors.shape[1], ACCURACY / np.sqrt(3.0))
+        made.append(Poses(link, sensors, sigma, {}))
+    return made
+
+
+@pytest.fixture(scope="module")
+def loads(loop, clean):
+    fit = identify_arm(loop, clean)
+    return [joint_loads(loop, poses, fit) for poses in clean]
+
+
+def simulate(clean, loads, seed, bend):
+    rng = np.random.default_rng(seed)
+    return [
+        replace(poses, theta=poses.theta + rng.uniform(-ACCURACY, ACCURACY, poses.theta.shape)
+                + bend * load * rng.standard_normal(poses.theta.shape))
+        for poses, load in zip(clean, loads, strict=True)
+    ]  # fmt: skip
+
+
+def test_loads_are_fractions_of_the_reach(loads):
+    whole = np.concatenate(loads)
+    assert whole.min() >= 0.0 and whole.max() <= 1.0
+    assert np.ptp(whole[:, 0]) > 0.1  # else flexibility could not be told from sensor noise
+
+
+def test_flexibility_is_found(loop, clean, loads):
+    """Three seeds: a standard deviation from 1000 poses scatters by 2 %; six of these allowed.
+
+    The larger part of the allowance is for what the fitted parameters take up.
+    """
+    found = []
+    for seed in range(3):
+        stages = simulate(clean, loads, seed, BEND)
+        flexibility = estimate_flexibility(loop, stages, identify_arm(loop, stages))
+        assert flexibility.gain > 50.0
+        found.append(flexibility.at_full_load)
+    mean = np.mean(found, axis=0)
+    assert mean[:2] == pytest.approx(BEND[:2], rel=0.15)
+    assert np.all(mean[2:] < 0.2 * BEND[1])
+
+
+def test_refit_has_intervals_of_its_noise_model(loop, clean, loads):
+    """Chi of a stage is 1 within 0.1: 600 equations scatter by 0.03."""
+    stages = simulate(clean, loads, 7, BEND)
+    fit = identify_arm(loop, stages)
+    better, _ = refit_with_flexibility(loop, stages, fit, lambda s: identify_arm(loop, s))
+    assert all(stage.chi > 2.0 for stage in fit.stages)
+    assert all(stage.chi == pytest.approx(1.0, abs=0.1) for stage in better.stages)
+
+
+def test_stiff_joints_have_no_flexibility(loop, clean, loads):
+    stages = simulate(clean, loads, 3, 0.0 * BEND)
+    fit = identify_arm(loop, stages)
+    assert np.all(estimate_flexibility(loop, stages, fit).at_full_load < 0.5 * ACCURACY)
