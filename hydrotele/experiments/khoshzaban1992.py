@@ -4,7 +4,12 @@ Chapters 2 and 3.3 to 3.6 are in `khoshzaban_machine`, section 3.7 in `khoshzaba
 in `khoshzaban_experiment`.
 """
 
-from hydrotele.experiments import khoshzaban_arm, khoshzaban_experiment, khoshzaban_machine
+from hydrotele.experiments import (
+    khoshzaban_arm,
+    khoshzaban_experiment,
+    khoshzaban_machine,
+    khoshzaban_outlook,
+)
 from hydrotele.experiments.comparison import Comparison, Experiment, Series
 
 # Chapter 4 (Tables 13 to 17, Figs 30 to 37): khoshzaban_dynamics.EXPERIMENTS and .UNAVAILABLE.
@@ -29,7 +34,7 @@ SERIES = Series(
     20,
     (
         *khoshzaban_machine.EXPERIMENTS, *khoshzaban_arm.EXPERIMENTS,
-        *khoshzaban_experiment.EXPERIMENTS, *DYNAMICS,
+        *khoshzaban_experiment.EXPERIMENTS, *DYNAMICS, *khoshzaban_outlook.EXPERIMENTS,
     ),
     UNAVAILABLE,
     DRAWINGS,

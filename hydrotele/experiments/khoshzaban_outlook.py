@@ -1,0 +1,175 @@
+"""Khoshzaban 1992: what the thesis proposes or leaves open, built and tried.
+
+The spatial linkage of a cylinder with ball joints (section 3.4.4) and a noise model for flexible
+calibrator joints (section 5.3).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hydrotele.calibrate.arm import identify_arm
+from hydrotele.calibrate.design import STILL, sweep_poses
+from hydrotele.calibrate.flexibility import refit_with_flexibility
+from hydrotele.calibrate.loop import loop_of
+from hydrotele.experiments.calibrator_readings import (
+    RESOLVER,
+    bend_level_joints,
+    simulate_readings,
+)
+from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Sample
+from hydrotele.experiments.intervals import check_exact, check_mean, check_statistic, collect
+from hydrotele.experiments.khoshzaban_arm import LENGTHS, MOVED, choose_settings
+from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.kinematics.linkages import TwoBar
+from hydrotele.machine.machine_file import load_machine
+
+_STEP = 1.0e-6  # m or rad of a central difference
+_RANK = 1.0e-6  # of the largest singular value: far above the differences' rounding of 1e-9
+
+LINKAGE_SETTINGS = {"axial_offset": 0.05}
+"""Distance of the two pins of the boom's cylinder along the joint's axis [m]."""
+
+
+def measure_linkage(seed: int, changes: Changes) -> Sample:
+    """Count the parameters of a spatial linkage that its sensors leave undetermined.
+
+    Sensors: the piston's displacement, and one or two angles of the cylinder at its base joint, in
+    the plane across the joint's axis and out of it, each with an unknown zero.
+    """
+    chosen = choose_settings(LINKAGE_SETTINGS, changes)
+    machine = load_machine("cat215", "none")
+    linkage, cylinder = axis_linkage(machine, "boom"), machine.axes["boom"].cylinder
+    assert isinstance(linkage, TwoBar) and cylinder
+    theta = np.linspace(-0.6, 0.9, 60)
+    offset = float(chosen["axial_offset"])
+    plane = [linkage.angle_offset, linkage.lower, linkage.upper, cylinder.closed_length]
+    sensors = {"length": (0,), "one_angle": (0, 1), "two_angles": (0, 1, 2)}
+    values = {}
+    for name, rows in sensors.items():
+        start = np.array([*plane, *([offset] if offset else []), *(0.0 for _ in rows[1:])])
+
+        def read(x, rows=rows):
+            angle, lower, upper, closed = x[:4]
+            apart = x[4] if offset else 0.0
+            bar = TwoBar(lower, upper, angle, linkage.direction, apart)
+            length = np.asarray(bar.length(theta))
+            included = linkage.direction * theta + angle
+            readings = [
+                length - closed,
+                np.arctan2(upper * np.sin(included), lower - upper * np.cos(included)),
+                np.arcsin(apart / length),
+            ]
+            zeros = (0.0, *x[len(x) - len(rows) + 1 :])
+            return np.concatenate([readings[k] + z for k, z in zip(rows, zeros, strict=True)])
+
+        columns = []
+        for k in range(len(start)):
+            step = np.zeros(len(start))
+            step[k] = _STEP
+            columns.append((read(start + step) - read(start - step)) / (2.0 * _STEP))
+        jacobian = np.array(columns).T
+        jacobian /= np.linalg.norm(jacobian, axis=0)
+        size = np.linalg.svd(jacobian, compute_uv=False)
+        values[name] = float(len(start) - np.sum(size > _RANK * size[0]))
+    needed = next((k for k, name in enumerate(sensors) if values[name] == 0.0), len(sensors))
+    return Sample(values | {"needed": float(needed)})
+
+
+def judge_linkage(samples: Sequence[Sample]) -> Judgement:
+    """Judge the number of further sensors that the parameters need."""
+    v = samples[0].values
+    check = check_exact(
+        "angle sensors needed besides the displacement", v["needed"], (2.0, 2.0),
+        "the document's number", published=2.0,
+    )  # fmt: skip
+    return Judgement(
+        (check,),
+        "the length depends on the distance h of the pins along the axis through"
+        " l_l^2 + l_u^2 + h^2 and l_l l_u alone; the ratio l_u / l_l, which one angle of the"
+        " cylinder shows, makes all of them definite",
+        f"parameters that stay undetermined: {v['length']:.0f} with the displacement alone,"
+        f" {v['one_angle']:.0f} with one angle at the cylinder's base joint,"
+        f" {v['two_angles']:.0f} with two",
+    )
+
+
+FLEXIBILITY_SETTINGS = {"bend": 1.0, "bent_share": 0.35, "estimated": True}
+"""Standard deviation of bent joints [deg], share of the poses in which they bend, and whether the
+noise model is estimated."""
+
+
+def measure_flexibility(seed: int, changes: Changes) -> Sample:
+    """Identify an arm with bent joints by plain least squares and with the noise model."""
+    chosen = choose_settings(FLEXIBILITY_SETTINGS, changes)
+    loop = loop_of(load_machine("calibrator"))
+    rng = np.random.default_rng([124, seed])
+    stages = []
+    for link in MOVED:
+        clean = sweep_poses(loop, link, STILL[link], seed)
+        bend = bend_level_joints(loop, clean, rng, chosen["bend"], chosen["bent_share"], False)
+        stages.append(simulate_readings(loop, clean, rng, RESOLVER, bend))
+    plain = identify_arm(loop, stages)
+    better, flexibility = plain, np.zeros(2)
+    if chosen["estimated"]:
+        better, found = refit_with_flexibility(loop, stages, plain, lambda s: identify_arm(loop, s))
+        flexibility = np.degrees(found.at_full_load[:2])
+    values = {"grapple": float(flexibility[0]), "yoke": float(flexibility[1])}
+    for name, fit in (("plain", plain), ("modelled", better)):
+        truth = {n: loop.value(n) for n in fit.names if n in loop.names}
+        lengths = [fit.value(n) - truth[n] for n in LENGTHS if n in truth]
+        values[f"{name}_square"] = float(np.mean(np.square(lengths)))
+        deviations = dict(zip(fit.names, fit.deviations, strict=True))
+        inside = [abs(fit.value(n) - t) < 1.96 * deviations[n] for n, t in truth.items()]
+        values[f"{name}_covered"] = float(np.mean(inside))
+    return Sample(values)
+
+
+def judge_flexibility(samples: Sequence[Sample]) -> Judgement:
+    """Judge the ratio of the length errors, and how often the intervals hold the truth."""
+    squares = np.column_stack([collect(samples, f"{n}_square") for n in ("modelled", "plain")])
+    ratio = check_statistic(
+        "RMS error of the lengths, noise model over sensors' errors alone", squares,
+        lambda rows: float(np.sqrt(rows[:, 0].mean() / rows[:, 1].mean())), (0.0, 0.95),
+        "improves: errors smaller by a twentieth at least",
+    )  # fmt: skip
+    covered = check_mean(
+        "fraction of the 95 % intervals that hold the truth", collect(samples, "modelled_covered"),
+        (0.85, 1.0), "95 %, less what a load that is modelled in another way than it was simulated"
+        " may cost: 10 %",
+    )  # fmt: skip
+    plain = float(np.mean(collect(samples, "plain_covered")))
+    return Judgement(
+        (ratio, covered),
+        note=f"intervals without the noise model hold the truth in {100 * plain:.0f} %; estimated"
+        f" flexibility at full load {np.mean(collect(samples, 'grapple')):.2f} deg (grapple) and"
+        f" {np.mean(collect(samples, 'yoke')):.2f} deg (yoke)",
+    )
+
+
+EXPERIMENTS = (
+    Experiment("spatial linkage", measure_linkage, (
+        Claim(
+            "cylinder with ball joints",
+            "If joints A and C are 3-DOF ball joints, the triangle becomes a spatial closed chain,"
+            " and two more joint angle sensors are required to identify the geometric parameters",
+            "p. 43, section 3.4.4, Fig. 12",
+            "document",
+            judge_linkage,
+            {"axial_offset": 0.0},
+            "pins in one plane: no angle sensor is needed",
+        ),
+    ), repetitions_fixed=1),
+    Experiment("flexible joints", measure_flexibility, (
+        Claim(
+            "noise model of flexible joints",
+            "A noise model of joint flexibility, which the thesis proposes for further work, is"
+            " estimated with the parameters of the arm and improves them",
+            "p. 124, section 5.3",
+            "additional",
+            judge_flexibility,
+            {"estimated": False},
+            "the noise model is not estimated",
+        ),
+    )),
+)  # fmt: skip
