@@ -15,7 +15,7 @@ IN2 = 6.4516e-4
 TOOLS = ("none", "bucket", "grapple", "grapple_log", "grapple_claw")
 
 
-def energy_drift(plant, seconds=5.0):
+def energy_drift(plant, seconds=3.5):
     """Largest change of total energy of the free fall from rest, per largest kinetic energy."""
     model = plant.model.__copy__()
     for part in ("ACTUATION", "LIMIT"):
@@ -38,9 +38,10 @@ def energy_drift(plant, seconds=5.0):
 @pytest.mark.parametrize("tool", ["none", "bucket"])
 def test_energy_is_kept_without_hydraulics(plant_of, tool):
     drift = [energy_drift(plant_of(tool, dt)) for dt in (1e-3, 5e-4, 2.5e-4)]
-    # semi-implicit Euler and the pins' damping are of first order in the step; 0.5 % is what they
-    # cost a machine that falls freely from 6 m at 1 ms
-    assert drift[0] < 5e-3
+    # semi-implicit Euler and the pins' damping are of first order in the step; 0.25 % is what they
+    # cost a machine that falls freely from 6 m at 1 ms. The fall ends before the bucket, whose
+    # limits are off, is whirled at 1000 deg/s (at 4 s).
+    assert drift[0] < 2.5e-3
     ratios = np.array(drift[1:]) / drift[:-1]
     assert np.all((ratios > 0.4) & (ratios < 0.6)), drift
 
@@ -52,7 +53,7 @@ def holding_pressures(boom, stick):
     from their pins, towards each other: together they weigh on the two pins like 100 kg on each.
     """
     deg = math.radians
-    pin_z = 2.000 * math.cos(boom + deg(20))  # of the boom cylinder's rod pin, per rad of boom
+    pin_z = 2.000 * math.cos(boom + deg(37))  # of the boom cylinder's rod pin, per rad of boom
     tail = 5.180 * math.cos(boom) + 2.444 * math.cos(boom + deg(155.3))  # stick cylinder's base pin
     knee, hang = 5.180 * math.cos(boom), boom + stick
     crank = 0.720 * math.cos(hang + deg(145))  # stick cylinder's rod pin, from the stick pin
