@@ -31,6 +31,7 @@ from hydrotele.experiments.khoshzaban_models import (
     make_regressor,
     read_settings,
 )
+from hydrotele.experiments.khoshzaban_sensors import SENSOR_ACCURACY
 from hydrotele.identify.equations import row_forces
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import fit_runs
@@ -55,9 +56,6 @@ FITTED_ROWS = 1664
 
 HELD_OUT_ROWS = 450
 """Samples to judge on (Figs 36 and 37, horizontal axis)."""
-
-SENSOR_ACCURACY = (1400.0, 5700.0, 4200.0)
-"""Limits of the error of the swing's torque [N m] and the cylinders' forces [N] (p. 108)."""
 
 PUBLISHED_RMS = {
     "complete": (3720.0, 5860.0, 8700.0),
