@@ -193,7 +193,8 @@ class Base:
         rows = self.rows(motion)
         length = np.linalg.norm(rows, axis=0)
         right = forces.reshape(*forces.shape[:-2], -1).T
-        return (np.linalg.lstsq(rows / length, right, rcond=_ROUNDING)[0].T) / length
+        q, r = np.linalg.qr(rows / length)
+        return np.linalg.lstsq(r, q.T @ right, rcond=_ROUNDING)[0].T / length
 
     def rows(self, motion: Motion) -> np.ndarray:
         """(3 n, p) equations of the base parameters."""
