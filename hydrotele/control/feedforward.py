@@ -10,7 +10,7 @@ from hydrotele.identify.setup import machine_setup
 from hydrotele.identify.smoothing import Smoothed, zero_phase
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import project, regressor
+from hydrotele.multibody.inverse_dynamics import regressor
 from hydrotele.scenario.scenario import Servo
 from hydrotele.simulate.closure import closed_chain
 
@@ -53,7 +53,7 @@ def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferen
     setup = machine_setup(machine, chain)
     step = float(plan.time[1] - plan.time[0])
     motion = _smooth(plan.reference, step)
-    found = project(chain, setup.given, plan.reference, motion.rate, motion.acceleration)
+    found = setup.project(plan.reference, motion.rate, motion.acceleration)
     table = regressor(
         chain, found, bodies=setup.bodies, rubbing=setup.rubbing, offsets=setup.offsets or {}
     )

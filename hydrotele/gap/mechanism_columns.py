@@ -30,7 +30,7 @@ from hydrotele.identify.record import IdentificationRecord, trimmed, without_err
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.machine.machine import SensorError
 from hydrotele.multibody.chain import Chain
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, project
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
 
 STRIBECK = (0.03, 0.1, 0.3)  # of a joint's RMS rate: Stribeck velocities that are tried
 _DRY = ("coulomb", "stribeck")  # terms of dry friction
@@ -309,7 +309,7 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
 def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, period: float):
     """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m)."""
     chain = setup.chain
-    found = project(chain, setup.given, *motion)
+    found = setup.project(*motion)
     passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.rest)
     base = setup.table(found).matrix @ value + np.einsum("nkv,nv->nk", found.share, passive)
     change = np.gradient(base, period, axis=0)
@@ -340,7 +340,7 @@ def _dry_friction(setup: RegressorSetup, motion: np.ndarray, band: float, period
     """
     chain, rubs = setup.chain, {one.place for one in setup.rubbing if "coulomb" in one.nominal}
     drives = [drive for drive in chain.drives if drive in rubs]
-    found, places = project(chain, setup.given, *motion), [chain.index(name) for name in drives]
+    found, places = setup.project(*motion), [chain.index(name) for name in drives]
     share, rate = found.share[:, :, places], found.rate[:, places]
     low, _ = low_pass(band, period)
     calm = fftconvolve(rate, low[:, None], mode="same", axes=0)
@@ -366,7 +366,7 @@ class _Differences:
     def columns(self, sizes) -> tuple[list[str], np.ndarray]:
         """Names, and (n, k, m)."""
         chain = self.setup.chain
-        found = project(chain, self.setup.given, *self.motion)
+        found = self.setup.project(*self.motion)
         here = [chain.index(name) for name in self.axes]
         moves = np.linalg.solve(found.share[:, :, here], found.share)  # q_v per measured joint
         given = [chain.index(name) for name in self.setup.given]

@@ -21,7 +21,7 @@ from hydrotele.identify.motion import (
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.identify.smoothing import Smoothed, error_draws, smooth
-from hydrotele.multibody.inverse_dynamics import Regressor, project, sign_uncertainty
+from hydrotele.multibody.inverse_dynamics import Regressor, sign_uncertainty
 
 _TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
 _KAISER = 5.0  # its ripple is 50 dB down
@@ -221,7 +221,7 @@ def _rows(
 ):
     """Some rows (3, n, k): regressor, doubt of the signs, damping and springs, the last pose."""
     chain = setup.chain
-    found = project(chain, setup.given, *motions, start=start)
+    found = setup.project(*motions, start=start)
     spread = None
     if errors is not None and np.isfinite(errors.std).all():
         measured = [chain.index(name) for name in errors.axes]

@@ -13,7 +13,7 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.identify.identifiability import identifiable_in_noise, reference_sizes
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.machine.machine import Machine
-from hydrotele.multibody.inverse_dynamics import Projection, project
+from hydrotele.multibody.inverse_dynamics import Projection
 
 _ROWS = 12  # per period of the highest harmonic
 _MARGIN = 0.05  # of a range, stroke or limit that is left free
@@ -101,7 +101,7 @@ def information(
         base: places of the p base parameters.
         sizes: (p,) to count the parameters in; 1 by default.
     """
-    found = project(setup.chain, setup.given, *motions)
+    found = setup.project(*motions)
     table = setup.table(found)
     noise = np.asarray(noise, float)
     if noise.ndim == 1:
@@ -137,7 +137,7 @@ def informative_base(
         limits.axes, period, limits.middle, wide * np.cos(phase), wide * np.sin(phase), 0, 0, 0
     ).motion(time)
     motion[0] = np.clip(motion[0], limits.low, limits.high)
-    found = project(setup.chain, setup.given, *motion)
+    found = setup.project(*motion)
     table = setup.table(found)
     forces = np.sqrt(np.mean((table.matrix @ table.nominal) ** 2, axis=0))
     flat = (table.matrix / noise[:, None]).reshape(-1, len(table.names))
@@ -273,7 +273,7 @@ def _sizes(
 ) -> np.ndarray:
     """Sizes of base parameters, so that a determinant is no matter of units: those given."""
     still = np.zeros((1, len(middle)))
-    found = project(setup.chain, setup.given, middle[None], still, still)
+    found = setup.project(middle[None], still, still)
     table = setup.table(found)
     return np.maximum(np.abs(table.nominal[np.asarray(base)]), 1.0)
 
@@ -307,7 +307,7 @@ class DriveLimits:
 
     def use(self, motions: np.ndarray, held: np.ndarray) -> np.ndarray:
         """Use of every limit at every row (n, l), 1 at the limit."""
-        found = project(self.setup.chain, self.setup.given, *held)
+        found = self.setup.project(*held)
         return np.concatenate(
             [
                 1.0 + (motions[0] - self.high) / self.half,
@@ -356,7 +356,7 @@ class MachineLimits:
             1.0 + (motions[0] - self.high) / self.half,
             1.0 + (self.low - motions[0]) / self.half,
         ]
-        found = project(self.setup.chain, self.setup.given, *held)
+        found = self.setup.project(*held)
         table = replace(self.setup, offsets=None).table(found)
         forces = table.matrix @ table.nominal
         flow = np.zeros(len(forces))

@@ -16,6 +16,7 @@ from hydrotele.multibody.inverse_dynamics import (
     Projection,
     Regressor,
     pin_friction,
+    project,
     regressor,
 )
 
@@ -56,6 +57,7 @@ def _numbers(f: Friction) -> dict[str, float]:
 
 
 Model = Literal["complete", "reduced"]
+_BAR_AXIS = (1.0, 0.0, 0.0)  # of a tube and of a rod, in their frames: from pin to pin
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,8 @@ class RegressorSetup:
         alike: bodies, joints or closures that have the same parameters; one column, named after
             the first, stands for all of a group.
         absent: parameters that are known to be 0, such as `moment_x.stator`.
+        moment_free: body -> unit axis in its frame about which it takes no moment from its
+            neighbours; see `project`.
     """
 
     chain: Chain
@@ -82,6 +86,30 @@ class RegressorSetup:
     drive_inertia: tuple[str, ...] = ()
     alike: tuple[tuple[str, ...], ...] = ()
     absent: tuple[str, ...] = ()
+    moment_free: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+
+    def project(
+        self, position: np.ndarray, rate: np.ndarray, acceleration: np.ndarray,
+        start: np.ndarray | None = None,
+    ) -> Projection:  # fmt: skip
+        """Project the chain on its drives along a motion of the given joints.
+
+        Args:
+            position: (n, k) of the given joints [rad] or [m].
+            rate: (n, k) [rad/s] or [m/s].
+            acceleration: (n, k) [rad/s^2] or [m/s^2].
+            start: (v,) positions from which to go to the first row; the chain's by default.
+
+        Returns:
+            The projection.
+
+        Raises:
+            InputError: as of `hydrotele.multibody.inverse_dynamics.project`.
+        """
+        return project(
+            self.chain, self.given, position, rate, acceleration, start=start,
+            moment_free=self.moment_free,
+        )  # fmt: skip
 
     def table(self, found: Projection, rate_std: np.ndarray | None = None) -> Regressor:
         """Regressor along a motion.
@@ -133,7 +161,7 @@ def _merged(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[s
 
 def machine_setup(
     machine: Machine, chain: Chain, model: Model = "complete", *, pins: bool = False,
-    asymmetry: bool = False,
+    asymmetry: bool = False, ball_joints: bool = False,
 ) -> RegressorSetup:  # fmt: skip
     """Setup for a machine.
 
@@ -144,11 +172,14 @@ def machine_setup(
         pins: whether joints and closures without drive have Coulomb friction.
         asymmetry: whether viscous friction of the drives may depend on the direction. Dry friction
             that does cannot be told from a force offset.
+        ball_joints: whether cylinders end in ball joints instead of pins: they then carry no
+            moment about their own axes. Tube and rod still turn about it as pins would turn them,
+            which is exact where their inertia about it is negligible.
 
     Returns:
         The setup. Bodies that no joint moves have no columns.
 
-    Source: Khoshzaban 1992, 4.3 (complete and reduced model).
+    Source: Khoshzaban 1992, 4.3 (complete and reduced model) and p. 92, Eq. 4.23 (ball joints).
     """
     moved = [b for k, b in enumerate(chain.bodies) if chain.tree.above[k + 1].any()]
     bodies = tuple(b for b in moved if model == "complete" or b not in cylinder_bars(machine))
@@ -164,6 +195,7 @@ def machine_setup(
     return RegressorSetup(
         chain=chain, given=tuple(machine.axes[a].joint for a in order), bodies=bodies,
         rubbing=(*rubbing, *(pin_friction(chain) if pins else ())), offsets=offsets,
+        moment_free=dict.fromkeys(cylinder_bars(machine), _BAR_AXIS) if ball_joints else {},
     )  # fmt: skip
 
 

@@ -33,6 +33,8 @@ from hydrotele.multibody.tree_motion import (
     point_column,
     qr_factor,
     qr_solve,
+    rotated,
+    rotation,
     subtract,
     vector,
     wrenches,
@@ -68,6 +70,7 @@ def project(
     chain: Chain, given: tuple[str, ...], position: np.ndarray, rate: np.ndarray,
     acceleration: np.ndarray, drives: tuple[str, ...] | None = None,
     start: np.ndarray | None = None,
+    moment_free: Mapping[str, tuple[float, float, float]] | None = None,
 ) -> Projection:  # fmt: skip
     """Project a chain on its drives.
 
@@ -79,16 +82,19 @@ def project(
         acceleration: (n, k) [rad/s^2] or [m/s^2].
         drives: k joints whose forces are asked for; the chain's own by default.
         start: (v,) positions from which to go to the first row; the chain's by default.
+        moment_free: body -> unit axis through the origin of its frame, in that frame, about which
+            it takes no moment from its neighbours. Its motion is that of the chain all the same.
 
     Returns:
         The projection. `bodies @ inertia.ravel()`, plus what friction asks for, are the drives'
         forces.
 
     Raises:
-        InputError: shapes do not fit, a value is missing, the closures do not determine the other
-            joints, or a row cannot be reached.
+        InputError: shapes do not fit, a value is missing, a body is not there, the closures do not
+            determine the other joints, or a row cannot be reached.
 
-    Source: Newton-Euler about the body frames, D'Alembert; Abdellatif 2008, section 2.
+    Source: Newton-Euler about the body frames, D'Alembert; Abdellatif 2008, section 2; bodies
+    without moment about an axis: Khoshzaban 1992, p. 92, Eq. 4.23.
     """
     drives = chain.drives if drives is None else drives
     columns = np.array([chain.index(name) for name in given], np.int64)
@@ -103,6 +109,9 @@ def project(
             " where there are as many",
         )
     n, v, k = len(tables[0]), len(chain.joints), len(columns)
+    axes = np.zeros((len(chain.bodies) + 1, 3))
+    for body, axis in (moment_free or {}).items():
+        axes[_body_place(chain, body) + 1] = axis
     others = np.setdiff1d(np.arange(v), columns)
     q = np.array(chain.start if start is None else start, float)
     if not close_from(chain.tree, q, np.arange(v), CLOSED, np.inf) < CLOSED:
@@ -115,7 +124,8 @@ def project(
         np.empty((n, k, 10 * len(chain.bodies))), np.empty((n, len(chain.tree.ends))),
         np.empty((n, k, len(chain.tree.ends))),
     )  # fmt: skip
-    failed = _project(chain.tree, _Given(columns, *tables), others, moved, q, out)
+    given_rows = _Given(columns, *tables)
+    failed = _project(chain.tree, given_rows, others, moved, axes, q, out)
     if failed >= 0:
         raise InputError(
             _WHERE,
@@ -123,6 +133,12 @@ def project(
             f" singular for the drives {', '.join(drives)}",
         )
     return out
+
+
+def _body_place(chain: Chain, body: str) -> int:
+    if body not in chain.bodies:
+        raise InputError(_WHERE, f"{chain.name} has no body {body}: {', '.join(chain.bodies)}")
+    return chain.bodies.index(body)
 
 
 def _table(values: np.ndarray, width: int) -> np.ndarray:
@@ -147,7 +163,7 @@ class _Given(NamedTuple):
 
 
 @compiled
-def _project(tree, given, others, drives, q, out):
+def _project(tree, given, others, drives, moment_free, q, out):
     """Fill a `Projection` row by row; the row that failed, or -1."""
     b, v, k = len(tree.parent), len(tree.zero), len(given.joints)
     hidden, space = len(others), loop_space(tree, len(others), k)
@@ -202,10 +218,21 @@ def _project(tree, given, others, drives, q, out):
                 share[i, j] = total
         for body in range(1, b):
             wrenches(frames, body, forces, torques)
+            _drop_moment(frames, body, vector(moment_free, body), torques)
             _load(tree, frames, body, forces, torques, share, out.bodies[row])
         for m in range(len(tree.ends)):
             out.twist[row, m] = _rub(tree, frames, m, share, out.pins[row])
     return -1
+
+
+@allocation_free
+def _drop_moment(frames, body, axis, torques):
+    """Take the part about a body's unit axis from torques (3, 10); a zero axis changes nothing."""
+    way = rotated(rotation(frames.turn, body), axis)
+    for m in range(10):
+        along = way[0] * torques[0, m] + way[1] * torques[1, m] + way[2] * torques[2, m]
+        for k in range(3):
+            torques[k, m] -= along * way[k]
 
 
 @allocation_free
@@ -344,11 +371,7 @@ def regressor(
         nominal.append(value)
 
     for body in chain.bodies if bodies is None else bodies:
-        if body not in chain.bodies:
-            raise InputError(
-                _REGRESSOR, f"{chain.name} has no body {body}: {', '.join(chain.bodies)}"
-            )
-        b = chain.bodies.index(body)
+        b = _body_place(chain, body)
         columns.append(found.bodies[:, :, 10 * b : 10 * (b + 1)])
         for p, (kind, unit) in enumerate(BODY_PARAMETERS.items()):
             add(None, f"{kind}.{body}", unit, chain.inertia[b, p])

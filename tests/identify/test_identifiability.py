@@ -63,11 +63,8 @@ def complete():
 
 
 def test_counts_of_the_complete_model(complete):
-    """Of the physical model on a wide motion; Khoshzaban's Table 13 has 31, 24 and 27.
-
-    On another motion it was 9, 56 and 17: the friction of the stick's three pins then showed in two
-    combinations only.
-    """
+    """Of cylinders that end in pins; Khoshzaban's Table 13 has ball joints, which the experiment
+    `khoshzaban1992` shows."""
     told = identifiability(complete.matrix.reshape(-1, 82), complete.names, complete.units)
     assert told.counts == {UNIDENTIFIABLE: 9, COMBINATION: 53, FULL: 20}
     assert told.gap[0] > 1e5 * told.gap[1]

@@ -1,0 +1,371 @@
+"""Chapter 4 of Khoshzaban 1992: dynamic calibration of a hydraulic machine with minor links.
+
+Forces of the complete and the reduced model (4.4.1), and which parameters can be identified
+(4.4.2). The sensors' accuracy (4.4.3) is in `khoshzaban_sensors`, the measured machine (4.6) in
+`khoshzaban_prediction`.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hydrotele.experiments.comparison import (
+    Changes,
+    Claim,
+    Comparison,
+    Experiment,
+    Judgement,
+    Panel,
+    Sample,
+)
+from hydrotele.experiments.intervals import (
+    check_exact,
+    check_mean,
+    check_statistic,
+    collect,
+    format_values,
+)
+from hydrotele.experiments.khoshzaban_models import (
+    DRIVES,
+    PERIOD,
+    UNITS,
+    Motion,
+    document_setup,
+    draw_motion,
+    draw_states,
+    make_regressor,
+    read_settings,
+    scale_cylinders,
+    stack_rows,
+)
+from hydrotele.experiments.khoshzaban_prediction import PREDICTION
+from hydrotele.experiments.khoshzaban_sensors import ACCURACY, NOISE, SENSOR_ACCURACY
+from hydrotele.identify.identifiability import (
+    COMBINATION,
+    FULL,
+    UNIDENTIFIABLE,
+    Identifiability,
+    identifiability,
+)
+
+FORCE_SETTINGS = {
+    "cylinder_scale": 1.0,  # of mass, mass moments and inertia of all tubes and rods
+    "rods_beyond_pins": False,  # whether rods' centres of mass lie beyond their pins
+}
+_LARGE = 0.5  # of its peak, from which the factor between two forces means something
+
+
+def measure_forces(seed: int, changes: Changes) -> Sample:
+    """Forces of the complete and the reduced model along a motion.
+
+    Args:
+        seed: of the motion.
+        changes: of `FORCE_SETTINGS`.
+
+    Returns:
+        Factors between the forces, and their differences.
+    """
+    settings = read_settings(FORCE_SETTINGS, changes)
+    motion = draw_motion(np.random.default_rng(seed))
+    table = make_regressor(document_setup("complete"), motion)
+    parameters = scale_cylinders(table, settings["cylinder_scale"])
+    if settings["rods_beyond_pins"]:
+        turned = [name.startswith("moment_x") and name.endswith("_rod") for name in table.names]
+        parameters = np.where(turned, -parameters, parameters)
+    complete = table.matrix @ parameters
+    reduced = table.matrix @ scale_cylinders(table, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.maximum(np.abs(complete / reduced), np.abs(reduced / complete))
+    share = np.abs(complete) / np.abs(complete).max(axis=0)
+    difference = np.sqrt(np.mean((complete - reduced) ** 2, axis=0))
+    usual = np.sqrt(np.mean(complete**2, axis=0))
+    values = {}
+    for k, drive in enumerate(DRIVES):
+        twice = factor[:, k] >= 2.0
+        values[f"factor.{drive}"] = float(factor[share[:, k] >= _LARGE, k].max())
+        values[f"twice.{drive}"] = float(twice.mean())
+        values[f"twice_below.{drive}"] = float(share[twice, k].max(initial=0.0))
+        values[f"difference.{drive}"] = float(difference[k])
+        values[f"relative.{drive}"] = float(difference[k] / usual[k])
+        values[f"peak_rate.{drive}"] = float(np.abs(motion[1][:, k]).max())
+        values[f"peak.{drive}"] = float(np.abs(complete[:, k]).max())
+    return Sample(values, _force_panels(motion, complete, reduced))
+
+
+MOTION_LABELS = ("joint angle [deg]", "joint rate [rad/s]", "joint acceleration [rad/s^2]")
+FORCE_LABELS = tuple(
+    f"{what} of the {drive} [{unit}]"
+    for what, drive, unit in zip(("torque", "force", "force"), DRIVES, UNITS, strict=True)
+)
+
+
+def _force_panels(motion: Motion, complete: np.ndarray, reduced: np.ndarray) -> tuple[Panel, ...]:
+    time = PERIOD * np.arange(len(complete))
+    angles, rates, accelerations = motion
+    parts = (np.rad2deg(angles), rates, accelerations)
+    panels = [
+        Panel(label, time, {drive: part[:, k] for k, drive in enumerate(DRIVES)})
+        for label, part in zip(MOTION_LABELS, parts, strict=True)
+    ]
+    for k, label in enumerate(FORCE_LABELS):
+        curves = {"complete model": complete[:, k], "reduced model": reduced[:, k]}
+        errors = {"complete less reduced": complete[:, k] - reduced[:, k]}
+        panels.append(Panel(label, time, curves, errors=errors,
+                            error_label=f"difference [{UNITS[k]}]"))  # fmt: skip
+    return tuple(panels)
+
+
+def judge_factor(samples: Sequence[Sample]) -> Judgement:
+    """The factor between the models' forces has to reach two where the force is large."""
+    largest = np.max([collect(samples, f"factor.{drive}") for drive in DRIVES], axis=0)
+    check = check_mean(
+        "largest factor between both models' forces, of three drives, at instants with more than"
+        " half of the peak force",
+        largest, (2.0, np.inf), '"a factor of two or more"; a factor near zero force means nothing',
+        published=2.0,
+    )  # fmt: skip
+    twice = "; ".join(
+        f"{d}: {format_values(samples, f'twice.{d}', 100.0, 0)} % of the time, where its force is"
+        f" below {100 * collect(samples, f'twice_below.{d}').max():.0f} % of its peak"
+        for d in DRIVES
+    )
+    relative = ", ".join(f"{d} {format_values(samples, f'relative.{d}', 100.0)} %" for d in DRIVES)
+    return Judgement(
+        (check,),
+        "Table 13's cylinders, of 200 kg each beside links of 1830 and 688 kg, are too light for"
+        " it: the boom's force reaches a factor of two with cylinders eight times as heavy (2.05),"
+        " the swing's torque with ten times (1.99), the stick's force with twice (2.2). Rods whose"
+        " centres of mass lie beyond their pins, by the sign of mcx, give 1.35. Only"
+        " where the stick's force is small does the factor exceed two.",
+        note=f"RMS difference over RMS force: {relative}; factor of two: {twice}",
+    )
+
+
+def judge_proximal(samples: Sequence[Sample]) -> Judgement:
+    """The boom's force has to be wrong by more than its sensors are, and more than the stick's."""
+    rows = np.stack([collect(samples, f"difference.{d}") for d in ("boom", "stick")], axis=1)
+    checks = (
+        check_mean(
+            "RMS difference of both models' forces, boom", rows[:, 0],
+            (SENSOR_ACCURACY[1], np.inf), "large: above the sensors' accuracy (p. 108)", unit="N",
+        ),
+        check_statistic(
+            "the same, boom over stick", rows,
+            lambda r: float(np.linalg.norm(r[:, 0]) / max(np.linalg.norm(r[:, 1]), 1e-300)),
+            (1.0, np.inf), "the proximal cylinder's error is the larger one",
+        ),
+    )  # fmt: skip
+    sizes = ", ".join(
+        f"{d} {format_values(samples, f'difference.{d}', digits=0)} {u}"
+        for d, u in zip(DRIVES, UNITS, strict=True)
+    )
+    relative = ", ".join(f"{d} {format_values(samples, f'relative.{d}', 100.0)} %" for d in DRIVES)
+    return Judgement(
+        checks,
+        "Of its own RMS force the stick's error is the larger one.",
+        note=f"RMS differences {sizes}; of the RMS force {relative}",
+    )
+
+
+def judge_motion(samples: Sequence[Sample]) -> Judgement:
+    """Motions are drawn within the axes' ticks, which are all that is legible."""
+    rates = ", ".join(f"{d} {format_values(samples, f'peak_rate.{d}', digits=2)}" for d in DRIVES)
+    return Judgement(note=f"drawn anew in every repetition; largest rates {rates} rad/s")
+
+
+FORCES = Experiment(
+    "complete and reduced model", measure_forces,
+    (
+        Claim(
+            "simulated motions", "Simulated trajectory of the swing, the boom, the stick (axes in"
+            " the document's signs: -40 to 20, -50 to 0, 0 to 150 deg; 0.4, 0.4, 1.5 rad/s; 5 s)",
+            "Figs 30 to 32, pp. 102 to 104", "caption", judge_motion, panels=MOTION_LABELS,
+        ),
+        Claim(
+            "neglected minor links: factor of two",
+            '"neglecting the dynamics of the minor links (hydraulic actuators) may overestimate or'
+            " underestimate the forces/torques applied to the joints/links of the arm by a factor"
+            ' of two or more."',
+            "Fig. 33, pp. 105 and 123", "document", judge_factor,
+            broken={"cylinder_scale": 0.0}, broken_how="cylinders without mass",
+            panels=FORCE_LABELS,
+        ),
+        Claim(
+            "neglected minor links: proximal links",
+            '"a large error in force/torque prediction results, especially for the proximal links,'
+            ' if we simply ignore the dynamics of the minor links"',
+            "Fig. 33, pp. 105 and 106", "document", judge_proximal,
+            broken={"cylinder_scale": 0.0}, broken_how="cylinders without mass", panels=(),
+        ),
+    ),
+)  # fmt: skip
+"""Figs 30 to 33."""
+
+
+COUNT_SETTINGS = {
+    "ball_joints": True,  # ends of the cylinders in the document's model
+    "pins": True,  # whether the model that is compared has pins instead
+    "tilt_deg": 0.0,  # of the ground
+    "states": 300,  # random states of the regressor
+}
+TABLE_13 = {"deleted": 31, "combined": 24, "full": 27}
+"""Unidentifiable, linearly identifiable and fully identifiable parameters of 82 (p. 107)."""
+
+PIN_COUNTS = {"deleted": 37, "combined": 25, "full": 20}
+"""The same with pins, of this project."""
+
+
+def count_parameters(told: Identifiability) -> dict[str, int]:
+    """Counts in the document's words.
+
+    Columns that have no effect and columns for which others can stand are deleted, and count as
+    unidentifiable; what remains is as many as the rank.
+
+    Args:
+        told: classification of all parameters.
+
+    Returns:
+        `deleted`, `combined` (kept, and standing for a combination), `full`.
+
+    Source: Khoshzaban 1992, p. 100.
+    """
+    rank, full = len(told.base), told.counts[FULL]
+    return {"deleted": len(told.names) - rank, "combined": rank - full, "full": full}
+
+
+def measure_identifiability(seed: int, changes: Changes) -> Sample:
+    """Classify the 82 parameters of the complete model with ball joints and with pins.
+
+    Args:
+        seed: of the random states.
+        changes: of `COUNT_SETTINGS`.
+
+    Returns:
+        Counts, and how clear the rank is.
+    """
+    settings = read_settings(COUNT_SETTINGS, changes)
+    states = draw_states(settings["states"], seed)
+    values = {}
+    for kind, ball in (("document", settings["ball_joints"]), ("pins", not settings["pins"])):
+        setup = document_setup("complete", ball, settings["tilt_deg"])
+        table = make_regressor(setup, states)
+        told = identifiability(stack_rows(table), table.names, table.units)
+        values |= {f"{kind}.{name}": n for name, n in count_parameters(told).items()}
+        values |= {f"{kind}.smallest": told.gap[0], f"{kind}.next": told.gap[1]}
+        status = dict(zip(told.names, told.status, strict=True))
+        lost = [name for name, s in status.items() if s == UNIDENTIFIABLE]
+        swing = [name for name in told.names if name.endswith(".swing")][:9]
+        values[f"{kind}.without_effect"] = len(lost)
+        values[f"{kind}.first_nine_lost"] = float(lost == swing)
+        values[f"{kind}.swing_combined"] = float(status["inertia_zz.swing"] == COMBINATION)
+    return Sample(values)
+
+
+def judge_table_13(samples: Sequence[Sample]) -> Judgement:
+    """The counts have to be those of the table."""
+    values = samples[0].values
+    words = {"deleted": "unidentifiable", "combined": "linearly identifiable",
+             "full": "fully identifiable"}  # fmt: skip
+    checks = tuple(
+        check_exact(f"{words[name]} parameters", values[f"document.{name}"], (n, n),
+                    "a count", published=n)
+        for name, n in TABLE_13.items()
+    )  # fmt: skip
+    pins = "/".join(f"{values[f'pins.{name}']:.0f}" for name in TABLE_13)
+    return Judgement(
+        checks,
+        "The counts hold for cylinders that carry no moment about their axes (Eq. 4.23, ball"
+        " joints). With pins the moment is carried, six combinations of the tubes' and rods'"
+        " parameters and the links' inertias can no longer be separated.",
+        note=f"with pins {pins}; singular values on either side of the rank"
+        f" {values['document.smallest']:.1g} and {values['document.next']:.0g} of the largest",
+    )
+
+
+def judge_pins(samples: Sequence[Sample]) -> Judgement:
+    """With pins the counts are those of this project."""
+    values = samples[0].values
+    return Judgement(
+        tuple(
+            check_exact(f"{name} parameters", values[f"pins.{name}"], (n, n), "a count")
+            for name, n in PIN_COUNTS.items()
+        )
+    )
+
+
+def judge_swing(samples: Sequence[Sample]) -> Judgement:
+    """Nine of the swing's parameters have no effect, the tenth shows in a combination."""
+    values = samples[0].values
+    return Judgement(
+        (
+            check_exact("parameters without effect", values["document.without_effect"], (9, 9),
+                        "the first nine of the swing", published=9),
+            check_exact("they are the first nine of the swing",
+                        values["document.first_nine_lost"], (1, 1), "1: yes"),
+            check_exact("Izz of the swing shows in a combination",
+                        values["document.swing_combined"], (1, 1), "1: yes"),
+        ),
+    )  # fmt: skip
+
+
+IDENTIFIABILITY = Experiment(
+    "identifiability", measure_identifiability,
+    (
+        Claim(
+            "identifiability of 82 parameters",
+            '"the 31 unidentifiable parameters in Table 13 are marked with "*", the 24 linearly'
+            ' identifiable ones are marked with "f", and the 27 fully identifiable parameters are'
+            ' marked with "t"."',
+            "Table 13, pp. 106 and 107", "document", judge_table_13,
+            broken={"ball_joints": False}, broken_how="cylinders that end in pins",
+        ),
+        Claim(
+            "identifiability with pins",
+            "With cylinders that end in pins, 37 of the 82 parameters are unidentifiable, 25"
+            " linearly identifiable and 20 fully identifiable.",
+            "beside Table 13", "additional", judge_pins,
+            broken={"pins": False}, broken_how="cylinders that end in ball joints",
+        ),
+        Claim(
+            "parameters of the swing",
+            '"the first nine parameters of the first link (cabin) are not identifiable because this'
+            ' link has only one degree of freedom about its z axis"; Izz, alone, is identifiable'
+            " only in linear combination in a multi-link manipulator",
+            "Tables 13 and 16, pp. 107 and 113", "document", judge_swing,
+            broken={"tilt_deg": 10.0}, broken_how="a machine on ground with a slope of 10 deg",
+        ),
+    ),
+    repetitions_fixed=1,
+)  # fmt: skip
+"""Table 13."""
+
+
+EXPERIMENTS: tuple[Experiment, ...] = (FORCES, IDENTIFIABILITY, ACCURACY, NOISE, PREDICTION)
+"""Chapter 4, in its order."""
+
+UNAVAILABLE: tuple[Comparison, ...] = (
+    Comparison(
+        "identified parameters of the UBC machine", "Tables 16 and 17, pp. 115 and 116",
+        "identified parameters of the UBC hydraulic manipulator, complete and reduced model",
+        "document",
+        Judgement(
+            unavailable="the excavator's logs are not published, and its parameters are not known"
+        ),
+    ),
+)  # fmt: skip
+"""Rows of chapter 4 that cannot be computed."""
+
+DRAWINGS = {
+    "Fig. 26": "coordinate frames of a link",
+    "Fig. 27": "free-body diagram of a major link",
+    "Fig. 28": "schematic of a hydraulic actuator",
+    "Fig. 29": "free-body diagram of a hydraulic actuator",
+    "Fig. 34": "block diagram of measurement and identification",
+}
+"""Figures of chapter 4 that show no result."""
+
+ITEMS = (
+    *(f"Table {n}" for n in range(13, 18)),
+    *(f"Fig. {n}" for n in range(26, 38)),
+)
+"""Tables and figures of chapter 4, from the document's lists."""

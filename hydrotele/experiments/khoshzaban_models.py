@@ -1,0 +1,226 @@
+"""Regressors and simulated motions of chapter 4 of Khoshzaban 1992, for the CAT 215.
+
+The complete model has 82 parameters: ten of each of seven bodies, Coulomb friction of three drives
+and six pins, three force offsets. The reduced model has the major links only: ten of each of three
+bodies, friction and offset of three drives.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from hydrotele.core.errors import InputError
+from hydrotele.experiments.comparison import Changes
+from hydrotele.identify.identifiability import Identifiability, identifiability, reference_sizes
+from hydrotele.identify.setup import Model, RegressorSetup, machine_setup
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.multibody.inverse_dynamics import FrictionTerm, Regressor, pin_friction
+from hydrotele.simulate.closure import closed_chain
+
+DRIVES = ("swing", "boom", "stick")
+UNITS = ("N m", "N", "N")
+PERIOD = 0.02
+"""Between samples [s] (p. 21, 50 Hz)."""
+
+DURATION = 5.0
+"""Of the simulated motion [s] (Figs 30 to 32)."""
+
+_DEG = np.pi / 180.0
+# Swing, boom, stick in the project's signs, as the axes of Figs 30 to 32 enclose the curves: lowest
+# and highest start and end [deg], and largest rate [rad/s].
+_STARTS = ((-40.0, -20.0), (0.0, 10.0), (-50.0, -25.0))
+_ENDS = ((0.0, 20.0), (40.0, 50.0), (-150.0, -100.0))
+_PEAK_RATES = ((0.3, 0.4), (0.3, 0.4), (1.0, 1.5))
+_QUINTIC_PEAK = 1.875  # largest rate of a fifth-order move of unit length and duration
+
+Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Positions, rates and accelerations (n, 3) of swing, boom and stick [rad], [rad/s], [rad/s^2]."""
+
+
+def read_settings(settings: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
+    """Settings of an experiment with changes.
+
+    Args:
+        settings: all of them, with their usual values.
+        changes: of some.
+
+    Returns:
+        The changed settings.
+
+    Raises:
+        InputError: a change is of no setting.
+    """
+    if strange := [name for name in changes if name not in settings]:
+        raise InputError("experiment", f"no setting {strange[0]}: {', '.join(settings)}")
+    return {**settings, **changes}
+
+
+@cache
+def document_setup(
+    model: Model = "complete", ball_joints: bool = True, tilt_deg: float = 0.0
+) -> RegressorSetup:
+    """Setup of the document's regressor.
+
+    Args:
+        model: `complete` (82 parameters) or `reduced` to the major links (36).
+        ball_joints: whether the cylinders end in ball joints, as the document has it; else in pins.
+        tilt_deg: slope of the ground, about the machine's y axis.
+
+    Returns:
+        The setup; friction and offsets are zero, as in Table 13.
+
+    Source: Khoshzaban 1992, p. 92, Eq. 4.23; pp. 97 to 98, Eqs 4.51 to 4.56.
+    """
+    machine = load_machine("cat215")
+    chain = closed_chain(machine)
+    slope = np.array([np.sin(_DEG * tilt_deg), 0.0, np.cos(_DEG * tilt_deg)])
+    gravity = -float(np.linalg.norm(chain.tree.gravity)) * slope
+    chain = replace(chain, tree=chain.tree._replace(gravity=gravity))
+    setup = machine_setup(machine, chain, model, ball_joints=ball_joints)
+    rubbing = [FrictionTerm(joint, {"coulomb": 0.0}) for joint in chain.drives]
+    if model == "complete":
+        rubbing += pin_friction(chain)
+    return replace(setup, rubbing=tuple(rubbing))
+
+
+def make_regressor(setup: RegressorSetup, motion: Motion) -> Regressor:
+    """Regressor along a motion."""
+    return setup.table(setup.project(*motion))
+
+
+def stack_rows(table: Regressor) -> np.ndarray:
+    """(3 n, m) equations of a regressor."""
+    return table.matrix.reshape(-1, len(table.names))
+
+
+def draw_states(count: int, seed: int = 0) -> Motion:
+    """Independent random poses, rates and accelerations, which excite whatever can be excited.
+
+    Args:
+        count: number n of states.
+        seed: of the draw.
+
+    Returns:
+        Within the machine's ranges, +-1 rad/s and +-2 rad/s^2.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = np.array([-3.0, -0.7, -2.6]), np.array([3.0, 1.0, -0.5])
+    return (rng.uniform(low, high, (count, 3)), rng.uniform(-1.0, 1.0, (count, 3)),
+            rng.uniform(-2.0, 2.0, (count, 3)))  # fmt: skip
+
+
+def draw_motion(rng: np.random.Generator) -> Motion:
+    """Draw a motion whose curves fit the axes of Figs 30 to 32.
+
+    The curves are not legible in the available text. Start, end and largest rate are drawn within
+    the axes' ticks; all links move from rest to rest by polynomials of fifth order, and stand still
+    after they arrive.
+
+    Args:
+        rng: source of the draw.
+
+    Returns:
+        Five seconds at 50 Hz.
+    """
+    start, end, peak = (
+        np.array([rng.uniform(*pair) for pair in pairs])
+        for pairs in (_STARTS, _ENDS, _PEAK_RATES)
+    )  # fmt: skip
+    start, way = _DEG * start, _DEG * (end - start)
+    lasting = np.minimum(_QUINTIC_PEAK * np.abs(way) / peak, DURATION)
+    s = np.clip(np.arange(0.0, DURATION, PERIOD)[:, None] / lasting, 0.0, 1.0)
+    return (
+        start + way * (10 * s**3 - 15 * s**4 + 6 * s**5),
+        way * (30 * s**2 - 60 * s**3 + 30 * s**4) / lasting,
+        way * (60 * s - 180 * s**2 + 120 * s**3) / lasting**2,
+    )
+
+
+def join_motions(motions: Sequence[Motion]) -> Motion:
+    """One motion below the other."""
+    position, rate, acceleration = (np.concatenate(parts) for parts in zip(*motions, strict=True))
+    return position, rate, acceleration
+
+
+def scale_cylinders(table: Regressor, scale: float, bodies: Sequence[str] | None = None):
+    """Parameters (m,) with those of tubes and rods multiplied.
+
+    Args:
+        table: the parameters.
+        scale: of mass, mass moments and inertia.
+        bodies: tubes and rods that are scaled; all by default.
+    """
+    places = [name.partition(".")[2] for name in table.names]
+    bars = [p for p in places if p.endswith(("_tube", "_rod"))] if bodies is None else bodies
+    inertial = [n.startswith(("mass.", "moment_", "inertia_")) for n in table.names]
+    chosen = np.array(inertial) & np.isin(places, bars)
+    return np.where(chosen, scale * table.nominal, table.nominal)
+
+
+@dataclass(frozen=True)
+class Base:
+    """Base parameters of a model.
+
+    Attributes:
+        setup: of the regressor.
+        told: which parameters a regressor determines.
+        names: (p,) of the parameters that stand for the base parameters.
+        truth: (p,) base parameters of Table 13's machine.
+        sizes: (p,) sizes to which errors are compared.
+    """
+
+    setup: RegressorSetup
+    told: Identifiability
+    names: tuple[str, ...]
+    truth: np.ndarray
+    sizes: np.ndarray
+
+    def estimate(self, motion: Motion, forces: np.ndarray) -> np.ndarray:
+        """Estimate the base parameters by least squares.
+
+        Args:
+            motion: measured.
+            forces: (n, 3) measured torque and forces [N m], [N]; or (c, n, 3), c cases.
+
+        Returns:
+            (p,), or (c, p); singular values at rounding count as zero, columns having length 1.
+
+        Source: Khoshzaban 1992, p. 99, Eq. 4.58; p. 100.
+        """
+        rows = self.rows(motion)
+        length = np.linalg.norm(rows, axis=0)
+        right = forces.reshape(*forces.shape[:-2], -1).T
+        q, r = np.linalg.qr(rows / length)
+        return np.linalg.lstsq(r, q.T @ right, rcond=_ROUNDING)[0].T / length
+
+    def rows(self, motion: Motion) -> np.ndarray:
+        """(3 n, p) equations of the base parameters."""
+        return stack_rows(make_regressor(self.setup, motion))[:, self.told.base]
+
+
+_ROUNDING = 1e-13  # of the largest singular value: some hundred times the rounding of doubles
+_STATES = 300  # random states; each has three equations, and there are at most 82 parameters
+
+
+@cache
+def find_base(model: Model, ball_joints: bool = True) -> Base:
+    """Base parameters of a model, by random states.
+
+    Args:
+        model: `complete` or `reduced`.
+        ball_joints: as of `document_setup`.
+
+    Returns:
+        The base parameters.
+    """
+    setup = document_setup(model, ball_joints)
+    table = make_regressor(setup, draw_states(_STATES))
+    told = identifiability(stack_rows(table), table.names, table.units)
+    usual = np.sqrt(np.mean((table.matrix @ table.nominal) ** 2, axis=0))
+    return Base(
+        setup, told, tuple(table.names[b] for b in told.base), told.combination @ table.nominal,
+        reference_sizes(table, setup, usual)[told.base],
+    )  # fmt: skip
