@@ -158,7 +158,9 @@ def hexapod_mechanism(
                     for k, kind in enumerate(kinds)))
         for leg in range(6)
     )  # fmt: skip
-    return Mechanism(name, chains, frozenset(f"link{leg}.{k}" for leg in range(6) for k in straight))
+    return Mechanism(
+        name, chains, frozenset(f"link{leg}.{k}" for leg in range(6) for k in straight)
+    )
 
 
 def delta_mechanism() -> Mechanism:

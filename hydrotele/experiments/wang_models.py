@@ -134,12 +134,14 @@ _SERIAL: dict[str, tuple[JointKind, ...]] = {
 
 def measure_parameter_counts(seed: int, changes: Changes) -> Sample:
     """Compare counts of parameters with ranks of identification Jacobians."""
-    settings = change_settings({"locked_joints": 0}, changes)
+    settings = change_settings({"locked_joints": 0, "poses": 30}, changes)
 
     def rank(mechanism: Mechanism) -> int:
         measured = [name for name, joint in mechanism.joints.items() if joint.measured]
         locked = frozenset(measured[: settings["locked_joints"]])
-        return identifiable_rank(mechanism, np.random.default_rng(seed), 30, unmoved=locked)
+        return identifiable_rank(
+            mechanism, np.random.default_rng(seed), settings["poses"], unmoved=locked
+        )
 
     values: dict[str, float] = {"hexapod": rank(STRAIGHT_HEXAPOD)}
     values["robot"] = rank(carriage_with_hexapod(straight=True))
@@ -218,7 +220,9 @@ def _judge_first_order(samples: Sequence[Sample]) -> Judgement:
 def _judge_growth(samples: Sequence[Sample]) -> Judgement:
     checks = []
     for name, words in (("errors", "errors"), ("structure", "lengths and travels")):
-        pairs = np.array([(s.values[f"omitted {name}"], s.values["omitted usual"]) for s in samples])
+        pairs = np.array(
+            [(s.values[f"omitted {name}"], s.values["omitted usual"]) for s in samples]
+        )
         checks.append(check_statistic(
             f"second-order error with doubled {words} over the usual one", pairs,
             lambda rows: float(np.sqrt(np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
@@ -345,7 +349,7 @@ PARAMETER_COUNTS = Experiment(
             '"the universal joint and the spherical joint can be simplified as a coordinate'
             ' point"; "the number of parameter errors for the Hexa-WH is 42"',
             "Eq. 27, section 3.1.2 (p. 34)", "document", _judge_hexapod,
-            {"locked_joints": 5}, "five legs never change their lengths",
+            {"poses": 6}, "six poses are measured, which give 36 equations",
         ),
     ),
     repetitions_fixed=1,

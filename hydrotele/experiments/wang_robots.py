@@ -100,7 +100,9 @@ def simulate_robot(
     return SimulatedRobot(model, errors, robot, measurement, random_poses(nominal, 25, rng, wires))
 
 
-def pose_errors_at_test_poses(simulated: SimulatedRobot, robot: Hybrid) -> tuple[np.ndarray, np.ndarray]:
+def pose_errors_at_test_poses(
+    simulated: SimulatedRobot, robot: Hybrid
+) -> tuple[np.ndarray, np.ndarray]:
     """Errors of a robot's forward kinematics at the test poses: (M,) [m] and (M,) [rad]."""
     difference = pose_difference(
         forward(robot, *simulated.test_commands), forward(simulated.robot, *simulated.test_commands)
@@ -167,4 +169,3 @@ def caption_claim(
         name, item=item, quote=quote, kind="caption", draw=draw,
         judge=lambda samples: Judgement(note=note(samples)),
     )  # fmt: skip
-
