@@ -5,62 +5,28 @@ figures that follow only the captions are known, so that their rows have simulat
 verdict. Dimensions, sensor noise and errors are assumptions (models/iwr/README.md).
 """
 
-from collections.abc import Sequence
+from hydrotele.experiments import wang_calibration, wang_identification, wang_models
+from hydrotele.experiments.comparison import Series
 
-import numpy as np
-
-from hydrotele.calibrate.estimation import Prior
-from hydrotele.calibrate.hybrid import (
-    Calibration,
-    Equations,
-    calibrate,
-    equations,
-    null_directions,
-    redundancy,
-    subset,
-)
-from hydrotele.calibrate.posterior import evolve, sample_posterior
-from hydrotele.experiments.comparison import (
-    Changes,
-    Check,
-    Claim,
-    Experiment,
-    Judgement,
-    Marginals,
-    Panel,
-    Sample,
-    Series,
-)
-from hydrotele.experiments.intervals import (
-    check_fraction,
-    check_mean,
-    check_statistic,
-    collect,
-    format_values,
-)
-from hydrotele.experiments.wang_models import EXPERIMENTS as MODEL_EXPERIMENTS
-from hydrotele.experiments.wang_models import MAX_ROUNDING
-from hydrotele.experiments.wang_robots import (
-    REQUIRED_ACCURACY,
-    SENSOR_NOISE,
-    DrawnClaim,
-    Drawing,
-    SimulatedRobot,
-    caption_claim,
-    change_settings,
-    pose_errors_at_test_poses,
-    root_mean_square,
-    simulate_robot,
-)
-from hydrotele.kinematics.hybrid import (
-    Hybrid,
-    document_parameters,
-    error_model,
-    forward,
-    inverse,
-    leg_readings,
-    load_hybrid,
-    pose_difference,
-)
-from hydrotele.kinematics.wires import pose_covariance, pose_of_wires, wire_lengths
-from hydrotele.simulate.hybrid import TILT, random_poses, shipped_wires
+SERIES = Series(
+    "wang2012",
+    "Y. Wang, Novel methods for error modeling and parameter identification of a redundant"
+    " serial-parallel hybrid robot, thesis, Lappeenranta 2012",
+    20,
+    (*wang_models.EXPERIMENTS, *wang_identification.EXPERIMENTS, *wang_calibration.EXPERIMENTS),
+    drawings={
+        "Fig. 1": "picture of the fusion reactor ITER",
+        "Fig. 2": "photograph of the robot",
+        "Fig. 3": "drawing of a SCARA robot",
+        "Fig. 4": "drawing of the Denavit-Hartenberg convention",
+        "Fig. 5": "drawing of the carriage's frames",
+        "Fig. 6": "drawing of the hexapod's frames",
+        "Fig. 7": "drawing of the robot",
+        "Fig. 8": "drawing of the reference configuration",
+        "Fig. 9": "flowchart of differential evolution",
+        "Fig. 22": "drawing of the 3-2-1 wire measurement",
+        "Fig. 23": "drawing of the trilateration",
+        "Fig. 24": "picture of the 3-2-1 wire measurement in the CAD model",
+    },
+)  # fmt: skip
+"""All tables and figures of the document."""
