@@ -6,8 +6,8 @@ error in all six directions, and the rank of the identification Jacobian is what
 identify.
 
 Source: Wang 2012, Eqs 4 and 5 (pages 23 and 24), after Mooring, Roth and Driels 1991 and Vischer
-1996; P. Vischer and R. Clavel, Kinematic calibration of the parallel Delta robot, Robotica 16 (1998)
-207-218 (the Delta robot's 54 parameters).
+1996; P. Vischer and R. Clavel, Kinematic calibration of the parallel Delta robot, Robotica 16
+(1998) 207-218 (the Delta robot's 54 parameters).
 """
 
 from collections.abc import Mapping

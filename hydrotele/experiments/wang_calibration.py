@@ -108,7 +108,7 @@ def _judge_minimality(samples: Sequence[Sample]) -> Judgement:
                          pairs, lambda rows: float(np.sqrt(
                              np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
                          (1.0, np.inf), '"deteriorate"'),),
-        note="robots with errors in the 36 parameters only; of 54 the 50 independent are identified",
+        note="robots with errors in the 36 parameters only; of the 54, 50 are identified",
     )  # fmt: skip
 
 
@@ -385,8 +385,10 @@ POE = Experiment(
         ),
         caption_claim("kinematic parameters of the POE model", "Table 6 (p. 56)",
                       '"Kinematic parameters in the reference configuration"', _describe_axes),
-        caption_claim("POE model: carriage", "Table 7 (p. 57)",
-                      '"Nominal and identified parameters of carriage"', _describe_part("carriage")),
+        caption_claim(
+            "POE model: carriage", "Table 7 (p. 57)",
+            '"Nominal and identified parameters of carriage"', _describe_part("carriage"),
+        ),
         caption_claim("POE model: hexapod", "Table 8 (p. 57)",
                       '"Nominal and identified parameters of the Hexa-WH (unit: mm)"',
                       _describe_part("hexapod")),

@@ -22,11 +22,13 @@ from hydrotele.experiments.wang_robots import (
     Drawing,
     caption_claim,
     change_settings,
+    measure_nominal_robot,
     pose_errors_at_test_poses,
     root_mean_square,
     simulate_robot,
 )
 from hydrotele.kinematics.hybrid import Kind, document_parameters, error_model, load_hybrid
+from hydrotele.simulate.hybrid import TILT
 
 MAX_RHAT = 1.1
 """Largest split R-hat of chains that have mixed: Gelman et al., Bayesian Data Analysis, 11.4."""
@@ -78,8 +80,9 @@ def measure_redundancy(seed: int, changes: Changes) -> Sample:
     )  # fmt: skip
     analysed = eq
     if settings["tilt_of_jacobian"] is not None:
-        other = simulate_robot(400 + seed, 25, document=False, tilt=settings["tilt_of_jacobian"])
-        analysed = equations(other.model, other.measurement)
+        analysed = equations(
+            simulated.model, measure_nominal_robot(25, seed, settings["tilt_of_jacobian"])
+        )
     found = redundancy(analysed)
     _, singular, rows = np.linalg.svd(analysed.jacobian(fit.values) * scales)
     scaled = (posterior.flat - posterior.mean) / scales
@@ -203,22 +206,21 @@ def _judge_refined_posterior(samples: Sequence[Sample]) -> Judgement:
 
 def measure_rank(seed: int, changes: Changes) -> Sample:
     """Count independent parameters, and calibrate a robot with errors in all 54 with 36 of them."""
-    settings = change_settings({"tilt": None}, changes)
-    tilt = {} if settings["tilt"] is None else {"tilt": settings["tilt"]}
-    nominal = load_hybrid("iwr")
-    simulated = simulate_robot(600 + seed, 25, document=False, **tilt)
-    still = simulate_robot(600 + seed, 60, document=False, noise=0.0, tilt=0.0).measurement
+    settings = change_settings({"tilt": TILT}, changes)
+    nominal, simulated = load_hybrid("iwr"), simulate_robot(600 + seed, 25, document=False)
+    measured = measure_nominal_robot(60, seed, settings["tilt"])
+    untilted = measure_nominal_robot(60, seed, 0.0)
     values: dict[str, float] = {}
     for kind in ("dh", "poe"):
         model = error_model(nominal, kind)
-        found = redundancy(equations(model, simulated.measurement))
+        found = redundancy(equations(model, measured))
         values[f"rank {kind}"] = found.rank
-        values[f"rank {kind} without tilt"] = redundancy(equations(model, still)).rank
+        values[f"rank {kind} without tilt"] = redundancy(equations(model, untilted)).rank
         if kind == "dh":
             values["told"] = len(found.told)
             singular = found.singular
     names = document_parameters(simulated.model)
-    values["rank of 36"] = redundancy(equations(simulated.model, simulated.measurement, names)).rank
+    values["rank of 36"] = redundancy(equations(simulated.model, measured, names)).rank
     for label, chosen in (("36", names), ("54", None)):
         robot = calibrate(nominal, simulated.measurement, "dh", chosen).robot
         values[f"error with {label}"] = root_mean_square(
@@ -239,12 +241,12 @@ def _judge_rank(samples: Sequence[Sample]) -> Judgement:
         (check_mean("independent parameters of the 54", collect(samples, "rank dh"), (36.0, 36.0),
                     "the refined model has as many, and must be minimal (p. 24)",
                     published=36.0),),
-        f"Four parameters are redundant: theta4, d4, a4 and alpha4 move the connecting platform as a"
-        f" common displacement of A1 to A6 does. Only without tilt of the platform A_i and B_i"
+        f"Four parameters are redundant: theta4, d4, a4 and alpha4 move the connecting platform as"
+        f" a common displacement of A1 to A6 does. Only without tilt of the platform A_i and B_i"
         f" cannot be distinguished; then the rank is {number('rank dh without tilt')} (D-H) or"
         f" {number('rank poe without tilt')} (POE). 36 parameters do not describe a robot with"
-        f" errors in all 54: RMS position error {format_values(samples, 'error with 36', 1e3, 2)} mm"
-        f" at test poses, {format_values(samples, 'error with 54', 1e3, 3)} mm with all"
+        f" errors in all 54: RMS position error {format_values(samples, 'error with 36', 1e3, 2)}"
+        f" mm at test poses, {format_values(samples, 'error with 54', 1e3, 3)} mm with all"
         " independent ones.",
         f"{number('told')} are known better than half of 1 mm or 1 mrad with this noise; the 36"
         f" have rank {number('rank of 36')}",
@@ -358,7 +360,8 @@ REDUNDANCY = Experiment(
         ),
         *(caption_claim(
             f"posterior of Fig. {figure}", f"Fig. {figure} (p. {page})",
-            f'"2D marginal posterior distributions and 1D marginal density for parameters {words}."',
+            '"2D marginal posterior distributions and 1D marginal density for parameters'
+            f' {words}."',
             _describe_correlation(figure, names), _draw_posterior(names),
         ) for figure, (page, names, words) in CAPTIONS.items()),
     ),
@@ -372,8 +375,9 @@ RANK = Experiment(
             "54 parameters are refined to 36",
             '"for the 54-parameter model"; "for the refined 36-parameter model"; "The kinematic'
             ' model must contain only a minimal number of parameters and the redundant parameters'
-            ' have to be eliminated"', "titles of Tables 3 to 5 (p. 47, 53, 54), section 2.1 (p. 24)",
-            "document", _judge_rank, {"tilt": 0.0}, "the platform never tilts",
+            ' have to be eliminated"', 
+            "titles of Tables 3 to 5 (p. 47, 53, 54), section 2.1 (p. 24)", "document",
+            _judge_rank, {"tilt": 0.0}, "the platform never tilts",
         ),
     ),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Wang 2012, chapters 2 and 3: kinematics, numbers of parameters and error models of the IWR robot."""
+"""Wang 2012, chapters 2 and 3: kinematics, numbers of parameters and error models."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,6 @@ import numpy as np
 
 from hydrotele.calibrate.parameter_count import (
     Chain,
-    Joint,
     JointKind,
     Mechanism,
     count_serial_parameters,
@@ -78,16 +77,17 @@ def measure_kinematics(seed: int, changes: Changes) -> Sample:
 
 
 def _judge_carriage(samples: Sequence[Sample]) -> Judgement:
-    return Judgement((check_exact(
-        "largest difference of a coordinate", samples[0].values["difference"], (0.0, MAX_ROUNDING),
-        "rounding", unit="m",
-    ),), note="200 random poses. Minus signs are lost in the available text; Table 1 decides them")  # fmt: skip
+    return Judgement(
+        (check_exact("largest difference of a coordinate", samples[0].values["difference"],
+                     (0.0, MAX_ROUNDING), "rounding", unit="m"),),
+        note="200 random poses; minus signs are lost in the available text, Table 1 decides them",
+    )  # fmt: skip
 
 
 def _judge_model_size(samples: Sequence[Sample]) -> Judgement:
     values = samples[0].values
     return Judgement(tuple(
-        check_exact(f"parameter errors of the {part}", values[part], (count, count),
+        check_exact(f"parameter errors of the {part}", values[part], (float(count), float(count)),
                     "as printed", published=count)
         for part, count in (("carriage", 12), ("hexapod", 42))
     ))  # fmt: skip
@@ -161,7 +161,7 @@ def _judge_counts(names: Sequence[str], note: str):
         values = samples[0].values
         return Judgement(tuple(
             check_exact(f"independent parameters of the {name}", values[f"rank {name}"],
-                        (values[f"count {name}"],) * 2, "the formula",
+                        (values[f"count {name}"], values[f"count {name}"]), "the formula",
                         published=values[f"count {name}"])
             for name in names
         ), note=note)  # fmt: skip
@@ -296,9 +296,9 @@ def _judge_forward_kinematics(samples: Sequence[Sample]) -> Judgement:
         (check_mean("largest error of a coordinate by DE", values,
                     (-np.inf, 1e1 * REQUIRED_ACCURACY),
                     "a hundredth of the required accuracy, page 19", unit="mm or mrad"),),
-        note=f"against Newton's method at {len(samples)} random poses; the closed-chain MuJoCo model"
-        f" differs by {largest['mechanism']:.1e} m or rad, and the inverse kinematics gives the"
-        f" leg lengths back to {largest['inverse']:.1e} m",
+        note=f"against Newton's method at {len(samples)} random poses; the closed-chain"
+        f" MuJoCo model differs by {largest['mechanism']:.1e} m or rad, and the inverse kinematics"
+        f" gives the leg lengths back to {largest['inverse']:.1e} m",
     )  # fmt: skip
 
 

@@ -33,6 +33,7 @@ from hydrotele.kinematics.hybrid import (
     load_hybrid,
     pose_difference,
 )
+from hydrotele.kinematics.wires import wire_lengths
 from hydrotele.simulate.hybrid import (
     TILT,
     manufactured_errors,
@@ -71,7 +72,6 @@ class SimulatedRobot(NamedTuple):
 
 def simulate_robot(
     seed: int, poses: int, kind: Kind = "dh", document: bool = True, noise: float = 1.0,
-    tilt: float = TILT,
 ) -> SimulatedRobot:  # fmt: skip
     """Simulate a robot with errors of 1 mm and 1 mrad (standard deviations) and measure it.
 
@@ -81,7 +81,6 @@ def simulate_robot(
         kind: error model of the errors.
         document: whether only the 36 parameters of the document's refined model have errors.
         noise: factor on `SENSOR_NOISE`; 0 measures exactly.
-        tilt: largest tilt of the platform [rad].
 
     Returns:
         The robot with 25 further poses to test it.
@@ -91,13 +90,27 @@ def simulate_robot(
     errors = manufactured_errors(model, rng, document_parameters(model) if document else None)
     robot = corrected(model, errors)
     sizes = {name: noise * size for name, size in SENSOR_NOISE.items()}
-    commands = random_poses(nominal, poses, rng, wires, tilt=tilt)
+    commands = random_poses(nominal, poses, rng, wires)
     read = measured_poses(robot, *commands, wires, sizes, rng)
     stated = sizes if noise > 0.0 else SENSOR_NOISE
     measurement = measurement_of_wires(
         nominal, read.joints, read.legs, read.wires, wires, stated, f"simulated robot {seed}"
     )
     return SimulatedRobot(model, errors, robot, measurement, random_poses(nominal, 25, rng, wires))
+
+
+def measure_nominal_robot(poses: int, seed: int, tilt: float = TILT) -> Measurement:
+    """Measure the robot without errors exactly.
+
+    Args:
+        poses: number of poses.
+        seed: of the poses.
+        tilt: largest tilt of the platform against the connecting platform [rad].
+    """
+    robot, wires = load_hybrid("iwr"), shipped_wires()
+    joints, legs = random_poses(robot, poses, np.random.default_rng([_SEED, seed]), tilt=tilt)
+    lengths = wire_lengths(wires, forward(robot, joints, legs))
+    return measurement_of_wires(robot, joints, legs, lengths, wires, SENSOR_NOISE, "exact")
 
 
 def pose_errors_at_test_poses(
