@@ -11,7 +11,11 @@ import numpy as np
 from hydrotele.calibrate.hybrid import Equations, calibrate, equations, informative_poses, subset
 from hydrotele.calibrate.hybrid_data import measurement_of_wires
 from hydrotele.calibrate.posterior import sample_posterior
-from hydrotele.experiments.wang2012 import NOISE, trial, unused_errors
+from hydrotele.experiments.wang_robots import (
+    SENSOR_NOISE,
+    pose_errors_at_test_poses,
+    simulate_robot,
+)
 from hydrotele.kinematics.hybrid import (
     corrected,
     document_parameters,
@@ -36,7 +40,7 @@ def coverage(trials: int) -> None:
     """Bias, standard deviation and 95 % intervals of the 36 parameters."""
     found, truth, deviations, inside, before, after = [], [], [], [], [], []
     for seed in range(trials):
-        one = trial(3000 + seed, 25)
+        one = simulate_robot(3000 + seed, 25)
         fit = (done := calibrate(IWR, one.measurement, "dh", DOCUMENT)).fit
         at = one.model.index(fit.names)
         found.append(fit.values)
@@ -44,8 +48,8 @@ def coverage(trials: int) -> None:
         deviations.append(fit.deviations)
         low, high = fit.intervals.T
         inside.append((one.errors[at] > low) & (one.errors[at] < high))
-        before.append(unused_errors(one, IWR)[0])
-        after.append(unused_errors(one, done.robot)[0])
+        before.append(pose_errors_at_test_poses(one, IWR)[0])
+        after.append(pose_errors_at_test_poses(one, done.robot)[0])
     away = (np.array(found) - truth) / np.array(deviations)
     share = np.mean(inside, axis=0)
     bias = away.mean(axis=0) * np.sqrt(trials)
@@ -59,10 +63,10 @@ def coverage(trials: int) -> None:
         f" standard deviation over the stated one {away.std(axis=0).min():.3f} to"
         f" {away.std(axis=0).max():.3f}"
     )
-    _say_unused(before, after)
+    _print_test_errors(before, after)
 
 
-def _say_unused(before, after) -> None:
+def _print_test_errors(before, after) -> None:
     rms = [1e3 * np.sqrt(np.mean(np.square(e), axis=1)) for e in (before, after)]
     largest = 1e3 * np.max(after, axis=1)
     print(
@@ -78,7 +82,7 @@ def all54(trials: int) -> None:
     for kind in ("dh", "poe"):
         inside, chi, before, after, ranks = [], [], [], [], set()
         for seed in range(trials):
-            one = trial(4000 + seed, 25, kind, document=False)
+            one = simulate_robot(4000 + seed, 25, kind, document=False)
             done = calibrate(IWR, one.measurement, kind)
             fit, told = done.fit, done.fit.told
             row = told.combination
@@ -87,13 +91,13 @@ def all54(trials: int) -> None:
             inside.append(np.abs(estimate - row @ one.errors) < fit.critical * size)
             chi.append(fit.chi)
             ranks.add(done.redundancy.rank)
-            before.append(unused_errors(one, IWR)[0])
-            after.append(unused_errors(one, done.robot)[0])
+            before.append(pose_errors_at_test_poses(one, IWR)[0])
+            after.append(pose_errors_at_test_poses(one, done.robot)[0])
         print(
             f"{trials} trials, {kind}, 54 planted, rank {ranks}: 95 % intervals of the"
             f" combinations hold {100 * np.mean(inside):.2f} %; chi {np.mean(chi):.3f}"
         )
-        _say_unused(before, after)
+        _print_test_errors(before, after)
 
 
 def noise(trials: int) -> None:
@@ -104,9 +108,9 @@ def noise(trials: int) -> None:
     for factor in (0.25, 0.5, 1.0, 2.0, 4.0):
         errors = []
         for seed in range(trials):
-            one = trial(5000 + seed, 25, noise=factor)
+            one = simulate_robot(5000 + seed, 25, noise=factor)
             done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
-            errors.append(unused_errors(one, done.robot)[0])
+            errors.append(pose_errors_at_test_poses(one, done.robot)[0])
         print(
             f"| {factor:g} x | {1e3 * np.sqrt(np.mean(np.square(errors))):.4f} |"
             f" {1e3 * np.max(errors):.4f} |"
@@ -120,13 +124,15 @@ def poses(trials: int) -> None:
     for count in (15, 20, 25, 50, 100, 200):
         errors, whole, took = [], [], 0.0
         for seed in range(trials):
-            one = trial(6000 + seed, count)
+            one = simulate_robot(6000 + seed, count)
             begin = time.process_time()
             done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
             took += time.process_time() - begin
-            errors.append(unused_errors(one, done.robot)[0])
-            other = trial(6500 + seed, count, document=False)
-            whole.append(unused_errors(other, calibrate(IWR, other.measurement, "dh").robot)[0])
+            errors.append(pose_errors_at_test_poses(one, done.robot)[0])
+            other = simulate_robot(6500 + seed, count, document=False)
+            whole.append(
+                pose_errors_at_test_poses(other, calibrate(IWR, other.measurement, "dh").robot)[0]
+            )
         sizes = [1e3 * np.sqrt(np.mean(np.square(e))) for e in (errors, whole)]
         print(f"| {count} | {sizes[0]:.4f} | {sizes[1]:.4f} | {took / trials:.2f} |")
 
@@ -141,14 +147,14 @@ def choice(trials: int) -> None:
         built = corrected(model, planted)
         joints, legs = random_poses(IWR, 200, rng, wires)
         lengths = wire_lengths(wires, forward(IWR, joints, legs))
-        exact = measurement_of_wires(IWR, joints, legs, lengths, wires, NOISE, "candidates")
+        exact = measurement_of_wires(IWR, joints, legs, lengths, wires, SENSOR_NOISE, "candidates")
         unused = random_poses(IWR, 50, rng, wires)
         for name, found in errors.items():
             places = (np.arange(20) if name == "random"
                       else informative_poses(model, exact, 20, name))  # fmt: skip
-            read = measured_poses(built, joints[places], legs[places], wires, NOISE, rng)
+            read = measured_poses(built, joints[places], legs[places], wires, SENSOR_NOISE, rng)
             measured = measurement_of_wires(
-                IWR, read.joints, read.legs, read.wires, wires, NOISE, name
+                IWR, read.joints, read.legs, read.wires, wires, SENSOR_NOISE, name
             )
             robot = calibrate(IWR, measured, "dh").robot
             away = forward(robot, *unused).position - forward(built, *unused).position
@@ -165,7 +171,7 @@ def posterior(trials: int) -> None:
     """Whether posteriors of MCMC hold the planted errors."""
     inside, agree = [], []
     for seed in range(trials):
-        one = trial(7000 + seed, 25)
+        one = simulate_robot(7000 + seed, 25)
         done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
         eq, fit = subset(done), done.fit
         sample = sample_posterior(
@@ -188,7 +194,7 @@ def speed(trials: int) -> None:
     print("| model | poses | 1e5 likelihoods, CPU seconds of one core |\n| --- | ---: | ---: |")
     for kind in ("dh", "poe"):
         for count in (25, 50, 100, 200):
-            one = trial(8000, count, kind, document=False)
+            one = simulate_robot(8000, count, kind, document=False)
             eq: Equations = equations(error_model(IWR, kind), one.measurement)
             values = rng.normal(size=(100, 54)) * eq.scales
             eq.misfit(values)

@@ -30,7 +30,7 @@ class Evolution:
         values: (p,) best parameters.
         cost: its cost.
         generations: made.
-        evaluations: of the cost.
+        evaluations: number of parameter sets whose cost was computed.
         converged: whether the population agreed before `generations` ran out.
         history: (generations,) best cost of each.
     """
@@ -73,8 +73,11 @@ def evolve(
     """
     low, high = np.asarray(low, float), np.asarray(high, float)
     history: list[float] = []
+    evaluations = 0
 
     def batch(x: np.ndarray) -> np.ndarray:
+        nonlocal evaluations  # SciPy counts a whole population as one
+        evaluations += x.shape[1] if x.ndim == 2 else 1
         found = cost(np.ascontiguousarray(x.T) if x.ndim == 2 else x[None])
         return found if x.ndim == 2 else found[0]
 
@@ -88,7 +91,7 @@ def evolve(
         polish=False, init="latinhypercube", rng=np.random.default_rng(seed), vectorized=True,
         updating="deferred", callback=watch,
     )  # fmt: skip
-    return Evolution(found.x, float(found.fun), int(found.nit), int(found.nfev),
+    return Evolution(found.x, float(found.fun), int(found.nit), evaluations,
                      len(history) > 0 and found.nit < generations, np.array(history))  # fmt: skip
 
 

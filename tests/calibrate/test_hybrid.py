@@ -20,7 +20,13 @@ from hydrotele.calibrate.posterior import (
     split_rhat,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.experiments.wang2012 import covered, trial, unused_errors
+from hydrotele.experiments.wang_identification import measure_rank
+from hydrotele.experiments.wang_robots import (
+    SENSOR_NOISE,
+    count_covered_errors,
+    pose_errors_at_test_poses,
+    simulate_robot,
+)
 from hydrotele.kinematics.hybrid import document_parameters, error_model, load_hybrid
 
 IWR = load_hybrid("iwr")
@@ -28,7 +34,7 @@ DOCUMENT = document_parameters(error_model(IWR, "dh"))
 
 
 def test_36_exact_errors_come_back():
-    one = trial(1, 25, noise=0.0)
+    one = simulate_robot(1, 25, noise=0.0)
     done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
     assert done.redundancy.rank == 36
     kept = one.model.index(done.fit.names)
@@ -38,7 +44,7 @@ def test_36_exact_errors_come_back():
 
 @pytest.mark.parametrize(("kind", "rank"), [("dh", 50), ("poe", 54)])
 def test_combinations_of_all_54_exact_errors_come_back(kind, rank):
-    one = trial(2, 25, kind, document=False, noise=0.0)
+    one = simulate_robot(2, 25, kind, document=False, noise=0.0)
     done = calibrate(IWR, one.measurement, kind)
     assert done.redundancy.rank == rank
     away = (done.errors - one.errors) / one.model.scales
@@ -48,11 +54,11 @@ def test_combinations_of_all_54_exact_errors_come_back(kind, rank):
     assert np.abs(found).max() < 2e-5 and size.max() > 1e-3
     if kind == "poe":
         assert np.abs(away).max() < 1e-6
-    assert max(e.max() for e in unused_errors(one, done.robot)) < 1e-8
+    assert max(e.max() for e in pose_errors_at_test_poses(one, done.robot)) < 1e-8
 
 
 def test_redundancy_is_told_in_words_and_by_its_directions():
-    one = trial(3, 30, document=False)
+    one = simulate_robot(3, 30, document=False)
     eq = equations(one.model, one.measurement)
     told = redundancy(eq)
     assert (told.rank, len(told.held), told.directions.shape) == (50, 4, (4, 54))
@@ -68,15 +74,13 @@ def test_redundancy_is_told_in_words_and_by_its_directions():
 
 
 def test_without_tilt_universal_and_spherical_joints_cannot_be_told_apart():
-    from hydrotele.experiments.wang2012 import _without_tilt
-
-    assert _without_tilt() == (32, 36)
+    values = measure_rank(1, {}).values
+    assert (values["rank dh without tilt"], values["rank poe without tilt"]) == (32, 36)
 
 
 @pytest.mark.parametrize("joint", [0, 1, 2, 3])
 def test_a_joint_that_never_moves_leaves_parameters_unknown_by_name(joint):
     from hydrotele.calibrate.hybrid_data import measurement_of_wires
-    from hydrotele.experiments.wang2012 import NOISE
     from hydrotele.kinematics.hybrid import forward, leg_readings
     from hydrotele.kinematics.wires import wire_lengths
     from hydrotele.simulate.hybrid import random_poses, shipped_wires
@@ -86,7 +90,7 @@ def test_a_joint_that_never_moves_leaves_parameters_unknown_by_name(joint):
     pose, wires = forward(IWR, joints, legs), shipped_wires()
     assert np.allclose(leg_readings(IWR, joints, pose), legs)
     measured = measurement_of_wires(
-        IWR, joints, legs, wire_lengths(wires, pose), wires, NOISE, "still"
+        IWR, joints, legs, wire_lengths(wires, pose), wires, SENSOR_NOISE, "still"
     )
     done = calibrate(IWR, measured, "poe")
     assert done.redundancy.rank < 54
@@ -97,10 +101,10 @@ def test_a_joint_that_never_moves_leaves_parameters_unknown_by_name(joint):
 
 def test_noisy_errors_shrink_from_millimetres_to_below_a_tenth_at_poses_not_used():
     for document, names in ((True, DOCUMENT), (False, None)):
-        one = trial(5, 25, document=document)
+        one = simulate_robot(5, 25, document=document)
         done = calibrate(IWR, one.measurement, "dh", names)
-        before = 1e3 * unused_errors(one, IWR)[0]
-        after = 1e3 * unused_errors(one, done.robot)[0]
+        before = 1e3 * pose_errors_at_test_poses(one, IWR)[0]
+        after = 1e3 * pose_errors_at_test_poses(one, done.robot)[0]
         assert np.sqrt(np.mean(before**2)) > 1.0
         assert np.sqrt(np.mean(after**2)) < 0.1  # the accuracy of Wang 2012, page 19
         assert 0.7 < done.fit.chi < 1.3  # 100 degrees of freedom: 1 +- 0.07
@@ -108,14 +112,14 @@ def test_noisy_errors_shrink_from_millimetres_to_below_a_tenth_at_poses_not_used
 
 def test_intervals_hold_the_planted_errors():
     """12 trials of 36: 432, correlated within a trial; 95 % +- 3 % are seen in twelve."""
-    inside, total = np.sum([covered(seed) for seed in range(500, 512)], axis=0)
+    inside, total = np.sum([count_covered_errors(seed) for seed in range(500, 512)], axis=0)
     assert 0.90 < inside / total < 0.99
 
 
 def test_without_stated_noise_it_is_estimated():
     from dataclasses import replace
 
-    one = trial(6, 25)
+    one = simulate_robot(6, 25)
     known = calibrate(IWR, one.measurement, "dh", DOCUMENT)
     unknown = calibrate(IWR, replace(one.measurement, stated=False), "dh", DOCUMENT)
     assert np.allclose(known.fit.values, unknown.fit.values, atol=1e-9)
@@ -123,7 +127,7 @@ def test_without_stated_noise_it_is_estimated():
 
 
 def test_left_out_poses_are_predicted_as_by_calibrations_without_them():
-    one = trial(7, 20)
+    one = simulate_robot(7, 20)
     done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
     for k in (0, 11):
         without = calibrate(IWR, one.measurement.subset(np.arange(20) != k), "dh", DOCUMENT)
@@ -133,27 +137,27 @@ def test_left_out_poses_are_predicted_as_by_calibrations_without_them():
 
 
 def test_a_wrong_reading_is_found_and_left_out():
-    one = trial(8, 25)
+    one = simulate_robot(8, 25)
     legs = one.measurement.legs.copy()
     legs[13, 2] += 0.003
     from dataclasses import replace
 
     done = calibrate(IWR, replace(one.measurement, legs=legs), "dh", DOCUMENT)
     assert done.wrong == (13,)
-    clean = [calibrate(IWR, trial(seed, 25).measurement, "dh", DOCUMENT).wrong
+    clean = [calibrate(IWR, simulate_robot(seed, 25).measurement, "dh", DOCUMENT).wrong
              for seed in range(20, 26)]  # fmt: skip
     assert clean == [()] * 6
 
 
 def test_the_better_model_is_chosen_where_the_frame_of_the_measurement_is_off():
     """D-H rows begin in frame 0; lines of axes need not."""
-    one = trial(9, 40, "poe", document=False)
+    one = simulate_robot(9, 40, "poe", document=False)
     assert best(IWR, one.measurement).model.kind == "poe"
-    assert best(IWR, trial(9, 40, "dh", document=False).measurement).model.kind == "dh"
+    assert best(IWR, simulate_robot(9, 40, "dh", document=False).measurement).model.kind == "dh"
 
 
 def test_too_few_poses_are_refused():
-    one = trial(10, 25)
+    one = simulate_robot(10, 25)
     with pytest.raises(InputError, match="8 different poses give 48 equations for 54 parameters"):
         calibrate(IWR, one.measurement.subset(np.arange(8)), "dh")
     same = one.measurement.subset(np.zeros(25, int))
@@ -164,7 +168,7 @@ def test_too_few_poses_are_refused():
 def test_what_is_no_error_of_manufacture_is_warned_of():
     from dataclasses import replace
 
-    one = trial(13, 25)
+    one = simulate_robot(13, 25)
     assert calibrate(IWR, one.measurement, "dh", DOCUMENT).warnings == ()
     shifted = replace(one.measurement, legs=one.measurement.legs + 0.03)
     (said,) = calibrate(IWR, shifted, "dh", DOCUMENT).warnings
@@ -176,7 +180,7 @@ def test_what_is_no_error_of_manufacture_is_warned_of():
 
 def test_three_methods_agree_on_a_few_parameters():
     """Five parameters, for time; the experiments do the 36."""
-    one = trial(11, 8)
+    one = simulate_robot(11, 8)
     names = ("theta3", "a3", "b1x", "b6z", "l4")
     done = calibrate(IWR, one.measurement, "dh", names)
     eq, fit = subset(done), done.fit

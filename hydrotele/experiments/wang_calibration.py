@@ -1,0 +1,460 @@
+"""Wang 2012, chapters 4 and 5: calibrations by least squares, and the 3-2-1 wire measurement."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hydrotele.calibrate.hybrid import calibrate
+from hydrotele.experiments.comparison import (
+    Changes,
+    Claim,
+    Experiment,
+    Judgement,
+    Panel,
+    Sample,
+)
+from hydrotele.experiments.intervals import (
+    check_fraction,
+    check_mean,
+    check_statistic,
+    collect,
+    format_values,
+)
+from hydrotele.experiments.wang_models import MAX_ROUNDING
+from hydrotele.experiments.wang_robots import (
+    REQUIRED_ACCURACY,
+    SENSOR_NOISE,
+    SimulatedRobot,
+    caption_claim,
+    change_settings,
+    pose_errors_at_test_poses,
+    root_mean_square,
+    simulate_robot,
+)
+from hydrotele.kinematics.hybrid import (
+    Hybrid,
+    document_parameters,
+    forward,
+    inverse,
+    leg_readings,
+    load_hybrid,
+    pose_difference,
+)
+from hydrotele.kinematics.wires import pose_covariance, pose_of_wires, wire_lengths
+from hydrotele.simulate.hybrid import random_poses, shipped_wires
+
+ACCURACY_REASON = "high accuracy (±0.1 mm), page 19, RMS"
+
+POSE_LABEL = "pose [1]"
+
+
+def _panel(label: str, before: np.ndarray, after: np.ndarray) -> Panel:
+    """Errors before and after at numbered poses; the latter also on an axis of their own."""
+    return Panel(
+        label, np.arange(1, len(before) + 1), {"before": 1e3 * before, "after": 1e3 * after},
+        POSE_LABEL, discrete=True, errors={"after": 1e3 * after}, error_label=label,
+    )  # fmt: skip
+
+
+def _check_accuracy(quantity: str, samples: Sequence[Sample], name: str):
+    return check_mean(quantity, 1e3 * collect(samples, name), (-np.inf, 1e3 * REQUIRED_ACCURACY),
+                      ACCURACY_REASON, unit="mm")  # fmt: skip
+
+
+def _describe_change(samples: Sequence[Sample], name: str, unit: str = "mm") -> str:
+    return (
+        f"{format_values(samples, f'{name} before', 1e3, 2)} {unit} before,"
+        f" {format_values(samples, f'{name} after', 1e3, 3)} {unit} after calibration"
+    )
+
+
+def measure_refined(seed: int, changes: Changes) -> Sample:
+    """Calibrate a robot with errors in the 36 parameters by least squares, from 25 poses."""
+    settings = change_settings(
+        {"document": True, "noise": 1.0, "stated_noise": 1.0, "exact_noise": 0.0}, changes
+    )
+    nominal = load_hybrid("iwr")
+    simulated = simulate_robot(
+        1000 + seed, 25, document=settings["document"], noise=settings["noise"]
+    )
+    measurement = simulated.measurement
+    covariance = measurement.covariance * settings["stated_noise"] ** 2
+    measurement = replace(measurement, covariance=covariance)
+    names = document_parameters(simulated.model)
+    done = calibrate(nominal, measurement, "dh", names)
+    truth = simulated.errors[simulated.model.index(done.fit.names)]
+    low, high = done.fit.intervals.T
+    exact = simulate_robot(1000 + seed, 25, noise=settings["exact_noise"])
+    recovered = calibrate(nominal, exact.measurement, "dh", names).fit
+    before = pose_errors_at_test_poses(simulated, nominal)[0]
+    after = pose_errors_at_test_poses(simulated, done.robot)[0]
+    complete = calibrate(nominal, measurement, "dh").robot
+    return Sample(
+        {"position before": root_mean_square(before), "position after": root_mean_square(after),
+         "largest": float(after.max()),
+         "with 54": root_mean_square(pose_errors_at_test_poses(simulated, complete)[0]),
+         "inside": float(np.mean((truth > low) & (truth < high))),
+         "exact": float(np.abs(
+             recovered.values - exact.errors[exact.model.index(recovered.names)]).max())},
+        (_panel("position error at test poses [mm]", before, after),),
+    )  # fmt: skip
+
+
+def _judge_minimality(samples: Sequence[Sample]) -> Judgement:
+    pairs = np.array([(s.values["with 54"], s.values["position after"]) for s in samples])
+    return Judgement(
+        (check_statistic("RMS error at test poses with the 54 parameters over that with the 36",
+                         pairs, lambda rows: float(np.sqrt(
+                             np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
+                         (1.0, np.inf), '"deteriorate"'),),
+        note="robots with errors in the 36 parameters only; of the 54, 50 are identified",
+    )  # fmt: skip
+
+
+def _judge_accurate_model(samples: Sequence[Sample]) -> Judgement:
+    within = [sample.values["largest"] < REQUIRED_ACCURACY for sample in samples]
+    return Judgement(
+        (_check_accuracy("RMS position error at 25 test poses", samples, "position after"),
+         check_fraction("robots with all 25 poses within 0.1 mm", within, (0.5, 1.0),
+                        "more than half of the robots; the publication had one")),
+        "The sensor noise is an assumption; errors grow in proportion to it.",
+        f"RMS {format_values(samples, 'position before', 1e3, 2)} mm before",
+    )  # fmt: skip
+
+
+def _judge_intervals(samples: Sequence[Sample]) -> Judgement:
+    return Judgement((check_mean(
+        "assumed errors within their 95 % intervals", 100.0 * collect(samples, "inside"),
+        (92.0, 98.0), "95 %; 3 % more or less are a standard deviation that is wrong by a sixth",
+        unit="%"),))  # fmt: skip
+
+
+def _judge_exact(samples: Sequence[Sample]) -> Judgement:
+    return Judgement((check_mean(
+        "largest error of an identified parameter", collect(samples, "exact"),
+        (-np.inf, MAX_ROUNDING), "rounding", unit="m or rad"),))  # fmt: skip
+
+
+def measure_poe(seed: int, changes: Changes) -> Sample:
+    """Calibrate a robot with errors in all 54 parameters of the POE model from 25 poses."""
+    settings = change_settings({"noise": 1.0}, changes)
+    nominal = load_hybrid("iwr")
+    simulated = simulate_robot(900 + seed, 25, "poe", document=False, noise=settings["noise"])
+    done = calibrate(nominal, simulated.measurement, "poe")
+    test = pose_errors_at_test_poses(simulated, done.robot)[0]
+    truth, found = simulated.errors, done.errors
+    count = simulated.model.carriage_count
+    values = {
+        "rank": done.redundancy.rank,
+        "position before": root_mean_square(done.before.position),
+        "position after": root_mean_square(done.after.position),
+        "test": root_mean_square(test),
+        "better": float(np.mean(done.after.position < done.before.position)),
+    }
+    for part, at in (("carriage", slice(0, count)), ("hexapod", slice(count, None))):
+        values[f"assumed {part}"] = root_mean_square(truth[at])
+        values[f"missed {part}"] = root_mean_square((found - truth)[at])
+    axes = simulated.model.nominal.facts.axes
+    arrays = {"axes": np.array([(*row.direction, *row.point) for row in axes])}
+    panel = _panel("position error [mm]", done.before.position, done.after.position)
+    return Sample(values, (panel,), arrays)
+
+
+def _judge_poe(samples: Sequence[Sample]) -> Judgement:
+    return Judgement(
+        (check_mean("independent parameters of the 54", collect(samples, "rank"), (54.0, 54.0),
+                    "all: complete and minimal"),
+         _check_accuracy("RMS position error at 25 test poses", samples, "test")),
+        "The sensor noise is an assumption; errors grow in proportion to it.",
+        f"RMS at the measured poses {_describe_change(samples, 'position')}",
+    )  # fmt: skip
+
+
+def _describe_part(part: str):
+    def describe(samples: Sequence[Sample]) -> str:
+        return (f"RMS of the assumed errors {format_values(samples, f'assumed {part}', 1e3, 2)}, of"
+                f" identified less assumed {format_values(samples, f'missed {part}', 1e3, 2)}"
+                " (mm or mrad)")  # fmt: skip
+
+    return describe
+
+
+def _describe_axes(samples: Sequence[Sample]) -> str:
+    rows = [f"({', '.join(f'{v:.0f}' for v in row[:3])}) through"
+            f" ({', '.join(f'{1e3 * v:.0f}' for v in row[3:])}) mm"
+            for row in samples[0].arrays["axes"]]  # fmt: skip
+    return f"axes of the carriage at joint positions 0: {'; '.join(rows)}; lengths are assumptions"
+
+
+def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
+    """Calibrate a robot with errors in all 54 parameters from 20 poses that wires measure."""
+    settings = change_settings({"noise": 1.0}, changes)
+    nominal = load_hybrid("iwr")
+    simulated = simulate_robot(1300 + seed, 20, document=False, noise=settings["noise"])
+    m = simulated.measurement
+    done = calibrate(nominal, m, "dh")
+    legs = [np.abs(leg_readings(robot, m.joints, m.pose) - m.legs).max(axis=1)
+            for robot in (nominal, done.robot)]  # fmt: skip
+    test = pose_errors_at_test_poses(simulated, done.robot)[0]
+    reached = [_reach_desired_poses(simulated, robot) for robot in (nominal, done.robot)]
+    truth, found = simulated.errors, done.errors
+    values = {
+        "leg before": float(legs[0].max()),
+        "leg after": float(legs[1].max()),
+        "test": root_mean_square(test),
+        "reached before": root_mean_square(reached[0]),
+        "reached after": root_mean_square(reached[1]),
+        "assumed": root_mean_square(truth),
+        "missed": root_mean_square(found - truth),
+        "rank": done.redundancy.rank,
+        "least legs": float(m.legs.min()),
+        "most legs": float(m.legs.max()),
+    }
+    for name, errors in (("before", done.before), ("after", done.after)):
+        values[f"position {name}"] = root_mean_square(errors.position)
+        values[f"orientation {name}"] = root_mean_square(errors.orientation)
+    panels = (
+        _panel("largest leg error [mm]", *legs),
+        _panel("orientation error [mrad]", done.before.orientation, done.after.orientation),
+        _panel("position error [mm]", done.before.position, done.after.position),
+        _panel("error of the reached position [mm]", *reached),
+    )
+    return Sample(values, panels)
+
+
+def _reach_desired_poses(simulated: SimulatedRobot, robot: Hybrid) -> np.ndarray:
+    """(M,) position errors [m] where a robot's inverse kinematics command the true robot."""
+    joints, legs = simulated.test_commands
+    desired = forward(load_hybrid("iwr"), joints, legs)
+    reached = forward(simulated.robot, joints, inverse(robot, desired, joints))
+    return np.linalg.norm(pose_difference(reached, desired)[:, :3], axis=1)
+
+
+def _judge_whole_robot(samples: Sequence[Sample]) -> Judgement:
+    return Judgement(
+        (_check_accuracy("RMS position error at 25 test poses", samples, "test"),),
+        "The sensor noise is an assumption; errors grow in proportion to it.",
+        f"from 20 platform poses; {format_values(samples, 'rank', digits=0)} of 54 parameters are"
+        " identified, the others are redundant",
+    )  # fmt: skip
+
+
+def _judge_correction(samples: Sequence[Sample]) -> Judgement:
+    return Judgement(
+        (_check_accuracy("RMS error of the reached position", samples, "reached after"),),
+        "The sensor noise is an assumption; errors grow in proportion to it.",
+        f"25 desired poses by the inverse kinematics; RMS"
+        f" {format_values(samples, 'reached before', 1e3, 2)} mm with the nominal robot",
+    )  # fmt: skip
+
+
+def _describe_range(name: str, words: str):
+    def describe(samples: Sequence[Sample]) -> str:
+        low, high = (format_values(samples[:1], f"{end} {name}", digits=2)
+                     for end in ("least", "most"))  # fmt: skip
+        return f"{words} {low} to {high} (m or rad), first robot"
+
+    return describe
+
+
+def measure_wire_method(seed: int, changes: Changes) -> Sample:
+    """Compute poses from exact and from noisy wire lengths."""
+    settings = change_settings({"noise": 1.0}, changes)
+    robot, wires, rng = load_hybrid("iwr"), shipped_wires(), np.random.default_rng(seed)
+    joints, legs = random_poses(robot, 100, rng, wires)
+    pose = forward(robot, joints, legs)
+    lengths = wire_lengths(wires, pose)
+    exact = np.abs(pose_difference(pose_of_wires(wires, lengths, pose), pose)).max()
+    sigma = SENSOR_NOISE["wire"]
+    covariance = pose_covariance(wires, pose, sigma)
+    noisy = lengths + settings["noise"] * sigma * rng.normal(size=lengths.shape)
+    away = pose_difference(pose_of_wires(wires, noisy, pose), pose)
+    squares = np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariance), away)
+    position, turn = (float(np.median(np.linalg.norm(away[:, k : k + 3], axis=1))) for k in (0, 3))
+    return Sample({
+        "exact": float(exact), "squares": float(np.mean(squares) / 6.0), "position": position,
+        "orientation": turn,
+        "least joints": float(joints.min()), "most joints": float(joints.max()),
+        "shortest": float(lengths.min()), "longest": float(lengths.max()),
+    })  # fmt: skip
+
+
+def _judge_wires(samples: Sequence[Sample]) -> Judgement:
+    return Judgement(
+        (check_mean("largest error of a pose from exact lengths", collect(samples, "exact"),
+                    (-np.inf, MAX_ROUNDING), "rounding", unit="m or rad"),
+         check_mean("squared pose error over that of the propagated covariance",
+                    collect(samples, "squares"), (0.9, 1.1),
+                    "1; within it standard deviations are right to 5 %")),
+    )  # fmt: skip
+
+
+def _describe_wire_poses(samples: Sequence[Sample]) -> str:
+    first = samples[0].values
+    return (
+        f"wires of {first['shortest']:.2f} to {first['longest']:.2f} m with errors of"
+        f" {1e3 * SENSOR_NOISE['wire']:g} mm (standard deviation) give the pose to"
+        f" {format_values(samples, 'position', 1e3, 3)} mm and"
+        f" {format_values(samples, 'orientation', 1e3, 3)} mrad (medians)"
+    )
+
+
+def _describe_wire_points(samples: Sequence[Sample]) -> str:
+    wires = shipped_wires()
+    anchors = "; ".join(str(tuple(round(1e3 * v) for v in point)) for point in wires.anchors)
+    points = "; ".join(str(tuple(round(1e3 * v) for v in point)) for point in wires.points)
+    return f"anchors {anchors} mm; platform points {points} mm; all are assumptions"
+
+
+POSES = Experiment(
+    "3-2-1 wires", measure_wire_method,
+    (
+        caption_claim(
+            "poses and carriage displacements", "Table 2 (p. 43)",
+            '"Randomly generated end-effector poses and carriage-joint displacements (unit: mm for'
+            ' lengths and rad. for angles)"', _describe_range("joints", "carriage joints from"),
+        ),
+        Claim(
+            "3-2-1 wires: pose by three spheres",
+            "Six wire lengths give the pose, with errors as the propagated covariance states.",
+            "section 5.1", "additional", _judge_wires, {"noise": 1.5},
+            "the wires' noise is 1.5 times the stated one",
+        ),
+        caption_claim(
+            "hexagon and end-effector points", "Table 10 (p. 69)",
+            '"The hexagon vertex coordinate values with respect to the reference frame and three'
+            ' end-effector points coordinate values with respect to the moving platform"',
+            _describe_wire_points,
+        ),
+        caption_claim(
+            "wire lengths and calculated poses", "Table 12 (p. 70)",
+            '"Measured wire lengths in the Solidworks model and the corresponding calculated'
+            ' end-effector poses based on the 3-2-1 pose estimation method"', _describe_wire_poses,
+        ),
+    ),
+)  # fmt: skip
+
+REFINED = Experiment(
+    "36 parameters by least squares", measure_refined,
+    (
+        Claim(
+            "redundant parameters deteriorate the identification",
+            '"the redundant parameters have to be eliminated since they would deteriorate the'
+            ' identification result"', "section 2.1 (p. 24)", "document", _judge_minimality,
+            {"document": False}, "the robot has errors in all 54 parameters", panels=(),
+        ),
+        Claim(
+            "accurate kinematic model",
+            '"the identified parameter errors are substituted into the error model to obtain an'
+            ' accurate kinematic model"; "high accuracy (±0.1 mm) for the assembly robot"',
+            "section 1.1 (p. 21, 19)", "document", _judge_accurate_model, {"noise": 10.0},
+            "ten times the sensor noise",
+        ),
+        caption_claim(
+            "36 parameters, without measurement noise", "Table 4 (p. 53)",
+            '"Nominal values, assumed errors, identified posterior mean values, and standard'
+            ' deviations for the refined 36-parameter model (without measurement noise)"',
+            lambda samples: "least squares returns every assumed error to"
+            f" {max(s.values['exact'] for s in samples):.1e} m or rad",
+        ),
+        Claim(
+            "exact measurements return the 36 assumed errors",
+            "Without noise the 36 identified errors are the assumed ones.", "section 4.2.2",
+            "additional", _judge_exact, {"exact_noise": 0.01},
+            "1 % of the sensor noise is added", panels=(),
+        ),
+        Claim(
+            "intervals of the 36 parameters",
+            "95 % of the assumed errors are within the 95 % intervals of least squares.",
+            "section 4.2.3", "additional", _judge_intervals, {"stated_noise": 0.5},
+            "half of the true noise is stated", panels=(),
+        ),
+    ),
+)  # fmt: skip
+
+POE = Experiment(
+    "POE model: 25 poses", measure_poe,
+    (
+        Claim(
+            "POE model of the hybrid robot",
+            '"Extending the product-of-exponentials (POE) modeling and calibration method from a'
+            ' serial robot to a redundant serial-parallel hybrid robot"; "high accuracy (±0.1 mm)'
+            ' for the assembly robot"', "section 1.3 (p. 22), section 1.1 (p. 19)", "document",
+            _judge_poe, {"noise": 10.0}, "ten times the sensor noise",
+        ),
+        caption_claim("kinematic parameters of the POE model", "Table 6 (p. 56)",
+                      '"Kinematic parameters in the reference configuration"', _describe_axes),
+        caption_claim(
+            "POE model: carriage", "Table 7 (p. 57)",
+            '"Nominal and identified parameters of carriage"', _describe_part("carriage"),
+        ),
+        caption_claim("POE model: hexapod", "Table 8 (p. 57)",
+                      '"Nominal and identified parameters of the Hexa-WH (unit: mm)"',
+                      _describe_part("hexapod")),
+        caption_claim(
+            "POE model: 25 poses before and after", "Table 9, Figs 20 and 21 (p. 60, 61)",
+            '"Results of 25 end-effector poses before and after calibration"; "Position errors'
+            ' before calibration in the 25 end-effector pose configurations."; "Position errors'
+            ' after calibration in the 25 end-effector pose configurations."',
+            lambda samples: f"position RMS {_describe_change(samples, 'position')}",
+            lambda samples: (samples[0].panels, None),
+        ),
+    ),
+)  # fmt: skip
+
+WIRE_CALIBRATION = Experiment(
+    "20 poses with wires", measure_wire_calibration,
+    (
+        Claim(
+            "the whole robot from platform poses",
+            '"the two hybrid parts do not need to be calibrated separately but can be regarded as a'
+            ' whole, and then the pose measurement of the end-effector can fulfill the calibration'
+            ' purpose effectively"; "high accuracy (±0.1 mm) for the assembly robot"',
+            "section 2.1 (p. 25), section 1.1 (p. 19)", "document", _judge_whole_robot,
+            {"noise": 10.0}, "ten times the sensor noise", panels=(),
+        ),
+        Claim(
+            "correction in the controller",
+            '"to compensate them in the robot controller so as to make the error model match the'
+            ' real robot as closely as possible"; "high accuracy (±0.1 mm) for the assembly robot"',
+            "section 1.1 (p. 20, 19)", "document", _judge_correction, {"noise": 10.0},
+            "ten times the sensor noise", panels=("error of the reached position [mm]",),
+        ),
+        caption_claim("actuated-joint displacements", "Table 11 (p. 69)",
+                      '"Measured actuated-joint displacements in the Solidworks environment"',
+                      _describe_range("legs", "legs from")),
+        caption_claim(
+            "identified parameters of the hybrid robot", "Table 13 (p. 72)",
+            '"Nominal and identified parameters of the hybrid IWR robot (unit: mm)"',
+            lambda samples: f"RMS of the assumed errors {format_values(samples, 'assumed', 1e3, 2)}"
+            " mm or mrad; of identified less assumed"
+            f" {format_values(samples, 'missed', 1e3, 2)}, since A_i and the last link are"
+            " identified in combinations only",
+        ),
+        caption_claim(
+            "legs before and after calibration", "Table 14, Figs 25 and 26 (p. 73, 74)",
+            '"Leg errors before calibration in 20 pose configurations."; "Leg errors after'
+            ' calibration in 20 pose configurations."',
+            lambda samples: f"largest leg error {_describe_change(samples, 'leg')}",
+            lambda samples: (samples[0].panels[:1], None),
+        ),
+        caption_claim(
+            "orientation before and after calibration", "Table 15, Figs 27 and 28 (p. 75, 76)",
+            '"Orientation errors before calibration in 20 pose configurations."; "Orientaion errors'
+            ' after calibration in 20 pose configurations."',
+            lambda samples: f"RMS {_describe_change(samples, 'orientation', 'mrad')}",
+            lambda samples: (samples[0].panels[1:2], None),
+        ),
+        caption_claim(
+            "position before and after calibration", "Table 15, Figs 29 and 30 (p. 75, 77)",
+            '"Position errors before calibration in 20 pose configurations."; "Position errors'
+            ' after calibration in 20 pose configurations"',
+            lambda samples: f"RMS {_describe_change(samples, 'position')}",
+            lambda samples: (samples[0].panels[2:3], None),
+        ),
+    ),
+)  # fmt: skip
+
+EXPERIMENTS = (REFINED, POE, POSES, WIRE_CALIBRATION)
+"""In the order of the document."""

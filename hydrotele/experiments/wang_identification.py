@@ -1,0 +1,423 @@
+"""Wang 2012, chapter 4: redundancy and identification by differential evolution and MCMC."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hydrotele.calibrate.estimation import Prior
+from hydrotele.calibrate.hybrid import calibrate, equations, redundancy, subset
+from hydrotele.calibrate.posterior import Posterior, evolve, sample_posterior
+from hydrotele.experiments.comparison import (
+    Changes,
+    Check,
+    Claim,
+    Experiment,
+    Judgement,
+    Marginals,
+    Panel,
+    Sample,
+)
+from hydrotele.experiments.intervals import check_mean, check_statistic, collect, format_values
+from hydrotele.experiments.wang_robots import (
+    Drawing,
+    caption_claim,
+    change_settings,
+    measure_nominal_robot,
+    pose_errors_at_test_poses,
+    root_mean_square,
+    simulate_robot,
+)
+from hydrotele.kinematics.hybrid import Kind, document_parameters, error_model, load_hybrid
+from hydrotele.simulate.hybrid import TILT
+
+MAX_RHAT = 1.1
+"""Largest split R-hat of chains that have mixed: Gelman et al., Bayesian Data Analysis, 11.4."""
+
+MAX_EXCESS = 0.5
+"""Log likelihood that DE may miss: the optimum's is changed so by one standard deviation of one
+parameter."""
+
+SEARCH_BOX = 5.0
+"""Half the edge of the box that DE searches, in standard deviations of the manufacturing errors."""
+
+KEPT_DRAWS = 4000
+"""Draws of a posterior that a sample keeps for its figure."""
+
+CAPTIONS = {
+    12: (49, ("a4", "theta4", "a1x", "a2x"), "δa4, δθ4, δa1x, δa2x"),
+    13: (50, ("a4", "a3x", "a4x", "a5x"), "δa4, δa3x, δa4x, δa5x"),
+    14: (50, ("d4", "a1y", "a2y", "a1x"), "δdd, δa1y, δa2y, δa1x"),
+    15: (51, ("d4", "a3y", "a4y", "a5y"), "δd4, δa3y, δa4y, δa5y"),
+    16: (51, ("theta4", "a1z", "a2z", "a3z"), "δθ4, δa1z, δa2z, δa3z"),
+    17: (52, ("alpha4", "a1z", "a2z", "a3z"), "δα4, δa1z, δa2z, δa3z"),
+}
+"""Figure -> page, parameters of this model, parameters as the caption prints them.
+
+The available text does not define the dd of Fig. 14, which is drawn as d4."""
+
+
+def _thin(posterior: Posterior) -> np.ndarray:
+    flat = posterior.flat
+    return flat[:: max(1, len(flat) // KEPT_DRAWS)]
+
+
+def measure_redundancy(seed: int, changes: Changes) -> Sample:
+    """Sample the posterior of the 54 parameters, and compare it with the null space by QR.
+
+    The prior is normal with the standard deviations of the manufacturing errors. Along the
+    parameter direction with singular value s of the scaled Jacobian, the posterior standard
+    deviation is 1 / sqrt(1 + s^2) of the prior's.
+    """
+    settings = change_settings({"tilt_of_jacobian": None, "steps": 4000}, changes)
+    simulated = simulate_robot(400 + seed, 25, document=False)
+    eq = equations(simulated.model, simulated.measurement)
+    scales, names = eq.scales, eq.names
+    prior = Prior(np.zeros(54), scales)
+    fit = calibrate(load_hybrid("iwr"), simulated.measurement, "dh", prior=prior).fit
+    posterior = sample_posterior(
+        lambda x: -eq.misfit(x) - 0.5 * np.sum((x / scales) ** 2, axis=1), fit.values,
+        fit.covariance, names, steps=settings["steps"], burn=200, walkers=110, seed=seed,
+    )  # fmt: skip
+    analysed = eq
+    if settings["tilt_of_jacobian"] is not None:
+        analysed = equations(
+            simulated.model, measure_nominal_robot(25, seed, settings["tilt_of_jacobian"])
+        )
+    found = redundancy(analysed)
+    _, singular, rows = np.linalg.svd(analysed.jacobian(fit.values) * scales)
+    scaled = (posterior.flat - posterior.mean) / scales
+    ratio = np.std(scaled @ rows.T, axis=0) * np.sqrt(1.0 + singular**2)
+    correlation = posterior.correlation
+    values = {
+        "redundant": float(len(found.held)),
+        "posterior over prior": float(np.std(scaled @ found.directions.T, axis=0).mean()),
+        "posterior over theory": float(np.sqrt(np.mean(ratio[: found.rank] ** 2))),
+        "rhat": float(posterior.rhat.max()),
+        "weak": float(np.sum(singular < 1.0)),
+    }
+    at = {name: k for k, name in enumerate(names)}
+    for figure, (_, shown, _) in CAPTIONS.items():
+        for name in shown[1:]:
+            values[f"{figure} {name}"] = float(correlation[at[shown[0]], at[name]])
+    for name in ("a4", "theta4", "a1x"):
+        values[f"mean {name}"] = 1e3 * float(posterior.mean[at[name]])
+        values[f"deviation {name}"] = 1e3 * float(posterior.deviations[at[name]])
+        values[f"assumed {name}"] = 1e3 * float(simulated.errors[at[name]])
+    arrays = {"draws": 1e3 * _thin(posterior), "truth": 1e3 * simulated.errors,
+              "names": np.array(names)}  # fmt: skip
+    return Sample(values, (), arrays)
+
+
+def _draw_posterior(names: tuple[str, ...]) -> Drawing:
+    def draw(samples: Sequence[Sample]):
+        arrays = samples[0].arrays
+        at = [list(arrays["names"]).index(name) for name in names]
+        return (), Marginals(names, arrays["draws"][:, at], arrays["truth"][at])
+
+    return draw
+
+
+def _check_rhat(samples: Sequence[Sample]) -> Check:
+    return check_mean("largest split R-hat of a parameter", collect(samples, "rhat"),
+                      (1.0, MAX_RHAT), "chains that have mixed, Gelman et al. 11.4")  # fmt: skip
+
+
+def _judge_redundancy(samples: Sequence[Sample]) -> Judgement:
+    return Judgement(
+        (check_mean("posterior over prior standard deviation along the redundant directions of QR",
+                    collect(samples, "posterior over prior"), (0.9, 1.1),
+                    "1: the data say nothing; 10 % is the error of a sampled standard deviation"),
+         check_mean("posterior standard deviation over that from the singular values, RMS over the"
+                    " other directions", collect(samples, "posterior over theory"), (0.9, 1.1),
+                    "1: both methods agree; 10 % as before"),
+         _check_rhat(samples)),
+        note=f"{format_values(samples, 'redundant', digits=0)} redundant parameters by QR; along"
+        f" {format_values(samples, 'weak', digits=0)} directions the data tell less than the prior"
+        " of 1 mm and 1 mrad",
+    )  # fmt: skip
+
+
+def _describe_correlation(figure: int, names: tuple[str, ...]):
+    def describe(samples: Sequence[Sample]) -> str:
+        parts = [f"{name} {format_values(samples, f'{figure} {name}', digits=2)}"
+                 for name in names[1:]]  # fmt: skip
+        return f"posterior correlation of {names[0]} with {', '.join(parts)}"
+
+    return describe
+
+
+def _describe_estimates(names: tuple[str, ...]):
+    def describe(samples: Sequence[Sample]) -> str:
+        first = samples[0].values
+        parts = [f"{name} assumed {first[f'assumed {name}']:.2f}, identified"
+                 f" {first[f'mean {name}']:.2f} ± {first[f'deviation {name}']:.2f}"
+                 for name in names]  # fmt: skip
+        return f"{'; '.join(parts)} (mm or mrad, first robot)"
+
+    return describe
+
+
+REFINED_NAMES = ("a4", "theta4", "b1x", "b6z")
+"""Parameters of the caption of Fig. 18."""
+
+
+def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
+    """Sample the posterior of the 36 parameters with sensor noise, and compare least squares."""
+    settings = change_settings({"chain_noise": 1.0, "steps": 4000}, changes)
+    simulated = simulate_robot(500 + seed, 25)
+    names = document_parameters(simulated.model)
+    done = calibrate(load_hybrid("iwr"), simulated.measurement, "dh", names)
+    eq, fit = subset(done), done.fit
+    weight = settings["chain_noise"] ** -2
+    posterior = sample_posterior(
+        lambda x: -weight * eq.misfit(x), fit.values, fit.covariance, eq.names,
+        steps=settings["steps"], burn=200, walkers=74, seed=seed,
+    )  # fmt: skip
+    truth = simulated.errors[simulated.model.index(names)]
+    low, high = posterior.intervals.T
+    values = {
+        "shift": float(np.abs((posterior.mean - fit.values) / fit.deviations).max()),
+        "ratio": root_mean_square(posterior.deviations / fit.deviations),
+        "inside": float(np.sum((truth > low) & (truth < high))),
+        "rhat": float(posterior.rhat.max()),
+    }
+    for name in REFINED_NAMES:
+        at = names.index(name)
+        values[f"mean {name}"] = 1e3 * float(posterior.mean[at])
+        values[f"deviation {name}"] = 1e3 * float(posterior.deviations[at])
+        values[f"assumed {name}"] = 1e3 * float(truth[at])
+    arrays = {"draws": 1e3 * _thin(posterior), "truth": 1e3 * truth, "names": np.array(names)}
+    return Sample(values, (), arrays)
+
+
+def _judge_refined_posterior(samples: Sequence[Sample]) -> Judgement:
+    return Judgement(
+        (check_mean("largest distance of a posterior mean from least squares, in standard"
+                    " deviations", collect(samples, "shift"), (-np.inf, 0.2),
+                    "an interval that is shifted so loses half a percent of its 95 %"),
+         check_mean("posterior over least-squares standard deviation, RMS of 36",
+                    collect(samples, "ratio"), (0.95, 1.05),
+                    "1; a 95 % interval that is 5 % too short holds 94 %"),
+         _check_rhat(samples)),
+        note=f"{format_values(samples, 'inside', digits=1)} of 36 assumed errors are within the"
+        " central 95 %",
+    )  # fmt: skip
+
+
+def measure_rank(seed: int, changes: Changes) -> Sample:
+    """Count independent parameters, and calibrate a robot with errors in all 54 with 36 of them."""
+    settings = change_settings({"tilt": TILT}, changes)
+    nominal, simulated = load_hybrid("iwr"), simulate_robot(600 + seed, 25, document=False)
+    measured = measure_nominal_robot(60, seed, settings["tilt"])
+    untilted = measure_nominal_robot(60, seed, 0.0)
+    values: dict[str, float] = {}
+    for kind in ("dh", "poe"):
+        model = error_model(nominal, kind)
+        found = redundancy(equations(model, measured))
+        values[f"rank {kind}"] = found.rank
+        values[f"rank {kind} without tilt"] = redundancy(equations(model, untilted)).rank
+        if kind == "dh":
+            values["told"] = len(found.told)
+            singular = found.singular
+    names = document_parameters(simulated.model)
+    values["rank of 36"] = redundancy(equations(simulated.model, measured, names)).rank
+    for label, chosen in (("36", names), ("54", None)):
+        robot = calibrate(nominal, simulated.measurement, "dh", chosen).robot
+        values[f"error with {label}"] = root_mean_square(
+            pose_errors_at_test_poses(simulated, robot)[0])  # fmt: skip
+    panel = Panel(
+        "singular value over the largest [1]", np.arange(1, 55),
+        {"Jacobian of 54 parameters, columns of length 1": np.maximum(singular, 1e-16)},
+        "number [1]", log=True, discrete=True,
+    )  # fmt: skip
+    return Sample(values, (panel,))
+
+
+def _judge_rank(samples: Sequence[Sample]) -> Judgement:
+    def number(name: str) -> str:
+        return format_values(samples, name, digits=0)
+
+    return Judgement(
+        (check_mean("independent parameters of the 54", collect(samples, "rank dh"), (36.0, 36.0),
+                    "the refined model has as many, and must be minimal (p. 24)",
+                    published=36.0),),
+        f"Four parameters are redundant: theta4, d4, a4 and alpha4 move the connecting platform as"
+        f" a common displacement of A1 to A6 does. Only without tilt of the platform A_i and B_i"
+        f" cannot be distinguished; then the rank is {number('rank dh without tilt')} (D-H) or"
+        f" {number('rank poe without tilt')} (POE). 36 parameters do not describe a robot with"
+        f" errors in all 54: RMS position error {format_values(samples, 'error with 36', 1e3, 2)}"
+        f" mm at test poses, {format_values(samples, 'error with 54', 1e3, 3)} mm with all"
+        " independent ones.",
+        f"{number('told')} are known better than half of 1 mm or 1 mrad with this noise; the 36"
+        f" have rank {number('rank of 36')}",
+    )  # fmt: skip
+
+
+def _measure_evolution(seed: int, changes: Changes, kind: Kind, poses: int) -> Sample:
+    settings = change_settings({"generations": 20000}, changes)
+    simulated = simulate_robot(seed, poses, kind)
+    names = document_parameters(simulated.model)
+    done = calibrate(load_hybrid("iwr"), simulated.measurement, simulated.model.kind, names)
+    eq = subset(done)
+    box = SEARCH_BOX * eq.scales
+    found = evolve(
+        eq.misfit, -box, box, seed=seed, agreement=1e-3, generations=settings["generations"]
+    )
+    optimum = float(eq.misfit(done.fit.values[~done.fit.held][None])[0])
+    return Sample(
+        {"excess": found.cost - optimum, "evaluations": float(found.evaluations),
+         "least squares": float(done.fit.evaluations + 2 * len(eq.names) * done.fit.iterations),
+         "generations": float(found.generations)},
+        arrays={"history": np.maximum(found.history - optimum, 1e-6)},
+    )  # fmt: skip
+
+
+def measure_evolution_dh(seed: int, changes: Changes) -> Sample:
+    """Identify the 36 parameters of the D-H model by DE from 15 poses."""
+    return _measure_evolution(100 + seed, changes, "dh", 15)
+
+
+def measure_evolution_poe(seed: int, changes: Changes) -> Sample:
+    """Identify 36 parameters of the POE model by DE from 25 poses."""
+    return _measure_evolution(200 + seed, changes, "poe", 25)
+
+
+def _judge_evolution(samples: Sequence[Sample]) -> Judgement:
+    effort = np.array([(s.values["evaluations"], s.values["least squares"]) for s in samples])
+    return Judgement(
+        (check_mean("negative log likelihood found by DE above that of least squares",
+                    collect(samples, "excess"), (-np.inf, MAX_EXCESS),
+                    "one standard deviation of one parameter"),
+         check_statistic("evaluations of the model by DE over those by least squares", effort,
+                         lambda rows: float(np.sum(rows[:, 0]) / np.sum(rows[:, 1])),
+                         (1.0, np.inf), '"less computation time" of the linearization, p. 25')),
+        note=f"DE begins anywhere within {SEARCH_BOX:g} standard deviations of the errors and ends"
+        f" after {format_values(samples, 'generations', digits=0)} generations",
+    )  # fmt: skip
+
+
+def _describe_evolution(samples: Sequence[Sample]) -> str:
+    return (
+        f"cost above the optimum {format_values(samples, 'excess', digits=3)} in units of log"
+        f" likelihood after {format_values(samples, 'generations', digits=0)} generations"
+    )
+
+
+def _draw_evolution(count: int) -> Drawing:
+    def draw(samples: Sequence[Sample]):
+        histories = [sample.arrays["history"] for sample in samples[:count]]
+        longest = max(map(len, histories))
+        curves = {f"data set {k}": np.pad(history, (0, longest - len(history)), mode="edge")
+                  for k, history in enumerate(histories, 1)}  # fmt: skip
+        panel = Panel("lowest cost above the optimum [log likelihood]", np.arange(1, longest + 1),
+                      curves, "generation [1]", log=True)  # fmt: skip
+        return (panel,), None
+
+    return draw
+
+
+EVOLUTION_DH = Experiment(
+    "D-H model by DE", measure_evolution_dh,
+    (
+        Claim(
+            "DE does not depend on initial values",
+            '"whether the initial values are close to the optimum solution or not is'
+            ' insignificant"; iterative linearization has "less computation time to converge"',
+            "section 2.2 (p. 25, 26)", "document", _judge_evolution, {"generations": 200},
+            "DE is stopped after 200 generations",
+        ),
+        caption_claim(
+            "DE on four data sets", "Fig. 10 (p. 45)",
+            '"Simulation results of four different data sets."',
+            lambda samples: _describe_evolution(samples[:4]), _draw_evolution(4),
+        ),
+        caption_claim(
+            "DE on five data sets of 15 poses", "Fig. 11 (p. 46)",
+            '"Simulation results of 15 measurement poses in five different data sets."',
+            _describe_evolution, _draw_evolution(5),
+        ),
+    ),
+    repetitions_fixed=5,
+)  # fmt: skip
+
+REDUNDANCY = Experiment(
+    "54 parameters by MCMC", measure_redundancy,
+    (
+        Claim(
+            "redundancy by MCMC and by QR",
+            '"the MCMC method has also been used to analyze parameter redundancy and parameter'
+            ' identifiability of the hybrid error model"; "the identifiable parameters are'
+            ' calculated from QR decomposition of the analytical observation matrix"',
+            "section 2.2 (p. 26), section 2.1 (p. 23)", "document", _judge_redundancy,
+            {"tilt_of_jacobian": 0.0}, "QR analyses poses without tilt, MCMC those with tilt",
+            panels=(),
+        ),
+        caption_claim(
+            "54 parameters, without measurement noise", "Table 3 (p. 47)",
+            '"Nominal values, assumed errors, identified posterior mean values, and standard'
+            ' deviations for the 54-parameter model (without measurement noise)"',
+            _describe_estimates(("a4", "theta4", "a1x")),
+        ),
+        *(caption_claim(
+            f"posterior of Fig. {figure}", f"Fig. {figure} (p. {page})",
+            '"2D marginal posterior distributions and 1D marginal density for parameters'
+            f' {words}."',
+            _describe_correlation(figure, names), _draw_posterior(names),
+        ) for figure, (page, names, words) in CAPTIONS.items()),
+    ),
+    max_repetitions=3,
+)  # fmt: skip
+
+RANK = Experiment(
+    "independent parameters", measure_rank,
+    (
+        Claim(
+            "54 parameters are refined to 36",
+            '"for the 54-parameter model"; "for the refined 36-parameter model"; "The kinematic'
+            ' model must contain only a minimal number of parameters and the redundant parameters'
+            ' have to be eliminated"', 
+            "titles of Tables 3 to 5 (p. 47, 53, 54), section 2.1 (p. 24)", "document",
+            _judge_rank, {"tilt": 0.0}, "the platform never tilts",
+        ),
+    ),
+)  # fmt: skip
+
+REFINED_POSTERIOR = Experiment(
+    "36 parameters by MCMC", measure_refined_posterior,
+    (
+        Claim(
+            "MCMC and least squares agree on 36 parameters",
+            "Posterior means and standard deviations of the 36 parameters with sensor noise are"
+            " those of least squares.", "Table 5, section 3.4", "additional",
+            _judge_refined_posterior, {"chain_noise": 2.0},
+            "the chain assumes twice the sensor noise", panels=(),
+        ),
+        caption_claim(
+            "36 parameters, with measurement noise", "Table 5 (p. 54)",
+            '"Nominal values, assumed errors, identified posterior mean values, and standard'
+            ' deviations for the refined 36-parameter model (with measurement noise)"',
+            _describe_estimates(REFINED_NAMES),
+        ),
+        caption_claim(
+            "posterior of Fig. 18", "Fig. 18 (p. 55)",
+            '"2D marginal posterior distributions and 1D marginal density for parameters δa4, δθ4,'
+            ' δb1x, δb6z."', _describe_estimates(REFINED_NAMES), _draw_posterior(REFINED_NAMES),
+        ),
+    ),
+    max_repetitions=3,
+)  # fmt: skip
+
+EVOLUTION_POE = Experiment(
+    "POE model by DE", measure_evolution_poe,
+    (
+        caption_claim(
+            "fitness of DE, POE model", "Fig. 19 (p. 59)",
+            '"Fitness values of four different runs with four different measurement data sets."',
+            _describe_evolution, _draw_evolution(4),
+        ),
+    ),
+    repetitions_fixed=4,
+)  # fmt: skip
+
+EXPERIMENTS = (EVOLUTION_DH, REDUNDANCY, RANK, REFINED_POSTERIOR, EVOLUTION_POE)
+"""In the order of the document."""

@@ -1,0 +1,407 @@
+"""Wang 2012, chapters 2 and 3: kinematics, numbers of parameters and error models."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from hydrotele.calibrate.parameter_count import (
+    Chain,
+    JointKind,
+    Mechanism,
+    count_serial_parameters,
+    delta_mechanism,
+    hexapod_mechanism,
+    identifiable_rank,
+    serial_mechanism,
+)
+from hydrotele.experiments.comparison import (
+    Changes,
+    Claim,
+    Experiment,
+    Judgement,
+    Panel,
+    Sample,
+)
+from hydrotele.experiments.intervals import (
+    check_exact,
+    check_mean,
+    check_statistic,
+    format_values,
+)
+from hydrotele.experiments.wang_robots import REQUIRED_ACCURACY, change_settings
+from hydrotele.kinematics.hybrid import (
+    Pose,
+    carriage_pose,
+    corrected,
+    error_model,
+    first_order,
+    forward,
+    forward_evolution,
+    hybrid_of,
+    leg_readings,
+    load_hybrid,
+    pose_difference,
+)
+from hydrotele.simulate.hybrid import (
+    hybrid_mechanism,
+    manufactured_errors,
+    mechanism_pose,
+    random_poses,
+)
+
+MAX_ROUNDING = 1e-9  # m and rad: far below any sensor, far above rounding
+
+
+def measure_kinematics(seed: int, changes: Changes) -> Sample:
+    """Compare the product of the D-H matrices with Eq. 7, and count the errors of the model."""
+    settings = change_settings({"third_twist": 0.5 * np.pi, "second_joint": "prismatic"}, changes)
+    robot, rng = load_hybrid("iwr"), np.random.default_rng(seed)
+    joints, _ = random_poses(robot, 200, rng)
+    rows = list(robot.facts.carriage)
+    rows[1] = rows[1].model_copy(update={"kind": settings["second_joint"]})
+    rows[2] = rows[2].model_copy(update={"alpha": settings["third_twist"]})
+    robot = hybrid_of(robot.facts.model_copy(update={"carriage": tuple(rows)}))
+    d1, d2, q3, q4 = joints.T
+    a3, d3, a4 = rows[2].a, rows[2].d, rows[3].a
+    c3, s3, c4, s4 = np.cos(q3), np.sin(q3), np.cos(q4), np.sin(q4)
+    printed = np.column_stack([
+        d3 + a4 * s4, -(d2 + a3 * s3 + a4 * s3 * c4), d1 + a3 * c3 + a4 * c3 * c4,
+    ])  # fmt: skip
+    model = error_model(robot, "dh")
+    difference = np.abs(carriage_pose(robot, joints)[:, :3, 3] - printed).max()
+    return Sample({
+        "difference": float(difference), "carriage": model.carriage_count,
+        "hexapod": len(model.names) - model.carriage_count,
+    })  # fmt: skip
+
+
+def _judge_carriage(samples: Sequence[Sample]) -> Judgement:
+    return Judgement(
+        (check_exact("largest difference of a coordinate", samples[0].values["difference"],
+                     (0.0, MAX_ROUNDING), "rounding", unit="m"),),
+        note="200 random poses; minus signs are lost in the available text, Table 1 decides them",
+    )  # fmt: skip
+
+
+def _judge_model_size(samples: Sequence[Sample]) -> Judgement:
+    values = samples[0].values
+    return Judgement(tuple(
+        check_exact(f"parameter errors of the {part}", values[part], (float(count), float(count)),
+                    "as printed", published=count)
+        for part, count in (("carriage", 12), ("hexapod", 42))
+    ))  # fmt: skip
+
+
+_TWO: tuple[JointKind, JointKind] = ("revolute", "revolute")
+_SLIDE: JointKind = "prismatic"
+_BALL: JointKind = "spherical"
+
+
+def carriage_with_hexapod(straight: bool) -> Mechanism:
+    """Build the IWR: a measured P P R R carriage that six S-P-S legs share.
+
+    Args:
+        straight: whether the slides' axes pass through both spherical joints, as in Wang Eq. 27.
+    """
+    carriage = serial_mechanism("", (_SLIDE, _SLIDE, *_TWO)).chains[0]
+    legs = hexapod_mechanism("", (_BALL, _SLIDE, _BALL), (1, 2) if straight else ())
+    chains = tuple(
+        Chain((*carriage.links[:-1], *leg.links), (*carriage.joints, *leg.joints))
+        for leg in legs.chains
+    )
+    return Mechanism("IWR", chains, legs.straight)
+
+
+MECHANISMS = {
+    "6-SPS hexapod": hexapod_mechanism("6-SPS", (_BALL, _SLIDE, _BALL)),
+    "6-UPS hexapod, universal joints of two hinges": hexapod_mechanism(
+        "6-UPS", (*_TWO, _SLIDE, _BALL)),
+    "6-RRPRRR hexapod": hexapod_mechanism("6-RRPRRR", (*_TWO, _SLIDE, *_TWO, "revolute")),
+    "Delta robot": delta_mechanism(),
+    "IWR with 6-SPS hexapod": carriage_with_hexapod(straight=False),
+}  # fmt: skip
+"""Mechanisms with loops and arbitrary dimensions, to which Eq. 5 is applied."""
+
+STRAIGHT_HEXAPOD = hexapod_mechanism("6-SPS", (_BALL, _SLIDE, _BALL), (1, 2))
+"""The hexapod of page 34: joints are points, and slides pass through both of them."""
+
+_SERIAL: dict[str, tuple[JointKind, ...]] = {
+    "carriage PPRR": (_SLIDE, _SLIDE, *_TWO), "SCARA RRPR": (*_TWO, _SLIDE, "revolute"),
+    "six hinges": (*_TWO, *_TWO, *_TWO),
+}  # fmt: skip
+
+
+def measure_parameter_counts(seed: int, changes: Changes) -> Sample:
+    """Compare counts of parameters with ranks of identification Jacobians."""
+    settings = change_settings({"locked_joints": 0, "poses": 30}, changes)
+
+    def rank(mechanism: Mechanism) -> int:
+        measured = [name for name, joint in mechanism.joints.items() if joint.measured]
+        locked = frozenset(measured[: settings["locked_joints"]])
+        return identifiable_rank(
+            mechanism, np.random.default_rng(seed), settings["poses"], unmoved=locked
+        )
+
+    values: dict[str, float] = {"hexapod": rank(STRAIGHT_HEXAPOD)}
+    values["robot"] = rank(carriage_with_hexapod(straight=True))
+    for name, kinds in _SERIAL.items():
+        values[f"rank {name}"] = rank(serial_mechanism(name, kinds))
+        values[f"count {name}"] = count_serial_parameters(
+            kinds.count("revolute"), kinds.count("prismatic")
+        )
+    for name, mechanism in MECHANISMS.items():
+        values[f"rank {name}"] = rank(mechanism)
+        values[f"count {name}"] = mechanism.count_parameters()
+    return Sample(values)
+
+
+def _judge_counts(names: Sequence[str], note: str):
+    def judge(samples: Sequence[Sample]) -> Judgement:
+        values = samples[0].values
+        return Judgement(tuple(
+            check_exact(f"independent parameters of the {name}", values[f"rank {name}"],
+                        (values[f"count {name}"], values[f"count {name}"]), "the formula",
+                        published=values[f"count {name}"])
+            for name in names
+        ), note=note)  # fmt: skip
+
+    return judge
+
+
+def _judge_hexapod(samples: Sequence[Sample]) -> Judgement:
+    values = samples[0].values
+    return Judgement(
+        (check_exact("independent parameters", values["hexapod"], (42, 42),
+                     "as many as the error model has: complete and minimal, page 23",
+                     published=42),),
+        note=f"Eq. 5 counts {MECHANISMS['6-SPS hexapod'].count_parameters()}, one more per leg, by"
+        " which the slide's axis misses the joints; with that offset zero its derivative is zero."
+        f" The IWR with such legs has {values['robot']:.0f} independent parameters",
+    )  # fmt: skip
+
+
+def measure_first_order(seed: int, changes: Changes) -> Sample:
+    """Measure what the first-order error model leaves out at the carriage's end."""
+    settings = change_settings({"error_size": 1.0, "growth": 2.0}, changes)
+    nominal, rng = load_hybrid("iwr"), np.random.default_rng(seed)
+    joints, _ = random_poses(nominal, 100, rng)
+    errors = manufactured_errors(error_model(nominal, "dh"), rng) * settings["error_size"]
+    growth = settings["growth"]
+    rows = tuple(row.model_copy(update={"a": growth * row.a, "d": growth * row.d})
+                 for row in nominal.facts.carriage)  # fmt: skip
+    larger = hybrid_of(nominal.facts.model_copy(update={"carriage": rows}))
+    stretched = joints * np.where(nominal.kinds == 0, growth, 1.0)
+    values = {}
+    for name, robot, planted, at in (
+        ("usual", nominal, errors, joints), ("errors", nominal, growth * errors, joints),
+        ("structure", larger, errors, stretched),
+    ):  # fmt: skip
+        model = error_model(robot, "dh")
+        true = carriage_pose(corrected(model, planted), at)[:, :3, 3]
+        linear = first_order(robot, planted[: model.carriage_count], at)[:, :3, 3]
+        unchanged = carriage_pose(robot, at)[:, :3, 3]
+        values[f"omitted {name}"] = float(np.linalg.norm(linear - true, axis=1).max())
+        values[f"moved {name}"] = float(np.linalg.norm(unchanged - true, axis=1).max())
+    return Sample(values)
+
+
+def _judge_first_order(samples: Sequence[Sample]) -> Judgement:
+    omitted = [1e3 * sample.values["omitted usual"] for sample in samples]
+    return Judgement(
+        (check_mean("largest position error of the first-order model, mean over robots",
+                    np.array(omitted), (-np.inf, 1e3 * REQUIRED_ACCURACY),
+                    "the accuracy that is required, page 19", unit="mm"),),
+        note=f"errors of 1 mm and 1 mrad move the carriage's end by"
+        f" {format_values(samples, 'moved usual', 1e3)} mm",
+    )  # fmt: skip
+
+
+def _judge_growth(samples: Sequence[Sample]) -> Judgement:
+    checks = []
+    for name, words in (("errors", "errors"), ("structure", "lengths and travels")):
+        pairs = np.array(
+            [(s.values[f"omitted {name}"], s.values["omitted usual"]) for s in samples]
+        )
+        checks.append(check_statistic(
+            f"second-order error with doubled {words} over the usual one", pairs,
+            lambda rows: float(np.sqrt(np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
+            (1.0, np.inf), "increases",
+        ))  # fmt: skip
+    return Judgement(tuple(checks))
+
+
+def measure_proportionality(seed: int, changes: Changes) -> Sample:
+    """Tilt the second of two axes by 0.1 to 10 mrad, and measure how much parameters change."""
+    settings = change_settings({"parallel": True}, changes)
+    rng = np.random.default_rng(seed)
+    distance, direction = rng.uniform(0.2, 0.5), rng.uniform(0.0, 2.0 * np.pi)
+    point = np.array([distance, 0.0, 0.0])
+    axis = np.array([0.0, 0.0, 1.0]) if settings["parallel"] else np.array([0.0, 1.0, 0.0])
+    across = np.cross(axis, [1.0, 0.0, 0.0])
+    tilt = np.cos(direction) * np.array([1.0, 0.0, 0.0]) + np.sin(direction) * across
+    angles = np.geomspace(1e-4, 1e-2, 9)
+    changed: dict[str, list[float]] = {"dh": [], "poe": []}
+    for angle in angles:
+        tilted = np.cos(angle) * axis + np.sin(angle) * tilt
+        common = np.cross([0.0, 0.0, 1.0], tilted)  # D-H: the common normal with the z axis
+        changed["dh"].append(abs(float(np.cross(point, tilted) @ common / (common @ common))))
+        moment = np.cross(point, tilted - axis)
+        changed["poe"].append(float(np.linalg.norm(np.r_[tilted - axis, moment])))
+    curves = {name: np.array(change) for name, change in changed.items()}
+    slopes = {name: float(np.polyfit(np.log(angles), np.log(change), 1)[0])
+              for name, change in curves.items()}  # fmt: skip
+    panel = Panel(
+        "change of the parameters [m or 1]", 1e3 * angles,
+        {"D-H: offset d along the first axis": curves["dh"],
+         "POE: direction and moment of the second axis": curves["poe"]},
+        "tilt of the second axis [mrad]", log=True, discrete=True,
+    )  # fmt: skip
+    return Sample({**slopes, "dh at 1 mrad": float(curves["dh"][4])}, (panel,))
+
+
+def _judge_proportionality(samples: Sequence[Sample]) -> Judgement:
+    exponents = {name: np.array([s.values[name] for s in samples]) for name in ("dh", "poe")}
+    return Judgement(
+        (check_mean("exponent of the change of d (D-H) with the tilt", exponents["dh"],
+                    (-np.inf, 0.0), "not proportional: it does not vanish with the tilt"),
+         check_mean("exponent of the change of the axis (POE) with the tilt", exponents["poe"],
+                    (0.99, 1.01), "proportional: 1, up to the second order of 10 mrad")),
+        note="two parallel hinges 0.2 to 0.5 m apart, tilts of 0.1 to 10 mrad; a tilt of 1 mrad"
+        f" changes d by {format_values(samples, 'dh at 1 mrad', 1.0, 0)} m",
+    )  # fmt: skip
+
+
+def measure_forward_kinematics(seed: int, changes: Changes) -> Sample:
+    """Solve the forward kinematics at one pose by DE, Newton's method and the MuJoCo mechanism."""
+    settings = change_settings({"reach": 0.35}, changes)
+    robot, rng = load_hybrid("iwr"), np.random.default_rng(seed)
+    joints, legs = random_poses(robot, 1, rng)
+    pose = forward(robot, joints, legs)
+    newton = Pose(pose.rotation[0], pose.position[0])
+    evolved = forward_evolution(robot, joints[0], legs[0], seed=seed, reach=settings["reach"])
+    model = hybrid_mechanism(robot).compile()
+    closed = mechanism_pose(model, mujoco.MjData(model), robot, joints[0], legs[0])
+    return Sample({
+        "evolution": float(np.abs(pose_difference(evolved, newton)).max()),
+        "mechanism": float(np.abs(pose_difference(closed, newton)).max()),
+        "inverse": float(np.abs(leg_readings(robot, joints, pose) - legs).max()),
+    })  # fmt: skip
+
+
+def _judge_forward_kinematics(samples: Sequence[Sample]) -> Judgement:
+    values = np.array([1e3 * sample.values["evolution"] for sample in samples])
+    largest = {name: max(s.values[name] for s in samples) for name in ("mechanism", "inverse")}
+    return Judgement(
+        (check_mean("largest error of a coordinate by DE", values,
+                    (-np.inf, 1e1 * REQUIRED_ACCURACY),
+                    "a hundredth of the required accuracy, page 19", unit="mm or mrad"),),
+        note=f"against Newton's method at {len(samples)} random poses; the closed-chain"
+        f" MuJoCo model differs by {largest['mechanism']:.1e} m or rad, and the inverse kinematics"
+        f" gives the leg lengths back to {largest['inverse']:.1e} m",
+    )  # fmt: skip
+
+
+KINEMATICS = Experiment(
+    "kinematics of the carriage", measure_kinematics,
+    (
+        Claim(
+            "carriage: forward kinematics",
+            "The product of the four D-H matrices of Table 1 is Eq. 7; its last column is (d3 + a4"
+            " s4, d2 + a3 s3 + a4 s3 c4, d1 + a3 c3 + a4 c3 c4).",
+            "Table 1, Eq. 7 (p. 29)", "input", _judge_carriage, {"third_twist": -0.5 * np.pi},
+            "the third link is twisted by -90 instead of 90 deg",
+        ),
+        Claim(
+            "size of the error model",
+            '"the number of parameter errors for the serial part is 12"; "the number of parameter'
+            ' errors for the Hexa-WH is 42"', "section 3.1.2 (p. 34)", "input", _judge_model_size,
+            {"second_joint": "revolute"}, "the second joint is a hinge",
+        ),
+    ),
+    repetitions_fixed=1,
+)  # fmt: skip
+
+PARAMETER_COUNTS = Experiment(
+    "numbers of parameters", measure_parameter_counts,
+    (
+        Claim(
+            "number of parameters of serial robots",
+            '"for the serial robot, the minimum number of geometrical parameters is given by'
+            ' Mooring et al." C = 4R + 2P + T', "Eq. 4 (p. 23)", "document",
+            _judge_counts(tuple(_SERIAL), "every link may err in all six directions; T = 6"),
+            {"locked_joints": 1}, "the first joint never moves",
+        ),
+        Claim(
+            "number of parameters of mechanisms with loops",
+            '"For multi-loop parallel robots, the number of independent parameters can be'
+            ' calculated by using the formula proposed by Vischer" C = 3R + P + SS + E + 6L +'
+            " 6(F-1)", "Eq. 5 (p. 24)", "document",
+            _judge_counts(
+                tuple(MECHANISMS), "every link may err in all six directions and has arbitrary"
+                " dimensions; F = 2; SS counts rigid links between spherical joints. For the Delta"
+                " robot Vischer and Clavel 1998, too, give 54; six legs with the 22 parameters of"
+                " page 34 have 132, and one of the two frames makes 138"),
+            {"locked_joints": 1}, "one measured joint never moves",
+        ),
+        Claim(
+            "hexapod: 42 parameters are complete and minimal",
+            '"the universal joint and the spherical joint can be simplified as a coordinate'
+            ' point"; "the number of parameter errors for the Hexa-WH is 42"',
+            "Eq. 27, section 3.1.2 (p. 34)", "document", _judge_hexapod,
+            {"poses": 6}, "six poses are measured, which give 36 equations",
+        ),
+    ),
+    repetitions_fixed=1,
+)  # fmt: skip
+
+FIRST_ORDER = Experiment(
+    "first-order error model", measure_first_order,
+    (
+        Claim(
+            "first-order error model",
+            '"the first-order model is sufficiently accurate for most applications"',
+            "Eqs 12 to 26 (p. 31 to 33)", "document", _judge_first_order, {"error_size": 10.0},
+            "errors of manufacture of 10 mm and 10 mrad",
+        ),
+        Claim(
+            "second-order errors grow with size and errors",
+            '"As the size of the manipulator structure or the size of the input kinematic errors'
+            ' increases, the effect of the second-order error terms increases."',
+            "section 3.1.2 (p. 33)", "document", _judge_growth, {"growth": 0.5},
+            "errors and structure are halved instead of doubled",
+        ),
+    ),
+)  # fmt: skip
+
+PROPORTIONALITY = Experiment(
+    "nearly parallel axes", measure_proportionality,
+    (
+        Claim(
+            "proportionality of D-H and POE models",
+            'the D-H model "fails to be proportional when the two consecutive joint axes are'
+            ' parallel or nearly parallel"; "the POE model can perfectly meet the proportionality'
+            ' properties"', "section 2.1 (p. 24)", "document", _judge_proportionality,
+            {"parallel": False}, "the axes are perpendicular",
+        ),
+    ),
+)  # fmt: skip
+
+FORWARD_KINEMATICS = Experiment(
+    "forward kinematics by DE", measure_forward_kinematics,
+    (
+        Claim(
+            "hexapod: forward kinematics by DE",
+            '"the DE algorithm was employed in Publications 1, 5 and 7 to identify parameter errors'
+            ' and to find numerical solutions for the robot forward kinematics"',
+            "section 2.2 (p. 26), Eqs 8 and 11", "document", _judge_forward_kinematics,
+            {"reach": 0.005}, "DE searches within 5 mm of the home pose only",
+        ),
+    ),
+    max_repetitions=10,
+)  # fmt: skip
+
+EXPERIMENTS = (
+    KINEMATICS, PARAMETER_COUNTS, FIRST_ORDER, PROPORTIONALITY, FORWARD_KINEMATICS
+)  # fmt: skip
+"""In the order of the document."""

@@ -1,0 +1,184 @@
+"""Simulated robots with manufacturing errors, measured by wires, for the experiments of Wang 2012.
+
+Dimensions, noise and errors of manufacture are assumptions (models/iwr/README.md): the part of the
+thesis that is available gives none.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hydrotele.calibrate.hybrid import calibrate
+from hydrotele.calibrate.hybrid_data import Measurement, measurement_of_wires
+from hydrotele.core.errors import InputError
+from hydrotele.experiments.comparison import (
+    Changes,
+    Claim,
+    Comparison,
+    Judgement,
+    Marginals,
+    Panel,
+    Sample,
+)
+from hydrotele.kinematics.hybrid import (
+    ErrorModel,
+    Hybrid,
+    Kind,
+    corrected,
+    document_parameters,
+    error_model,
+    forward,
+    load_hybrid,
+    pose_difference,
+)
+from hydrotele.kinematics.wires import wire_lengths
+from hydrotele.simulate.hybrid import (
+    TILT,
+    manufactured_errors,
+    measured_poses,
+    random_poses,
+    shipped_wires,
+)
+
+SENSOR_NOISE = {"leg": 1e-5, "slide": 1e-5, "turn": 2e-5, "wire": 2e-5}
+"""Standard deviations [m] or [rad]."""
+
+REQUIRED_ACCURACY = 1e-4
+"""m: `high accuracy (±0.1 mm) for the assembly robot`, page 19."""
+
+_SEED = 2012
+
+
+class SimulatedRobot(NamedTuple):
+    """A robot with manufacturing errors, and its measurement.
+
+    Attributes:
+        model: error model of the errors.
+        errors: (p,) true errors [model.units].
+        robot: with the errors.
+        measurement: poses to calibrate from.
+        test_commands: carriage positions (M, n) and leg readings (M, 6) of poses that are not used
+            in the calibration.
+    """
+
+    model: ErrorModel
+    errors: np.ndarray
+    robot: Hybrid
+    measurement: Measurement
+    test_commands: tuple[np.ndarray, np.ndarray]
+
+
+def simulate_robot(
+    seed: int, poses: int, kind: Kind = "dh", document: bool = True, noise: float = 1.0,
+) -> SimulatedRobot:  # fmt: skip
+    """Simulate a robot with errors of 1 mm and 1 mrad (standard deviations) and measure it.
+
+    Args:
+        seed: of errors, poses and noise.
+        poses: number of poses to calibrate from.
+        kind: error model of the errors.
+        document: whether only the 36 parameters of the document's refined model have errors.
+        noise: factor on `SENSOR_NOISE`; 0 measures exactly.
+
+    Returns:
+        The robot with 25 further poses to test it.
+    """
+    rng, wires, nominal = np.random.default_rng([_SEED, seed]), shipped_wires(), load_hybrid("iwr")
+    model = error_model(nominal, kind)
+    errors = manufactured_errors(model, rng, document_parameters(model) if document else None)
+    robot = corrected(model, errors)
+    sizes = {name: noise * size for name, size in SENSOR_NOISE.items()}
+    commands = random_poses(nominal, poses, rng, wires)
+    read = measured_poses(robot, *commands, wires, sizes, rng)
+    stated = sizes if noise > 0.0 else SENSOR_NOISE
+    measurement = measurement_of_wires(
+        nominal, read.joints, read.legs, read.wires, wires, stated, f"simulated robot {seed}"
+    )
+    return SimulatedRobot(model, errors, robot, measurement, random_poses(nominal, 25, rng, wires))
+
+
+def measure_nominal_robot(poses: int, seed: int, tilt: float = TILT) -> Measurement:
+    """Measure the robot without errors exactly.
+
+    Args:
+        poses: number of poses.
+        seed: of the poses.
+        tilt: largest tilt of the platform against the connecting platform [rad].
+    """
+    robot, wires = load_hybrid("iwr"), shipped_wires()
+    joints, legs = random_poses(robot, poses, np.random.default_rng([_SEED, seed]), tilt=tilt)
+    lengths = wire_lengths(wires, forward(robot, joints, legs))
+    return measurement_of_wires(robot, joints, legs, lengths, wires, SENSOR_NOISE, "exact")
+
+
+def pose_errors_at_test_poses(
+    simulated: SimulatedRobot, robot: Hybrid
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of a robot's forward kinematics at the test poses: (M,) [m] and (M,) [rad]."""
+    difference = pose_difference(
+        forward(robot, *simulated.test_commands), forward(simulated.robot, *simulated.test_commands)
+    )
+    return np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)
+
+
+def count_covered_errors(seed: int) -> tuple[int, int]:
+    """Count true errors within the 95 % intervals of least squares: (inside, parameters)."""
+    simulated = simulate_robot(1000 + seed, 25)
+    names = document_parameters(simulated.model)
+    fit = calibrate(load_hybrid("iwr"), simulated.measurement, "dh", names).fit
+    truth = simulated.errors[simulated.model.index(fit.names)]
+    return int(np.sum((truth > fit.intervals[:, 0]) & (truth < fit.intervals[:, 1]))), len(names)
+
+
+def root_mean_square(values: np.ndarray) -> float:
+    """RMS of an array."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def change_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
+    """Settings of an experiment with some of them changed.
+
+    Raises:
+        InputError: no setting of a name.
+    """
+    for name in changes:
+        if name not in defaults:
+            raise InputError(f"setting {name!r}", f"valid: {', '.join(defaults)}")
+    return {**defaults, **changes}
+
+
+Drawing = Callable[[Sequence[Sample]], tuple[tuple[Panel, ...], Marginals | None]]
+
+
+@dataclass(frozen=True)
+class DrawnClaim(Claim):
+    """A claim whose row draws what `draw` selects from all samples."""
+
+    draw: Drawing | None = None
+
+    def compare(self, samples: Sequence[Sample]) -> Comparison:
+        """Judge the claim and draw its curves."""
+        row = super().compare(samples)
+        panels, marginals = self.draw(samples) if self.draw else ((), None)
+        return row._replace(panels=panels, marginals=marginals)
+
+
+def caption_claim(
+    name: str, item: str, quote: str, note: Callable[[Sequence[Sample]], str],
+    draw: Drawing | None = None,
+) -> Claim:  # fmt: skip
+    """Build a claim about a table or figure of which only the caption is available.
+
+    Args:
+        name: of the claim.
+        item: table or figure with its page.
+        quote: the caption, within quotation marks.
+        note: samples -> the simulated values in words.
+        draw: samples -> curves and posterior.
+    """
+    return DrawnClaim(
+        name, item=item, quote=quote, kind="caption", draw=draw,
+        judge=lambda samples: Judgement(note=note(samples)),
+    )  # fmt: skip
