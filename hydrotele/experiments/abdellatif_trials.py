@@ -11,6 +11,11 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import binomtest, ncx2
 
+from hydrotele.experiments.abdellatif_processing import (
+    average_force,
+    average_periods,
+    process_lengths,
+)
 from hydrotele.experiments.comparison import (
     Changes,
     Check,
@@ -42,16 +47,11 @@ from hydrotele.experiments.palida import (
     simulate_measurement,
 )
 from hydrotele.identify.estimation import estimate
-from hydrotele.identify.mechanism import in_coordinates
-from hydrotele.identify.motion import Processing, joint_motion, resolution
-from hydrotele.identify.record import IdentificationRecord
 
 PERIODS = 4
 """Repetitions of the motion in one trial; the document prints none."""
 TRIALS = 100
 """Trials of one series, as in section 5.3."""
-HARMONICS = 5
-"""Of the excitation and of the window, as in section 5.2."""
 FRICTION_EXCESS = 0.03
 """Excess of all friction parameters in the first trial, over their stationary values; assumed. The
 document says only that friction varies "at the beginning of the measurement process"."""
@@ -67,73 +67,6 @@ MAX_EXCEPTIONS = 0.1
 _PRINTED = np.array([one.value for one in TABLE])
 _STD = np.array([one.std for one in TABLE])
 _IS_FRICTION = np.array([one.column.startswith(("coulomb", "viscous")) for one in TABLE])
-
-
-class AveragedPeriod(NamedTuple):
-    """One period of data, ready for the regressor.
-
-    Attributes:
-        motion: (3, n, 6) poses, rates and accelerations.
-        force: (n, 6) mean of all periods [N].
-        covariance: (6, 6) of one force reading's noise, from the periods' differences [N^2].
-    """
-
-    motion: np.ndarray
-    force: np.ndarray
-    covariance: np.ndarray
-
-
-def average_periods(record: IdentificationRecord, period: float) -> AveragedPeriod:
-    """Process repeated periods in the frequency domain.
-
-    The leg lengths' mean over the periods goes through forward kinematics; the pose keeps its first
-    five harmonics and is differentiated with them.
-
-    Args:
-        record: leg lengths and forces of at least two whole periods.
-        period: [s].
-
-    Returns:
-        One period.
-
-    Source: Abdellatif 2008, section 4.1, (27).
-    """
-    rows = round(period / record.period)
-    length, force = (part.reshape(-1, rows, 6).copy() for part in (record.position, record.force))
-    mean, covariance = average_force(force)
-    averaged = replace(record, position=length.mean(axis=0), force=mean)
-    return AveragedPeriod(process_lengths(averaged, period, "periodic"), mean, covariance)
-
-
-def average_force(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (n, 6) of periods (p, n, 6), and covariance (6, 6) of one reading's noise [N^2]."""
-    mean = force.mean(axis=0)
-    rest = (force - mean).reshape(-1, 6)
-    return mean, rest.T @ rest / ((len(force) - 1) * len(mean))
-
-
-def process_lengths(
-    record: IdentificationRecord, period: float, method: str, harmonics: int = HARMONICS
-) -> np.ndarray:
-    """Poses, rates and accelerations (3, n, 6) of measured leg lengths.
-
-    Args:
-        record: leg lengths.
-        period: of the motion [s].
-        method: `raw`, `zero_phase` (time domain) or `periodic` (frequency domain).
-        harmonics: that the window of `periodic` keeps.
-
-    Returns:
-        The motion in coordinates of the pose.
-    """
-    pose = in_coordinates(record, load_robot().setup)
-    found = resolution(pose.position, pose.period, pose.position_noise)
-    processing = (
-        Processing("periodic", period=period, harmonics=harmonics) if method == "periodic"
-        else Processing(method)  # pyright: ignore[reportArgumentType]
-    )  # fmt: skip
-    smoothed = joint_motion(pose.position, pose.period, found, processing)
-    return np.stack([smoothed.value, smoothed.rate, smoothed.acceleration])
 
 
 class NormalEquations:
@@ -409,7 +342,7 @@ def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: i
     """Check of the bias of an estimator, in standard deviations of one estimate.
 
     Args:
-        quantity: what is biased.
+        quantity: name of the bias.
         mean: (p,) mean of the estimates' errors.
         covariance: (p, p) of one estimate.
         count: number of estimates n.
@@ -425,8 +358,8 @@ def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: i
         if ncx2.cdf(squared, degrees, 0.0) < chance:
             return 0.0
         high = 4.0 * squared + 100.0
-        found = brentq(lambda size: ncx2.cdf(squared, degrees, size) - chance, 0.0, high)
-        return float(np.sqrt(found / count))
+        root = brentq(lambda size: ncx2.cdf(squared, degrees, size) - chance, 0.0, high)
+        return float(np.sqrt(float(root) / count))  # pyright: ignore[reportArgumentType]
 
     return Check(
         quantity, float(np.sqrt(max(squared - degrees, 0.0) / count)),
@@ -450,7 +383,7 @@ def judge_least_squares(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         (check,),
         "where the regressor has no noise, least squares is free of bias for any covariance of the"
-        f" forces; what it loses is precision: its standard deviations are {wide:.2f} times those"
+        f" forces; it loses precision: its standard deviations are {wide:.2f} times those"
         " of the Gauss-Markov estimate",
     )
 
@@ -526,11 +459,10 @@ TRIAL_SERIES = Experiment(
         ),
         Claim(
             "history of the estimates",
-            '"The robustness of the identification is proven, since the estimates remain mostly'
-            ' within the confidence intervals. Some exceptions are observed though, such the very'
-            ' small first rigid-body parameter and the first few measurement trials. The latter is'
-            ' due to the variation of friction at the beginning of the measurement process until a'
-            ' nearly stationary state is reached."',
+            '"the estimates remain mostly within the confidence intervals. Some exceptions are'
+            ' observed though, such the very small first rigid-body parameter and the first few'
+            ' measurement trials." "due to the variation of friction at the beginning of the'
+            ' measurement process until a nearly stationary state is reached."',
             "Fig. 8, section 5.3", "document", judge_history, _CLAIM_TOO_SMALL, _HALF_NOISE,
             tuple(f"{SYMBOLS[k]} over its mean [1]" for k in (0, 1, 4, 9, 12, 18)),
         ),

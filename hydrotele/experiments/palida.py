@@ -21,6 +21,7 @@ from hydrotele.multibody.inverse_dynamics import project
 
 _MAX_ROWS = 1000  # rows computed together: memory that is used again is faster than new one
 LEGS = range(1, 7)
+DRIVE = 4  # that figures show: actuator 5, as in Fig. 11
 CHI2_LIMIT = 36.42  # 95 % quantile of chi^2 with 24 degrees of freedom, as printed (5.3)
 HOME_POSE = np.array([0.0, 0.0, 0.55, 0.0, 0.0, 0.0])
 # Assumed, as README.md of the model says: the document prints neither noise nor limits.

@@ -108,20 +108,16 @@ def list_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relatio
         moved = transfer_parameters(tree.turn[body], tree.offset[body])
         for kind in ("mass", "moment_z"):
             yield Relation(f"{kind}.{stator}", _name_weights(moved, kind, ring))
-        rod = {
-            name: value + _name_weights(moved, "inertia_yy", ring).get(name, 0.0)
-            for name, value in _name_weights(moved, "inertia_xx", ring).items()
-        }
-        rod |= {k: v for k, v in _name_weights(moved, "inertia_yy", ring).items() if k not in rod}
+        rod = _name_weights(moved, "inertia_xx", ring, "inertia_yy")
         yield Relation(f"inertia_yy.{stator}", rod | {f"inertia_xx.{stator}": -1.0})
         for kind in ("mass", "moment_z", *_INERTIAS):
             if kind != "inertia_zz":
                 yield Relation(f"{kind}.{ring}", {})
 
 
-def _name_weights(matrix: np.ndarray, kind: str, body: str) -> dict[str, float]:
-    """Weights of the carrier's parameters for one parameter of the carried body."""
-    column = matrix[:, _KINDS.index(kind)]
+def _name_weights(matrix: np.ndarray, kind: str, body: str, *more: str) -> dict[str, float]:
+    """Weights of the carrier's parameters for one or a sum of parameters of the carried body."""
+    column = matrix[:, [_KINDS.index(one) for one in (kind, *more)]].sum(axis=1)
     return {f"{k}.{body}": float(c) for k, c in zip(_KINDS, column, strict=True) if abs(c) > 1e-12}
 
 
@@ -152,8 +148,8 @@ def table_1(joints: np.ndarray) -> dict[str, dict[str, float]]:
         joints: (6, 3) places of the platform joints r_B in the platform's frame [m].
 
     Returns:
-        Symbol -> parameter -> coefficient. The table writes s_y3 for p5; beside I_yy2 + I_zz3 in p1
-        the strut's axis is z of frame 3, as in the model.
+        Symbol -> parameter -> coefficient. The table prints s_y3 for p5; by I_yy2 + I_zz3 in p1 the
+        strut's axis is z of frame 3, as in the model.
     """
     x, y, z = np.sum(joints**2, axis=0)
     slider = "mass.slider_1"
@@ -177,7 +173,7 @@ _STAGES = {
     "equal legs": {"absent": ()},
     "equal legs, symmetrical bodies": {},
 }
-"""What is known of the bodies -> changes of the model's regressor. With the last, 19 inertial
+"""Knowledge of the bodies -> changes of the model's regressor. With the last, 19 inertial
 parameters of a leg and of the platform are declared absent, as in Table 1."""
 
 
@@ -193,8 +189,8 @@ def measure_structure(seed: int, changes: Changes) -> Sample:
     Returns:
         Numbers of base parameters, and largest differences of coefficients.
     """
-    settings = read_settings(
-        {"declare_symmetry": True, "platform_rule": True, "joint_radius": 1.0}, changes)  # fmt: skip
+    defaults = {"declare_symmetry": True, "platform_rule": True, "joint_radius": 1.0}
+    settings = read_settings(defaults, changes)
     own = load_robot()
     chain, found = own.setup.chain, project(own.setup.chain, own.setup.given, *draw_states())
     bodies = [f"{kind}.{body}" for body in chain.bodies for kind in _KINDS]
@@ -206,12 +202,12 @@ def measure_structure(seed: int, changes: Changes) -> Sample:
         structure, kept = _reduce_inertial(table)
         names = [table.names[k] for k in kept]
         sums = _sum_equal(bodies, names, own.setup.alike if stage != "19 bodies" else ())
-        rules = _unite_rows(regrouped @ sums, bodies, names)
-        null = np.linalg.norm(structure.combination - _in_base(rules, names, structure), axis=1)
+        rules = (regrouped @ sums)[[bodies.index(name) for name in names]]  # one of equal legs
+        rules = rules[np.any(rules, axis=1)]
         values[f"columns, {stage}"] = len(kept)
         values[f"rank, {stage}"] = len(structure.base)
-        values[f"rules, {stage}"] = int(np.any(rules, axis=1).sum())
-        values[f"difference, {stage}"] = float(np.max(null, initial=0.0))
+        values[f"rules, {stage}"] = len(rules)
+        values[f"difference, {stage}"] = _largest_difference(rules, structure)
         rows = table.matrix[:, :, kept].reshape(-1, len(kept))
         spectra.append(np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-9),
                                      compute_uv=False))  # fmt: skip
@@ -254,24 +250,16 @@ def _sum_equal(
     return sums
 
 
-def _unite_rows(
-    rules: np.ndarray, bodies: Sequence[str], names: Sequence[str]
-) -> np.ndarray:  # fmt: skip
-    """Rows of the parameters that are left: those of equal bodies are equal."""
-    return rules[[list(bodies).index(name) for name in names]]
+def _largest_difference(rules: np.ndarray, structure: Identifiability) -> float:
+    """Largest difference of coefficients between rules (r, m) and null space.
 
-
-def _in_base(rules: np.ndarray, names: Sequence[str], structure: Identifiability) -> np.ndarray:
-    """The rules' combinations (r, m) by the representatives that the null space's base has.
-
-    Rows of `rules` are regrouped parameters. The null space names the same combinations after other
-    members, so that both are compared after one is solved for the other's representatives.
+    The null space may name the same combinations after other members, so that the rules are first
+    solved for its representatives; infinite where the numbers of combinations differ.
     """
-    rows = rules[np.any(rules, axis=1)]
-    square = rows[:, structure.base]
-    if square.shape[0] != square.shape[1]:
-        return np.full((len(structure.base), len(names)), np.inf)
-    return np.linalg.solve(square, rows)
+    if len(rules) != len(structure.base):
+        return np.inf
+    solved = np.linalg.solve(rules[:, structure.base], rules)
+    return float(np.abs(solved - structure.combination).max())
 
 
 def _compare_with_print(
