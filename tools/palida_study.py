@@ -111,7 +111,8 @@ def design(seed: int, iterations: int) -> None:
     own = load_robot()
     found = design_motion(
         drive_limits(), own.setup, force_covariance(), own.structure.base, period=3.0, harmonics=5,
-        starts=1, iterations=iterations, seed=seed, progress=lambda said, share: print(said, f"{share:.2f}"),
+        starts=1, iterations=iterations, seed=seed,
+        progress=lambda stage, fraction: print(stage, f"{fraction:.2f}"),
     )  # fmt: skip
     parts = {
         "period": found.period, "mean": found.mean.tolist(), "sin": found.sin.tolist(),
