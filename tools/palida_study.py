@@ -18,12 +18,12 @@ import numpy as np
 
 from hydrotele.core.files import models_folder
 from hydrotele.experiments.palida import (
-    HOME,
+    HOME_POSE,
     STROKE,
-    excitation,
+    drive_limits,
     force_covariance,
-    limits,
-    robot,
+    load_excitation,
+    load_robot,
 )
 from hydrotele.identify.excitation import design_motion
 from hydrotele.multibody.closures import assemblies, jacobian, joint_positions
@@ -43,13 +43,13 @@ def cut(
     first: int, second: int, wide: tuple[float, float], high: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Grid values (c,), (c,), condition numbers (c, c) and whether a pose is allowed (c, c)."""
-    own, chain = robot(), robot().setup.chain
+    own, chain = load_robot(), load_robot().setup.chain
     a, b = np.linspace(wide[0], wide[1], CELLS), np.linspace(high[0], high[1], CELLS)
     condition, allowed = np.full((2, CELLS, CELLS), np.nan)
     drives = [chain.index(name) for name in chain.drives]
     scale = np.array([1.0, 1.0, 1.0, RADIUS, RADIUS, RADIUS])
     for row, value in enumerate(b):
-        poses = np.tile(HOME, (CELLS, 1))
+        poses = np.tile(HOME_POSE, (CELLS, 1))
         poses[:, first], poses[:, second] = a, value
         middle = CELLS // 2
         out = joint_positions(chain, own.setup.given, poses[middle:])
@@ -98,7 +98,7 @@ def draw(target: Path) -> None:
 
 def speed() -> tuple[int, float]:
     """Rows and processor seconds of the regressor of 20 s at 1 kHz."""
-    own, motion = robot(), excitation()
+    own, motion = load_robot(), load_excitation()
     whole = motion.motion(np.arange(20_000) / 1000.0)
     own.matrix(whole[:, :10])  # compiled before
     started = time.process_time()
@@ -108,10 +108,11 @@ def speed() -> tuple[int, float]:
 
 def design(seed: int, iterations: int) -> None:
     """Design the excitation and write it beside the model."""
-    own = robot()
+    own = load_robot()
     found = design_motion(
-        limits(), own.setup, force_covariance(), own.told.base, period=3.0, harmonics=5, starts=1,
-        iterations=iterations, seed=seed, progress=lambda said, share: print(said, f"{share:.2f}"),
+        drive_limits(), own.setup, force_covariance(), own.structure.base, period=3.0, harmonics=5,
+        starts=1, iterations=iterations, seed=seed,
+        progress=lambda stage, fraction: print(stage, f"{fraction:.2f}"),
     )  # fmt: skip
     parts = {
         "period": found.period, "mean": found.mean.tolist(), "sin": found.sin.tolist(),
@@ -129,9 +130,9 @@ def main() -> None:
         return
     if asked.picture:
         draw(Path(asked.picture))
-    own, rows = robot(), ["| quantity | value |", "| --- | --- |"]
+    own, rows = load_robot(), ["| quantity | value |", "| --- | --- |"]
     chain = own.setup.chain
-    q = joint_positions(chain, own.setup.given, HOME[None])[0]
+    q = joint_positions(chain, own.setup.given, HOME_POSE[None])[0]
     legs = q[[chain.index(name) for name in chain.drives]]
     scale = np.array([1.0, 1.0, 1.0, RADIUS, RADIUS, RADIUS])
     home = np.linalg.cond(jacobian(chain, q, chain.drives, own.setup.given) / scale)

@@ -3,12 +3,13 @@
 import json
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from hydrotele.core.files import models_folder
+from hydrotele.experiments.comparison import Changes
 from hydrotele.identify.excitation import DriveLimits, Excitation
 from hydrotele.identify.identifiability import Identifiability, identifiability
 from hydrotele.identify.mechanism import Mechanism, load_mechanism
@@ -18,18 +19,19 @@ from hydrotele.multibody.chain import cardan_angles
 from hydrotele.multibody.closures import joint_positions
 from hydrotele.multibody.inverse_dynamics import project
 
-_CHUNK = 1000  # rows at a time: memory that stays in use is faster than new one
+_MAX_ROWS = 1000  # rows computed together: memory that is used again is faster than new one
 LEGS = range(1, 7)
-CHI2_95 = 36.42  # of 24 degrees of freedom, as the document prints it
-HOME = np.array([0.0, 0.0, 0.55, 0.0, 0.0, 0.0])
+DRIVE = 4  # that figures show: actuator 5, as in Fig. 11
+CHI2_LIMIT = 36.42  # 95 % quantile of chi^2 with 24 degrees of freedom, as printed (5.3)
+HOME_POSE = np.array([0.0, 0.0, 0.55, 0.0, 0.0, 0.0])
 # Assumed, as README.md of the model says: the document prints neither noise nor limits.
-RATE = 1000.0  # Hz
+SAMPLE_RATE = 1000.0  # Hz
 FORCE_NOISE = 53.0  # of a drive, over the published standard deviation of its dry friction
 LENGTH_NOISE = 10e-6  # m, standard deviation of a measured leg length
 CORRELATION = 0.6  # of the force noise of any two drives
-STROKE, SPEED, ACCELERATION = (0.60, 1.06), 1.2, 25.0  # m, m/s, m/s^2 of every drive
-LOW = np.array([-0.20, -0.20, 0.42, -0.35, -0.35, -0.25])  # of the pose [m], [rad]
-HIGH = np.array([0.20, 0.20, 0.70, 0.35, 0.35, 0.25])
+STROKE, MAX_SPEED, MAX_ACCELERATION = (0.60, 1.06), 1.2, 25.0  # m, m/s, m/s^2 of every drive
+POSE_LOW = np.array([-0.20, -0.20, 0.42, -0.35, -0.35, -0.25])  # of the pose [m], [rad]
+POSE_HIGH = np.array([0.20, 0.20, 0.70, 0.35, 0.35, 0.25])
 
 
 class Published(NamedTuple):
@@ -39,43 +41,52 @@ class Published(NamedTuple):
         symbol: as printed.
         column: of the regressor, which stands for the combination.
         value: identified.
-        std: standard deviation; that of the printed interval for p6 and p9, whose printed standard
-            deviations are those of each other.
+        interval: 95 % confidence interval, value -+ 2 standard deviations by (30).
         prior: a-priori value; 0 for friction, which has none. That of p5 is printed without sign.
     """
 
     symbol: str
     column: str
     value: float
-    std: float
+    interval: tuple[float, float]
     prior: float = 0.0
+
+    @property
+    def std(self) -> float:
+        """Standard deviation by the printed interval.
+
+        The printed standard deviations agree with it to rounding except for p6 to p9: those four
+        are shifted cyclically by one row, so that p6 has that of p9, p7 that of p6, p8 that of p7
+        and p9 that of p8.
+        """
+        return 0.25 * (self.interval[1] - self.interval[0])
 
 
 TABLE = (
-    Published("p1", "inertia_zz.ring_1", -0.0447, 0.0039, 0.0074),
-    Published("p2", "inertia_xx.stator_1", 1.0892, 0.0070, 0.9439),
-    Published("p3", "inertia_zz.stator_1", 1.0077, 0.0045, 0.9458),
-    Published("p4", "moment_y.stator_1", 0.5995, 0.0036, 0.6201),
-    Published("p5", "moment_z.slider_1", -1.2885, 0.0056, -1.2295),
-    Published("p6", "inertia_xx.platform", 0.3078, 0.0014, 0.2878),
-    Published("p7", "inertia_yy.platform", 0.3021, 0.0014, 0.2878),
-    Published("p8", "inertia_zz.platform", 0.1176, 0.0012, 0.1217),
-    Published("p9", "moment_z.platform", 1.8896, 0.0061, 1.9012),
-    Published("p10", "mass.platform", 16.3081, 0.0460, 16.1920),
-    Published("r_alpha", "coulomb.alpha_1", 0.5756, 0.0158),
-    Published("r_beta", "coulomb.beta_1", 0.9195, 0.0179),
-    Published("r11", "coulomb.slide_1", 11.9772, 0.2485),
-    Published("r12", "coulomb.slide_2", 4.8071, 0.1861),
-    Published("r13", "coulomb.slide_3", 20.1528, 0.3226),
-    Published("r14", "coulomb.slide_4", 5.1518, 0.1817),
-    Published("r15", "coulomb.slide_5", 1.5857, 0.2618),
-    Published("r16", "coulomb.slide_6", 5.0057, 0.3519),
-    Published("r21", "viscous.slide_1", 16.8771, 0.5268),
-    Published("r22", "viscous.slide_2", 16.7406, 0.3712),
-    Published("r23", "viscous.slide_3", 6.3408, 0.5720),
-    Published("r24", "viscous.slide_4", 23.1662, 0.3799),
-    Published("r25", "viscous.slide_5", 26.4675, 0.4461),
-    Published("r26", "viscous.slide_6", 22.8053, 0.5539),
+    Published("p1", "inertia_zz.ring_1", -0.0447, (-0.0526, -0.0369), 0.0074),
+    Published("p2", "inertia_xx.stator_1", 1.0892, (1.0753, 1.1032), 0.9439),
+    Published("p3", "inertia_zz.stator_1", 1.0077, (0.9988, 1.0166), 0.9458),
+    Published("p4", "moment_y.stator_1", 0.5995, (0.5922, 0.6068), 0.6201),
+    Published("p5", "moment_z.slider_1", -1.2885, (-1.2998, -1.2772), -1.2295),
+    Published("p6", "inertia_xx.platform", 0.3078, (0.3049, 0.3106), 0.2878),
+    Published("p7", "inertia_yy.platform", 0.3021, (0.2996, 0.3045), 0.2878),
+    Published("p8", "inertia_zz.platform", 0.1176, (0.1152, 0.1201), 0.1217),
+    Published("p9", "moment_z.platform", 1.8896, (1.8774, 1.9017), 1.9012),
+    Published("p10", "mass.platform", 16.3081, (16.2161, 16.4002), 16.1920),
+    Published("r_alpha", "coulomb.alpha_1", 0.5756, (0.5440, 0.6072)),
+    Published("r_beta", "coulomb.beta_1", 0.9195, (0.8837, 0.9552)),
+    Published("r11", "coulomb.slide_1", 11.9772, (11.4803, 12.4742)),
+    Published("r12", "coulomb.slide_2", 4.8071, (4.4350, 5.1793)),
+    Published("r13", "coulomb.slide_3", 20.1528, (19.5075, 20.7980)),
+    Published("r14", "coulomb.slide_4", 5.1518, (4.7884, 5.5151)),
+    Published("r15", "coulomb.slide_5", 1.5857, (1.0620, 2.1094)),
+    Published("r16", "coulomb.slide_6", 5.0057, (4.3018, 5.7096)),
+    Published("r21", "viscous.slide_1", 16.8771, (15.8235, 17.9307)),
+    Published("r22", "viscous.slide_2", 16.7406, (15.9981, 17.4830)),
+    Published("r23", "viscous.slide_3", 6.3408, (5.1968, 7.4848)),
+    Published("r24", "viscous.slide_4", 23.1662, (22.4065, 23.9259)),
+    Published("r25", "viscous.slide_5", 26.4675, (25.5754, 27.3596)),
+    Published("r26", "viscous.slide_6", 22.8053, (21.6974, 23.9131)),
 )
 SYMBOLS = tuple(one.symbol for one in TABLE)
 
@@ -85,14 +96,15 @@ class Robot:
     """The model, and its parameters in the order of Table 2.
 
     Attributes:
-        mechanism: as a user of `hydrotele identify --mjcf` has it.
-        told: base parameters found from the regressor alone.
+        mechanism: as a user of `hydrotele identify --mjcf` has it: equal legs, and 19 inertial
+            parameters that are 0 by symmetry of the bodies.
+        structure: base parameters, found from the null space of the regressor's other columns.
         order: (24,) place of every row of Table 2 among the base parameters.
         truth: (24,) values of the model.
     """
 
     mechanism: Mechanism
-    told: Identifiability
+    structure: Identifiability
     order: np.ndarray
     truth: np.ndarray
 
@@ -104,11 +116,11 @@ class Robot:
     def matrix(self, motion: np.ndarray) -> np.ndarray:
         """Regressor (n, 6, 24) of Table 2's parameters along a motion (3, n, 6) of the pose."""
         out, start = [], None
-        for first in range(0, motion.shape[1], _CHUNK):
-            some = motion[:, first : first + _CHUNK]
+        for first in range(0, motion.shape[1], _MAX_ROWS):
+            some = motion[:, first : first + _MAX_ROWS]
             found = project(self.setup.chain, self.setup.given, *some, start=start)
             start = found.position[-1]
-            out.append(self.setup.table(found).matrix[:, :, self.told.base[self.order]])
+            out.append(self.setup.table(found).matrix[:, :, self.structure.base[self.order]])
         return np.concatenate(out)
 
     def lengths(self, motion: np.ndarray) -> np.ndarray:
@@ -117,130 +129,155 @@ class Robot:
         return q[:, [self.setup.chain.index(name) for name in self.setup.chain.drives]]
 
 
+def read_settings(defaults: Changes, changes: Changes) -> dict[str, Any]:
+    """Settings of an experiment with some of them changed.
+
+    Raises:
+        KeyError: a setting is not known.
+    """
+    if unknown := set(changes) - set(defaults):
+        raise KeyError(f"{', '.join(sorted(unknown))}: valid are {', '.join(defaults)}")
+    return {**defaults, **changes}
+
+
+def draw_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses, rates and accelerations (100, 6) that excite whatever can be excited, always equal."""
+    rng = np.random.default_rng(0)
+    poses = 0.5 * (POSE_LOW + POSE_HIGH)
+    poses = poses + 0.4 * (POSE_HIGH - POSE_LOW) * rng.uniform(-1.0, 1.0, (100, 6))
+    return poses, rng.normal(0.0, 1.0, (100, 6)), rng.normal(0.0, 10.0, (100, 6))
+
+
 @cache
-def robot() -> Robot:
-    """The shipped model; base parameters from the null space of 100 random states."""
+def load_robot() -> Robot:
+    """Load the shipped model; base parameters from the null space of 100 random states."""
     folder = models_folder() / "palida"
     mechanism = load_mechanism(folder / "palida.xml", folder / "columns.yaml")
-    setup, rng = mechanism.setup, np.random.default_rng(0)
-    poses = 0.5 * (LOW + HIGH) + 0.4 * (HIGH - LOW) * rng.uniform(-1.0, 1.0, (100, 6))
-    states = (poses, rng.normal(0.0, 1.0, (100, 6)), rng.normal(0.0, 10.0, (100, 6)))
-    table = setup.table(project(setup.chain, setup.given, *states))
+    setup = mechanism.setup
+    table = setup.table(project(setup.chain, setup.given, *draw_states()))
     rows = table.matrix.reshape(-1, len(table.names))
-    told = identifiability(rows, table.names, table.units, [one.column for one in TABLE])
-    names = [table.names[b] for b in told.base]
+    structure = identifiability(rows, table.names, table.units, [one.column for one in TABLE])
+    names = [table.names[b] for b in structure.base]
     order = np.array([names.index(one.column) for one in TABLE])
-    return Robot(mechanism, told, order, (told.combination @ table.nominal)[order])
+    return Robot(mechanism, structure, order, (structure.combination @ table.nominal)[order])
 
 
 def force_covariance() -> np.ndarray:
-    """Covariance (6, 6) of the drives' force noise [N^2], white at `RATE`.
+    """Covariance (6, 6) of the drives' force noise [N^2], white at `SAMPLE_RATE`.
 
     The document calls it high and cross-correlated and prints no number. Ratios of the drives are
-    those of the published standard deviations of their dry friction; the level, 10 to 19 N, is
-    chosen so that the standard deviations of the parameters are about the published ones.
+    those of the published standard deviations of their dry friction; the level, 10 to 19 N, and the
+    robot's geometry are chosen so that the standard deviations of the parameters are about the
+    published ones.
     """
     size = FORCE_NOISE * np.array([one.std for one in TABLE[12:18]])
     return np.outer(size, size) * (CORRELATION + (1.0 - CORRELATION) * np.eye(6))
 
 
 @cache
-def excitation() -> Excitation:
-    """The designed motion that comes with the model; `tools/palida_study.py` designs it anew."""
+def load_excitation() -> Excitation:
+    """Load the designed motion of the model, which `tools/palida_study.py --design 1` designs."""
     found = json.loads((models_folder() / "palida" / "excitation.json").read_text(encoding="utf-8"))
     mean, sin, cos = (np.array(found[key]) for key in ("mean", "sin", "cos"))
     return Excitation(
-        robot().setup.given,
-        found["period"],
-        mean,
-        sin,
-        cos,
-        found["criterion"],
-        found["worst"],
-        len(TABLE),
+        load_robot().setup.given, found["period"], mean, sin, cos, found["criterion"],
+        found["worst"], len(TABLE),
+    )  # fmt: skip
+
+
+def drive_limits() -> DriveLimits:
+    """Limits of the drives, within which motions are designed."""
+    return DriveLimits(
+        load_robot().setup,
+        POSE_LOW,
+        POSE_HIGH,
+        np.tile(STROKE, (6, 1)),
+        MAX_SPEED,
+        MAX_ACCELERATION,
     )
 
 
-def limits() -> DriveLimits:
-    """What the drives may do."""
-    return DriveLimits(robot().setup, LOW, HIGH, np.tile(STROKE, (6, 1)), SPEED, ACCELERATION)
-
-
-class Experiment(NamedTuple):
-    """What is measured of a repeated motion; n rows per period.
+class RepeatedMotion(NamedTuple):
+    """One period of a motion that is repeated; n rows.
 
     Attributes:
         period: of the motion [s].
-        motion: (3, n, 6) true poses, rates and accelerations of one period.
+        motion: (3, n, 6) true poses, rates and accelerations.
         length: (n, 6) true leg lengths [m].
+        matrix: (n, 6, 24) true regressor of Table 2's parameters.
         force: (n, 6) true drive forces [N].
     """
 
     period: float
     motion: np.ndarray
     length: np.ndarray
+    matrix: np.ndarray
     force: np.ndarray
 
 
-def experiment(motion: np.ndarray, period: float) -> Experiment:
-    """One period of a motion (3, n, 6), with the lengths and forces of the model."""
-    own = robot()
-    return Experiment(period, motion, own.lengths(motion[0]), own.matrix(motion) @ own.truth)
+def simulate_motion(motion: np.ndarray, period: float) -> RepeatedMotion:
+    """Lengths and forces of the model along one period of a motion (3, n, 6)."""
+    own = load_robot()
+    matrix = own.matrix(motion)
+    return RepeatedMotion(period, motion, own.lengths(motion[0]), matrix, matrix @ own.truth)
 
 
 @cache
-def excited() -> Experiment:
-    """The designed motion at 1 kHz."""
-    motion = excitation()
-    time = np.arange(round(motion.period * RATE)) / RATE
-    return experiment(motion.motion(time), motion.period)
+def simulate_excitation() -> RepeatedMotion:
+    """The designed motion at `SAMPLE_RATE`."""
+    motion = load_excitation()
+    time = np.arange(round(motion.period * SAMPLE_RATE)) / SAMPLE_RATE
+    return simulate_motion(motion.motion(time), motion.period)
 
 
-def measured(
-    of: Experiment,
-    periods: int,
-    rng: np.random.Generator,
-    reaction: tuple[float, float] | None = None,
-) -> IdentificationRecord:
-    """Simulated measurement: repeated periods of true lengths and forces, and noise.
+def draw_force_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Force noise (*shape, 6) [N] with `force_covariance`."""
+    return rng.standard_normal((*shape, 6)) @ np.linalg.cholesky(force_covariance()).T
+
+
+def simulate_measurement(
+    cycle: RepeatedMotion, periods: int, rng: np.random.Generator,
+    reaction: tuple[float, float] = (0.0, 0.0), length_noise: float = LENGTH_NOISE,
+) -> IdentificationRecord:  # fmt: skip
+    """Simulate a measurement: repeated periods of true lengths and forces, with noise.
 
     Args:
-        of: one period.
-        periods: how many.
+        cycle: one period.
+        periods: number of repetitions.
         rng: of the noise.
         reaction: force of every drive per error of its measured length [N/m] and of its rate
-            [N s/m]: what a controller does about the encoder's noise, which is then in the forces,
-            too; None for noise that is not.
+            [N s/m], by which a controller brings the encoder's noise into the forces.
+        length_noise: standard deviation of a measured leg length [m].
 
     Returns:
         A record of leg lengths and drive forces.
     """
-    n = len(of.length) * periods
-    error = LENGTH_NOISE * rng.standard_normal((n, 6))
-    noise = rng.standard_normal((n, 6)) @ np.linalg.cholesky(force_covariance()).T
-    if reaction is not None:
-        noise -= reaction[0] * error + reaction[1] * np.gradient(error, 1.0 / RATE, axis=0)
-    drives = robot().setup.chain.drives
+    n = len(cycle.length) * periods
+    error = length_noise * rng.standard_normal((n, 6))
+    noise = draw_force_noise((n,), rng)
+    noise -= reaction[0] * error
+    noise -= reaction[1] * np.gradient(error, 1.0 / SAMPLE_RATE, axis=0)
+    drives = load_robot().setup.chain.drives
     return IdentificationRecord(
-        "excitation", 1.0 / RATE, drives, np.tile(of.length, (periods, 1)) + error,
-        np.full(6, LENGTH_NOISE), np.tile(of.force, (periods, 1)) + noise,
+        "excitation", 1.0 / SAMPLE_RATE, drives, np.tile(cycle.length, (periods, 1)) + error,
+        np.full(6, length_noise), np.tile(cycle.force, (periods, 1)) + noise,
         np.sqrt(np.diag(force_covariance())),
     )  # fmt: skip
 
 
 # Control: one linear controller per drive (PID), and forces of a model along the reference.
-MASS, BANDWIDTH, DAMPING = 4.0, 12.0, 0.8  # kg that a drive moves on average, Hz, 1
-INTEGRAL = 3.0  # 1/s, of the proportional part
-_FADE = 1.0  # s in which a path starts from rest
+DRIVE_MASS, BANDWIDTH, DAMPING_RATIO = 4.0, 12.0, 0.8  # kg that a drive moves on average, Hz, 1
+INTEGRAL_RATE = 3.0  # 1/s, of the proportional part
+_START_TIME = 1.0  # s until a circle has its speed
 
 
 def control_gains() -> tuple[float, float]:
     """Stiffness [N/m] and damping [N s/m] of every drive's controller."""
     turn = 2.0 * np.pi * BANDWIDTH
-    return MASS * turn**2, 2.0 * DAMPING * MASS * turn
+    return DRIVE_MASS * turn**2, 2.0 * DAMPING_RATIO * DRIVE_MASS * turn
 
 
-def circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.ndarray:
+def plan_circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.ndarray:
     """A horizontal circle about the home pose, started from rest.
 
     Args:
@@ -249,17 +286,17 @@ def circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.ndarray:
         laps: at full speed.
 
     Returns:
-        (3, n, 6) poses, rates and accelerations at `RATE`.
+        (3, n, 6) poses, rates and accelerations at `SAMPLE_RATE`.
     """
     turn = speed / radius
-    time = np.arange(0.0, _FADE + laps * 2.0 * np.pi / turn, 1.0 / RATE)
-    r = np.clip(time / _FADE, 0.0, 1.0)  # the speed rises as 10 r^3 - 15 r^4 + 6 r^5
-    faded = _FADE * (2.5 * r**4 - 3.0 * r**5 + r**6)
-    angle = turn * (faded + np.maximum(time - _FADE, 0.0))
-    return _differentiated(radius * np.cos(angle), radius * np.sin(angle))
+    time = np.arange(0.0, _START_TIME + laps * 2.0 * np.pi / turn, 1.0 / SAMPLE_RATE)
+    r = np.clip(time / _START_TIME, 0.0, 1.0)  # the speed rises as 10 r^3 - 15 r^4 + 6 r^5
+    faded = _START_TIME * (2.5 * r**4 - 3.0 * r**5 + r**6)
+    angle = turn * (faded + np.maximum(time - _START_TIME, 0.0))
+    return _differentiate(radius * np.cos(angle), radius * np.sin(angle))
 
 
-def square(speed: float, side: float = 0.16, laps: float = 2.0) -> np.ndarray:
+def plan_square(speed: float, side: float = 0.16, laps: float = 2.0) -> np.ndarray:
     """A horizontal square about the home pose, at rest in its corners.
 
     Args:
@@ -268,31 +305,31 @@ def square(speed: float, side: float = 0.16, laps: float = 2.0) -> np.ndarray:
         laps: of it.
 
     Returns:
-        (3, n, 6) poses, rates and accelerations at `RATE`.
+        (3, n, 6) poses, rates and accelerations at `SAMPLE_RATE`.
 
     Source: quintic of a side, whose largest speed is 15/8 of the mean one.
     """
     span = 15.0 / 8.0 * side / speed
-    time = np.arange(0.0, 4.0 * laps * span, 1.0 / RATE)
+    time = np.arange(0.0, 4.0 * laps * span, 1.0 / SAMPLE_RATE)
     place = time / span
     corner = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * 0.5 * side
     at = place.astype(int)
     s = place - at
     share = (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5)[:, None]
     path = corner[at % 4] + share * (corner[(at + 1) % 4] - corner[at % 4])
-    return _differentiated(path[:, 0], path[:, 1])
+    return _differentiate(path[:, 0], path[:, 1])
 
 
-def _differentiated(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    pose = np.tile(HOME, (len(x), 1))
+def _differentiate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    pose = np.tile(HOME_POSE, (len(x), 1))
     pose[:, 0] += x
     pose[:, 1] += y
-    rate = np.gradient(pose, 1.0 / RATE, axis=0)
-    return np.stack([pose, rate, np.gradient(rate, 1.0 / RATE, axis=0)])
+    rate = np.gradient(pose, 1.0 / SAMPLE_RATE, axis=0)
+    return np.stack([pose, rate, np.gradient(rate, 1.0 / SAMPLE_RATE, axis=0)])
 
 
 class Tracked(NamedTuple):
-    """A path under control; n rows at `RATE`.
+    """A path under control; n rows at `SAMPLE_RATE`.
 
     Attributes:
         time: (n,) [s].
@@ -307,7 +344,7 @@ class Tracked(NamedTuple):
     warnings: int
 
 
-def track(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> Tracked:
+def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> Tracked:
     """Drive a path in MuJoCo, with closed chains, friction and encoder noise.
 
     Args:
@@ -320,14 +357,14 @@ def track(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> 
 
     Source: Abdellatif 2008, section 5.4.
     """
-    own, rng = robot(), np.random.default_rng(seed)
+    own, rng = load_robot(), np.random.default_rng(seed)
     chain = own.setup.chain
     model = mujoco.MjModel.from_xml_path(str(models_folder() / "palida" / "palida.xml"))
     data = mujoco.MjData(model)
     q = joint_positions(chain, own.setup.given, motion[0])
     drives = [chain.index(name) for name in chain.drives]
     reference = q[:, drives]
-    rate = np.gradient(reference, 1.0 / RATE, axis=0)
+    rate = np.gradient(reference, 1.0 / SAMPLE_RATE, axis=0)
     model_force = np.zeros_like(reference)
     if feedforward is not None:
         model_force = own.matrix(motion) @ feedforward
@@ -343,7 +380,7 @@ def track(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> 
     if feedforward is not None:
         held = held - model_force[0]  # the integral part holds the robot where it starts
     slides = chain.places[drives]
-    steps = round(1.0 / RATE / model.opt.timestep)
+    steps = round(1.0 / SAMPLE_RATE / model.opt.timestep)
     error, pose_error = np.empty_like(reference), np.empty_like(reference)
     last, speed = None, np.zeros(6)
     for row in range(len(reference)):
@@ -352,14 +389,14 @@ def track(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> 
         pose_error[row] = motion[0, row] - _pose(data.qpos[place : place + 7])
         reading = true + LENGTH_NOISE * rng.standard_normal(6)
         if last is not None:  # first-order low-pass at 100 Hz of the differences
-            speed += (1.0 - np.exp(-2.0 * np.pi * 100.0 / RATE)) * (
-                (reading - last) * RATE - speed)  # fmt: skip
+            speed += (1.0 - np.exp(-2.0 * np.pi * 100.0 / SAMPLE_RATE)) * (
+                (reading - last) * SAMPLE_RATE - speed)  # fmt: skip
         last = reading
         away = reference[row] - reading
-        held = held + stiff * INTEGRAL * away / RATE
+        held = held + stiff * INTEGRAL_RATE * away / SAMPLE_RATE
         data.ctrl[:] = stiff * away + damp * (rate[row] - speed) + held + model_force[row]
         mujoco.mj_step(model, data, steps)
-    time = np.arange(len(reference)) / RATE
+    time = np.arange(len(reference)) / SAMPLE_RATE
     return Tracked(time, error, pose_error, int(sum(w.number for w in data.warning)))
 
 

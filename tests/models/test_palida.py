@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.files import models_folder
-from hydrotele.experiments.palida import TABLE, excitation, robot
+from hydrotele.experiments.palida import TABLE, load_excitation, load_robot
 from hydrotele.multibody.inverse_dynamics import project
 
 
@@ -34,10 +34,10 @@ def test_steps_under_noise_without_warning(name, share):
 
 
 def test_a_hexapod_has_19_bodies_and_the_published_base_parameters():
-    chain = robot().setup.chain
+    chain = load_robot().setup.chain
     assert len(chain.bodies) == 19 and len(chain.closures) == 6 and len(chain.drives) == 6
     # rounding of the file's decimals
-    np.testing.assert_allclose(robot().truth, [one.value for one in TABLE], atol=1e-9)
+    np.testing.assert_allclose(load_robot().truth, [one.value for one in TABLE], atol=1e-9)
 
 
 def test_drive_forces_are_those_of_the_simulator():
@@ -46,8 +46,8 @@ def test_drive_forces_are_those_of_the_simulator():
     Along the designed motion `M a + h + friction = S' F + J' l` is solved with MuJoCo's own M, h,
     J; rates of the platform's quaternion follow from those of its Cardan angles.
     """
-    own, model = robot(), compiled("palida")
-    motion = excitation()
+    own, model = load_robot(), compiled("palida")
+    motion = load_excitation()
     whole = motion.motion(np.linspace(0.0, motion.period, 40))
     setup = own.setup
     found, forces = project(setup.chain, setup.given, *whole), own.matrix(whole) @ own.truth

@@ -1,0 +1,252 @@
+"""Data processing of Abdellatif 2008: from leg lengths to the motion of the pose.
+
+Sections 4.1 and 5.2, Figs 6 and 7.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
+from hydrotele.experiments.intervals import check_mean, check_statistic, collect
+from hydrotele.experiments.palida import (
+    DRIVE,
+    POSE_HIGH,
+    POSE_LOW,
+    SAMPLE_RATE,
+    RepeatedMotion,
+    force_covariance,
+    load_robot,
+    read_settings,
+    simulate_excitation,
+    simulate_measurement,
+    simulate_motion,
+)
+from hydrotele.identify.estimation import estimate
+from hydrotele.identify.mechanism import in_coordinates
+from hydrotele.identify.motion import Processing, joint_motion, resolution
+from hydrotele.identify.record import IdentificationRecord
+
+HARMONICS = 5
+"""Of the excitation and of the window, as in section 5.2."""
+WAYS = {"raw": "raw", "zero_phase": "time domain", "periodic": "frequency domain"}
+MAX_VISIBLE_ERROR = 0.01
+"""RMS error over RMS signal that "almost no noise" allows: the width of a line in print."""
+Y_AXIS = 1  # of the pose, as in Fig. 6
+CIRCLE_SPEED, CIRCLE_RADIUS = 0.5, 0.10  # m/s and m, of the circle that no model is fitted to
+
+
+class AveragedPeriod(NamedTuple):
+    """One period of data, ready for the regressor.
+
+    Attributes:
+        motion: (3, n, 6) poses, rates and accelerations.
+        force: (n, 6) mean of all periods [N].
+        covariance: (6, 6) of one force reading's noise, from the periods' differences [N^2].
+    """
+
+    motion: np.ndarray
+    force: np.ndarray
+    covariance: np.ndarray
+
+
+def average_periods(record: IdentificationRecord, period: float) -> AveragedPeriod:
+    """Process repeated periods in the frequency domain.
+
+    The leg lengths' mean over the periods goes through forward kinematics; the pose keeps its first
+    five harmonics and is differentiated with them.
+
+    Args:
+        record: leg lengths and forces of at least two whole periods.
+        period: [s].
+
+    Returns:
+        One period.
+
+    Source: Abdellatif 2008, section 4.1, (27).
+    """
+    rows = round(period / record.period)
+    length, force = (part.reshape(-1, rows, 6).copy() for part in (record.position, record.force))
+    mean, covariance = average_force(force)
+    averaged = replace(record, position=length.mean(axis=0), force=mean)
+    return AveragedPeriod(process_lengths(averaged, period, "periodic"), mean, covariance)
+
+
+def average_force(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (n, 6) of periods (p, n, 6), and covariance (6, 6) of one reading's noise [N^2]."""
+    mean = force.mean(axis=0)
+    rest = (force - mean).reshape(-1, 6)
+    return mean, rest.T @ rest / ((len(force) - 1) * len(mean))
+
+
+def process_lengths(
+    record: IdentificationRecord, period: float, method: str, harmonics: int = HARMONICS
+) -> np.ndarray:
+    """Poses, rates and accelerations (3, n, 6) of measured leg lengths.
+
+    Args:
+        record: leg lengths.
+        period: of the motion [s].
+        method: `raw`, `zero_phase` (time domain) or `periodic` (frequency domain).
+        harmonics: that the window of `periodic` keeps.
+
+    Returns:
+        The motion in coordinates of the pose.
+    """
+    pose = in_coordinates(record, load_robot().setup)
+    found = resolution(pose.position, pose.period, pose.position_noise)
+    processing = (
+        Processing("periodic", period=period, harmonics=harmonics) if method == "periodic"
+        else Processing(method)  # pyright: ignore[reportArgumentType]
+    )  # fmt: skip
+    smoothed = joint_motion(pose.position, pose.period, found, processing)
+    return np.stack([smoothed.value, smoothed.rate, smoothed.acceleration])
+
+
+@cache
+def simulate_circle() -> RepeatedMotion:
+    """One lap of a circle at constant speed."""
+    rows = round(2.0 * np.pi * CIRCLE_RADIUS / CIRCLE_SPEED * SAMPLE_RATE)
+    angle = 2.0 * np.pi * np.arange(rows) / rows
+    speed = 2.0 * np.pi * SAMPLE_RATE / rows
+    motion = np.zeros((3, rows, 6))
+    motion[0] = 0.5 * (POSE_LOW + POSE_HIGH)
+    for order in range(3):
+        phase = angle + 0.5 * np.pi * order
+        turned = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+        motion[order, :, :2] += CIRCLE_RADIUS * speed**order * turned
+    return simulate_motion(motion, rows / SAMPLE_RATE)
+
+
+def measure_processing(seed: int, changes: Changes) -> Sample:
+    """Reconstruct the motion and identify models, by three kinds of data processing.
+
+    Args:
+        seed: of the noise.
+        changes: `harmonics`: width of the window in the frequency domain.
+
+    Returns:
+        Relative errors of y and its derivatives, and variances of the error of the predicted force
+        on the circle.
+    """
+    settings = read_settings({"harmonics": HARMONICS}, changes)
+    cycle, lap, own, periods = simulate_excitation(), simulate_circle(), load_robot(), 2
+    rng = np.random.default_rng([7, seed])
+    record = simulate_measurement(cycle, periods, rng)
+    check = simulate_measurement(lap, 3, rng)
+    rows, middle = len(cycle.force), slice(len(lap.force), 2 * len(lap.force))
+    true = cycle.motion[:, :, Y_AXIS]
+    values, rebuilt, predicted = {}, {}, {}
+    for way in WAYS:
+        motion = process_lengths(record, cycle.period, way, settings["harmonics"])
+        rebuilt[way] = motion[:, :rows, Y_AXIS]
+        for order, error in enumerate(rebuilt[way] - true):
+            values[f"{way} {order}"] = float(np.std(error) / np.std(true[order]))
+        value = estimate(own.matrix(motion), record.force, force_covariance(), order=0).value
+        circle = process_lengths(check, lap.period, way, settings["harmonics"])[:, middle]
+        force = own.matrix(circle) @ value
+        values[f"{way} variance"] = float(np.mean((force - check.force[middle]) ** 2))
+        values[f"{way} true variance"] = float(np.mean((force - lap.force) ** 2))
+        predicted[way] = force[:, DRIVE]
+    panels = (*_draw_reconstruction(rebuilt, true, record.force[:rows, DRIVE], cycle.period,
+                                    settings["harmonics"]),
+              *_draw_prediction(predicted, check.force[middle, DRIVE]))  # fmt: skip
+    return Sample(values, panels)
+
+
+_ORDERS = ("y [m]", "rate of y [m/s]", "acceleration of y [m/s^2]")
+
+
+def _draw_reconstruction(
+    rebuilt: dict[str, np.ndarray], true: np.ndarray, force: np.ndarray, period: float,
+    harmonics: int,
+) -> list[Panel]:  # fmt: skip
+    """Spectra of the measured pose with the window, and signals in the time domain."""
+    lines = np.arange(1, 6 * HARMONICS + 1)
+    frequency = lines / period
+    panels, spectrum = [], 2.0 * np.fft.rfft(rebuilt["raw"][0])[lines] / true.shape[1]
+    spectra = [np.abs(spectrum * (2.0 * np.pi * frequency) ** order) for order in range(3)]
+    spectra.append(np.abs(2.0 * np.fft.rfft(force)[lines] / len(force)))
+    for label, amplitude in zip((*_ORDERS, "force of drive 5 [N]"), spectra, strict=True):
+        window = np.where(lines <= harmonics, amplitude.max(), np.nan)
+        panels.append(Panel(f"amplitude of {label}", frequency,
+                            {"measured": amplitude, "window": window}, "frequency [Hz]", log=True,
+                            discrete=True))  # fmt: skip
+    time = np.arange(true.shape[1]) / SAMPLE_RATE
+    for order, label in enumerate(_ORDERS):
+        panels.append(Panel(
+            label, time, {"frequency domain": rebuilt["periodic"][order], "true": true[order]},
+            errors={WAYS[way]: rebuilt[way][order] - true[order] for way in WAYS if way != "raw"},
+            error_label=f"error of {label}",
+        ))  # fmt: skip
+    return panels
+
+
+def _draw_prediction(predicted: dict[str, np.ndarray], force: np.ndarray) -> list[Panel]:
+    time = np.arange(len(force)) / SAMPLE_RATE
+    return [
+        Panel(f"force of drive 5, {WAYS[way]} [N]", time, {"measured": force, "predicted": one})
+        for way, one in predicted.items()
+    ]
+
+
+def judge_reconstruction(samples: Sequence[Sample]) -> Judgement:
+    """Judge the error of y and its derivatives after frequency-domain filtering."""
+    checks = tuple(
+        check_mean(f"relative RMS error of {label.partition(' [')[0]}",
+                   collect(samples, f"periodic {order}"), (0.0, MAX_VISIBLE_ERROR),
+                   '"almost no noise": below the width of a printed line, 1 % of the signal')
+        for order, label in enumerate(_ORDERS)
+    )  # fmt: skip
+    others = ", ".join(
+        f"{np.mean(collect(samples, f'{way} 2')):.2g} {WAYS[way]}" for way in ("raw", "zero_phase")
+    )
+    return Judgement(checks, note=f"acceleration by the other ways: {others}")
+
+
+def judge_prediction(samples: Sequence[Sample]) -> Judgement:
+    """Judge the order of the error variances."""
+    checks = tuple(
+        check_statistic(
+            f"error variance, {WAYS[one]} over {WAYS[other]}",
+            collect(samples, f"{one} variance") / collect(samples, f"{other} variance"),
+            lambda ratios: float(np.exp(np.mean(np.log(ratios)))), (0.0, 1.0),
+            "smaller")
+        for one, other in (("periodic", "zero_phase"), ("zero_phase", "raw"))
+    )  # fmt: skip
+    measured, true = (
+        ", ".join(f"{np.mean(collect(samples, f'{way} {kind}')):.3g} N^2 {words}"
+                  for way, words in WAYS.items())
+        for kind in ("variance", "true variance")
+    )  # fmt: skip
+    return Judgement(checks, note=f"variance of measured less predicted force: {measured}; of true"
+                     f" less predicted force: {true}")  # fmt: skip
+
+
+PROCESSING = Experiment(
+    "data processing",
+    measure_processing,
+    (
+        Claim(
+            "reconstruction of the motion",
+            '"The effectiveness of the proposed filter is obvious, since the calculated signals'
+            ' exhibit almost no noise or disturbance corruption."',
+            "Fig. 6, section 5.2", "document", judge_reconstruction,
+            {"harmonics": 200}, "the window is forty times too wide",
+            (*(f"amplitude of {label}" for label in (*_ORDERS, "force of drive 5 [N]")), *_ORDERS),
+        ),
+        Claim(
+            "prediction on a circle",
+            '"The frequency-domain processing yields the best prediction quality corresponding to'
+            ' the smallest error variance σ2 . Time-domain filtering is not accurate enough to'
+            ' extract all information at the relevant frequencies."',
+            "Fig. 7, section 5.2", "document", judge_prediction,
+            {"harmonics": 200}, "the window is forty times too wide",
+            tuple(f"force of drive 5, {words} [N]" for words in WAYS.values()),
+        ),
+    ),
+    max_repetitions=10,
+)  # fmt: skip

@@ -1,0 +1,512 @@
+"""Repeated identification of PaLiDA: estimates, their covariance, and friction that warms up.
+
+Abdellatif 2008, sections 3, 4.2 and 5.3: Table 2, Figs 8 and 9, and the bias of least squares.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import binomtest, ncx2
+
+from hydrotele.experiments.abdellatif_processing import (
+    average_force,
+    average_periods,
+    process_lengths,
+)
+from hydrotele.experiments.comparison import (
+    Changes,
+    Check,
+    Claim,
+    Experiment,
+    Judgement,
+    Panel,
+    Sample,
+)
+from hydrotele.experiments.intervals import (
+    CONFIDENCE,
+    check_exact,
+    check_fraction,
+    check_mean,
+    check_statistic,
+    collect,
+)
+from hydrotele.experiments.palida import (
+    CHI2_LIMIT,
+    LENGTH_NOISE,
+    SYMBOLS,
+    TABLE,
+    control_gains,
+    draw_force_noise,
+    force_covariance,
+    load_robot,
+    read_settings,
+    simulate_excitation,
+    simulate_measurement,
+)
+from hydrotele.identify.estimation import estimate
+
+PERIODS = 4
+"""Repetitions of the motion in one trial; the document prints none."""
+TRIALS = 100
+"""Trials of one series, as in section 5.3."""
+FRICTION_EXCESS = 0.03
+"""Excess of all friction parameters in the first trial, over their stationary values; assumed. The
+document says only that friction varies "at the beginning of the measurement process"."""
+EXCESS_DECAY = 0.15
+"""Factor of the excess from one trial to the next; assumed. The second trial is within the
+document's ellipsoid, the first is not."""
+RIPPLE, RIPPLE_PITCH = 5.0, 0.03
+"""Amplitude [N] and period in leg length [m] of a repeatable force such as the magnets of linear
+motors cause; assumed, and used for an explanation only."""
+MAX_EXCEPTIONS = 0.1
+"""Fraction of estimates outside their intervals that "mostly within" allows: twice the 5 % that a
+95 % interval leaves outside."""
+_PRINTED = np.array([one.value for one in TABLE])
+_STD = np.array([one.std for one in TABLE])
+_IS_FRICTION = np.array([one.column.startswith(("coulomb", "viscous")) for one in TABLE])
+
+
+class NormalEquations:
+    """Normal equations of one regressor for any forces and any covariance of the drives.
+
+    Attributes:
+        matrix: (n, 6, 24) regressor.
+    """
+
+    def __init__(self, matrix: np.ndarray):
+        """Multiply the columns of all pairs of drives.
+
+        Args:
+            matrix: (n, 6, 24) regressor.
+        """
+        self.matrix = matrix
+        self._columns = np.ascontiguousarray(matrix.transpose(1, 2, 0)).reshape(-1, len(matrix))
+        products = (self._columns @ self._columns.T).reshape(6, 24, 6, 24)
+        self._products = products.transpose(0, 2, 1, 3)
+
+    def information(self, weight: np.ndarray) -> np.ndarray:
+        """(24, 24) of equations with weight (6, 6) [1/N^2]: the inverse of P in (28)."""
+        return np.tensordot(weight, self._products, axes=2)
+
+    def solve(
+        self, weight: np.ndarray, correlations: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Estimate parameters, by (21).
+
+        Args:
+            weight: (t, 6, 6) of the drives, or (1, 6, 6) for all.
+            correlations: (t, 6, 6, 24) with the forces.
+
+        Returns:
+            Estimates (t, 24) and their information (t, 24, 24).
+        """
+        information = np.tensordot(weight, self._products, axes=2)
+        right = np.sum(weight[..., None] * correlations, axis=(1, 2))
+        return np.linalg.solve(information, right[..., None])[..., 0], information
+
+    def correlate(self, force: np.ndarray) -> np.ndarray:
+        """(6, 6, 24) products of every drive's columns with the force (n, 6) of every drive."""
+        return (self._columns @ force).reshape(6, 24, 6).transpose(0, 2, 1)
+
+
+class Trials(NamedTuple):
+    """A series of t trials.
+
+    Attributes:
+        value: (t, 24) Gauss-Markov estimates.
+        information: (t, 24, 24) inverse of their covariance P by (28).
+        warm_first: (24,) the first trial's estimate with the same noise and stationary friction.
+        least_squares: (t, 24) estimates with equal weights for all drives.
+        rippled: (t, 24) estimates with a repeatable force and a covariance of residuals.
+        rippled_information: (24, 24) inverse of the covariance that is claimed for these.
+    """
+
+    value: np.ndarray
+    information: np.ndarray
+    warm_first: np.ndarray
+    least_squares: np.ndarray
+    rippled: np.ndarray
+    rippled_information: np.ndarray
+
+
+TRIAL_SETTINGS = {
+    "friction_excess": FRICTION_EXCESS, "claimed_noise": 1.0, "processing": "periodic",
+    "trials": TRIALS,
+}  # fmt: skip
+"""Of `simulate_trials`: excess of friction in the first trial; factor of the standard deviations of
+force noise that the covariance claims; `periodic` or `raw` differences of the poses; number of
+trials."""
+
+
+def simulate_trials(seed: int, settings: Changes) -> Trials:
+    """Identify the robot again and again, with new force noise in every trial.
+
+    The trials of a series share the noise of the leg lengths, whose effect on the estimates is
+    small: see `judge_ellipsoid`.
+
+    Args:
+        seed: of the series.
+        settings: see `TRIAL_SETTINGS`.
+
+    Returns:
+        The estimates.
+
+    Source: Abdellatif 2008, (21), (28), section 5.3.
+    """
+    own, cycle = load_robot(), simulate_excitation()
+    rng = np.random.default_rng([2008, seed])
+    record = simulate_measurement(cycle, PERIODS, rng)
+    lengths = record.position.reshape(PERIODS, -1, 6).mean(axis=0)
+    averaged = replace(record, position=lengths, force=cycle.force)
+    motion = process_lengths(averaged, cycle.period, settings["processing"])
+    equations = NormalEquations(own.matrix(motion))
+    friction = cycle.matrix[:, :, _IS_FRICTION] @ own.truth[_IS_FRICTION]
+    friction = settings["friction_excess"] * friction
+    found, weights = [], []
+    for number in range(settings["trials"]):
+        noise = draw_force_noise((PERIODS, len(lengths)), rng)
+        mean, covariance = average_force(noise)
+        covariance = settings["claimed_noise"] ** 2 * covariance / PERIODS
+        weights.append(np.linalg.inv(covariance))
+        found.append(equations.correlate(cycle.force + EXCESS_DECAY**number * friction + mean))
+    weight, correlations = np.array(weights), np.array(found)
+    value, information = equations.solve(weight, correlations)
+    warm, _ = equations.solve(weight[:1], correlations[:1] - equations.correlate(friction))
+    plain, _ = equations.solve(np.eye(6)[None], correlations)
+    ripple = RIPPLE * np.sin(2.0 * np.pi / RIPPLE_PITCH * cycle.length)
+    residual = cycle.force + ripple - equations.matrix @ (value[-1] + equations.solve(
+        weight[-1:], equations.correlate(ripple)[None])[0][0])  # fmt: skip
+    total = np.linalg.inv(weight[-1]) + residual.T @ residual / len(residual)
+    rippled, claimed = equations.solve(
+        np.linalg.inv(total)[None], correlations + equations.correlate(ripple))  # fmt: skip
+    return Trials(value, information, warm[0], plain, rippled, claimed[0])
+
+
+def measure_trials(seed: int, changes: Changes) -> Sample:
+    """Simulate one series of trials.
+
+    Args:
+        seed: of the series.
+        changes: of `TRIAL_SETTINGS`.
+
+    Returns:
+        Estimates `value` and `least_squares` (t, 24), `std` (24,), squared distances `distance`
+        (t,) from the mean of all trials after the first, and figures of the first trial.
+    """
+    trials = simulate_trials(seed, read_settings(TRIAL_SETTINGS, changes))
+    later = trials.value[1:]
+    mean = later.mean(axis=0)
+    std = np.sqrt(np.diag(np.linalg.inv(trials.information[-1])))
+    distance = square_distance(trials.value - mean, trials.information)
+    rippled = trials.rippled[1:] - trials.rippled[1:].mean(axis=0)
+    outside = np.abs(trials.value - mean) > 2.0 * std
+    values = {
+        "printed": float(np.mean(np.abs(later - _PRINTED) <= 2.0 * _STD)),
+        "inside": float(1.0 - outside[1:].mean()), "first": float(outside[0].mean()),
+        "p1": float(outside[1:, 0].mean()), "first distance": float(distance[0]),
+        "warm first distance": float(
+            square_distance(trials.warm_first - mean, trials.information[0])),
+        "rippled": float(np.mean(
+            square_distance(rippled, trials.rippled_information) < CHI2_LIMIT)),
+        "common shift": float(np.sqrt(square_distance(
+            mean - load_robot().truth, trials.information[-1]))),
+    }  # fmt: skip
+    arrays = {"value": trials.value, "least_squares": trials.least_squares, "std": std,
+              "distance": distance}  # fmt: skip
+    return Sample(values, (*_draw_history(trials.value, mean, std), _draw_distance(distance)),
+                  arrays)  # fmt: skip
+
+
+def square_distance(error: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Squared length (...) of errors (..., 24) in standard deviations, by (29)."""
+    return np.einsum("...p,...pq,...q->...", error, information, error)
+
+
+def _draw_history(value: np.ndarray, mean: np.ndarray, std: np.ndarray) -> tuple[Panel, ...]:
+    number, ones = np.arange(1.0, len(value) + 1), np.ones(len(value))
+    return tuple(
+        Panel(f"{SYMBOLS[k]} over its mean [1]", number,
+              {"estimate": value[:, k] / mean[k],
+               "upper bound": (1.0 + 2.0 * abs(std[k] / mean[k])) * ones,
+               "lower bound": (1.0 - 2.0 * abs(std[k] / mean[k])) * ones}, "trial")
+        for k in (0, 1, 4, 9, 12, 18)
+    )  # fmt: skip
+
+
+_DISTANCE = "squared distance from the mean estimate [1]"
+
+
+def _draw_distance(distance: np.ndarray) -> Panel:
+    limit = np.full(len(distance), CHI2_LIMIT)
+    return Panel(_DISTANCE, np.arange(1.0, len(distance) + 1),
+                 {"trial": distance, "95 % ellipsoid": limit}, "trial", log=True)  # fmt: skip
+
+
+def judge_intervals(samples: Sequence[Sample]) -> Judgement:
+    """Judge the estimates by the printed intervals."""
+    check = check_mean(
+        "fraction of the estimates within the printed 95 % intervals", collect(samples, "printed"),
+        (1.0 - MAX_EXCEPTIONS, 1.0), "at most twice the 5 % that a 95 % interval leaves outside",
+    )  # fmt: skip
+    return Judgement((check,))
+
+
+def judge_deviations(samples: Sequence[Sample]) -> Judgement:
+    """Judge the standard deviations by those of the printed intervals."""
+    ratio = np.mean([sample.arrays["std"] for sample in samples], axis=0) / _STD
+    low, high = int(np.argmin(ratio)), int(np.argmax(ratio))
+    words = "standard deviation over the printed one, "
+    reason = "the noise and the geometry were chosen for a factor of two at most"
+    return Judgement(
+        (
+            check_exact(f"{words}smallest ({SYMBOLS[low]})", ratio[low], (0.5, 2.0), reason),
+            check_exact(f"{words}largest ({SYMBOLS[high]})", ratio[high], (0.5, 2.0), reason),
+        ),
+        note=f"geometric mean {np.exp(np.mean(np.log(ratio))):.2f}",
+    )
+
+
+def judge_history(samples: Sequence[Sample]) -> Judgement:
+    """Judge the estimates by their own intervals about the mean of the series."""
+    return Judgement((
+        check_mean(
+            "fraction of the estimates after the first trial within their intervals",
+            collect(samples, "inside"), (1.0 - MAX_EXCEPTIONS, 1.0),
+            '"mostly": at most twice the 5 % that a 95 % interval leaves outside'),
+        check_mean(
+            "fraction of the 24 estimates of the first trial outside their intervals",
+            collect(samples, "first"), (MAX_EXCEPTIONS, 1.0),
+            '"exceptions": more than twice the 5 % that a 95 % interval leaves outside'),
+    ))  # fmt: skip
+
+
+def judge_first_parameter(samples: Sequence[Sample]) -> Judgement:
+    """Judge whether p1 leaves its interval more often than others."""
+    check = check_mean(
+        "fraction of the estimates of p1 outside their intervals", collect(samples, "p1"),
+        (MAX_EXCEPTIONS, 1.0),
+        '"exceptions": more than twice the 5 % that a 95 % interval leaves outside',
+    )  # fmt: skip
+    others = 100.0 * (1.0 - float(np.mean(collect(samples, "inside"))))
+    return Judgement(
+        (check,),
+        f"the simulated force noise is all that changes from trial to trial, and the covariance"
+        f" holds all of it, so that p1 is no exception ({others:.1f} % of all estimates are"
+        " outside); the document's p1 is a sum of moments of inertia with a negative estimate, so"
+        " that effects without a parameter are in it",
+    )
+
+
+def judge_first_trial(samples: Sequence[Sample]) -> Judgement:
+    """Judge whether friction that is not warm brings the first trial out of the ellipsoid."""
+    cold, warm = (collect(samples, name) for name in ("first distance", "warm first distance"))
+    return Judgement(
+        (
+            check_fraction("fraction of the first trials outside the ellipsoid", cold > CHI2_LIMIT,
+                           reason="more than half of the series; the document had one"),
+            check_fraction("fraction outside with the same noise and friction that is warm from"
+                           " the start", warm > CHI2_LIMIT, (0.0, 0.5),
+                           "less than half of the series: friction is the cause"),
+        ),
+        note=f"squared distance of the first trial {np.median(cold):.0f} with"
+        f" {100 * FRICTION_EXCESS:.0f} % more friction, {np.median(warm):.0f} without (medians)",
+    )  # fmt: skip
+
+
+def judge_ellipsoid(samples: Sequence[Sample]) -> Judgement:
+    """Judge the fraction of the sets within the ellipsoid by the document's 99 of 99."""
+    distance = np.concatenate([sample.arrays["distance"][1:] for sample in samples])
+    published = TRIALS - 1
+    low = float(binomtest(published, published).proportion_ci(CONFIDENCE, "exact").low)
+    check = check_fraction(
+        "fraction of the trials after the first within the ellipsoid", distance < CHI2_LIMIT,
+        (low, 1.0), f"95 % interval of the document's {published} of {published}", published=1.0,
+    )  # fmt: skip
+    rippled, shift = (np.mean(collect(samples, name)) for name in ("rippled", "common shift"))
+    return Judgement(
+        (check,),
+        f"a 95 % ellipsoid leaves 5 % outside where the covariance is that of the trials'"
+        f" differences; all {published} are then within it with a probability of"
+        f" {100 * 0.95**published:.1f} %. A covariance of residuals also holds what repeats in"
+        f" every trial: with a repeatable force of {RIPPLE:g} N in every drive,"
+        f" {100 * rippled:.1f} % are within it",
+        f"the mean of a series is {shift:.2f} standard deviations from the model's values, where"
+        f" {np.sqrt(len(TABLE) / published):.2f} are expected of {published} independent trials",
+    )  # fmt: skip
+
+
+def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: int) -> Check:
+    """Check of the bias of an estimator, in standard deviations of one estimate.
+
+    Args:
+        quantity: name of the bias.
+        mean: (p,) mean of the estimates' errors.
+        covariance: (p, p) of one estimate.
+        count: number of estimates n.
+
+    Returns:
+        The check; n d^2 for a bias of length d is the noncentrality of a chi^2 distribution with p
+        degrees of freedom, by whose quantiles the interval is found.
+    """
+    degrees = len(mean)
+    squared = count * float(mean @ np.linalg.solve(covariance, mean))
+
+    def bound(chance: float) -> float:
+        if ncx2.cdf(squared, degrees, 0.0) < chance:
+            return 0.0
+        high = 4.0 * squared + 100.0
+        root = brentq(lambda size: ncx2.cdf(squared, degrees, size) - chance, 0.0, high)
+        return float(np.sqrt(float(root) / count))  # pyright: ignore[reportArgumentType]
+
+    return Check(
+        quantity, float(np.sqrt(max(squared - degrees, 0.0) / count)),
+        bound(0.5 + CONFIDENCE / 2.0), bound(0.5 - CONFIDENCE / 2.0), (1.0, np.inf),
+        "a bias that one experiment can show: at least the standard deviation of its estimate",
+    )  # fmt: skip
+
+
+def judge_least_squares(samples: Sequence[Sample]) -> Judgement:
+    """Judge the bias of least squares where the forces of the drives are cross-correlated."""
+    truth = load_robot().truth
+    value = np.concatenate([sample.arrays["least_squares"][1:] for sample in samples])
+    equations = NormalEquations(simulate_excitation().matrix)
+    normal = np.linalg.inv(equations.information(np.eye(6)))
+    noise = force_covariance() / PERIODS
+    covariance = normal @ equations.information(noise) @ normal
+    best = np.linalg.inv(equations.information(np.linalg.inv(noise)))
+    wide = np.exp(0.5 * np.mean(np.log(np.diag(covariance) / np.diag(best))))
+    check = check_bias("bias of least squares in standard deviations of one estimate",
+                       value.mean(axis=0) - truth, covariance, len(value))  # fmt: skip
+    return Judgement(
+        (check,),
+        "where the regressor has no noise, least squares is free of bias for any covariance of the"
+        f" forces; it loses precision: its standard deviations are {wide:.2f} times those"
+        " of the Gauss-Markov estimate",
+    )
+
+
+METHODS = {
+    "samples, least squares": "least squares on samples",
+    "samples, Gauss-Markov": "Gauss-Markov on samples",
+    "periods, Gauss-Markov": "Gauss-Markov on mean periods in the frequency domain",
+}
+
+
+def measure_reaction(seed: int, changes: Changes) -> Sample:
+    """Estimate where controllers bring the noise of their encoders into the forces.
+
+    Args:
+        seed: of the noise.
+        changes: `length_noise`: factor of the standard deviation of a measured length.
+
+    Returns:
+        Errors (24,) of the estimates by the methods of `METHODS`, in printed standard deviations.
+    """
+    settings = read_settings({"length_noise": 1.0}, changes)
+    own, cycle, periods = load_robot(), simulate_excitation(), 2
+    record = simulate_measurement(
+        cycle, periods, np.random.default_rng([21, seed]), control_gains(),
+        settings["length_noise"] * LENGTH_NOISE,
+    )  # fmt: skip
+    sampled = NormalEquations(own.matrix(process_lengths(record, cycle.period, "raw")))
+    mean = average_periods(record, cycle.period)
+    weight = np.linalg.inv(mean.covariance)[None]
+    found = sampled.correlate(record.force)[None]
+    value = {
+        "samples, least squares": sampled.solve(np.eye(6)[None], found)[0][0],
+        "samples, Gauss-Markov": sampled.solve(weight, found)[0][0],
+        "periods, Gauss-Markov": estimate(
+            own.matrix(mean.motion), mean.force, mean.covariance, order=0).value,
+    }  # fmt: skip
+    return Sample({}, arrays={name: (one - own.truth) / _STD for name, one in value.items()})
+
+
+def judge_reaction(samples: Sequence[Sample]) -> Judgement:
+    """Judge which methods are biased by noise that regressor and forces share."""
+    checks = []
+    for name, words in METHODS.items():
+        biased = name.startswith("samples")
+        checks.append(check_statistic(
+            f"bias of {words}, RMS of 24 parameters",
+            np.array([sample.arrays[name] for sample in samples]),
+            lambda errors: float(np.sqrt(np.mean(errors.mean(axis=0) ** 2))),
+            (10.0, np.inf) if biased else (0.0, 1.0),
+            "bias prevails over chance" if biased else "a standard deviation of one experiment",
+            unit="printed standard deviations",
+        ))  # fmt: skip
+    return Judgement(tuple(checks))
+
+
+_CLAIM_TOO_SMALL = {"claimed_noise": 0.5}
+_HALF_NOISE = "the covariance claims half of the noise"
+
+TRIAL_SERIES = Experiment(
+    "trials",
+    measure_trials,
+    (
+        Claim(
+            "estimates within the printed intervals",
+            "24 parameters with 95 % confidence intervals",
+            "Table 2", "document", judge_intervals,
+            {"processing": "raw"}, "poses are differentiated without a filter", (),
+        ),
+        Claim(
+            "standard deviations", "24 standard deviations (of the printed intervals)", "Table 2",
+            "input", judge_deviations, None, "", (),
+        ),
+        Claim(
+            "history of the estimates",
+            '"the estimates remain mostly within the confidence intervals. Some exceptions are'
+            ' observed though, such the very small first rigid-body parameter and the first few'
+            ' measurement trials." "due to the variation of friction at the beginning of the'
+            ' measurement process until a nearly stationary state is reached."',
+            "Fig. 8, section 5.3", "document", judge_history, _CLAIM_TOO_SMALL, _HALF_NOISE,
+            tuple(f"{SYMBOLS[k]} over its mean [1]" for k in (0, 1, 4, 9, 12, 18)),
+        ),
+        Claim(
+            "exception of the first parameter",
+            '"Some exceptions are observed though, such the very small first rigid-body parameter"',
+            "Fig. 8, section 5.3", "document", judge_first_parameter,
+            {"claimed_noise": 2.0}, "the covariance claims twice the noise",
+            (f"{SYMBOLS[0]} over its mean [1]",),
+        ),
+        Claim(
+            "first trial outside the ellipsoid",
+            '"Excepting the first trial, the set of all parameters lays clearly within the'
+            ' confidence ellipsoid"; radius 36.42',
+            "Fig. 9, section 5.3", "document", judge_first_trial,
+            {"friction_excess": 0.0}, "friction is warm from the start", (_DISTANCE,),
+        ),
+        Claim(
+            "all other trials within the ellipsoid",
+            '"Excepting the first trial, the set of all parameters lays clearly within the'
+            ' confidence ellipsoid"; radius 36.42, 100 trials',
+            "Fig. 9, section 5.3", "document", judge_ellipsoid, _CLAIM_TOO_SMALL, _HALF_NOISE,
+            (_DISTANCE,),
+        ),
+        Claim(
+            "bias of least squares",
+            '"Neglecting this fact by applying the simple LS-method will lead to biased estimates"',
+            "section 3, after (21)", "document", judge_least_squares,
+            {"friction_excess": 0.0}, "friction is warm from the start", (),
+        ),
+    ),
+)  # fmt: skip
+
+REACTION = Experiment(
+    "controllers that react to encoder noise",
+    measure_reaction,
+    (
+        Claim(
+            "bias by controllers",
+            "controllers bring the noise of their encoders into the forces; least squares and"
+            " Gauss-Markov on samples are then biased, the frequency-domain processing is not",
+            "section 3, after (21)", "additional", judge_reaction,
+            {"length_noise": 0.001}, "encoders without noise", (),
+        ),
+    ),
+    max_repetitions=20,
+)  # fmt: skip

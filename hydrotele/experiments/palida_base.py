@@ -1,0 +1,352 @@
+"""Base parameters of PaLiDA: printed in Table 1, by regrouping rules, and by the null space.
+
+Three ways to the same result. Table 1 gives ten combinations. The rules of section 2.1 regroup the
+parameters body by body from the geometry alone. The null space of the regressor needs random states
+and no rule.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
+from hydrotele.experiments.intervals import check_exact, collect
+from hydrotele.experiments.palida import (
+    LEGS,
+    SYMBOLS,
+    TABLE,
+    draw_states,
+    load_robot,
+    read_settings,
+)
+from hydrotele.identify.identifiability import Identifiability, identifiability
+from hydrotele.multibody.chain import Chain
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor, project
+
+_KINDS = tuple(BODY_PARAMETERS)
+_INERTIAS = tuple(kind for kind in _KINDS if kind.startswith("inertia"))
+MAX_ROUNDING = 1e-8
+"""Largest difference of coefficients [kg m^2, kg m, kg] that counts as rounding: the places of the
+joints in the MJCF have twelve decimals, the null space takes 600 equations in double precision."""
+
+
+class Relation(NamedTuple):
+    """A column of the regressor that is a combination of others, by (10).
+
+    Attributes:
+        parameter: whose column it is, such as `inertia_yy.stator_1`.
+        weights: parameter -> coefficient; empty where the parameter has no effect.
+    """
+
+    parameter: str
+    weights: dict[str, float]
+
+
+def transfer_parameters(rotation: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Matrix (10, 10) that expresses a body's inertial parameters in the frame of its carrier.
+
+    Args:
+        rotation: (3, 3) orientation of the body's frame in the carrier's.
+        offset: (3,) origin of the body's frame in the carrier's [m].
+
+    Returns:
+        The matrix L of (9), whose rows and columns are in the order of `BODY_PARAMETERS`.
+
+    >>> unit = transfer_parameters(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    >>> dict(zip(_KINDS, unit[:, 0].tolist()))["inertia_xx"]  # Steiner: 1 kg at a distance of 2 m
+    4.0
+    """
+    columns = []
+    for unit in np.eye(10):
+        mass, moment = unit[0], unit[1:4]
+        tensor = _tensor(unit[4:])
+        shifted = rotation @ moment + mass * offset
+        second = rotation @ (0.5 * np.trace(tensor) * np.eye(3) - tensor) @ rotation.T
+        cross = np.outer(rotation @ moment, offset)
+        second = second + cross + cross.T + mass * np.outer(offset, offset)
+        tensor = np.trace(second) * np.eye(3) - second
+        columns.append([mass, *shifted, *tensor[np.triu_indices(3)]])
+    return np.array(columns).T
+
+
+def _tensor(entries: np.ndarray) -> np.ndarray:
+    tensor = np.zeros((3, 3))
+    tensor[np.triu_indices(3)] = entries
+    return tensor + np.triu(tensor, 1).T
+
+
+def list_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relation]:
+    """Relations between the parameters of the 19 bodies by the rules of section 2.1.
+
+    Args:
+        chain: of the hexapod; the frames of ring, stator and slider have their joint along z.
+        platform_rule: whether the masses of the sliders are added to the platform.
+
+    Yields:
+        Relations from the sliders to the frame, so that each can use the results of those before.
+
+    Source: Abdellatif 2008, section 2.1, after (11). Prismatic joint: all moments of inertia of the
+    slider go to the stator. Platform: the slider's mass is a point mass in the platform joint,
+    where its frame has its origin (Steiner). Revolute joint: a mass, a first moment along the axis
+    and equal inertias about x and y are those of point masses on the axis, which the joint does not
+    move: they go to the antecedent body. The frame does not move, so that of a ring only what
+    turns about its axis is left.
+    """
+    tree = chain.tree
+    for leg in LEGS:
+        ring, stator, slider = (f"{kind}_{leg}" for kind in ("ring", "stator", "slider"))
+        body = chain.bodies.index(slider) + 1
+        turned = transfer_parameters(tree.turn[body], np.zeros(3))
+        for kind in _INERTIAS:
+            yield Relation(f"{kind}.{slider}", _name_weights(turned, kind, stator))
+        if platform_rule:
+            joint = transfer_parameters(np.eye(3), tree.points[leg - 1, 1])
+            yield Relation(f"mass.{slider}", _name_weights(joint, "mass", "platform"))
+        body = chain.bodies.index(stator) + 1
+        moved = transfer_parameters(tree.turn[body], tree.offset[body])
+        for kind in ("mass", "moment_z"):
+            yield Relation(f"{kind}.{stator}", _name_weights(moved, kind, ring))
+        rod = _name_weights(moved, "inertia_xx", ring, "inertia_yy")
+        yield Relation(f"inertia_yy.{stator}", rod | {f"inertia_xx.{stator}": -1.0})
+        for kind in ("mass", "moment_z", *_INERTIAS):
+            if kind != "inertia_zz":
+                yield Relation(f"{kind}.{ring}", {})
+
+
+def _name_weights(matrix: np.ndarray, kind: str, body: str, *more: str) -> dict[str, float]:
+    """Weights of the carrier's parameters for one or a sum of parameters of the carried body."""
+    column = matrix[:, [_KINDS.index(one) for one in (kind, *more)]].sum(axis=1)
+    return {f"{k}.{body}": float(c) for k, c in zip(_KINDS, column, strict=True) if abs(c) > 1e-12}
+
+
+def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> np.ndarray:
+    """Regrouped parameters as combinations of all parameters, by (11).
+
+    Args:
+        names: the m inertial parameters.
+        relations: in the order in which they are applied.
+
+    Returns:
+        (m, m); rows of parameters that the relations eliminate are 0.
+    """
+    places = {name: k for k, name in enumerate(names)}
+    regrouped = np.eye(len(names))
+    for parameter, weights in relations:
+        row = places[parameter]
+        for name, weight in weights.items():
+            regrouped[places[name]] += weight * regrouped[row]
+        regrouped[row] = 0.0
+    return regrouped
+
+
+def table_1(joints: np.ndarray) -> dict[str, dict[str, float]]:
+    """The ten combinations of Table 1 with the names of the model's first leg.
+
+    Args:
+        joints: (6, 3) places of the platform joints r_B in the platform's frame [m].
+
+    Returns:
+        Symbol -> parameter -> coefficient. The table prints s_y3 for p5; by I_yy2 + I_zz3 in p1 the
+        strut's axis is z of frame 3, as in the model.
+    """
+    x, y, z = np.sum(joints**2, axis=0)
+    slider = "mass.slider_1"
+    return {
+        "p1": {"inertia_zz.ring_1": 1.0, "inertia_yy.stator_1": 1.0, "inertia_zz.slider_1": 1.0},
+        "p2": {"inertia_xx.stator_1": 1.0, "inertia_xx.slider_1": 1.0,
+               "inertia_yy.stator_1": -1.0, "inertia_zz.slider_1": -1.0},
+        "p3": {"inertia_zz.stator_1": 1.0, "inertia_yy.slider_1": 1.0},
+        "p4": {"moment_y.stator_1": 1.0},
+        "p5": {"moment_z.slider_1": 1.0},
+        "p6": {"inertia_xx.platform": 1.0, slider: float(y + z)},
+        "p7": {"inertia_yy.platform": 1.0, slider: float(x + z)},
+        "p8": {"inertia_zz.platform": 1.0, slider: float(x + y)},
+        "p9": {"moment_z.platform": 1.0, slider: float(joints[:, 2].sum())},
+        "p10": {"mass.platform": 1.0, slider: 6.0},
+    }  # fmt: skip
+
+
+_STAGES = {
+    "19 bodies": {"alike": (), "absent": ()},
+    "equal legs": {"absent": ()},
+    "equal legs, symmetrical bodies": {},
+}
+"""Knowledge of the bodies -> changes of the model's regressor. With the last, 19 inertial
+parameters of a leg and of the platform are declared absent, as in Table 1."""
+
+
+def measure_structure(seed: int, changes: Changes) -> Sample:
+    """Find the base parameters in three ways.
+
+    Args:
+        seed: nothing is random.
+        changes: `declare_symmetry` False: no parameter is declared absent. `platform_rule` False:
+            the rule for the platform is left out. `joint_radius`: factor of the places of the
+            platform joints in Table 1.
+
+    Returns:
+        Numbers of base parameters, and largest differences of coefficients.
+    """
+    defaults = {"declare_symmetry": True, "platform_rule": True, "joint_radius": 1.0}
+    settings = read_settings(defaults, changes)
+    own = load_robot()
+    chain, found = own.setup.chain, project(own.setup.chain, own.setup.given, *draw_states())
+    bodies = [f"{kind}.{body}" for body in chain.bodies for kind in _KINDS]
+    regrouped = regroup_parameters(bodies, list_relations(chain, settings["platform_rule"]))
+    values: dict[str, float] = {}
+    spectra = []
+    for stage, options in _STAGES.items():
+        table = replace(own.setup, **options).table(found)
+        structure, kept = _reduce_inertial(table)
+        names = [table.names[k] for k in kept]
+        sums = _sum_equal(bodies, names, own.setup.alike if stage != "19 bodies" else ())
+        rules = (regrouped @ sums)[[bodies.index(name) for name in names]]  # one of equal legs
+        rules = rules[np.any(rules, axis=1)]
+        values[f"columns, {stage}"] = len(kept)
+        values[f"rank, {stage}"] = len(structure.base)
+        values[f"rules, {stage}"] = len(rules)
+        values[f"difference, {stage}"] = _largest_difference(rules, structure)
+        rows = table.matrix[:, :, kept].reshape(-1, len(kept))
+        spectra.append(np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-9),
+                                     compute_uv=False))  # fmt: skip
+    printed = table_1(settings["joint_radius"] * chain.tree.points[:, 1])
+    structure = own.structure
+    if not settings["declare_symmetry"]:
+        table = replace(own.setup, absent=()).table(found)
+        rows = table.matrix.reshape(-1, len(table.names))
+        structure = identifiability(rows, table.names, table.units, [one.column for one in TABLE])
+    values |= _compare_with_print(structure, printed)
+    values["values"] = float(np.abs(own.truth - [one.value for one in TABLE]).max())
+    panels = tuple(
+        Panel(f"singular value, {stage} [1]", np.arange(1.0, len(s) + 1),
+              {"over the largest": np.maximum(s / s[0], 1e-18)}, "number", log=True, discrete=True)
+        for stage, s in zip(_STAGES, spectra, strict=True)
+    )  # fmt: skip
+    return Sample(values, panels)
+
+
+def _reduce_inertial(table: Regressor) -> tuple[Identifiability, list[int]]:
+    """Base of the inertial columns, and their places among the regressor's."""
+    kept = [k for k, name in enumerate(table.names) if name.partition(".")[0] in _KINDS]
+    names, units = [table.names[k] for k in kept], [table.units[k] for k in kept]
+    rows = table.matrix[:, :, kept].reshape(-1, len(kept))
+    first = [one.column for one in TABLE[:10]]
+    return identifiability(rows, names, units, [name for name in first if name in names]), kept
+
+
+def _sum_equal(
+    bodies: Sequence[str], names: Sequence[str], alike: Sequence[Sequence[str]]
+) -> np.ndarray:
+    """Parameters (190, m) of all bodies by the m that are left, where some are equal."""
+    first = {body: group[0] for group in alike for body in group}
+    sums = np.zeros((len(bodies), len(names)))
+    for k, name in enumerate(bodies):
+        kind, _, body = name.partition(".")
+        united = f"{kind}.{first.get(body, body)}"
+        if united in names:
+            sums[k, names.index(united)] = 1.0
+    return sums
+
+
+def _largest_difference(rules: np.ndarray, structure: Identifiability) -> float:
+    """Largest difference of coefficients between rules (r, m) and null space.
+
+    The null space may name the same combinations after other members, so that the rules are first
+    solved for its representatives; infinite where the numbers of combinations differ.
+    """
+    if len(rules) != len(structure.base):
+        return np.inf
+    solved = np.linalg.solve(rules[:, structure.base], rules)
+    return float(np.abs(solved - structure.combination).max())
+
+
+def _compare_with_print(
+    structure: Identifiability, printed: dict[str, dict[str, float]]
+) -> dict[str, float]:
+    """Numbers of parameters, and of combinations whose coefficients are those of Table 1."""
+    names, same = [structure.names[k] for k in structure.base], 0
+    for symbol, members in printed.items():
+        column = TABLE[SYMBOLS.index(symbol)].column
+        if column not in names:
+            continue
+        row = structure.combination[names.index(column)]
+        found = {structure.names[k]: row[k] for k in np.flatnonzero(row)
+                 if not structure.names[k].startswith("drive_inertia")}  # fmt: skip
+        same += set(found) == set(members) and all(
+            abs(found[name] - members[name]) < MAX_ROUNDING for name in members
+        )
+    friction = sum(name.startswith(("coulomb", "viscous")) for name in names)
+    return {"rigid": len(names) - friction, "friction": friction, "same": same}
+
+
+def judge_table_1(samples: Sequence[Sample]) -> Judgement:
+    """Judge number and members of the base parameters."""
+    values = samples[0].values
+    return Judgement(
+        (
+            check_exact("rigid-body base parameters", values["rigid"], (10, 10), "Table 1",
+                        published=10),
+            check_exact("friction parameters", values["friction"], (14, 14), "Table 1",
+                        published=14),
+            check_exact("combinations with the members and coefficients of Table 1", values["same"],
+                        (10, 10), "Table 1", published=10),
+        ),
+        "the null space is that of a regressor in which legs are equal and 19 inertial columns are"
+        " declared absent, because Table 1 has bodies that are symmetrical; without this"
+        f" declaration the rank of the inertial columns is {values['rank, equal legs']:.0f}",
+    )  # fmt: skip
+
+
+def judge_rules(samples: Sequence[Sample]) -> Judgement:
+    """Judge number and coefficients of the regrouped parameters by the null space."""
+    values, checks = samples[0].values, []
+    for stage in _STAGES:
+        rank = values[f"rank, {stage}"]
+        checks += [
+            check_exact(f"base parameters by the rules, {stage}", values[f"rules, {stage}"],
+                        (rank, rank), f"rank of {values[f'columns, {stage}']:.0f} columns"),
+            check_exact(f"largest difference of coefficients, {stage}",
+                        values[f"difference, {stage}"], (0.0, MAX_ROUNDING), "rounding"),
+        ]  # fmt: skip
+    return Judgement(tuple(checks))
+
+
+def judge_values(samples: Sequence[Sample]) -> Judgement:
+    """Judge the model's base parameters by the printed estimates."""
+    worst = float(collect(samples, "values").max())
+    check = check_exact("largest difference from the estimates of Table 2", worst, (0.0, 1e-9),
+                        "rounding of the decimals in the MJCF", unit="SI")  # fmt: skip
+    return Judgement((check,))
+
+
+STRUCTURE = Experiment(
+    "base parameters",
+    measure_structure,
+    (
+        Claim(
+            "base parameters",
+            '"The rigid-body part contains 10 base parameters (see Table 1)." "The friction model'
+            ' contains therefore 14 different parameters."',
+            "Table 1, section 5.1", "document", judge_table_1,
+            {"declare_symmetry": False}, "no inertial parameter is declared absent", (),
+        ),
+        Claim(
+            "regrouping rules",
+            '"For revolute joints the 9th, the 10th and the sum of the 1st and 4th columns of Li'
+            ' and Ki comply with the mentioned conditions." "For prismatic joints however, the'
+            ' moments of inertia can be added to the carrying antecedent joint" "The masses of'
+            " terminal bodies can be grouped to the inertial parameter of the platform according to"
+            " Steiner's laws.\"",
+            "section 2.1, (9) to (11)", "document", judge_rules,
+            {"platform_rule": False}, "the rule for the platform is left out",
+        ),
+        Claim(
+            "parameters of the model",
+            "24 estimates",
+            "Table 2", "input", judge_values, None, "", (),
+        ),
+    ),
+    repetitions_fixed=1,
+)  # fmt: skip
