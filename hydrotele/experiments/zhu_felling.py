@@ -337,7 +337,7 @@ FELLING = (
             "p. 105",
             "document",
             _judge_process,
-            {"pilot.buttons": "[{at: 19.0, axis: saw, command: 1.0}]"},
+            {"pilot.buttons": "[{at: 16.0, axis: saw, command: 1.0}]"},
             "the grab arm never closes",
         ),
     ), 10),
