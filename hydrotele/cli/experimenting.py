@@ -1,109 +1,112 @@
-"""`hydrotele experiments`: published experiments repeated, beside what was published."""
+"""`hydrotele experiments`: the experiments of a published document, repeated in simulation."""
 
+import importlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydrotele
 from hydrotele.cli.console import notes, out, print_result, stages, write_json
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import check_target, whole_folder
-from hydrotele.experiments.abdellatif2008 import abdellatif2008
-from hydrotele.experiments.finding import Finding, tally
-from hydrotele.experiments.khoshzaban1992 import khoshzaban1992
-from hydrotele.experiments.wang2012 import wang2012
-from hydrotele.experiments.zhu1994 import zhu1994
+from hydrotele.experiments.comparison import Comparison, Series, run_series, summarize
 
-SERIES = {
-    "abdellatif2008": (abdellatif2008, 100),
-    "khoshzaban1992": (khoshzaban1992, 20),
-    "wang2012": (wang2012, 20),
-    "zhu1994": (zhu1994, 20),
-}
-"""Name -> (function, usual number of repetitions)."""
+DOCUMENTS = ("abdellatif2008", "khoshzaban1992", "wang2012", "zhu1994")
+"""Modules of `hydrotele.experiments`, each with its `SERIES`."""
+
+_COLOURS = {"agrees": "green", "differs": "red", "undecided": "yellow"}
+
+
+def load_series(name: str) -> Series:
+    """The experiments of a document.
+
+    Raises:
+        InputError: no such document.
+    """
+    if name not in DOCUMENTS:
+        raise InputError(f"experiments {name!r}", f"valid: {', '.join(DOCUMENTS)}")
+    return importlib.import_module(f"hydrotele.experiments.{name}").SERIES
 
 
 def experiments_to_folder(
     name: str, target: Path | None, seeds: int | None, jobs: int | None, as_json: bool
-) -> list[Finding]:
-    """Run a series of experiments; write the table and the curves, whole or not at all.
+) -> list[Comparison]:
+    """Run the experiments of a document; write table, report and figures, all or nothing.
 
     Args:
-        name: of the series.
+        name: of the document.
         target: folder, default `runs/<name>`; with `as_json` none.
         seeds: operators or trials of repeated experiments; as many as usual by default.
         jobs: processes; as many as there are cores by default.
-        as_json: print the findings as JSON instead of words.
+        as_json: print the rows as JSON instead of text.
 
     Returns:
-        The findings.
+        The rows.
 
     Raises:
-        InputError: no such series, or the target is not usable.
+        InputError: no such document, or the target is not usable.
     """
-    if name not in SERIES:
-        raise InputError(f"experiments {name!r}", f"valid: {', '.join(SERIES)}")
-    series, usual = SERIES[name]
-    seeds = seeds or usual
+    series = load_series(name)
+    seeds = seeds or series.repetitions
     target = target or (None if as_json else Path("runs") / name)
     if target:
         check_target(target, "experiments")
     with stages(f"experiments {name}", as_json) as progress:
-        findings = series(seeds, jobs, progress)
+        rows = run_series(series, seeds, jobs, progress)
     if target:
         with whole_folder(target, "experiments") as folder:
-            _write(folder, name, seeds, findings)
-    print_result([finding.row() for finding in findings], as_json, lambda: _print(findings), target)
-    return findings
+            _write(folder, series, seeds, rows)
+    print_result([row.row() for row in rows], as_json, lambda: _print(rows), target)
+    return rows
 
 
-def _write(folder: Path, name: str, seeds: int, findings: list[Finding]) -> None:
+def _write(folder: Path, series: Series, seeds: int, rows: list[Comparison]) -> None:
     from hydrotele.show.experiment_report import write_experiment_report
 
-    notes.print("writing report.html ...", style="dim")
-    rows = [finding.row() for finding in findings]
-    write_json(folder / "experiments.json", rows)
-    write_experiment_report(name, findings, folder / "report.html")
-    head = f"# Experiments of {name}\n\n`hydrotele experiments {name} --seeds {seeds}`\n\n"
-    (folder / "table.md").write_text(head + markdown_table(findings), encoding="utf-8")
-    summary = {"kind": "experiments", "name": name, "hydrotele": hydrotele.__version__}
+    notes.print("writing report.html and figures ...", style="dim")
+    write_json(folder / "experiments.json", [row.row() for row in rows])
+    write_experiment_report(series.title, rows, series.drawings, folder)
+    text = f"`hydrotele experiments {series.name} --seeds {seeds}`: {summarize(rows)}.\n\n"
+    text += markdown_table(rows, series)
+    (folder / "table.md").write_text(f"# Experiments of {series.title}\n\n{text}", "utf-8")
+    summary = {"kind": "experiments", "name": series.name, "hydrotele": hydrotele.__version__}
     write_json(folder / "summary.json", summary)
 
 
-def markdown_table(findings: list[Finding]) -> str:
-    """The findings as a Markdown table, with whose statement each is where that is told."""
-    if any(one.basis for one in findings):
-        return _long_table(findings)
-    lines = ["| experiment | published | simulated | same |", "| --- | --- | --- | --- |"]
-    for one in findings:
-        name = f"{one.name} ({one.source})"
-        lines.append(f"| {name} | {one.published} | {one.simulated} | {_word(one)} |")
+def markdown_table(rows: Sequence[Comparison], series: Series) -> str:
+    """The rows as Markdown: results, then inputs of the model, then items without a result."""
+    lines = _table([row for row in rows if row.kind != "input"])
+    inputs = [row for row in rows if row.kind == "input"]
+    if inputs:
+        lines += ["", "## Numbers that the model was built from", "", *_table(inputs)]
+    if series.drawings:
+        lines += ["", "## Tables and figures without a result", ""]
+        lines += [f"- {item}: {content}" for item, content in series.drawings.items()]
     return "\n".join(lines) + "\n"
 
 
-def _long_table(findings: list[Finding]) -> str:
+def _table(rows: Sequence[Comparison]) -> list[str]:
     lines = [
-        "| experiment | where | whose | stated | simulated | same | explanation |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| result | published | simulated [95 % interval] | verdict | criterion, reason |",
+        "| --- | --- | --- | --- | --- |",
     ]
-    for one in findings:
-        stated = f'"{one.published}"' if one.basis == "document" else one.published
-        cells = (one.name, one.source, one.basis, stated, one.simulated, _word(one),
-                 one.explanation)  # fmt: skip
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    marks = {"additional": "; not in the publication", "caption": "; caption only"}
+    for row in rows:
+        reason = ". ".join(part for part in (row.criterion, row.explanation) if part)
+        cells = (f"{row.name} ({row.item}{marks.get(row.kind, '')})", row.published,
+                 row.simulated, row.verdict, reason)  # fmt: skip
+        lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+    return lines
 
 
-def _word(finding: Finding) -> str:
-    return "yes" if finding.ok else "no"
-
-
-def _print(findings: list[Finding]) -> None:
-    for one in findings:
-        mark = "[green]same[/]" if one.ok else "[red]differs[/]"
-        out.print(f"{mark} [bold]{one.name}[/] ({one.source})")
-        out.print(
-            f"  {'ours' if one.basis == 'ours' else 'published'}: {one.published}", markup=False
-        )
-        out.print(f"  simulated: {one.simulated}", markup=False)
-        if one.explanation:
-            out.print(f"  explanation: {one.explanation}", markup=False)
-    out.print(tally(findings))
+def _print(rows: Sequence[Comparison]) -> None:
+    for row in rows:
+        colour = _COLOURS.get(row.verdict, "dim")
+        out.print(f"[{colour}]{row.verdict}[/] [bold]{row.name}[/] ({row.item})")
+        for label, text in (
+            ("stated here" if row.kind == "additional" else "published", row.published),
+            ("simulated", row.simulated), ("agrees if", row.criterion),
+            ("reason", row.explanation),
+        ):  # fmt: skip
+            if text:
+                out.print(f"  {label}: {text}", markup=False)
+    out.print(summarize(rows)[:1].upper() + summarize(rows)[1:])

@@ -28,7 +28,7 @@ OURS = {
     "arm calibration": ("calibration.json", "report.html", "machine.yaml", "*.png"),
     "identify": ("identify.json", "report.html", "identified/machine.*",
                  "identified/machine_assets/*"),
-    "experiments": ("experiments.json", "table.md", "report.html"),
+    "experiments": ("experiments.json", "table.md", "report.html", "figures/*"),
     "hybrid calibration": ("calibration.json", "robot.yaml", "*.png"),
     "hybrid measurement": ("*.csv", "*.yaml", "truth/*"),
     "two-port analysis": ("analysis.json", "report.html", "stability.png"),

@@ -264,9 +264,8 @@ class Claim:
 
     def compare(self, samples: Sequence[Sample]) -> Comparison:
         """Judge the claim by at least one sample; the curves are those of the first sample."""
-        panels = tuple(
-            panel for panel in samples[0].panels if self.panels is None or panel.label in self.panels
-        )  # fmt: skip
+        panels = tuple(panel for panel in samples[0].panels
+                       if self.panels is None or panel.label in self.panels)  # fmt: skip
         return Comparison(
             self.name, self.item, self.quote, self.kind, self.judge(samples), panels,
             samples[0].marginals if self.panels is None else None,

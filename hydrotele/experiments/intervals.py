@@ -136,9 +136,7 @@ def check_population(
     )  # fmt: skip
 
 
-def format_values(
-    samples: Sequence[Sample], name: str, scale: float = 1.0, digits: int = 1
-) -> str:
+def format_values(samples: Sequence[Sample], name: str, scale: float = 1.0, digits: int = 1) -> str:
     """Mean of a figure over the samples with its extremes, as text.
 
     Args:

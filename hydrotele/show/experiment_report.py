@@ -1,62 +1,141 @@
-"""The report of a series of experiments: published beside simulated, with the curves."""
+"""The report of a published document: its results beside ours, with figures of print quality."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import hydrotele
-from hydrotele.experiments.finding import Finding, Panel, tally
+from hydrotele.experiments.comparison import Comparison, Panel, summarize
 from hydrotele.show import report_html
 from hydrotele.show.calibration_report import corner
-from hydrotele.show.report_html import drawing, png
+from hydrotele.show.report_html import drawing, png, svg
 
-_COLOURS = ("#1769aa", "#e07b00", "#23794a", "#8a5fb0", "#a33b3b", "#5b6670")
-_MOST = 4000  # points of a curve: more are not seen
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_STYLES = (
+    ("#1769aa", "-", "o"), ("#e07b00", "--", "s"), ("#23794a", "-.", "^"), ("#8a5fb0", ":", "D"),
+    ("#a33b3b", (0, (5, 1)), "v"), ("#5b6670", (0, (3, 1, 1, 1)), "x"),
+)  # fmt: skip
+"""Colour, line and marker of the curves, which a print without colour keeps apart."""
+_MAX_POINTS = 4000  # of a curve: more are not visible
+_INCHES = 1.9  # height of one pair of axes
 
 
-def write_experiment_report(name: str, findings: Sequence[Finding], path: Path) -> None:
-    """Write the report.
+class ReportFigure(NamedTuple):
+    """A figure of the report and its files.
+
+    Attributes:
+        row: to which it belongs.
+        stem: of its files' names.
+        caption: one paragraph.
+        png: for the screen and for documents.
+        svg: for print; None for the dense points of a posterior.
+    """
+
+    row: Comparison
+    stem: str
+    caption: str
+    png: bytes
+    svg: bytes | None
+
+
+def write_experiment_report(
+    title: str, rows: Sequence[Comparison], drawings: Mapping[str, str], folder: Path
+) -> None:
+    """Write `report.html`, and `figures/` with an SVG and a PNG per figure and `captions.md`.
 
     Args:
-        name: of the series.
-        findings: of its experiments.
-        path: HTML file to write.
+        title: of the document.
+        rows: of its table.
+        drawings: item -> why it has nothing to compare.
+        folder: that exists.
     """
+    figures = draw_figures(rows)
+    if figures:
+        (folder / "figures").mkdir(exist_ok=True)
+    for one in figures:
+        (folder / "figures" / f"{one.stem}.png").write_bytes(one.png)
+        if one.svg:
+            (folder / "figures" / f"{one.stem}.svg").write_bytes(one.svg)
+    if figures:
+        captions = [f"- `{one.stem}`: {one.caption}" for one in figures]
+        (folder / "figures" / "captions.md").write_text("\n".join(captions) + "\n", "utf-8")
     report_html.write_report(
-        "experiments", path, title=f"experiments {name}", version=hydrotele.__version__, name=name,
-        tally=tally(findings), findings=findings,
-        curves=[(one, draw_panels(one.panels)) for one in findings if one.panels],
-        posteriors=[(one, _corner(one)) for one in findings if one.marginals],
+        "experiments", folder / "report.html", title=f"Experiments of {title}",
+        version=hydrotele.__version__, document=title, summary=summarize(rows),
+        counted=[row for row in rows if row.kind != "input"],
+        inputs=[row for row in rows if row.kind == "input"],
+        drawings=list(drawings.items()), figures=figures,
     )  # fmt: skip
 
 
-def _corner(finding: Finding) -> bytes:
-    shown = finding.marginals
-    assert shown is not None
-    return corner(shown.sample, shown.names, shown.truth, "truth", shown.unit)
+def draw_figures(rows: Sequence[Comparison]) -> list[ReportFigure]:
+    """Draw the panels and posteriors of all rows, numbered in their order."""
+    figures = []
+    for row in rows:
+        slug = re.sub(r"[^a-z0-9]+", "-", row.name.lower()).strip("-")
+        if row.panels:
+            made = draw_panels(row.panels)
+            stem = f"{len(figures) + 1:02d}-{slug}"
+            figures.append(ReportFigure(row, stem, _caption(row, _describe(row.panels)), *made))
+        if row.marginals:
+            shown = row.marginals
+            picture = corner(shown.sample, shown.names, shown.truth, "truth", shown.unit)
+            stem = f"{len(figures) + 1:02d}-{slug}-posterior"
+            what = f"Posterior of {', '.join(shown.names)} [{shown.unit}]; lines: truth."
+            figures.append(ReportFigure(row, stem, _caption(row, what), picture, None))
+    return figures
 
 
-def draw_panels(panels: Sequence[Panel]) -> bytes:
-    """Curves below each other; those over time on one clock.
+def _caption(row: Comparison, what: str) -> str:
+    return f"{row.name[:1].upper()}{row.name[1:]} ({row.item}). {what}"
+
+
+def _describe(panels: Sequence[Panel]) -> str:
+    labels = dict.fromkeys(panel.label.split(" [")[0] for panel in panels)
+    across = dict.fromkeys(panel.x_label.split(" [")[0] for panel in panels)
+    return f"Simulated {', '.join(labels)} over {', '.join(across)}; first repetition."
+
+
+def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
+    """Draw curves below each other; those over the same quantity share its axis.
 
     Args:
         panels: what to draw.
 
     Returns:
-        A PNG.
+        The figure as PNG and as SVG.
     """
-    with drawing(0.4 + 1.35 * len(panels)) as figure:
-        shared = len({panel.over for panel in panels}) == 1
-        axes = figure.subplots(len(panels), 1, sharex=shared, squeeze=False)[:, 0]
-        for panel, place in zip(panels, axes, strict=True):
-            every = max(1, len(panel.time) // _MOST)
-            for (label, curve), colour in zip(panel.curves.items(), _COLOURS, strict=False):
-                place.plot(panel.time[::every], curve[::every], color=colour, lw=1.0, label=label)
-            place.set_title(panel.title)
-            if panel.log:
-                place.set_yscale("log")
+    rows = [(panel, error) for panel in panels for error in (False, True)
+            if not error or panel.errors]  # fmt: skip
+    with drawing(0.5 + _INCHES * len(rows)) as figure:
+        shared = len({panel.x_label for panel in panels}) == 1
+        axes = figure.subplots(len(rows), 1, sharex=shared, squeeze=False)[:, 0]
+        for (panel, error), place in zip(rows, axes, strict=True):
+            _draw_curves(place, panel, error)
             if not shared:
-                place.set_xlabel(panel.over)
-            if len(panel.curves) > 1:
-                place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-        axes[-1].set_xlabel(panels[-1].over)
-        return png(figure)
+                place.set_xlabel(panel.x_label)
+        axes[-1].set_xlabel(panels[-1].x_label)
+        figure.align_ylabels(list(axes))
+        return png(figure), svg(figure)
+
+
+def _draw_curves(place: "Axes", panel: Panel, error: bool) -> None:
+    curves = panel.errors if error else panel.curves
+    every = max(1, len(panel.x) // _MAX_POINTS)
+    order = list(dict.fromkeys([*panel.curves, *panel.errors]))
+    for label, curve in curves.items():
+        colour, line, marker = _STYLES[order.index(label) % len(_STYLES)]
+        look = (
+            {"ls": "none", "marker": marker, "ms": 4.0, "mfc": "none"} if panel.discrete
+            else {"ls": line, "lw": 1.2}
+        )  # fmt: skip
+        place.plot(panel.x[::every], curve[::every], color=colour, label=label, **look)
+    name, _, unit = (panel.error_label if error else panel.label).rpartition(" [")
+    place.set_ylabel(f"{name}\n[{unit}" if name else unit)
+    if panel.log and not error:
+        place.set_yscale("log")
+    if len(curves) > 1 or error:
+        place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

@@ -51,6 +51,16 @@ def png(figure: "Figure") -> bytes:
     return stream.getvalue()
 
 
+def svg(figure: "Figure") -> bytes:
+    """A figure as SVG, the same bytes for the same figure."""
+    import matplotlib
+
+    stream = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "hydrotele"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None})
+    return stream.getvalue()
+
+
 @contextlib.contextmanager
 def drawing(height: float) -> Iterator["Figure"]:
     """A figure of the report's width and a height [inch], in the report's style."""
