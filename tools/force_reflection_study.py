@@ -1,6 +1,8 @@
 """Force reflection under rate control: predicted and simulated limits, delays, held forces.
 
 python tools/force_reflection_study.py --seeds 5 --held 12 --jobs 2
+
+`--part held` prints the table of the forces held by feel only.
 """
 
 import argparse
@@ -251,7 +253,11 @@ def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -
 
 
 def main() -> None:
-    asked = options(__doc__, seeds=5, held=12, jobs=2)
+    asked = options(__doc__, seeds=5, held=12, jobs=2, part="all")
+    if asked.part == "held":
+        with ProcessPoolExecutor(asked.jobs) as pool:
+            print("\n".join(held_table(list(pool.map(held, range(asked.held))))))
+        return
     many, seeds = range(len(SETTINGS)), range(asked.seeds)
     cases = [
         (t, b, s) for b in (DAMPED, 60.0) for t in (0.0, 0.05, 0.1, 0.15) for s in seeds
