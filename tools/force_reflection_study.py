@@ -244,10 +244,8 @@ def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -
         *delays_table(cases, late, asked.seeds), "",
         f"## A force held by feel, `press_stiffness`, {asked.held} seeds", "",
         "True contact force against the target in the last 6 s before each target's end.",
-        "What limits it: a push that is 0.05 mm off moves the tip by a millimetre, a kilonewton;",
-        "the estimate is 0.3 s late, felt forces are 3 % rough, and the force creeps for seconds.",
-        "Pushes of 0.3 s, a tolerance of 5 % of the present target and full compensation of the",
-        "valves' overlap are the technique; perception is as for everything else.", "",
+        "The operator knows the nominal stiffness and the gain of the stiffness feedback, and feels",
+        "the stiffness with the error of a hand.", "",
         *held_table(kept), "",
     ])  # fmt: skip
 

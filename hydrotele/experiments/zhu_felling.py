@@ -22,7 +22,7 @@ from hydrotele.scenario.teleoperation import TeleopPilot, TipOver
 from hydrotele.teleop.master import tipping_share
 
 JUST_NOTICEABLE = 0.23
-"""Fraction of a compliance that a hand tells apart without other cues (Tan 1995)."""
+"""Just noticeable difference of a compliance without other cues, as a fraction (Tan 1995)."""
 _CONTACT = 500.0  # N of the head on the stem
 _STANDS_OUT = 3.0  # times the force that is estimated in the air
 _MAX_RISE = 1.0  # s: a ninth of the time axis of Fig. 6.55
@@ -127,8 +127,8 @@ def _judge_felt(samples: Sequence[Sample]) -> Judgement:
         f" up to {format_values(samples, 'centring')} N"
     )
     explanation = (
-        f"felt: a change of more than the {100 * JUST_NOTICEABLE:.0f} % that a hand tells apart"
-        " (Tan 1995)"
+        f"felt: a change of more than {100 * JUST_NOTICEABLE:.0f} %, the just noticeable difference"
+        " of a compliance (Tan 1995)"
     )
     return Judgement((check,), explanation, note)
 

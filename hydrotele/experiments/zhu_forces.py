@@ -129,8 +129,8 @@ def _judge_by_feel(samples: Sequence[Sample]) -> Judgement:
         collect(samples, "error") < JUST_NOTICEABLE,
     )
     explanation = (
-        f"reasonably good: the {100 * JUST_NOTICEABLE:.0f} % of a compliance that a hand tells"
-        " apart (Tan 1995). A stiffness and a K_nom felt wrongly by that fraction are a force"
+        f"reasonably good: {100 * JUST_NOTICEABLE:.0f} %, the just noticeable difference of a"
+        " compliance (Tan 1995). A stiffness and a K_nom felt wrongly by that fraction are a force"
         " wrong by 33 % at 20 kN and 29 % at 35 kN (4.1, Tables 6.7 and 6.8); the operator of the"
         " thesis learnt the feel with the force on a screen, the simulated one knows K_nom and K_r"
         " only"

@@ -75,7 +75,7 @@ def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
 def _judge_line(samples: Sequence[Sample]) -> Judgement:
     checks = (
         check_mean("travel", collect(samples, "travel"), (_MIN_TRAVEL, np.inf),
-                   "a line is long against what the tip may stray", unit="m"),
+                   "a line is long compared with the accepted stray", unit="m"),
         check_mean("largest stray across the line over the travel",
                    collect(samples, "stray_share"), (0.0, _MAX_STRAY),
                    "constant: the width of a drawn line in a plot of this travel"),
@@ -431,7 +431,7 @@ STEERING = Experiment("steering", measure_steering, (
 ))  # fmt: skip
 
 LINES = tuple(
-    Experiment(f"line {one}", partial(measure_line, one), (_claim_line(one),), 6) for one in _LINES
+    Experiment(f"line {one}", partial(measure_line, one), (_claim_line(one),), 10) for one in _LINES
 )
 
 HANDLE = (
@@ -447,7 +447,7 @@ HANDLE = (
             {"pilot.detent": "false"},
             "detents off",
         ),
-    ), 6),
+    )),
     Experiment("handle ramp", partial(measure_handle_ramp, "false"), (
         Claim(
             "conventional centring force",
@@ -459,7 +459,7 @@ HANDLE = (
             {"pilot.detent": "true"},
             "detents on",
         ),
-    ), 6),
+    )),
 )  # fmt: skip
 
 STEPS = (

@@ -93,11 +93,13 @@ def test_unknown_changes_are_refused():
 
 
 def test_centring_force_is_a_line_and_detents_are_not():
-    """Both in two repetitions, which is the smallest number with an interval."""
-    for detent, name in (("false", "conventional centring force"), ("true", "detents")):
-        samples = [zhu_motion.measure_handle_ramp(detent, seed, {}) for seed in (1, 2)]
+    """Three repetitions leave the detents' interval wider than the printed digits."""
+    for detent, name, verdict in (
+        ("false", "conventional centring force", "agrees"), ("true", "detents", "undecided"),
+    ):  # fmt: skip
+        samples = [zhu_motion.measure_handle_ramp(detent, seed, {}) for seed in (1, 2, 3)]
         row = SERIES.claims[name].compare(samples)
-        assert row.verdict == "agrees", row.simulated
+        assert row.verdict == verdict, row.simulated
 
 
 def test_a_line_is_straight():
