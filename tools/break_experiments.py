@@ -1,43 +1,56 @@
-"""Every criterion of `hydrotele experiments zhu1994` on a run that is deliberately broken.
+"""Judge every criterion of a document by runs that are deliberately broken.
 
-    python tools/break_experiments.py [--jobs 2] [--only "NAME,NAME"]
-        [--out docs/results/zhu1994_broken.md]
+    python tools/break_experiments.py NAME [--only "ROW,ROW"] [--jobs 2] [--out FILE]
 
-A criterion that still says yes cannot fail in the way that it should: exit status 1.
+NAME is a document, such as zhu1994. A row that does not say `differs` has a criterion that cannot
+fail in the way that it should: exit status 1.
 """
 
+import argparse
 import sys
 
-from hydrotele.experiments.zhu1994 import broken_findings, zhu1994
-from tools.study import options, publish
-
-
-def _word(ok: bool) -> str:
-    return "yes" if ok else "no"
+from hydrotele.experiments.comparison import break_series
+from tools.experiment_seeds import import_series, report_progress
 
 
 def main() -> None:
-    asked = options(__doc__, jobs=2, only="")
-    names = [name.strip() for name in asked.only.split(",") if name.strip()]
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("name")
+    parser.add_argument("--only", default="", help="rows, separated by commas; all by default")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", help="Markdown file to write")
+    arguments = parser.parse_args()
 
-    def said(name: str, share: float) -> None:
-        print(f"{100 * share:3.0f} % {name}", file=sys.stderr, flush=True)
+    series = import_series(arguments.name)
+    names = [name.strip() for name in arguments.only.split(",") if name.strip()]
+    unknown = set(names) - set(series.claims)
+    if unknown:
+        parser.error(f"no row {unknown.pop()!r}; valid: {', '.join(series.claims)}")
+    judged = break_series(series, names, arguments.jobs, report_progress)
 
-    found = broken_findings(names, asked.jobs, said)
-    whole = {one.name: _word(one.ok) for one in zhu1994(1, asked.jobs, said)} if not names else {}
     lines = [
-        "| criterion | how it was broken | measured | says | unbroken, one operator |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    for one in found:
-        cells = (one.name, one.explanation, one.simulated, _word(one.ok), whole.get(one.name, ""))
-        lines.append(f"| {' | '.join(cells)} |")
-    fails = sum(not one.ok for one in found)
-    lines.append("")
-    lines.append(f"{fails} of {len(found)} criteria say no on their broken run.\n")
-    delattr(asked, "only")
-    publish("\n".join(lines), "Criteria of zhu1994 on broken runs", asked)
-    sys.exit(fails < len(found))
+        f"# Broken runs of {arguments.name}", "",
+        f"`python tools/break_experiments.py {arguments.name}`", "",
+        "Every row is judged by runs with a planted fault, up to six repetitions.", "",
+        "| row | fault | simulated with the fault | verdict |", "| --- | --- | --- | --- |",
+    ]  # fmt: skip
+    for claim, row in judged:
+        cells = (claim.name, claim.broken_how, row.simulated, row.verdict)
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    failed = [claim.name for claim, row in judged if row.verdict != "differs"]
+    lines += ["", f"{len(judged) - len(failed)} of {len(judged)} rows say differs.", ""]
+    unbroken = [name for name, claim in series.claims.items() if claim.broken is None]
+    if unbroken and not names:
+        lines += [f"Rows without a verdict have no fault: {', '.join(unbroken)}.", ""]
+    text = "\n".join(lines)
+    print(text)
+    if arguments.out:
+        with open(arguments.out, "w", encoding="utf-8") as file:
+            file.write(text)
+    if failed:
+        sys.exit(f"no difference found: {', '.join(failed)}")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from hydrotele.show.pose import (
     model_with_looks,
 )
 
-MOMENTS = (5.0, 11.0, 28.0, 52.0, 64.0, 73.5)  # s
+MOMENTS = (11.0, 29.0, 38.0, 60.0, 74.0, 85.5)  # s
 SIZE = (560, 420)
 COLUMNS = 3
 

@@ -1,7 +1,7 @@
 """Zhu 1994, chapter 6, without contact: lines, rate against position, the handle's force, steps.
 
-Every measurement takes the seed of its operator and sensors, and changes of its scenario; every
-claim quotes the thesis and is judged on measured channels or on the true path of the tip.
+Every measurement takes the seed of its operator and sensors, and changes of its scenario. Claims
+are judged by measured channels or by the true path of the tip.
 """
 
 from collections.abc import Sequence
@@ -9,32 +9,34 @@ from functools import partial
 
 import numpy as np
 
-from hydrotele.experiments.finding import (
+from hydrotele.experiments.comparison import (
     Changes,
+    Check,
     Claim,
     Experiment,
+    Judgement,
     Panel,
     Sample,
-    Verdict,
-    cylindrical,
-    drawn,
-    largest,
-    least,
-    mean,
-    perform,
-    spread,
 )
+from hydrotele.experiments.intervals import (
+    check_fraction,
+    check_mean,
+    collect,
+    format_values,
+)
+from hydrotele.experiments.scenario_runs import cylindrical_pose, operator_changes, run_shipped
 from hydrotele.run.run import Run
 
-_WAYS = {
+_LINES = {
     "up": (45, "z", 1, ("r",), {"z": "0.8"}),
     "down": (46, "z", -1, ("r",), {"z": "2.2"}),
     "out": (47, "x", 1, ("z",), {"r": "4.8", "z": "1.2"}),
     "in": (48, "x", -1, ("z",), {"r": "6.2", "z": "1.2"}),
 }
-_STRAY = 0.02  # of the way: less than the width of a line in the published plots
-_TURN = 2.0  # degrees of the bucket: the same on their axis of some 60 degrees
-_LEAST_WAY = 1.0  # m
+"""Direction -> figure 6.n, axis of the handle, its sign, constant coordinates, start [m]."""
+_MAX_STRAY = 0.02  # of the travel
+_MAX_ROTATION = 2.0  # degrees of the bucket
+_MIN_TRAVEL = 1.0  # m
 _VERTICAL = (
     "the bucket was commanded to go straightly up and down while keeping the bucket angle and"
     " radial displacement constant"
@@ -45,50 +47,56 @@ _HORIZONTAL = (
 )
 
 
-def line(way: str, seed: int, changes: Changes) -> Sample:
-    """A straight line of the tip under operator control: up, down, out or in."""
-    _, axis, sign, held, start = _WAYS[way]
+def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
+    """Move the tip in a straight line under operator control: up, down, out or in."""
+    _, axis, sign, held, start = _LINES[direction]
     push = 0.004 * sign
     keys = {f"start.pose.{k}": v for k, v in start.items()}
-    keys |= {"pilot.operator.path": f"{{{axis}: [0, 0, {push}, {push}, 0, 0]}}"} | drawn(seed)
-    _, run = perform("joystick_up", keys | dict(changes))
-    pose, time = cylindrical(run), run.truth.time
-    gone = pose["z" if axis == "z" else "r"]
+    keys |= {"pilot.operator.path": f"{{{axis}: [0, 0, {push}, {push}, 0, 0]}}"}
+    _, run = run_shipped("joystick_up", keys | operator_changes(seed) | dict(changes))
+    pose, time = cylindrical_pose(run), run.truth.time
+    moved = pose["z" if axis == "z" else "r"]
+    travel = float(sign * (moved[-1] - moved[0]))
+    stray = float(max(np.abs(pose[c] - pose[c][0]).max() for c in held))
+    sideways = float((pose["r"] * np.abs(pose["theta"] - pose["theta"][0])).max())
+    attitude = np.degrees(pose["attitude"] - pose["attitude"][0])
     values = {
-        "way": float(sign * (gone[-1] - gone[0])),
-        "stray": float(max(np.abs(pose[c] - pose[c][0]).max() for c in held)),
-        "aside": float((pose["r"] * np.abs(pose["theta"] - pose["theta"][0])).max()),
-        "turn": float(np.degrees(np.abs(pose["attitude"] - pose["attitude"][0]).max())),
-    }
+        "travel": travel, "stray": stray, "sideways": sideways,
+        "stray_share": max(stray, sideways) / max(abs(travel), 1e-3),
+        "rotation": float(np.abs(attitude).max()),
+    }  # fmt: skip
     return Sample(values, (
         Panel("tip [m]", time, {"r": pose["r"], "z": pose["z"]}),
-        Panel("bucket [deg]", time, {"attitude": np.degrees(pose["attitude"])}),
+        Panel("bucket angle from its start [deg]", time, {"attitude": attitude}),
         Panel("handle [mm]", run.measured.time, {axis: 1e3 * run.measured[f"handle.{axis}"]}),
     ))  # fmt: skip
 
 
-def _line_verdict(samples: Sequence[Sample]) -> Verdict:
-    way, stray = least(samples, "way"), largest(samples, "stray")
-    aside, turn = largest(samples, "aside"), largest(samples, "turn")
-    worst = max(stray, aside)
-    ok = way > _LEAST_WAY and worst < _STRAY * way and turn < _TURN
-    told = (
-        f"{way:.2f} m; the other coordinate strays by {1e3 * stray:.0f} mm at most, sideways by"
-        f" {1e3 * aside:.0f} mm, the bucket by {turn:.1f} deg"
+def _judge_line(samples: Sequence[Sample]) -> Judgement:
+    checks = (
+        check_mean("travel", collect(samples, "travel"), (_MIN_TRAVEL, np.inf),
+                   "a line is long compared with the accepted stray", unit="m"),
+        check_mean("largest stray across the line over the travel",
+                   collect(samples, "stray_share"), (0.0, _MAX_STRAY),
+                   "constant: the width of a drawn line in a plot of this travel"),
+        check_mean("largest rotation of the bucket", collect(samples, "rotation"),
+                   (0.0, _MAX_ROTATION),
+                   "constant: the width of a drawn line on the plot's axis of 60 deg", unit="deg"),
+    )  # fmt: skip
+    note = (
+        f"strays by {format_values(samples, 'stray', 1e3, 0)} mm, sideways by"
+        f" {format_values(samples, 'sideways', 1e3, 0)} mm"
     )
-    limits = (
-        f"constant: within {100 * _STRAY:.0f} % of the way and {_TURN:.0f} deg, a limit of ours"
-    )
-    return Verdict(ok, told, f"{limits}; the thesis gives no figures")
+    return Judgement(checks, "the thesis gives no figures", note)
 
 
-def _line_claim(way: str) -> Claim:
+def _claim_line(direction: str) -> Claim:
     return Claim(
-        f"straight line {way}",
-        _VERTICAL if way in ("up", "down") else _HORIZONTAL,
-        f"p. 91, Fig. 6.{_WAYS[way][0]}",
+        f"straight line {direction}",
+        f'"{_VERTICAL if direction in ("up", "down") else _HORIZONTAL}"',
+        f"p. 91, Fig. 6.{_LINES[direction][0]}",
         "document",
-        _line_verdict,
+        _judge_line,
         {"servo.axis_gains": "{stick: 0.0}", "servo.feedforward": "0.0"},
         "no servo on the stick, no feedforward",
     )
@@ -96,40 +104,40 @@ def _line_claim(way: str) -> Claim:
 
 _GOALS = {"r": (5.8, 6.2, 6.2, 6.0), "z": (1.4, 1.4, 1.8, 1.6)}
 _HOLDS = ((2.0, 11.0), (11.0, 20.0), (20.0, 30.0))  # s
-_NEAR = 0.03  # m: swings that the operator sees, half as much again as he resolves
-_SMOOTH = 0.15  # of a step, overshoot of a motion that is called smooth
-_SWINGS = 2  # reversals about a goal from which a motion is called an oscillation
-_CAUSES = 5  # operators with whom it is asked what an oscillation comes from
+_RESOLVED = 0.03  # m: half as much again as the operator resolves by sight
+_MAX_OVERSHOOT = 0.15  # of a step, for a motion that is called smooth
+_MIN_REVERSALS = 2  # about a goal, for a motion that is called an oscillation
+_CAUSE_OPERATORS = 5  # operators with whom the causes of an oscillation are varied
 _FAST = "{r: {speed: 3.0, scale: 120.0}, theta: {speed: 0.75, scale: 20.0}, z: {speed: 3.0, scale: 120.0}, attitude: {speed: 2.0, scale: 5.0}}"  # noqa: E501
 
 
-def swings(run: Run) -> tuple[float, int]:
-    """Overshoot of the tip's steps and how often it comes back across a goal.
+def count_reversals(run: Run) -> tuple[float, int]:
+    """Return the overshoot of the tip's steps and how often it passes a goal again.
 
     Args:
         run: of the scenario `steer`.
 
     Returns:
-        (largest overshoot as a share of its step [1], reversals of more than 3 cm either side).
+        (largest overshoot as a fraction of its step [1], reversals of more than 3 cm either side).
     """
-    pose, time = cylindrical(run), run.truth.time
-    over, count = 0.0, 0
+    pose, time = cylindrical_pose(run), run.truth.time
+    overshoot, count = 0.0, 0
     for c, goals in _GOALS.items():
-        for k, (begin, end) in enumerate(_HOLDS):
-            inside = (time > begin) & (time < end)
+        for k, (start, end) in enumerate(_HOLDS):
+            inside = (time > start) & (time < end)
             step, error = goals[k + 1] - goals[k], pose[c][inside] - goals[k + 1]
             if step:
-                over = max(over, float((np.sign(step) * error).max() / abs(step)))
-            far = error[np.abs(error) > _NEAR]
+                overshoot = max(overshoot, float((np.sign(step) * error).max() / abs(step)))
+            far = error[np.abs(error) > _RESOLVED]
             count += int(np.count_nonzero(np.diff(np.sign(far))))
-    return over, count
+    return overshoot, count
 
 
-def steering(seed: int, changes: Changes) -> Sample:
-    """The same places reached by the same eyes under rate and under position control.
+def measure_steering(seed: int, changes: Changes) -> Sample:
+    """Steer the tip to the same places by sight under rate and under position control.
 
-    The operator is asked the same of the tip in both; with a hand that does not tremble, and with
-    a machine five times as fast, it is measured what an oscillation comes from.
+    The operator has the same task in both. With the first operators the causes of an oscillation
+    are varied: no tremor, a machine five times as fast, a slower operator.
     """
     cases = {
         "rate": {"pilot.mode": "rate"},
@@ -139,16 +147,16 @@ def steering(seed: int, changes: Changes) -> Sample:
         "slow_rate": {"pilot.mode": "rate", "pilot.perception.crossover": "1.5"},
         "slow_position": {"pilot.mode": "position", "pilot.perception.crossover": "1.5"},
     }
-    if seed > _CAUSES:
+    if seed > _CAUSE_OPERATORS:
         cases = {name: cases[name] for name in ("rate", "position")}
     values, panels = {}, []
     for name, keys in cases.items():
-        keys = {"pilot.mount": "table"} | drawn(seed) | keys | dict(changes)
-        _, run = perform("steer", keys)
-        over, count = swings(run)
-        values |= {f"{name}_over": over, f"{name}_swings": float(count)}
+        keys = {"pilot.mount": "table"} | operator_changes(seed) | keys | dict(changes)
+        _, run = run_shipped("steer", keys)
+        overshoot, count = count_reversals(run)
+        values |= {f"{name}_overshoot": overshoot, f"{name}_reversals": float(count)}
         if name in ("rate", "position"):
-            pose = cylindrical(run)
+            pose = cylindrical_pose(run)
             tip = {c: pose[c] for c in "rz"}
             panels.append(Panel(f"tip under {name} control [m]", run.truth.time, tip))
             handle = {c: 1e3 * run.measured[f"handle.{c}"] for c in "xz"}
@@ -156,310 +164,327 @@ def steering(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _steering_verdict(samples: Sequence[Sample]) -> Verdict:
-    smooth = largest(samples, "rate_over") < _SMOOTH and largest(samples, "rate_swings") < _SWINGS
-    swinging = least(samples, "position_swings") >= _SWINGS
-    told = [
-        f"{name}: overshoot {spread(samples, f'{key}_over', 100.0, 0)} % of a step,"
-        f" {spread(samples, f'{key}_swings', 1.0, 0)} reversals"
-        for name, key in (("rate", "rate"), ("position", "position"))
-    ]
-    calm = sum(
-        s.values["rate_over"] < _SMOOTH and s.values["rate_swings"] < _SWINGS for s in samples
+def _judge_steering(samples: Sequence[Sample]) -> Judgement:
+    smooth = (collect(samples, "rate_overshoot") < _MAX_OVERSHOOT) & (
+        collect(samples, "rate_reversals") < _MIN_REVERSALS
     )
-    restless = sum(s.values["position_swings"] >= _SWINGS for s in samples)
-    told.append(
-        f"smooth under rate control: {calm} of {len(samples)} operators, swinging under position"
-        f" control: {restless}"
+    oscillates = collect(samples, "position_reversals") >= _MIN_REVERSALS
+    check = check_fraction(
+        "operators whose motion is smooth under rate control and oscillates under position control",
+        smooth & oscillates,
     )
-    few = [sample for sample in samples if "calm_swings" in sample.values]
+    note = "; ".join(
+        f"{key} control: overshoot {format_values(samples, f'{key}_overshoot', 100.0, 0)} % of a"
+        f" step, {format_values(samples, f'{key}_reversals', 1.0, 0)} reversals"
+        for key in ("rate", "position")
+    )
+    note += (
+        f"; smooth under rate control: {smooth.sum()} of {len(samples)} operators, oscillating"
+        f" under position control: {oscillates.sum()}"
+    )
+    varied = [sample for sample in samples if "calm_reversals" in sample.values]
 
-    def case(key: str) -> str:
+    def describe_case(key: str) -> str:
         return (
-            f"{spread(few, f'{key}_over', 100.0, 0)} %, {spread(few, f'{key}_swings', 1.0, 0)}"
-            " reversals"
+            f"overshoot {format_values(varied, f'{key}_overshoot', 100.0, 0)} %,"
+            f" {format_values(varied, f'{key}_reversals', 1.0, 0)} reversals"
         )
 
-    why = (
-        f"smooth: overshoot below {100 * _SMOOTH:.0f} % and fewer than {_SWINGS} reversals; same"
-        f" eyes and task in both. Position control without tremor: {case('calm')}; with a machine"
-        f" five times as fast: {case('fast')}. Operators of a crossover of 1.5 rad/s: rate"
-        f" {case('slow_rate')}, position {case('slow_position')}"
+    explanation = (
+        f"smooth: overshoot below {100 * _MAX_OVERSHOOT:.0f} % and fewer than {_MIN_REVERSALS}"
+        " reversals. Rate control is not smooth for most operators, who estimate the machine's gain"
+        " and lag while they steer. Position control without tremor:"
+        f" {describe_case('calm')}; with a machine five times as fast: {describe_case('fast')}."
+        f" Operators with a crossover of 1.5 rad/s: rate {describe_case('slow_rate')}, position"
+        f" {describe_case('slow_position')}"
     )
-    if not smooth:
-        why += (
-            ". Rate control is not smooth for these operators, who learn gain and lag of the"
-            " machine as they go: a mechanism that lets position control alone swing does not"
-            " come out"
-        )
-    return Verdict(smooth and swinging, "; ".join(told), why)
+    return Judgement((check,), explanation, note)
 
 
-_STRAIGHT = 0.03  # of the largest force: what a linear law may miss by
-_TABLE = 0.05  # of a table's figure
+_MAX_NONLINEARITY = 0.03  # of the largest force
 _RAMPS = {"x": (1.0, 7.0, 4.0, 0.3, 2.0), "z": (9.0, 15.0, 4.0, 0.4, 2.0)}
-# axis -> begin, end [s], then Kp, Kp1 [N/mm] and force drop [N] of Table 6.11
-_EDGE = 1.5  # mm: dead band of Table 6.9
+"""Axis -> start, end [s], then Kp, Kp1 [N/mm] and force drop [N] of Table 6.11."""
+_DEADBAND_EDGE = 1.5  # mm, Table 6.9
 
 
-def handle_ramp(detent: str, seed: int, changes: Changes) -> Sample:
-    """Force of the hand while it moves the handle slowly from its centre to near its stop."""
-    keys = {"pilot.detent": detent} | drawn(seed) | dict(changes)
-    _, run = perform("handle_ramp", keys)
+def measure_handle_ramp(detent: str, seed: int, changes: Changes) -> Sample:
+    """Measure the hand's force while it moves the handle slowly from its centre to its stop."""
+    keys = {"pilot.detent": detent} | operator_changes(seed) | dict(changes)
+    _, run = run_shipped("handle_ramp", keys)
     m, values, panels = run.measured, {}, []
-    for axis, (begin, end, *_) in _RAMPS.items():
-        inside = (m.time > begin) & (m.time < end)
+    for axis, (start, end, *_) in _RAMPS.items():
+        inside = (m.time > start) & (m.time < end)
         x, force = 1e3 * m[f"handle.{axis}"][inside], m[f"hand_force.{axis}"][inside]
         slope = float(x @ force / (x @ x))
         values[f"{axis}_slope"] = slope
-        values[f"{axis}_curved"] = float(
+        values[f"{axis}_nonlinearity"] = float(
             np.sqrt(np.mean((force - slope * x) ** 2)) / np.abs(force).max()
         )
-        values[f"{axis}_rank"] = float(np.corrcoef(x, force)[0, 1])
-        near, far = (x > 0.2) & (x < _EDGE - 0.1), x > _EDGE + 0.3
-        values[f"{axis}_inside"] = float(np.polyfit(x[near], force[near], 1)[0])
-        out = np.polyfit(x[far], force[far], 1)
-        values[f"{axis}_outside"] = float(out[0])
-        inner = np.polyfit(x[near], force[near], 1)
-        values[f"{axis}_drop"] = float(np.polyval(inner, _EDGE) - np.polyval(out, _EDGE))
+        near, far = (x > 0.2) & (x < _DEADBAND_EDGE - 0.1), x > _DEADBAND_EDGE + 0.3
+        inner, outer = np.polyfit(x[near], force[near], 1), np.polyfit(x[far], force[far], 1)
+        values[f"{axis}_inside"], values[f"{axis}_outside"] = float(inner[0]), float(outer[0])
+        values[f"{axis}_drop"] = float(
+            np.polyval(inner, _DEADBAND_EDGE) - np.polyval(outer, _DEADBAND_EDGE)
+        )
         order = np.argsort(x)
         panels.append(Panel(f"hand force along {axis} [N]", x[order], {"force": force[order]},
-                            over="displacement [mm]"))  # fmt: skip
+                            "displacement [mm]"))  # fmt: skip
     return Sample(values, tuple(panels))
 
 
-def _centring_verdict(samples: Sequence[Sample]) -> Verdict:
-    ok, told = True, []
+def _judge_centring(samples: Sequence[Sample]) -> Judgement:
+    checks: list[Check] = []
     for axis, (_, _, kp, _, _) in _RAMPS.items():
-        curved = largest(samples, f"{axis}_curved")
-        slope = mean(samples, f"{axis}_slope")
-        ok = ok and curved < _STRAIGHT and abs(slope / kp - 1.0) < _TABLE
-        told.append(
-            f"{axis}: {slope:.2f} N/mm (Table 6.9: {kp:g}), off a straight line by"
-            f" {100 * curved:.1f} % of the largest force"
-        )
-    return Verdict(ok, "; ".join(told), "judged on the hand's force, not on the command")
+        checks.append(check_mean(
+            f"stiffness along {axis}", collect(samples, f"{axis}_slope"), (kp - 0.05, kp + 0.05),
+            "the printed digits of Table 6.9", unit="N/mm", published=kp,
+        ))  # fmt: skip
+        checks.append(check_mean(
+            f"RMS distance from a straight line along {axis} over the largest force",
+            collect(samples, f"{axis}_nonlinearity"), (0.0, _MAX_NONLINEARITY),
+            "linear: noise and friction of the measured hand force",
+        ))  # fmt: skip
+    return Judgement(tuple(checks), "judged by the hand's force, not by the command")
 
 
-def _detent_verdict(samples: Sequence[Sample]) -> Verdict:
-    ok, told = True, []
+def _judge_detent(samples: Sequence[Sample]) -> Judgement:
+    checks: list[Check] = []
     for axis, (_, _, kp, kp1, drop) in _RAMPS.items():
-        inside, outside = mean(samples, f"{axis}_inside"), mean(samples, f"{axis}_outside")
-        fell = mean(samples, f"{axis}_drop")
-        ok = ok and abs(inside / kp - 1.0) < _TABLE and outside < 0.5 * inside
-        ok = ok and abs(outside - kp1) < 0.25 * kp1 and abs(fell / drop - 1.0) < 0.15
-        told.append(
-            f"{axis}: {inside:.2f} N/mm inside, {outside:.2f} outside, drop {fell:.2f} N"
-            f" (Table 6.11: {kp:g}, {kp1:g}, {drop:g})"
-        )
-    why = "lines fitted to the hand's force; outside within 25 %, drop within 15 %: its noise"
-    return Verdict(ok, "; ".join(told), why)
+        checks.append(check_mean(
+            f"Kp along {axis}", collect(samples, f"{axis}_inside"), (kp - 0.05, kp + 0.05),
+            "the printed digits of Table 6.11", unit="N/mm", published=kp,
+        ))  # fmt: skip
+        checks.append(check_mean(
+            f"Kp1 along {axis}", collect(samples, f"{axis}_outside"), (kp1 - 0.05, kp1 + 0.05),
+            "the printed digits of Table 6.11", unit="N/mm", published=kp1,
+        ))  # fmt: skip
+        checks.append(check_mean(
+            f"force drop along {axis}", collect(samples, f"{axis}_drop"), (0.9 * drop, 1.1 * drop),
+            "10 %: both lines are extrapolated to the edge from the moving hand's force", unit="N",
+            published=drop,
+        ))  # fmt: skip
+    return Judgement(tuple(checks), "lines fitted to the hand's force inside and outside")
 
 
-_JOINTS = {"boom": 1.0, "stick": 11.0, "tilt": 21.0}  # s of the steps, back 5 s later
+_JOINT_STEPS = {"boom": (1.0, 56), "stick": (11.0, 57), "tilt": (21.0, 58)}
+"""Joint -> time of its step [s], figure 6.n; it steps back 5 s later."""
 _BACK = 5.0  # s
 _REST = 0.5  # s
-_HUGE = 0.5  # of the load's pressure difference
-_FOLLOWED = 0.05  # of a step
-_OVERSHOOT = 0.10  # of a step
-_RINGING = 2.0  # percent of a step, at rest
+_MIN_PRESSURE_SWING = 0.5  # of the pressure before the step
+_MAX_JOINT_ERROR = 0.05  # of a step
+_MAX_JOINT_OVERSHOOT = 0.10  # of a step
+_MAX_RINGING = 0.02  # of a step, at rest
 
 
-def joint_steps(seed: int, changes: Changes) -> Sample:
-    """Steps of 0.1 rad of boom, stick and tilt, there and back, and the pressures meanwhile.
+def measure_joint_steps(seed: int, changes: Changes) -> Sample:
+    """Step boom, stick and tilt by 0.1 rad, there and back, and record the pressures.
 
-    Once more with half the position gain, to see whether the servo makes what rings.
+    The first repetition is simulated again with half the position gain, to see whether the servo
+    causes the oscillation.
     """
-    values, panels = _joint_steps(seed, changes)
+    values, panels = _measure_joint_steps(seed, changes)
     if seed == 1:
-        slower, _ = _joint_steps(seed, {"servo.position_gain": "2.0"} | dict(changes))
-        for key in ("over", "ringing"):
+        slower, _ = _measure_joint_steps(seed, {"servo.position_gain": "2.0"} | dict(changes))
+        for key in ("overshoot", "ringing"):
             values[f"boom_{key}_slower"] = slower[f"boom_{key}"]
     return Sample(values, panels)
 
 
-def _joint_steps(seed: int, changes: Changes) -> tuple[dict[str, float], tuple[Panel, ...]]:
-    _, run = perform("feller_joint_steps", {"seed": str(seed)} | dict(changes))
+def _measure_joint_steps(seed: int, changes: Changes) -> tuple[dict[str, float], tuple[Panel, ...]]:
+    _, run = run_shipped("feller_joint_steps", {"seed": str(seed)} | dict(changes))
     m, values, panels = run.measured, {}, []
     table = run.scenario.pilot.columns  # pyright: ignore[reportAttributeAccessIssue]
-    for name, begin in _JOINTS.items():
-        before = (m.time > begin - _REST) & (m.time < begin)
-        after = (m.time >= begin) & (m.time < begin + _BACK - 0.1)
-        late = (m.time >= begin + _BACK - 0.1 - _REST) & (m.time < begin + _BACK - 0.1)
+    for name, (start, _) in _JOINT_STEPS.items():
+        before = (m.time > start - _REST) & (m.time < start)
+        after = (m.time >= start) & (m.time < start + _BACK - 0.1)
+        late = (m.time >= start + _BACK - 0.1 - _REST) & (m.time < start + _BACK - 0.1)
         angle, head = m[f"angle.{name}"], m[f"pressure_head.{name}"]
-        start, goal = table[name][0], max(table[name])
-        step = goal - start
+        goal = max(table[name])
+        step = goal - table[name][0]
         values[f"{name}_swing"] = float(np.ptp(head[after]))
         values[f"{name}_level"] = float(head[before].mean())
-        values[f"{name}_over"] = float((angle[after].max() - goal) / step)
-        values[f"{name}_left"] = float(abs(angle[late].mean() - goal) / step)
-        values[f"{name}_ringing"] = float(100.0 * np.ptp(angle[late]) / 2.0 / step)
-        shown = (m.time > begin - 1.0) & (m.time < begin + 2 * _BACK)
-        panels.append(Panel(f"{name} [rad]", m.time[shown], {"measured": angle[shown]}))
+        values[f"{name}_pressure"] = values[f"{name}_swing"] / values[f"{name}_level"]
+        values[f"{name}_overshoot"] = float((angle[after].max() - goal) / step)
+        values[f"{name}_error"] = float(abs(angle[late].mean() - goal) / step)
+        values[f"{name}_ringing"] = float(np.ptp(angle[late]) / 2.0 / step)
+        shown = (m.time > start - 1.0) & (m.time < start + 2 * _BACK)
+        panels.append(Panel(f"{name} angle [rad]", m.time[shown], {"measured": angle[shown]}))
         panels.append(Panel(f"head-side pressure of the {name} [MPa]", m.time[shown],
                             {"measured": head[shown] / 1e6}))  # fmt: skip
     return values, tuple(panels)
 
 
-def _pressure_verdict(samples: Sequence[Sample]) -> Verdict:
-    shares = {n: min(s.values[f"{n}_swing"] / s.values[f"{n}_level"] for s in samples)
-              for n in _JOINTS}  # fmt: skip
-    told = [f"{n}: {mean(samples, f'{n}_swing') / 1e6:.0f} MPa from peak to peak on"
-            f" {mean(samples, f'{n}_level') / 1e6:.0f} MPa" for n in _JOINTS]  # fmt: skip
-    why = f"huge: more than {100 * _HUGE:.0f} % of the pressure before the step, a limit of ours"
-    return Verdict(min(shares.values()) > _HUGE, "; ".join(told), why)
-
-
-def _following_verdict(samples: Sequence[Sample]) -> Verdict:
-    told, bad = [], []
-    for name in _JOINTS:
-        over, left = largest(samples, f"{name}_over"), largest(samples, f"{name}_left")
-        ringing = largest(samples, f"{name}_ringing")
-        told.append(
-            f"{name}: overshoot {100 * over:.0f} %, left {100 * left:.1f} %, swing 5 s later"
-            f" +-{ringing:.1f} % of the step"
-        )
-        if over > _OVERSHOOT or left > _FOLLOWED or ringing > _RINGING:
-            bad.append(name)
-    limits = (
-        f"limits: overshoot {100 * _OVERSHOOT:.0f} %, left {100 * _FOLLOWED:.0f} %, swing"
-        f" +-{_RINGING:.0f} %"
+def _judge_pressure(joint: str, samples: Sequence[Sample]) -> Judgement:
+    check = check_mean(
+        "pressure from peak to peak over the pressure before the step",
+        collect(samples, f"{joint}_pressure"), (_MIN_PRESSURE_SWING, np.inf),
+        "huge: half of the pressure that carries the arm; the curves have no figures in the text",
+    )  # fmt: skip
+    note = (
+        f"{format_values(samples, f'{joint}_swing', 1e-6, 0)} MPa from peak to peak on"
+        f" {format_values(samples, f'{joint}_level', 1e-6, 0)} MPa"
     )
-    why = f"{limits}; beyond them: {', '.join(bad) or 'none'}"
-    if "boom" in bad:
-        v = samples[0].values
-        why += (
-            "; with half the position gain (2 /s) the boom overshoots by"
-            f" {100 * v['boom_over_slower']:.0f} % and swings by"
-            f" +-{v['boom_ringing_slower']:.1f} %: the servo's gain is too high"
-            " for the oil under the whole arm's weight"
-        )
-    return Verdict(not bad, "; ".join(told), why)
+    return Judgement((check,), note=note)
+
+
+def _claim_pressure(joint: str) -> Claim:
+    return Claim(
+        f"feller-buncher: pressure of a {joint} step",
+        '"the joint step responses of the fellerbuncher , from which we can see that huge hydraulic'
+        ' pressures oscillations during free motion"',
+        f"p. 107, Fig. 6.{_JOINT_STEPS[joint][1]}",
+        "document",
+        partial(_judge_pressure, joint),
+        _SLOW_RAMPS,
+        "slow ramps instead of steps",
+        (f"{joint} angle [rad]", f"head-side pressure of the {joint} [MPa]"),
+    )
+
+
+def _judge_following(samples: Sequence[Sample]) -> Judgement:
+    checks = [
+        check_mean(f"{words} of the {name} over its step", collect(samples, f"{name}_{key}"),
+                   (-np.inf, limit), "a limit of this project")
+        for name in _JOINT_STEPS
+        for key, words, limit in (("overshoot", "overshoot", _MAX_JOINT_OVERSHOOT),
+                                  ("error", "remaining error", _MAX_JOINT_ERROR),
+                                  ("ringing", "oscillation after 5 s", _MAX_RINGING))
+    ]  # fmt: skip
+    v = samples[0].values
+    explanation = (
+        "with half the position gain (2 /s) the boom overshoots by"
+        f" {100 * v['boom_overshoot_slower']:.0f} % and oscillates by"
+        f" +-{100 * v['boom_ringing_slower']:.1f} %: the servo's gain is too high for the oil under"
+        " the whole arm's weight"
+    )
+    return Judgement(tuple(checks), explanation)
 
 
 _COORDINATES = {"r": 1.0, "theta": 6.0, "z": 11.0, "attitude": 16.0, "head": 21.0}
-_CROSS = 0.1  # of a step
+"""Coordinate -> time of its step [s]."""
+_MAX_CROSS = 0.1  # of the other coordinate's own step
 
 
-def resolved_steps(seed: int, changes: Changes) -> Sample:
-    """Steps of the joystick in all five task coordinates, judged on the measured pose."""
-    _, run = perform("feller_steps", drawn(seed) | dict(changes))
+def measure_resolved_steps(seed: int, changes: Changes) -> Sample:
+    """Step the joystick in all five task coordinates and measure the pose."""
+    _, run = run_shipped("feller_steps", operator_changes(seed) | dict(changes))
     m, values, panels = run.measured, {}, []
-    for name, begin in _COORDINATES.items():
-        inside = (m.time >= begin) & (m.time < begin + 4.9)
-        pose, asked = m[f"tip_pose.{name}"][inside], m[f"tip_reference.{name}"][inside]
-        step = asked[-1] - asked[0]
+    for name, start in _COORDINATES.items():
+        inside = (m.time >= start) & (m.time < start + 4.9)
+        pose, reference = m[f"tip_pose.{name}"][inside], m[f"tip_reference.{name}"][inside]
+        step = reference[-1] - reference[0]
         values[f"{name}_step"] = float(abs(step))
-        values[f"{name}_over"] = float((np.sign(step) * (pose - asked[-1])).max() / abs(step))
-        values[f"{name}_left"] = float(abs(pose[-25:].mean() - asked[-1]) / abs(step))
-        values[f"{name}_behind"] = float(np.abs(pose - asked).max() / abs(step))
+        values[f"{name}_overshoot"] = float(
+            (np.sign(step) * (pose - reference[-1])).max() / abs(step)
+        )
+        values[f"{name}_error"] = float(abs(pose[-25:].mean() - reference[-1]) / abs(step))
         cross = 0.0
         for other in _COORDINATES:
             if other != name:
                 moved, scale = m[f"tip_pose.{other}"][inside], np.ptp(m[f"tip_reference.{other}"])
                 cross = max(cross, float(np.abs(moved - moved[0]).max() / scale))
         values[f"{name}_cross"] = cross
-        title = f"{name} [{'m' if name in 'rz' else 'rad'}]"
-        panels.append(Panel(title, m.time[inside], {"asked": asked, "measured": pose}))
+        unit = "m" if name in "rz" else "rad"
+        panels.append(Panel(f"{name} [{unit}]", m.time[inside],
+                            {"reference": reference, "measured": pose},
+                            errors={"measured - reference": pose - reference},
+                            error_label=f"error of {name} [{unit}]"))  # fmt: skip
     return Sample(values, tuple(panels))
 
 
-def _resolved_verdict(samples: Sequence[Sample]) -> Verdict:
-    told, bad = [], []
-    for name in _COORDINATES:
-        over, left = largest(samples, f"{name}_over"), largest(samples, f"{name}_left")
-        cross, step = largest(samples, f"{name}_cross"), least(samples, f"{name}_step")
-        unit = "m" if name in "rz" else "rad"
-        told.append(f"{name} ({step:.2f} {unit}): overshoot {100 * over:.0f} %, left"
-                    f" {100 * left:.1f} %, others {100 * cross:.0f} %")  # fmt: skip
-        if over > _OVERSHOOT or left > _FOLLOWED or cross > _CROSS or step < 0.1:
-            bad.append(name)
-    why = (
-        f"measured pose; limits: overshoot {100 * _OVERSHOOT:.0f} %, left {100 * _FOLLOWED:.0f} %,"
-        f" others {100 * _CROSS:.0f} % of their own step; beyond them: {', '.join(bad) or 'none'}"
-    )
-    return Verdict(not bad, "; ".join(told), why)
+def _judge_resolved(samples: Sequence[Sample]) -> Judgement:
+    checks = [
+        check_mean(f"{words} of {name}", collect(samples, f"{name}_{key}"), (-np.inf, limit),
+                   "a limit of this project")
+        for name in _COORDINATES
+        for key, words, limit in (
+            ("overshoot", "overshoot", _MAX_JOINT_OVERSHOOT),
+            ("error", "remaining error", _MAX_JOINT_ERROR),
+            ("cross", "motion of the others during the step", _MAX_CROSS),
+        )
+    ]  # fmt: skip
+    steps = ", ".join(f"{name} {format_values(samples, f'{name}_step', 1.0, 2)}"
+                      for name in _COORDINATES)  # fmt: skip
+    return Judgement(tuple(checks), note=f"steps of {steps} m or rad; errors over the own step")
 
 
 _SLACK = {"servo.position_gain": "0.3", "servo.feedforward": "0.6"}
-_NO_RINGING = {
+_SLOW_RAMPS = {
     "pilot.interpolate": "linear", "pilot.time": "[0, 5, 6, 15, 16, 25, 31]",
     "pilot.columns": "{boom: [0.45, 0.55, 0.55, 0.55, 0.55, 0.55, 0.55],"
     " stick: [-1.35, -1.35, -1.35, -1.25, -1.25, -1.25, -1.25],"
     " tilt: [0.9, 0.9, 0.9, 0.9, 0.9, 1.0, 1.0]}",
 }  # fmt: skip
 
-EXPERIMENTS = (
-    *(Experiment(f"line {way}", partial(line, way), (_line_claim(way),), most=5)
-      for way in _WAYS),
-    Experiment("steering", steering, (
-        Claim(
-            "rate against position control",
-            "The mismatch of the fast joystick and the slow excavator could cause oscillation under"
-            " position control, on the other hand, an operator can easily achieve a smooth"
-            " operation when the machine is under rate control",
-            "p. 90",
-            "document",
-            _steering_verdict,
-            {"pilot.mode": "rate"},
-            "rate control in both",
-        ),
-    )),
-    Experiment("handle ramp", partial(handle_ramp, "false"), (
-        Claim(
-            "conventional centring force",
-            "the restoring force is a linear function of the position error. The bigger the"
-            " position error, the higher the restoring force",
-            "p. 101, Fig. 6.52",
-            "document",
-            _centring_verdict,
-            {"pilot.detent": "true"},
-            "detents on",
-        ),
-    ), most=5),
-    Experiment("handle ramp with detents", partial(handle_ramp, "true"), (
+STEERING = Experiment("steering", measure_steering, (
+    Claim(
+        "rate against position control",
+        '"The mismatch of the fast joystick and the slow excavator could cause oscillation under'
+        " position control, on the other hand, an operator can easily achieve a smooth operation"
+        ' when the machine is under rate control"',
+        "p. 90",
+        "document",
+        _judge_steering,
+        {"pilot.mode": "rate"},
+        "rate control in both",
+    ),
+))  # fmt: skip
+
+LINES = tuple(
+    Experiment(f"line {one}", partial(measure_line, one), (_claim_line(one),), 10) for one in _LINES
+)
+
+HANDLE = (
+    Experiment("handle ramp with detents", partial(measure_handle_ramp, "true"), (
         Claim(
             "detents",
-            "Within the joystick position deadband, it is the same as the single slope approach."
+            '"Within the joystick position deadband, it is the same as the single slope approach.'
             " Outside this band, it has another slope which is lower than the first one. At the"
-            " edge of the band, there is fixed amount of force drop",
-            "p. 101, Fig. 6.51, Table 6.11",
+            ' edge of the band, there is fixed amount of force drop"',
+            "p. 101, Fig. 6.51",
             "document",
-            _detent_verdict,
+            _judge_detent,
             {"pilot.detent": "false"},
             "detents off",
         ),
-    ), most=5),
-    Experiment("joint steps", joint_steps, (
+    )),
+    Experiment("handle ramp", partial(measure_handle_ramp, "false"), (
         Claim(
-            "feller-buncher: pressures of joint steps",
-            "the joint step responses of the fellerbuncher , from which we can see that huge"
-            " hydraulic pressures oscillations during free motion",
-            "p. 107, Figs 6.56-6.58",
+            "conventional centring force",
+            '"the restoring force is a linear function of the position error. The bigger the'
+            ' position error, the higher the restoring force"',
+            "p. 101, Fig. 6.52",
             "document",
-            _pressure_verdict,
-            _NO_RINGING,
-            "slow ramps instead of steps",
+            _judge_centring,
+            {"pilot.detent": "true"},
+            "detents on",
         ),
+    )),
+)  # fmt: skip
+
+STEPS = (
+    Experiment("joint steps", measure_joint_steps, (
+        *(_claim_pressure(joint) for joint in _JOINT_STEPS),
         Claim(
             "feller-buncher: joints follow their steps",
-            "boom, stick and tilt follow a step of 0.1 rad, without overshoot or lasting swing",
-            "beyond Figs 6.56-6.58, whose curves have no figures in the text",
-            "ours",
-            _following_verdict,
+            "boom, stick and tilt follow a step of 0.1 rad, without overshoot or lasting"
+            " oscillation",
+            "additional to Fig. 6.56, whose curves have no figures in the text",
+            "additional",
+            _judge_following,
             {"servo.position_gain": "12.0", "servo.pressure_feedback": "0.0"},
             "three times the position gain, no damping by pressure",
         ),
-    ), most=5),
-    Experiment("resolved steps", resolved_steps, (
+    ), 6),
+    Experiment("resolved steps", measure_resolved_steps, (
         Claim(
             "feller-buncher: steps of all five coordinates",
             "the measured pose follows every step of the joystick, the other coordinates stay",
-            "beyond Figs 6.56-6.58, which show joints",
-            "ours",
-            _resolved_verdict,
+            "additional to Fig. 6.56, which shows joints",
+            "additional",
+            _judge_resolved,
             _SLACK,
             "joint servos with a tenth of the gain and 60 % of the feedforward",
         ),
-    ), most=5),
+    ), 10),
 )  # fmt: skip

@@ -88,6 +88,7 @@ TRUTH: Mapping[str, Kind] = {
     "force": Kind(("N", "N m"), "piston force or motor torque after friction"),
     "piston_velocity": Kind(("m/s",), "velocity of the piston in its tube"),
     "contact_force": Kind(("N",), "contact force on the tool, base frame", "xyz"),
+    "object_contact": Kind(("N",), "contact force of a plate, tree, stump or log on the machine"),
     "tip": Kind(("m",), "position of the tool tip, base frame", "xyz"),
 }
 

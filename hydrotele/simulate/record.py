@@ -59,6 +59,7 @@ class Record:
         act: (n, na).
         command: (n, nu) mean command over the row's interval.
         contact: (n, 3) sum of the forces on the machine of ground and things, world frame [N].
+        contact_of: name of each thing around -> (n, 3) force of this thing on the machine [N].
         tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
         late: (n, c) what the sensors of `sensed_channels` show but for their errors; empty (n, 0)
             where none is late.
@@ -71,6 +72,7 @@ class Record:
     act: np.ndarray
     command: np.ndarray
     contact: np.ndarray
+    contact_of: dict[str, np.ndarray]
     tip: np.ndarray
     late: np.ndarray
 
@@ -153,7 +155,8 @@ STATE_ROW = np.dtype(
     + [("timestep", np.float64)]
     + [(name, np.int64) for name in ("qpos", "qvel", "qacc", "act", "site")]  # addresses from here
     + [(name, np.int64) for name in ("to_time", "to_qpos", "to_qvel", "to_qacc", "to_act")]
-    + [(name, np.int64) for name in ("to_contact", "to_tip")],
+    + [(name, np.int64) for name in ("to_contact", "to_tip")]
+    + [("groups", np.int64)],
     align=True,
 )
 """Record of a Recorder."""
@@ -190,7 +193,7 @@ def take_row(record, contacts, row, time):
     copy_to(rows_of(r.to_act, r.rows, r.na)[row], act)
     if r.tip >= 0:
         copy_to(rows_of(r.to_tip, r.rows, 3)[row], rows_of(r.site, r.sites, 3)[r.tip])
-    sum_contact_forces(contacts, rows_of(r.to_contact, r.rows, 3)[row])
+    _add_contact_forces(contacts[0], rows_of(r.to_contact, r.rows, 3 * r.groups)[row])
     warnings = short_integers(r.warning, 2 * _WARNINGS)  # information and number of each
     for kind in range(_WARNINGS):
         good = good and warnings[2 * kind + 1] == 0
@@ -210,11 +213,12 @@ class Recorder:
         model = plant.model
         self.model, self._data = model, None
         self.tip_site = model.site(TIP_SITE).id if plant.machine.arm else -1
-        self.around = surrounding_geoms(plant)
+        self.around, self.groups = surrounding_groups(plant)
         self.time = np.zeros(rows)
         self.qpos, self.qvel = np.zeros((rows, model.nq)), np.zeros((rows, model.nv))
         self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
-        self.command, self.contact = np.zeros((rows, model.nu)), np.zeros((rows, 3))
+        self.command = np.zeros((rows, model.nu))
+        self.contact = np.zeros((rows, len(self.groups), 3))
         self.tip = np.zeros((rows, 3 if self.tip_site >= 0 else 0))
         late = any(error.late for error in plant.machine.sensor_errors.values())
         self.late = np.zeros((rows, len(sensed_channels(plant)) if late else 0))
@@ -266,7 +270,7 @@ class Recorder:
             "rows": len(self.time), "nq": model.nq, "nv": model.nv, "na": model.na,
             "plain": _plain_positions(model), "sites": model.nsite, "tip": self.tip_site,
             "warning": data._address + field_offsets("mjData")["warning"],
-            "timestep": model.opt.timestep,
+            "timestep": model.opt.timestep, "groups": len(self.groups),
         }.items():  # fmt: skip
             self._row[name] = value
         self._contacts = contact_record(model, data, self.around)
@@ -281,9 +285,11 @@ class Recorder:
 
     def record(self, rows: int | None = None) -> Record:
         """All rows as a Record, or the first ones."""
+        contact = self.contact[:rows]
+        single = {name: contact[:, k] for k, name in enumerate(self.groups) if k > 0}
         return Record(
             self.time[:rows], self.qpos[:rows], self.qvel[:rows], self.qacc[:rows],
-            self.act[:rows], self.command[:rows], self.contact[:rows], self.tip[:rows],
+            self.act[:rows], self.command[:rows], contact.sum(axis=1), single, self.tip[:rows],
             self.late[:rows],
         )  # fmt: skip
 
@@ -298,6 +304,27 @@ def surrounding_bodies(plant: Plant) -> np.ndarray:
 def surrounding_geoms(plant: Plant) -> np.ndarray:
     """The same of each geom, (ngeom,) integers."""
     return _of_geoms(plant.model, surrounding_bodies(plant))
+
+
+def surrounding_groups(plant: Plant) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The things around, each a group of geoms whose contact forces are recorded together.
+
+    Args:
+        plant: the plant.
+
+    Returns:
+        (ngeom,) number of each geom's group, 0 for the machine and k + 1 for the k-th name; and the
+        names: `ground` with what is fixed to it, then every plate, tree, stump and log.
+    """
+    model, numbers, names = plant.model, surrounding_geoms(plant), ["ground"]
+    for geom in np.flatnonzero(numbers):
+        name, body = model.geom(geom).name, model.body(model.geom_bodyid[geom]).name
+        thing = body if model.body_weldid[model.geom_bodyid[geom]] else name
+        if plant.surroundings and is_surrounding_object(thing):
+            if thing not in names:
+                names.append(thing)
+            numbers[geom] = names.index(thing) + 1
+    return numbers, tuple(names)
 
 
 def _of_geoms(model: mujoco.MjModel, around: np.ndarray) -> np.ndarray:
@@ -361,26 +388,30 @@ def sum_contact_forces(record, total):
 
     Source: `contact_force`.
     """
-    total[:] = 0.0
     _add_contact_forces(record[0], total)
 
 
 @compiled
-def _add_contact_forces(r, total):
-    """Add the forces of contacts, turned into the world, on bodies that are not around."""
-    around, wrench = integers(r.around, r.geoms), np.empty(6)
+def _add_contact_forces(r, totals):
+    """Write the sums of contact forces, turned into the world, on bodies that are not around.
+
+    totals: (3 n,) written, [N]; geoms of group k add to the k-th three, groups above n to the last.
+    """
+    totals[:] = 0.0
+    around, wrench, groups = integers(r.around, r.geoms), np.empty(6), len(totals) // 3
     first_contact = integers(r.contacts, 1)[0]
     for k in range(short_integers(r.count, 1)[0]):
         contact = first_contact + k * r.size
         geom = short_integers(contact + r.geom, 2)
-        first = around[geom[0]]
-        if first == around[geom[1]]:
+        first, second = around[geom[0]], around[geom[1]]
+        if (first > 0) == (second > 0):
             continue  # the machine touching itself is no ground force
         call_contact_force(r.function, r.model, r.data, k, wrench.ctypes.data)
-        frame, sign = floats(contact + r.frame, 9), 1.0 if first else -1.0
+        frame, sign = floats(contact + r.frame, 9), 1.0 if first > 0 else -1.0
+        start = 3 * (min(max(first, second), groups) - 1)
         for i in range(3):
             force = frame[i] * wrench[0] + frame[3 + i] * wrench[1]
-            total[i] += sign * (force + frame[6 + i] * wrench[2])
+            totals[start + i] += sign * (force + frame[6 + i] * wrench[2])
 
 
 _BRISTLE, _STIFFNESS = int(Slot.BRISTLE), int(Slot.BRISTLE_STIFFNESS)
@@ -521,6 +552,10 @@ def _hidden(plant: Plant, record: Record):
         put(f"truth.{shown}", record.act[:, place], "1")
     _put_things(plant, record, put)
     _put_hydraulics(plant, record, put)
+    for name, force in record.contact_of.items():
+        if np.any(force):
+            for letter, column in zip("xyz", force.T, strict=True):
+                put(f"truth.object_contact.{name}_{letter}", column, "N")
     for k, letter in enumerate("xyz"):
         if np.any(record.contact):
             put(f"truth.contact_force.{letter}", record.contact[:, k], "N")

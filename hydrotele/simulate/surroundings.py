@@ -268,7 +268,7 @@ def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: st
         limited="false",
     )  # fmt: skip
     body.add(
-        "geom", name=name, type="capsule", size=(radius, half - radius), pos=(0, 0, half),
+        "geom", name=name, type="cylinder", size=(radius, half), pos=(0, 0, half),
         contype=3, conaffinity=3, **bark,
     )  # fmt: skip
     body.add(

@@ -92,6 +92,7 @@ def test_any_text_parses_or_is_a_value_error(name):
         ("truth.force.swing", ("N", "N m")),
         ("truth.acceleration.boom", ("rad/s^2", "m/s^2")),
         ("truth.contact_force.x", ("N",)),
+        ("truth.object_contact.tree_0_x", ("N",)),
         ("truth.flow_supply", ("m^3/s",)),
     ],
 )

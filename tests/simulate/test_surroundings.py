@@ -56,6 +56,9 @@ def test_the_force_that_is_felt_is_the_plates():
     run = run_scenario(scenario.model_copy(update={"pilot": pilot}))
     felt = run.measured["tip_force.z"][-25:].mean()
     assert felt == pytest.approx(run.truth["truth.contact_force.z"][-25:].mean(), rel=0.1)
+    for c in "xyz":  # the plate is all that the machine touches
+        single = run.truth[f"truth.object_contact.plate_0_{c}"]
+        np.testing.assert_array_equal(single, run.truth[f"truth.contact_force.{c}"])
 
 
 def test_a_plate_far_away_changes_nothing():

@@ -1,0 +1,345 @@
+"""Zhu 1994, 6.3 and 6.3.2: a tree felled with the feller-buncher, and a machine that could tip."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
+from hydrotele.experiments.intervals import (
+    check_fraction,
+    check_mean,
+    collect,
+    format_values,
+)
+from hydrotele.experiments.scenario_runs import (
+    cylindrical_pose,
+    operator_changes,
+    run_shipped,
+    true_channel,
+)
+from hydrotele.run.run import Run
+from hydrotele.scenario.teleoperation import TeleopPilot, TipOver
+from hydrotele.teleop.master import tipping_share
+
+JUST_NOTICEABLE = 0.23
+"""Just noticeable difference of a compliance without other cues, as a fraction (Tan 1995)."""
+_CONTACT = 500.0  # N of the head on the stem
+_STANDS_OUT = 3.0  # times the force that is estimated in the air
+_MAX_RISE = 1.0  # s: a ninth of the time axis of Fig. 6.55
+_NEVER = np.inf  # s
+_MAX_LAID = -50.0  # deg of the head: a stem that lies more than it stands
+_MIN_SWING = 30.0  # deg to the side
+_EVENTS = {"cut": "is cut", "held": "holds", "let_go": "lets"}
+
+
+def measure_felling(seed: int, changes: Changes) -> Sample:
+    """Touch a tree, saw, grab and lay it down; record force and felt stiffness meanwhile.
+
+    `touched` is the first contact of the head with the stem of 0.5 kN or more; that with the stump
+    does not count. The saw starts by the scenario's first button of the saw.
+    """
+    scenario, run = run_shipped("fell_tree", operator_changes(seed) | dict(changes))
+    pose, time, m = cylindrical_pose(run), run.truth.time, run.measured
+    contact = {thing: _contact_size(run, thing) for thing in ("tree_0", "tree_0_stump")}
+    values = {
+        key: next((float(n.rsplit(" ", 2)[-2]) for n in run.summary["notes"] if word in n), _NEVER)
+        for key, word in _EVENTS.items()
+    }
+    assert isinstance(scenario.pilot, TeleopPilot)
+    saw = min((b.at for b in scenario.pilot.buttons if b.axis == "saw" and b.command), default=0.0)
+    on_stem = contact["tree_0"] > _CONTACT
+    touched = float(time[np.argmax(on_stem)]) if on_stem.any() else _NEVER
+    free = (m.time > 0.5) & (m.time < min(touched, saw) - 0.2)
+    pressing = (m.time >= touched) & (m.time < saw)
+    force, stiffness = np.abs(m["tip_force.r"]), m["handle_stiffness.x"]
+    free_force = _percentile(force[free])
+    rise = m.time[pressing & (force > _STANDS_OUT * free_force)]
+    in_air = float(np.median(stiffness[free])) if free.any() else np.nan
+    change = np.abs(stiffness[pressing] / in_air - 1.0)
+    before_release = time < min(values["let_go"], time[-1])
+    values |= {
+        "touched": touched, "saw": saw, "free_force": free_force,
+        "contact_force": _percentile(force[pressing]),
+        "rise": float(rise[0]) - touched if rise.size else _NEVER,
+        "stem": float(contact["tree_0"][(time >= touched) & (time < saw)].max(initial=0.0)),
+        "stump": float(contact["tree_0_stump"].max()),
+        "stiffness_free": in_air,
+        "stiffness_contact": float(stiffness[pressing][change.argmax()]) if change.size else np.nan,
+        "stiffness_change": float(change.max(initial=0.0)),
+        "centring": _percentile(np.abs(m["handle_force.x"][pressing])),
+        "laid": float(np.degrees(pose["attitude"][before_release][-1])),
+        "aside": float(np.degrees(pose["theta"][before_release][-1])),
+        "tripped": float(run.summary["teleoperation"]["tripped"]),
+    }  # fmt: skip
+    return Sample(values, (
+        Panel("tip [m]", time, {"r": pose["r"], "z": pose["z"]}),
+        Panel("swing and attitude [rad]", time,
+              {"theta": pose["theta"], "attitude": pose["attitude"]}),
+        Panel("contact force, true [kN]", time,
+              {"stem": contact["tree_0"] / 1e3, "stump": contact["tree_0_stump"] / 1e3}),
+        Panel("estimated force along r [kN]", m.time, {"r": m["tip_force.r"] / 1e3}),
+        Panel("stiffness of the joystick along x [N/mm]", m.time, {"x": stiffness / 1e3}),
+        Panel("centring force along x [N]", m.time, {"x": m["handle_force.x"]}),
+    ))  # fmt: skip
+
+
+def _contact_size(run: Run, thing: str) -> np.ndarray:
+    """Size of the force between the machine and a thing around it, (n,) [N]."""
+    parts = [true_channel(run, f"truth.object_contact.{thing}_{c}") for c in "xyz"]
+    return np.linalg.norm(parts, axis=0)
+
+
+def _percentile(values: np.ndarray) -> float:
+    """98th percentile, which a single noisy sample does not set."""
+    return float(np.percentile(values, 98)) if values.size else np.nan
+
+
+def _judge_contact(samples: Sequence[Sample]) -> Judgement:
+    checks = (
+        check_fraction("operators whose head presses on the stem by 0.5 kN or more before the saw"
+                       " starts", collect(samples, "touched") < collect(samples, "saw")),
+        check_fraction(f"operators whose estimated force reaches {_STANDS_OUT:g} times that in the"
+                       f" air within {_MAX_RISE:g} s of the contact",
+                       collect(samples, "rise") <= _MAX_RISE),
+    )  # fmt: skip
+    note = (
+        f"contact at {format_values(samples, 'touched')} s, up to"
+        f" {format_values(samples, 'stem', 1e-3)} kN on the stem, the estimated force rises within"
+        f" {format_values(samples, 'rise', 1.0, 2)} s; estimated"
+        f" {format_values(samples, 'contact_force', 1e-3)} kN in contact,"
+        f" {format_values(samples, 'free_force', 1e-3)} kN in the air (98th percentiles)"
+    )
+    explanation = (
+        "the disc touches the stem at rest, then the operator eases off and starts the saw: pressed"
+        " on the stem a disc does not start"
+    )
+    return Judgement(checks, explanation, note)
+
+
+def _judge_felt(samples: Sequence[Sample]) -> Judgement:
+    check = check_fraction(
+        f"operators whose stiffness changes by more than {100 * JUST_NOTICEABLE:.0f} % before the"
+        " saw starts", collect(samples, "stiffness_change") > JUST_NOTICEABLE,
+    )  # fmt: skip
+    note = (
+        f"stiffness along x from {format_values(samples, 'stiffness_free', 1e-3)} N/mm in the air"
+        f" to {format_values(samples, 'stiffness_contact', 1e-3)} N/mm in contact; centring force"
+        f" up to {format_values(samples, 'centring')} N"
+    )
+    explanation = (
+        f"felt: a change of more than {100 * JUST_NOTICEABLE:.0f} %, the just noticeable difference"
+        " of a compliance (Tan 1995)"
+    )
+    return Judgement((check,), explanation, note)
+
+
+def _judge_process(samples: Sequence[Sample]) -> Judgement:
+    touched, saw, cut, held, let_go, laid, aside, tripped = (
+        collect(samples, key)
+        for key in ("touched", "saw", "cut", "held", "let_go", "laid", "aside", "tripped")
+    )
+    in_order = (touched < saw) & (saw < cut) & (cut < _NEVER) & (saw < held) & (held < let_go)
+    lies = (let_go < _NEVER) & (laid < _MAX_LAID) & (aside > _MIN_SWING)
+    checks = (
+        check_fraction("operators who touch, saw, grab and let go in this order",
+                       in_order & (tripped == 0.0)),
+        check_fraction("operators who let go of a stem that lies to the side", lies),
+    )  # fmt: skip
+    times = ", ".join(
+        f"{words} at {format_values(samples, key)} s"
+        for words, key in (("contact", "touched"), ("saw started", "saw"), ("cut", "cut"),
+                           ("held", "held"), ("let go", "let_go"))
+    )  # fmt: skip
+    note = (
+        f"{times}; laid down at {format_values(samples, 'laid', 1.0, 0)} deg,"
+        f" {format_values(samples, 'aside', 1.0, 0)} deg to the side; largest force on the stump"
+        f" {format_values(samples, 'stump', 1e-3)} kN"
+    )
+    explanation = (
+        f"lies: the head beyond {_MAX_LAID:.0f} deg, where a stem lies more than it stands; to the"
+        f" side: more than {_MIN_SWING:.0f} deg of swing"
+    )
+    return Judgement(checks, explanation, note)
+
+
+_FELLER = TipOver(mass=25.0e3, edge=1.6)
+"""25 t is from the feller-buncher's data sheet; half the gauge of its tracks is assumed."""
+_DEADBAND = 1.5e-3  # m, Table 6.9
+_SOIL = "[{kind: plate, position: [6.8, 0.0, 0.3], size: [1.0, 1.0], stiffness: 3.0e+5, damping: 3.0e+4}]"  # noqa: E501
+
+
+def _tipping_share(run: Run, facts: TipOver) -> np.ndarray:
+    """Fraction of the tipping moment that the contact force makes, (n,)."""
+    pose, force = cylindrical_pose(run), true_channel(run, "truth.contact_force.z")
+    pairs = zip(pose["r"], force, strict=True)
+    return np.array([tipping_share(facts, r, f) for r, f in pairs])
+
+
+def measure_pushing(seed: int, changes: Changes) -> Sample:
+    """Push the feller-buncher's head down with a constant force, with and without reflection.
+
+    The hand keeps the force that moved the handle to 3.5 mm. Further conditions: softer ground, and
+    a hand that keeps its place instead.
+    """
+    cases = {
+        "with": {"pilot.reflection": "stiffness"},
+        "without": {"pilot.reflection": "none"},
+        "soil": {"surroundings": _SOIL},
+        "stiff_hand": {"pilot.perception.muscle": "6.0"},
+    }
+    values, panels = {}, []
+    for name, keys in cases.items():
+        keys = operator_changes(seed) | keys | dict(changes)
+        _, run = run_shipped("press_over", keys)
+        share, m = _tipping_share(run, _FELLER), run.measured
+        touching = run.truth.time[np.argmax(share > 0.02)] if (share > 0.02).any() else 0.0
+        late = m.time > run.scenario.duration - 5.0
+        before = (m.time > touching - 0.5) & (m.time < touching)
+        values[f"{name}_share"] = float(share.max())
+        values[f"{name}_handle"] = float(np.abs(m["handle.z"][late]).max())
+        values[f"{name}_before"] = float(np.abs(m["handle.z"][before]).mean())
+        if name in ("with", "without"):
+            words = f"{name} reflection"
+            panels.append(Panel(f"fraction of the tipping moment, {words} [1]", run.truth.time,
+                                {"fraction": share}))  # fmt: skip
+            panels.append(Panel(f"handle, {words} [mm]", m.time, {"z": 1e3 * m["handle.z"]}))
+    return Sample(values, tuple(panels))
+
+
+def _judge_pushed_back(samples: Sequence[Sample]) -> Judgement:
+    pushed_back = (collect(samples, "with_handle") < _DEADBAND) & (
+        collect(samples, "without_handle") > _DEADBAND
+    )
+    check = check_fraction("operators whose handle is in the dead band with reflection and outside"
+                           " without", pushed_back)  # fmt: skip
+    note = (
+        f"a hand that keeps its force is pushed from {format_values(samples, 'with_before', 1e3)}"
+        f" to {format_values(samples, 'with_handle', 1e3)} mm; without reflection it stays at"
+        f" {format_values(samples, 'without_handle', 1e3)} mm; a hand that keeps its place is not"
+        f" pushed back ({format_values(samples, 'stiff_hand_handle', 1e3)} mm)"
+    )
+    return Judgement((check,), "dead band of 1.5 mm, Table 6.9", note)
+
+
+def _judge_avoided(samples: Sequence[Sample]) -> Judgement:
+    reason = "the machine tips at 1; mass and gauge are not in the thesis"
+    checks = tuple(
+        check_mean(f"largest fraction of the tipping moment {words}",
+                   collect(samples, f"{key}_share"), accepted, reason)
+        for key, words, accepted in (
+            ("with", "with reflection on rock of 2 MN/m", (0.0, 1.0)),
+            ("soil", "with reflection on soil of 0.3 MN/m", (0.0, 1.0)),
+            ("without", "without reflection on rock", (1.0, np.inf)),
+        )
+    )  # fmt: skip
+    explanation = (
+        "the handle returns to its dead band, but the estimated force is late by 0.3 s and the"
+        " stiffness saturates at the 30 kN of Table 6.10: on hard rock the head is driven on"
+    )
+    return Judgement(checks, explanation)
+
+
+def measure_protection(seed: int, changes: Changes) -> Sample:
+    """Press with an operator who aims at too large a force, with and without an added spring."""
+    values, panels = {}, []
+    for name, keys in (("spring", {}), ("bare", {"pilot.tip_over": "null"})):
+        scenario, run = run_shipped("tip_over", operator_changes(seed) | keys | dict(changes))
+        assert isinstance(scenario.pilot, TeleopPilot)
+        facts = scenario.pilot.tip_over or TipOver(mass=20.0e3, edge=1.6)
+        share, handle = _tipping_share(run, facts), run.measured["handle.z"]
+        values[f"{name}_share"] = float(share.max())
+        late = run.measured.time > 10.0
+        values[f"{name}_handle"] = float(np.abs(handle[late]).max())
+        words = "with the spring" if name == "spring" else "without the spring"
+        panels.append(Panel(f"fraction of the tipping moment, {words} [1]", run.truth.time,
+                            {"fraction": share}))  # fmt: skip
+        panels.append(Panel(f"handle, {words} [mm]", run.measured.time, {"z": 1e3 * handle}))
+    return Sample(values, tuple(panels))
+
+
+def _judge_protection(samples: Sequence[Sample]) -> Judgement:
+    kept, bare = collect(samples, "spring_share"), collect(samples, "bare_share")
+    checks = (
+        check_mean("largest fraction of the tipping moment with the spring", kept, (0.0, 1.0),
+                   "the machine tips at 1"),
+        check_fraction("operators whose largest fraction is smaller with the spring", kept < bare),
+    )  # fmt: skip
+    note = (
+        f"without the spring {format_values(samples, 'bare_share', 1.0, 2)};"
+        f" {np.sum(bare > 1.0)} of {len(samples)} operators press hard enough to tip the machine"
+        f" without it; handle within {format_values(samples, 'spring_handle', 1e3)} mm after 10 s"
+    )
+    explanation = "8 kN/m and 100 N s/m beyond half of the tipping moment; not in the thesis"
+    return Judgement(checks, explanation, note)
+
+
+TIP_OVER = (
+    Experiment("hand that goes on pushing", measure_pushing, (
+        Claim(
+            "tip-over: the stick pushed back",
+            '"the most effective way is via force reflection which automatically pushes the'
+            ' joystick back into its position deadband"',
+            "p. 99",
+            "document",
+            _judge_pushed_back,
+            {"pilot.reflection": "none"},
+            "no reflection in both",
+        ),
+        Claim(
+            "tip-over avoided by stiffness feedback alone",
+            '"machine tip-over can be avoided by pushing the joystick back to the center under'
+            ' computer control"',
+            "p. 6",
+            "document",
+            _judge_avoided,
+            {"pilot.reflection": "none"},
+            "no reflection in both",
+        ),
+    ), 6),
+    Experiment("added spring", measure_protection, (
+        Claim(
+            "tip-over: an added spring",
+            "a further spring of 8 kN/m beyond half of the tipping moment keeps an operator who"
+            " aims at too large a force from tipping the machine",
+            "additional to p. 99",
+            "additional",
+            _judge_protection,
+            {"pilot.tip_over": "null"},
+            "without the spring in both",
+        ),
+    ), 6),
+)  # fmt: skip
+
+FELLING = (
+    Experiment("tree", measure_felling, (
+        Claim(
+            "a tree felled: contact",
+            '"The endpoint force increased rapidly after contact with the tree was made"',
+            "p. 105, Fig. 6.55",
+            "document",
+            _judge_contact,
+            {"pilot.buttons": "[{at: 0.0, axis: saw, command: 1.0}]"},
+            "the saw turns from the start, so that the head meets no standing stem",
+        ),
+        Claim(
+            "a tree felled: felt stiffness",
+            '"Through the change of stiffness of the joystick, the operator could feel this contact'
+            ' kinesthetically"',
+            "p. 105, Fig. 6.55",
+            "document",
+            _judge_felt,
+            {"pilot.reflection": "none"},
+            "no reflection",
+        ),
+        Claim(
+            "a tree felled: the process",
+            '"the rotating saw started cutting the tree, and the grab arm on the felling-head'
+            ' closed and grabbed it. The cut tree was then laid to the side in bunches"',
+            "p. 105",
+            "document",
+            _judge_process,
+            {"pilot.buttons": "[{at: 16.0, axis: saw, command: 1.0}]"},
+            "the grab arm never closes",
+        ),
+    ), 10),
+)  # fmt: skip
