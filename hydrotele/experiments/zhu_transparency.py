@@ -99,20 +99,19 @@ def judge_lossless(samples: Sequence[Sample]) -> Judgement:
     ))  # fmt: skip
 
 
-def intervening_port(case: Case, force_error: float = 0.0) -> TwoPort:
+def intervening_port(case: Case) -> TwoPort:
     """Four channels that need no acceleration, with an intervening impedance.
 
     Args:
         case: master and slave with damper and spring added to their masses.
-        force_error: relative error of the force that is fed forward [1].
 
     Returns:
         The two-port of (3.37).
     """
     own, held = case.master_control, case.slave_control
     return TwoPort(
-        case.master, case.slave, own, held, held, constant_block(1.0),
-        constant_block(1.0 + force_error), lambda s: -own(s),
+        case.master, case.slave, own, held, held, constant_block(1.0), constant_block(1.0),
+        lambda s: -own(s),
     )  # fmt: skip
 
 
