@@ -230,5 +230,6 @@ EXPERIMENTS: tuple[Experiment, ...] = (
 UNAVAILABLE: tuple[Comparison, ...] = ()
 
 DRAWINGS: dict[str, str] = {
-    "Figure 6.36": "drawing of a four-bar linkage; its law is that of another document",
+    "Figure 6.35": "drawing of a two-bar linkage",
+    "Figure 6.36": "drawing of a four-bar linkage",
 }

@@ -250,7 +250,11 @@ def measure_pressing(seed: int, changes: Changes) -> Sample:
     shift = float(abs(error[late].mean() - error[free].mean()))
     noise = float((m["tip_pose.z"] - height)[late].std())
     force = float(np.mean(m["tip_force.z"][late]))
-    return Sample({"ratio": shift / noise, "shift": shift, "noise": noise, "force": force}, (
+    pushed = late & (np.abs(m["handle.z"]) > 1e-4)
+    law = np.clip(600.0 + (4000.0 - 600.0) / 50e3 * np.abs(m["tip_force.z"]), 300.0, 4000.0)
+    off = float(np.sqrt(np.mean((m["handle_stiffness.z"] / law - 1.0)[pushed] ** 2)))
+    values = {"ratio": shift / noise, "shift": shift, "noise": noise, "force": force, "law": off}
+    return Sample(values, (
         Panel("position error of the bucket [mm]", m.time, {
             "reference - measured": 1e3 * error, "reference - true":
             1e3 * (m["tip_reference.z"] - height)}),
@@ -268,6 +272,15 @@ def judge_position_error(samples: Sequence[Sample]) -> Judgement:
         f" {format_values(samples, 'force', 1e-3)} kN; noise {format_values(samples, 'noise', 1e3)}"
         " mm, that of the angle sensors of khoshzaban1992",
     )  # fmt: skip
+
+
+def judge_stiffness_law(samples: Sequence[Sample]) -> Judgement:
+    """Judge the joystick's stiffness against (4.1) with the numbers of Tables 6.7 and 6.8."""
+    return Judgement((
+        check_mean("RMS difference of the stiffness along z from (4.1), relative",
+                   collect(samples, "law"), (-np.inf, 0.05),
+                   "force and stiffness are logged up to a period of 20 ms apart"),
+    ))  # fmt: skip
 
 
 def measure_direct_force(changes: Changes) -> Sample:
@@ -347,7 +360,7 @@ def _judge_opacity(*structures: str) -> Callable[[Sequence[Sample]], Judgement]:
 
 def make_claim(
     name: str, quote: str, item: str, judge: Callable[[Sequence[Sample]], Judgement],
-    broken: Changes, broken_how: str, kind: Kind = "document",
+    broken: Changes | None, broken_how: str, kind: Kind = "document",
 ) -> Claim:  # fmt: skip
     """A claim with the arguments in the order in which a reader wants them."""
     return Claim(name, quote, item, kind, judge, broken, broken_how)
@@ -391,7 +404,11 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         ' feller-bunchers that there is virtually no position error for feedback considering the'
         ' noise"', "p. 34, Fig. 3.18", judge_position_error, {"servo.position_gain": "1.0"},
         "joint loops with an eighth of the position gain",
-    ),), max_repetitions=6),
+    ), make_claim(
+        "stiffness adjustment",
+        "the stiffness of the joystick is that of (4.1) with Tables 6.7 and 6.8", "p. 51, Fig. 4.24",
+        judge_stiffness_law, {"pilot.reflection": "none"}, "no reflection", "input",
+    )), max_repetitions=6),
     exact_experiment("direct force, linear", measure_direct_force, make_claim(
         "position-force structure: reduced gain",
         '"For position control with direct force feedback, stability can be achieved by reducing'
