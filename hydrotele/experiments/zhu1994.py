@@ -1,19 +1,24 @@
 """Zhu 1994: force-reflecting resolved motion control of an excavator and a feller-buncher.
 
+Chapters 2 to 5 are computed from the two-port, the stiffness controller and the joystick.
 The machine experiments of chapter 6 are repeated with simulated operators of the published
 population, one per repetition. The thesis had one person for each figure, who is not known.
 """
 
 from hydrotele.experiments import (
+    zhu_control,
     zhu_false_force,
     zhu_felling,
     zhu_forces,
+    zhu_identification,
     zhu_motion,
     zhu_tables,
 )
-from hydrotele.experiments.comparison import Comparison, Experiment, Series
+from hydrotele.experiments.comparison import Experiment, Series
 
 EXPERIMENTS: tuple[Experiment, ...] = (
+    *zhu_control.EXPERIMENTS,
+    *zhu_identification.EXPERIMENTS,
     zhu_tables.TABLES,
     zhu_motion.STEERING,
     *zhu_motion.LINES,
@@ -28,14 +33,10 @@ EXPERIMENTS: tuple[Experiment, ...] = (
 )
 """In the order of the document."""
 
-UNAVAILABLE: tuple[Comparison, ...] = ()
-DRAWINGS: dict[str, str] = {}
-
 SERIES = Series(
     "zhu1994",
     "Zhu 1994, Master-slave force-reflecting resolved motion control of hydraulic mobile machines",
     20,
     EXPERIMENTS,
-    UNAVAILABLE,
-    DRAWINGS,
+    drawings=zhu_control.DRAWINGS | zhu_identification.DRAWINGS,
 )

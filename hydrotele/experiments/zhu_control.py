@@ -1,7 +1,7 @@
 """Zhu 1994, chapters 1 to 5: all rows, and the figures that show no result."""
 
 from hydrotele.experiments import zhu_kinematics, zhu_stiffness, zhu_transparency, zhu_two_port
-from hydrotele.experiments.comparison import Comparison, Experiment
+from hydrotele.experiments.comparison import Experiment
 
 EXPERIMENTS: tuple[Experiment, ...] = (
     *zhu_kinematics.EXPERIMENTS,
@@ -9,8 +9,6 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     *zhu_transparency.EXPERIMENTS,
     *zhu_stiffness.EXPERIMENTS,
 )
-
-UNAVAILABLE: tuple[Comparison, ...] = ()
 
 DRAWINGS: dict[str, str] = {
     "Figure 1.1": "sketch of a kinematically similar master and slave",

@@ -15,7 +15,6 @@ from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
-    Comparison,
     Experiment,
     Judgement,
     Panel,
@@ -226,8 +225,6 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     _convergence("excavator"),
     _convergence("feller-buncher"),
 )  # fmt: skip
-
-UNAVAILABLE: tuple[Comparison, ...] = ()
 
 DRAWINGS: dict[str, str] = {
     "Figure 6.35": "drawing of a two-bar linkage",
