@@ -1,4 +1,4 @@
-"""Cylinders whose pins lie in no common plane: ball joints at their ends (Khoshzaban 1992, p. 43)."""
+"""Cylinders whose pins lie in no common plane end in ball joints (Khoshzaban 1992, p. 43)."""
 
 import mujoco
 import numpy as np
