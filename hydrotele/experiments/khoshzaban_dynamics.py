@@ -162,7 +162,7 @@ def judge_proximal(samples: Sequence[Sample]) -> Judgement:
     relative = ", ".join(f"{d} {format_values(samples, f'relative.{d}', 100.0)} %" for d in DRIVES)
     return Judgement(
         checks,
-        "Of its own RMS force the stick's error is the larger one.",
+        "Relative to the RMS force, the stick's error is larger than the boom's.",
         note=f"RMS differences {sizes}; of the RMS force {relative}",
     )
 
@@ -219,7 +219,7 @@ def count_parameters(told: Identifiability) -> dict[str, int]:
     """Counts in the document's words.
 
     Columns that have no effect and columns for which others can stand are deleted, and count as
-    unidentifiable; what remains is as many as the rank.
+    unidentifiable. The number of the others is the rank.
 
     Args:
         told: classification of all parameters.

@@ -1,4 +1,4 @@
-"""Section 4.4.3 of Khoshzaban 1992: what the sensors' accuracy does to identified parameters."""
+"""Section 4.4.3 of Khoshzaban 1992: effect of the sensors' accuracy on identified parameters."""
 
 from collections.abc import Sequence
 
@@ -93,7 +93,7 @@ def _ratio_of_means(rows: np.ndarray) -> float:
     return float(np.median(np.exp(logs[0] - logs[1])))
 
 
-def _improved(samples: Sequence[Sample], model: str, better: str) -> np.ndarray:
+def _fraction_improved(samples: Sequence[Sample], model: str, better: str) -> np.ndarray:
     """(n,) fraction of parameters whose error falls 10 to 100 times."""
     ratio = _errors(samples, f"{model}.25 psi") / _errors(samples, f"{model}.{better}")
     return np.mean((ratio >= 10.0) & (ratio <= 100.0), axis=1)
@@ -112,7 +112,7 @@ def _improvement_judge(model: str, more: str = ""):
             )
         }
         reason = '"10 to 100 times"'
-        independent = _improved(samples, model, "independent")
+        independent = _fraction_improved(samples, model, "independent")
         checks = (
             check_statistic("error with 25 psi over error with 5 psi, median of the parameters",
                             pairs[""], _ratio_of_means, (10.0, 100.0), reason),

@@ -63,7 +63,7 @@ def complete():
 
 
 def test_counts_of_the_complete_model(complete):
-    """Of cylinders that end in pins; the experiment of Khoshzaban's Table 13 has ball joints."""
+    """Of cylinders that end in pins; Khoshzaban's Table 13 has ball joints."""
     told = identifiability(complete.matrix.reshape(-1, 82), complete.names, complete.units)
     assert told.counts == {UNIDENTIFIABLE: 9, COMBINATION: 53, FULL: 20}
     assert told.gap[0] > 1e5 * told.gap[1]

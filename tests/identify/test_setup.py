@@ -8,9 +8,11 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.identify.mechanism import load_mechanism
-from hydrotele.identify.setup import mechanism_setup
+from hydrotele.identify.setup import machine_setup, mechanism_setup
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.simulate.closure import closed_chain
 
 FOLDER = models_folder() / "palida"
 
@@ -38,3 +40,26 @@ def test_what_is_not_there_is_refused():
         found = project(chain, chain.drives, legs, still, still)
         with pytest.raises(InputError, match=message):
             setup.table(found)
+
+
+def test_ball_joints_carry_no_moment_about_a_cylinders_axis():
+    machine = load_machine("cat215")
+    chain = closed_chain(machine)
+    pose = np.array([[0.1, 0.4, -1.5]])
+    columns = {}
+    for ball_joints in (True, False):
+        setup = machine_setup(machine, chain, ball_joints=ball_joints)
+        # the swing accelerates alone, so that tubes and rods are turned about their axes
+        table = setup.table(setup.project(pose, 0.0 * pose, np.array([[1.0, 0.0, 0.0]])))
+        column = [n.endswith("_tube") and n.startswith("inertia_xx") for n in table.names]
+        columns[ball_joints] = table.matrix[0, 0, np.flatnonzero(column)]
+    assert np.all(np.abs(columns[True]) < 1e-15), "rounding"
+    assert np.all(columns[False] > 0.01), "the square of the sine of the cylinder's slope"
+
+
+def test_a_body_without_moment_that_is_not_there_is_refused():
+    chain = load_chain(FOLDER / "palida.xml")
+    own = replace(mechanism_setup(chain), moment_free={"wing": (1.0, 0.0, 0.0)})
+    legs = chain.start[[chain.index(d) for d in chain.drives]][None]
+    with pytest.raises(InputError, match="has no body wing"):
+        own.project(legs, 0.0 * legs, 0.0 * legs)
