@@ -244,8 +244,8 @@ def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -
         *delays_table(cases, late, asked.seeds), "",
         f"## A force held by feel, `press_stiffness`, {asked.held} seeds", "",
         "True contact force against the target in the last 6 s before each target's end.",
-        "The operator knows the nominal stiffness and the gain of the stiffness feedback, and feels",
-        "the stiffness with the error of a hand.", "",
+        "The operator knows the nominal stiffness and the gain of the stiffness feedback, and",
+        "feels the stiffness with the error of a hand.", "",
         *held_table(kept), "",
     ])  # fmt: skip
 

@@ -11,7 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 from study import options, publish
 
-from hydrotele.experiments.finding import cylindrical
+from hydrotele.experiments.scenario_runs import cylindrical_pose
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
@@ -108,7 +108,7 @@ def tracked(changes: dict[str, str]) -> float:
 def restless(changes: dict[str, str]) -> float:
     """RMS speed of the tip where it should rest [m/s]."""
     run = run_scenario(load_scenario("steer", changes))
-    pose, time = cylindrical(run), run.truth.time
+    pose, time = cylindrical_pose(run), run.truth.time
     rest = np.zeros(len(time), bool)
     for begin, end in RESTING:
         rest |= (time > begin) & (time < end)

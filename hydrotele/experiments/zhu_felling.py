@@ -341,5 +341,5 @@ FELLING = (
             {"pilot.buttons": "[{at: 16.0, axis: saw, command: 1.0}]"},
             "the grab arm never closes",
         ),
-    ), 10),
+    ), 8),
 )  # fmt: skip
