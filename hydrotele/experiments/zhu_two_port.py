@@ -406,8 +406,9 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "joint loops with an eighth of the position gain",
     ), make_claim(
         "stiffness adjustment",
-        "the stiffness of the joystick is that of (4.1) with Tables 6.7 and 6.8", "p. 51, Fig. 4.24",
-        judge_stiffness_law, {"pilot.reflection": "none"}, "no reflection", "input",
+        "the stiffness of the joystick is that of (4.1) with Tables 6.7 and 6.8",
+        "p. 51, Fig. 4.24", judge_stiffness_law, {"pilot.reflection": "none"}, "no reflection",
+        "input",
     )), max_repetitions=6),
     exact_experiment("direct force, linear", measure_direct_force, make_claim(
         "position-force structure: reduced gain",
