@@ -16,10 +16,11 @@ Static model of an arm: the torque of its weight, linear in a few parameters.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from hydrotele.control.state_filter import (
     CHANGE,
@@ -57,7 +58,8 @@ _NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
 _GRID = 9  # poses per joint to which the masses' torques are fitted
 _SPREAD = 3.0e5  # N m: nothing is known of the parameters before
 _RUBBING = 3.0e4  # N: nor of friction
-_PERIOD = 0.2  # s between equations
+PERIOD = 0.2
+"""Time between the equations of an identification [s]."""
 _SMOOTH = 1.0  # Hz
 _CREEP = 5.0e-3  # m/s or rad/s: slower drives may stand, and are asked nothing about friction
 _START = 50  # equations whose parameters are no estimate yet (Zhu 1994, 6.1.3)
@@ -74,6 +76,7 @@ class Gravity:
         interval: (p,) half the width of their 95 % interval [N m]; 0 where they were computed.
         history: (r, p) parameters after every equation [N m]; empty where they were computed.
         residual: (m - 1,) RMS of the torques that are left, from the boom outwards [N m].
+        removed: (q,) indices of the equations that were left out as outliers, sorted.
     """
 
     names: tuple[str, ...]
@@ -81,6 +84,7 @@ class Gravity:
     interval: np.ndarray
     history: np.ndarray
     residual: np.ndarray
+    removed: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
 
 def gravity_rows(q: np.ndarray) -> np.ndarray:
@@ -158,12 +162,13 @@ class SlowMoves(NamedTuple):
     rubbing: np.ndarray
 
 
-def slow_moves(machine: Machine, log: Log) -> SlowMoves:
+def slow_moves(machine: Machine, log: Log, period: float = PERIOD) -> SlowMoves:
     """Angles and torques of an arm's drives in a log, by virtual work through their linkages.
 
     Args:
         machine: the machine.
         log: measured angles and pressures.
+        period: between rows [s], rounded to a multiple of the log's.
 
     Returns:
         One row for every period between equations.
@@ -175,7 +180,7 @@ def slow_moves(machine: Machine, log: Log) -> SlowMoves:
     """
     free_axes(machine, f"torques of {machine.name}")
     driver = {axis.joint: name for name, axis in machine.axes.items()}
-    table, every = filter_table(_SMOOTH, 1.0 / log.rate), max(1, round(_PERIOD * log.rate))
+    table, every = filter_table(_SMOOTH, 1.0 / log.rate), max(1, round(period * log.rate))
     columns = []
     for name in (driver[joint] for joint in arm_joints(machine)):
         head, rod = machine.axes[name].hydraulic_drive.areas
@@ -188,38 +193,51 @@ def slow_moves(machine: Machine, log: Log) -> SlowMoves:
     return SlowMoves(*(np.column_stack(part) for part in zip(*columns, strict=True)))
 
 
-def identify_gravity(machine: Machine, log: Log, friction: bool = True) -> Gravity:
+def identify_gravity(
+    machine: Machine, log: Log, friction: bool = True, *, remove_outliers: bool = False,
+    period: float = PERIOD,
+) -> Gravity:  # fmt: skip
     """Static model of a machine from a log of slow moves, by recursive least squares.
+
+    With `remove_outliers` equations with a large residual, such as those of a sensor that failed
+    for a moment, are left out and the estimation is repeated until none is left. Large is, by
+    Chauvenet's criterion, a residual of which less than half a one is expected among all equations;
+    its normal distribution has the scale of the median absolute residual of the joint.
 
     Args:
         machine: the machine; its masses are not used.
         log: measured angles and pressures of joints that move slowly to and fro over their ranges.
         friction: whether a dry friction of every drive is estimated along with it, or left in the
             torques as by Zhu, to average out.
+        remove_outliers: whether equations with large residuals are left out.
+        period: between equations [s].
 
     Returns:
         The parameters with their history.
 
     Raises:
-        InputError: a channel is missing or the log is too short.
+        InputError: a channel is missing, or the log is too short or has too few equations that are
+            no outliers.
 
-    Source: Zhu 1994, 6.1.3.
+    Source: Zhu 1994, 6.1.3; Chauvenet 1863, A manual of spherical and practical astronomy, vol. 2.
     """
-    moves = slow_moves(machine, log)
+    moves = slow_moves(machine, log, period)
     size, joints = gravity_size(moves.angle.shape[1]), moves.angle.shape[1]
-    if len(moves.angle) < _START:
-        raise InputError(log.source, f"{_START * _PERIOD:g} s of slow moves are needed at least")
     rows = np.array([gravity_rows(q)[1:] for q in moves.angle])
     if friction:
         rubbing = moves.rubbing[:, 1:, None] * np.eye(joints - 1)
         rows = np.concatenate([rows, rubbing], axis=2)
-    spread = np.append(np.full(size, _SPREAD), np.full(rows.shape[2] - size, _RUBBING))
-    found, history = RecursiveLeastSquares(np.zeros(rows.shape[2]), spread), []
-    for table, torque in zip(rows, moves.torque[:, 1:], strict=True):
-        for row, one in zip(table, torque, strict=True):
-            found.update(row, one)
-        history.append(found.value[:size])
-    left = moves.torque[:, 1:] - rows @ found.value
+    torque, kept = moves.torque[:, 1:], np.ones(len(rows), bool)
+    while True:
+        if np.count_nonzero(kept) < _START:
+            raise InputError(log.source, f"{_START * period:g} s of slow moves are needed at least")
+        found, history = _solve_recursively(rows[kept], torque[kept], size)
+        left = torque - rows @ found.value
+        outside = kept & _are_outliers(left, kept)
+        if not remove_outliers or not outside.any():
+            break
+        kept &= ~outside
+    left = left[kept]
     usual = math.sqrt(float(np.sum(left**2)) / (left.size - rows.shape[2]))
     return Gravity(
         _NAMES[:size],
@@ -227,7 +245,28 @@ def identify_gravity(machine: Machine, log: Log, friction: bool = True) -> Gravi
         _NORMAL * usual * np.sqrt(np.diag(found.covariance)[:size]),
         np.array(history),
         np.sqrt(np.mean(left**2, axis=0)),
+        np.flatnonzero(~kept),
     )
+
+
+def _solve_recursively(
+    rows: np.ndarray, torque: np.ndarray, size: int
+) -> tuple[RecursiveLeastSquares, list[np.ndarray]]:
+    """Take in equations (r, m - 1, p); the estimate, and the first parameters after every one."""
+    spread = np.append(np.full(size, _SPREAD), np.full(rows.shape[2] - size, _RUBBING))
+    found, history = RecursiveLeastSquares(np.zeros(rows.shape[2]), spread), []
+    for table, torques in zip(rows, torque, strict=True):
+        for row, one in zip(table, torques, strict=True):
+            found.update(row, one)
+        history.append(found.value[:size])
+    return found, history
+
+
+def _are_outliers(left: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Whether residuals (r, m - 1) of an equation are too large for their number, (r,)."""
+    scale = np.median(np.abs(left[kept]), axis=0) / stats.norm.ppf(0.75)
+    most = stats.norm.isf(0.25 / np.count_nonzero(kept))
+    return (np.abs(left) > most * scale).any(axis=1)
 
 
 WAITING, GOOD, BAD, SINGULAR = range(4)

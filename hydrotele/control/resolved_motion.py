@@ -3,6 +3,9 @@
 Inverse kinematics gives the joint references and the inverse Jacobian their rates, so that no error
 is integrated. A step that would leave the reach or a joint's range is not made: the reference stays
 and `blocked` says so, until the command comes back to where it stands.
+
+`follow_rate` is the alternative of Zhu 1994, Eq. 2.1: joint rates by the inverse Jacobian at the
+measured joint angles, which are integrated to references. Errors of the direction accumulate.
 """
 
 import dataclasses
@@ -74,6 +77,47 @@ def follow_pose(g, ranges, wanted, rate, blocked, pose, q, speed):
         pose[i] = wanted[i]
     if k < 4:
         pose[3] = found[1] + found[2]
+    return False
+
+
+@compiled
+def follow_rate(g, ranges, measured, rate, period, pose, q, speed):
+    """Integrate joint rates that the inverse Jacobian gives, or hold them at the edge.
+
+    Args:
+        g: (9,) of `kinematics.task.arm_parameters`.
+        ranges: (k, 2) joint ranges [rad].
+        measured: (k,) joint angles at which the Jacobian is taken [rad].
+        rate: (5,) rate of the pose [m/s], [rad/s].
+        period: over which it is integrated, scalar [s].
+        pose: (5,) pose of the references, updated [m], [rad].
+        q: (k,) joint references, updated [rad].
+        speed: (k,) their rates, written; 0 while held [rad/s].
+
+    Returns:
+        Whether the references were held, as a scalar: the arm is singular, a joint would leave its
+        range, or a measured angle is not finite.
+
+    Source: Zhu 1994, Eq. 2.1.
+    """
+    k = len(q)
+    there = np.zeros(5)
+    held = False
+    for i in range(k):
+        held = held or not math.isfinite(measured[i])
+    if not held:
+        task_forward(g, measured, there)
+        held = task_rates(g, measured, there, rate, speed) != 0
+    if not held:
+        for i in range(k):
+            if not ranges[i, 0] <= q[i] + period * speed[i] <= ranges[i, 1]:
+                held = True
+    if held:
+        speed[:] = 0.0
+        return True
+    for i in range(k):
+        q[i] += period * speed[i]
+    task_forward(g, q, pose)
     return False
 
 

@@ -1,20 +1,25 @@
 """Zhu 1994: force-reflecting resolved motion control of an excavator and a feller-buncher.
 
-The machine experiments of chapter 6 are repeated with simulated operators of the published
-population, one per repetition. The thesis had one person for each figure, who is not known.
+Chapters 2 to 5 are computed from the models, the machine experiments of chapter 6 are repeated with
+simulated operators of the published population, one per repetition. The thesis had one person for
+each figure, who is not known.
 """
 
 from hydrotele.experiments import (
+    zhu_control,
     zhu_false_force,
     zhu_felling,
     zhu_forces,
+    zhu_identification,
     zhu_motion,
     zhu_tables,
 )
 from hydrotele.experiments.comparison import Comparison, Experiment, Series
 
 EXPERIMENTS: tuple[Experiment, ...] = (
+    *zhu_control.EXPERIMENTS,
     zhu_tables.TABLES,
+    *zhu_identification.EXPERIMENTS,
     zhu_motion.STEERING,
     *zhu_motion.LINES,
     *zhu_forces.BY_FEEL,
@@ -28,8 +33,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
 )
 """In the order of the document."""
 
-UNAVAILABLE: tuple[Comparison, ...] = ()
-DRAWINGS: dict[str, str] = {}
+UNAVAILABLE: tuple[Comparison, ...] = (*zhu_control.UNAVAILABLE, *zhu_identification.UNAVAILABLE)
 
 SERIES = Series(
     "zhu1994",
@@ -37,5 +41,5 @@ SERIES = Series(
     20,
     EXPERIMENTS,
     UNAVAILABLE,
-    DRAWINGS,
+    zhu_control.DRAWINGS | zhu_identification.DRAWINGS,
 )

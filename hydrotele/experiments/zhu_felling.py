@@ -240,7 +240,7 @@ def _judge_avoided(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_protection(seed: int, changes: Changes) -> Sample:
-    """Press with an operator who aims at 60 kN, which tip the machine, with and without a spring."""
+    """Press with an operator who aims at 60 kN, enough to tip the machine, with a spring or not."""
     values, panels = {}, []
     too_large = {"pilot.operator.target.force": "[6.0e+4]"}
     for name, keys in (("spring", {}), ("bare", {"pilot.tip_over": "null"})):

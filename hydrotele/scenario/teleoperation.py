@@ -341,6 +341,10 @@ class TeleopPilot(Facts):
 
     `compliance: springs` makes the joystick's axes springs at the handle, `decoupled` gives each
     its own second-order system whatever the flotor's inertia couples (Zhu 1994, 5.9-5.11).
+
+    `resolved_motion: inverse_kinematics` solves the joint references from the commanded pose;
+    `inverse_jacobian` integrates joint rates `J^-1(q) V` at the measured angles, so that errors of
+    the path accumulate (Zhu 1994, Eq. 2.1). The second is there for comparison.
     """
 
     kind: Literal["teleop"]
@@ -356,6 +360,7 @@ class TeleopPilot(Facts):
     coupling_damping: NonNegative | None = None
     coordinating: Literal["handle", "reference"] = "handle"
     compliance: Literal["springs", "decoupled"] = "springs"
+    resolved_motion: Literal["inverse_kinematics", "inverse_jacobian"] = "inverse_kinematics"
     wave: Positive | None = None
     virtual_mass: Positive = 2.0
     force: Literal["static", "dynamic", "true"] = "dynamic"

@@ -145,7 +145,7 @@ class SlaveSide(NamedTuple):
         joint: (nu,) measured [rad] or [m].
         force: (k,) at the tip, task coordinates [N], [N m].
         columns: (k,) places of the arm's joints among the axes.
-        slave: (23 + 14 k,) Slave.
+        slave: (24 + 14 k,) Slave.
         state: (102 + 3 k,) SlaveState, written.
     """
 

@@ -12,7 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import COORDINATES, arm_facts, follow_pose
+from hydrotele.control.resolved_motion import (
+    COORDINATES,
+    arm_facts,
+    follow_pose,
+    follow_rate,
+)
 from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
@@ -53,6 +58,7 @@ from hydrotele.teleop.master import (
 from hydrotele.teleop.passive_line import GONE_IN, controlled_slave, wave_slave
 
 BLOCKED, SILENT, TRIPPED, AGE = range(4)  # of `SlaveState.flags`
+JACOBIAN = 4  # of `Slave.kind`
 # columns of `Slave.table`
 (AXIS, WAY, SCALE, EDGE, STOP, SPRING, DAMPER, SHARE, LEVERAGE, FASTEST, STRONGEST,
  WAVE_IMPEDANCE) = range(12)  # fmt: skip
@@ -75,7 +81,7 @@ class Slave(NamedTuple):
             impedance [N s/m].
         limits: (5,) silence [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
             mass [kg], lead of the drives [s].
-        kind: (2,) structure and mode.
+        kind: (5,) of `master.Master.kind`, then 1 where the inverse Jacobian resolves the motion.
     """
 
     arm: np.ndarray
@@ -122,7 +128,7 @@ def unpack_slave(flat, k):
     """The parts of `flat_view(Slave)`.
 
     Args:
-        flat: (23 + 14 k,) array.
+        flat: (24 + 14 k,) array.
         k: number of joints, scalar.
 
     Returns:
@@ -214,7 +220,8 @@ def slave(
         (5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,), (5, SENT + 2),
     ])  # fmt: skip
     state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
-    return flattened(Slave(arm, ranges, pose, table, limits, numbers.kind)), state
+    kind = np.append(numbers.kind, float(pilot.resolved_motion == "inverse_jacobian"))
+    return flattened(Slave(arm, ranges, pose, table, limits, kind)), state
 
 
 @compiled
@@ -248,7 +255,7 @@ def measure_task(numbers, joint, fresh, elapsed, s):
 
 
 @compiled
-def update_references(numbers, packet, arrived, force, period, s):
+def update_references(numbers, packet, arrived, force, joint, period, s):
     """Joint references of this period from what the master says.
 
     Args:
@@ -256,6 +263,7 @@ def update_references(numbers, packet, arrived, force, period, s):
         packet: (3, 6) handle's displacement [m], [rad], its rate, the hand's force [N], [N m].
         arrived: whether a packet came this period, scalar.
         force: (k,) of the environment on the tip, task coordinates [N], [N m].
+        joint: (k,) measured, at which an inverse Jacobian is taken [rad].
         period: scalar [s].
         s: SlaveState; references and flags are written.
 
@@ -293,16 +301,12 @@ def update_references(numbers, packet, arrived, force, period, s):
         rate[c] = min(s.rate[c] + change, max(s.rate[c] - change, goal))
         wanted[c] += period * rate[c]
     before = s.joint_rate.copy()
-    held = follow_pose(
-        numbers.arm,
-        numbers.ranges,
-        wanted,
-        rate,
-        s.flags[BLOCKED] > 0.0,
-        s.pose,
-        s.joint,
-        s.joint_rate,
-    )
+    arm, ranges = numbers.arm, numbers.ranges
+    if numbers.kind[JACOBIAN] > 0.0:
+        held = follow_rate(arm, ranges, joint, rate, period, s.pose, s.joint, s.joint_rate)
+    else:
+        blocked = s.flags[BLOCKED] > 0.0
+        held = follow_pose(arm, ranges, wanted, rate, blocked, s.pose, s.joint, s.joint_rate)
     lead = numbers.limits[LEAD]
     for i in range(k):
         share = min(1.0, period / AHEAD)
@@ -461,5 +465,5 @@ def slave_step(numbers, packet, arrived, force, joint, period, s):
 
     Source: this module.
     """
-    update_references(numbers, packet, arrived, force, period, s)
+    update_references(numbers, packet, arrived, force, joint, period, s)
     watch(numbers, joint, s)

@@ -218,7 +218,12 @@ def scattering_norm(port: TwoPort, s: np.ndarray | complex, unit: float = 1.0) -
 
     Source: Anderson and Spong 1989; Zhu 1994, chapter 3.
     """
-    h = hybrid(port, s) * np.array([[1.0 / unit, 1.0], [1.0, unit]])
+    return hybrid_scattering_norm(hybrid(port, s), unit)
+
+
+def hybrid_scattering_norm(matrix: np.ndarray, unit: float = 1.0) -> np.ndarray:
+    """`scattering_norm` of hybrid matrices (..., 2, 2)."""
+    h = matrix * np.array([[1.0 / unit, 1.0], [1.0, unit]])
     one = np.eye(2)
     scatter = np.diag([1.0, -1.0]) @ (h - one) @ np.linalg.inv(h + one)
     return np.linalg.svd(scatter, compute_uv=False)[..., 0]

@@ -1,0 +1,242 @@
+"""Zhu 1994, 6.1.3: parameters of the static models by recursive least squares, and bad data.
+
+The machines move slowly from one configuration to another in simulation; pressures and angles come
+from their simulated sensors. As many samples as in the document's figures are estimated from: 250
+of the excavator, 400 of the feller-buncher.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from hydrotele.control.endpoint_force import Gravity, gravity_from_masses, identify_gravity
+from hydrotele.core.errors import InputError
+from hydrotele.experiments.comparison import (
+    Changes,
+    Claim,
+    Comparison,
+    Experiment,
+    Judgement,
+    Panel,
+    Sample,
+)
+from hydrotele.experiments.intervals import check_mean, check_statistic, collect, format_values
+from hydrotele.experiments.scenario_runs import run_shipped
+from hydrotele.logs.log import Log
+
+_FIRST = 50  # samples of which the document computed the initial parameters
+_CONVERGED = 0.01  # of the largest parameter
+_DRAWS = 8  # of failures per run
+_RUNS = 6  # repetitions; a run of the machine takes several seconds
+
+_MACHINES = {
+    "excavator": ("slow_moves", 250, "6.37-6.40"),
+    "feller-buncher": ("feller_slow_moves", 400, "6.41-6.44"),
+}
+
+
+def _scaled_error(found: np.ndarray, true: np.ndarray) -> float:
+    """Largest error of a parameter over the largest parameter."""
+    return float(np.abs(found - true).max() / np.abs(true).max())
+
+
+def measure_convergence(name: str, seed: int, changes: Changes) -> Sample:
+    """Estimates of the static model's parameters over the samples.
+
+    Args:
+        name: `excavator` or `feller-buncher`.
+        seed: of the sensors.
+        changes: of the scenario.
+
+    Returns:
+        `late`: largest change in the second half, `error`: largest error in the end, both over the
+        largest parameter [1]; parameters and half intervals in N m as `P1`, `interval P1`.
+    """
+    scenario, samples, _ = _MACHINES[name]
+    shipped, run = run_shipped(scenario, {"seed": str(seed)} | dict(changes))
+    machine = run.plant.machine
+    true = gravity_from_masses(machine).value
+    period = shipped.duration / samples
+    found = identify_gravity(machine, run.measured, period=period)
+    half = len(found.history) // 2
+    values = {"late": max(_scaled_error(row, found.value) for row in found.history[half:]),
+              "error": _scaled_error(found.value, true)}  # fmt: skip
+    for i, value in enumerate(found.value):
+        values |= {f"P{i + 1}": value, f"interval P{i + 1}": found.interval[i],
+                   f"true P{i + 1}": true[i]}  # fmt: skip
+    number = np.arange(len(found.history))[_FIRST:]
+    return Sample(values, tuple(
+        Panel(f"P{i + 1}, factor of {part} [kN m]", number, {
+            "estimated": found.history[_FIRST:, i] / 1e3,
+            "of the masses": np.full(len(number), true[i] / 1e3),
+        }, "sample")
+        for i, part in enumerate(found.names)
+    ))  # fmt: skip
+
+
+def judge_parameters(samples: Sequence[Sample]) -> Judgement:
+    """State the parameters: the document has curves, whose values the available text lacks."""
+    count = sum(name.startswith("true P") for name in samples[0].values)
+    words = [
+        f"P{i} {format_values(samples, f'P{i}', 1e-3)}"
+        f" (masses {samples[0].values[f'true P{i}'] / 1e3:.1f})"
+        for i in range(1, count + 1)
+    ]
+    return Judgement(note=f"in kN m: {', '.join(words)}")
+
+
+def judge_convergence(samples: Sequence[Sample]) -> Judgement:
+    """Judge the change in the second half of the samples, and the error."""
+    reason = "converged to 1 % of the largest parameter"
+    return Judgement((
+        check_mean("largest change of a parameter in the second half of the samples, over the"
+                   " largest parameter", collect(samples, "late"), (-np.inf, _CONVERGED), reason),
+        check_mean("largest error of a parameter in the end, over the largest parameter",
+                   collect(samples, "error"), (-np.inf, 2.0 * _CONVERGED),
+                   "2 %: inertia of the slow moves and the shape of friction are left"),
+    ))  # fmt: skip
+
+
+def fail_sensors(log: Log, axes: Sequence[str], failures: int, rng: np.random.Generator) -> Log:
+    """Let one sensor after the other read zero for half a second to three seconds.
+
+    Args:
+        log: measured.
+        axes: whose angles and pressures may fail.
+        failures: their number.
+        rng: draws sensors and times.
+
+    Returns:
+        The log with the failures.
+    """
+    kinds = ("angle", "pressure_head", "pressure_rod")
+    names = [f"{kind}.{axis}" for axis in axes for kind in kinds]
+    columns = dict(log.columns)
+    for _ in range(failures):
+        name = names[rng.integers(len(names))]
+        begin, lasts = rng.uniform(log.time[0], log.time[-1] - 3.0), rng.uniform(0.5, 3.0)
+        dead = (log.time > begin) & (log.time < begin + lasts)
+        columns[name] = np.where(dead, 0.0, columns[name])
+    return Log(log.time, columns, log.units)
+
+
+def measure_outliers(seed: int, changes: Changes) -> Sample:
+    """Errors of the excavator's parameters without failures, with them, and without outliers.
+
+    Args:
+        seed: of the sensors and their failures.
+        changes: `failures` per log, whether to `remove` outliers.
+
+    Returns:
+        `clean`, `spoilt`, `kept`: largest error over the largest parameter [1] without failures,
+        with failures, and after removing outliers, the last two as means over eight draws.
+    """
+    given = {"failures": 6, "remove": True}
+    if unknown := sorted(set(changes) - set(given)):
+        raise InputError("changes", f"{', '.join(unknown)} unknown; there are: failures, remove")
+    given |= changes
+    scenario, samples, _ = _MACHINES["excavator"]
+    shipped, run = run_shipped(scenario, {"seed": str(seed)})
+    machine, period = run.plant.machine, shipped.duration / samples
+    true = gravity_from_masses(machine).value
+    rng = np.random.default_rng([seed, 81])
+
+    def identify(log: Log, remove: bool) -> Gravity:
+        return identify_gravity(machine, log, remove_outliers=remove, period=period)
+
+    clean, spoilt, kept = identify(run.measured, False), [], []
+    for _ in range(_DRAWS):
+        bad = fail_sensors(run.measured, ("boom", "stick", "bucket"), int(given["failures"]), rng)
+        spoilt.append(identify(bad, False))
+        kept.append(identify(bad, bool(given["remove"])))
+    number = np.arange(_FIRST, len(clean.history))
+    return Sample({
+        "clean": _scaled_error(clean.value, true),
+        "spoilt": float(np.mean([_scaled_error(one.value, true) for one in spoilt])),
+        "kept": float(np.mean([_scaled_error(one.value, true) for one in kept])),
+        "removed": float(np.mean([len(one.removed) for one in kept])),
+    }, (
+        Panel("P1, factor of C2 [kN m]", number, {
+            "no failure": clean.history[_FIRST:, 0] / 1e3,
+            "failures of sensors": spoilt[0].history[_FIRST:, 0] / 1e3,
+        }, "sample"),
+    ))  # fmt: skip
+
+
+def _ratio_of_means(rows: np.ndarray) -> float:
+    return float(rows[:, 0].mean() / rows[:, 1].mean())
+
+
+def _errors(samples: Sequence[Sample], name: str) -> np.ndarray:
+    return np.column_stack([collect(samples, name), collect(samples, "clean")])
+
+
+def judge_effect(samples: Sequence[Sample]) -> Judgement:
+    """Judge how much failures of sensors increase the error."""
+    return Judgement(
+        (check_statistic("error with failures of sensors over that without",
+                         _errors(samples, "spoilt"), _ratio_of_means, (2.0, np.inf),
+                         "strong: at least twice; no size is published"),),
+        note=f"{format_values(samples, 'spoilt', 100.0)} % of the largest parameter against"
+        f" {format_values(samples, 'clean', 100.0)} %",
+    )  # fmt: skip
+
+
+def _removed_fraction(rows: np.ndarray) -> float:
+    """Of rows of error with failures, after removal, without failures."""
+    spoilt, kept, clean = rows.mean(axis=0)
+    return float((spoilt - kept) / (spoilt - clean))
+
+
+def judge_removal(samples: Sequence[Sample]) -> Judgement:
+    """Judge how much of the error that failures add is gone after outliers are removed."""
+    rows = np.column_stack([collect(samples, name) for name in ("spoilt", "kept", "clean")])
+    return Judgement(
+        (check_statistic("fraction of the error that failures add which the removal takes away",
+                         rows, _removed_fraction, (0.75, np.inf),
+                         "eliminated: at least three quarters; no size is published"),),
+        note=f"{format_values(samples, 'kept', 100.0)} % of the largest parameter;"
+        f" {format_values(samples, 'removed', 1.0, 0)} of 250 samples removed",
+    )  # fmt: skip
+
+
+def _convergence(name: str) -> Experiment:
+    _, samples, figures = _MACHINES[name]
+    judge: Callable[[Sequence[Sample]], Judgement] = judge_parameters
+    claims = (
+        Claim(f"{name}: parameters by recursive least squares",
+              f'"{name.capitalize()} link parameter identification"; curves over {samples} samples',
+              f"p. {82 if name == 'excavator' else 86}, Figs {figures}", "caption", judge),
+        Claim(f"{name}: convergence of the parameters",
+              "the estimates converge: in the second half of the samples no parameter changes by"
+              " more than 1 % of the largest one, and none is wrong by more than 2 % of it",
+              f"beyond p. 81, Figs {figures}", "additional", judge_convergence,
+              {"duration": "20.0"}, "the machine moves for 20 s, to the first configuration only"),
+    )  # fmt: skip
+    return Experiment(
+        f"parameters of the {name}", partial(measure_convergence, name), claims, _RUNS
+    )
+
+
+EXPERIMENTS: tuple[Experiment, ...] = (
+    Experiment("outliers", measure_outliers, (
+        Claim("outliers: effect on the parameters",
+              '"Since the number of observations is always limited, these outliers can have a'
+              ' strong effect on the estimated parameters."', "p. 81", "document", judge_effect,
+              {"failures": 0}, "no sensor fails"),
+        Claim("outliers: removed before the estimation",
+              '"In our case, these outliers can be eliminated, and the estimation procedure'
+              ' repeated."', "p. 81", "document", judge_removal, {"remove": False},
+              "outliers are kept"),
+    ), _RUNS),
+    _convergence("excavator"),
+    _convergence("feller-buncher"),
+)  # fmt: skip
+
+UNAVAILABLE: tuple[Comparison, ...] = ()
+
+DRAWINGS: dict[str, str] = {
+    "Figure 6.35": "drawing of a two-bar linkage",
+    "Figure 6.36": "drawing of a four-bar linkage",
+}

@@ -1,0 +1,408 @@
+"""Zhu 1994, chapter 2: inverse kinematics, resolved motion by rates, the edge of the workspace."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
+from hydrotele.experiments.intervals import (
+    check_exact,
+    check_fraction,
+    check_mean,
+    check_statistic,
+    collect,
+    format_values,
+)
+from hydrotele.experiments.scenario_runs import cylindrical_pose, operator_changes, run_shipped
+from hydrotele.experiments.zhu_two_port import (
+    ROUNDING,
+    exact_experiment,
+    make_claim,
+    read_settings,
+)
+from hydrotele.kinematics.from_machine import feller_geometry
+from hydrotele.kinematics.task import (
+    ALONG,
+    BASE_HEIGHT,
+    BASE_RADIUS,
+    BOOM,
+    HEAD,
+    REACHED,
+    SIDE,
+    STICK,
+    UP,
+    task_forward,
+    task_inverse,
+)
+from hydrotele.machine.machine_file import load_machine
+
+_MACHINES = {"excavator": ("cat215", "bucket"), "feller-buncher": ("cat325", None)}
+_POSES = 400
+_RUNS = 6  # repetitions of a scenario
+
+
+def _arm(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (9,) of an arm and its joint ranges (k, 2) [rad]."""
+    machine, tool = _MACHINES[name]
+    numbers, _, ranges = arm_facts(load_machine(machine, tool) if tool else load_machine(machine))
+    ranges = ranges.copy()
+    ranges[0] = -math.pi, math.pi
+    return numbers, ranges
+
+
+def _link(turn: float, along: float, length: float, twist: float) -> np.ndarray:
+    """Homogeneous transformation of a link by its Denavit-Hartenberg parameters."""
+    ct, st, ca, sa = math.cos(turn), math.sin(turn), math.cos(twist), math.sin(twist)
+    return np.array([
+        [ct, -st * ca, st * sa, length * ct],
+        [st, ct * ca, -ct * sa, length * st],
+        [0.0, sa, ca, along],
+        [0.0, 0.0, 0.0, 1.0],
+    ])  # fmt: skip
+
+
+def tool_place(g: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Place of the tool (3,) [m] by the chains of Tables 2.1 and 2.2.
+
+    Args:
+        g: (9,) of `kinematics.task.arm_parameters`.
+        q: (4,) or (5,) joint angles [rad].
+
+    Returns:
+        Place above the foot of the swing axis.
+    """
+    whole = _link(q[0], g[BASE_HEIGHT], g[BASE_RADIUS], math.pi / 2.0)
+    whole = whole @ _link(q[1], -g[SIDE], g[BOOM], 0.0) @ _link(q[2], 0.0, g[STICK], 0.0)
+    if len(q) == 4:
+        whole = whole @ _link(q[3], 0.0, 0.0, 0.0)
+        return (whole @ [g[ALONG], g[UP], 0.0, 1.0])[:3]
+    whole = whole @ _link(q[3], 0.0, g[ALONG], math.pi / 2.0)
+    return (whole @ _link(q[4], -g[UP], g[HEAD], 0.0))[:3, 3]
+
+
+def measure_inverse(changes: Changes) -> Sample:
+    """Pose from joints and back, by the chains of the tables, and poses out of reach."""
+    given = read_settings(changes, stick=1.0)
+    rng, values = np.random.default_rng(23), {}
+    for name in _MACHINES:
+        g, ranges = _arm(name)
+        wrong = g.copy()
+        wrong[STICK] *= given["stick"]
+        chain, back, agree = 0.0, 0.0, 0
+        for _ in range(_POSES):
+            q, pose, found = rng.uniform(*ranges.T), np.zeros(5), np.zeros(len(ranges))
+            task_forward(g, q, pose)
+            place = tool_place(g, q)
+            there = np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
+            chain = max(chain, float(np.abs(place - there).max()))
+            status = task_inverse(wrong, pose, q[0], found)
+            error = np.abs(tool_place(g, found) - place).max() if status == REACHED else np.inf
+            back = max(back, float(error))
+            pose[0] = rng.uniform(1.5, 1.5 * (g[BOOM] + g[STICK]))
+            pose[2] = rng.uniform(-1.0, 1.5) * g[BOOM]
+            agree += (task_inverse(wrong, pose, q[0], found) == REACHED) == _is_reachable(g, pose)
+        values |= {f"chain {name}": chain, f"back {name}": back, f"agree {name}": agree / _POSES}
+    return Sample(values)
+
+
+def _is_reachable(g: np.ndarray, pose: np.ndarray) -> bool:
+    """Whether an elbow angle brings the tool pin to its distance from the boom pin, by trying."""
+    head, attitude = pose[4], pose[3]
+    ahead = math.sqrt(pose[0] ** 2 - (g[SIDE] - g[HEAD] * math.sin(head)) ** 2) - g[BASE_RADIUS]
+    bar, rise = g[ALONG] + g[HEAD] * math.cos(head), g[UP]
+    ahead -= bar * math.cos(attitude) - rise * math.sin(attitude)
+    up = pose[2] - g[BASE_HEIGHT] - bar * math.sin(attitude) - rise * math.cos(attitude)
+    elbow = np.linspace(0.0, math.pi, 2001)
+    reach = np.abs(g[BOOM] + g[STICK] * np.exp(1j * elbow))
+    return bool(reach.min() <= math.hypot(ahead, up) <= reach.max())
+
+
+def judge_chain(samples: Sequence[Sample]) -> Judgement:
+    """Judge the forward kinematics against the tables' chains."""
+    return Judgement(tuple(
+        check_exact(f"largest difference of place, {name}", samples[0].values[f"chain {name}"],
+                    ROUNDING, "rounding", unit="m") for name in _MACHINES
+    ))  # fmt: skip
+
+
+def judge_inverse(samples: Sequence[Sample]) -> Judgement:
+    """Judge the closed form in reach."""
+    return Judgement(tuple(
+        check_exact(f"largest error of place over {_POSES} poses in reach, {name}",
+                    samples[0].values[f"back {name}"], (0.0, 1e-6), "closed form: rounding, which"
+                    " grows at a straight elbow", unit="m") for name in _MACHINES
+    ))  # fmt: skip
+
+
+def judge_reach(samples: Sequence[Sample]) -> Judgement:
+    """Judge that solutions exist exactly where the pose is in reach."""
+    return Judgement(tuple(
+        check_exact(f"fraction of {_POSES} poses, many of them out of reach, for which the closed"
+                    f" form and a search over the elbow agree, {name}",
+                    samples[0].values[f"agree {name}"], (1.0, 1.0), "it exists or does not")
+        for name in _MACHINES
+    ))  # fmt: skip
+
+
+def measure_solutions(changes: Changes) -> Sample:
+    """Candidates and solutions of both approaches for the feller-buncher's tool.
+
+    A candidate is extraneous if the plane's azimuth is not that of the end of the tilt link (2.14,
+    2.32), which then lies behind the swing axis.
+    """
+    given = read_settings(changes, check=1.0)
+    g, (numbers, ranges) = feller_geometry(load_machine("cat325")), _arm("feller-buncher")
+    rng = np.random.default_rng(24)
+    counts = {"first": [], "second": [], "extra_first": [], "extra_second": []}
+    for _ in range(_POSES):
+        q, pose = rng.uniform(*ranges.T), np.zeros(5)
+        task_forward(numbers, q, pose)
+        x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
+        depth, radius = g.head_depth, g.head_radius
+        ahead = radius * math.cos(pose[4]) * math.cos(pose[3]) + depth * math.sin(pose[3])
+        aside = radius * math.sin(pose[4])
+        base = math.atan2(x, -y)
+        turn = math.atan2(math.sqrt(max(x * x + y * y - aside * aside, 0.0)), aside)
+        radii = [
+            x * math.cos(phi) + y * math.sin(phi) - ahead for phi in (base + turn, base - turn)
+        ]
+        kept = sum(r > 0.0 for r in radii) if given["check"] else len(radii)
+        counts["first"].append(kept)
+        counts["extra_first"].append(len(radii) - kept)
+        swing, out = q[0], math.cos(pose[4]) * math.cos(pose[3])
+        across = math.sin(pose[4])
+        m = np.array([out * math.cos(swing) + across * math.sin(swing),
+                      out * math.sin(swing) - across * math.cos(swing),
+                      math.cos(pose[4]) * math.sin(pose[3])])  # fmt: skip
+        px, py = x - radius * m[0], y - radius * m[1]
+        radii = []
+        for phi in (math.atan2(py, px), math.atan2(py, px) + math.pi):
+            forward = m[0] * math.cos(phi) + m[1] * math.sin(phi)
+            for side in (1.0, -1.0):
+                attitude = math.atan2(side * m[2], side * forward)
+                radii.append(px * math.cos(phi) + py * math.sin(phi) - depth * math.sin(attitude))
+        kept = sum(r > 0.0 for r in radii) if given["check"] else len(radii)
+        counts["second"].append(kept)
+        counts["extra_second"].append(len(radii) - kept)
+    return Sample({
+        "first": float(max(counts["first"])), "second": float(max(counts["second"])),
+        "extra_first": float(np.mean(counts["extra_first"])),
+        "extra_second": float(np.mean(counts["extra_second"])),
+    })  # fmt: skip
+
+
+def judge_solutions(samples: Sequence[Sample]) -> Judgement:
+    """Judge the numbers of solutions and of extraneous candidates."""
+    v = samples[0].values
+    return Judgement((
+        check_exact("most solutions, approach 1", v["first"], (1.0, 2.0), "at most two"),
+        check_exact("most solutions, approach 2", v["second"], (1.0, 4.0), "at most four"),
+        check_exact("extraneous candidates per pose, approach 1 less approach 2",
+                    v["extra_first"] - v["extra_second"], (-np.inf, -1e-9), "fewer"),
+    ), note=f"extraneous candidates per pose {v['extra_first']:.2f} of 2 and"
+       f" {v['extra_second']:.2f} of 4")  # fmt: skip
+
+
+_CYCLES = {
+    "duration": "22.0",
+    "pilot.operator.time":
+        "[0, 1, 1.5, 4.5, 5, 6, 6.5, 9.5, 10, 11, 11.5, 14.5, 15, 16, 16.5, 19.5, 20, 22]",
+    "pilot.operator.path": "{z: [0, 0, 0.004, 0.004, 0, 0, -0.004, -0.004, 0, 0, 0.004, 0.004, 0,"
+                           " 0, -0.004, -0.004, 0, 0]}",
+}  # fmt: skip
+"""Twice up and down, 1.4 m each way."""
+_METHODS = {
+    "kinematics": {},
+    "jacobian": {"pilot.resolved_motion": "inverse_jacobian"},
+    "rates": {"pilot.resolved_motion": "inverse_jacobian", "servo.position_gain": "0.0"},
+    "open": {"servo.position_gain": "0.0"},
+}
+
+
+def measure_methods(seed: int, changes: Changes) -> Sample:
+    """Bucket twice up and down with both methods of resolved motion, joint loops closed and open.
+
+    Args:
+        seed: of operator and sensors.
+        changes: of the scenario, made after those of the method.
+
+    Returns:
+        Per method the largest deviation of the radius [m], the deviation of the radius of the
+        references after one and after two cycles [m].
+    """
+    values, radius, time = {}, {}, np.zeros(0)
+    for name, keys in _METHODS.items():
+        _, run = run_shipped("joystick_up", operator_changes(seed) | _CYCLES | keys | dict(changes))
+        pose, time = cylindrical_pose(run), run.truth.time
+        radius[name] = 1e3 * (pose["r"] - pose["r"][0])
+        reference = run.measured["tip_reference.r"]
+        once, twice = np.searchsorted(run.measured.time, (10.9, 21.9))
+        values |= {
+            f"stray {name}": 1e-3 * float(np.abs(radius[name]).max()),
+            f"once {name}": float(abs(reference[once] - reference[0])),
+            f"twice {name}": float(abs(reference[twice] - reference[0])),
+        }
+    words = {"kinematics": "inverse kinematics", "jacobian": "inverse Jacobian",
+             "rates": "inverse Jacobian, open joint loops",
+             "open": "inverse kinematics, open joint loops"}  # fmt: skip
+    return Sample(values, (
+        Panel("deviation of the radius, joint loops closed [mm]", time,
+              {words[name]: radius[name] for name in ("kinematics", "jacobian")}),
+        Panel("deviation of the radius, joint loops open [mm]", time,
+              {words[name]: radius[name] for name in ("open", "rates")}),
+    ))  # fmt: skip
+
+
+def _ratio_of_means(rows: np.ndarray) -> float:
+    return float(rows[:, 0].mean() / max(rows[:, 1].mean(), 1e-12))
+
+
+def _pairs(samples: Sequence[Sample], first: str, second: str) -> np.ndarray:
+    return np.column_stack([collect(samples, first), collect(samples, second)])
+
+
+def judge_accumulation(samples: Sequence[Sample]) -> Judgement:
+    """Judge the growth of the references' error, and the accuracy of the bucket."""
+    return Judgement(
+        (
+            check_statistic("error of the references' radius after two cycles over that after one",
+                            _pairs(samples, "twice jacobian", "once jacobian"), _ratio_of_means,
+                            (1.0, np.inf), "it accumulates"),
+            check_statistic("largest deviation of the radius over that by inverse kinematics",
+                            _pairs(samples, "stray jacobian", "stray kinematics"),
+                            _ratio_of_means, (2.0, np.inf),
+                            "low: at least twice as much; no size is published"),
+        ),
+        explanation="the rates are integrated to references of closed joint loops, whose path"
+        f" strays by {format_values(samples, 'twice jacobian', 1e3, 2)} mm in two cycles, as the"
+        " Jacobian is that of the measured angles, which are late; the machine itself strays by"
+        f" {format_values(samples, 'stray kinematics', 1e3)} mm with inverse kinematics. Accuracy"
+        " is lost where the joint loops are open:"
+        f" {format_values(samples, 'stray rates', 1e3, 0)} mm",
+        note=f"{format_values(samples, 'stray jacobian', 1e3)} mm against"
+        f" {format_values(samples, 'stray kinematics', 1e3)} mm",
+    )  # fmt: skip
+
+
+def judge_accuracy(samples: Sequence[Sample]) -> Judgement:
+    """Judge inverse kinematics with closed joint loops against joint rates alone."""
+    return Judgement(
+        (check_statistic("largest deviation of the radius by joint rates of the inverse Jacobian"
+                         " alone, over that by inverse kinematics with closed joint loops",
+                         _pairs(samples, "stray rates", "stray kinematics"), _ratio_of_means,
+                         (2.0, np.inf), "high: at least twice as accurate; no size is published"),),
+        explanation="the closed joint loops make the difference: with open loops inverse kinematics"
+        f" strays by {format_values(samples, 'stray open', 1e3, 0)} mm, with closed loops the"
+        f" inverse Jacobian by {format_values(samples, 'stray jacobian', 1e3)} mm",
+        note=f"{format_values(samples, 'stray kinematics', 1e3)} mm in 1.4 m against"
+        f" {format_values(samples, 'stray rates', 1e3, 0)} mm",
+    )  # fmt: skip
+
+
+_EDGE = {
+    "duration": "18.0",
+    "pilot.operator": "{kind: follow, time: [0, 1, 1.5, 13, 13.5, 17, 17.5],"
+                      " path: {x: [0, 0, 0.004, 0.004, -0.004, -0.004, 0]}}",
+}  # fmt: skip
+_PAST, _OUTWARDS, _BACK = 10.5, 13.0, 13.5  # s: at the edge; pushed outwards until; then back
+
+
+def measure_edge(seed: int, changes: Changes) -> Sample:
+    """The feller-buncher's head commanded outwards beyond the edge, and back.
+
+    Args:
+        seed: of operator and sensors.
+        changes: of the scenario.
+
+    Returns:
+        `beyond`: largest distance of the head beyond the radius at which its references stop [m],
+        `height`: largest deviation of its height until the command turns [m], `edge`: that radius
+        [m], `back`: time until the references leave after the command has turned [s], `speed`:
+        largest joint rate [rad/s], `stick`: angle of the stick from straight at the edge [deg].
+    """
+    _, run = run_shipped("feller_steps", operator_changes(seed) | _EDGE | dict(changes))
+    pose, time, m = cylindrical_pose(run), run.truth.time, run.measured
+    reference = m["tip_reference.r"]
+    edge = float(reference[np.searchsorted(m.time, _OUTWARDS)])
+    left = m.time[(m.time > _OUTWARDS) & (reference < edge - 1e-3)]
+    before = time < _OUTWARDS
+    rates = [np.abs(np.gradient(run.truth.columns[f"angle.{axis}"], time)).max()
+             for axis in ("boom", "stick", "tilt")]  # fmt: skip
+    stick = run.truth.columns["angle.stick"][np.searchsorted(time, _OUTWARDS)]
+    held = (m.time > _PAST) & (m.time < _OUTWARDS)
+    return Sample({
+        "beyond": float(pose["r"].max() - edge), "edge": edge,
+        "moved": float(np.ptp(reference[held])),
+        "height": float(np.abs(pose["z"][before] - pose["z"][0]).max()),
+        "back": float(left[0] - _OUTWARDS) if len(left) else np.inf,
+        "speed": float(max(rates)), "stick": float(abs(np.degrees(stick))),
+    }, (
+        Panel("head [m]", m.time, {
+            "r, reference": reference, "r": np.interp(m.time, time, pose["r"]),
+            "z": np.interp(m.time, time, pose["z"])}),
+    ))  # fmt: skip
+
+
+def judge_edge(samples: Sequence[Sample]) -> Judgement:
+    """Judge the stop, the coordinate that is held, and the way back."""
+    way = "2 % of the way of 2.9 m, as in the rows of straight lines"
+    turned = _BACK - _OUTWARDS
+    return Judgement((
+        check_mean("distance of the head beyond the edge", collect(samples, "beyond"),
+                   (-np.inf, 0.058), way, unit="m"),
+        check_mean("deviation of the height", collect(samples, "height"), (-np.inf, 0.058), way,
+                   unit="m"),
+        check_fraction("operators whose references stand still at the edge and leave it before the"
+                       f" handle has turned fully, within {turned:g} s",
+                       [s.values["back"] < turned and s.values["moved"] < 1e-3 for s in samples]),
+    ), note=f"edge at r = {format_values(samples, 'edge', 1.0, 2)} m, where the stick's range ends"
+       f" {format_values(samples, 'stick', 1.0, 0)} deg before it is straight; largest joint rate"
+       f" {format_values(samples, 'speed', 1.0, 2)} rad/s")  # fmt: skip
+
+
+EXPERIMENTS: tuple[Experiment, ...] = (
+    exact_experiment("inverse kinematics", measure_inverse, make_claim(
+        "links: Denavit-Hartenberg parameters",
+        "the chains of Tables 2.1 and 2.2 are those of the arms", "p. 13, Tables 2.1, 2.2,"
+        " Figs 2.7, 2.9", judge_chain, None, "", "input",
+    ), make_claim(
+        "inverse kinematics in closed form",
+        '"In this chapter, closed-form inverse kinematics solutions are provided for typical'
+        ' hydraulic mobile machines, excavators and feller-bunchers"', "p. 10, Fig. 2.8",
+        judge_inverse, {"stick": 1.01}, "a stick 1 % too long in the closed form",
+    ), make_claim(
+        "no solution out of reach",
+        '"assuming the specified endpoint frame is within the manipulator\'s work space; Otherwise,'
+        ' solution does not exist."', "p. 15", judge_reach, {"stick": 1.1},
+        "a stick 10 % too long in the closed form",
+    )),
+    exact_experiment("number of solutions", measure_solutions, make_claim(
+        "feller-buncher: number of solutions",
+        '"We can see there are at most two" (approach 1); "there are at most four solutions to this'
+        ' problem" (approach 2); "approach 1 is easier than approach 2, and introduces fewer'
+        ' extraneous solutions"', "p. 24, Fig. 2.9", judge_solutions, {"check": 0.0},
+        "extraneous candidates are not looked for",
+    )),
+    Experiment("methods of resolved motion", measure_methods, (make_claim(
+        "inverse Jacobian: error accumulates",
+        '"Since position error can accumulate, the inverse Jacobian method suffers from low'
+        ' accuracy."', "p. 10, Eq. 2.1", judge_accumulation,
+        {"pilot.resolved_motion": "inverse_kinematics"}, "inverse kinematics in its place",
+    ), make_claim(
+        "inverse kinematics and closed joint loops: accuracy",
+        '"It is clear from these plots that the motion accuracy is high due to the fact inverse'
+        " kinematics instead of Jacobian transformations were used and the joint angles of the"
+        ' excavator were under closed-loop control."', "p. 91", judge_accuracy,
+        {"servo.position_gain": "0.0"}, "open joint loops everywhere",
+    )), _RUNS),
+    Experiment("edge of the workspace", measure_edge, (Claim(
+        "feller-buncher: edge of the workspace",
+        'commanded beyond the edge, the references stop there, height and attitude are held, and'
+        ' the head leaves when the command turns; the document says "Resolved motion control of the'
+        ' feller-buncher near the edge of workspace needs further study."',
+        "beyond p. 112", "additional", judge_edge, {"servo.axis_gains": "{stick: 0.0}"},
+        "no position loop of the stick",
+    ),), _RUNS),
+)  # fmt: skip

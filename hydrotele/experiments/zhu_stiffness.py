@@ -1,0 +1,322 @@
+"""Zhu 1994, chapters 4 and 5: stability of stiffness feedback, and the levitated joystick.
+
+Motions `x'' + B x' + K(t) x = 0` are integrated for a unit mass. Nothing is random but the
+switching of the stiffness, which is drawn from the repetition's seed.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from hydrotele.core.compiled import compiled
+from hydrotele.experiments.comparison import (
+    Changes,
+    Experiment,
+    Judgement,
+    Panel,
+    Sample,
+)
+from hydrotele.experiments.intervals import check_exact, check_mean, collect
+from hydrotele.experiments.zhu_two_port import exact_experiment, make_claim, read_settings
+from hydrotele.machine.joystick import load_joystick
+from hydrotele.teleop.coils import three_stations
+from hydrotele.teleop.levitation import pose_resolution
+from hydrotele.teleop.switching import Spring, worst_growth
+
+_STEP = 1e-3  # s
+_LOWEST, _HIGHEST = 1.0, 9.0  # 1/s^2, K_min and K_max of a unit mass; B^2 > 4 K_max from B = 6 on
+_DAMPING = 6.1  # 1/s
+
+
+def measure_counter_example(changes: Changes) -> Sample:
+    """Motion with damping that rises exponentially (4.6), and with one that rises slowly (4.7)."""
+    given = read_settings(changes, stiffness=1.0)
+
+    def solve(damping, last: float) -> tuple[np.ndarray, np.ndarray]:
+        def motion(t: float, state: np.ndarray) -> list[float]:
+            return [state[1], -damping(t) * state[1] - given["stiffness"] * state[0]]
+
+        times = np.linspace(0.0, last, 400)
+        found = solve_ivp(motion, (0.0, last), [2.0, -1.0], "Radau", times, rtol=1e-9, atol=1e-12)
+        return times, found.y[0]
+
+    time, place = solve(lambda t: 2.0 + np.exp(t), 12.0)
+    slow_time, slow = solve(lambda t: 2.0 + 0.5 * t, 100.0)
+    return Sample({"end": float(place[-1]), "slow": float(abs(slow[-1]))}, (
+        Panel("x [1]", time, {"B = 2 + exp(t)": place, "1 + exp(-t)": 1.0 + np.exp(-time)},
+              errors={"difference": place - 1.0 - np.exp(-time)}, error_label="difference [1]"),
+        Panel("x with B = 2 + t/2 [1]", slow_time, {"x": slow}),
+    ))  # fmt: skip
+
+
+def judge_counter_example(samples: Sequence[Sample]) -> Judgement:
+    """Judge where both motions end."""
+    v = samples[0].values
+    return Judgement((
+        check_exact("x after 12 s", v["end"], (1.0 - 1e-4, 1.0 + 1e-4),
+                    "1 + exp(-12) is 6 10^-6 above 1; the rest is the integration's",
+                    published=1.0),
+        check_exact("size of x after 100 s with B = 2 + t/2, which meets (4.7)", v["slow"],
+                    (0.0, 0.01), "it dies out as 1/t^2, which leaves some 10^-3 of 2"),
+    ), note="K = 1, which the printed solution 1 + exp(-t) demands")  # fmt: skip
+
+
+def measure_worst_switching(changes: Changes) -> Sample:
+    """Growth of half a swing with a stiff spring inwards and a soft one outwards."""
+    given = read_settings(changes, ratio=0.02)
+    ratios = np.geomspace(0.01, 1.5, 25)
+    growth = [worst_growth(1.0, 2.0 * ratio * 3.0, _LOWEST, _HIGHEST) for ratio in ratios]
+    return Sample(
+        {"growth": worst_growth(1.0, 2.0 * given["ratio"] * 3.0, _LOWEST, _HIGHEST)},
+        (Panel("speed over that half a swing before [1]", ratios, {"worst switching":
+               np.array(growth)}, "damping ratio with K_max [1]"),),
+    )  # fmt: skip
+
+
+def judge_worst_switching(samples: Sequence[Sample]) -> Judgement:
+    """Judge the growth."""
+    return Judgement((
+        check_exact("speed after half a swing over that before, damping ratio 0.02, K_max 9 times"
+                    " K_min", samples[0].values["growth"], (1.0 + 1e-9, np.inf),
+                    "it grows, so that the system is unstable"),
+    ))  # fmt: skip
+
+
+@compiled
+def integrate_motion(damping, stiffness, place, speed, step, path):
+    """Integrate `x'' = -B x' - K(t) x`, K held over every step, by Runge and Kutta.
+
+    Args:
+        damping: B, scalar [1/s].
+        stiffness: (n,) K [1/s^2].
+        place: x at the start, scalar.
+        speed: x' at the start, scalar.
+        step: scalar [s].
+        path: (n + 1, 2) written: x, x'.
+
+    Returns:
+        Nothing.
+
+    Source: Zhu 1994, Eq. 4.11.
+    """
+    x, v = place, speed
+    path[0, 0], path[0, 1] = x, v
+    for i in range(len(stiffness)):
+        k = stiffness[i]
+        a1 = -damping * v - k * x
+        a2 = -damping * (v + 0.5 * step * a1) - k * (x + 0.5 * step * v)
+        x3 = x + 0.5 * step * (v + 0.5 * step * a1)
+        a3 = -damping * (v + 0.5 * step * a2) - k * x3
+        a4 = -damping * (v + step * a3) - k * (x + step * (v + 0.5 * step * a2))
+        x += step * v + step * step / 6.0 * (a1 + a2 + a3)
+        v += step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+        path[i + 1, 0], path[i + 1, 1] = x, v
+
+
+def switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count,) stiffness that jumps at random times to random values between K_min and K_max."""
+    jumps = rng.random(count) < _STEP / 10.0 ** rng.uniform(-1.5, 0.5)
+    jumps[0] = True
+    values = rng.choice(
+        [_LOWEST, _HIGHEST, rng.uniform(_LOWEST, _HIGHEST)], size=count, p=[0.4, 0.4, 0.2]
+    )
+    return values[np.maximum.accumulate(np.where(jumps, np.arange(count), 0))]
+
+
+def _path(damping: float, stiffness: np.ndarray, start: tuple[float, float]) -> np.ndarray:
+    path = np.empty((len(stiffness) + 1, 2))
+    integrate_motion(damping, stiffness, *start, _STEP, path)
+    return path
+
+
+def measure_theorem(seed: int, changes: Changes) -> Sample:
+    """Motions from random states with a stiffness that jumps at random.
+
+    Args:
+        seed: of 20 motions.
+        changes: `damping` [1/s].
+
+    Returns:
+        `crossings`: most crossings of the x axis (x' = 0) after the start; `left`: largest distance
+        from the origin after 40 s over that at the start; `outside`: largest distance by which the
+        paths from the x axis leave the region between those of K_min and K_max.
+    """
+    given = read_settings(changes, damping=_DAMPING)
+    damping, rng, count = given["damping"], np.random.default_rng([seed, 42]), 40_000
+    crossings, left, outside, panels = 0, 0.0, 0.0, ()
+    from_axis = {
+        "K_min": _path(damping, np.full(count, _LOWEST), (1.0, 0.0)),
+        "K_max": _path(damping, np.full(count, _HIGHEST), (1.0, 0.0)),
+    }
+    for trial in range(20):
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        stiffness = switched_stiffness(rng, count)
+        path = _path(damping, stiffness, (float(np.cos(angle)), float(np.sin(angle))))
+        away = np.hypot(*path.T) > 1e-6
+        speed = path[away, 1]
+        crossings = max(crossings, int(np.count_nonzero(np.diff(np.sign(speed[speed != 0.0])))))
+        left = max(left, float(np.hypot(*path[-1])))
+        bounded = _path(damping, stiffness, (1.0, 0.0))
+        outside = max(outside, _leaves(bounded, from_axis))
+        if trial == 0:
+            grid = np.linspace(0.01, 1.0, 300)
+            curves = {name: _speed_at(path, grid) for name, path in from_axis.items()}
+            curves["K(t)"] = _speed_at(bounded, grid)
+            panels = (
+                Panel("speed dx/dt, start on the x axis [1/s]", grid, curves, "displacement x [1]"),
+                Panel("displacement, start anywhere [1]", _STEP * np.arange(5000),
+                      {"x": path[:5000, 0]}),
+            )  # fmt: skip
+    values = {"crossings": float(crossings), "left": left, "outside": outside}
+    return Sample(values, panels)
+
+
+def _speed_at(path: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Speed at displacements, on the first way towards the origin."""
+    turn = np.flatnonzero(np.diff(path[:, 0]) >= 0.0)
+    end = int(turn[1]) if len(turn) > 1 and turn[0] == 0 else int(turn[0]) if len(turn) else None
+    way = path[: end or len(path)]
+    return np.interp(grid, way[::-1, 0], way[::-1, 1])
+
+
+def _leaves(path: np.ndarray, bounds: dict[str, np.ndarray]) -> float:
+    """Largest distance by which a path in quadrant IV lies outside those of K_min and K_max."""
+    grid = np.linspace(0.02, 0.98, 200)
+    speed = _speed_at(path, grid)
+    upper, lower = _speed_at(bounds["K_min"], grid), _speed_at(bounds["K_max"], grid)
+    return float(max(np.max(speed - upper), np.max(lower - speed), 0.0, np.max(-path[:, 0])))
+
+
+def judge_theorem(samples: Sequence[Sample]) -> Judgement:
+    """Judge the end of the motions and their crossings."""
+    return Judgement((
+        check_mean("largest distance from the origin after 40 s over that at the start",
+                   collect(samples, "left"), (-np.inf, 1e-2), "asymptotically stable: the slowest"
+                   " rate with K_min is 0.17 1/s, which leaves 10^-3"),
+        check_exact("most crossings of the x axis", float(collect(samples, "crossings").max()),
+                    (0.0, 1.0), "at most once"),
+    ))  # fmt: skip
+
+
+def judge_bounds(samples: Sequence[Sample]) -> Judgement:
+    """Judge whether paths stay between those of K_min and K_max."""
+    return Judgement((
+        check_exact("largest distance by which a path lies outside",
+                    float(collect(samples, "outside").max()), (0.0, 1e-3),
+                    "interpolation between steps of 1 ms"),
+    ))  # fmt: skip
+
+
+_TABLES = {
+    "excavator x y z": (0.06e3, 0.6e3, 0.3e3, 4.0e3),
+    "feller-buncher x": (0.06e3, 4.0e3, 3.0e3, 8.0e3),
+    "feller-buncher y": (0.06e3, 3.0e3, 2.0e3, 4.0e3),
+    "feller-buncher z": (0.06e3, 4.0e3, 3.0e3, 9.0e3),
+}
+"""Tables 6.7 and 6.9: K_d [N s/m], K_p nominal, minimum, maximum [N/m]."""
+
+
+def measure_published_gains(changes: Changes) -> Sample:
+    """Condition (4.14) and the worst switching with the published gains."""
+    given = read_settings(changes, damping=1.0)
+    joystick = load_joystick()
+    mass, hand = joystick.flotor.mass, joystick.hand.along(0)
+    margins, growths = [], []
+    for damping, nominal, least, most in _TABLES.values():
+        alone = Spring(mass, given["damping"] * damping, nominal, least, most)
+        for spring in (alone, Spring(mass + hand[0], alone.damping + given["damping"] * hand[1],
+                       nominal + hand[2], least + hand[2], most + hand[2])):  # fmt: skip
+            margins.append(spring.margin)
+            growths.append(spring.growth)
+    return Sample({"margin": max(margins), "growth": max(growths)})
+
+
+def judge_published_gains(samples: Sequence[Sample]) -> Judgement:
+    """Judge margin and growth."""
+    v = samples[0].values
+    return Judgement((
+        check_exact("largest B^2 - 4 M K_max over the axes, hand on and off", v["margin"],
+                    (-np.inf, -1e-9), "no axis meets (4.14)", unit="(N s/m)^2"),
+        check_exact("largest growth of half a swing with the worst switching", v["growth"],
+                    (0.0, 1.0 - 1e-9), "below 1 every change of stiffness dies out"),
+    ), note="masses of joystick and hand are assumptions of models/joystick")  # fmt: skip
+
+
+def measure_joystick(changes: Changes) -> Sample:
+    """Condition of the coils' map, and what the diodes' resolution makes of the pose."""
+    given = read_settings(changes, step=1.0, radius=1.0)
+    joystick = load_joystick()
+    facts = joystick.coils
+    coils = three_stations(facts.radius, facts.force_per_ampere, facts.max_current)
+    sizes = np.array([1.0, 1.0, 1.0, *[given["radius"] / facts.radius] * 3])
+    pose = pose_resolution(joystick.diodes.distance, given["step"] * joystick.diodes.step)
+    return Sample({
+        "condition": float(np.linalg.cond(sizes[:, None] * coils.wrench_map)),
+        "translation": 1e6 * float(pose[:3].max()),
+        "rotation": float(np.degrees(pose[3:].max())),
+    })  # fmt: skip
+
+
+def judge_condition(samples: Sequence[Sample]) -> Judgement:
+    """Judge the condition of the coils' map."""
+    return Judgement((
+        check_exact("condition of M, torques over the coils' radius",
+                    samples[0].values["condition"], (1.0, 10.0),
+                    "well-conditioned: within a factor of ten"),
+    ))  # fmt: skip
+
+
+def judge_resolution(samples: Sequence[Sample]) -> Judgement:
+    """Judge the resolution of the pose that the diodes' steps of 1 um make."""
+    v, reason = samples[0].values, "approximately: up to the printed figure"
+    return Judgement((
+        check_exact("standard deviation of the place", v["translation"], (0.0, 1.0), reason,
+                    unit="um", published=1.0),
+        check_exact("of the rotation", v["rotation"], (0.0, 1e-3), reason, unit="deg",
+                    published=1e-3),
+    ), note="three beams on diodes that read in steps of 1 um")  # fmt: skip
+
+
+EXPERIMENTS: tuple[Experiment, ...] = (
+    exact_experiment("damping that rises", measure_counter_example, make_claim(
+        "counter-example of rising damping",
+        '"the above system has solution x(t)" = 1 + e^-t "which goes to x(oo)" = 1 "instead" of 0',
+        "p. 53, Eq. 4.6", judge_counter_example, {"stiffness": 2.0}, "a spring of K = 2",
+    )),
+    exact_experiment("worst switching", measure_worst_switching, make_claim(
+        "stiffness that switches: unstable",
+        '"a slightly damped mass-damper-spring system goes unstable if we set the spring constant'
+        " to a large value whenever the mass moves towards the equihbrium point and a small value"
+        ' whenever the mass moves away from it"', "p. 54", judge_worst_switching, {"ratio": 1.0},
+        "critical damping",
+    )),
+    Experiment("theorem 4-2", measure_theorem, (make_claim(
+        "theorem 4-2: stable, one crossing at most",
+        '"Under these conditions, the system is uniformly asymptotically stable. Further the'
+        ' trajectory on phrase plane can cross the x axis at most once."',
+        "p. 55, Figs 4.26, 4.27", judge_theorem, {"damping": 0.3},
+        "damping that is too small for the condition",
+    ), make_claim(
+        "theorem 4-2: paths between those of K_min and K_max",
+        '"the trajectory of this time-variant system must be bounded by curve 1 and curve 2"',
+        "p. 61, Figs 4.28, 4.29", judge_bounds, {"damping": 0.3},
+        "damping that is too small for the condition",
+    ))),
+    exact_experiment("published gains", measure_published_gains, make_claim(
+        "published gains: worst switching dies out",
+        "no axis of Tables 6.7 and 6.9 meets the condition of theorem 4-2, but the worst switching"
+        " between their bounds dies out", "beyond p. 55, Tables 6.7, 6.9", judge_published_gains,
+        {"damping": 0.1}, "a tenth of the damping", "additional",
+    )),
+    exact_experiment("levitated joystick", measure_joystick, make_claim(
+        "joystick: condition of the coils' map",
+        '"M is a well-conditioned 6 x 6 constant matrix"', "p. 66, Eq. 5.1", judge_condition,
+        {"radius": 100.0}, "torques counted on a lever a hundred times as long", "input",
+    ), make_claim(
+        "joystick: resolution of the pose",
+        '"approximately 1" um "for translation and 0.001" deg "for rotation"',
+        "p. 65, Figs 5.31, 5.32", judge_resolution, {"step": 10.0},
+        "diodes that read in steps of 10 um", "input",
+    )),
+)  # fmt: skip

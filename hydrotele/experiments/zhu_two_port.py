@@ -1,0 +1,436 @@
+"""Zhu 1994, pages 28 to 37: the two-port, its passivity and stability, direct force.
+
+All rows but the one of a pressing excavator are computed with the numbers of
+`teleop/cat215_axis.yaml`. Sides that the document calls identical both have the master's numbers.
+Nothing is random but the cases that are drawn from a fixed seed, so that most experiments have one
+repetition.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from hydrotele.core.errors import InputError
+from hydrotele.experiments.comparison import (
+    Changes,
+    Claim,
+    Experiment,
+    Judgement,
+    Kind,
+    Panel,
+    Sample,
+)
+from hydrotele.experiments.intervals import check_exact, check_mean, collect, format_values
+from hydrotele.experiments.scenario_runs import operator_changes, run_shipped, true_channel
+from hydrotele.teleop.analysis import Case, gain_margin, load_teleop_case
+from hydrotele.teleop.findings import agreement
+from hydrotele.teleop.two_port import (
+    Impedance,
+    TwoPort,
+    hybrid,
+    hybrid_scattering_norm,
+    scattering_norm,
+    transmitted,
+)
+
+ROUNDING = (0.0, 1e-9)
+"""Accepted relative error of a formula that is computed in two ways."""
+HAND_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 60)  # rad/s, what a hand moves
+WIDE_FREQUENCIES = 2.0 * np.pi * np.geomspace(1e-3, 1e3, 2000)  # rad/s
+NOTICED_DIFFERENCE = 0.23  # relative difference of a compliance that a hand notices; Tan 1995
+PASSIVE_NORM = 1.0 + 1e-9  # scattering norm, with rounding
+
+
+def read_settings(changes: Changes, **defaults: float) -> dict[str, float]:
+    """Settings of an experiment with its changes.
+
+    Args:
+        changes: setting -> value.
+        **defaults: all settings.
+
+    Returns:
+        Setting -> value.
+
+    Raises:
+        InputError: a setting is not known.
+    """
+    if unknown := sorted(set(changes) - set(defaults)):
+        known = ", ".join(defaults) or "none"
+        raise InputError("changes", f"{', '.join(unknown)} unknown; there are: {known}")
+    return defaults | dict(changes)
+
+
+def exact_experiment(name: str, measure: Callable[[Changes], Sample], *claims: Claim) -> Experiment:
+    """An experiment in which nothing is random."""
+    return Experiment(name, partial(_measure_once, measure), claims, repetitions_fixed=1)
+
+
+def _measure_once(measure: Callable[[Changes], Sample], seed: int, changes: Changes) -> Sample:
+    return measure(changes)
+
+
+def shipped_case() -> Case:
+    """The axis of `cat215_axis.yaml` without delay."""
+    return load_teleop_case().case().with_delay(0.0)
+
+
+def identical_case() -> Case:
+    """The same with the master's numbers on both sides."""
+    case = shipped_case()
+    return dataclasses.replace(case, slave=case.master, slave_control=case.master_control)
+
+
+def constant_block(value: float) -> Callable[[np.ndarray], np.ndarray]:
+    """A transfer function that is a number."""
+    return lambda s: np.full_like(s, value)
+
+
+def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
+    """Largest difference over the largest expected size."""
+    return float(np.abs(found - expected).max() / np.abs(expected).max())
+
+
+# --- p. 28 to 32: the network ---------------------------------------------------------------------
+
+
+def measure_hybrid_matrix(changes: Changes) -> Sample:
+    """Hybrid matrix and felt impedance against the equations of Fig. 3.13, solved numerically."""
+    given = read_settings(changes, velocity_back_sign=1.0)
+    rng = np.random.default_rng(313)
+    errors = {"matrix": 0.0, "felt": 0.0}
+    for _ in range(50):
+        sizes = rng.uniform(0.2, 5.0, (9, 3))
+        parts = [Impedance(*size) for size in sizes]
+        master, slave, own, held, c1, c2, c3, c4, task = parts
+        port = TwoPort(master, slave, own, held, c1, c2, c3, c4)
+        w = rng.uniform(0.5, 20.0)
+        s = np.array(1j * w)
+        a, b = master(s) + own(s), slave(s) + held(s)
+        back = given["velocity_back_sign"] * c4(s)
+        # unknown F_h, V_e: F_h - C4 V_e = A V_h + C2 F_e; -C3 F_h + B V_e = C1 V_h - F_e
+        matrix = np.array([[1.0, -back], [-c3(s), b]])
+        solved = np.linalg.solve(matrix, np.array([[a, c2(s)], [c1(s), -1.0]]))
+        solved[1] *= -1.0
+        errors["matrix"] = max(errors["matrix"], relative_error(hybrid(port, s), solved))
+        # with F_e = Z_e V_e and V_h = 1
+        whole = np.array([[1.0, -back - c2(s) * task(s)], [-c3(s), b + task(s)]])
+        felt = np.linalg.solve(whole, np.array([a, c1(s)]))[0]
+        found = transmitted(port, s, task)
+        errors["felt"] = max(errors["felt"], float(abs(found / felt - 1.0)))
+    return Sample(errors)
+
+
+def judge_hybrid_matrix(samples: Sequence[Sample]) -> Judgement:
+    """Judge both formulas."""
+    values, reason = samples[0].values, "rounding: two ways to solve the same equations"
+    return Judgement((
+        check_exact("largest relative error of the hybrid matrix (3.11)", values["matrix"],
+                    ROUNDING, reason),
+        check_exact("of the felt impedance (3.12)", values["felt"], ROUNDING, reason),
+    ))  # fmt: skip
+
+
+def measure_delayed_channel(changes: Changes) -> Sample:
+    """Scattering norm of a channel that only delays force and velocity."""
+    given = read_settings(changes, wave_impedance=0.0)
+    delays = np.array([1e-3, 1e-2, 5e-2, 0.2, 1.0, 5.0])
+    s = 1j * np.geomspace(0.05, 500.0, 4001)
+    norms, lossless = [], []
+    for delay in delays:
+        late = np.exp(-s * delay)
+        zero = np.zeros_like(s)
+        plain = np.moveaxis(np.array([[zero, late], [-late, zero]]), (0, 1), (-2, -1))
+        # b = 1: F_m = F_s late + (V_m - V_s late) b, V_s = V_m late + (F_m late - F_s) / b
+        turn, secant = np.tanh(s * delay), 1.0 / np.cosh(s * delay)
+        line = np.moveaxis(np.array([[turn, secant], [-secant, turn]]), (0, 1), (-2, -1))
+        lossless.append(hybrid_scattering_norm(line).max())
+        norms.append(hybrid_scattering_norm(line if given["wave_impedance"] else plain).max())
+    return Sample({"least": min(norms), "lossless": max(lossless)}, (
+        Panel("largest scattering norm [1]", delays, {"force and velocity sent as they are":
+              np.array(norms), "lossless line": np.array(lossless)}, "delay [s]", True, True),
+    ))  # fmt: skip
+
+
+def judge_delayed_channel(samples: Sequence[Sample]) -> Judgement:
+    """Judge the smallest norm over the delays."""
+    values = samples[0].values
+    return Judgement(
+        (check_exact("smallest over six delays from 1 ms to 5 s of the largest scattering norm",
+                     values["least"], (PASSIVE_NORM, np.inf), "above 1 is not passive (3.6)"),),
+        note=f"the lossless line of the same delays has {values['lossless']:.3g}",
+    )  # fmt: skip
+
+
+_DELAYS, _FACTORS = np.array([0.0, 0.02, 0.1]), np.array([0.1, 1.0, 5.0, 30.0])
+
+
+def measure_nyquist(changes: Changes) -> Sample:
+    """Stability by the argument principle against a simulated kick, six structures."""
+    given = read_settings(changes, simulated_task=1.0)
+    case, right, cells = shipped_case(), 0, 0
+    real = dataclasses.replace(
+        case, task=dataclasses.replace(case.task, stiffness=given["simulated_task"] * 36e3)
+    )
+    for structure in ("position_position", "position_force", "rate_position", "rate_force"):
+        predicted = agreement(case, structure, _DELAYS, _FACTORS)
+        seen = predicted.seen
+        if given["simulated_task"] != 1.0:
+            seen = agreement(real, structure, _DELAYS, _FACTORS).seen
+        right += int(np.sum(predicted.predicted == seen))
+        cells += seen.size
+    return Sample({"fraction": right / cells, "cells": float(cells)})
+
+
+def judge_nyquist(samples: Sequence[Sample]) -> Judgement:
+    """Judge the fraction of the cells."""
+    values = samples[0].values
+    return Judgement((
+        check_exact(f"fraction of {values['cells']:.0f} loops (four structures, three delays, four"
+                    " gains) in which the criterion and a simulated kick agree", values["fraction"],
+                    (1.0, 1.0), "the criterion is necessary and sufficient"),
+    ))  # fmt: skip
+
+
+# --- p. 32 to 37: coordinating force and force feedback -------------------------------------------
+
+
+def measure_coordinating_force(changes: Changes) -> Sample:
+    """Scattering norm of the position-position structure, and its mechanical equivalent."""
+    given = read_settings(changes, slave_gain=1.0, coupling_gain=1.0)
+    case = identical_case()
+    control, k = case.master_control, given["slave_gain"]
+    held = Impedance(0.0, k * control.damping, k * control.stiffness)
+    port = dataclasses.replace(case, slave_control=held).port("position_position")
+    s = 1j * WIDE_FREQUENCIES
+    # masses M_m and M_s joined by C: F_h = Z_m V_h + C (V_h - V_e), -F_e = Z_s V_e - C (V_h - V_e)
+    a, b = port.master(s), port.slave(s)
+    c = given["coupling_gain"] * control(s)
+    whole = b + c
+    rows = [[a + c - c * c / whole, c / whole], [-c / whole, 1.0 / whole]]
+    network = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    found = hybrid(port, s)
+    error = np.abs(found - network).max(axis=0) / np.abs(network).max(axis=0)
+    return Sample({"norm": float(scattering_norm(port, s, 30.0).max()),
+                   "difference": float(error.max())})  # fmt: skip
+
+
+def judge_passive_coupling(samples: Sequence[Sample]) -> Judgement:
+    """Judge the scattering norm."""
+    return Judgement((
+        check_exact("largest scattering norm, 1 mHz to 1 kHz", samples[0].values["norm"],
+                    (0.0, PASSIVE_NORM), "passive (3.6), with rounding"),
+    ))  # fmt: skip
+
+
+def judge_mechanical_equivalent(samples: Sequence[Sample]) -> Judgement:
+    """Judge the difference of the two hybrid matrices."""
+    return Judgement((
+        check_exact("largest relative difference of the hybrid matrices",
+                    samples[0].values["difference"], ROUNDING, "rounding"),
+    ))  # fmt: skip
+
+
+_DURATION = 16.0  # s of the first target, 20 kN
+
+
+def measure_pressing(seed: int, changes: Changes) -> Sample:
+    """Position error that a contact force causes against the noise of the measured position.
+
+    The excavator presses with 20 kN under stiffness feedback. Also the joystick's stiffness
+    against (4.1).
+    """
+    keys = {"duration": str(_DURATION)} | operator_changes(seed) | dict(changes)
+    scenario, run = run_shipped("press_stiffness", keys)
+    m = run.measured
+    height = np.interp(m.time, run.truth.time, true_channel(run, "truth.tip.z"))
+    error = m["tip_reference.z"] - m["tip_pose.z"]
+    free, late = (m.time > 0.3) & (m.time < 1.0), m.time > _DURATION - 5.0
+    shift = float(abs(error[late].mean() - error[free].mean()))
+    noise = float((m["tip_pose.z"] - height)[late].std())
+    force = float(np.mean(m["tip_force.z"][late]))
+    pushed = late & (np.abs(m["handle.z"]) > 1e-4)
+    law = np.clip(600.0 + (4000.0 - 600.0) / 50e3 * np.abs(m["tip_force.z"]), 300.0, 4000.0)
+    off = float(np.sqrt(np.mean((m["handle_stiffness.z"] / law - 1.0)[pushed] ** 2)))
+    values = {"ratio": shift / noise, "shift": shift, "noise": noise, "force": force, "law": off}
+    return Sample(values, (
+        Panel("position error of the bucket [mm]", m.time, {
+            "reference - measured": 1e3 * error, "reference - true":
+            1e3 * (m["tip_reference.z"] - height)}),
+        Panel("contact force [kN]", m.time, {"estimated": m["tip_force.z"] / 1e3}),
+    ))  # fmt: skip
+
+
+def judge_position_error(samples: Sequence[Sample]) -> Judgement:
+    """Judge the position error over the noise."""
+    return Judgement(
+        (check_mean("position error that the contact causes over the RMS noise of the measured"
+                    " position", collect(samples, "ratio"), (-np.inf, 1.0),
+                    "smaller than the noise"),),
+        note=f"{format_values(samples, 'shift', 1e3)} mm with"
+        f" {format_values(samples, 'force', 1e-3)} kN; noise {format_values(samples, 'noise', 1e3)}"
+        " mm, that of the angle sensors of khoshzaban1992",
+    )  # fmt: skip
+
+
+def judge_stiffness_law(samples: Sequence[Sample]) -> Judgement:
+    """Judge the joystick's stiffness against (4.1) with the numbers of Tables 6.7 and 6.8."""
+    return Judgement((
+        check_mean("RMS difference of the stiffness along z from (4.1), relative",
+                   collect(samples, "law"), (-np.inf, 0.05),
+                   "force and stiffness are logged up to a period of 20 ms apart"),
+    ))  # fmt: skip
+
+
+def measure_direct_force(changes: Changes) -> Sample:
+    """Largest factor on the reflected force for which the loop is stable."""
+    given = read_settings(changes, task=1.0)
+    case, k = shipped_case(), given["task"]
+    task = Impedance(0.0, k * case.task.damping, k * case.task.stiffness)
+    case = dataclasses.replace(case, task=task)
+    late = case.with_delay(0.02)
+    return Sample({
+        "rate": gain_margin(case, "rate_force"),
+        "position": gain_margin(case, "position_force"),
+        "late_rate": gain_margin(late, "rate_force"),
+        "late_position": gain_margin(late, "position_force"),
+    })  # fmt: skip
+
+
+def judge_rate_force(samples: Sequence[Sample]) -> Judgement:
+    """Judge whether rate control without delay has a limit, and a smaller one than position."""
+    v = samples[0].values
+    ratio = v["rate"] / v["position"]
+    return Judgement(
+        (
+            check_exact("largest stable factor on the reflected force under rate control, without"
+                        " delay", v["rate"], (0.0, 100.0), "a limit exists; 100 times the shipped"
+                        " reflection, 450 N in the hand for 25 kN, counts as none"),
+            check_exact("the same over that of position control", ratio, (0.0, 1.0 - 1e-9),
+                        "rate control is the less stable one"),
+        ),
+        note=f"with 20 ms each way {v['late_rate']:.2f} under rate control,"
+        f" {v['late_position']:.2f} under position control: with delay position control is the less"
+        " stable one at these gains",
+    )  # fmt: skip
+
+
+def judge_position_force(samples: Sequence[Sample]) -> Judgement:
+    """Judge whether direct force under position control has a limit that a smaller gain keeps."""
+    v = samples[0].values
+    return Judgement(
+        (check_exact("largest stable factor on the reflected force under position control, 20 ms"
+                     " each way", v["late_position"], (1e-9, 1.0 - 1e-9),
+                     "unstable as it is shipped, and a smaller gain makes it stable"),),
+        note=f"without delay: {v['position']:.3g}",
+    )  # fmt: skip
+
+
+def measure_opacity(changes: Changes) -> Sample:
+    """How far the felt impedance is from the task's, over what a hand moves."""
+    given = read_settings(changes, transparent=0.0)
+    case, s, values, curves = shipped_case(), 1j * HAND_FREQUENCIES, {}, {}
+    names = {"position_position": "position_position", "position_force": "position_force",
+             "rate_force": "rate_force"}  # fmt: skip
+    for name, structure in names.items():
+        if given["transparent"]:
+            structure = "four_channel_position"
+        felt = transmitted(case.port(structure), s, case.task) / case.task(s)
+        values[name] = float(np.abs(felt - 1.0).max())
+        curves[name.replace("_", "-")] = np.abs(felt)
+    return Sample(values, (
+        Panel("felt over the task's impedance [1]", HAND_FREQUENCIES / (2.0 * np.pi), curves,
+              "frequency [Hz]", True),
+    ))  # fmt: skip
+
+
+def _judge_opacity(*structures: str) -> Callable[[Sequence[Sample]], Judgement]:
+    def judge(samples: Sequence[Sample]) -> Judgement:
+        return Judgement(tuple(
+            check_exact(
+                f"largest relative difference of the felt and the task's impedance,"
+                f" {name.replace('_', '-')}", samples[0].values[name], (NOTICED_DIFFERENCE, np.inf),
+                "a hand notices 23 % of a compliance (Tan 1995)",
+            ) for name in structures
+        ))  # fmt: skip
+
+    return judge
+
+
+def make_claim(
+    name: str, quote: str, item: str, judge: Callable[[Sequence[Sample]], Judgement],
+    broken: Changes | None, broken_how: str, kind: Kind = "document",
+) -> Claim:  # fmt: skip
+    """A claim with the arguments in the order in which a reader wants them."""
+    return Claim(name, quote, item, kind, judge, broken, broken_how)
+
+
+EXPERIMENTS: tuple[Experiment, ...] = (
+    exact_experiment("hybrid matrix", measure_hybrid_matrix, make_claim(
+        "general structure: hybrid matrix",
+        '"The hybrid matrix of this two-port teleoperator system can be easily derived" (3.11,'
+        " 3.12)", "p. 30, Fig. 3.13", judge_hybrid_matrix, {"velocity_back_sign": -1.0},
+        "the velocity that comes back has the wrong sign in the equations",
+    )),
+    exact_experiment("delayed channel", measure_delayed_channel, make_claim(
+        "delay: not passive",
+        '"It can be shown that the standard method of communicating forces and velocity between the'
+        ' master and slave in a teleoperator system leads to a nonpassive system for any time'
+        ' delay."', "p. 28, Eq. 3.8", judge_delayed_channel, {"wave_impedance": 1.0},
+        "a lossless line in place of the plain channel",
+    )),
+    exact_experiment("Nyquist criterion", measure_nyquist, make_claim(
+        "closed-loop stability by the loop transfer functions",
+        'the Nyquist plots of LG1 and LG2 "can not encircle the critical point" for a stable'
+        " system", "p. 31, Fig. 3.14", judge_nyquist, {"simulated_task": 0.01},
+        "the simulated task is a hundred times softer than the one of the criterion",
+    )),
+    exact_experiment("coordinating force", measure_coordinating_force, make_claim(
+        "position-position structure: passive",
+        '"coordinating force (position error) method can be shown to be passive under position'
+        ' control"; "any circuit network made up of strictly passive components is itself passive,'
+        ' thus the system can not go unstable"', "p. 32, Figs 3.15, 3.16", judge_passive_coupling,
+        {"slave_gain": 3.0}, "the slave's controller three times as stiff as the master's",
+    ), make_claim(
+        "position-position structure: mechanical equivalence",
+        '"The mechanical equivalent of the above two-port teleoperator system is shown" as two'
+        " masses joined by a spring and a damper", "p. 33, Fig. 3.17", judge_mechanical_equivalent,
+        {"coupling_gain": 2.0}, "a spring and a damper twice as large between the masses",
+    )),
+    Experiment("pressing", measure_pressing, (make_claim(
+        "rate-position structure: position error below noise",
+        '"the position gain is so high for hydraulic mobile machines such as excavators and'
+        ' feller-bunchers that there is virtually no position error for feedback considering the'
+        ' noise"', "p. 34, Fig. 3.18", judge_position_error, {"servo.position_gain": "1.0"},
+        "joint loops with an eighth of the position gain",
+    ), make_claim(
+        "stiffness adjustment",
+        "the stiffness of the joystick is that of (4.1) with Tables 6.7 and 6.8",
+        "p. 51, Fig. 4.24", judge_stiffness_law, {"pilot.reflection": "none"}, "no reflection",
+        "input",
+    )), max_repetitions=6),
+    exact_experiment("direct force, linear", measure_direct_force, make_claim(
+        "position-force structure: reduced gain",
+        '"For position control with direct force feedback, stability can be achieved by reducing'
+        ' the loop gain"', "p. 36, Fig. 3.19", judge_position_force, {"task": 1e-6},
+        "a task a million times softer, which reflects no force",
+    ), make_claim(
+        "rate control with direct force feedback",
+        '"Therefore rate control with direct force feedback tends to be unstable even without'
+        ' time-delay in the system."', "p. 37", judge_rate_force, {"task": 1e-6},
+        "a task a million times softer, which reflects no force",
+    )),
+    exact_experiment("felt impedance", measure_opacity, make_claim(
+        "structures that are not transparent, position control",
+        '"the position-position structure does not provide transparency, nor does the'
+        ' position-force structure if the dynamics of the system can not be neglected"',
+        "p. 37, Figs 3.15, 3.19", _judge_opacity("position_position", "position_force"),
+        {"transparent": 1.0}, "the transparent four-channel structure instead",
+    ), make_claim(
+        "structures that are not transparent, rate control",
+        '"The position-force structure does not provide transparency nor does the rate-force'
+        ' structure."', "p. 43", _judge_opacity("rate_force"), {"transparent": 1.0},
+        "the transparent four-channel structure instead",
+    )),
+)  # fmt: skip
