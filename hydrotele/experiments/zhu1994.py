@@ -1,8 +1,8 @@
 """Zhu 1994: force-reflecting resolved motion control of an excavator and a feller-buncher.
 
-Chapters 2 to 5 are computed from the two-port, the stiffness controller and the joystick.
-The machine experiments of chapter 6 are repeated with simulated operators of the published
-population, one per repetition. The thesis had one person for each figure, who is not known.
+Chapters 2 to 5 are computed from the models, the machine experiments of chapter 6 are repeated with
+simulated operators of the published population, one per repetition. The thesis had one person for
+each figure, who is not known.
 """
 
 from hydrotele.experiments import (
@@ -18,8 +18,8 @@ from hydrotele.experiments.comparison import Experiment, Series
 
 EXPERIMENTS: tuple[Experiment, ...] = (
     *zhu_control.EXPERIMENTS,
-    *zhu_identification.EXPERIMENTS,
     zhu_tables.TABLES,
+    *zhu_identification.EXPERIMENTS,
     zhu_motion.STEERING,
     *zhu_motion.LINES,
     *zhu_forces.BY_FEEL,

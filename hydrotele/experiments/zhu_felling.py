@@ -240,10 +240,13 @@ def _judge_avoided(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_protection(seed: int, changes: Changes) -> Sample:
-    """Press with an operator who aims at too large a force, with and without an added spring."""
+    """Press with an operator who aims at 60 kN, enough to tip the machine, with a spring or not."""
     values, panels = {}, []
+    too_large = {"pilot.operator.target.force": "[6.0e+4]"}
     for name, keys in (("spring", {}), ("bare", {"pilot.tip_over": "null"})):
-        scenario, run = run_shipped("tip_over", operator_changes(seed) | keys | dict(changes))
+        scenario, run = run_shipped(
+            "tip_over", operator_changes(seed) | too_large | keys | dict(changes)
+        )
         assert isinstance(scenario.pilot, TeleopPilot)
         facts = scenario.pilot.tip_over or TipOver(mass=20.0e3, edge=1.6)
         share, handle = _tipping_share(run, facts), run.measured["handle.z"]
@@ -259,18 +262,17 @@ def measure_protection(seed: int, changes: Changes) -> Sample:
 
 def _judge_protection(samples: Sequence[Sample]) -> Judgement:
     kept, bare = collect(samples, "spring_share"), collect(samples, "bare_share")
-    checks = (
-        check_mean("largest fraction of the tipping moment with the spring", kept, (0.0, 1.0),
-                   "the machine tips at 1"),
-        check_fraction("operators whose largest fraction is smaller with the spring", kept < bare),
+    check = check_fraction(
+        "operators who tip the machine without the spring and not with it",
+        (kept < 1.0) & (bare > 1.0), reason="a statement on most operators",
     )  # fmt: skip
     note = (
-        f"without the spring {format_values(samples, 'bare_share', 1.0, 2)};"
-        f" {np.sum(bare > 1.0)} of {len(samples)} operators press hard enough to tip the machine"
-        f" without it; handle within {format_values(samples, 'spring_handle', 1e3)} mm after 10 s"
+        f"largest fraction of the tipping moment {format_values(samples, 'spring_share', 1.0, 2)}"
+        f" with the spring, {format_values(samples, 'bare_share', 1.0, 2)} without; handle within"
+        f" {format_values(samples, 'spring_handle', 1e3)} mm after 10 s"
     )
     explanation = "8 kN/m and 100 N s/m beyond half of the tipping moment; not in the thesis"
-    return Judgement(checks, explanation, note)
+    return Judgement((check,), explanation, note)
 
 
 TIP_OVER = (
@@ -307,7 +309,7 @@ TIP_OVER = (
             {"pilot.tip_over": "null"},
             "without the spring in both",
         ),
-    ), 6),
+    ), 10),
 )  # fmt: skip
 
 FELLING = (
@@ -341,5 +343,5 @@ FELLING = (
             {"pilot.buttons": "[{at: 16.0, axis: saw, command: 1.0}]"},
             "the grab arm never closes",
         ),
-    ), 10),
+    ), 8),
 )  # fmt: skip

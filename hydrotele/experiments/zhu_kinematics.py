@@ -39,7 +39,7 @@ from hydrotele.kinematics.task import (
 from hydrotele.machine.machine_file import load_machine
 
 _MACHINES = {"excavator": ("cat215", "bucket"), "feller-buncher": ("cat325", None)}
-_POSES = 2000
+_POSES = 400
 _RUNS = 6  # repetitions of a scenario
 
 

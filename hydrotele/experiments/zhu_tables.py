@@ -196,7 +196,7 @@ _TABLES: dict[str, tuple[str, str, Callable[[], Entries]]] = {
         "p. 100, Table 6.10", "30 kN and 40 kN m", partial(_force_limits, "feller", 30.0)),
     "detent parameters": ("p. 102, Table 6.11", "force drop, Kp and Kp1 of six axes", _detents),
 }  # fmt: skip
-"""Row -> item, what is printed, entries."""
+"""Row -> item, published quantities, entries."""
 
 
 def measure_tables(seed: int, changes: Changes) -> Sample:

@@ -186,9 +186,9 @@ def measure_force_error(changes: Changes) -> Sample:
         stiff = Impedance(hand.mass, np.sqrt(scale) * hand.damping, scale * hand.stiffness)
         return dataclasses.replace(case, hand=stiff)
 
-    scales = np.geomspace(1.0, 1e-3, 13)
+    scales = np.geomspace(1.0, 1e-3, 7)
     limits = np.array([smallest_force_error(softer(scale)) for scale in scales])
-    hands = np.geomspace(1.0, 1e3, 13)
+    hands = np.geomspace(1.0, 1e3, 7)
     by_hand = np.array([smallest_force_error(stiffer(scale)) for scale in hands])
     enough, firm = scales[limits <= 0.05], hands[by_hand <= 0.05]
     port = case.port("four_channel_position")

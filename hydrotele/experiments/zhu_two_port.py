@@ -407,8 +407,8 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     ), make_claim(
         "stiffness adjustment",
         "the stiffness of the joystick is that of (4.1) with Tables 6.7 and 6.8",
-        "p. 51, Fig. 4.24",
-        judge_stiffness_law, {"pilot.reflection": "none"}, "no reflection", "input",
+        "p. 51, Fig. 4.24", judge_stiffness_law, {"pilot.reflection": "none"}, "no reflection",
+        "input",
     )), max_repetitions=6),
     exact_experiment("direct force, linear", measure_direct_force, make_claim(
         "position-force structure: reduced gain",
