@@ -384,12 +384,12 @@ def judge_task_identification(samples: Sequence[Sample]) -> Judgement:
 EXPERIMENTS: tuple[Experiment, ...] = (
     exact_experiment("four channels, position control", measure_transparency, make_claim(
         "transparency under position control",
-        'H = [[0, 1], [-1, 0]] (3.28); "Thus the slave tracks the master position asymptotically."',
+        'H = [[0, 1], [-1, 0]] (3.28); "the master position asymptotically"',
         "p. 39", judge_transparency, {"mass_error": 0.1}, "a slave 10 % heavier than assumed",
     ), make_claim(
         "transparent teleoperator: lossless and stable",
         '"Therefore, from the network point of view, this two-port is passive" (norm 1, 3.33);'
-        ' "Hence when it is connected to any strictly passive load, the system'
+        ' "Hence when it is connected to any" strictly "passive load, the system'
         ' stability is ensured."', "p. 39", judge_lossless, {"delay": 0.05}, "50 ms each way",
     )),
     exact_experiment("intervening impedance", measure_intervening, make_claim(

@@ -251,7 +251,8 @@ def measure_pressing(seed: int, changes: Changes) -> Sample:
     noise = float((m["tip_pose.z"] - height)[late].std())
     force = float(np.mean(m["tip_force.z"][late]))
     pushed = late & (np.abs(m["handle.z"]) > 1e-4)
-    law = np.clip(600.0 + (4000.0 - 600.0) / 50e3 * np.abs(m["tip_force.z"]), 300.0, 4000.0)
+    felt = -np.sign(m["handle.z"]) * m["tip_force.z"]  # stiffer where the hand presses on
+    law = np.clip(600.0 + (4000.0 - 600.0) / 50e3 * felt, 300.0, 4000.0)
     off = float(np.sqrt(np.mean((m["handle_stiffness.z"] / law - 1.0)[pushed] ** 2)))
     values = {"ratio": shift / noise, "shift": shift, "noise": noise, "force": force, "law": off}
     return Sample(values, (
@@ -389,9 +390,10 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     exact_experiment("coordinating force", measure_coordinating_force, make_claim(
         "position-position structure: passive",
         '"coordinating force (position error) method can be shown to be passive under position'
-        ' control"; "any circuit network made up of strictly passive components is itself passive,'
-        ' thus the system can not go unstable"', "p. 32, Figs 3.15, 3.16", judge_passive_coupling,
-        {"slave_gain": 3.0}, "the slave's controller three times as stiff as the master's",
+        ' control"; "any circuit network made up of strictly passive" "components is itself'
+        ' passive, thus the system can not go unstable"', "p. 32, Figs 3.15, 3.16",
+        judge_passive_coupling, {"slave_gain": 3.0},
+        "the slave's controller three times as stiff as the master's",
     ), make_claim(
         "position-position structure: mechanical equivalence",
         '"The mechanical equivalent of the above two-port teleoperator system is shown" as two'

@@ -99,3 +99,15 @@ def test_a_short_log_is_refused(slow_log):
     )
     with pytest.raises(InputError, match="10 s of slow moves"):
         identify_gravity(CAT, short)
+
+
+def test_outliers_of_a_dead_pressure_sensor_are_removed(slow_log):
+    """A boom sensor that reads nothing for 3 s; without outliers within 1 % as without failure."""
+    columns = dict(slow_log.columns)
+    dead = (slow_log.time > 40.0) & (slow_log.time < 43.0)
+    columns["pressure_head.boom"] = np.where(dead, 0.0, columns["pressure_head.boom"])
+    bad, true = Log(slow_log.time, columns, slow_log.units), gravity_from_masses(CAT).value
+    kept, removed = identify_gravity(CAT, bad), identify_gravity(CAT, bad, remove_outliers=True)
+    assert np.abs(removed.value - true).max() < 0.01 * np.abs(true).max()
+    assert np.abs(removed.value - true).max() < np.abs(kept.value - true).max()
+    assert len(kept.removed) == 0 and set(range(201, 214)) <= set(removed.removed.tolist())

@@ -7,10 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.control.resolved_motion import ResolvedMotion, arm_axes, pose_to_joints
+from hydrotele.control.resolved_motion import (
+    ResolvedMotion,
+    arm_axes,
+    arm_facts,
+    follow_rate,
+    pose_to_joints,
+)
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import forward
 from hydrotele.kinematics.from_machine import arm_geometry
+from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Pose
 
@@ -103,3 +110,21 @@ def test_arm_with_a_joint_that_nothing_drives():
     axes = {k: v for k, v in BUCKET.axes.items() if k != "stick"}
     with pytest.raises(InputError, match=r"\['stick'\] are not driven"):
         arm_axes(BUCKET.model_copy(update={"axes": axes}))
+
+
+def test_inverse_jacobian_follows_the_rate_and_stops_at_the_edge():
+    """Euler's steps of 2.5 mm leave 0.1 mm of 0.5 m beside the line; one step at the edge."""
+    g, axes, ranges = arm_facts(BUCKET)
+    q = np.array([(HOME | {"swing": 0.0})[axis] for axis in axes])
+    pose, speed, rate = np.zeros(5), np.zeros(len(q)), np.array([0.0, 0.0, 0.5, 0.0, 0.0])
+    task_forward(g, q, pose)
+    start = pose.copy()
+    for _ in range(200):
+        assert not follow_rate(g, ranges, q.copy(), rate, 0.005, pose, q, speed)
+    np.testing.assert_allclose(pose[:4], start[:4] + [0.0, 0.0, 0.5, 0.0], atol=2e-3)
+    rate[:] = 1.0, 0.0, 0.0, 0.0, 0.0
+    held = [follow_rate(g, ranges, q.copy(), rate, 0.005, pose, q, speed) for _ in range(2000)]
+    assert held[-1] and np.all(speed == 0.0)
+    assert np.all((ranges[:, 0] <= q) & (q <= ranges[:, 1]))
+    assert follow_rate(g, ranges, np.full(len(q), np.nan), -rate, 0.005, pose, q, speed)
+    assert not follow_rate(g, ranges, q.copy(), -rate, 0.005, pose, q, speed)
