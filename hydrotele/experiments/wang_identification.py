@@ -163,7 +163,7 @@ REFINED_NAMES = ("a4", "theta4", "b1x", "b6z")
 
 def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
     """Sample the posterior of the 36 parameters with sensor noise, and compare least squares."""
-    settings = change_settings({"chain_noise": 1.0, "steps": 4000}, changes)
+    settings = change_settings({"chain_noise": 1.0, "steps": 3000}, changes)
     simulated = simulate_robot(500 + seed, 25)
     names = document_parameters(simulated.model)
     done = calibrate(load_hybrid("iwr"), simulated.measurement, "dh", names)
@@ -380,6 +380,7 @@ RANK = Experiment(
             _judge_rank, {"tilt": 0.0}, "the platform never tilts",
         ),
     ),
+    max_repetitions=10,
 )  # fmt: skip
 
 REFINED_POSTERIOR = Experiment(
