@@ -50,7 +50,7 @@ POSE_LABEL = "pose [1]"
 
 
 def _panel(label: str, before: np.ndarray, after: np.ndarray) -> Panel:
-    """Errors before and after at numbered poses; the latter also on an axis of their own."""
+    """Errors before and after at numbered poses; errors after it have a second axis."""
     return Panel(
         label, np.arange(1, len(before) + 1), {"before": 1e3 * before, "after": 1e3 * after},
         POSE_LABEL, discrete=True, errors={"after": 1e3 * after}, error_label=label,

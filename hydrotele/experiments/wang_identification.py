@@ -56,7 +56,7 @@ CAPTIONS = {
 The available text does not define the dd of Fig. 14, which is drawn as d4."""
 
 
-def _thin(posterior: Posterior) -> np.ndarray:
+def _select_draws(posterior: Posterior) -> np.ndarray:
     flat = posterior.flat
     return flat[:: max(1, len(flat) // KEPT_DRAWS)]
 
@@ -103,7 +103,7 @@ def measure_redundancy(seed: int, changes: Changes) -> Sample:
         values[f"mean {name}"] = 1e3 * float(posterior.mean[at[name]])
         values[f"deviation {name}"] = 1e3 * float(posterior.deviations[at[name]])
         values[f"assumed {name}"] = 1e3 * float(simulated.errors[at[name]])
-    arrays = {"draws": 1e3 * _thin(posterior), "truth": 1e3 * simulated.errors,
+    arrays = {"draws": 1e3 * _select_draws(posterior), "truth": 1e3 * simulated.errors,
               "names": np.array(names)}  # fmt: skip
     return Sample(values, (), arrays)
 
@@ -163,7 +163,7 @@ REFINED_NAMES = ("a4", "theta4", "b1x", "b6z")
 
 def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
     """Sample the posterior of the 36 parameters with sensor noise, and compare least squares."""
-    settings = change_settings({"chain_noise": 1.0, "steps": 4000}, changes)
+    settings = change_settings({"chain_noise": 1.0, "steps": 3000}, changes)
     simulated = simulate_robot(500 + seed, 25)
     names = document_parameters(simulated.model)
     done = calibrate(load_hybrid("iwr"), simulated.measurement, "dh", names)
@@ -186,7 +186,11 @@ def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
         values[f"mean {name}"] = 1e3 * float(posterior.mean[at])
         values[f"deviation {name}"] = 1e3 * float(posterior.deviations[at])
         values[f"assumed {name}"] = 1e3 * float(truth[at])
-    arrays = {"draws": 1e3 * _thin(posterior), "truth": 1e3 * truth, "names": np.array(names)}
+    arrays = {
+        "draws": 1e3 * _select_draws(posterior),
+        "truth": 1e3 * truth,
+        "names": np.array(names),
+    }
     return Sample(values, (), arrays)
 
 
@@ -380,6 +384,7 @@ RANK = Experiment(
             _judge_rank, {"tilt": 0.0}, "the platform never tilts",
         ),
     ),
+    max_repetitions=10,
 )  # fmt: skip
 
 REFINED_POSTERIOR = Experiment(

@@ -182,7 +182,7 @@ def _judge_hexapod(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_first_order(seed: int, changes: Changes) -> Sample:
-    """Measure what the first-order error model leaves out at the carriage's end."""
+    """Measure the second-order position error of the carriage's end."""
     settings = change_settings({"error_size": 1.0, "growth": 2.0}, changes)
     nominal, rng = load_hybrid("iwr"), np.random.default_rng(seed)
     joints, _ = random_poses(nominal, 100, rng)
