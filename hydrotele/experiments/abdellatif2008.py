@@ -122,13 +122,17 @@ def measure_reduction(seed: int, changes: Changes) -> Sample:
     values = {"start": found.steps[0].parameters, "stop": found.steps[-1].parameters,
               "reached": reached, "dropped": dropped, "merged": merged}  # fmt: skip
     return Sample(values, (
-        Panel("parameters", number, {"left": np.array([s.parameters for s in found.steps])},
+        Panel("parameters left [1]", number, {"": np.array([s.parameters for s in found.steps])},
               "step", discrete=True),
-        Panel("estimate over its standard deviation (dropped) or correlation (merged) [1]", number,
-              {action: np.array([s.figure if s.action == action else np.nan for s in found.steps])
-               for action in ("drop", "merge")}, "step", discrete=True),
-        Panel("weighted squared residual per degree of freedom [1]", number,
-              {"residual": np.array([s.misfit for s in found.steps])}, "step", discrete=True),
+        *(
+            Panel(label, number, {"": np.array([
+                step.figure if step.action == action else np.nan for step in found.steps
+            ])}, "step", discrete=True)
+            for action, label in (("drop", "estimate / standard deviation [1]"),
+                                  ("merge", "correlation of merged [1]"))
+        ),
+        Panel("squared residual per degree [1]", number,
+              {"": np.array([step.misfit for step in found.steps])}, "step", discrete=True),
     ))  # fmt: skip
 
 

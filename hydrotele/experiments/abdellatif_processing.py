@@ -169,12 +169,14 @@ def _draw_reconstruction(
     frequency = lines / period
     panels, spectrum = [], 2.0 * np.fft.rfft(rebuilt["raw"][0])[lines] / true.shape[1]
     spectra = [np.abs(spectrum * (2.0 * np.pi * frequency) ** order) for order in range(3)]
-    spectra.append(np.abs(2.0 * np.fft.rfft(force)[lines] / len(force)))
-    for label, amplitude in zip((*_ORDERS, "force of drive 5 [N]"), spectra, strict=True):
+    for label, amplitude in zip(_ORDERS, spectra, strict=True):
         window = np.where(lines <= harmonics, amplitude.max(), np.nan)
         panels.append(Panel(f"amplitude of {label}", frequency,
                             {"measured": amplitude, "window": window}, "frequency [Hz]", log=True,
                             discrete=True))  # fmt: skip
+    amplitude = np.abs(2.0 * np.fft.rfft(force)[lines] / len(force))  # forces are not filtered
+    panels.append(Panel("amplitude of force of drive 5 [N]", frequency, {"measured": amplitude},
+                        "frequency [Hz]", log=True, discrete=True))  # fmt: skip
     time = np.arange(true.shape[1]) / SAMPLE_RATE
     for order, label in enumerate(_ORDERS):
         panels.append(Panel(
