@@ -214,7 +214,8 @@ def judge_reidentified(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         tuple(checks),
         "without the bent poses both alpha and beta come near the truth; a1 is identified in the"
-        " swing's stage, which has no bent poses, and keeps the errors that the drift of held links causes",
+        " swing's stage, which has no bent poses, and keeps the errors that the drift of held links"
+        " causes",
     )
 
 
