@@ -138,10 +138,10 @@ def identify_twice(done: Calibration) -> dict[str, ArmFit]:
 
 
 def leave_out_visible(loop: Loop, stage: Poses) -> Poses:
-    """The poses in which all sensors agree with the nominal model to 1 deg at the yoke.
+    """Keep the poses in which all sensors agree with the nominal model to 1 deg at the yoke.
 
-    The chain's gap is compared with what a turn of the yoke moves at the ball. In the stage of
-    joint 4, which has no sensor, every pose is kept.
+    A pose is left out where the chain's gap exceeds the ball's displacement by 1 deg of the yoke.
+    In the stage of joint 4, which has no sensor, every pose is kept.
     """
     if stage.link not in MOVED:
         return stage

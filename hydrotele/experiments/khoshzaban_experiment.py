@@ -1,8 +1,7 @@
 """Claims of Khoshzaban 1992, section 3.8: Tables 7 to 10 and Figs 19 to 25.
 
-The thesis calibrates one machine once; what is published is compared as one repetition of the
-simulated calibrations (`khoshzaban_calibration`), or by a factor where it is a change that the
-removal of bad data makes.
+The thesis calibrates one machine once: published figures are compared as one repetition of the
+simulated calibrations (`khoshzaban_calibration`), published changes by a factor.
 """
 
 from collections.abc import Sequence
@@ -215,7 +214,8 @@ def judge_reidentified(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         tuple(checks),
         "without the bent poses both alpha and beta come near the truth; a1 is identified in the"
-        " swing's stage, which has no bent poses, and keeps what the drift of held links makes",
+        " swing's stage, which has no bent poses, and keeps the errors that the drift of held links"
+        " causes",
     )
 
 
@@ -280,7 +280,7 @@ def judge_fall(samples: Sequence[Sample]) -> Judgement:
     names = ("identified", "reidentified")
     return Judgement(
         tuple(_check_fall(samples, names, POSITIONS, "manipulator", _POSITION)),
-        "what is left is the drift of held links: with links that stay where they are the stick's"
+        "the drift of held links remains: with links that stay where they are the stick's"
         " end falls from 0.076 to 0.031 m",
     )
 

@@ -194,8 +194,8 @@ def judge_pressures(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_lists(seed: int, changes: Changes) -> Sample:
-    """Find what the poses of every stage identify; the setting is the grapple's turn [deg]."""
-    chosen = choose_settings({"wander": None, "noise": True}, changes)
+    """Find the parameters that every stage identifies; the setting is the grapple's turn [deg]."""
+    chosen = choose_settings({"wander": None}, changes)
     loop = loop_of(load_machine("calibrator"))
     rng = np.random.default_rng(1)
     sweeps = {
@@ -267,7 +267,13 @@ def judge_drift(samples: Sequence[Sample]) -> Judgement:
                     " less than one", unit="deg", published=0.0)
         for name, value in values.items() if name.startswith("swing while")
     ]  # fmt: skip
-    return Judgement(tuple(checks))
+    return Judgement(
+        tuple(checks),
+        "closed spools of the scenarios leak 2.7e-14 m3/(s Pa) to tank (25 mm, 7.5 um of radial"
+        " clearance), the cylinders are tight, and a run takes 120 s; the thesis gives neither."
+        " Ten times that leakage makes 1.5 deg of the boom and 0.26 to 0.30 deg of the stick: no"
+        " coefficient that both share gives the figures, in which the stick drifts more",
+    )
 
 
 def judge_closure(samples: Sequence[Sample]) -> Judgement:
