@@ -26,7 +26,7 @@ CASES = {
         ("angle_scale", "stick", {"ratio": 1.01}),
         ("angle_delay", "swing", {"delay": 0.0133}),
         ("angle_drift", "swing", {"drift": 0.03, "time_constant": 1.0}),
-        ("angle_drift", "boom", {"drift": -0.02, "time_constant": 0.5}),
+        ("angle_drift", "boom", {"drift": -0.02, "time_constant": 2.0}),
         ("pressure_offset", "boom.head", {"offset": 60e3}),
         ("pressure_delay", "stick", {"delay": 0.0275}),
     ),
