@@ -1,15 +1,19 @@
 """Compare a document's verdicts among numbers of repetitions.
 
     python tools/experiment_seeds.py NAME [--counts 10 20 40] [--jobs 2] [--out FILE]
+        [--folder DIR]
 
 NAME is a document, such as zhu1994. Repetitions of a smaller number are the first of the larger
-one. Exit status 1 where a row changes between `agrees` and `differs`.
+one. --folder holds what `hydrotele experiments NAME` writes, if its number of repetitions is among
+the counts. Exit status 1 where a row changes between `agrees` and `differs`.
 """
 
 import argparse
 import importlib
 import sys
+from pathlib import Path
 
+from hydrotele.cli.experimenting import write_results
 from hydrotele.experiments.comparison import Series, compare_by_seeds
 
 
@@ -31,10 +35,14 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 20, 40])
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", help="Markdown file to write")
+    parser.add_argument("--folder", type=Path, help="folder for table, report and figures")
     arguments = parser.parse_args()
 
     series, counts = import_series(arguments.name), arguments.counts
     found = compare_by_seeds(series, counts, arguments.jobs, report_progress)
+    if arguments.folder and series.repetitions in counts:
+        arguments.folder.mkdir(parents=True, exist_ok=True)
+        write_results(arguments.folder, series, series.repetitions, found[series.repetitions])
     words = " ".join(map(str, counts))
     lines = [
         f"# Verdicts of {arguments.name} by number of repetitions", "",

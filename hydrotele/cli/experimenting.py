@@ -54,12 +54,13 @@ def experiments_to_folder(
         rows = run_series(series, seeds, jobs, progress)
     if target:
         with whole_folder(target, "experiments") as folder:
-            _write(folder, series, seeds, rows)
+            write_results(folder, series, seeds, rows)
     print_result([row.row() for row in rows], as_json, lambda: _print(rows), target)
     return rows
 
 
-def _write(folder: Path, series: Series, seeds: int, rows: list[Comparison]) -> None:
+def write_results(folder: Path, series: Series, seeds: int, rows: list[Comparison]) -> None:
+    """Write table, report, figures and `experiments.json` of a document into a folder."""
     from hydrotele.show.experiment_report import write_experiment_report
 
     notes.print("writing report.html and figures ...", style="dim")
