@@ -110,8 +110,8 @@ def test_printed_parameters_give_some_of_the_printed_position_errors():
         assert values[f"{model}.calibrator.grapple"] < 1e-9
 
 
-def synthetic(case: str, scale: float, count: int, spread: float = 0.02) -> list[Sample]:
-    """Samples whose errors scatter by `spread` [m] about `scale` times the published ones."""
+def make_samples(case: str, scale: float, count: int, spread: float = 0.02) -> list[Sample]:
+    """Samples whose errors scatter by `spread` [m, rad] about `scale` times the published ones."""
     rng = np.random.default_rng(0)
     samples = []
     for _ in range(count):
@@ -119,17 +119,19 @@ def synthetic(case: str, scale: float, count: int, spread: float = 0.02) -> list
             n: scale * published_error(case, n) + spread * rng.standard_normal() for n in LENGTHS
         }
         values = {f"{case}.error.{n}": v for n, v in lengths.items()}
-        values |= {f"{case}.error.{n}": np.radians(scale * v)
-                   for n, v in zip(TWISTS, PUBLISHED_TWISTS[case], strict=True)}  # fmt: skip
+        values |= {
+            f"{case}.error.{n}": np.radians(scale * v) + spread * rng.standard_normal()
+            for n, v in zip(TWISTS, PUBLISHED_TWISTS[case], strict=True)
+        }
         values[f"{case}.largest"] = max(map(abs, lengths.values()))
         samples.append(Sample(values))
     return samples
 
 
 def test_table_4_agrees_with_its_own_errors_only():
-    assert judge_drift(synthetic("drift", 1.0, 40)).verdict == "agrees"
-    assert judge_drift(synthetic("drift", 3.0, 40)).verdict == "differs"
-    assert judge_drift(synthetic("drift", 0.0, BROKEN_REPETITIONS, 1e-9)).verdict == "differs"
+    assert judge_drift(make_samples("drift", 1.0, 40)).verdict == "agrees"
+    assert judge_drift(make_samples("drift", 3.0, 40)).verdict == "differs"
+    assert judge_drift(make_samples("drift", 0.0, BROKEN_REPETITIONS, 1e-9)).verdict == "differs"
 
 
 def test_iterations_have_to_grow_as_much_as_published():
