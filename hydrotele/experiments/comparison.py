@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 Kind = Literal["document", "caption", "input", "additional"]
-"""What a row compares with.
+"""Kind of a row.
 
 `document`: a sentence or figure of the document. `caption`: the document (or the part of it that is
 available) gives a title only, so that the row has a simulated value and no verdict. `input`: a
@@ -37,8 +37,8 @@ class Panel(NamedTuple):
         x_label: of the horizontal axis: quantity and unit.
         log: whether the vertical axis is logarithmic.
         discrete: whether the points are separate measurements, which are drawn as markers.
-        errors: legend -> (n,) differences that are drawn on an axis of their own below; to be used
-            where the curves coincide to the eye.
+        errors: legend -> (n,) differences, drawn on a separate axis below; for curves that
+            coincide to the eye.
         error_label: of that axis: quantity and unit.
     """
 
@@ -72,7 +72,7 @@ class Check(NamedTuple):
     """A simulated quantity with its 95 % interval, and the values that agree with the document.
 
     Attributes:
-        quantity: what it is, such as `RMS error of d0`.
+        quantity: name, such as `RMS error of d0`.
         value: estimate.
         low, high: 95 % confidence interval; both equal `value` where nothing is random.
         accepted: lowest and highest value that agree.
@@ -136,11 +136,11 @@ def _format(value: float) -> str:
 
 
 class Judgement(NamedTuple):
-    """What the samples say about a claim.
+    """The result of judging a claim by its samples.
 
     Attributes:
         checks: all of them have to agree; none where a caption is all that is published.
-        explanation: the measured reason for a difference, or what the agreement depends on.
+        explanation: the measured reason for a difference, or the conditions of the agreement.
         note: further simulated figures, which are not judged.
         unavailable: why the claim cannot be judged by these samples; empty where it can.
     """
@@ -164,13 +164,13 @@ class Judgement(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A row of the table: what is published, what is simulated, and whether both agree.
+    """A row of the table: published result, simulated result and verdict.
 
     Attributes:
         name: short, such as `straight line up`.
         item: table, figure, equation or section of the document, with its page.
         published: the document's sentence or figures.
-        kind: what the row compares with.
+        kind: see `Kind`.
         judgement: of the samples.
         panels: curves to draw.
         marginals: a posterior to draw.
@@ -222,7 +222,7 @@ Changes = Mapping[str, Any]
 
 
 class Sample(NamedTuple):
-    """What one repetition of an experiment measured.
+    """Measurements of one repetition of an experiment.
 
     Attributes:
         values: name -> figure, SI.
@@ -243,10 +243,10 @@ class Claim:
 
     Attributes:
         name: short, unique in its series.
-        quote: what the document states; a quoted sentence is verbatim. Of an additional claim,
-            what this project states.
+        quote: the document's statement; a quoted sentence is verbatim. Of an additional claim,
+            the statement of this project.
         item: table, figure, equation or section, with its page.
-        kind: what is compared with.
+        kind: see `Kind`.
         judge: samples of all repetitions -> judgement.
         broken: changes with which the claim must be judged `differs`; None where it has no verdict.
         broken_how: those changes in words.
@@ -323,7 +323,7 @@ class Series:
 
 
 Progress = Callable[[str, float], None]
-"""Called with the name of what is done and the fraction that is done."""
+"""Called with the name of the finished task and the finished fraction."""
 
 BROKEN_REPETITIONS = 6
 """Smallest number of failures in a row whose 95 % interval of the fraction is below one half."""
@@ -336,7 +336,7 @@ def run_series(
 
     Args:
         series: the document.
-        seeds: repetitions of every experiment; some have a smaller limit of their own.
+        seeds: repetitions of every experiment; some have a smaller limit.
         jobs: processes; as many as there are cores by default.
         progress: called after every repetition.
 
@@ -431,7 +431,7 @@ def run_tasks(
         jobs: processes; as many as there are cores by default.
 
     Yields:
-        What the functions return.
+        The results.
     """
     count = jobs or os.cpu_count() or 1
     if count == 1:

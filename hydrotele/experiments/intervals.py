@@ -36,7 +36,7 @@ def check_mean(
     """Check of a mean over repetitions.
 
     Args:
-        quantity: what it is.
+        quantity: its name.
         values: (n,) one per repetition; with n = 1 the interval is unbounded.
         accepted: lowest and highest value that agree.
         reason: where the accepted range comes from.
@@ -83,7 +83,7 @@ def check_statistic(
     """Check of any statistic of repetitions, such as a ratio of two RMS values.
 
     Args:
-        quantity: what it is.
+        quantity: its name.
         values: (n, ...) one row per repetition, so that what belongs together stays together.
         statistic: rows of repetitions -> number.
         accepted: lowest and highest value that agree.
@@ -110,7 +110,7 @@ def check_population(
     """Check whether a published figure of one experiment is a plausible repetition of ours.
 
     Args:
-        quantity: what is published.
+        quantity: name of the published figure.
         values: (n,) of our repetitions, n > 2.
         published: the document's figure, of one experiment.
         unit: of the figures, for the text.

@@ -1,7 +1,7 @@
 """Khoshzaban 1992: kinematic and dynamic calibration of a hydraulic arm, repeated in simulation.
 
 Chapters 2 and 3.3 to 3.6 are in `khoshzaban_machine`, section 3.7 in `khoshzaban_arm`, section 3.8
-in `khoshzaban_experiment`, chapter 4 in `khoshzaban_dynamics`, what the thesis proposes in
+in `khoshzaban_experiment`, chapter 4 in `khoshzaban_dynamics`, proposals of the thesis in
 `khoshzaban_outlook`.
 """
 

@@ -1,4 +1,4 @@
-"""Khoshzaban 1992: what the thesis proposes or leaves open, built and tried.
+"""Khoshzaban 1992: proposals and open points of the thesis.
 
 The spatial linkage of a cylinder with ball joints (section 3.4.4) and a noise model for flexible
 calibrator joints (section 5.3).
@@ -135,8 +135,7 @@ def judge_flexibility(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
     covered = check_mean(
         "fraction of the 95 % intervals that hold the truth", collect(samples, "modelled_covered"),
-        (0.85, 1.0), "95 %, less what a load that is modelled in another way than it was simulated"
-        " may cost: 10 %",
+        (0.85, 1.0), "95 %, less 10 %, because the simulated joints bend by another law than the modelled ones",
     )  # fmt: skip
     plain = float(np.mean(collect(samples, "plain_covered")))
     return Judgement(

@@ -15,7 +15,7 @@ def run_shipped(name: str, overrides: Mapping[str, str] | None = None) -> tuple[
 
 
 def true_channel(run: Run, channel: str) -> np.ndarray:
-    """(n,) of a true channel; zeros where nothing of the kind happened."""
+    """(n,) of a true channel; zeros if the run has no such channel."""
     return run.truth.columns.get(channel, np.zeros(len(run.truth.time)))
 
 
