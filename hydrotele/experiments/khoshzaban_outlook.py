@@ -135,7 +135,8 @@ def judge_flexibility(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
     covered = check_mean(
         "fraction of the 95 % intervals that hold the truth", collect(samples, "modelled_covered"),
-        (0.85, 1.0), "95 %, less 10 %, because the simulated joints bend by another law than the modelled ones",
+        (0.85, 1.0),
+        "95 %, less 10 %, because the simulated joints bend by another law than the modelled ones",
     )  # fmt: skip
     plain = float(np.mean(collect(samples, "plain_covered")))
     return Judgement(

@@ -132,8 +132,8 @@ def _judge_redundancy(samples: Sequence[Sample]) -> Judgement:
                     "1: both methods agree; 10 % as before"),
          _check_rhat(samples)),
         note=f"{format_values(samples, 'redundant', digits=0)} redundant parameters by QR; along"
-        f" {format_values(samples, 'weak', digits=0)} directions the data determine less than the prior"
-        " of 1 mm and 1 mrad",
+        f" {format_values(samples, 'weak', digits=0)} directions the data determine less than the"
+        " prior of 1 mm and 1 mrad",
     )  # fmt: skip
 
 
