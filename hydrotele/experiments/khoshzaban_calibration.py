@@ -220,7 +220,11 @@ def _compare_sensors(done: Calibration) -> Sample:
         {},
         [
             Panel(
-                "stick angle [deg]", pose, {"stick": np.degrees(stage.manipulator["stick"])}, "pose"
+                "stick angle [deg]",
+                pose,
+                {"stick": np.degrees(stage.manipulator["stick"])},
+                "pose [1]",
+                discrete=True,
             )
         ],
     )
@@ -230,7 +234,7 @@ def _compare_sensors(done: Calibration) -> Sample:
         panels.append(Panel(
             f"joint {5 + k}, {name} [deg]", pose,
             {"sensor": np.degrees(stage.theta[:, k]), "predicted": np.degrees(predicted[:, k])},
-            "pose", errors={"sensor less prediction": difference[:, k]},
+            "pose [1]", discrete=True, errors={"sensor less prediction": difference[:, k]},
             error_label="difference [deg]",
         ))  # fmt: skip
     return Sample(values, tuple(panels))
@@ -305,7 +309,7 @@ def _compare_ends(done: Calibration) -> Sample:
                     pose = np.arange(len(error), dtype=float)
                     panels += [
                         Panel(f"{end}'s end, {axis} [m]", pose,
-                              {"nominal": both[0][:, k], "re-identified": both[1][:, k]}, "pose",
+                              {"nominal": both[0][:, k], "re-identified": both[1][:, k]}, "pose [1]", discrete=True,
                               errors={"re-identified less nominal": error[:, k]},
                               error_label="difference [m]")
                         for k, axis in enumerate("xyz")
@@ -339,7 +343,7 @@ def _compare_distances(done: Calibration, tape: float, rng: np.random.Generator)
                     values[f"{key}.far"] = root_mean_square(error[far])
                     values[f"{key}.near"] = root_mean_square(error[~far])
     kept = {n: curves[n] for n in ("measurement", "nominal", "identified")}
-    panel = Panel("stick's end to the ball [m]", np.arange(1.0, _TAPED + 1.0), kept, "pose",
+    panel = Panel("stick's end to the ball [m]", np.arange(1.0, _TAPED + 1.0), kept, "pose [1]",
                   discrete=True, errors={n: kept[n] - kept["measurement"] for n in list(kept)[1:]},
                   error_label="error [m]")  # fmt: skip
     return Sample(values, (panel,))
@@ -375,7 +379,7 @@ def _identify_minor_links(
         error = np.degrees(computed - angle)
         values[f"{axis}.angle"] = float(np.std(error))
         panels.append(Panel(f"{axis}: error of the displacement [mm]",
-                            np.arange(len(length), dtype=float), residuals, "pose"))  # fmt: skip
+                            np.arange(len(length), dtype=float), residuals, "pose [1]", discrete=True))  # fmt: skip
     return Sample(values, tuple(panels))
 
 

@@ -1,6 +1,7 @@
 """The report of a published document: its results beside ours, with figures of print quality."""
 
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -21,6 +22,8 @@ _STYLES = (
 """Colour, line and marker of the curves, which a print without colour keeps apart."""
 _MAX_POINTS = 4000  # of a curve: more are not visible
 _INCHES = 1.9  # height of one pair of axes
+_LABEL = 24  # characters of a line beside an axis of that height
+_MANY = 60  # points, from which on markers are smaller
 
 
 class ReportFigure(NamedTuple):
@@ -96,7 +99,7 @@ def _caption(row: Comparison, what: str) -> str:
 def _describe(panels: Sequence[Panel]) -> str:
     labels = dict.fromkeys(panel.label.split(" [")[0] for panel in panels)
     across = dict.fromkeys(panel.x_label.split(" [")[0] for panel in panels)
-    return f"Simulated {', '.join(labels)} over {', '.join(across)}; first repetition."
+    return f"First repetition, over {', '.join(across)}: {'; '.join(labels)}."
 
 
 def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
@@ -129,12 +132,13 @@ def _draw_curves(place: "Axes", panel: Panel, error: bool) -> None:
     for label, curve in curves.items():
         colour, line, marker = _STYLES[order.index(label) % len(_STYLES)]
         look = (
-            {"ls": "none", "marker": marker, "ms": 4.0, "mfc": "none"} if panel.discrete
-            else {"ls": line, "lw": 1.2}
+            {"ls": "none", "marker": marker, "ms": 4.0 if len(curve) < _MANY else 2.0,
+             "mfc": "none"} if panel.discrete
+            else {"ls": "-" if error else line, "lw": 1.2}
         )  # fmt: skip
         place.plot(panel.x[::every], curve[::every], color=colour, label=label, **look)
     name, _, unit = (panel.error_label if error else panel.label).rpartition(" [")
-    place.set_ylabel(f"{name}\n[{unit}" if name else unit)
+    place.set_ylabel("\n".join([*textwrap.wrap(name, _LABEL), f"[{unit}"]) if name else unit)
     if panel.log and not error:
         place.set_yscale("log")
     if len(curves) > 1 or error:
