@@ -309,7 +309,8 @@ def _compare_ends(done: Calibration) -> Sample:
                     pose = np.arange(len(error), dtype=float)
                     panels += [
                         Panel(f"{end}'s end, {axis} [m]", pose,
-                              {"nominal": both[0][:, k], "re-identified": both[1][:, k]}, "pose [1]", discrete=True,
+                              {"nominal": both[0][:, k], "re-identified": both[1][:, k]},
+                              "pose [1]", discrete=True,
                               errors={"re-identified less nominal": error[:, k]},
                               error_label="difference [m]")
                         for k, axis in enumerate("xyz")
@@ -379,7 +380,8 @@ def _identify_minor_links(
         error = np.degrees(computed - angle)
         values[f"{axis}.angle"] = float(np.std(error))
         panels.append(Panel(f"{axis}: error of the displacement [mm]",
-                            np.arange(len(length), dtype=float), residuals, "pose [1]", discrete=True))  # fmt: skip
+                            np.arange(len(length), dtype=float), residuals, "pose [1]",
+                            discrete=True))  # fmt: skip
     return Sample(values, tuple(panels))
 
 
