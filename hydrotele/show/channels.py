@@ -30,6 +30,7 @@ TITLES: Mapping[str, str] = {
     "torque": "torque",
     "bristle": "force of friction's bristles, of the breakaway force",
     "contact_force": "contact force",
+    "object_contact": "contact force of an object",
     "length": "piston displacement",
     "piston_velocity": "piston velocity",
     "angle": "joint angle",
