@@ -123,7 +123,10 @@ def test_sign_of_the_feedback():
 
 @pytest.mark.parametrize("tool", ["none", "bucket", "grapple"])
 def test_every_axis_goes_where_it_is_told(tool):
-    """Small joint steps of both signs: 90 % done within a second; no axis runs away."""
+    """Small joint steps of both signs: 90 % done after a second; no axis runs away.
+
+    The boom rings at 2.5 Hz, so that the mean over one of its periods counts.
+    """
     machine = load_machine("cat215", tool)
     for sign in (1, -1):
         goal = {a: machine.home.get(x.joint, 0.0) + 0.05 * sign for a, x in machine.axes.items()}
@@ -134,7 +137,8 @@ def test_every_axis_goes_where_it_is_told(tool):
         )  # fmt: skip
         for axis, target in goal.items():
             way = target - run.truth[f"angle.{axis}"]
-            assert abs(way[-1]) < 0.1 * abs(way[0]), axis
+            last = run.truth.time > run.truth.time[-1] - 0.4
+            assert abs(way[last].mean()) < 0.1 * abs(way[0]), axis
             assert np.abs(way).max() < 1.5 * abs(way[0])
 
 
