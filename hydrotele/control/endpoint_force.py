@@ -266,7 +266,7 @@ def _are_outliers(left: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """Whether residuals (r, m - 1) of an equation are too large for their number, (r,)."""
     scale = np.median(np.abs(left[kept]), axis=0) / stats.norm.ppf(0.75)
     most = stats.norm.isf(0.25 / np.count_nonzero(kept))
-    return (np.abs(left) > most * scale).any(axis=1)
+    return np.asarray((np.abs(left) > most * scale).any(axis=1))
 
 
 WAITING, GOOD, BAD, SINGULAR = range(4)
