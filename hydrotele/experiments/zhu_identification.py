@@ -225,8 +225,8 @@ EXPERIMENTS: tuple[Experiment, ...] = (
               ' strong effect on the estimated parameters."', "p. 81", "document", judge_effect,
               {"failures": 0}, "no sensor fails"),
         Claim("outliers: removed before the estimation",
-              '"In our case, these outliers can be eliminated, and the estimation procedure'
-              ' repeated."', "p. 81", "document", judge_removal, {"remove": False},
+              'outliers of the residuals "can be eliminated, and the estimation procedure'
+              ' repeated"', "p. 81", "document", judge_removal, {"remove": False},
               "outliers are kept"),
     ), _RUNS),
     _convergence("excavator"),

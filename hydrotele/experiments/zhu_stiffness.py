@@ -293,8 +293,8 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     )),
     Experiment("theorem 4-2", measure_theorem, (make_claim(
         "theorem 4-2: stable, one crossing at most",
-        '"Under these conditions, the system is uniformly asymptotically stable. Further the'
-        ' trajectory on phrase plane can cross the x axis at most once."',
+        '"Under these conditions, the system is uniformly asymptotically stable"; the trajectory'
+        ' "can cross the x axis at most once"',
         "p. 55, Figs 4.26, 4.27", judge_theorem, {"damping": 0.3},
         "damping that is too small for the condition",
     ), make_claim(
