@@ -85,7 +85,7 @@ def test_what_a_model_lacks_is_not_taken_for_jitter(truth, tmp_path, name, place
 
 
 def test_jitter_that_another_lack_hides_is_found_with_it(truth, tmp_path):
-    """By the given machine an angle is read 150 ms late, and its errors hide what the clock does."""
+    """An angle delay of 150 ms, which the given machine has, hides the jitter."""
     wrong = apply_effect(load_machine("cat215"), "angle_delay", "boom", {"delay": 0.15})
     data = dataset(truth, wrong, tmp_path, JITTER)
     assert levels(data).jitter == 0.0
