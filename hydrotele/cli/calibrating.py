@@ -5,11 +5,10 @@ from typing import Annotated
 
 import typer
 
-from hydrotele.cli.help_page import HelpGroup
 from hydrotele.core.errors import InputError
 
 app = typer.Typer(
-    cls=HelpGroup, help="Calibrate the kinematics of a mechanism from measured poses.",
+    help="Calibrate the kinematics of a mechanism from measured poses.",
     no_args_is_help=True,
 )  # fmt: skip
 

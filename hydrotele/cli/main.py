@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer.core import TyperGroup
 
 from hydrotele.cli.calibrating import app as calibrate_app
-from hydrotele.cli.help_page import HelpGroup
 from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
 from hydrotele.cli.option_values import chosen, numbers_of, overrides_of
+from hydrotele.cli.overview import DESCRIPTION, format_overview
 from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
 from hydrotele.core.errors import InputError
 
@@ -99,7 +100,7 @@ def compare(
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
 ) -> None:
-    """Compare models by free runs on measured commands: RMS errors per channel and horizon."""
+    """Compare models by free runs on measured commands: RMS error per channel."""
     from hydrotele.cli.comparing import compare_models
 
     pass
@@ -169,7 +170,7 @@ def drive(
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
 ) -> None:
-    """Drive a machine yourself, in real time; write a folder as run does."""
+    """Drive a machine in real time; write a folder as `run` does."""
     from hydrotele.cli.driving import DriveOptions, drive_to_folder
 
     pass
@@ -238,16 +239,24 @@ def sweep(
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
 ) -> None:
-    """Do many runs of a scenario, varied by a grid or random samples, into one table."""
+    """Run variations of a scenario (grid or random samples) and collect one table."""
     from hydrotele.cli.running import SweepOptions, sweep_to_folder
 
     sweep_to_folder(file, out, SweepOptions(jobs, dask, fresh, retry_failed, strict, json))
 
 
+class OverviewGroup(TyperGroup):
+    """The program's commands, with the page of `cli.overview` as their help."""
+
+    def format_help(self, ctx, formatter) -> None:
+        """Print the page."""
+        typer.echo(format_overview())
+
+
 app = typer.Typer(
     name="hydrotele",
-    cls=HelpGroup,
-    help="Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo.",
+    cls=OverviewGroup,
+    help=DESCRIPTION,
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
@@ -255,7 +264,7 @@ app = typer.Typer(
 )
 
 analyse_app = typer.Typer(
-    cls=HelpGroup, help="Analyse by formula what others simulate.", no_args_is_help=True
+    help="Analyse a teleoperator by linear two-port theory.", no_args_is_help=True
 )
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(calibrate_app, name="calibrate")
@@ -301,7 +310,7 @@ def run(
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Simulate a scenario; write both logs, the rerun recording, the summary and the MJCF."""
+    """Simulate a scenario; write logs, a rerun recording, a summary and the MJCF."""
     from hydrotele.cli.running import run_to_folder
 
     run_to_folder(scenario, out, overrides_of(set_ or []) | chosen(machine, tool), review, json)
@@ -333,7 +342,7 @@ def replay(
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Drive the model with logged commands from the logged initial state; print the differences."""
+    """Drive the model with the commands of a log; print the prediction errors."""
     from hydrotele.cli.reviewing import replay_logs
 
     replay_logs(logs, machine, tool, timestep, out, json)
@@ -453,7 +462,7 @@ def identify(
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Identify masses, friction and hydraulics from measured logs; write the identified machine.
+    """Identify masses, friction and hydraulics from measured logs; write the machine.
 
     With --mjcf: any mechanism of hinges, slides and balls, its loops closed by connect and weld.
     """
@@ -502,7 +511,7 @@ def excite(
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Design the motion that tells a machine's parameters best, within its limits."""
+    """Design the most informative trajectory within a machine's limits."""
     from hydrotele.cli.identifying import excite_to_file
 
     excite_to_file(machine, tool, sensors, out, period, harmonics, starts, seed, cycles, json)
@@ -580,7 +589,7 @@ def review(
     ] = None,
     effects: EffectFiles = None,
 ) -> None:
-    """Look at a run: the machine moving in 3D, joints, pressures, flows and forces, in rerun."""
+    """Show a run in rerun: the machine in 3D, joints, pressures, flows and forces."""
     from hydrotele.cli.reviewing import review_logs
 
     review_logs(log, log2, machine, tool, out, serve, port, screenshot, plot)
@@ -595,7 +604,7 @@ def list_(
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """List what is shipped: machines, scenarios, sweeps, effects, environments, ..."""
+    """List what is shipped: machines, scenarios, sweeps, effects, environments."""
     from hydrotele.cli.catalogue import list_things
 
     list_things(what, json)
@@ -607,7 +616,7 @@ def validate(
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Check a machine, a joystick, a scenario, a sweep or a log; say what is wrong and where."""
+    """Check a machine, joystick, scenario, sweep or log; report errors and their place."""
     from hydrotele.cli.catalogue import validate_files
 
     validate_files(files, json)
@@ -649,7 +658,7 @@ def experiments(
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
     json: Json = False,
 ) -> None:
-    """Repeat the experiments of a published document and compare every table and figure.
+    """Repeat a published document's experiments; compare every table and figure.
 
     Each row states the published value, the simulated one with its 95 % interval, and a verdict:
     agrees, differs (with the measured reason), undecided, or cannot be computed.
@@ -677,11 +686,23 @@ def bench(
     run_benchmarks(save, compare, quick, json)
 
 
+@app.command("compile", epilog="Example:  hydrotele compile --jobs 4")
+def compile_functions(
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes to use; default one per core.")
+    ] = None,
+) -> None:
+    """Compile all numerical functions now, so that no later command waits for it."""
+    from hydrotele.core.compile_jobs import compile_all
+
+    compile_all(jobs)
+
+
 @app.command(epilog="Example:  hydrotele demo --out demo")
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("demo"),
 ) -> None:
-    """Run an excavator, replay its log, draw the pictures: a tour of what is there."""
+    """Run an excavator, replay its log, draw the pictures."""
     from hydrotele.cli.running import run_demo
 
     run_demo(out)

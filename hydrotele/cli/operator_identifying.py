@@ -34,7 +34,7 @@ def identify_operator(
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
 ) -> None:
-    """Fit the operator model to a person's tracking: delay, margins, neuromuscular lag, remnant."""
+    """Fit the operator model to a tracking log: delay, margins, lag, remnant."""
     import hydrotele
     from hydrotele.cli.console import notes, plain, print_json, write_json
     from hydrotele.core.output import check_target, whole_folder

@@ -34,7 +34,7 @@ def haptic_device(
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
 ) -> None:
-    """Serve a haptic device to a machine: poses out, wrenches in, with a watchdog."""
+    """Connect a haptic device to a machine: poses out, wrenches in, watchdog."""
     from hydrotele.cli.haptic import HapticOptions, serve_device
 
     serve_device(HapticOptions(kind, host, port, rate, duration, until_eof, json))
