@@ -20,7 +20,7 @@ from hydrotele.machine.machine import SensorError
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.inverse_dynamics import project
 from hydrotele.simulate.driven_chain import open_loop_errors
-from tools.blind import hexapod
+from tools.validation.blind import hexapod
 
 ARM = """\
 <mujoco model="arm"><compiler angle="radian"/><option timestep="0.001"/>

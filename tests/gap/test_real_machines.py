@@ -1,4 +1,7 @@
-"""The workflow on public records of real machines; a full run is `tools/real_machines.py`."""
+"""The workflow on public records of real machines.
+
+`tools/validation/real_machines.py` is the full run.
+"""
 
 import dataclasses
 import json
@@ -15,7 +18,13 @@ from hydrotele.gap.find import find_gap
 from hydrotele.logs.dataset import busiest, load_dataset
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import REAL, needs_real
-from tools.real_machines import FIRST_THREE_QUARTERS, PUSH, ec20_splits, force_error, pushed
+from tools.validation.real_machines import (
+    FIRST_THREE_QUARTERS,
+    PUSH,
+    ec20_splits,
+    force_error,
+    pushed,
+)
 
 pytestmark = needs_real
 

@@ -16,7 +16,7 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.closure import closed_chain
-from tools.identify_coverage import one_trial
+from tools.studies.identify_coverage import one_trial
 
 PERIOD = 20.0  # s, of the scenario `excitation`
 
@@ -91,7 +91,7 @@ def test_a_motion_with_another_period_is_refused(repeated, method):
 
 
 def test_intervals_of_repeated_experiments_cover_the_truth():
-    """Six of the three hundred of `tools/identify_coverage.py`."""
+    """Six of the three hundred of `tools/studies/identify_coverage.py`."""
     results = [one_trial(2026, number, "khoshzaban1992") for number in range(6)]
     away = np.array([z for r in results for z in r["away"].values()])
     # of some 140 intervals, 95 % each, fewer than 88 % cover in one of a thousand studies

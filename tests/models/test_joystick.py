@@ -114,7 +114,7 @@ def test_a_users_joystick_is_a_file_or_a_folder(tmp_path):
 
 @pytest.mark.parametrize("rate", ["1.0e-320", "1.0e9"])
 def test_a_control_rate_that_leaves_no_period_is_refused(tmp_path, rate):
-    """Found by tools/fuzz.py: its period was infinite."""
+    """Found by tools/validation/fuzz.py: its period was infinite."""
     shutil.copytree(models_folder() / "joystick", tmp_path / "own")
     file = tmp_path / "own" / "joystick.yaml"
     text = file.read_text()

@@ -1,4 +1,4 @@
-"""A small version of tools/random_commands.py (10^8 steps in full)."""
+"""A small version of tools/validation/random_commands.py (10^8 steps in full)."""
 
 import os
 import subprocess
@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-SCRIPT = ROOT / "tools" / "random_commands.py"
+SCRIPT = ROOT / "tools" / "validation" / "random_commands.py"
 
 
 def run(*arguments):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hydrotele.control.task_impedance import RecursiveLeastSquares
 from hydrotele.core.errors import InputError
-from tools.handle_laws import Detent, StiffnessFeedback
+from tools.studies.handle_laws import Detent, StiffnessFeedback
 
 # Zhu 1994, Tables 6.7 and 6.8, the excavator's x: stiffness 300 .. 4000 N/m at up to 50 kN
 AXIS = StiffnessFeedback(600.0, 300.0, 4000.0, (4000.0 - 600.0) / 50e3, 60.0, 50e3, 1.5e-3)

@@ -19,7 +19,7 @@ from hydrotele.teleop.master import (
     unpack_master,
     unpack_master_state,
 )
-from tools.handle_laws import Detent, StiffnessFeedback
+from tools.studies.handle_laws import Detent, StiffnessFeedback
 
 STICK = load_joystick()
 NAMES = ("r", "theta", "z", "attitude")

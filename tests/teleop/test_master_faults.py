@@ -9,7 +9,7 @@ from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.teleop.coils import three_stations
 from hydrotele.teleop.compliance import holding_wrench
 from hydrotele.teleop.master import master, master_step
-from tools.handle_laws import Detent
+from tools.studies.handle_laws import Detent
 
 JOYSTICK = load_joystick()
 COORDINATES = ("r", "theta", "z")

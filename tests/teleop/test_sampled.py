@@ -1,9 +1,7 @@
 """Sampled teleoperators with late and jittering packets: told by the analysis, seen in time."""
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,9 +22,7 @@ from hydrotele.teleop.sampled import (
 )
 from hydrotele.teleop.sampled_run import kick
 from hydrotele.teleop.two_port import STRUCTURES, Impedance
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-import stability_study  # noqa: E402 - a tool, found by the line above
+from tools.studies import stability_study
 
 CASE = load_teleop_case().case()
 PERIOD = 0.005
@@ -98,7 +94,7 @@ def test_growth_is_that_of_a_periods_matrix(forward, back, force):
 
 
 def test_random_cases_are_told_right():
-    """A small version of tools/stability_study.py, half of it aimed at the limits.
+    """A small version of tools/studies/stability_study.py, half of it aimed at the limits.
 
     With 98 % right, 80 answers have more than 6 wrong ones in one of 700 such tests.
     """

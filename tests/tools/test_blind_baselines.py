@@ -6,7 +6,7 @@ import pytest
 from hydrotele.effects import EFFECTS
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine
-from tools.blind.baselines import (
+from tools.validation.blind.baselines import (
     changed,
     errors,
     floor,
@@ -15,8 +15,8 @@ from tools.blind.baselines import (
     table,
     world_prediction,
 )
-from tools.blind.world import PA, Q, S, W
-from tools.blind.world_runs import Noise, nominal_world, record_run, references
+from tools.validation.blind.world import PA, Q, S, W
+from tools.validation.blind.world_runs import Noise, nominal_world, record_run, references
 
 CAT = load_machine("cat215")
 

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from tools.blind import hexapod
+from tools.validation.blind import hexapod
 
 
 def test_a_load_lies_where_the_key_says():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tools.blind.judge import judge
-from tools.blind.score import closure, floor_scatter, score, share, swapped
+from tools.validation.blind.judge import judge
+from tools.validation.blind.score import closure, floor_scatter, score, share, swapped
 
 
 def effect(name, location, probability=0.95, alternatives=(), value=1.0, ci=(0.5, 1.5)):

@@ -20,17 +20,24 @@ import pytest
 
 from hydrotele.effects import EFFECTS
 from hydrotele.machine.machine_file import load_machine
-from tools import blind_trials
-from tools.blind.draw import SMALLEST, Planted, draw_double, draw_effect, draw_outside, with_effects
-from tools.blind.generate import make_trial
-from tools.blind.motions import motions
-from tools.blind.outside import OUTSIDE
-from tools.blind.plant import record
-from tools.blind.trials import Place, Series
-from tools.blind.visibility import visibility
+from tools.validation import blind_trials
+from tools.validation.blind.draw import (
+    SMALLEST,
+    Planted,
+    draw_double,
+    draw_effect,
+    draw_outside,
+    with_effects,
+)
+from tools.validation.blind.generate import make_trial
+from tools.validation.blind.motions import motions
+from tools.validation.blind.outside import OUTSIDE
+from tools.validation.blind.plant import record
+from tools.validation.blind.trials import Place, Series
+from tools.validation.blind.visibility import visibility
 
 ROOT = Path(__file__).parents[2]
-SCRIPT = ROOT / "tools" / "blind_trials.py"
+SCRIPT = ROOT / "tools" / "validation" / "blind_trials.py"
 MACHINE = load_machine("cat215", tool="none")
 
 

@@ -16,15 +16,21 @@ from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log, save_log
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import TRUTH
-from tools.blind.forms import FORMS
-from tools.blind.open_loop import open_loop_error
-from tools.blind.spreads import SIZES, draw_library_effect, off_everywhere
-from tools.blind.trials import Place
-from tools.blind.world import PA, PB, STATES, Q, R, S, W, simulate
-from tools.blind.world_judge import closed, judge_world, score_world
-from tools.blind.world_machine import channels
-from tools.blind.world_runs import Noise, nominal_world, record_run, references, visibility
-from tools.blind.world_trials import (
+from tools.validation.blind.forms import FORMS
+from tools.validation.blind.open_loop import open_loop_error
+from tools.validation.blind.spreads import SIZES, draw_library_effect, off_everywhere
+from tools.validation.blind.trials import Place
+from tools.validation.blind.world import PA, PB, STATES, Q, R, S, W, simulate
+from tools.validation.blind.world_judge import closed, judge_world, score_world
+from tools.validation.blind.world_machine import channels
+from tools.validation.blind.world_runs import (
+    Noise,
+    nominal_world,
+    record_run,
+    references,
+    visibility,
+)
+from tools.validation.blind.world_trials import (
     KINDS,
     Drawn,
     WorldSeries,
@@ -359,7 +365,12 @@ def test_a_series_is_stamped_goes_on_and_is_summarised(tmp_path):
     stub, out = tmp_path / "stub.py", tmp_path / "series"
     stub.write_text(STUB)
     root = Path(__file__).parents[2]
-    command = [sys.executable, str(root / "tools" / "blind_world.py"), "--out", str(out)]
+    command = [
+        sys.executable,
+        str(root / "tools" / "validation" / "blind_world.py"),
+        "--out",
+        str(out),
+    ]
     asked = ["--kinds", "clean:1,near:1", "--seconds", "4", "--workflow", sys.executable, str(stub)]
     done = subprocess.run(
         [*command, *asked], env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"}, cwd=root,

@@ -1,10 +1,13 @@
-"""A few damaged files of every kind end in one sentence; `tools/fuzz.py` tries thousands."""
+"""A few damaged files of every kind end in one sentence.
+
+`tools/validation/fuzz.py` tries thousands.
+"""
 
 from collections import Counter
 
 import pytest
 
-from tools import fuzz
+from tools.validation import fuzz
 
 
 @pytest.mark.nightly

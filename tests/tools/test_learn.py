@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="the extra `learn` is not installed")
 
-from tools import learn  # noqa: E402 - after the skip
+from tools.studies import learn  # noqa: E402 - after the skip
 
 
 def test_a_policy_is_learned_written_read_back_and_compared(tmp_path, monkeypatch, capsys):

@@ -1,0 +1,95 @@
+"""Page about the environments, from their own facts.
+
+python tools/release/environments_page.py --out docs/environments.md
+"""
+
+from hydrotele.envs.core import set_up
+from hydrotele.envs.episode import ACTIONS
+from hydrotele.envs.facts import TaskSetup
+from hydrotele.envs.making import TASKS
+from hydrotele.envs.task import Options, Task
+from tools.studies.study import options, publish
+
+COMMON = """\
+Every environment is `gymnasium.make("hydrotele/NAME-v0", **options)` after `import
+hydrotele.envs`, batched with `gymnasium.make_vec(..., vectorization_mode="vector_entry_point")`,
+and for dm_control `hydrotele.envs.dm.load("NAME", **options)`.
+
+**Observation**: a `Box` of float32 in SI; each number is named in
+`env.unwrapped.core.setup.fields`. Readings saturate at the ends of the box.
+`gymnasium.wrappers.RescaleObservation(env, -1, 1)` brings all to the same size.
+
+**Action**: a `Box` from -1 to 1 per driven axis; beyond it counts as full. `action="valve"`
+commands the valves; `"joint_rate"` asks for rates of the axes, `"resolved_motion"` for rates of
+the tip (r, theta, z, attitude, head), both followed by the joint servo at 200 Hz with bounded
+acceleration.
+
+**Episode**: `truncated` when its duration is over; `terminated` where the task says so, or if the
+simulation became unstable (`info["fault"]`, never seen in ten million random steps).
+`reset(seed=...)` gives the same bits again, alone, batched, on any number of threads; a batch's
+environment i has the seed of the first one plus i.
+
+**Info**: the task's figures, below; `variant`: which machine and start of those drawn
+(`env.unwrapped.core.setup.variants`).
+
+**Options** of all:
+"""
+
+
+def main() -> None:
+    publish(page(), "Environments", options(__doc__))
+
+
+def page() -> str:
+    sections = [_section(task) for task in TASKS.values()]
+    return "\n\n".join([COMMON + _options(), *sections]) + "\n"
+
+
+def _options() -> str:
+    """The attributes of Options in its docstring, as a list."""
+    lines = (Options.__doc__ or "").partition("Attributes:\n")[2].rstrip().splitlines()
+    joined: list[str] = []
+    for line in lines:
+        if line.startswith(" " * 8 + " "):
+            joined[-1] += " " + line.strip()
+        elif line.strip():
+            joined.append(line.strip())
+    defaults = Options()
+    items = (line.partition(": ") for line in joined)
+    rows = [f"| `{name}` | {what} | `{getattr(defaults, name)!r}` |" for name, _, what in items]
+    return "\n| option | what | default |\n| --- | --- | --- |\n" + "\n".join(rows)
+
+
+def _section(task: Task) -> str:
+    setup = set_up(task, Options(variants=1))
+    lines = [
+        f"## {task.name}",
+        "",
+        f"{task.sentence} {task.reward}",
+        "",
+        f"Machine `{task.machine}`, tool `{setup.machine.tool}`, {setup.options.duration:g} s,"
+        f' `action="{setup.options.action}"` by default.',
+        f"Info: {', '.join(f'`{name}` [{unit}]' for name, unit in task.measures)}.",
+        "",
+        f"Actions: {'; '.join(_actions(setup, kind) for kind in ACTIONS)}.",
+        "",
+        "| observation | unit | from | to |",
+        "| --- | --- | --- | --- |",
+    ]
+    lines += [
+        f"| {field.name} | {field.unit} | {field.low:.4g} | {field.high:.4g} |"
+        for field in setup.fields
+    ]
+    return "\n".join(lines)
+
+
+def _actions(setup: TaskSetup, kind: str) -> str:
+    names = list(setup.axes)
+    if kind == "resolved_motion":
+        names[: setup.arm_axes] = ["r", "theta", "z", "attitude", "head"][: setup.arm_axes]
+        return f"`{kind}` {', '.join(names)}"
+    return f"`{kind}` {', '.join(names)}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""Six moments of a felled tree in one PNG: `python tools/studies/felling_picture.py RUN_FOLDER PICTURE`.
+
+Needs OpenGL without a screen: MUJOCO_GL=egl or osmesa.
+"""
+
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from PIL import Image
+
+from hydrotele.logs.log import load_log
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.show.pose import (
+    logged_joints,
+    logged_positions,
+    logged_surroundings,
+    model_with_looks,
+)
+
+MOMENTS = (11.0, 29.0, 38.0, 60.0, 74.0, 85.5)  # s
+SIZE = (560, 420)
+COLUMNS = 3
+
+folder, picture = Path(sys.argv[1]), Path(sys.argv[2])
+machine, log = load_machine(folder / "machine.yaml"), load_log(folder / "truth.parquet")
+model = model_with_looks(machine, surroundings=logged_surroundings(log))
+rows = np.searchsorted(log.time, MOMENTS)
+positions = logged_positions(machine, model, logged_joints(machine, log), log)[rows]
+data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (4.0, 1.5, 3.2), 18, 125, -12
+renderer = mujoco.Renderer(model, SIZE[1], SIZE[0])
+whole = Image.new("RGB", (COLUMNS * SIZE[0], len(MOMENTS) // COLUMNS * SIZE[1]))
+for number, qpos in enumerate(positions):
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    renderer.update_scene(data, camera)
+    place = (number % COLUMNS * SIZE[0], number // COLUMNS * SIZE[1])
+    whole.paste(Image.fromarray(renderer.render()), place)
+renderer.close()
+whole.quantize(96).save(picture, optimize=True)

@@ -1,0 +1,219 @@
+"""Study of the hybrid robot's calibration: tables of docs/results/kinematic_calibration.md.
+
+Usage: python tools/studies/hybrid_calibration_study.py [--trials 200] [--part coverage ...]
+"""
+
+import argparse
+import time
+
+import numpy as np
+
+from hydrotele.calibrate.hybrid import Equations, calibrate, equations, informative_poses, subset
+from hydrotele.calibrate.hybrid_data import measurement_of_wires
+from hydrotele.calibrate.posterior import sample_posterior
+from hydrotele.experiments.wang_robots import (
+    SENSOR_NOISE,
+    pose_errors_at_test_poses,
+    simulate_robot,
+)
+from hydrotele.kinematics.hybrid import (
+    corrected,
+    document_parameters,
+    error_model,
+    forward,
+    load_hybrid,
+)
+from hydrotele.kinematics.wires import wire_lengths
+from hydrotele.simulate.hybrid import (
+    manufactured_errors,
+    measured_poses,
+    random_poses,
+    shipped_wires,
+)
+
+IWR = load_hybrid("iwr")
+DOCUMENT = document_parameters(error_model(IWR, "dh"))
+PARTS = ("coverage", "all54", "noise", "poses", "choice", "posterior", "speed")
+
+
+def coverage(trials: int) -> None:
+    """Bias, standard deviation and 95 % intervals of the 36 parameters."""
+    found, truth, deviations, inside, before, after = [], [], [], [], [], []
+    for seed in range(trials):
+        one = simulate_robot(3000 + seed, 25)
+        fit = (done := calibrate(IWR, one.measurement, "dh", DOCUMENT)).fit
+        at = one.model.index(fit.names)
+        found.append(fit.values)
+        truth.append(one.errors[at])
+        deviations.append(fit.deviations)
+        low, high = fit.intervals.T
+        inside.append((one.errors[at] > low) & (one.errors[at] < high))
+        before.append(pose_errors_at_test_poses(one, IWR)[0])
+        after.append(pose_errors_at_test_poses(one, done.robot)[0])
+    away = (np.array(found) - truth) / np.array(deviations)
+    share = np.mean(inside, axis=0)
+    bias = away.mean(axis=0) * np.sqrt(trials)
+    print(f"{trials} trials, 36 parameters, 25 poses")
+    print(
+        f"95 % intervals hold {100 * np.mean(inside):.2f} % of the planted errors;"
+        f" per parameter {100 * share.min():.1f} to {100 * share.max():.1f} %"
+    )
+    print(
+        f"bias over its standard error: largest {np.abs(bias).max():.2f} of 36;"
+        f" standard deviation over the stated one {away.std(axis=0).min():.3f} to"
+        f" {away.std(axis=0).max():.3f}"
+    )
+    _print_test_errors(before, after)
+
+
+def _print_test_errors(before, after) -> None:
+    rms = [1e3 * np.sqrt(np.mean(np.square(e), axis=1)) for e in (before, after)]
+    largest = 1e3 * np.max(after, axis=1)
+    print(
+        f"25 poses not used: RMS {np.median(rms[0]):.2f} mm before (least {rms[0].min():.2f}),"
+        f" {np.median(rms[1]):.4f} mm after (largest trial {rms[1].max():.4f}); largest single"
+        f" pose: median {np.median(largest):.4f}, of all {largest.max():.4f} mm; trials with every"
+        f" pose below 0.1 mm: {100 * np.mean(largest < 0.1):.1f} %"
+    )
+
+
+def all54(trials: int) -> None:
+    """The same with errors in all 54 parameters: the independent combinations."""
+    for kind in ("dh", "poe"):
+        inside, chi, before, after, ranks = [], [], [], [], set()
+        for seed in range(trials):
+            one = simulate_robot(4000 + seed, 25, kind, document=False)
+            done = calibrate(IWR, one.measurement, kind)
+            fit, told = done.fit, done.fit.told
+            row = told.combination
+            estimate = row @ fit.values
+            size = np.sqrt(np.einsum("ij,jk,ik->i", row, fit.covariance, row))
+            inside.append(np.abs(estimate - row @ one.errors) < fit.critical * size)
+            chi.append(fit.chi)
+            ranks.add(done.redundancy.rank)
+            before.append(pose_errors_at_test_poses(one, IWR)[0])
+            after.append(pose_errors_at_test_poses(one, done.robot)[0])
+        print(
+            f"{trials} trials, {kind}, 54 planted, rank {ranks}: 95 % intervals of the"
+            f" combinations hold {100 * np.mean(inside):.2f} %; chi {np.mean(chi):.3f}"
+        )
+        _print_test_errors(before, after)
+
+
+def noise(trials: int) -> None:
+    """Error at poses not used against the noise of all sensors."""
+    print(
+        "| noise of all sensors | RMS at poses not used, mm | largest, mm |\n| --- | ---: | ---: |"
+    )
+    for factor in (0.25, 0.5, 1.0, 2.0, 4.0):
+        errors = []
+        for seed in range(trials):
+            one = simulate_robot(5000 + seed, 25, noise=factor)
+            done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
+            errors.append(pose_errors_at_test_poses(one, done.robot)[0])
+        print(
+            f"| {factor:g} x | {1e3 * np.sqrt(np.mean(np.square(errors))):.4f} |"
+            f" {1e3 * np.max(errors):.4f} |"
+        )
+
+
+def poses(trials: int) -> None:
+    """Error at poses not used against the number of poses."""
+    print("| poses | 36 parameters, RMS mm | 50 of 54, RMS mm | seconds per calibration |")
+    print("| ---: | ---: | ---: | ---: |")
+    for count in (15, 20, 25, 50, 100, 200):
+        errors, whole, took = [], [], 0.0
+        for seed in range(trials):
+            one = simulate_robot(6000 + seed, count)
+            begin = time.process_time()
+            done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
+            took += time.process_time() - begin
+            errors.append(pose_errors_at_test_poses(one, done.robot)[0])
+            other = simulate_robot(6500 + seed, count, document=False)
+            whole.append(
+                pose_errors_at_test_poses(other, calibrate(IWR, other.measurement, "dh").robot)[0]
+            )
+        sizes = [1e3 * np.sqrt(np.mean(np.square(e))) for e in (errors, whole)]
+        print(f"| {count} | {sizes[0]:.4f} | {sizes[1]:.4f} | {took / trials:.2f} |")
+
+
+def choice(trials: int) -> None:
+    """Chosen poses against random ones, 20 of 200."""
+    wires, model = shipped_wires(), error_model(IWR, "dh")
+    errors: dict[str, list] = {"random": [], "D": [], "O1": [], "O3": [], "O5": []}
+    for seed in range(trials):
+        rng = np.random.default_rng([77, seed])
+        planted = manufactured_errors(model, rng)
+        built = corrected(model, planted)
+        joints, legs = random_poses(IWR, 200, rng, wires)
+        lengths = wire_lengths(wires, forward(IWR, joints, legs))
+        exact = measurement_of_wires(IWR, joints, legs, lengths, wires, SENSOR_NOISE, "candidates")
+        unused = random_poses(IWR, 50, rng, wires)
+        for name, found in errors.items():
+            places = (np.arange(20) if name == "random"
+                      else informative_poses(model, exact, 20, name))  # fmt: skip
+            read = measured_poses(built, joints[places], legs[places], wires, SENSOR_NOISE, rng)
+            measured = measurement_of_wires(
+                IWR, read.joints, read.legs, read.wires, wires, SENSOR_NOISE, name
+            )
+            robot = calibrate(IWR, measured, "dh").robot
+            away = forward(robot, *unused).position - forward(built, *unused).position
+            found.append(np.linalg.norm(away, axis=1))
+    print("| 20 poses | RMS at 50 poses not used, mm | largest, mm |\n| --- | ---: | ---: |")
+    for name, found in errors.items():
+        print(
+            f"| {name} | {1e3 * np.sqrt(np.mean(np.square(found))):.4f} |"
+            f" {1e3 * np.max(found):.4f} |"
+        )
+
+
+def posterior(trials: int) -> None:
+    """Whether posteriors of MCMC hold the planted errors."""
+    inside, agree = [], []
+    for seed in range(trials):
+        one = simulate_robot(7000 + seed, 25)
+        done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
+        eq, fit = subset(done), done.fit
+        sample = sample_posterior(
+            lambda x, eq=eq: -eq.misfit(x), fit.values, fit.covariance, eq.names, steps=4000,
+            burn=500, seed=seed,
+        )  # fmt: skip
+        low, high = sample.intervals.T
+        truth = one.errors[one.model.index(fit.names)]
+        inside.append((truth > low) & (truth < high))
+        agree.append(np.abs(sample.mean - fit.values) / fit.deviations)
+    print(
+        f"{trials} trials of MCMC: central 95 % hold {100 * np.mean(inside):.1f} % of the planted"
+        f" errors; means differ from least squares by at most {np.max(agree):.2f} deviations"
+    )
+
+
+def speed(trials: int) -> None:
+    """Time of 1e5 likelihoods of the 54-parameter models on one core."""
+    rng = np.random.default_rng(0)
+    print("| model | poses | 1e5 likelihoods, CPU seconds of one core |\n| --- | ---: | ---: |")
+    for kind in ("dh", "poe"):
+        for count in (25, 50, 100, 200):
+            one = simulate_robot(8000, count, kind, document=False)
+            eq: Equations = equations(error_model(IWR, kind), one.measurement)
+            values = rng.normal(size=(100, 54)) * eq.scales
+            eq.misfit(values)
+            begin = time.process_time()
+            for _ in range(100):
+                eq.misfit(values)
+            print(f"| {kind} | {count} | {10 * (time.process_time() - begin):.2f} |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
+    chosen = parser.parse_args()
+    for part in chosen.part:
+        print(f"\n### {part}", flush=True)
+        share = {"coverage": 1, "all54": 2, "posterior": 20}.get(part, 10)
+        globals()[part](max(1, chosen.trials // share))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Khoshzaban's cross-validation: complete, reduced and given model on motions that were not fitted.
+
+    python tools/studies/identify_cross_validation.py MEASURED [--trials 10] [--seed 1] [--jobs 2]
+        [--out docs/results/identify_cross_validation.md]
+
+Each of `excitation` and `excitation_fast` of the CAT 215, recorded with its sensors' noise, is
+fitted and judged on the other one: RMS of measured less predicted force. The given machine's
+masses, centres of mass, inertia and friction are off by up to 15 %, drawn anew in every trial.
+MEASURED is the folder of the independent simulator's logs: there the same is done with its clean
+data, each run held out in turn.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hydrotele.identify.identification import identify_dynamics
+from hydrotele.identify.record import IdentificationRecord, records
+from hydrotele.identify.result import Identification
+from hydrotele.identify.setup import machine_setup
+from hydrotele.logs.dataset import load_dataset, make_dataset
+from hydrotele.logs.files import RunFiles
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
+from hydrotele.simulate.closure import closed_chain
+from tools.studies.identify_coverage import wrong_setup
+from tools.studies.study import options, publish, side_by_side
+
+MOTIONS, SENSORS, CLEAN = ("excitation", "excitation_fast"), "khoshzaban1992", "open_04"
+THESIS = {  # Khoshzaban 1992, cross-validation of the CAT 215's models
+    "swing": (3720.0, 4720.0, 12200.0), "boom_rod": (5860.0, 5500.0, 39200.0),
+    "stick_rod": (8700.0, 11900.0, 14600.0),
+}  # fmt: skip
+Errors = dict[str, tuple[float, float, float, float]]  # of a drive: complete, reduced, given, noise
+
+
+def judged(
+    machine: Machine, fit: Sequence[IdentificationRecord], heldout: IdentificationRecord, rng
+) -> Errors:
+    """Errors of the three models on a run."""
+    chain, found = closed_chain(machine), []
+    state = rng.bit_generator.state
+    for model in ("complete", "reduced"):
+        rng.bit_generator.state = state  # both start from the same wrong machine
+        found.append(
+            identify_dynamics(fit, heldout, wrong_setup(machine_setup(machine, chain, model), rng))
+        )
+    complete, reduced = found
+    return {drive: _errors(complete, reduced, drive) for drive in complete.heldout}
+
+
+def _errors(complete: Identification, reduced: Identification, drive: str):
+    one, other = complete.heldout[drive], reduced.heldout[drive]
+    return one.rms, other.rms, one.nominal_rms, one.noise_rms
+
+
+def one_trial(seed: int, number: int) -> list[Errors]:
+    """Errors on either motion, fitted on the other."""
+    machine, rng = load_machine("cat215"), np.random.default_rng([seed, number])
+    files = []
+    for name in MOTIONS:
+        own = {"seed": str(int(rng.integers(2**31))), "sensors": SENSORS}
+        files.append(RunFiles(name, (run_scenario(load_scenario(name, own)).measured,)))
+    out = []
+    for name in MOTIONS:
+        fit, heldout, _ = records(make_dataset(files, machine, SENSORS, name))
+        out.append(judged(machine, fit, heldout, rng))
+    return out
+
+
+def independent(folder: Path, seed: int) -> list[Errors]:
+    """Errors on every run of the clean logs, held out in turn."""
+    machine, rng, out = load_machine("cat215"), np.random.default_rng([seed]), []
+    data = load_dataset([folder], machine)
+    for name in sorted(run.name for run in (*data.fit, data.heldout)):
+        fit, heldout, _ = records(load_dataset([folder], machine, heldout=name))
+        out.append(judged(machine, fit, heldout, rng))
+    return out
+
+
+def rows(results: Sequence[Errors]) -> list[str]:
+    """RMS over results, drive by drive."""
+    lines = [
+        "| force of | complete | reduced | as given | noise alone | complete over noise |"
+        " given over complete |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for drive in results[0]:
+        found = np.sqrt(np.mean([np.square(r[drive]) for r in results], axis=0))
+        lines.append(
+            f"| {drive} | " + " | ".join(f"{v:.0f}" for v in found)
+            + f" | {found[0] / found[3]:.2f} | {found[2] / found[0]:.0f} |"
+        )  # fmt: skip
+    return lines
+
+
+def report(trials: Sequence[list[Errors]], measured: Sequence[Errors]) -> str:
+    """All tables in Markdown."""
+    return "\n".join([
+        "N m for the swing, N for the cylinders.", "",
+        f"Simulated here, {len(trials)} trials:", "", *rows([e for found in trials for e in found]),
+        "", f"The independent simulator's clean logs ({CLEAN}), each run held out in turn:", "",
+        *rows(measured), "",
+        "The thesis' excavator (all frequencies, its own noise and nominal model):", "",
+        "| force of | complete | reduced | nominal |", "| --- | ---: | ---: | ---: |",
+        *(f"| {d} | {c:.0f} | {r:.0f} | {n:.0f} |" for d, (c, r, n) in THESIS.items()), "",
+    ])  # fmt: skip
+
+
+if __name__ == "__main__":
+    asked = options(__doc__, "measured", trials=10, seed=1, jobs=2)
+    found = side_by_side(one_trial, asked)
+    text = report(found, independent(asked.measured / CLEAN, asked.seed))
+    publish(text, "Cross-validation", asked)

@@ -1,0 +1,57 @@
+"""Judge every criterion of a document by runs that are deliberately broken.
+
+    python tools/validation/break_experiments.py NAME [--only "ROW,ROW"] [--jobs 2] [--out FILE]
+
+NAME is a document, such as zhu1994. A row that does not say `differs` has a criterion that cannot
+fail in the way that it should: exit status 1.
+"""
+
+import argparse
+import sys
+
+from hydrotele.experiments.comparison import break_series
+from tools.studies.experiment_seeds import import_series, report_progress
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("name")
+    parser.add_argument("--only", default="", help="rows, separated by commas; all by default")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", help="Markdown file to write")
+    arguments = parser.parse_args()
+
+    series = import_series(arguments.name)
+    names = [name.strip() for name in arguments.only.split(",") if name.strip()]
+    unknown = set(names) - set(series.claims)
+    if unknown:
+        parser.error(f"no row {unknown.pop()!r}; valid: {', '.join(series.claims)}")
+    judged = break_series(series, names, arguments.jobs, report_progress)
+
+    lines = [
+        f"# Broken runs of {arguments.name}", "",
+        f"`python tools/validation/break_experiments.py {arguments.name}`", "",
+        "Every row is judged by runs with a planted fault, up to six repetitions.", "",
+        "| row | fault | simulated with the fault | verdict |", "| --- | --- | --- | --- |",
+    ]  # fmt: skip
+    for claim, row in judged:
+        cells = (claim.name, claim.broken_how, row.simulated, row.verdict)
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    failed = [claim.name for claim, row in judged if row.verdict != "differs"]
+    lines += ["", f"{len(judged) - len(failed)} of {len(judged)} rows say differs.", ""]
+    unbroken = [name for name, claim in series.claims.items() if claim.broken is None]
+    if unbroken and not names:
+        lines += [f"Rows without a verdict have no fault: {', '.join(unbroken)}.", ""]
+    text = "\n".join(lines)
+    print(text)
+    if arguments.out:
+        with open(arguments.out, "w", encoding="utf-8") as file:
+            file.write(text)
+    if failed:
+        sys.exit(f"no difference found: {', '.join(failed)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Random actions for millions of steps: no NaN, no warning, observations inside their spaces.
+
+    python tools/validation/env_soak.py --steps 10000000 --out docs/results/env_soak.md
+
+The steps are shared by all tasks, kinds of actions and sensors.
+"""
+
+import time
+import warnings
+
+import gymnasium
+import numpy as np
+
+import hydrotele.envs
+from hydrotele.envs.episode import ACTIONS
+from tools.studies.study import options, publish
+
+
+def main() -> None:
+    asked = options(__doc__, steps=10_000_000, batch=1024, seed=20261121, hold=5)
+    warnings.simplefilter("error")
+    cases = [
+        (name, action, sensors)
+        for name in hydrotele.envs.TASK_NAMES
+        for action in ACTIONS
+        for sensors in ("ideal", "real")
+    ]
+    each = -(-asked.steps // (len(cases) * asked.batch))
+    rows = [_soak(*case, each, asked) for case in cases]
+    lines = [
+        "Uniform actions, held for a number of steps that is itself drawn; observations are tested"
+        " against their space after every step, and what would have left it is counted before it"
+        " saturates.\n",
+        "| task | actions | sensors | steps | episodes | not finite | outside the space | MuJoCo's"
+        " warnings | unstable | saturated readings | physics steps/s |",
+        "| " + " | ".join(["---"] * 11) + " |",
+        *["| " + " | ".join(row) + " |" for row in rows],
+        f"\n{sum(int(row[3].replace(',', '')) for row in rows):,} environment steps in all.",
+    ]
+    publish("\n".join(lines) + "\n", "Random actions in every environment", asked)
+
+
+def _soak(name: str, action: str, sensors: str, steps: int, asked) -> list[str]:
+    env = gymnasium.make_vec(
+        f"hydrotele/{name}-v0", asked.batch, "vector_entry_point", action=action, sensors=sensors
+    )
+    core = env.unwrapped.core  # pyright: ignore
+    chance, space = np.random.default_rng(asked.seed), env.observation_space
+    seen, _ = env.reset(seed=asked.seed)
+    chosen = chance.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+    infinite = outside = 0
+    begin = time.perf_counter()
+    for _ in range(steps):
+        fresh = chance.random(asked.batch) < 1.0 / asked.hold
+        drawn = chance.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+        chosen[fresh] = drawn[fresh]
+        seen, reward, *_ = env.step(chosen)
+        infinite += int(not (np.isfinite(seen).all() and np.isfinite(reward).all()))
+        outside += int(not space.contains(seen))
+    speed = steps * asked.batch * 1000.0 / core.setup.options.control_rate
+    speed /= time.perf_counter() - begin
+    memory = core.episodes
+    row = [name, action, sensors, f"{steps * asked.batch:,}", f"{memory['episode'].sum():,}"]
+    row += [str(infinite), str(outside), str(memory["warnings"].sum())]
+    row += [str(memory["faults"].sum()), f"{memory['saturated'].sum():,}", f"{speed:,.0f}"]
+    print(" ".join(row), flush=True)
+    env.close()
+    return row
+
+
+if __name__ == "__main__":
+    main()

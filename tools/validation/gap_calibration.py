@@ -1,0 +1,153 @@
+"""Calibrate the thresholds of gap finding on simulated clean machines.
+
+    python tools/validation/gap_calibration.py --out runs/clean --trials 100 --pulls 30
+    python tools/validation/gap_calibration.py --out runs/clean            # goes on after a kill
+
+Makes the clean trials of a series (the motions, noise and sensors of the blind trials, nothing
+planted), and notes of each: the best score that any effect reaches, the residual tests of the given
+model, and for some of them every effect's estimate over its stated spread, which a perfect model
+would leave at a standard deviation of 1. Writes `calibration.json` and `calibration.md`.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from hydrotele.estimate.evidence import Evidence
+from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.gap.residuals import LIMITS, residual_tests
+from hydrotele.gap.rivals import ENTER
+from hydrotele.gap.screening import screen
+from hydrotele.logs.dataset import load_dataset
+from hydrotele.machine.machine_file import load_machine
+from tools.validation.blind.run_trial import ROOT
+from tools.validation.blind.trials import Place, Series, begin_series, load_series, write_json
+
+_FITTED = 3  # of the screened effects
+_SHARES = (0.5, 0.9, 0.98, 1.0)
+
+
+def measure_trial(out: Path, trial: str, machine_name: str, pulls: bool) -> str:
+    """Make a clean trial if it is not there, and note its figures."""
+    place = Place(out, trial)
+    if not place.data.is_dir():
+        command = [sys.executable, "-m", "tools.validation.blind.generate", str(out), trial]
+        subprocess.run(command, cwd=ROOT, check=True)
+    data = load_dataset(place.data, load_machine(machine_name))
+    evidence, nominal = Evidence(data, data.fit, 1, lacking=True), Guess()
+    try:
+        base = evidence.set_base(nominal)
+        ranked = screen(evidence, nominal, hypotheses(data.machine))[:_FITTED]
+        before = float(np.sum(evidence.base_errors**2))
+        fits = [evidence.fit(nominal.plus(s.hypothesis, s.start), before) for s in ranked]
+        best = max(fits, key=lambda fit: fit.score)
+        score = base.loss - evidence.judged(best.guess).loss - best.charge
+        hypothesis, deviation = best.guess.parts[-1]
+        tracks = evidence.track(data.machine, (data.heldout, *data.fit))
+        noted = {
+            "score": score,
+            "effect": f"{hypothesis.name}({hypothesis.location})",
+            "worth_naming": bool(np.any(np.abs(deviation) >= hypothesis.least)),
+            "tests": {k: t["value"] for k, t in residual_tests(tracks, data.channels).items()},
+            "pulls": _pulls(evidence) if pulls else {},
+        }
+    finally:
+        evidence.close()
+    write_json(place.folder / "calibration.json", noted)
+    return trial
+
+
+def _pulls(evidence: Evidence) -> dict[str, list[float]]:
+    """Estimate over spread of every effect that has a slope at nominal, fitted alone."""
+    errors = evidence.base_errors
+    found = {}
+    for hypothesis in hypotheses(evidence.data.machine):
+        if np.any(hypothesis.starts[0]):
+            continue
+        guess = Guess().plus(hypothesis, hypothesis.starts[0])
+        slopes = evidence.slopes(guess, evidence.errors(guess))
+        curvature = slopes.T @ slopes + np.eye(hypothesis.size)
+        covariance = np.linalg.inv(curvature)
+        pull = -covariance @ slopes.T @ errors / np.sqrt(np.diag(covariance))
+        found[f"{hypothesis.name}({hypothesis.location})"] = [float(v) for v in pull]
+    return found
+
+
+def summary(noted: dict[str, dict]) -> tuple[dict, str]:
+    """Quantiles over the trials, as a document and as Markdown."""
+    rows = {"score of the best effect": ([n["score"] for n in noted.values()], ENTER)}
+    for test, limit in LIMITS.items():
+        rows[f"worst channel, {test}"] = ([n["tests"][test] for n in noted.values()], limit)
+    lines = [
+        f"{len(noted)} simulated clean machines, motions and sensors of the blind trials.", "",
+        "| figure | " + " | ".join(f"{s:.0%} below" for s in _SHARES) + " | threshold |",
+        "| --- |" + " --- |" * (len(_SHARES) + 1),
+    ]  # fmt: skip
+    document: dict = {"trials": len(noted), "quantiles": {}}
+    for name, (values, limit) in rows.items():
+        cuts = [float(np.quantile(values, s)) for s in _SHARES]
+        document["quantiles"][name] = dict(zip(map(str, _SHARES), cuts, strict=True))
+        lines.append(f"| {name} | " + " | ".join(f"{c:.3g}" for c in cuts) + f" | {limit:g} |")
+    over = [n["effect"] for n in noted.values() if n["score"] >= ENTER and n["worth_naming"]]
+    document["falsely named"] = over
+    lines += ["", f"Over the threshold and worth naming: {len(over)} {over or ''}".rstrip() + "."]
+    pulled = [n["pulls"] for n in noted.values() if n["pulls"]]
+    if pulled:
+        lines += ["", f"Estimate over stated spread in {len(pulled)} of them (a perfect model: 1):",
+                  "", "| effect | RMS |", "| --- | --- |"]  # fmt: skip
+        document["pulls"] = {}
+        for key in pulled[0]:
+            size = float(np.sqrt(np.mean([np.square(p[key]) for p in pulled])))
+            document["pulls"][key] = size
+            lines.append(f"| {key} | {size:.2f} |")
+        every = [v for p in pulled for pull in p.values() for v in pull]
+        beyond = float(np.mean(np.abs(every) > 1.96))
+        size = float(np.sqrt(np.mean(np.square(every))))
+        document |= {"pulls_rms": size, "beyond_1.96": beyond}
+        lines += ["", f"All: RMS {size:.2f}, beyond 1.96: {beyond:.1%}."]
+    return document, "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Parse the arguments, measure what is missing, summarise."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the series")
+    parser.add_argument("--trials", type=int, help="of a new series (default 100)")
+    parser.add_argument("--pulls", type=int, default=30, help="trials with every effect's pull")
+    parser.add_argument("--seed", type=int, default=101, help="of a new series (default 101)")
+    parser.add_argument("--jobs", type=int, default=2, help="trials at a time")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.trials or not (args.out / "settings.json").is_file():
+        counts = {"single": 0, "double": 0, "clean": args.trials or 100, "outside": 0}
+        begin_series(args.out, Series(args.seed, counts))
+    series = load_series(args.out)
+    missing = [n for n in series.names() if not _note(args.out, n).is_file()]
+    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
+        tasks = [
+            pool.submit(measure_trial, args.out, n, series.machine, int(n) < args.pulls)
+            for n in missing
+        ]
+        for count, task in enumerate(tasks, 1):
+            print(f"{task.result()} measured ({count}/{len(tasks)})", flush=True)
+    noted = {n: json.loads(_note(args.out, n).read_text()) for n in series.names()}
+    document, text = summary(noted)
+    write_json(args.out / "calibration.json", document)
+    (args.out / "calibration.md").write_text(text)
+    print(text)
+
+
+def _note(out: Path, trial: str) -> Path:
+    return Place(out, trial).folder / "calibration.json"
+
+
+if __name__ == "__main__":
+    main()
