@@ -176,7 +176,7 @@ def force_covariance() -> np.ndarray:
 
 @cache
 def load_excitation() -> Excitation:
-    """Load the model's excitation motion, designed by `tools/studies/palida_study.py --design 1`."""
+    """Load the excitation motion, designed by `tools/studies/palida_study.py --design 1`."""
     found = json.loads((models_folder() / "palida" / "excitation.json").read_text(encoding="utf-8"))
     mean, sin, cos = (np.array(found[key]) for key in ("mean", "sin", "cos"))
     return Excitation(

@@ -1,4 +1,4 @@
-"""How fast environments run: batched in native code, in gymnasium's loop, in its processes.
+"""Measure the speed of environments: native batch, gymnasium's sync and async vector environments.
 
     python tools/release/env_speed.py --out docs/results/env_speed.md
 

@@ -1,4 +1,4 @@
-"""Page about the environments, from their own facts.
+"""Write the page that lists the environments with their observations, actions and rewards.
 
 python tools/release/environments_page.py --out docs/environments.md
 """

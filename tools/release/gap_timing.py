@@ -1,4 +1,4 @@
-"""How long gap finding takes: by length of the runs, and for a clean machine and a single effect.
+"""Measure the time that gap finding takes, for runs of several lengths and two machines.
 
     python tools/release/gap_timing.py ../shared/measured [--jobs 2]
 

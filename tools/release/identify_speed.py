@@ -1,4 +1,4 @@
-"""How fast identification is, and how its cost grows with the length of a log.
+"""Measure time and memory of an identification against the length of the log.
 
     python tools/release/identify_speed.py [--minutes 60] [--out docs/results/identify_speed.md]
 

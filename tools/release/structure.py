@@ -1,12 +1,13 @@
-"""The structure of the package in numbers: rooms, modules, lines, arrows, and what a command uses.
+"""Count packages, modules, lines and imports between packages; list the modules a command uses.
 
     python tools/release/structure.py            # packages, modules, lines, dependencies
     python tools/release/structure.py --arrows   # the same, and each dependency between packages
     python tools/release/structure.py -- run scenarios/dig.yaml --out runs/dig   # modules used
 
-An arrow is a pair of rooms of which one imports the other, anywhere in its modules. A module is
-passed by a command when a Python function of it is called while the command runs, other than by an
-import; compiled functions call each other without Python, and are not seen.
+A room is a package below hydrotele. An arrow is a pair of rooms of which one imports the other,
+anywhere in its modules. A module is used by a command when one of its Python functions is called
+while the command runs, other than by an import; compiled functions call each other without Python,
+and are not seen.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Studies of the calibration of an arm with an external calibrator; results in docs/results.
+"""Study the calibration of an excavator arm with an external calibrator.
 
     python tools/studies/arm_calibration.py noise --seeds 200
     python tools/studies/arm_calibration.py bad-data --trials 200 --clean 200

@@ -1,4 +1,6 @@
-"""Studies of calibrations. The first argument says which one.
+"""Study the coverage and accuracy of kinematic calibration; the first argument selects the study.
+
+    python tools/studies/calibration_study.py mukca --trials 200
 
 mukca   robots with random errors, calibrated from simulated postures with their ball in sockets:
         share of 95 % intervals that cover the truth, bias and standard deviation per parameter,

@@ -1,4 +1,4 @@
-"""The published controller of the electro-hydraulic actuator, and the actuator under it.
+"""Simulate the electro-hydraulic actuator under its published controller.
 
 Imported by `real_machines.py`. Once per ms, in the units of the firmware (counts of 25 um, rpm,
 steps of a 5398-step bridge): position P 10, 7 on negative errors, limited to 2000 rpm; then speed

@@ -1,4 +1,4 @@
-"""Fits the unpublished numbers of the electro-hydraulic actuator on its shared runs.
+"""Fit the unpublished parameters of the electro-hydraulic actuator to its recorded runs.
 
     python tools/studies/eha_fit.py ../shared/real/eha [--rounds 12] [--without 3_1] [--each]
 

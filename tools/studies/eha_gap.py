@@ -1,4 +1,4 @@
-"""What `hydrotele gap` says of the published numbers of the electro-hydraulic actuator.
+"""Run `hydrotele gap` on the published parameters of the electro-hydraulic actuator.
 
     python tools/studies/eha_gap.py ../shared/real/eha --group 3
 

@@ -1,4 +1,4 @@
-"""What each published number of the electro-hydraulic actuator costs.
+"""Compute the prediction error caused by each published parameter of the actuator `models/eha`.
 
     python tools/studies/eha_published.py ../shared/real/eha
 

@@ -1,4 +1,4 @@
-"""The shared runs of the electro-hydraulic actuator: reading, starting, judging.
+"""Read the recorded runs of the electro-hydraulic actuator and compute their error measures.
 
 Imported by `eha_fit.py` and `real_machines.py`; `../shared/real/README.md` describes the runs and
 the way of judging.

@@ -1,4 +1,4 @@
-"""Force at the tip from cylinder pressures: static model, dynamic model, and what was there.
+"""Estimate the force at the tip from cylinder pressures, with the static and the dynamic model.
 
     python tools/studies/endpoint_force_study.py [--trials 5] [--seed 1] [--jobs 2]
         [--out docs/results/endpoint_force.md]

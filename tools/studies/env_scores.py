@@ -1,4 +1,4 @@
-"""Scores of controllers in the control tasks: reference, zero and random actions.
+"""Score the reference controller, zero actions and random actions in the control tasks.
 
 With ideal and real sensors, on the nominal machine and on machines of `typical_variation`.
 """

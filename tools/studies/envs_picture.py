@@ -1,4 +1,6 @@
-"""A picture of every environment in one PNG: `python tools/studies/envs_picture.py PICTURE [TASK ...]`.
+"""Render every environment into one picture.
+
+    python tools/studies/envs_picture.py PICTURE [TASK ...]
 
 Each is driven by the reference controller of its task, where it has one. Needs OpenGL without a
 screen.

@@ -1,4 +1,4 @@
-"""The designed excitation against one of Khoshzaban's style: determinant and intervals.
+"""Compare the designed excitation with one as Khoshzaban used: determinant and intervals.
 
     python tools/studies/excitation_study.py [--harmonics 10] [--starts 4] [--seed 0] [--trials 5]
         [--out docs/results/excitation.md]

@@ -1,4 +1,4 @@
-"""Computed-force feedforward at rising speed: no model, the given model, the identified model.
+"""Compare computed-force feedforward without a model, with a given and with an identified model.
 
     python tools/studies/feedforward_study.py [--seed 1] [--out docs/results/feedforward.md]
 

@@ -1,4 +1,6 @@
-"""Six moments of a felled tree in one PNG: `python tools/studies/felling_picture.py RUN_FOLDER PICTURE`.
+"""Render six moments of the felling of a tree into one picture.
+
+    python tools/studies/felling_picture.py RUN_FOLDER PICTURE
 
 Needs OpenGL without a screen: MUJOCO_GL=egl or osmesa.
 """

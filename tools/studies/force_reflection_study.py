@@ -1,4 +1,4 @@
-"""Force reflection under rate control: predicted and simulated limits, delays, held forces.
+"""Study force reflection under rate control: stability limits, delays and held forces.
 
 python tools/studies/force_reflection_study.py --seeds 5 --held 12 --jobs 2
 

@@ -1,4 +1,4 @@
-"""Laws that let a joystick axis feel: stiffness feedback, and a detent at the dead band's edge."""
+"""Force laws of a joystick axis: stiffness feedback, and a detent at the edge of the dead band."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Study of the hybrid robot's calibration: tables of docs/results/kinematic_calibration.md.
+"""Study the calibration of the hybrid robot: tables of docs/results/kinematic_calibration.md.
 
 Usage: python tools/studies/hybrid_calibration_study.py [--trials 200] [--part coverage ...]
 """

@@ -1,4 +1,4 @@
-"""Which parameters of the CAT 215's complete model can be identified, beside Khoshzaban's Table 13.
+"""Determine the identifiable parameters of the CAT 215; compare with Khoshzaban's Table 13.
 
     python tools/studies/identifiability_study.py [--out docs/results/identifiability.md]
 

@@ -1,4 +1,4 @@
-"""How often 95 % intervals of identified parameters hold the truth, over repeated experiments.
+"""Measure how often 95 % intervals of identified parameters contain the true values.
 
     python tools/studies/identify_coverage.py [--trials 300] [--seed 1] [--jobs 2] [--sensors NAME]
         [--out docs/results/identify_coverage.md]

@@ -1,4 +1,4 @@
-"""Khoshzaban's cross-validation: complete, reduced and given model on motions that were not fitted.
+"""Cross-validate the complete, reduced and given models on motions that were not fitted.
 
     python tools/studies/identify_cross_validation.py MEASURED [--trials 10] [--seed 1] [--jobs 2]
         [--out docs/results/identify_cross_validation.md]

@@ -1,4 +1,4 @@
-"""Identification on the public records of two real machines, with figures that others can check.
+"""Identify two real machines from public records and compare with the published results.
 
     python tools/studies/identify_real.py ../shared/real [--only emps]
 

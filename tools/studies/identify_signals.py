@@ -1,4 +1,4 @@
-"""Which signal processing yields the parameters that predict best: on a circle that was not fitted.
+"""Compare signal processing methods by the prediction error of the identified parameters.
 
     python tools/studies/identify_signals.py [--trials 10] [--seed 1] [--cycles 5] [--jobs 2]
         [--out docs/results/identify_signals.md]

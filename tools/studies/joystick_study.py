@@ -1,4 +1,4 @@
-"""The joystick alone: steps, identification, detent, travel, damping, heat, a cab that shakes it.
+"""Study the joystick alone: steps, identification, detent, travel, damping, heat, cab motion.
 
     python tools/studies/joystick_study.py [--trials 20] [--seed 1] [--jobs 2]
         [--out docs/results/joystick.md]

@@ -1,4 +1,4 @@
-"""Teach a network a control task with PPO, and compare it with the reference controller.
+"""Train a neural network for a control task with PPO and compare it with the reference controller.
 
 Both see the same sensors at the same rate and are scored on episodes and machines that neither has
 met. Needs the extra `learn`. Writes policy.zip, normalisation.npz, training.json

@@ -1,4 +1,4 @@
-"""Operator model: crossover, discrimination, identification, drawn operators, sensitivity.
+"""Study the operator model: crossover, discrimination, identification, sensitivity.
 
 python tools/studies/operator_study.py --part all --operators 20 --records 10 --trials 60
 --seeds 2 --jobs 1

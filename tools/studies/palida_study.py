@@ -1,4 +1,4 @@
-"""Kinematics of the hexapod PaLiDA: workspace and singularities, speed; or its excitation anew.
+"""Compute workspace, singularities and speed of the hexapod PaLiDA, or design its excitation.
 
     python tools/studies/palida_study.py [--picture docs/results/palida_workspace.png]
         [--out docs/results/palida_kinematics.md]

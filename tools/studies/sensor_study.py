@@ -1,4 +1,4 @@
-"""What better pressure sensors are worth: Khoshzaban's Tables 14 and 15 with the CAT 215.
+"""Evaluate better pressure sensors: Khoshzaban's Tables 14 and 15 with the CAT 215.
 
     python tools/studies/sensor_study.py [--trials 10] [--seed 1] [--jobs 2]
         [--out docs/results/sensor_study.md]

@@ -1,4 +1,4 @@
-"""Stability of sampled teleoperators with jitter: predicted against simulated, random cases.
+"""Compare predicted with simulated stability of sampled teleoperators with jitter.
 
 python tools/studies/stability_study.py --trials 400 --seed 0 --jobs 2
 """

@@ -1,4 +1,4 @@
-"""Direct force under rate control: the linear limit against the simulated machine, with jitter.
+"""Compare the linear stability limit of direct force feedback with the simulated machine.
 
 python tools/studies/station_stability.py --trials 24 --seed 0 --jobs 2
 """

@@ -1,4 +1,4 @@
-"""What the studies share: their options, trials side by side, and the file that they write."""
+"""Options, parallel trials and page writing that the studies share."""
 
 import argparse
 import sys

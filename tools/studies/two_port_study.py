@@ -1,4 +1,4 @@
-"""Linear predictions of the two-port against simulated two masses: the shipped case, random ones.
+"""Compare linear predictions of the two-port with simulations of two masses.
 
 python tools/studies/two_port_study.py --trials 20 --points 12 --seed 0 --jobs 2
 """

@@ -1,9 +1,9 @@
-"""Blind trials: hide effects in the simulated machine, let the workflow look for them, score it.
+"""Run blind trials: hide effects in the simulated machine, run the workflow, score its answers.
 
     python tools/validation/blind_trials.py --out runs/blind --single 100 --double 40 --clean 100
         --outside 40
-    python tools/validation/blind_trials.py --out runs/blind              # goes on after a kill
-    python tools/validation/blind_trials.py --out runs/blind --only 0007  # one trial anew, same data
+    python tools/validation/blind_trials.py --out runs/blind              # continue after a kill
+    python tools/validation/blind_trials.py --out runs/blind --only 0007  # repeat one trial
     python tools/validation/blind_trials.py --out runs/blind --score-only
 
 Each trial is generated in a process of its own, which writes the logs, seals the key and ends;

@@ -1,9 +1,9 @@
-"""Blind trials on an independent machine: other code, other forms, wrong noise, wrong numbers.
+"""Run blind trials on an independent simulator with other laws, wrong noise and wrong parameters.
 
     python tools/validation/blind_world.py --out runs/world --count 20
         --kinds near,noise,off,outside,clean
-    python tools/validation/blind_world.py --out runs/world              # goes on after a kill
-    python tools/validation/blind_world.py --out runs/world --only 0007  # one trial anew, same data
+    python tools/validation/blind_world.py --out runs/world              # continue after a kill
+    python tools/validation/blind_world.py --out runs/world --only 0007  # repeat one trial
     python tools/validation/blind_world.py --out runs/world --score-only
 
 Kinds: `near` (a mechanism of the library in another form), `noise` (0.7 to 2 times the stated one,

@@ -1,4 +1,4 @@
-"""Judge every criterion of a document by runs that are deliberately broken.
+"""Judge every criterion of a document by runs with a deliberate fault.
 
     python tools/validation/break_experiments.py NAME [--only "ROW,ROW"] [--jobs 2] [--out FILE]
 

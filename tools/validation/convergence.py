@@ -1,4 +1,4 @@
-"""Replay the independent nominal logs at several steps and print errors and their ratios.
+"""Replay the independent nominal logs at several time steps; print errors and their ratios.
 
     python tools/validation/convergence.py ../shared/measured/nominal_truth --steps 1 0.5 0.25 0.1
 

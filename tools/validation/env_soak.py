@@ -1,4 +1,4 @@
-"""Random actions for millions of steps: no NaN, no warning, observations inside their spaces.
+"""Run environments with random actions for millions of steps and check every observation.
 
     python tools/validation/env_soak.py --steps 10000000 --out docs/results/env_soak.md
 

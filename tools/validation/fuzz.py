@@ -1,4 +1,4 @@
-"""Damaged files of all kinds that hydrotele reads: one sentence each, soon, in little memory.
+"""Damage files of every kind and check that hydrotele refuses each in one sentence.
 
     python tools/validation/fuzz.py --count 10000 --seed 1 --jobs 2
 

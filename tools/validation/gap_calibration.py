@@ -1,7 +1,7 @@
 """Calibrate the thresholds of gap finding on simulated clean machines.
 
     python tools/validation/gap_calibration.py --out runs/clean --trials 100 --pulls 30
-    python tools/validation/gap_calibration.py --out runs/clean            # goes on after a kill
+    python tools/validation/gap_calibration.py --out runs/clean            # continue after a kill
 
 Makes the clean trials of a series (the motions, noise and sensors of the blind trials, nothing
 planted), and notes of each: the best score that any effect reaches, the residual tests of the given

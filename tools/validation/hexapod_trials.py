@@ -1,7 +1,7 @@
-"""Blind trials of `hydrotele gap` on the hexapod: hide something, let the command look for it.
+"""Run blind trials of `hydrotele gap` on the hexapod.
 
     python tools/validation/hexapod_trials.py --out runs/hexapod --single 20 --clean 10 --outside 6
-    python tools/validation/hexapod_trials.py --out runs/hexapod            # goes on after a kill
+    python tools/validation/hexapod_trials.py --out runs/hexapod            # continue after a kill
     python tools/validation/hexapod_trials.py --out runs/hexapod --score-only
 
 One process makes the trials (`tools.validation.blind.hexapod`: MuJoCo, no regressor): it writes

@@ -1,4 +1,4 @@
-"""Kill commands, end them and fill their disk at random moments: nothing half, reruns identical.
+"""Kill commands, terminate them and fill their disk; check that reruns give the same output.
 
     python tools/validation/interruptions.py --kills 200 --terms 50 --full 50 --seed 0
 

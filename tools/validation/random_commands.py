@@ -1,4 +1,4 @@
-"""Step a machine with random valve commands in every tool, and look at every state.
+"""Step a machine with random valve commands with every tool and check every state.
 
 Wanted: no NaN, no warning of MuJoCo, closed pins, no pressure at or below vacuum, and none above
 what the chamber's relief valve lets stand at the flow that the piston presses through it.

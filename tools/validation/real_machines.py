@@ -1,4 +1,4 @@
-"""The workflow on the public records of two real machines, with figures that others can check.
+"""Run the workflow on public records of real machines and compare with published results.
 
     python tools/validation/real_machines.py ../shared/real [--only emps eha] [--jobs 2]
 

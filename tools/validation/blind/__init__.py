@@ -1,1 +1,1 @@
-"""Blind trials: plant an effect in the simulated machine, hide it, let the workflow look for it."""
+"""Run blind trials: add a hidden effect to the simulated machine and test whether it is found."""

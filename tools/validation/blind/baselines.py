@@ -1,4 +1,4 @@
-"""What other methods make of the same trials: who names, who closes the gap.
+"""Run other identification methods on the same trials and compare their scores.
 
     python -m tools.validation.blind.baselines --out runs/world --limit 600
         --methods single,cma,sparse,network

@@ -1,4 +1,4 @@
-"""What is hidden in a trial: effects at random places in random sizes."""
+"""Draw the hidden effects of a trial, with random locations and sizes."""
 
 import dataclasses
 import math

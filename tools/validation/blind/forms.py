@@ -1,4 +1,4 @@
-"""Effects whose mechanism the library knows and whose form it does not, and what counts as right.
+"""Define effects that the library has in another form, and the names accepted as right.
 
 Each form changes the independent machine where no fact of a machine file could. `accepted` was
 fixed before any trial was run: the names that a hydraulics engineer would call right, with the

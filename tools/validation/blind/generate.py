@@ -1,4 +1,4 @@
-"""Make the data of one trial and seal its key; runs as a process of its own.
+"""Make the data of one trial and seal its key; runs as a separate process.
 
     python -m tools.validation.blind.generate FOLDER_OF_THE_SERIES TRIAL
 

@@ -1,4 +1,4 @@
-"""The hexapod as a world of its own: MuJoCo, a controller, sensors, and what may be hidden in it.
+"""Simulate the hexapod for blind trials: MuJoCo, a controller, sensors and hidden effects.
 
     python -m tools.validation.blind.hexapod FOLDER_OF_THE_SERIES TRIAL...
 

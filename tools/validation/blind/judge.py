@@ -1,4 +1,4 @@
-"""Was one answer right? Pure functions of a key and a `gap.json` document."""
+"""Judge one answer: pure functions of a key and a `gap.json` document."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""The search under trial for mechanisms: a process that knows nothing but a model and logs.
+"""Run the search under trial for mechanisms; the process gets only a model and logs.
 
     python mechanism_workflow.py MJCF COLUMNS DATA...
 

@@ -1,4 +1,4 @@
-"""Random motions of a trial: three runs to learn from and one of another kind to judge on."""
+"""Draw the motions of a trial: three runs to fit and one of another kind to judge."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""How well a machine predicts a run without readings: the state is known, then only commands."""
+"""Compute the open-loop prediction error of a machine from a known state and commands alone."""
 
 import numpy as np
 

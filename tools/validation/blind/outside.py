@@ -1,4 +1,4 @@
-"""Effects outside the library, for trials only: what each is, where it sits, how large it gets.
+"""List the effects of trials that the library does not have, with location and size.
 
 The workflow knows nothing of them. How they act stands in `outside_steps` (they change the plant
 while it runs) and in `outside_readings` (they change what a sensor says).

@@ -1,4 +1,4 @@
-"""How the sensors of trials err in ways that the library does not know."""
+"""Apply sensor errors that the library does not have."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""How the effects outside the library act in the plant, before every physics step.
+"""Apply the effects that the library does not have, before every physics step.
 
 Each function gets the model, the number of the actuator (0 for `supply` and `all`), the machine,
 the location and the parameters, and returns what to do with the MjData at the start of a step. They

@@ -1,4 +1,4 @@
-"""Pictures of a series: confusion matrix, reliability of the probabilities, closure of the gap."""
+"""Draw the figures of a series: confusion matrix, reliability diagram, closure of the gap."""
 
 from collections.abc import Sequence
 from pathlib import Path

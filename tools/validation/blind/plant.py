@@ -1,4 +1,4 @@
-"""One run of a trial's machine: what its sensors say, and what they would say without noise."""
+"""Record one run of a trial's machine, with and without sensor noise."""
 
 import dataclasses
 from collections.abc import Callable

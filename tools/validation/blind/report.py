@@ -1,4 +1,4 @@
-"""What a series came to, for people: one Markdown page and the same as lines for a terminal."""
+"""Write the results of a series as a Markdown page and as lines for a terminal."""
 
 from collections.abc import Sequence
 from typing import Any

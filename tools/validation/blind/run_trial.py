@@ -1,4 +1,4 @@
-"""Run one trial: make its data if they are not there, let the workflow answer, keep the answer."""
+"""Run one trial: make its data if they are missing, run the workflow, keep the answer."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Scores of a series: shares per class, coverage, closure, time, and what they must reach."""
+"""Score a series: fractions per class, coverage, closure, time, and the required values."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""How large effects are in the field: sizes for trials, each with where its spread comes from.
+"""Draw effect sizes as they occur in the field, each with the source of its spread.
 
 The search's own `least` and `scale` play no part. Sources by letter:
 

@@ -1,4 +1,4 @@
-"""The trials of one series: which there are, what class each has, where its files lie."""
+"""List the trials of a series with their class and the location of their files."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""How visible an effect is, computed from the truth after the fact; no draw depends on it.
+"""Compute how visible an effect is in the readings, from the true states.
 
 A model without the effect starts every half second from the true state of the machine that has it
 and is fed with the logged commands; what its sensors would read is compared with what those of the

@@ -1,4 +1,4 @@
-"""What no library knows: random smooth functions of physical variables that act on the machine.
+"""Draw random smooth functions of physical variables that act on the machine.
 
 Drawn without a look at the search's own terms: waves of random direction in the plane of two
 variables, with and without switching, play (hysteresis) and a window of time.

@@ -1,4 +1,4 @@
-"""The workflow under trial, as a process of its own that knows nothing but a folder of logs.
+"""Run the workflow under trial as a separate process that gets only a folder of logs.
 
     python workflow.py DATA MACHINE [THREADS]
 

@@ -1,4 +1,4 @@
-"""An independent machine for trials: own equations of motion, hydraulics, sensors and integrator.
+"""Simulate an independent machine: own equations of motion, hydraulics, sensors and integrator.
 
 Nothing of hydrotele's laws, circuit, multibody code or MuJoCo acts here, so that a search that
 finds effects in these logs cannot owe it to shared code. With neutral `Forms` the equations are

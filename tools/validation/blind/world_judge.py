@@ -1,4 +1,4 @@
-"""Was an answer right? What trials on the independent machine come to; pure functions.
+"""Judge and score the trials on the independent machine; pure functions.
 
 Fixed before any trial was run:
 

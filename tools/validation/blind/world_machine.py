@@ -1,4 +1,4 @@
-"""The independent machine of a Machine's facts: numbers only, no law of hydrotele.
+"""Build the independent machine from the numbers of a Machine, without a law of hydrotele.
 
 It reads what a machine file says, so that an effect of the library, which changes facts, and a
 wrong number reach the independent equations the same way.

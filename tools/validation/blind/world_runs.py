@@ -1,4 +1,4 @@
-"""Runs of the independent machine: what is asked of it, where it starts, what its log holds."""
+"""Simulate runs of the independent machine: commands, initial state, log."""
 
 import dataclasses
 

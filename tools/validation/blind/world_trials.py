@@ -1,4 +1,4 @@
-"""Trials on the independent machine: what is planted in each kind, its logs, its sealed key.
+"""Make the trials on the independent machine: hidden effects, logs and sealed keys.
 
     python -m tools.validation.blind.world_trials FOLDER_OF_THE_SERIES TRIAL
 
