@@ -1,6 +1,6 @@
 """`python -m hydrotele` is the command `hydrotele`."""
 
-from hydrotele.cli.overview import main
+from hydrotele.cli.start import main
 
 if __name__ == "__main__":
     main()

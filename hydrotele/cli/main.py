@@ -693,7 +693,7 @@ def compile_functions(
     ] = None,
 ) -> None:
     """Compile all numerical functions now, so that no later command waits for it."""
-    from hydrotele.core.compile_jobs import compile_all
+    from hydrotele.cli.compiling import compile_all
 
     compile_all(jobs)
 

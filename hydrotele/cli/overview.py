@@ -3,9 +3,7 @@
 Importing typer takes longer than the rest of `hydrotele --help`.
 """
 
-import os
 import shutil
-import sys
 from textwrap import fill
 
 DESCRIPTION = "Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo."
@@ -54,16 +52,3 @@ def format_overview(width: int | None = None) -> str:
         parts.append("\n".join([f"{title}:", *lines]))
     parts.append("hydrotele COMMAND --help describes a command and its options.")
     return "\n\n".join(parts)
-
-
-def main() -> None:
-    """Entry point of the program `hydrotele`."""
-    if sys.argv[1:] in (["--help"], ["-h"]):
-        try:
-            print(format_overview(), flush=True)
-        except BrokenPipeError:  # the reader, such as `head`, has seen enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return
-    from hydrotele.cli.main import main as run_command
-
-    run_command()

@@ -110,7 +110,7 @@ def test_overview_imports_nothing_but_the_standard_library():
     """`--help` is fast because neither typer nor what the commands need is imported."""
     script = f"""if True:
         import sys
-        from hydrotele.cli.overview import main
+        from hydrotele.cli.start import main
         sys.argv = ["hydrotele", "--help"]
         main()
         print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)

@@ -1,0 +1,19 @@
+"""Entry point of the program `hydrotele`."""
+
+import os
+import sys
+
+from hydrotele.cli.overview import format_overview
+
+
+def main() -> None:
+    """Print the overview, or hand the words to the commands, which import typer."""
+    if sys.argv[1:] in (["--help"], ["-h"]):
+        try:
+            print(format_overview(), flush=True)
+        except BrokenPipeError:  # the reader, such as `head`, has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return
+    from hydrotele.cli.main import main as run_command
+
+    run_command()
