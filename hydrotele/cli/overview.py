@@ -41,7 +41,7 @@ COMMANDS = {
 def format_overview(width: int | None = None) -> str:
     """Return the help page of the program, wrapped to a width in characters (the terminal's)."""
     width = min(width or shutil.get_terminal_size().columns, 120)
-    parts = [f"Usage: hydrotele [OPTIONS] COMMAND [ARGS]...\n\n{fill(DESCRIPTION, width)}"]
+    parts = [fill(text, width) for text in (USAGE, DESCRIPTION)]
     for title, rows in ("Options", OPTIONS), ("Commands", COMMANDS):
         indent = max(map(len, rows)) + 4
         lines = [
@@ -50,5 +50,5 @@ def format_overview(width: int | None = None) -> str:
             for name, text in rows.items()
         ]  # fmt: skip
         parts.append("\n".join([f"{title}:", *lines]))
-    parts.append("hydrotele COMMAND --help describes a command and its options.")
+    parts.append(fill("hydrotele COMMAND --help describes a command and its options.", width))
     return "\n\n".join(parts)

@@ -93,7 +93,7 @@ def test_overview_lists_every_command_with_the_first_paragraph_of_its_help():
         assert " ".join(command.help.partition("\n\n")[0].split()) == SUMMARIES[name]
 
 
-@pytest.mark.parametrize("width", [40, 80, 200])
+@pytest.mark.parametrize("width", [50, 80, 200])
 def test_overview_fits_the_terminal(width):
     lines = format_overview(width).splitlines()
     assert max(map(len, lines)) <= width
