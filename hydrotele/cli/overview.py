@@ -6,6 +6,7 @@ Importing typer takes longer than the rest of `hydrotele --help`.
 import shutil
 from textwrap import fill
 
+USAGE = "Usage: hydrotele [OPTIONS] COMMAND [ARGS]..."
 DESCRIPTION = "Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo."
 OPTIONS = {
     "--version": "Print the version and exit.",
