@@ -15,14 +15,12 @@ import contextlib
 import fcntl
 import functools
 import hashlib
-import logging
 import os
 import re
 import shutil
 import stat
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +30,8 @@ from numba import cfunc, njit
 from numba.core import config as _numba_config
 from numba.core import event
 from numba.core.caching import FunctionCache, UserProvidedCacheLocator
+
+from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, CompileProgress, ProgressLine
 
 _CONFIG: Any = _numba_config  # its settings are made at run time
 _UNUSED = 30 * 24 * 3600.0  # s, after which the cache of other sources is removed
@@ -65,12 +65,22 @@ def inlined(function):
 
 
 def _compile(function, **options):
-    options["no_cfunc_wrapper"] = True  # for calls by address, which takes a fifth of the time
+    """Make a dispatcher for calls from Python and one for calls from compiled functions.
+
+    The second has no wrapper that converts Python objects, which takes a fifth of the time to
+    compile, and most functions are never called from Python.
+    """
     with _caching(function.__module__) as cache:
-        made: Any = njit(cache=cache, error_model="numpy", nogil=True, **options)(function)
+        options |= {
+            "cache": cache, "error_model": "numpy", "nogil": True,
+            "no_cfunc_wrapper": True,  # for calls by address, which takes a fifth of the time
+        }  # fmt: skip
+        made: Any = njit(**options)(function)
+        called: Any = njit(no_cpython_wrapper=True, **options)(function)
         if cache:
-            made._cache = _SharedCache(function)
-        return made
+            made._cache, called._cache = _SharedCache(function), _CalledCache(function)
+    made.get_call_template, made.get_overload = called.get_call_template, called.get_overload
+    return made
 
 
 def callback(signature):
@@ -254,6 +264,13 @@ class _SharedCache(FunctionCache):
         self._held = None
 
 
+class _CalledCache(_SharedCache):
+    """The same for code without a wrapper for Python."""
+
+    def _index_key(self, sig, codegen):
+        return *super()._index_key(sig, codegen), "called"
+
+
 def _line(function) -> int:
     return function.__code__.co_firstlineno
 
@@ -265,15 +282,16 @@ def _lock(folder: str, function) -> int | None:
         handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
     except OSError:
         return None
-    began = said = time.monotonic()
-    while time.monotonic() - began < _PATIENT:
+    began, line = time.monotonic(), ProgressLine()
+    while (waited := time.monotonic() - began) < _PATIENT:
         with contextlib.suppress(BlockingIOError):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            line.clear()
             return handle
         time.sleep(0.02)
-        if time.monotonic() - said > _HEARTBEAT:
-            said = time.monotonic()
-            _LOG.warning("a process beside this one compiles, for %.0f s so far", said - began)
+        if waited > SECONDS_BEFORE_BAR:
+            name = function.__name__.strip("_")
+            line.show(f"waiting for {name}, which another process compiles ({waited:.0f} s)")
     os.close(handle)
     return None
 
@@ -318,41 +336,12 @@ def _folder_of(module: str) -> Path | None:
     return folder
 
 
-class _Announcement(event.Listener):
-    """Logs that code is being compiled once that has taken a moment, and how far it is."""
-
-    def __init__(self) -> None:
-        self._depth, self._count = 0, 0
-        self._began, self._spent = 0.0, 0.0  # s: start of the outermost, all compiled before it
-        self._told: float | None = None  # s of compiling at the last message
-
-    def on_start(self, event: event.Event) -> None:
-        """A function is compiled, perhaps for another one that is."""
-        self._depth, self._count = self._depth + 1, self._count + 1
-        if self._depth == 1:
-            self._began = time.monotonic()
-            if self._told is None:
-                timer = threading.Timer(_PATIENCE, self._announce, [self._began])
-                timer.daemon = True
-                timer.start()
-        spent = self._spent + time.monotonic() - self._began
-        if self._told is not None and spent - self._told > _HEARTBEAT:
-            self._told = spent
-            _LOG.warning("compiled %d functions in %.0f s", self._count, spent)
-
-    def on_end(self, event: event.Event) -> None:
-        """It is done."""
-        self._depth -= 1
-        if self._depth == 0:
-            self._spent += time.monotonic() - self._began
-
-    def _announce(self, began: float) -> None:
-        if self._depth and self._told is None and began == self._began:
-            self._told = self._spent + _PATIENCE
-            _LOG.warning("compiling numerical code once, up to a minute; it is kept for later")
+def _is_cached(function) -> bool:
+    """Return whether any code of a function of this package lies in the cache."""
+    if not _FOLDER or _source(function.__module__) is None:
+        return False
+    folder = _folder_of(function.__module__)
+    return folder is not None and any(folder.glob(_index(function)))
 
 
-_LOG = logging.getLogger("hydrotele")
-_PATIENCE = 1.0  # s of compiling before it is said
-_HEARTBEAT = 10.0  # s
-event.register("numba:compile", _Announcement())
+event.register("numba:compile", CompileProgress(_is_cached))

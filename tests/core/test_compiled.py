@@ -1,6 +1,7 @@
 """Compiled functions: what those without counted references may do, their caches, what is said."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import pytest
 from numba.core.errors import TypingError
 
 import hydrotele
+from hydrotele.core.compile_progress import format_bar
 from hydrotele.core.compiled import allocation_free
 
 
@@ -113,14 +115,29 @@ def test_two_processes_compile_a_function_once(tmp_path):
     assert sorted(callbacks for _, callbacks in hits) == [b"0", b"1"]
 
 
-def test_the_first_compilation_is_announced(tmp_path):
-    code = (
-        "from hydrotele.core import compiled as c; c._PATIENCE = 0.0\n"
-        "@c.compiled\n"
-        "def law(x):\n    return 2.0 * x\n"
-        "law(1.0)"
-    )
-    assert "compiling numerical code once" in _run(ROOT, tmp_path, code)[1]
+PROGRESS = """
+from hydrotele.core import compile_progress, compiled
+compile_progress.SECONDS_BEFORE_BAR = compile_progress.SECONDS_BETWEEN_LINES = 0.0
+compile_progress._REDRAW = 0.01
+inner = compiled.compiled(lambda x: 2.0 * x)
+@compiled.compiled
+def law(x):
+    return inner(x) + 1.0
+law(1.0)
+print([f.py_func is inner.py_func for f in compile_progress.called_dispatchers(law.py_func)])
+"""
+
+
+def test_progress_names_the_function_and_the_time_left(tmp_path):
+    out, lines = _run(ROOT, tmp_path, PROGRESS)
+    assert out == ["[True]"]
+    assert "compiling law" in lines and "(once, then cached)" in lines
+    assert re.search(r"about \d+ s left", lines)
+
+
+def test_bar_shows_the_fraction():
+    assert "[" + "#" * 15 + "-" * 15 + "], about 8 s left" in format_bar("law", 0.5, 8.2)
+    assert "[" + "-" * 30 + "] (once" in format_bar("law", 0.0, None)
 
 
 ELSEWHERE = """

@@ -1,0 +1,153 @@
+"""`hydrotele compile`: fill the cache of compiled functions with several processes.
+
+Each job runs the smallest task that calls all compiled functions of one kind of command, with the
+argument types that the command uses.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import typer
+
+from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, ProgressLine, format_bar
+from hydrotele.core.compiled import cache_folder
+from hydrotele.core.errors import InputError
+
+_POLL = 0.2  # s between two looks at the jobs
+
+
+class Job(NamedTuple):
+    """One process's part of the work.
+
+    Attributes:
+        name: shown in the progress bar.
+        run: does the task.
+        seconds: processor time on an empty cache, for the order and the estimate of time left [s].
+    """
+
+    name: str
+    run: Callable[[], None]
+    seconds: float
+
+
+def _compile_teleoperation() -> None:
+    from hydrotele.run.run import compile_ticks
+
+    compile_ticks()
+
+
+def _compile_runs() -> None:
+    from hydrotele.run.run import run_scenario
+    from hydrotele.scenario.scenario import load_scenario
+
+    for name in ("dig", "press_stiffness"):
+        run_scenario(load_scenario(name, {"duration": "0.2"}))
+
+
+def _compile_task(name: str) -> Callable[[], None]:
+    def run() -> None:
+        import gymnasium
+
+        import hydrotele.envs  # noqa: F401 - registers the environments
+
+        env = gymnasium.make(f"hydrotele/{name}-v0")
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
+
+    return run
+
+
+def _compile_gap() -> None:
+    from hydrotele.gap.find import find_gap
+    from hydrotele.logs.dataset import load_dataset
+    from hydrotele.logs.log import save_log
+    from hydrotele.machine.machine_file import load_machine
+    from hydrotele.run.run import run_scenario
+    from hydrotele.scenario.scenario import load_scenario
+
+    with tempfile.TemporaryDirectory() as folder:
+        for k in range(2):
+            scenario = load_scenario("excitation", {"duration": "2", "seed": str(k)})
+            save_log(run_scenario(scenario).measured, Path(folder) / f"{k}.parquet")
+        find_gap(load_dataset(Path(folder), load_machine("cat215")), effects=("valve_gain",))
+
+
+TASKS = ("TrackTrajectory", "Grade", "PlaceLog", "HoldForce", "StraightLine", "ReachFeller")
+JOBS = (
+    Job("gap", _compile_gap, 130.0),
+    Job("teleoperation", _compile_teleoperation, 65.0),
+    *(Job(name, _compile_task(name), seconds)
+      for name, seconds in zip(TASKS, (45.0, 20.0, 12.0, 10.0, 7.0, 3.0), strict=True)),
+    Job("runs", _compile_runs, 10.0),
+)  # fmt: skip
+
+
+def run_job(name: str) -> None:
+    """Run one job in this process."""
+    next(job for job in JOBS if job.name == name).run()
+
+
+def compile_all(processes: int | None = None) -> None:
+    """Run all jobs, longest first.
+
+    Args:
+        processes: that work side by side; one per core unless given.
+
+    Raises:
+        InputError: there is no folder for the cache, or a job failed.
+    """
+    if cache_folder() is None:
+        raise InputError(
+            "cache", "there is no folder that only you can write to; set XDG_CACHE_HOME to one"
+        )
+    processes = processes or len(os.sched_getaffinity(0))
+    began, line = time.monotonic(), ProgressLine()
+    waiting = sorted(JOBS, key=lambda job: -job.seconds)
+    running: dict[Job, tuple[float, subprocess.Popen]] = {}
+    finished, spent, total = 0.0, 0.0, sum(job.seconds for job in JOBS)
+    try:
+        while waiting or running:
+            while waiting and len(running) < processes:
+                job = waiting.pop(0)
+                running[job] = time.monotonic(), _start(job)
+            time.sleep(_POLL)
+            for job, (start, process) in [*running.items()]:
+                if process.poll() is not None:
+                    del running[job]
+                    finished, spent = finished + job.seconds, spent + time.monotonic() - start
+                    if process.returncode:
+                        raise InputError(f"compiling of {job.name}", _last_line(process))
+            scale = spent / finished if finished else 1.0  # of this computer
+            begun = sum(min((time.monotonic() - start) / scale, job.seconds)
+                        for job, (start, _) in running.items())  # fmt: skip
+            left = (total - finished - begun) * scale / processes
+            if running and time.monotonic() - began > SECONDS_BEFORE_BAR:
+                names = ", ".join(job.name for job in running)
+                line.show(format_bar(names, (finished + begun) / total, left))
+    finally:
+        line.clear()
+        for _, process in running.values():
+            process.kill()
+            process.wait()
+    typer.echo(f"all functions are compiled ({time.monotonic() - began:.0f} s)")
+
+
+def _start(job: Job) -> subprocess.Popen:
+    code = f"from hydrotele.cli.compiling import run_job; run_job({job.name!r})"
+    return subprocess.Popen(
+        [sys.executable, "-P", "-c", code], stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def _last_line(process: subprocess.Popen) -> str:
+    assert process.stderr
+    lines = process.stderr.read().decode(errors="replace").strip().splitlines()
+    return lines[-1] if lines else f"ended with {process.returncode}"

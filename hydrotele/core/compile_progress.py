@@ -1,0 +1,156 @@
+"""Progress bar on stderr while numba compiles functions: what is compiled, and the time left.
+
+The work left is estimated from the call graph: every function of this package that the compiled
+one reaches and that has no code in the cache counts with the length of its bytecode. In a terminal
+the bar is drawn on one line; elsewhere a line is written every two seconds. It is silent where the
+level of the logger `hydrotele` is above `WARNING`.
+"""
+
+import gc
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable
+from types import FunctionType, ModuleType
+from typing import Any
+
+from numba.core import event
+
+SECONDS_BEFORE_BAR = 1.0
+"""Time spent compiling, in seconds, before the bar appears."""
+SECONDS_BETWEEN_LINES = 2.0
+"""Time between two lines where stderr is no terminal, in seconds."""
+_REDRAW = 0.2  # s between two drawings in a terminal
+_CONSTANT = 100  # bytes of bytecode that cost as much to compile as an empty function
+_WIDTH = 30  # characters of the bar
+_LOG = logging.getLogger("hydrotele")
+
+
+def format_bar(name: str, fraction: float, left: float | None) -> str:
+    """Return one line of progress.
+
+    Args:
+        name: what is compiled.
+        fraction: of the work that is done, 0 to 1.
+        left: estimated time left [s]; None where it is unknown.
+
+    Returns:
+        The line, without a line break.
+    """
+    filled = round(_WIDTH * min(max(fraction, 0.0), 1.0))
+    rest = "" if left is None else f", about {left:.0f} s left"
+    return f"compiling {name} [{'#' * filled}{'-' * (_WIDTH - filled)}]{rest} (once, then cached)"
+
+
+class ProgressLine:
+    """A line on stderr that is redrawn in a terminal and repeated elsewhere."""
+
+    def __init__(self) -> None:
+        self._printed, self._width = 0.0, 0
+
+    def show(self, text: str) -> None:
+        """Draw the line, or write it where the last one is two seconds old."""
+        if not _LOG.isEnabledFor(logging.WARNING):
+            return
+        if sys.stderr.isatty():
+            sys.stderr.write("\r" + text.ljust(self._width))
+            self._width = len(text)
+        elif time.monotonic() - self._printed >= SECONDS_BETWEEN_LINES:
+            sys.stderr.write(text + "\n")
+            self._printed = time.monotonic()
+        sys.stderr.flush()
+
+    def clear(self) -> None:
+        """Remove the line from a terminal."""
+        if self._width:
+            sys.stderr.write("\r" + " " * self._width + "\r")
+            sys.stderr.flush()
+            self._width = 0
+
+
+class CompileProgress(event.Listener):
+    """Follows numba's compiler and draws the bar from a thread of its own.
+
+    Args:
+        is_cached: whether a function has code in the cache.
+    """
+
+    def __init__(self, is_cached: Callable[[Any], bool]) -> None:
+        self._is_cached = is_cached
+        self._line, self._lock = ProgressLine(), threading.Lock()
+        self._names: list[str] = []
+        self._began = self._spent = 0.0
+        self._pending: dict[FunctionType, int] = {}
+        self._total = self._done = self._done_before = 0
+        self._collecting = False
+        self._thread: threading.Thread | None = None
+
+    def on_start(self, event: event.Event) -> None:
+        """Note that the compilation of a function has begun."""
+        dispatcher = (event.data or {})["dispatcher"]
+        if not self._names:
+            # The compiler makes millions of objects that live until it ends.
+            self._collecting = gc.isenabled()
+            gc.disable()
+            self._pending = self._find_pending(dispatcher)
+            self._total, self._done = sum(self._pending.values()), 0
+            self._began = time.monotonic()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._draw, daemon=True)
+                self._thread.start()
+        self._names.append(dispatcher.py_func.__name__.strip("_"))
+
+    def on_end(self, event: event.Event) -> None:
+        """Note that it has ended."""
+        function = (event.data or {})["dispatcher"].py_func
+        self._names.pop()
+        weight = self._pending.pop(function, 0)
+        self._done, self._done_before = self._done + weight, self._done_before + weight
+        if not self._names:
+            self._spent += time.monotonic() - self._began
+            if self._collecting:
+                gc.enable()
+            with self._lock:
+                self._line.clear()
+
+    def _find_pending(self, dispatcher: Any) -> dict[FunctionType, int]:
+        """Return the weight of every function to be compiled for one of them."""
+        found, left = dict[FunctionType, int](), [dispatcher]
+        while left:
+            function = left.pop().py_func
+            if function in found:
+                continue
+            found[function] = _CONSTANT + len(function.__code__.co_code)
+            left += [d for d in called_dispatchers(function) if not self._is_cached(d.py_func)]
+        return found
+
+    def _draw(self) -> None:
+        while True:
+            time.sleep(_REDRAW)
+            names = self._names[:1] + self._names[-1:]
+            spent = self._spent + time.monotonic() - self._began
+            if not names or spent < SECONDS_BEFORE_BAR:
+                continue
+            left = None
+            if self._done_before:
+                left = spent / self._done_before * max(self._total - self._done, 0)
+            name = names[0] if names[0] == names[-1] else f"{names[0]}: {names[-1]}"
+            with self._lock:
+                if self._names:
+                    self._line.show(format_bar(name, self._done / max(self._total, 1), left))
+
+
+def called_dispatchers(function: FunctionType) -> list[Any]:
+    """Return the compiled functions that a function names, directly or in a module."""
+    names = function.__code__.co_names
+    scope = function.__globals__ | {
+        name: cell.cell_contents
+        for name, cell in zip(
+            function.__code__.co_freevars, function.__closure__ or (), strict=True
+        )
+    }
+    found = [scope.get(name) for name in (*names, *function.__code__.co_freevars)]
+    for module in [m for m in found if isinstance(m, ModuleType)]:
+        found += [getattr(module, name, None) for name in names]
+    return [one for one in found if hasattr(one, "py_func")]
