@@ -4,6 +4,7 @@ Each job runs the smallest task that calls all compiled functions of one kind of
 argument types that the command uses.
 """
 
+import hashlib
 import os
 import subprocess
 import sys
@@ -13,8 +14,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numba
 import typer
+from llvmlite.binding import get_host_cpu_name
 
+import hydrotele
 from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, ProgressLine, format_bar
 from hydrotele.core.compiled import cache_folder
 from hydrotele.core.errors import InputError
@@ -103,10 +107,15 @@ def compile_all(processes: int | None = None) -> None:
     Raises:
         InputError: there is no folder for the cache, or a job failed.
     """
-    if cache_folder() is None:
+    folder = cache_folder()
+    if folder is None:
         raise InputError(
             "cache", "there is no folder that only you can write to; set XDG_CACHE_HOME to one"
         )
+    complete = folder / f"complete_{_digest()}"
+    if complete.exists():
+        typer.echo("all functions are compiled already")
+        return
     processes = processes or len(os.sched_getaffinity(0))
     began, line = time.monotonic(), ProgressLine()
     waiting = sorted(JOBS, key=lambda job: -job.seconds)
@@ -136,7 +145,19 @@ def compile_all(processes: int | None = None) -> None:
         for _, process in running.values():
             process.kill()
             process.wait()
+    for old in folder.glob("complete_*"):
+        old.unlink()
+    complete.touch()
     typer.echo(f"all functions are compiled ({time.monotonic() - began:.0f} s)")
+
+
+def _digest() -> str:
+    """Return a digest of everything that the compiled code depends on."""
+    package = Path(hydrotele.__file__).parent
+    text = hashlib.sha256(f"{sys.version} {numba.__version__} {get_host_cpu_name()}".encode())
+    for path in sorted(package.rglob("*.py")):
+        text.update(path.read_bytes())
+    return text.hexdigest()[:16]
 
 
 def _start(job: Job) -> subprocess.Popen:
