@@ -64,7 +64,7 @@ def inlined(function):
     return _compile(function, _nrt=False, forceinline=True)
 
 
-def _compile(function, **options):
+def _compile(function, **options: Any):
     """Make a dispatcher for calls from Python and one for calls from compiled functions.
 
     The second has no wrapper that converts Python objects, which takes a fifth of the time to
@@ -76,7 +76,7 @@ def _compile(function, **options):
             "no_cfunc_wrapper": True,  # for calls by address, which takes a fifth of the time
         }  # fmt: skip
         made: Any = njit(**options)(function)
-        called: Any = njit(no_cpython_wrapper=True, **options)(function)
+        called: Any = njit(**options | {"no_cpython_wrapper": True})(function)
         if cache:
             made._cache, called._cache = _SharedCache(function), _CalledCache(function)
     made.get_call_template, made.get_overload = called.get_call_template, called.get_overload

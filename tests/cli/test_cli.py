@@ -469,8 +469,6 @@ def test_a_library_that_makes_another_error_of_sigterm_changes_no_exit_status():
     code = """if True:
         import os, signal, time
         from hydrotele.cli import main as cli
-from hydrotele.cli.overview import COMMANDS as SUMMARIES
-from hydrotele.cli.overview import format_overview
         def app():
             try:
                 os.kill(os.getpid(), signal.SIGTERM)
