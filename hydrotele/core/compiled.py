@@ -75,8 +75,9 @@ def _compile(function, **options: Any):
             "cache": cache, "error_model": "numpy", "nogil": True,
             "no_cfunc_wrapper": True,  # for calls by address, which takes a fifth of the time
         }  # fmt: skip
-        made: Any = njit(**options)(function)
-        called: Any = njit(**options | {"no_cpython_wrapper": True})(function)
+        compile_with: Any = njit  # whose type states only some of its options
+        made = compile_with(**options)(function)
+        called = compile_with(**options, no_cpython_wrapper=True)(function)
         if cache:
             made._cache, called._cache = _SharedCache(function), _CalledCache(function)
     made.get_call_template, made.get_overload = called.get_call_template, called.get_overload
