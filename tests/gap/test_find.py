@@ -36,8 +36,14 @@ def found(folder):
     return find_gap(half(folder))
 
 
-def test_the_unchanged_machine_has_no_gap():
-    gap = find_gap(half(MEASURED / "open_04", 20.0))
+@pytest.mark.parametrize(("effects", "seconds"), [
+    (("pressure_offset", "valve_deadband", "command_delay", "payload"), 10.0),
+    pytest.param((), 20.0, marks=pytest.mark.nightly, id="the whole library"),
+])  # fmt: skip
+def test_the_unchanged_machine_has_no_gap(effects, seconds, monkeypatch):
+    """Daily with an effect of each kind; patched, as named effects would switch learning off."""
+    monkeypatch.setattr(find, "hypotheses", lambda machine, names: hypotheses(machine, effects))
+    gap = find_gap(half(MEASURED / "open_04", seconds))
     assert gap.verdict == "no_gap"
     assert gap.effects == () and gap.unknown is None and gap.patched is gap.machine
     assert gap.size.before == pytest.approx(gap.size.noise_floor, abs=0.03)  # scatter 0.01
@@ -301,7 +307,8 @@ def test_effects_that_make_the_held_out_run_worse_are_taken_back_and_laws_learne
     monkeypatch.setattr(find, "discover", learnt)
     if after_laws:  # as if only the laws beside it made it worse
         monkeypatch.setattr(find, "_worse_held_out", lambda *_: "")
-    gap = find_gap(half(MEASURED / "open_04", 20.0))
+    monkeypatch.setattr(find, "hypotheses", lambda m, names: hypotheses(m, ("valve_gain",)))
+    gap = find_gap(half(MEASURED / "open_04", 6.0))
     assert gap.verdict == "no_gap" and not gap.effects
     assert sum("held-out run worse" in note for note in gap.notes) == 1
     gain = ["valve_gain.boom.ratio"]  # which cannot be believed: laws are tried without it, too
