@@ -84,7 +84,7 @@ def test_missing_channels_and_rows_still_find_the_dead_band(effects, tmp_path):
             ),
             tmp_path / path.name,
         )
-    # 16 or 30 s: of these logs the fit to 20 s ends in a local optimum, 0.0822 with verdict "unknown";
+    # 16 or 30 s: the fit to 20 s ends in a local optimum, 0.0822 with verdict "unknown";
     # 16, 18, 19, 21, 22, 24, 30 and 40 s give 0.0848 to 0.0851
     gap = find_gap(half(tmp_path, 16.0 if effects else 30.0), effects=effects)
     assert {(e.name, e.location) for e in gap.effects} == {("valve_deadband", "stick")}
