@@ -15,7 +15,8 @@ from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.terms.law import Term
 
-ROWS, PERIOD = 60, 0.02
+PERIOD = 0.02
+ROWS = 50  # 1 s
 ANGLE, LENGTH, PRESSURE = np.radians(0.01), 0.2e-3, 0.1 * 25 * 6894.757
 CASES = {
     "cat215/none": (),

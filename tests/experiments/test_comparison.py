@@ -61,19 +61,22 @@ def test_judgement_needs_all_checks():
 def test_intervals_cover_the_truth():
     """Of 100 intervals 95 should: the binomial standard error is 2.2 %, and three are allowed.
 
+    Of the 40 intervals of the bootstrap, whose standard error is 3.4 %, three are 10.2 %.
+
     The percentile bootstrap of the ratio covers less with 20 samples; 5 % are allowed for that.
     """
     rng, mean, ratio, fraction = np.random.default_rng(1), [], [], []
-    for _ in range(100):
+    for number in range(100):
         pair = rng.normal([2.0, 1.0], [0.5, 0.2], (20, 2))
         check = check_mean("", pair[:, 0], (0, 1), "")
         mean.append(check.low <= 2.0 <= check.high)
-        check = check_statistic("", pair, lambda x: x[:, 0].mean() / x[:, 1].mean(), (0, 1), "")
-        ratio.append(check.low <= 2.0 <= check.high)
+        if number < 40:
+            check = check_statistic("", pair, lambda x: x[:, 0].mean() / x[:, 1].mean(), (0, 1), "")
+            ratio.append(check.low <= 2.0 <= check.high)
         check = check_fraction("", rng.random(20) < 0.7)
         fraction.append(check.low <= 0.7 <= check.high)
     assert np.mean(mean) > 0.95 - 0.066
-    assert np.mean(ratio) > 0.95 - 0.066 - 0.05
+    assert np.mean(ratio) > 0.95 - 0.102 - 0.05
     assert np.mean(fraction) > 0.95 - 0.066  # exact intervals are conservative
 
 

@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 from hydrotele.cli.main import app
 from hydrotele.estimate.baselines import fit_baseline
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
+from hydrotele.estimate.hypothesis import hypotheses
+from hydrotele.gap import find
 from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.gap.find import find_gap
 from hydrotele.logs.dataset import busiest, load_dataset
@@ -29,7 +31,13 @@ from tools.validation.real_machines import (
 pytestmark = needs_real
 
 
-def test_emps_names_friction_that_depends_on_the_direction():
+@pytest.mark.parametrize("effects", [
+    ("friction_asymmetry", "viscous_friction", "coulomb_friction", "command_offset"),
+    pytest.param((), marks=pytest.mark.nightly, id="the whole library"),
+])  # fmt: skip
+def test_emps_names_friction_that_depends_on_the_direction(effects, monkeypatch):
+    """Daily with a small library, patched: named effects would switch learning off."""
+    monkeypatch.setattr(find, "hypotheses", lambda machine, names: hypotheses(machine, effects))
     machine = load_machine("emps")
     data = load_dataset(REAL / "emps" / "main.parquet", machine)
     gap = find_gap(data)

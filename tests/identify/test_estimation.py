@@ -23,10 +23,10 @@ PERIOD = 20.0  # s, of the scenario `excitation`
 
 @pytest.fixture(scope="module")
 def repeated():
-    """Four periods to fit and another motion to judge on."""
+    """Three periods to fit and another motion to judge on."""
     machine, sensors = load_machine("cat215"), "khoshzaban1992"
     files = []
-    for name, duration in (("excitation", "80.0"), ("excitation_fast", "40.0")):
+    for name, duration in (("excitation", "60.0"), ("excitation_fast", "20.0")):
         own = {"seed": "3", "sensors": sensors, "duration": duration}
         files.append(RunFiles(name, (run_scenario(load_scenario(name, own)).measured,)))
     fit, heldout, _ = records(make_dataset(files, machine, sensors, "excitation_fast"))
@@ -90,6 +90,18 @@ def test_a_motion_with_another_period_is_refused(repeated, method):
         identify_dynamics(fit, heldout, setup, Processing("periodic", period=13.0))
 
 
+def test_a_trial_of_the_coverage_study_is_near_the_truth():
+    """One small trial; how many intervals cover the truth is counted nightly."""
+    result = one_trial(2026, 0, "khoshzaban1992")
+    away = np.array(list(result["away"].values()))
+    # of some 23 intervals, 95 % each, more than 5 miss the truth in one of a thousand trials
+    assert len(away) > 20 and np.sum(np.abs(away) > 1.959964) <= 5
+    # in units of the 95 % limit; one in a thousand right ones lies further away
+    limits = chi2.ppf([0.95, 0.999], len(away))
+    assert result["ellipsoid"] < limits[1] / limits[0]
+
+
+@pytest.mark.nightly
 def test_intervals_of_repeated_experiments_cover_the_truth():
     """Six of the three hundred of `tools/studies/identify_coverage.py`."""
     results = [one_trial(2026, number, "khoshzaban1992") for number in range(6)]
