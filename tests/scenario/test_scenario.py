@@ -21,7 +21,7 @@ from hydrotele.simulate.record import SimulationFailed
 
 PIN = 1.0e-4  # m, asked for by the project: a tenth of a millimetre
 SHORTER = {"hold": "10", "emps_track": "6"}  # s; their later parts repeat the earlier ones
-# Simulated time [s] of the daily run, for scenarios that take long in full; nightly they run in full.
+# Simulated time [s] of the daily run, for scenarios that take long; nightly they run in full.
 # None: no daily run, because another scenario has the same machine and kind of pilot.
 BEGUN = {
     "calibrate_swing": "20", "calibrate_boom": None, "calibrate_pitch": None,

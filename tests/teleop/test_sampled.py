@@ -96,9 +96,9 @@ def test_growth_is_that_of_a_periods_matrix(forward, back, force):
 def test_random_cases_are_told_right():
     """A small version of tools/studies/stability_study.py, half of it aimed at the limits.
 
-    With 98 % right, 80 answers have more than 6 wrong ones in one of 700 such tests.
+    With 98 % right, 40 answers have more than 4 wrong ones in one of 800 such tests.
     """
-    rows = [stability_study.trial(42, number) for number in range(10)]
+    rows = [stability_study.trial(42, number) for number in range(5)]
     every = [row for case in rows for row in case]
     wrong = [
         (number, name)
@@ -106,7 +106,7 @@ def test_random_cases_are_told_right():
         for name, row in zip(SAMPLED_STRUCTURES, case, strict=True)
         if row.told != row.seen
     ]
-    assert len(wrong) <= 6, wrong
+    assert len(wrong) <= 4, wrong
     assert 0.2 < np.mean([row.seen for row in every]) < 0.8
     assert any(row.near for row in every) and any(row.held for row in every)
     assert not all(row.held for row in every)
