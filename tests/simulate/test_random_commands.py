@@ -18,7 +18,7 @@ def run(*arguments):
 
 
 def test_random_commands_make_no_nan_and_no_warning():
-    result = run("--steps", "6e4", "--simulations", "12", "--reset", "1000")
+    result = run("--steps", "6e4", "--simulations", "12", "--states", "12", "--reset", "1000")
     assert result.returncode == 0, result.stdout + result.stderr
     lines = result.stdout.splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[2:-2]]
@@ -33,6 +33,17 @@ def test_random_commands_make_no_nan_and_no_warning():
 
 def test_a_step_that_cannot_work_is_noticed():
     # 50 ms is a whole period of the stick's 20 Hz
-    result = run("--tools", "none", "--steps", "4e3", "--simulations", "8", "--timestep", "0.05")
+    result = run(
+        "--tools",
+        "none",
+        "--steps",
+        "4e3",
+        "--states",
+        "8",
+        "--simulations",
+        "8",
+        "--timestep",
+        "0.05",
+    )
     assert result.returncode == 1
     assert "mjWARN_BADQACC" in result.stdout, result.stdout + result.stderr
