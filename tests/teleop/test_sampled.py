@@ -96,7 +96,7 @@ def test_growth_is_that_of_a_periods_matrix(forward, back, force):
 @pytest.mark.parametrize(
     ("numbers", "most"),
     [
-        # Daily the five that are simulated fastest and are not all alike.
+        # Daily four quick ones, and 9, the only one of the ten that is near a limit.
         ((2, 4, 6, 8, 9), 4),
         pytest.param(range(10), 6, marks=pytest.mark.nightly),
     ],
