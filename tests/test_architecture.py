@@ -1,11 +1,12 @@
-"""Rooms import downwards only, files stay short, heavy libraries stay where they are used."""
+"""Rooms import downwards only, files and signatures stay short, heavy libraries load late."""
 
 import ast
+import functools
 import graphlib
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -48,6 +49,12 @@ ONLY = {
 
 HEAVY = {"rerun": {"show", "envs"}, "matplotlib": {"show", "envs"}, "gymnasium": {"show", "envs"}}
 MAX_LINES = 1000
+MAX_ARGUMENTS = 10  # what belongs together is a record
+# Functions of `cli` have one argument per option of a command and are not looked at.
+LONGER = {
+    # Options of an optimiser by keyword, as SciPy's function of that name has them.
+    "calibrate/estimation.py:least_squares",
+}
 UNFINISHED = re.compile(r"\b(?:TODO|FIXME|XXX|HACK)\b")
 MACHINE_PATH = re.compile(r"(?<![\w.:/~$}-])/(?:work|home|root|Users|mnt|srv|tmp)/\w")
 
@@ -92,14 +99,7 @@ def room_of(module: str) -> str:
 
 def imports_of(tree: ast.Module, module: str, is_package: bool) -> Iterator[Import]:
     """Every import statement of a file, with relative names made absolute."""
-    inside = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            inside.update(id(child) for child in ast.walk(node))
-        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            inside.update(id(child) for statement in node.body for child in ast.walk(statement))
-    for node in ast.walk(tree):
-        at_top = id(node) not in inside
+    for node, at_top in walk_imports(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield Import(alias.name, node.lineno, at_top)
@@ -110,9 +110,33 @@ def imports_of(tree: ast.Module, module: str, is_package: bool) -> Iterator[Impo
                 base = ".".join(parts[: -node.level] + ([base] if base else []))
             for alias in node.names:
                 yield Import(f"{base}.{alias.name}", alias.lineno, at_top)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+        else:  # a call of import_module
             if node.args and isinstance(node.args[0], ast.Constant):
                 yield Import(str(node.args[0].value), node.lineno, at_top)
+
+
+def walk_imports(node: ast.AST, at_top: bool = True) -> Iterator[tuple[Any, bool]]:
+    """Import statements and calls of `import_module`; whether importing the file executes them."""
+    if isinstance(node, ast.Import | ast.ImportFrom):
+        yield node, at_top
+    elif isinstance(node, ast.Call):
+        if dotted_end(node.func).endswith("import_module"):
+            yield node, at_top
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+        at_top = False
+    typing_only = isinstance(node, ast.If) and any(
+        dotted_end(part) == "TYPE_CHECKING" for part in ast.walk(node.test)
+    )
+    executed = node.orelse if typing_only else ast.iter_child_nodes(node)
+    for child in executed:
+        yield from walk_imports(child, at_top)
+    for child in node.body if typing_only else ():
+        yield from walk_imports(child, False)
+
+
+def dotted_end(node: ast.AST) -> str:
+    """`import_module` of `importlib.import_module`; empty for what is no name."""
+    return getattr(node, "attr", getattr(node, "id", ""))
 
 
 def known_module(name: str, modules: Iterable[str]) -> str | None:
@@ -120,6 +144,16 @@ def known_module(name: str, modules: Iterable[str]) -> str | None:
     while name and name not in modules:
         name = name.rpartition(".")[0]
     return name or None
+
+
+def tree_of(path: Path, root: Path) -> ast.Module:
+    """Syntax tree of a file; of a file of this repository it is kept."""
+    return kept_tree(path) if root == ROOT else ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
+def kept_tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 
 
 def import_problems(root: Path) -> list[str]:
@@ -133,7 +167,7 @@ def import_problems(root: Path) -> list[str]:
     graph: dict[str, set[str]] = {module: set() for module in modules}
     for module, path in modules.items():
         room, where = room_of(module), path.relative_to(root).as_posix()
-        tree = ast.parse(path.read_text(encoding="utf-8"), filename=where)
+        tree = tree_of(path, root)
         for name, line, at_top in imports_of(tree, module, path.name == "__init__.py"):
             library = name.partition(".")[0]
             if at_top and library in HEAVY and room not in HEAVY[library]:
@@ -243,6 +277,26 @@ def texts(*patterns: str) -> Iterator[tuple[str, list[str]]]:
                 yield path.relative_to(ROOT).as_posix(), path.read_text("utf-8").splitlines()
             except UnicodeDecodeError:
                 continue  # a picture
+
+
+def long_signatures() -> set[str]:
+    """Functions with more than `MAX_ARGUMENTS` arguments, without `self`."""
+    found, package = set(), ROOT / PACKAGE
+    for path in sorted(package.rglob("*.py")):
+        name = path.relative_to(package).as_posix()
+        for node in ast.walk(kept_tree(path)):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            a = node.args
+            arguments = [one.arg for one in (*a.posonlyargs, *a.args, *a.kwonlyargs)]
+            count = len(arguments) - (arguments[:1] in (["self"], ["cls"]))
+            if count > MAX_ARGUMENTS and not name.startswith("cli/"):
+                found.add(f"{name}:{node.name}")
+    return found
+
+
+def test_no_function_takes_more_than_ten_arguments():
+    assert long_signatures() == LONGER
 
 
 def test_files_are_short():

@@ -85,13 +85,13 @@ def error(core: TaskCore, number: int) -> np.ndarray:
 @pytest.fixture(scope="module")
 def graded():
     """Three soils by the reference controller until all have been dumped once."""
-    core = core_of(8, duration=60.0)
-    before = [mass(core, n) for n in range(8)]
+    core = core_of(4, duration=60.0)
+    before = [mass(core, n) for n in range(4)]
     start = core.episodes["goal"][:, ERROR].copy()
     controller = Grade(core.setup)
-    controller.begin(8)
-    total, live, dumped = np.zeros(8), np.ones(8, bool), np.zeros(8, bool)
-    least = np.full(8, np.inf)
+    controller.begin(4)
+    total, live, dumped = np.zeros(4), np.ones(4, bool), np.zeros(4, bool)
+    least = np.full(4, np.inf)
     for _ in range(core.setup.clock.horizon):
         core.step(controller(core.observation))
         total += np.where(live, core.reward, 0.0)

@@ -263,10 +263,10 @@ def test_moves_leave_a_pendulum_of_their_period_at_rest(length):
 
 
 def test_the_reference_controller_places_logs():
-    core = make(TASK, 4, action="resolved_motion", sensors="real", duration=50.0, variants=4)
+    core = make(TASK, 2, action="resolved_motion", sensors="real", duration=50.0, variants=2)
     controller = make_controller("reference", core.setup)
-    controller.begin(4)
-    placed, over = np.zeros(4), np.zeros(4, bool)
+    controller.begin(2)
+    placed, over = np.zeros(2), np.zeros(2, bool)
     for _ in range(core.setup.clock.horizon):
         core.step(controller(core.observation))
         over |= (core.terminated | core.truncated) != 0

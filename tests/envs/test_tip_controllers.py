@@ -10,7 +10,7 @@ from hydrotele.envs.episode import ACTIONS, DISABLED
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 
-COUNT = 4
+COUNT = 2
 
 
 def played(name: str, **choices) -> tuple[TaskCore, np.ndarray]:

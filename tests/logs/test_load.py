@@ -116,10 +116,11 @@ def test_clean_measured_logs_pass_unchanged(case):
         assert not (read[:, 5:][kept[:, 5:]] == 0.0).any()
 
 
-def test_hundred_draws_of_noise_have_no_stuck_sensor():
+@pytest.mark.parametrize("draws", [10, pytest.param(100, marks=pytest.mark.nightly)])
+def test_draws_of_noise_have_no_stuck_sensor(draws):
     truths = [load_log(MEASURED / "nominal_truth" / f"{run}.parquet").without_truth()
               for run in ("fit_1", "test_1")]  # fmt: skip
-    for seed in range(100):
+    for seed in range(draws):
         runs = {}
         for number, truth in enumerate(truths):
             true = {c: v for c, v in truth.columns.items() if not c.startswith("command")}

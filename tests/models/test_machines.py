@@ -17,6 +17,12 @@ from tests.measured import REAL, needs_real
 CASES = [(name, tool) for name in shipped_machines() for tool in load_machine(name).tools]
 PIN = 1.0e-4  # m, asked for: a tenth of a millimetre on a 20 t machine
 PLANTS = {}
+SAMPLES = {}
+
+
+# Looks with meshes of a tool, of a limb in parts, and plain shapes; the others nightly.
+LOOKED_AT = {("cat215", "grapple_claw"), ("cat325", "none"), ("rig", "none")}
+assert set(CASES) >= LOOKED_AT
 
 
 @pytest.fixture(params=CASES, ids="-".join)
@@ -32,12 +38,21 @@ def no_warnings(data) -> bool:
     return not np.any(data.warning.number)
 
 
-def samples(plant, count):
-    """Poses over the joint ranges: each driven joint alone over its range, the others at home."""
-    for axis in plant.machine.axes.values():
-        low, high = plant.machine.joints[axis.joint].range or (-math.pi, math.pi)
-        for value in np.linspace(low, high, count):
-            yield axis, float(value), rest_state(plant, {axis.joint: float(value)})
+def samples(plant):
+    """Nine poses of each driven joint over its range, the other joints at home; kept for all tests.
+
+    Tests must not change their data.
+    """
+    key = plant.machine.name, plant.machine.tool
+    if key not in SAMPLES:
+        SAMPLES[key] = [
+            (axis, float(value), rest_state(plant, {axis.joint: float(value)}))
+            for axis in plant.machine.axes.values()
+            for value in np.linspace(
+                *(plant.machine.joints[axis.joint].range or (-math.pi, math.pi)), 9
+            )
+        ]
+    return SAMPLES[key]
 
 
 def test_steps_under_noise_without_warning(plant):
@@ -109,7 +124,7 @@ def test_holding_forces_are_the_slope_of_potential_energy(plant):
 
 def test_linkages_close_over_the_joint_range_within_the_stroke(plant):
     """Every cylinder reaches its joint's whole range within its stroke, to the loops' 1e-9 m."""
-    for axis, value, data in samples(plant, 9):
+    for axis, value, data in samples(plant):
         where = f"{axis.joint} at {value:.3f}"
         assert pin_opening(plant.model, data) < 1e-9, where
         for place, name in zip(plant.rod_qpos, plant.axes, strict=True):
@@ -125,7 +140,7 @@ def test_strokes_are_used(plant):
     The CAT's stick leaves most: its linkage ends at 1.365 m of 1.45 m.
     """
     used = {}
-    for axis, _, data in samples(plant, 9):
+    for axis, _, data in samples(plant):
         for place, name in zip(plant.rod_qpos, plant.axes, strict=True):
             if place >= 0 and plant.machine.axes[name] == axis:
                 used.setdefault(name, []).append(data.qpos[place] / axis.cylinder.stroke)
@@ -137,7 +152,7 @@ def test_strokes_are_used(plant):
 def test_moment_arms_keep_their_sign(plant):
     """No cylinder passes a dead point inside its joint's range, so that it can always drive it."""
     signs = {}
-    for axis, _, data in samples(plant, 15):
+    for axis, _, data in samples(plant):
         if not axis.cylinder:
             continue
         name = next(n for n, a in plant.machine.axes.items() if a == axis)
@@ -162,6 +177,12 @@ def test_log_columns_are_channels(plant):
         assert parse_channel(channel.removeprefix("-")).axis in plant.machine.axes
 
 
+@pytest.mark.parametrize(
+    "plant",
+    [c if c in LOOKED_AT else pytest.param(c, marks=pytest.mark.nightly) for c in CASES],
+    indirect=True,
+    ids="-".join,
+)
 def test_motion_is_independent_of_the_looks(plant):
     """`model` leaves out the looks: the full MJCF has the same joints, masses and inertias."""
     full = mujoco.MjModel.from_xml_string(plant.mjcf)
@@ -181,7 +202,13 @@ def test_folder_is_complete(name):
     assert f"]({name}.png)" in readme and "hydrotele export" in readme
 
 
-@pytest.mark.parametrize("name", shipped_machines())
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in {n for n, _ in LOOKED_AT} else pytest.param(name, marks=pytest.mark.nightly)
+        for name in shipped_machines()
+    ],
+)
 @pytest.mark.skipif(os.environ.get("MUJOCO_GL") != "egl", reason="needs MUJOCO_GL=egl")
 def test_renders(name):
     """The overview camera shows more than ground and sky."""

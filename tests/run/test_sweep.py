@@ -173,19 +173,6 @@ def test_a_journal_survives_being_cut_anywhere(tmp_path, monkeypatch):
     assert path.read_bytes() == whole
 
 
-def test_a_half_written_journal_is_gone_on_with(done, tmp_path):
-    file, out = copied(done, tmp_path)
-    lines = (out / "journal.jsonl").read_bytes().splitlines(keepends=True)
-    (out / "journal.jsonl").write_bytes(b"".join(lines[2:6]) + lines[6][:100])
-    for name in ("table.parquet", "timings.csv"):
-        (out / name).unlink()
-    (out / ".table.0a.parquet").write_bytes(b"half")
-    swept = run_sweep(load_sweep(file), out, SweepSettings(jobs=1))
-    assert swept.done == 4
-    assert (out / "table.parquet").read_bytes() == (done / "table.parquet").read_bytes()
-    assert not list(out.glob(".*"))
-
-
 def test_another_sweep_is_refused_with_what_differs(done, tmp_path):
     file, out = copied(done, tmp_path)
     file.write_text(file.read_text().replace("0.05", "0.06"))

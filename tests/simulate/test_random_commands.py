@@ -1,4 +1,4 @@
-"""A small version of tools/validation/random_commands.py (10^8 steps in full)."""
+"""A small version of tools/validation/random_commands.py (10^8 steps in full, 10^7 nightly)."""
 
 import os
 import subprocess
@@ -18,7 +18,7 @@ def run(*arguments):
 
 
 def test_random_commands_make_no_nan_and_no_warning():
-    result = run("--steps", "2e5", "--simulations", "32", "--reset", "1000")
+    result = run("--steps", "6e4", "--simulations", "12", "--states", "12", "--reset", "1000")
     assert result.returncode == 0, result.stdout + result.stderr
     lines = result.stdout.splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[2:-2]]
@@ -28,11 +28,22 @@ def test_random_commands_make_no_nan_and_no_warning():
         assert 0 < float(gap) < 0.1, "pins open by less than 0.1 mm"
         assert 0.0 < float(pressures.split()[0]) < 0.1013, "chambers are drawn empty"
         assert float(beyond) <= 0.0
-    assert int(lines[-1].split()[2]) >= 200_000
+    assert int(lines[-1].split()[2]) >= 60_000
 
 
 def test_a_step_that_cannot_work_is_noticed():
     # 50 ms is a whole period of the stick's 20 Hz
-    result = run("--tools", "none", "--steps", "2e4", "--simulations", "8", "--timestep", "0.05")
+    result = run(
+        "--tools",
+        "none",
+        "--steps",
+        "4e3",
+        "--states",
+        "8",
+        "--simulations",
+        "8",
+        "--timestep",
+        "0.05",
+    )
     assert result.returncode == 1
     assert "mjWARN_BADQACC" in result.stdout, result.stdout + result.stderr

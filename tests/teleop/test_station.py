@@ -67,7 +67,14 @@ def check_sound(run, speeds=SPEEDS):
         assert np.isfinite(values).all()
 
 
-@pytest.mark.parametrize(("mode", "delay"), [("rate", 0.1), ("position", 0.0), ("position", 0.1)])
+@pytest.mark.parametrize(
+    ("mode", "delay"),
+    [
+        ("rate", 0.1),
+        pytest.param("position", 0.0, marks=pytest.mark.nightly),
+        ("position", 0.1),
+    ],
+)
 @pytest.mark.parametrize("reflection", REFLECTIONS)
 def test_every_structure_goes_down_and_presses(reflection, mode, delay):
     """From free motion into the plate: it touches, and nothing leaves its bounds."""
@@ -307,8 +314,17 @@ def test_a_joystick_that_shakes_the_hand_is_seen_as_active(aside, at_stops):
         assert told[-1] == pytest.approx(true[-1], rel=0.05)
 
 
-@pytest.mark.parametrize("force", ["dynamic", "true"])
-@pytest.mark.parametrize("channel", ["angle.boom", "pressure_head.boom", "pressure_rod.stick"])
+@pytest.mark.parametrize(
+    ("channel", "force"),
+    [
+        ("angle.boom", "true"),
+        ("pressure_head.boom", "dynamic"),
+        pytest.param("angle.boom", "dynamic", marks=pytest.mark.nightly),
+        pytest.param("pressure_head.boom", "true", marks=pytest.mark.nightly),
+        pytest.param("pressure_rod.stick", "dynamic", marks=pytest.mark.nightly),
+        pytest.param("pressure_rod.stick", "true", marks=pytest.mark.nightly),
+    ],
+)
 def test_frozen_sensor_closes_the_valves(channel, force):
     """Within `safety.frozen`, a tenth of a second between looks, and a sample."""
     run = run_scenario(scenario(

@@ -19,8 +19,6 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 
-STATES = 64  # reachable states to start from
-
 
 def reachable_states(plant: Plant, count: int, rng: np.random.Generator) -> np.ndarray:
     """Rest states at random joint positions, clear of the ground and inside every stroke.
@@ -107,7 +105,7 @@ def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator
         Counts and extremes: steps, nan, warnings, gap [m], speed [rad/s], pressures.
     """
     plant = build_plant(load_machine(machine, tool), args.timestep)
-    states = reachable_states(plant, STATES, rng)
+    states = reachable_states(plant, args.states, rng)
     batch = Batch(plant.model, args.simulations, nthread=args.threads)
     nq, pins = plant.model.nq, (plant.model.eq_obj1id, plant.model.eq_obj2id)
     warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), dtype=np.int64)
@@ -160,6 +158,7 @@ def main() -> int:
     parser.add_argument("--hold", type=int, default=20, help="steps for which a command is held")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--reset", type=int, default=4000, help="steps between new states")
+    parser.add_argument("--states", type=int, default=64, help="reachable states to start from")
     parser.add_argument("--timestep", type=float, default=1.0e-3, help="[s]")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
