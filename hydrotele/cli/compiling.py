@@ -54,18 +54,16 @@ def _compile_runs() -> None:
         run_scenario(load_scenario(name, {"duration": "0.2"}))
 
 
-def _compile_task(name: str) -> Callable[[], None]:
-    def run() -> None:
-        import gymnasium
+def _compile_environments() -> None:
+    import gymnasium
 
-        import hydrotele.envs  # noqa: F401 - registers the environments
+    from hydrotele.envs import TASK_NAMES
 
+    for name in TASK_NAMES:
         env = gymnasium.make(f"hydrotele/{name}-v0")
         env.reset(seed=0)
         env.step(env.action_space.sample())
         env.close()
-
-    return run
 
 
 def _compile_gap() -> None:
@@ -83,14 +81,12 @@ def _compile_gap() -> None:
         find_gap(load_dataset(Path(folder), load_machine("cat215")), effects=("valve_gain",))
 
 
-TASKS = ("TrackTrajectory", "Grade", "PlaceLog", "HoldForce", "StraightLine", "ReachFeller")
 JOBS = (
     Job("gap", _compile_gap, 130.0),
+    Job("environments", _compile_environments, 95.0),
     Job("teleoperation", _compile_teleoperation, 65.0),
-    *(Job(name, _compile_task(name), seconds)
-      for name, seconds in zip(TASKS, (45.0, 20.0, 12.0, 10.0, 7.0, 3.0), strict=True)),
-    Job("runs", _compile_runs, 10.0),
-)  # fmt: skip
+    Job("runs", _compile_runs, 15.0),
+)
 
 
 def run_job(name: str) -> None:
