@@ -4,13 +4,10 @@ import ctypes
 import importlib.util
 import os
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 import hypothesis
-
-FOLDER = "HYDROTELE_TEST_RECORDINGS"
 
 # Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out; the last lines of
 # the suite say so, and tools/nightly has a check `learn`, which runs them with it.
@@ -48,14 +45,6 @@ LONG = (
     "gap/test_report.py", "gap/test_experiment.py", "teleop/test_analyse_command.py",
     "core/test_compiled.py",
 )  # fmt: skip
-
-
-def pytest_configure(config):
-    """Make the folder of the session's shared recordings; workers inherit its name."""
-    if FOLDER not in os.environ:
-        folder = tempfile.TemporaryDirectory(prefix="hydrotele_recordings_")
-        os.environ[FOLDER] = folder.name
-        config.add_cleanup(folder.cleanup)
 
 
 _REAL = Path(__file__).resolve().parents[2] / "shared" / "real"
