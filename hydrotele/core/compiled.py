@@ -26,12 +26,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from numba import cfunc, njit
+from numba import njit
 from numba.core import config as _numba_config
 from numba.core import event
 from numba.core.caching import FunctionCache, UserProvidedCacheLocator
+from numba.core.ccallback import CFunc
+from numba.core.sigutils import normalize_signature
 
 from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, CompileProgress, ProgressLine
+from hydrotele.core.linking import Callee, LinkedCache
 
 _CONFIG: Any = _numba_config  # its settings are made at run time
 _UNUSED = 30 * 24 * 3600.0  # s, after which the cache of other sources is removed
@@ -80,7 +83,8 @@ def _compile(function, **options: Any):
         called = compile_with(**options, no_cpython_wrapper=True)(function)
         if cache:
             made._cache, called._cache = _SharedCache(function), _CalledCache(function)
-    made.get_call_template, made.get_overload = called.get_call_template, called.get_overload
+    callee = Callee(called, inline=options.get("forceinline", False))
+    made.get_call_template, made.get_overload = callee.call_template, callee.overload
     return made
 
 
@@ -106,10 +110,13 @@ class Callback:
 
     @functools.cached_property
     def _compiled(self) -> Any:
-        with _caching(self._function.__module__) as cache, contextlib.ExitStack() as stack:
+        with _caching(self._function.__module__) as cache:
+            signature = normalize_signature(self._signature)
+            made = CFunc(self._function, signature, {}, {"error_model": "numpy"})
             if cache:
-                stack.callback(_release, _lock(_CONFIG.CACHE_DIR, self._function))
-            return cfunc(self._signature, cache=cache, error_model="numpy")(self._function)
+                made._cache = _SharedCache(self._function)
+            made.compile()
+            return made
 
     @property
     def address(self) -> int:
@@ -241,6 +248,7 @@ class Locator(UserProvidedCacheLocator):
 class _SharedCache(FunctionCache):
     """A function's cache, in which one process at a time compiles what is missing."""
 
+    _impl_class = LinkedCache
     _held: int | None = None
 
     def load_overload(self, sig, target_context):
