@@ -35,6 +35,7 @@ from numba.core.sigutils import normalize_signature
 
 from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, CompileProgress, ProgressLine
 from hydrotele.core.linking import Callee, LinkedCache
+from hydrotele.core.references import argument_type
 
 _CONFIG: Any = _numba_config  # its settings are made at run time
 _UNUSED = 30 * 24 * 3600.0  # s, after which the cache of other sources is removed
@@ -85,6 +86,8 @@ def _compile(function, **options: Any):
             made._cache, called._cache = _SharedCache(function), _CalledCache(function)
     callee = Callee(called, inline=options.get("forceinline", False))
     made.get_call_template, made.get_overload = callee.call_template, callee.overload
+    type_of = made.typeof_pyval
+    made.typeof_pyval = lambda value: argument_type(type_of(value))
     return made
 
 
@@ -112,7 +115,7 @@ class Callback:
     def _compiled(self) -> Any:
         with _caching(self._function.__module__) as cache:
             signature = normalize_signature(self._signature)
-            made = CFunc(self._function, signature, {}, {"error_model": "numpy"})
+            made: Any = CFunc(self._function, signature, {}, {"error_model": "numpy"})
             if cache:
                 made._cache = _SharedCache(self._function)
             made.compile()

@@ -1,4 +1,4 @@
-"""How compiled functions call each other: large ones by symbol, small ones as part of the caller.
+"""How compiled functions call each other: large ones by symbol, small ones inlined.
 
 numba copies the code of every function that is called, and of those that it calls, into the caller,
 and optimises and translates all of it again. With calls ten deep this is most of the time to
@@ -9,9 +9,10 @@ cache is loaded together with the functions whose symbols it names.
 import importlib
 from typing import Any
 
-from numba.core import types
 from numba.core.caching import CompileResultCacheImpl
 from numba.core.typing.templates import make_concrete_template
+
+from hydrotele.core.references import argument_type, check_result
 
 LINKED_BYTECODE = 300
 """Length of a function's bytecode up to which its code becomes part of the caller [bytes]. LLVM
@@ -49,8 +50,9 @@ class Callee:
         each constant.
         """
         pysig, args = self.dispatcher.fold_argument_types(args, keywords)
-        args = tuple(map(types.unliteral, args))
+        args = tuple(map(argument_type, args))
         signature, name = self.compile(args).signature, self.place[1]
+        check_result(signature.return_type, name)
         return make_concrete_template(f"CallTemplate({name})", name, [signature]), pysig, args, {}
 
     def overload(self, args: tuple) -> Any:
