@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import hypothesis
+import pytest
 
 # Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out; the last lines of
 # the suite say so, and tools/nightly has a check `learn`, which runs them with it.
@@ -50,15 +51,37 @@ LONG = (
 _REAL = Path(__file__).resolve().parents[2] / "shared" / "real"
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest leaves out those that are marked as nightly
 def pytest_collection_modifyitems(config, items):
-    """Leave out what needs absent records; put the files that take long first."""
+    """Mark nightly cases, leave out what needs absent records, put files that take long first."""
     root = Path(__file__).parent
+    mark_nightly_cases(items, whole=not any("::" in word for word in config.args))
     if not _REAL.is_dir():
         absent = [item for item in items if item.get_closest_marker("real")]
         config.hook.pytest_deselected(items=absent)
         items[:] = [item for item in items if item not in absent]
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(_inside(item.path, root), len(LONG)))
+
+
+def mark_nightly_cases(items, whole):
+    """Mark the cases of a test that its marker `daily` does not name as nightly.
+
+    Args:
+        items: the tests.
+        whole: whether all cases of each test are among them; a name that is none is then refused.
+    """
+    named = {}
+    for item in items:
+        if marker := item.get_closest_marker("daily"):
+            left = named.setdefault(item.nodeid.partition("[")[0], set(marker.args))
+            if item.callspec.id in marker.args:
+                left.discard(item.callspec.id)
+            else:
+                item.add_marker("nightly")
+    wrong = {test: left for test, left in named.items() if left and whole}
+    if wrong:
+        raise pytest.UsageError(f"cases that the marker `daily` names do not exist: {wrong}")
 
 
 def _inside(path, root):

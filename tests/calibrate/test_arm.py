@@ -97,6 +97,7 @@ def test_identifiable_sets_are_those_of_the_thesis(exact):
         assert f"d.{stage.link}" in stage.fixed
 
 
+@pytest.mark.nightly
 def test_errors_are_as_large_as_said_and_joint_knows_more(clean):
     """28 parameters: RMS of normalised errors of six seeds near 1, within the scatter of 168."""
     scores, fits = [], None

@@ -71,6 +71,7 @@ def test_linkage_command(folder):
         assert axis["heldout"]["rms_m"] < 2e-3 and axis["heldout"]["vaf_percent"] > 99.9
 
 
+@pytest.mark.nightly
 def test_machine_command_calibrates_kinematics_before_dynamics(folder, tmp_path):
     """A machine file with a stick 30 mm too long and 10 % too heavy a boom gets both back."""
     machine = load_machine("calibrator")

@@ -73,6 +73,7 @@ def test_flexibility_is_found(loop, clean, loads):
     assert np.all(mean[2:] < 0.2 * BEND[1])
 
 
+@pytest.mark.nightly
 def test_refit_has_intervals_of_its_noise_model(loop, clean, loads):
     """Chi of a stage is 1 within 0.1: 600 equations scatter by 0.03."""
     stages = simulate(clean, loads, 7, BEND)

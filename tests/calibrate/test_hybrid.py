@@ -149,6 +149,7 @@ def test_a_wrong_reading_is_found_and_left_out():
     assert clean == [()] * 6
 
 
+@pytest.mark.nightly
 def test_the_better_model_is_chosen_where_the_frame_of_the_measurement_is_off():
     """D-H rows begin in frame 0; lines of axes need not."""
     one = simulate_robot(9, 40, "poe", document=False)
@@ -178,6 +179,7 @@ def test_what_is_no_error_of_manufacture_is_warned_of():
     assert "larger than stated" in said
 
 
+@pytest.mark.nightly
 def test_three_methods_agree_on_a_few_parameters():
     """Five parameters, for time; the experiments do the 36."""
     one = simulate_robot(11, 8)

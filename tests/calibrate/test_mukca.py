@@ -53,6 +53,7 @@ def test_without_noise_unseen_places_are_exact():
     assert judge(nominal, unseen).rms > 1e-3
 
 
+@pytest.mark.daily("panda")
 @pytest.mark.parametrize("robot", ["panda", "ur5e"])
 def test_noise_leaves_less_than_it_is_itself(robot):
     nominal, true, _, sockets = simulated(robot)
@@ -67,6 +68,7 @@ def test_noise_leaves_less_than_it_is_itself(robot):
     assert found.noise == pytest.approx(1e-4, rel=0.15)
 
 
+@pytest.mark.nightly
 def test_base_frame_and_what_no_posture_tells_is_named(noisy):
     nominal, _, _, sockets = noisy
     told = calibrate_sockets(nominal, sockets, Options(model="rigid")).fit.told
@@ -91,6 +93,7 @@ def test_intervals_cover_most_of_what_was_planted(noisy):
     assert np.sum(np.abs(z) < 1.96) >= 17
 
 
+@pytest.mark.nightly
 def test_joints_that_yield_are_found():
     nominal = load_robot("panda")
     names = deflection_names(nominal, True, False)
@@ -103,6 +106,7 @@ def test_joints_that_yield_are_found():
     assert judge(found.robot, unseen).rms < 0.7 * judge(rigid.robot, unseen).rms
 
 
+@pytest.mark.nightly
 def test_rows_with_the_ball_elsewhere_are_named_and_left_out(noisy):
     nominal, true, _, sockets = noisy
     wrong = [s.joints.copy() for s in sockets]
@@ -193,6 +197,7 @@ def test_degrees_are_read_where_they_are_said(folder):
     np.testing.assert_allclose(again[0].joints, sockets[0].joints, atol=1e-12)
 
 
+@pytest.mark.nightly
 def test_a_joint_that_never_moves_stays_unknown_by_name():
     nominal = load_robot("panda")
     rng = np.random.default_rng(5)

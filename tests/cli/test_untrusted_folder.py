@@ -34,6 +34,7 @@ def hostile(tmp_path):
     return folder
 
 
+@pytest.mark.daily("command1")
 @pytest.mark.parametrize(
     "command",
     [

@@ -59,6 +59,7 @@ def test_torques_are_those_that_hold_the_machine(joints):
     assert np.any(np.abs(forces) > 1e4)
 
 
+@pytest.mark.nightly
 def test_slow_moves_with_real_sensors_give_the_parameters(slow_log):
     """Within 1 % of the largest, 1.4 kN m: inertia of the slow moves is left, 0.9 kN m."""
     true, found = gravity_from_masses(CAT), identify_gravity(CAT, slow_log)

@@ -155,6 +155,7 @@ print(len(compiled._ELSEWHERE), sum(widest_pin.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.nightly
 def test_what_a_process_beside_has_compiled_is_loaded_and_is_not_compiled_again(tmp_path):
     assert _run(ROOT, tmp_path, ELSEWHERE)[0] == ["1", "1"]
     assert _run(ROOT, tmp_path, ELSEWHERE)[0] == ["0", "1"]

@@ -103,6 +103,7 @@ def graded():
     return core, before, start, total, least
 
 
+@pytest.mark.nightly
 def test_reference_controller_halves_the_error_in_every_soil(graded):
     core, _, start, total, least = graded
     assert set(core.episodes["goal"][:, SOIL]) == set(range(len(GRADE_SOILS)))

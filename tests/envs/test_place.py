@@ -262,6 +262,7 @@ def test_moves_leave_a_pendulum_of_their_period_at_rest(length):
     assert left < 5e-3 * most  # the sum of the ramps is exact but for the grid's step of T / 2000
 
 
+@pytest.mark.nightly
 def test_the_reference_controller_places_logs():
     core = make(TASK, 2, action="resolved_motion", sensors="real", duration=50.0, variants=2)
     controller = make_controller("reference", core.setup)

@@ -67,6 +67,7 @@ def env():
 DRAWN = ("TrackTrajectory", "PlaceLog")  # daily; their machines and goals differ most
 
 
+@pytest.mark.daily("TrackTrajectory")
 @pytest.mark.parametrize("name", set_nightly(hydrotele.envs.TASK_NAMES, DRAWN))
 def test_a_picture_of_every_task_shows_machine_and_goal_and_changes_with_them(name):
     """The same picture without the goal's markers is another one."""
@@ -141,6 +142,7 @@ def test_each_episode_is_drawn_with_its_own_machine():
     env.close()
 
 
+@pytest.mark.nightly
 def test_pictures_of_the_first_environments():
     env = MachineVectorEnv("TrackTrajectory", 8, "rgb_array", shown=2, **SMALL)
     env.reset(seed=2)
@@ -162,6 +164,7 @@ def test_batched_pictures_are_the_single_ones():
     one.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", set_nightly(DRAWN, ["TrackTrajectory"]))
 def test_the_checker_of_gymnasium_sees_pictures(name):
     options = {"render_mode": "rgb_array", "width": 40, "height": 30, "variants": 1}
@@ -173,6 +176,7 @@ def test_the_checker_of_gymnasium_sees_pictures(name):
         env.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("what", ["step", pytest.param("check", marks=pytest.mark.nightly)])
 def test_windows(what):
     """On a screen of its own, where every warning is an error; nightly gymnasium's checker."""
@@ -194,6 +198,7 @@ def of_free_camera():
     env.close()
 
 
+@pytest.mark.daily("0")
 @pytest.mark.parametrize("camera", set_nightly(["overview", "cab", 0, "free"], ["cab", 0, "free"]))
 def test_cameras_of_the_machine(camera, of_free_camera):
     other = MachineEnv("TrackTrajectory", "rgb_array", camera=camera, **SMALL)
@@ -202,6 +207,7 @@ def test_cameras_of_the_machine(camera, of_free_camera):
     other.close()
 
 
+@pytest.mark.nightly
 def test_wrappers_of_gymnasium_get_frames():
     make = {"render_mode": "rgb_array", **SMALL}
     env = RenderCollection(gymnasium.make("hydrotele/TrackTrajectory-v0", **make))

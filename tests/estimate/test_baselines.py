@@ -62,6 +62,7 @@ def test_the_linear_model_finds_a_linear_slide_and_not_a_dead_band():
     assert error_over_still("arx", data_of(valve)) > error_over_still("table", data_of(valve))
 
 
+@pytest.mark.nightly
 def test_the_network_learns_the_dead_band():
     pytest.importorskip("sklearn", reason="scikit-learn is an extra")
     assert error_over_still("mlp", data_of(valve)) < 0.3

@@ -76,6 +76,7 @@ def test_a_loss_that_a_data_sheet_leaves_out_is_uncertain_if_the_file_says_so():
     assert dragged.axes["piston"].pump.motor.drag == 0.4
 
 
+@pytest.mark.nightly
 def test_a_scale_of_all_areas_flows_and_masses_does_not_show():
     """Pressures and positions do not tell it: 1 % of all is known no better than by the priors.
 

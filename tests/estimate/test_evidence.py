@@ -54,6 +54,7 @@ def test_the_gain_of_an_effect_does_not_depend_on_the_step(evidence, name, devia
     assert integrator > 0.5 * abs(gains[0])
 
 
+@pytest.mark.nightly
 def test_where_a_number_ends_the_others_move_as_is_best_with_it_there():
     """Three numbers that hardly differ in what they do, two with little room, by brute force."""
     rng = np.random.default_rng(3)

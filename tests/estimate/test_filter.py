@@ -97,6 +97,7 @@ def test_missing_readings_are_left_out(clean):
     assert np.sqrt(np.nanmean(w[50:] ** 2)) == pytest.approx(1.0, abs=0.04)
 
 
+@pytest.mark.daily("valve_deadband-boom-values0", "pressure_offset-stick.rod-values2")
 @pytest.mark.parametrize(
     ("name", "place", "values"),
     [
@@ -116,6 +117,7 @@ def test_the_true_machine_has_the_smallest_errors(clean, name, place, values):
     assert np.sqrt(np.mean(right.whitened[50:] ** 2)) == pytest.approx(1.0, abs=0.04)
 
 
+@pytest.mark.daily("backlash-swing-values0")
 @pytest.mark.parametrize(
     ("name", "place", "values"),
     [
@@ -134,6 +136,7 @@ def test_a_transmission_adds_states_that_gains_without_it_can_carry(clean, name,
     assert np.isfinite(back.whitened).all()
 
 
+@pytest.mark.daily("pressure_delay-boom-0.034-0.00023")
 @pytest.mark.parametrize(
     ("name", "place", "delay", "sd"),
     [
@@ -155,6 +158,7 @@ def test_the_delay_of_late_readings_is_found_without_bias(name, place, delay, sd
     assert np.sqrt(np.mean(there.whitened[50:] ** 2)) == pytest.approx(1.0, abs=0.04)
 
 
+@pytest.mark.daily("1.0")
 @pytest.mark.parametrize("rest", [pytest.param(-1.0, marks=pytest.mark.nightly), -0.45, 1.0])
 def test_a_drive_may_rest_anywhere_in_its_backlash(rest):
     gap = 0.012
@@ -194,6 +198,7 @@ def test_errors_of_lagging_transducers_are_white_and_of_size_one(first):
     assert np.all(np.abs(np.mean(w[1:] * w[:-1], axis=0)) < 4.5 / n**0.5)
 
 
+@pytest.mark.daily("angle_lag-boom-0.03")
 @pytest.mark.parametrize(
     ("name", "place", "constant"),
     [

@@ -164,6 +164,7 @@ def test_a_window_knows_the_commands_and_readings_on_their_way(late):
 LAGGING = (("angle_lag", "boom", {"time_constant": 0.12}),)
 
 
+@pytest.mark.nightly
 def test_sensors_with_a_first_order_lag_are_followed_from_any_row(tmp_path):
     """A lag of 0.12 s that is forgotten at a window's start is off by rate times lag, 0.3 deg."""
     machine = load_machine("cat215")

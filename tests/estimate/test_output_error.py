@@ -117,6 +117,7 @@ def planted(tmp_path_factory):
     return load_dataset(folder, load_machine("ec20"))
 
 
+@pytest.mark.nightly
 def test_a_planted_delay_and_dead_band_come_out_of_angles_alone(planted):
     """The plant is MuJoCo's, the fit the reduced model's; no accuracy is stated.
 

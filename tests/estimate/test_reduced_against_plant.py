@@ -154,6 +154,16 @@ def beyond(found):
     }
 
 
+@pytest.mark.daily(
+    "valves",
+    "forces of terms",
+    "joint_flexibility",
+    "pump_lag",
+    "presliding",
+    "tank_leakage",
+    "sensors",
+    "load_holding",
+)
 @pytest.mark.parametrize("case", CASES)
 def test_readings_are_those_of_the_plant(case, machine_of, reduced_of):
     name = case if "/" in case else "cat215/none"

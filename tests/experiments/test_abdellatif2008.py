@@ -105,6 +105,7 @@ def test_designed_motion_keeps_all_limits_and_is_better_than_random_ones():
     assert row.verdict == "differs"
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("scatter", "left"), [(0.0, 24), (0.5, 26)])
 def test_dry_friction_is_merged_where_hinges_are_equal(scatter, left):
     """Two kinds of hinges with two values each need two parameters more.
@@ -116,6 +117,7 @@ def test_dry_friction_is_merged_where_hinges_are_equal(scatter, left):
     assert scatter == 0.0 or not values["reached"]
 
 
+@pytest.mark.nightly
 def test_frequency_domain_predicts_best_and_time_domain_better_than_raw():
     sample = processing.measure_processing(1, {})
     variances = [sample.values[f"{way} true variance"] for way in processing.WAYS]
@@ -151,6 +153,7 @@ def test_normal_equations_give_the_gauss_markov_estimate():
     )  # rounding of a sum over 300 rows
 
 
+@pytest.mark.nightly
 def test_distances_of_the_trials_have_their_distribution():
     settings = trials.TRIAL_SETTINGS | {"friction_excess": 0.0, "trials": 60}
     found = trials.simulate_trials(1, settings)
@@ -160,6 +163,7 @@ def test_distances_of_the_trials_have_their_distribution():
     assert abs(chi2.ppf(0.95, 24) - CHI2_LIMIT) < 0.005  # two printed decimals
 
 
+@pytest.mark.nightly
 def test_only_friction_that_warms_up_brings_the_first_trial_out():
     cold = trials.measure_trials(1, {"trials": 30}).values
     assert cold["first distance"] > CHI2_LIMIT > 0.0
@@ -170,6 +174,7 @@ def test_only_friction_that_warms_up_brings_the_first_trial_out():
     assert warm["first distance"] == pytest.approx(cold["warm first distance"], rel=0.2)
 
 
+@pytest.mark.nightly
 def test_small_covariance_is_found():
     few = {"trials": 30}
     claims = ("history of the estimates", "all other trials within the ellipsoid")
@@ -191,6 +196,7 @@ def test_bias_is_found_where_it_is_and_not_where_it_is_not():
     assert ncx2.cdf(distance, 24, squared) == pytest.approx(0.025, rel=1e-6)
 
 
+@pytest.mark.nightly
 def test_encoder_noise_that_controllers_pass_on_biases_samples_but_not_periods():
     arrays = trials.measure_reaction(1, {}).arrays
     rms = {name: float(np.sqrt(np.mean(error**2))) for name, error in arrays.items()}

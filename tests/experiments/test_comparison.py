@@ -131,6 +131,7 @@ def test_series_is_judged_and_can_be_broken():
     assert counts[8][0] == rows[0]._replace(panels=counts[8][0].panels)
 
 
+@pytest.mark.nightly
 def test_processes_give_the_same_samples():
     alone, shared = (run_series(SERIES, 3, jobs)[0].judgement for jobs in (1, 2))
     assert alone == shared

@@ -173,6 +173,7 @@ def test_parameters_come_back_from_forces_without_errors():
         assert np.all(np.abs(found - base.truth) < 1e-8 * base.sizes)
 
 
+@pytest.mark.daily("identifiability", "complete and reduced model")
 @pytest.mark.parametrize("experiment", [FORCES, IDENTIFIABILITY, NOISE], ids=lambda e: e.name)
 def test_a_broken_run_differs(experiment: Experiment):
     seeds = range(1, experiment.repetitions(3) + 1)
@@ -227,6 +228,7 @@ def test_every_claim_with_a_verdict_has_a_broken_run():
             assert bool(claim.broken_how) == (claim.broken is not None)
 
 
+@pytest.mark.nightly
 def test_a_prediction_by_the_reduced_model_is_as_good():
     (sample,) = [PREDICTION.measure(1, {})]
     for drive in ("swing", "boom", "stick"):

@@ -53,6 +53,7 @@ def measure(one: Experiment, changes, count: int) -> list[Sample]:
     return [one.measure(seed, changes) for seed in range(1, one.repetitions(count) + 1)]
 
 
+@pytest.mark.daily("20 poses with wires-few")
 @pytest.mark.parametrize(
     "counts", [DAILY, pytest.param(NIGHTLY, marks=pytest.mark.nightly)], ids=["few", "many"]
 )

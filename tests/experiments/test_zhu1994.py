@@ -108,6 +108,7 @@ def test_unknown_changes_are_refused():
         zhu_motion.measure_line("in", 1, {"pilot.modus": "rate"})
 
 
+@pytest.mark.nightly
 def test_centring_force_is_a_line_and_detents_are_not():
     """Three repetitions leave the detents' interval wider than the printed digits.
 
@@ -130,6 +131,7 @@ def test_a_line_is_straight():
     assert claim.compare([stray, stray]).verdict == "differs"
 
 
+@pytest.mark.nightly
 def test_direct_force_is_unstable_when_large():
     assert zhu_forces.measure_direct(4.0e-4, 1, {}).values["ripple"] > 0.5
 

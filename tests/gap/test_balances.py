@@ -107,6 +107,7 @@ CHANGES = {  # of the real machine: (path, value, places that must stand out)
 }  # fmt: skip
 
 
+@pytest.mark.daily("delay", "friction", "leakage")
 @pytest.mark.parametrize("case", CHANGES)
 def test_a_changed_machine_stands_out_in_its_law_alone(case):
     path, value, places = CHANGES[case]
@@ -241,6 +242,7 @@ def test_exact_signals_leave_less_than_the_sensors_noise():
         assert max(judged(machine, log).values()) < 1.0
 
 
+@pytest.mark.daily("open_03-place1-10.0-runs0", "open_10-place9-5.0-runs0")
 @pytest.mark.parametrize("runs", [RUNS[1:3], pytest.param(RUNS, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("case", "place", "least"),

@@ -73,6 +73,7 @@ def data(tmp_path_factory):
     return load_dataset(logs, rig)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("effects", [
     ("valve_gain", "internal_leakage"),
     pytest.param((), marks=pytest.mark.nightly, id="the whole library"),
@@ -330,6 +331,7 @@ def test_pairs_are_never_of_variables_that_only_their_drives_tell_apart(made_up)
     assert not any("." in variable for table in alone for variable in table.variables)
 
 
+@pytest.mark.nightly
 def test_a_smooth_surface_is_found_among_other_tables():
     rng = np.random.default_rng(2)
     values = {name: rng.normal(size=6000) for name in NAMES}

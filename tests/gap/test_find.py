@@ -64,6 +64,7 @@ def test_a_pressure_offset_below_one_reading_is_named():
     assert gap.tests["constancy"]["passed"]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("effects", [
     ("valve_deadband", "command_delay"),
     pytest.param((), marks=pytest.mark.nightly, id="the whole library"),
@@ -287,6 +288,7 @@ def test_laws_are_learned_without_a_calibration_whose_machine_runs_away(
     assert stays is not emptied
 
 
+@pytest.mark.daily("True")
 @pytest.mark.parametrize("after_laws", [False, True])
 def test_effects_that_make_the_held_out_run_worse_are_taken_back_and_laws_learned_without(
     monkeypatch, after_laws

@@ -1,6 +1,7 @@
 """A pump drive whose data sheet is wrong in several places, calibrated by its free runs."""
 
 import numpy as np
+import pytest
 
 from hydrotele.effects.effect import changed
 from hydrotele.estimate.hypothesis import numbers
@@ -33,6 +34,7 @@ def value(machine, path):
     return machine
 
 
+@pytest.mark.nightly
 def test_wrong_figures_of_a_data_sheet_are_found():
     """Each within a third of what it was off by, of 9 s of motion; the rest stays uncertain."""
     truth = changed(load_machine("eha", "load_30_bar"), "sensor_errors", {})

@@ -109,6 +109,7 @@ def test_a_model_that_fits_has_no_gap_and_is_left_alone(tmp_path):
     assert gap.verdict == "no_gap" and gap.patched is gap.machine and not gap.unknown
 
 
+@pytest.mark.nightly
 def test_friction_is_named_beside_late_sensors(tmp_path):
     """Both positions are late: how late against the forces is told, not always in fewest names."""
     logs(tmp_path, ARM.replace('frictionloss="0.8"', 'frictionloss="2.4"'), late=0.012)
@@ -133,6 +134,7 @@ def test_a_law_outside_the_library_is_located_but_not_named(tmp_path):
     assert "position.shoulder" in gap.unknown.depends_on
 
 
+@pytest.mark.nightly
 def test_an_effect_that_differs_from_run_to_run_is_taken_back(tmp_path):
     turns = iter((0.5, 3.0, 1.5))  # N m s/rad, run by run
     logs(tmp_path, law=lambda q, v: next(turns) * v[:, 0])
@@ -203,6 +205,7 @@ def test_columns_are_what_sensors_defects_do(tmp_path):
             assert rest < 0.35, (name, rest)  # steps of dry friction move by parts of a row
 
 
+@pytest.mark.nightly
 def test_where_dry_friction_turns_is_not_taken_for_another_law():
     """A strut with 20 N of dry friction turns more sharply than its uncertain rate tells."""
     rng, folder = np.random.default_rng(1), models_folder() / "palida"

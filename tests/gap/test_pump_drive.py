@@ -65,6 +65,7 @@ def test_every_number_of_pump_motor_and_load_can_be_calibrated():
     } <= keys  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_a_weaker_motor_is_named_or_calibrated(site):
     """Nearly four times what the machine states as uncertain: an effect, or the calibration's."""
     machine = load_machine("eha", TOOL)

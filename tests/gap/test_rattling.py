@@ -28,6 +28,7 @@ def looked(truth):
         evidence.close()
 
 
+@pytest.mark.nightly
 def test_ringing_teeth_are_found_with_inertia_and_damping_unlike_the_librarys(monkeypatch):
     """With few steps: a gap between two of the grid is found in them."""
     monkeypatch.setattr(gap_rattling, "_EVALUATIONS", 15)

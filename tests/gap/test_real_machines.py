@@ -31,6 +31,7 @@ from tools.validation.real_machines import (
 pytestmark = needs_real
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("effects", [
     ("friction_asymmetry", "viscous_friction", "coulomb_friction", "command_offset"),
     pytest.param((), marks=pytest.mark.nightly, id="the whole library"),

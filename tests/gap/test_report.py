@@ -65,6 +65,7 @@ def named(page_of):
     return page_of("named")
 
 
+@pytest.mark.nightly
 def test_it_needs_no_network(named):
     page, text = named
     assert page.links and all(link.startswith("data:image/png;base64,") for link in page.links)
@@ -135,6 +136,7 @@ def test_texts_are_escaped(page_of):
     assert "<b>x</b> & 1 < 2" in page.text and "&lt;b&gt;x&lt;/b&gt; &amp; 1 &lt; 2" in text
 
 
+@pytest.mark.nightly
 def test_missing_readings_and_channels_are_shown_as_such(page_of, gap_of):
     def holed(prediction):
         measured, whitened = prediction.measured.copy(), prediction.whitened.copy()

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from hydrotele.effects import apply_effect
 from hydrotele.estimate.evidence import Evidence
@@ -37,6 +38,7 @@ def test_a_payload_heavier_than_the_stick_stands_out():
     assert score > 1000.0
 
 
+@pytest.mark.nightly
 def test_an_effect_stands_out_where_all_numbers_are_off():
     """Numbers half a stated deviation off, each way by turns, and the payload."""
     nominal = load_machine("cat215")

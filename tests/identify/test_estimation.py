@@ -90,6 +90,7 @@ def test_a_motion_with_another_period_is_refused(repeated, method):
         identify_dynamics(fit, heldout, setup, Processing("periodic", period=13.0))
 
 
+@pytest.mark.nightly
 def test_a_trial_of_the_coverage_study_is_near_the_truth():
     """One small trial; how many intervals cover the truth is counted nightly."""
     result = one_trial(2026, 0, "khoshzaban1992")

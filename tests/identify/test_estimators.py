@@ -34,6 +34,7 @@ def test_without_noise_the_parameters_are_exact(options):
     np.testing.assert_allclose(found.value, TRUTH, rtol=1e-10)
 
 
+@pytest.mark.daily("0.8")
 @pytest.mark.parametrize("share", [0.0, 0.8])
 def test_intervals_cover_the_truth_even_where_errors_are_correlated(share):
     """600 experiments: a share of 95 % scatters by 0.9 %; twice that.

@@ -38,6 +38,7 @@ def test_motion_is_its_own_derivative():
     np.testing.assert_allclose(e.motion(time + 7.0), now, atol=1e-9)
 
 
+@pytest.mark.nightly
 def test_a_cylinder_on_rails_is_driven_within_its_limits_and_tells_more(rig, tmp_path):
     machine, setup, noise = rig
     places = informative_base(machine, setup, noise, 6.0)

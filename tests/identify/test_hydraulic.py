@@ -39,6 +39,7 @@ def found():
     return identify_hydraulics(data, jobs=1), given
 
 
+@pytest.mark.nightly
 def test_hidden_numbers_are_found_with_honest_intervals(found):
     result, given = found
     numbers = {n.name: n for n in result.numbers}

@@ -65,6 +65,7 @@ def test_held_out_forces_differ_by_noise(found):
     assert found.status == "ok"
 
 
+@pytest.mark.nightly
 def test_a_wrong_machine_is_found_out_and_mended(short, found_short):
     fit, heldout, setup = short
     wrong = dataclasses.replace(setup.chain, inertia=setup.chain.inertia * 0.8)
@@ -80,6 +81,7 @@ def test_a_wrong_machine_is_found_out_and_mended(short, found_short):
         assert judged.rms < 1.1 * found_short.heldout[drive].rms, drive  # weak ones stay wrong
 
 
+@pytest.mark.nightly
 def test_the_complete_model_is_at_least_as_good_as_the_reduced_one(clean, found):
     """As Khoshzaban's cross-validation: 3720, 5860, 8700 against 4720, 5500, 11900."""
     fit, heldout, setup = clean
@@ -90,6 +92,7 @@ def test_the_complete_model_is_at_least_as_good_as_the_reduced_one(clean, found)
     assert max(better) < 1.08
 
 
+@pytest.mark.nightly
 def test_with_perfect_sensors_tubes_and_rods_show():
     machine = load_machine("cat215")
     fit, heldout, _ = records(load_dataset([MEASURED / "nominal_truth"], machine, "ideal"))
@@ -104,6 +107,7 @@ def test_with_perfect_sensors_tubes_and_rods_show():
         assert complete[drive].relative < 0.006, drive
 
 
+@pytest.mark.nightly
 def test_without_pressures_of_one_side_the_others_are_still_told(short):
     fit, heldout, setup = short
 
@@ -149,6 +153,7 @@ def test_missing_samples_are_bridged(clean, found):
         assert judged.rms < 1.1 * found.heldout[drive].rms, drive
 
 
+@pytest.mark.nightly
 def test_readings_of_a_saturated_sensor_are_left_out(clean, tmp_path):
     """A third of the time the pressure is above what its sensor can say."""
     for file in sorted((MEASURED / "open_04").glob("*.parquet")):
@@ -213,6 +218,7 @@ def test_processing_refuses_nonsense():
         Processing("periodic")
 
 
+@pytest.mark.nightly
 def test_pressures_that_are_read_half_as_often_are_enough(short):
     fit, heldout, setup = short
 

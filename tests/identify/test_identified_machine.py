@@ -94,6 +94,7 @@ def test_a_machine_of_the_family_is_found_again(truth):
     assert machine.axes["boom"].cylinder.friction.stribeck_extra == pytest.approx(1100, rel=2e-3)
 
 
+@pytest.mark.nightly
 def test_impossible_numbers_become_the_nearest_possible_ones():
     table, told = table_of(load_machine("cat215"))
     value = table.nominal.copy()
@@ -113,6 +114,7 @@ def test_impossible_numbers_become_the_nearest_possible_ones():
     assert best.loss > len(told.base), "it must say that the estimate itself cannot be"
 
 
+@pytest.mark.nightly
 def test_freedom_keeps_axes_and_lines():
     table, told = table_of(load_machine("cat215"))
     value = table.nominal.copy()

@@ -76,6 +76,7 @@ def test_the_identified_machine_runs_and_replays(identified, site, tmp_path):
     assert "position.slide" in json.loads(replayed.stdout)["channels"]
 
 
+@pytest.mark.nightly
 def test_words_for_people(site, tmp_path):
     done = call("identify", "--data", site, "--out", tmp_path / "found", "--reduced")
     assert done.exit_code == 0, done.output

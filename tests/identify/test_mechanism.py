@@ -161,6 +161,7 @@ def test_a_machine_option_is_refused_beside_mjcf(tmp_path):
     assert isinstance(result.exception, InputError) and "--pins" in str(result.exception)
 
 
+@pytest.mark.nightly
 @needs_real
 def test_the_panda_set_is_predicted():
     """Published relative error 1.41 % with 43 coefficients; here below a third not fitted."""

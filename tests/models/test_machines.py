@@ -202,6 +202,7 @@ def test_folder_is_complete(name):
     assert f"]({name}.png)" in readme and "hydrotele export" in readme
 
 
+@pytest.mark.daily("cat325")
 @pytest.mark.parametrize(
     "name",
     [

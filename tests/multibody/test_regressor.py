@@ -90,6 +90,7 @@ def test_regressor_times_parameters_is_the_inverse_dynamics_of_mujoco(tool):
         assert np.abs(error).max() < 1e-8 * np.abs(expected).max()
 
 
+@pytest.mark.nightly
 def test_noise_free_forces_of_mujoco_tell_every_combination_exactly():
     """Complete model: forces by MuJoCo's inverse dynamics, not by our own regressor."""
     machine, rng, rows = load_machine("cat215"), np.random.default_rng(5), 120

@@ -46,6 +46,7 @@ def driven(tmp_path_factory):
     return folder
 
 
+@pytest.mark.nightly
 def test_the_device_moves_the_machine_and_latency_is_told(driven):
     log = load_log(driven / "measured.parquet")
     assert np.abs(log["handle.x"]).max() > 1.5e-3  # beyond the dead band

@@ -247,6 +247,7 @@ def test_live_scenario_cannot_be_run_alone():
         run_scenario(scenario)
 
 
+@pytest.mark.daily("cat325-None")
 @pytest.mark.parametrize(("machine", "tool"), [("cat325", None), ("cat215", "grapple")])
 def test_usual_scenario_of_other_machines_and_tools(machine, tool, tmp_path):
     (tmp_path / "s.yaml").write_text("time: [0, 0.4]\naxes: {z: [1, 1]}\n")

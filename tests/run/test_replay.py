@@ -46,6 +46,7 @@ def without(log: Log, *channels: str) -> Log:
     )
 
 
+@pytest.mark.daily("dig", "grapple_log")
 @pytest.mark.parametrize("name", CASES)
 def test_own_run_replays_itself(name):
     """1e-9 of each range over 2 to 6 s.

@@ -54,6 +54,7 @@ def test_progress_and_timing_do_not_change_the_run():
     assert seen[-1] == (2.0, 2.0) and all(0 <= done <= total for done, total in seen)
 
 
+@pytest.mark.daily("asked0", "asked3")
 @pytest.mark.parametrize("asked", [
     ("zhu_in", {"duration": "2"}),
     ("press_stiffness", {"duration": "3", "pilot.channel.lost": "0.3"}),

@@ -106,6 +106,7 @@ def test_a_finished_sweep_is_reported_without_running_anything(done, tmp_path, m
     assert code == 2 and "did you mean 'largest_pin_opening_mm'" in said
 
 
+@pytest.mark.nightly
 def test_a_two_key_grid_gets_a_map_and_failed_runs_are_listed(tmp_path):
     grid = {"servo.lead": [0.0, 0.1], "start.joints.slide": [0.1, 9.0]}
     file = write_sweep(tmp_path, "some", grid=grid, sample=None, repeat=None)

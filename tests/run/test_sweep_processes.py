@@ -51,6 +51,7 @@ def lines(journal: Path) -> int:
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "signals",
     [

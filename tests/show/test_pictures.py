@@ -43,6 +43,7 @@ def _drawn(function, *arguments, **options):
         raise
 
 
+@pytest.mark.daily("overview")
 @pytest.mark.parametrize("camera", ["overview", "free"])
 def test_a_picture_shows_a_yellow_machine(tmp_path, camera):
     path = tmp_path / "machine.png"
@@ -94,6 +95,7 @@ def test_the_web_viewer_is_served_while_wanted(recording):
         urllib.request.urlopen(url, timeout=10)
 
 
+@pytest.mark.nightly
 def test_an_overlay_has_the_asked_size(tmp_path, log, make):
     path = tmp_path / "overlay.png"
     plot_overlay(log, make(log.time, offset=0.05), path, size=(900, 700))

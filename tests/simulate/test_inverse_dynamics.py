@@ -190,6 +190,7 @@ def test_constraint_solver_gives_the_acceleration_of_those_forces(plant_of, tool
     assert errors[0] / errors[1] == pytest.approx(10, rel=0.01)
 
 
+@pytest.mark.daily("bucket")
 @pytest.mark.parametrize("tool", POSES)
 def test_forces_that_moved_the_machine_are_found_from_its_motion(plant_of, tool):
     deviations = [motion_deviation(plant_of(tool, dt), POSES[tool][0]) for dt in (1e-3, 5e-4)]

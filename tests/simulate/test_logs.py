@@ -87,6 +87,7 @@ def test_what_does_not_lie_between_the_jaws_stays(log):
     assert np.abs(way[-1] - way[0]).max() < 1e-4
 
 
+@pytest.mark.nightly
 def test_pick_log_puts_it_down_where_it_should():
     """0.1 m: a third of what is asked for; the swinging grapple and its drop leave 0.03 m.
 

@@ -95,6 +95,7 @@ def batched(plant, controls, threads):
     return np.concatenate([batch.time[:, None], batch.qpos, batch.qvel, batch.act], axis=1)
 
 
+@pytest.mark.daily("none")
 @pytest.mark.parametrize("tool", ["none", "bucket"])
 def test_every_way_of_stepping_gives_the_same_bits(plant_of, tool):
     plant = plant_of(tool, ground=True)

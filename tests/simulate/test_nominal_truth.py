@@ -53,6 +53,7 @@ def test_replay_at_1_ms_stays_with_the_independent_simulator(replayed, run):
     assert angles.min() > 0, "a replay that reads the log back would prove nothing"
 
 
+@pytest.mark.nightly
 def test_replay_converges_with_first_order(replayed):
     errors = [np.linalg.norm(replayed("test_1", dt)[0]) for dt in (1e-3, 5e-4, 2.5e-4)]
     ratios = np.array(errors[1:]) / errors[:-1]

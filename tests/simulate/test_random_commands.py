@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "tools" / "validation" / "random_commands.py"
 
@@ -17,6 +19,7 @@ def run(*arguments):
     )  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_random_commands_make_no_nan_and_no_warning():
     result = run("--steps", "6e4", "--simulations", "12", "--states", "12", "--reset", "1000")
     assert result.returncode == 0, result.stdout + result.stderr

@@ -45,6 +45,7 @@ def hit(plant, speed, end):
     return deepest, data.qvel[0]
 
 
+@pytest.mark.nightly
 def test_a_hit_converges_to_the_differential_equation_with_first_order():
     stiffness, damping, speed = 4e6, 4e3, 0.3
 

@@ -19,6 +19,7 @@ def with_com(com):
     return shipped.model_copy(update={"flotor": flotor})
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("diodes", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_planted_numbers_are_found(diodes):
     """12 s of wobbling under a control that takes the flotor for another one."""

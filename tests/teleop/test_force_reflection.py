@@ -31,6 +31,7 @@ def swing(name, overrides):
     return 0.5 * (high - low) / TARGET
 
 
+@pytest.mark.nightly
 def test_direct_force_is_stable_below_the_prediction_and_unstable_above():
     """Within a factor of 2: friction, loss of contact and stops are not in the linear loop."""
     ratio = analyse_scenario(load_scenario("press_direct", BARE)).loop.largest_ratio
@@ -38,6 +39,7 @@ def test_direct_force_is_stable_below_the_prediction_and_unstable_above():
     assert swing("press_direct", BARE | {"pilot.ratio": str(2.0 * ratio)}) > 0.25
 
 
+@pytest.mark.nightly
 def test_stiffness_feedback_with_150_ms_each_way_holds_the_ground():
     """With damping that the theorem asks for; 0.25 is a share that no bouncing run stays below."""
     overrides = {

@@ -81,6 +81,7 @@ def test_task_is_the_plate_or_said_to_be_the_default():
     assert case.task.stiffness == pytest.approx(36.0e6) and "6 m" in contact.source  # K r^2
 
 
+@pytest.mark.nightly
 def test_limit_falls_with_speed_stiffness_delay_and_lag():
     """What makes the loop faster or later leaves less reflection; by speed, in proportion."""
     ratio = structure_findings(made()[0], "rate_force").largest_ratio
@@ -134,6 +135,7 @@ def test_theorem_counts_the_hand_and_its_damping():
     assert damped.edge_ratio == pytest.approx(3400.0 / 5e4 * 1.5e-3)
 
 
+@pytest.mark.daily("position-direct_force", "rate-coordinating_force")
 @pytest.mark.parametrize("reflection", ["direct_force", "coordinating_force"])
 @pytest.mark.parametrize("mode", ["rate", "position"])
 def test_every_structure_has_a_margin(reflection, mode):

@@ -47,6 +47,7 @@ def test_the_pose_comes_back_from_its_readings(place, vector):
     assert apart(turn, back)[0] < 1e-11
 
 
+@pytest.mark.nightly
 def test_steps_of_the_diodes_give_the_stated_resolution():
     """Errors of 500 poses within the stops, against those of rounding to 1 um and 0.001 deg.
 

@@ -10,6 +10,7 @@ from hydrotele.teleop.psychophysics import discriminate, fit_psychometric
 FILE, HAND = load_operator_file(), load_joystick().hand
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("reference", [600.0, 3000.0])
 def test_stiffness_is_told_to_22_percent(reference):
     """Tan et al. 1995: 22 % without work and terminal force; 5 % is what the issue allows."""
@@ -23,6 +24,7 @@ def test_force_is_told_to_7_percent():
     assert found.jnd == pytest.approx(0.07, abs=0.02)
 
 
+@pytest.mark.daily("0.4")
 @pytest.mark.parametrize("integration", [0.0, 0.4])
 def test_the_experiment_sees_another_operator(integration):
     him = drawn_operator(FILE, None, integration_weber=integration)
@@ -30,6 +32,7 @@ def test_the_experiment_sees_another_operator(integration):
     assert abs(found.jnd - 0.22) > 0.05
 
 
+@pytest.mark.nightly
 def test_a_strong_tremor_spoils_the_sense_of_force():
     """Ten times the tremor: he feels his own shaking, too."""
     calm, shaking = (

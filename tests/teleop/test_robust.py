@@ -123,6 +123,7 @@ def test_the_published_gains_are_stable_by_the_switching_bound(spring, margin):
     assert edge.growth == pytest.approx(1.0, abs=0.01) and edge.damping < held.damping
 
 
+@pytest.mark.nightly
 def test_worst_of_drawn_hands_and_tasks():
     line = steady_line(0.005, 0.1, 0.1)
     spread = spread_of(FACTS)

@@ -93,6 +93,7 @@ def test_growth_is_that_of_a_periods_matrix(forward, back, force):
     assert growth_rate(case, "position_force", line) == pytest.approx(exact, rel=3e-3, abs=3e-3)
 
 
+@pytest.mark.nightly
 def test_random_cases_are_told_right():
     """A small version of tools/studies/stability_study.py, half of it aimed at the limits.
 

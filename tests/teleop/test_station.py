@@ -138,6 +138,7 @@ def test_coordinating_force_of_the_document_compares_with_the_handle(mode):
     np.testing.assert_allclose(log.master("push")[:, 2], wanted, atol=1e-9)
 
 
+@pytest.mark.daily("wave_variables")
 @pytest.mark.parametrize("reflection", PASSIVE_LINES)
 def test_passive_lines_bring_place_and_force_over_a_bad_network(reflection):
     """100 ms each way, 20 ms of jitter, 2 % lost: the tip follows; the handle gives no energy.

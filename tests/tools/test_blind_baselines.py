@@ -33,6 +33,7 @@ def recorded(tmp_path_factory):
     return make_problem(folder, CAT, 60.0), runs
 
 
+@pytest.mark.nightly
 def test_smoothed_states_are_near_the_true_ones(recorded):
     problem, runs = recorded
     for states, run in zip(problem.states, runs, strict=True):

@@ -2,6 +2,7 @@
 
 import mujoco
 import numpy as np
+import pytest
 
 from tools.validation.blind import hexapod
 
@@ -24,6 +25,7 @@ def test_a_load_lies_where_the_key_says():
     np.testing.assert_allclose(moments[1] - moments[0], [0.16, -0.04, 0.2], atol=1e-9)
 
 
+@pytest.mark.nightly
 def test_a_faint_effect_is_less_visible_than_a_strong_one(monkeypatch):
     seen = []
     for offset in (0.5, 50.0):

@@ -96,6 +96,7 @@ def test_an_unchanged_machine_shows_nothing(fast_run):
     assert seen(fast_run, []) < 1.0
 
 
+@pytest.mark.daily("3", "7")
 @pytest.mark.parametrize("turn", range(len(OUTSIDE)))
 def test_every_effect_outside_the_library_shows(fast_run, turn):
     planted = draw_outside(MACHINE, turn, np.random.default_rng([3, turn]))
@@ -210,6 +211,7 @@ def killed_and_resumed(tmp_path_factory):
     return series, early, series.run("--jobs", "2")
 
 
+@pytest.mark.nightly
 def test_a_killed_series_goes_on_where_it_was(killed_and_resumed):
     series, early, again = killed_and_resumed
     assert again.returncode == 0, again.stderr
