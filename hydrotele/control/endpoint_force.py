@@ -20,7 +20,6 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from hydrotele.control.state_filter import (
     CHANGE,
@@ -264,8 +263,10 @@ def _solve_recursively(
 
 def _are_outliers(left: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """Whether residuals (r, m - 1) of an equation are too large for their number, (r,)."""
-    scale = np.median(np.abs(left[kept]), axis=0) / stats.norm.ppf(0.75)
-    most = stats.norm.isf(0.25 / np.count_nonzero(kept))
+    from scipy.special import ndtri  # a run does without it
+
+    scale = np.median(np.abs(left[kept]), axis=0) / ndtri(0.75)
+    most = -ndtri(0.25 / np.count_nonzero(kept))
     return np.asarray((np.abs(left) > most * scale).any(axis=1))
 
 

@@ -18,8 +18,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
-from scipy.signal import correlate
 
 from hydrotele.core.datafile import suggest
 from hydrotele.core.errors import InputError
@@ -211,6 +209,8 @@ def _correlation(a: np.ndarray, b: np.ndarray, least: int) -> tuple[np.ndarray, 
     """Correlation of a[i + lag] and b[i] over their overlap, by lag; 0 for too short overlaps."""
     columns = range(a.shape[1])
     ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
+    from scipy.signal import correlate  # a second to import, and most logs are one file
+
     product = sum(correlate(a[:, k], b[:, k], method="fft") for k in columns)
     power_a = sum(correlate(a[:, k] ** 2, ones_b, method="fft") for k in columns)
     power_b = sum(correlate(ones_a, b[:, k] ** 2, method="fft") for k in columns)
@@ -250,6 +250,8 @@ def _refined(clock: Clock, command, other: Clock, other_command, coarse: float) 
         )
 
     width = 2.0 * max(clock.period, other.period)
+    from scipy.optimize import minimize_scalar
+
     found = minimize_scalar(difference, bounds=(coarse - width, coarse + width), method="bounded",
                             options={"xatol": 1e-3 * clock.period})  # fmt: skip
     return float(found.x)  # type: ignore[union-attr]

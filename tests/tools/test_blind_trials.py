@@ -226,6 +226,7 @@ def test_a_killed_series_goes_on_where_it_was(killed_and_resumed):
     assert "with the keys swapped" in again.stdout
 
 
+@pytest.mark.nightly
 def test_the_workflow_sees_nothing_but_logs(killed_and_resumed):
     series, _, _ = killed_and_resumed
     folders = list(series.stub.parent.glob("seen_*.json"))
@@ -239,6 +240,7 @@ def test_the_workflow_sees_nothing_but_logs(killed_and_resumed):
         assert found["arguments"][1] == "cat215"
 
 
+@pytest.mark.nightly
 def test_one_trial_runs_anew_with_the_same_data(killed_and_resumed):
     series, _, _ = killed_and_resumed
     before, data = series.results(), (series.out / "trials/0001/data/fit_1.parquet").read_bytes()
@@ -251,12 +253,14 @@ def test_one_trial_runs_anew_with_the_same_data(killed_and_resumed):
     assert wrong.returncode == 2 and "0000 .. 0001" in wrong.stderr
 
 
+@pytest.mark.nightly
 def test_a_series_is_not_mixed_with_another(killed_and_resumed):
     series, _, _ = killed_and_resumed
     done = series.run("--single", "5", "--seed", "7")
     assert done.returncode == 2 and "holds another series" in done.stderr
 
 
+@pytest.mark.nightly
 def test_a_changed_key_is_found_out(killed_and_resumed):
     series, _, _ = killed_and_resumed
     path = series.out / "keys" / "0000.json"
