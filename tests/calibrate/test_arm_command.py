@@ -38,6 +38,7 @@ def folder(runs, tmp_path_factory):
     return place
 
 
+@pytest.mark.nightly
 def test_mujoco_and_kinematics_are_one_chain(runs):
     """The closed chain of MuJoCo closes in Denavit-Hartenberg form, to its pins' softness."""
     loop = loop_of(load_machine("calibrator"))

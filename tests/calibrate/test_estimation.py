@@ -35,6 +35,7 @@ def test_planted_parameters_come_back(jac, truncation):
     np.testing.assert_allclose(found.values, TRUTH, atol=1e-9)
 
 
+@pytest.mark.nightly
 def test_intervals_cover_the_truth():
     rng = np.random.default_rng(0)
     inside = np.zeros(3)

@@ -51,12 +51,14 @@ def simulate(clean, loads, seed, bend):
     ]  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_loads_are_fractions_of_the_reach(loads):
     whole = np.concatenate(loads)
     assert whole.min() >= 0.0 and whole.max() <= 1.0
     assert np.ptp(whole[:, 0]) > 0.1  # else flexibility could not be told from sensor noise
 
 
+@pytest.mark.nightly
 def test_flexibility_is_found(loop, clean, loads):
     """Three seeds: a standard deviation from 1000 poses scatters by 2 %; six of these allowed.
 

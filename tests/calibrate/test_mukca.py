@@ -53,7 +53,7 @@ def test_without_noise_unseen_places_are_exact():
     assert judge(nominal, unseen).rms > 1e-3
 
 
-@pytest.mark.daily("panda")
+@pytest.mark.nightly
 @pytest.mark.parametrize("robot", ["panda", "ur5e"])
 def test_noise_leaves_less_than_it_is_itself(robot):
     nominal, true, _, sockets = simulated(robot)
@@ -81,6 +81,7 @@ def test_base_frame_and_what_no_posture_tells_is_named(noisy):
     assert 20 <= len(told.base) <= 27
 
 
+@pytest.mark.nightly
 def test_intervals_cover_most_of_what_was_planted(noisy):
     nominal, _, values, sockets = noisy
     fit = calibrate_sockets(nominal, sockets, Options(model="rigid")).fit

@@ -17,6 +17,7 @@ from hydrotele.experiments.wang_models import STRAIGHT_HEXAPOD, carriage_with_he
 HINGES = ("revolute", "revolute")
 
 
+@pytest.mark.daily("6-UPS-84")
 @pytest.mark.parametrize(
     ("mechanism", "count"),
     [

@@ -46,6 +46,7 @@ def test_offsets_are_fitted_where_they_predict_better(offset):
     assert found.heldout_rms == pytest.approx(0.071e-3, rel=0.35)
 
 
+@pytest.mark.nightly
 def test_intervals_cover_planted_lengths():
     inside = 0
     for seed in range(200):

@@ -306,7 +306,7 @@ def test_interrupt_exits_with_130_and_leaves_nothing(finished_run, tmp_path):
     assert process.returncode == 130 and "Traceback" not in err and names(tmp_path) == []
 
 
-@pytest.mark.daily("words0")
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "words",
     [

@@ -69,6 +69,7 @@ def test_slow_moves_with_real_sensors_give_the_parameters(slow_log):
     assert np.abs(plain.value - true.value).max() < 0.02 * np.abs(true.value).max()
 
 
+@pytest.mark.nightly
 def test_the_recursion_converges(slow_log):
     """After half of the moves nothing changes by more than 1 % of the largest parameter."""
     found = identify_gravity(CAT, slow_log)

@@ -161,6 +161,7 @@ def test_what_a_process_beside_has_compiled_is_loaded_and_is_not_compiled_again(
     assert _run(ROOT, tmp_path, ELSEWHERE)[0] == ["0", "1"]
 
 
+@pytest.mark.nightly
 def test_a_teleoperated_run_finds_what_was_compiled_ahead(tmp_path):
     """Its arguments are of the types that `compile_ticks` says: nothing is compiled again."""
     code = """

@@ -198,6 +198,7 @@ def friction_at(machine, axis, speed):
     return forces[0] - forces[1]
 
 
+@pytest.mark.daily("cat215-stick")
 @pytest.mark.parametrize(("name", "axis"), [("cat215", "swing"), ("cat215", "stick"),
                                             ("emps", "slide"), ("rig", "slide")])  # fmt: skip
 def test_friction_is_that_of_the_law(name, axis):

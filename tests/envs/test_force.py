@@ -38,6 +38,7 @@ def press(core: TaskCore, seconds: float) -> None:
         core.step(action)
 
 
+@pytest.mark.nightly
 def test_the_load_cell_reads_the_contact_force_of_every_plate(core):
     core.reset(np.arange(COUNT))
     assert len(set(core.episodes["variant"].tolist())) > 1

@@ -125,6 +125,7 @@ def test_no_soil_is_lost_or_made(graded):
     assert after == pytest.approx(before, abs=1e-6)
 
 
+@pytest.mark.nightly
 def test_what_acts_on_the_bucket_is_the_wrench_of_soil_and_load():
     core = core_of(1, action="valve", control_rate=200.0)
     down = np.array([0.0, -0.5, 0.3, 0.0])

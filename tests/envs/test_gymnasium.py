@@ -79,6 +79,7 @@ def test_random_actions_leave_no_space_and_raise_no_warning(task, action):
     env.close()
 
 
+@pytest.mark.daily("HoldForce")
 def test_batched_is_single_with_the_same_seed(name):
     options = {**SHORT, "action": "valve", "sensors": "real"}
     one = batched(name, 4, **options)
@@ -149,6 +150,7 @@ def test_seeds():
     assert not np.array_equal(env.reset(seed=[7, None, 9])[0][1], first[1])
 
 
+@pytest.mark.nightly
 def test_an_environment_in_a_process_of_its_own():
     many = gymnasium.make_vec(TRACK, 1, "async", vector_kwargs={"context": "spawn"}, **SHORT)
     one = batched(TRACK, 1, **SHORT)

@@ -198,7 +198,7 @@ def of_free_camera():
     env.close()
 
 
-@pytest.mark.daily("0")
+@pytest.mark.nightly
 @pytest.mark.parametrize("camera", set_nightly(["overview", "cab", 0, "free"], ["cab", 0, "free"]))
 def test_cameras_of_the_machine(camera, of_free_camera):
     other = MachineEnv("TrackTrajectory", "rgb_array", camera=camera, **SMALL)

@@ -22,6 +22,7 @@ def course(core: TaskCore, number: int, axis: int, times: np.ndarray) -> np.ndar
     return np.array([track_reference.py_func(goal, axis, time) for time in times])
 
 
+@pytest.mark.nightly
 def test_rates_are_derivatives_and_it_begins_at_rest_where_the_arm_stands(core):
     times = np.arange(0.0, 6.0, 1.0e-4)
     for axis in range(3):

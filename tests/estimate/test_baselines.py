@@ -57,6 +57,7 @@ def test_the_table_finds_delay_and_dead_band(periods):
     assert error_over_still("table", data_of(valve, periods)) < 0.1
 
 
+@pytest.mark.nightly
 def test_the_linear_model_finds_a_linear_slide_and_not_a_dead_band():
     assert error_over_still("arx", data_of(linear)) < 0.1
     assert error_over_still("arx", data_of(valve)) > error_over_still("table", data_of(valve))

@@ -25,6 +25,7 @@ def fitted(name, location, values, step=1e-3):
     return evidence, fit, np.sqrt(np.diag(np.linalg.inv(fit.information)))
 
 
+@pytest.mark.nightly
 def test_only_scatter_beyond_chance_widens():
     evidence, fit, noise = fitted("angle_offset", "boom", {"offset": 0.01})
     # steps hardly matter to an offset; 40 stretches tell a spread to 11 %
@@ -35,6 +36,7 @@ def test_only_scatter_beyond_chance_widens():
     evidence.close()
 
 
+@pytest.mark.nightly
 def test_errors_that_hang_together_widen():
     """Readings of one sensor off by a slow wave, as of a law of another form."""
     nominal = load_machine("cat215")

@@ -155,14 +155,7 @@ def beyond(found):
 
 
 @pytest.mark.daily(
-    "valves",
-    "forces of terms",
-    "joint_flexibility",
-    "pump_lag",
-    "presliding",
-    "tank_leakage",
-    "sensors",
-    "load_holding",
+    "valves", "joint_flexibility", "pump_lag", "presliding", "tank_leakage", "load_holding"
 )
 @pytest.mark.parametrize("case", CASES)
 def test_readings_are_those_of_the_plant(case, machine_of, reduced_of):
@@ -264,6 +257,7 @@ def test_a_plain_force_drive(effects, machine_of, reduced_of):
     assert travel > 1e-3
 
 
+@pytest.mark.nightly
 def test_terms_with_variables_of_another_drive(machine_of, reduced_of, tmp_path):
     """Force, flows and command of one drive that go with another's motion, pressure and command."""
     nominal = machine_of("cat215/none")

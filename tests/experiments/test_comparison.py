@@ -58,6 +58,7 @@ def test_judgement_needs_all_checks():
     assert Judgement((good,), unavailable="the text ends").verdict == "cannot be computed"
 
 
+@pytest.mark.nightly
 def test_intervals_cover_the_truth():
     """Of 100 intervals 95 should: the binomial standard error is 2.2 %, and three are allowed.
 

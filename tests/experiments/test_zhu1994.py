@@ -85,6 +85,7 @@ def test_every_table_and_figure_is_there(kind, number):
     raise AssertionError(f"no row for {kind} {number}")
 
 
+@pytest.mark.nightly
 def test_criteria_fail_on_a_broken_run():
     names = {c.name for c in zhu_tables.TABLES.claims}
     rows = [row for _, row in break_series(SERIES, sorted(names), jobs=1)]

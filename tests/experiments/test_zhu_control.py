@@ -68,6 +68,7 @@ def test_claims_can_be_broken_and_begin_with_their_page():
             assert claim.broken is not None and claim.broken_how, claim.name
 
 
+@pytest.mark.daily("inverse kinematics", "force feed-forward error")
 @pytest.mark.parametrize("one", [e for e in EXPERIMENTS if e.repetitions_fixed == 1],
                          ids=lambda one: one.name)  # fmt: skip
 def test_exact_rows_agree_and_differ_when_broken(one):

@@ -107,7 +107,7 @@ CHANGES = {  # of the real machine: (path, value, places that must stand out)
 }  # fmt: skip
 
 
-@pytest.mark.daily("delay", "friction", "leakage")
+@pytest.mark.daily("friction")
 @pytest.mark.parametrize("case", CHANGES)
 def test_a_changed_machine_stands_out_in_its_law_alone(case):
     path, value, places = CHANGES[case]
@@ -235,6 +235,7 @@ def test_clean_measured_runs_are_at_their_noise():
         assert loud == {}  # as above: 40 s hold 120 independent values, 6 % by chance
 
 
+@pytest.mark.nightly
 def test_exact_signals_leave_less_than_the_sensors_noise():
     machine = load_machine("cat215")
     for run in RUNS:
@@ -242,7 +243,7 @@ def test_exact_signals_leave_less_than_the_sensors_noise():
         assert max(judged(machine, log).values()) < 1.0
 
 
-@pytest.mark.daily("open_03-place1-10.0-runs0", "open_10-place9-5.0-runs0")
+@pytest.mark.daily("open_03-place1-10.0-runs0")
 @pytest.mark.parametrize("runs", [RUNS[1:3], pytest.param(RUNS, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("case", "place", "least"),

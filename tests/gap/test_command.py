@@ -97,6 +97,7 @@ def test_the_patched_machine_runs_and_is_replayed(site, searching):
     assert other["pressure_head.boom"]["rms"] > 5 * channels["pressure_head.boom"]["rms"]
 
 
+@pytest.mark.nightly
 def test_a_machine_with_a_learned_law_runs_and_is_replayed(site, searching):
     searching("partly")
     code, out, _ = invoke("gap", "--data", "site", "--no-recording")

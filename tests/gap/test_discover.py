@@ -245,6 +245,7 @@ def cut(told, values):
     return [(readings(told[c]), {name: x[c] for name, x in values.items()}) for c in CUT]
 
 
+@pytest.mark.nightly
 def test_thresholds_of_a_relay_are_found():
     """A constant that a pressure switches, in noise as large: to a tenth of the range."""
     rng = np.random.default_rng(4)
@@ -265,6 +266,7 @@ def test_thresholds_of_a_relay_are_found():
     assert share(best) > 1.3 * share(table), "the same table without a memory"
 
 
+@pytest.mark.daily("0.4")
 @pytest.mark.parametrize("level", [0.25, 0.4, 0.6, 0.8])
 def test_a_relay_with_hardly_any_hysteresis_is_found(level):
     """A constant that a pressure switches at nearly one value, in noise as large."""

@@ -50,7 +50,7 @@ def test_every_effect_and_every_law_has_a_motion():
     assert used == MOTIONS.keys() == EXAMPLES.keys()
 
 
-@pytest.mark.daily("stairs", "poses", "steps")
+@pytest.mark.daily("poses", "steps")
 @pytest.mark.parametrize("motion", EXAMPLES)
 def test_experiment_runs_inside_the_ranges_and_above_the_ground(motion, folder):
     done = run("cat215", EXAMPLES[motion], folder)
@@ -66,6 +66,7 @@ def test_experiment_runs_inside_the_ranges_and_above_the_ground(motion, folder):
     assert min(forward(geometry, q)[2] for q in poses[::10]) > 0.1
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("machine", "effects"),
     [

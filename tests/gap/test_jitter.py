@@ -68,14 +68,14 @@ def test_jitter_and_noise_are_told_apart(truth, tmp_path):
     np.testing.assert_allclose(found.noise, data.noise, rtol=0.15)  # 3.3 standard deviations
 
 
-@pytest.mark.daily("0.002")
+@pytest.mark.nightly
 @pytest.mark.parametrize("stated", [0.0, 0.002])
 def test_a_steady_clock_is_left_alone(truth, tmp_path, stated):
     machine = changed(load_machine("cat215"), f"sensors.{SITE}.jitter", stated)
     assert levels(dataset(truth, machine, tmp_path, 0.0)).jitter == 0.0
 
 
-@pytest.mark.daily("bulk_modulus-all-values0")
+@pytest.mark.nightly
 @pytest.mark.parametrize("name, place, values", [
     ("bulk_modulus", "all", {"bulk_modulus": 1.4e9}),
     ("angle_delay", "boom", {"delay": 0.02}),

@@ -72,6 +72,7 @@ def test_it_needs_no_network(named):
     assert not re.search(r"https?://|@import|url\(|<script", text)
 
 
+@pytest.mark.nightly
 def test_every_picture_decodes(named):
     from PIL import Image
 

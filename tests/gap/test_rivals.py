@@ -40,6 +40,7 @@ def test_a_number_is_a_case_of_its_numbers_by_direction(evidence, name, other, c
     assert is_case_of(evidence, guess, 0, table[other, "stick"]) is case
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("bands", "more"), [((0.07, 0.07), False), ((0.05, 0.09), True)])
 def test_numbers_by_direction_are_asked_where_the_directions_differ(bands, more):
     """An effect that was fitted, beside the same with two numbers, from there on."""

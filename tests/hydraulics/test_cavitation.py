@@ -76,6 +76,7 @@ def test_without_a_way_in_the_missing_volume_is_filled_by_oil_that_stretches_and
     assert got == pytest.approx(expected, abs=10.0)  # 1e-4 of what the step misses in the volume
 
 
+@pytest.mark.daily("0.001")
 @pytest.mark.parametrize("dt", [1e-3, 2.5e-4])
 def test_drawing_and_refilling_as_an_independent_integration_has_them(boom, dt):
     """Chambers as compliances that depend on their pressure, integrated by scipy's Radau."""

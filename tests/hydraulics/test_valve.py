@@ -232,7 +232,7 @@ def test_the_step_converges_with_second_order_where_everything_is_in_it():
     assert errors[0] < 1e-3 * 28e6
 
 
-@pytest.mark.daily("200.0-10.0-0.005")
+@pytest.mark.nightly
 @pytest.mark.parametrize(("bandwidth", "limit", "dt"), [(50.0, 3.0, 1e-3), (200.0, 10.0, 5e-3)])
 def test_a_slew_limited_spool_follows_the_saturated_equation(bandwidth, limit, dt):
     """w^2 (u - s) - 2 z w s', with s' held at the limit while the equation asks for more."""

@@ -60,6 +60,7 @@ def test_weights_make_the_intervals_narrower(found):
         assert np.mean(stds[1]) < np.mean(stds[0])
 
 
+@pytest.mark.nightly
 def test_the_bias_taken_off_is_what_noise_of_positions_does_to_friction(repeated, found):
     corrected = found["weighted"]
     kept = identify_dynamics(*repeated, Processing(period=PERIOD), Estimator(pairs=0))

@@ -45,6 +45,7 @@ def found_short(short):
     return identify_dynamics(*short)
 
 
+@pytest.mark.nightly
 def test_intervals_hold_the_parameters_of_the_machine_that_was_recorded(found):
     truth = found.told.combination @ found.nominal
     away = np.abs(found.estimate.value - truth) / found.estimate.std
@@ -138,6 +139,7 @@ def test_a_drive_that_rests_has_no_friction_to_tell(short):
     assert all(rows[f"{kind}.boom_rod"].value is None for kind in ("coulomb", "viscous"))
 
 
+@pytest.mark.nightly
 def test_missing_samples_are_bridged(clean, found):
     fit, heldout, setup = clean
     rng = np.random.default_rng(1)

@@ -78,6 +78,7 @@ def truth():
     return machine
 
 
+@pytest.mark.nightly
 def test_a_machine_of_the_family_is_found_again(truth):
     table, told = table_of(load_machine("cat215"))
     other, _ = table_of(truth)

@@ -119,6 +119,7 @@ def test_home_is_a_felling_posture():
     assert 7.0 < data.site("hydrotele_tip").xpos[0] < 8.0
 
 
+@pytest.mark.daily("head")
 @pytest.mark.parametrize("axis", CYLINDERS)
 def test_linkage_follows_the_cylinder_over_the_whole_range(axis):
     """Lengths to 1e-9 m (loops are closed to 1e-12 m); the range uses the stroke but 12 mm."""

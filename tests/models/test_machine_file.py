@@ -378,6 +378,7 @@ DAILY = {("cat215", "bucket"), ("cat215", "grapple_claw"), ("cat325", "none"), (
 assert set(CASES) >= DAILY
 
 
+@pytest.mark.daily("rig-none", "cat325-none")
 @pytest.mark.parametrize(
     ("name", "tool"),
     [c if c in DAILY else pytest.param(*c, marks=pytest.mark.nightly) for c in CASES],

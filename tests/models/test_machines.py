@@ -122,6 +122,7 @@ def test_holding_forces_are_the_slope_of_potential_energy(plant):
         assert np.dot(forces, moved_by) == pytest.approx(slope, rel=1e-5, abs=0.05)
 
 
+@pytest.mark.daily("calibrator-none", "cat215-bucket")
 def test_linkages_close_over_the_joint_range_within_the_stroke(plant):
     """Every cylinder reaches its joint's whole range within its stroke, to the loops' 1e-9 m."""
     for axis, value, data in samples(plant):

@@ -118,6 +118,7 @@ def test_folder_is_that_of_a_run(driven):
         assert len(log) == 200 and all(len(column) == 200 for column in log.columns.values())
 
 
+@pytest.mark.nightly
 def test_same_script_same_bits_and_the_scenario_repeats_it(driven):
     drive_to_folder(wishes(driven / "b", device=f"scripted:{driven / 'out.csv'}"))
     again = run_scenario(load_scenario(driven / "a" / "scenario.yaml"))

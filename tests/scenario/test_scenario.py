@@ -172,6 +172,7 @@ def test_hold_drifts_by_leakage():
         assert (drift < -5e-3) if falls else (drift > 2e-3)  # m in 10 s; the load pushes it in
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("effect", "leakage", "lasting"), [
     ("tank_leakage", 2.7e-13, True), ("internal_leakage", 2.0e-11, False),
 ])  # fmt: skip

@@ -15,6 +15,7 @@ def model(machine):
     return model_with_looks(machine)
 
 
+@pytest.mark.nightly
 def test_following_closes_all_pins_on_the_branch_of_close_loops(machine, model, log):
     joints, data = logged_joints(machine, log), mujoco.MjData(model)
     assert set(joints) == {"swing", "boom", "stick", "bucket"}

@@ -40,6 +40,7 @@ def _floats(column) -> np.ndarray:
     return np.asarray(column, dtype=float)
 
 
+@pytest.mark.nightly
 def test_channels_come_back_in_shown_units(chunks, log):
     chunk = chunks["/measured/pressure_head/boom", False]
     assert np.asarray(chunk["time"]).astype(np.int64).tolist() == [

@@ -201,10 +201,12 @@ def in_a_process_of_its_own(text, *words):
     return result.stdout
 
 
+@pytest.mark.nightly
 def test_models_of_others_are_left_alone():
     assert "identical" in in_a_process_of_its_own(FOREIGN)
 
 
+@pytest.mark.nightly
 def test_callbacks_of_others_are_not_replaced():
     """One after the other in one process: that of activations, that of forces."""
     said = in_a_process_of_its_own(TAKEN)

@@ -61,6 +61,7 @@ def test_the_force_that_is_felt_is_the_plates():
         np.testing.assert_array_equal(single, run.truth[f"truth.contact_force.{c}"])
 
 
+@pytest.mark.nightly
 def test_a_plate_far_away_changes_nothing():
     """Not bit for bit: the constraint solver sums over one more joint. 1e-10 is far above that."""
     alone = load_scenario("zhu_in", {"duration": "2"})
@@ -149,6 +150,7 @@ def test_cut_held_lifted_and_let_go():
     assert model.geom_contype[model.geom("tree_0").id] == 3
 
 
+@pytest.mark.nightly
 def test_felling_again_gives_the_same_bits():
     first, again = (run_scenario(fell(12.0, [SAW])) for _ in range(2))
     assert any("the tree is cut" in note for note in first.summary["notes"])

@@ -179,6 +179,7 @@ def test_what_is_too_fast_is_not_simulated():
         Case(CASE.master, CASE.slave, Impedance(1.0), CASE.slave_control, CASE.hand, CASE.task)
 
 
+@pytest.mark.nightly
 def test_different_delays_there_and_back():
     """What is felt depends on both, stability on their sum only."""
     uneven = Case(**{**vars(CASE), "delay_forward": 0.08, "delay_back": 0.0})

@@ -30,6 +30,7 @@ def test_every_axis_steps_as_designed_and_leaves_the_others_alone(axis, diodes):
     assert not flight.warnings
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("diodes", [False, True])
 def test_it_hovers_within_ten_micrometres(diodes):
     """After it was lifted by 0.3 mm, with errors of a reading up to one step."""

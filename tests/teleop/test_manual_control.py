@@ -70,6 +70,7 @@ def test_a_turn_between_two_sines_does_not_count_as_margin():
     assert abs(crossover_of(w[::5], np.exp(-0.3j * w[::5]) / (1j * w[::5])).margin) < np.pi
 
 
+@pytest.mark.nightly
 def test_an_operator_with_twice_the_delay_crosses_over_at_a_lower_frequency():
     slow = drawn_operator(load_operator_file(), None, visual_delay=0.32)
     assert measured(INTEGRATOR, him=slow).frequency < 0.8 * measured(INTEGRATOR).frequency

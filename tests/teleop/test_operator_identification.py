@@ -40,7 +40,7 @@ def noisy(made, seed):
     )
 
 
-@pytest.mark.daily("1-gain")
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("form", "kind"), [(GAIN, "integral"), (INTEGRATOR, "gain"), (DOUBLE_INTEGRATOR, "lead")]
 )

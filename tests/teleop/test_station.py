@@ -67,6 +67,13 @@ def check_sound(run, speeds=SPEEDS):
         assert np.isfinite(values).all()
 
 
+@pytest.mark.daily(
+    "stiffness-position-0.1",
+    "direct_force-rate-0.1",
+    "four_channel-rate-0.1",
+    "wave_variables-position-0.1",
+    "passivity_control-position-0.1",
+)
 @pytest.mark.parametrize(
     ("mode", "delay"),
     [
@@ -223,6 +230,7 @@ def test_four_channels_under_position_control_are_transparent_at_rest():
     assert place == pytest.approx(100.0 * log.master("handle")[late, 2].mean(), abs=0.01)
 
 
+@pytest.mark.nightly
 def test_four_channels_under_rate_control_leave_a_constant_force_unfelt():
     """Some 14 kN would be 3 N by the ratio; the hand rests at the centre and feels nothing.
 
@@ -362,6 +370,7 @@ def test_a_dead_line_stops_the_machine_softly(mode):
     assert any("no packet came" in note for note in run.summary["notes"])
 
 
+@pytest.mark.nightly
 def test_half_of_the_packets_do_as_well():
     """A held packet now and then is no jump; the tip comes 2 cm near where it comes with all."""
     hand = {"kind": "follow", "time": [0, 3], "path": {"z": [0.003, 0.003]}}

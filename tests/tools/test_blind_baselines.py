@@ -45,6 +45,7 @@ def test_smoothed_states_are_near_the_true_ones(recorded):
         assert np.abs(error[:, :, S]).max() < 0.03  # Euler's rule at 1 ms for an 8 Hz spool
 
 
+@pytest.mark.nightly
 def test_the_true_model_reaches_the_floor_and_a_wrong_one_does_not(recorded):
     problem, _ = recorded
     last = len(problem.commands) - 1

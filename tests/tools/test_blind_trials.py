@@ -105,6 +105,7 @@ def test_every_effect_outside_the_library_shows(fast_run, turn):
     assert mujoco.get_mjcb_control() is None
 
 
+@pytest.mark.nightly
 def test_a_scored_bore_rubs_at_its_place_only(fast_run):
     plain = record(MACHINE, fast_run, []).truth
     passed = plain["length.stick"]
@@ -118,6 +119,7 @@ def test_a_scored_bore_rubs_at_its_place_only(fast_run):
     assert change(passed.max() + 0.5) < 1.0  # ten widths away the bell is 2e-22 of 9 kN
 
 
+@pytest.mark.nightly
 def test_a_key_tells_all_and_the_logs_nothing(tmp_path):
     series = Series(seed=5, counts={"single": 0, "double": 1, "clean": 0, "outside": 0}, duration=4)
     (tmp_path / "a" / "keys").mkdir(parents=True)

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 NIGHTLY = ROOT / "tools" / "nightly"
 
@@ -22,6 +24,7 @@ def test_every_check_is_a_command_of_this_repository():
         assert script == "-m" or (ROOT / script).is_file()
 
 
+@pytest.mark.nightly
 def test_a_check_needs_its_data_and_its_failure_is_told(tmp_path):
     refused = nightly("--only", "open_cases")
     assert refused.returncode == 2 and "--data is needed by open_cases" in refused.stderr
