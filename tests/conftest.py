@@ -31,20 +31,26 @@ hypothesis.settings.register_profile("hydrotele", deadline=None, derandomize=Tru
 hypothesis.settings.load_profile("hydrotele")
 
 
-# Files that take ten seconds or more, the longest first: two processes then end together. A file
-# that is missing here costs at most its own length at the end. The first two compile unlike code,
-# so that neither process waits for the other.
+# Files that take five seconds or more, the longest first: two processes then end together. A file
+# that is missing here costs at most its own length at the end.
 LONG = (
-    "gap/test_find.py", "scenario/test_scenario.py", "envs/test_render.py",
-    "tools/test_blind_baselines.py", "gap/test_rattling.py", "cli/test_cli.py",
-    "tools/test_blind_trials.py", "teleop/test_station.py", "models/test_machines.py",
-    "effects/test_library.py", "estimate/test_reduced_against_plant.py", "gap/test_discover.py",
-    "run/test_sweep_processes.py", "estimate/test_filter.py", "gap/test_balances.py",
-    "envs/test_gymnasium.py", "cli/test_untrusted_folder.py", "gap/test_command.py",
-    "gap/test_mechanism.py", "estimate/test_output_error.py", "calibrate/test_mukca.py",
-    "experiments/test_zhu1994.py", "gap/test_without_inputs.py", "run/test_replay.py",
-    "gap/test_report.py", "gap/test_experiment.py", "teleop/test_analyse_command.py",
-    "core/test_compiled.py",
+    "cli/test_cli.py", "scenario/test_scenario.py", "effects/test_library.py",
+    "teleop/test_station.py", "envs/test_render.py", "run/test_sweep.py",
+    "models/test_machines.py", "gap/test_mechanism.py", "gap/test_command.py", "gap/test_find.py",
+    "run/test_run.py", "show/test_pictures.py", "teleop/test_analyse_command.py",
+    "identify/test_identification.py", "identify/test_estimation.py", "core/test_compiled.py",
+    "estimate/test_reduced_against_plant.py", "gap/test_balances.py", "estimate/test_filter.py",
+    "run/test_replay.py", "gap/test_report.py", "calibrate/test_mukca.py", "run/test_haptic.py",
+    "core/test_linking.py", "test_architecture.py", "gap/test_discover.py", "logs/test_load.py",
+    "show/test_recording.py", "run/test_live.py", "experiments/test_abdellatif2008.py",
+    "identify/test_identify_command.py", "envs/test_dm.py", "test_packaging.py",
+    "calibrate/test_hybrid.py", "multibody/test_poses.py", "simulate/test_mechanism.py",
+    "simulate/test_native.py", "control/test_endpoint_force.py", "hydraulics/test_circuit.py",
+    "simulate/test_surroundings.py", "experiments/test_wang2012.py", "effects/test_timing.py",
+    "envs/test_grade.py", "gap/test_experiment.py", "envs/test_core.py", "control/test_plan.py",
+    "cli/test_untrusted_folder.py", "effects/test_transmission.py",
+    "experiments/test_khoshzaban_dynamics.py", "gap/test_without_inputs.py",
+    "teleop/test_linear_case.py",
 )  # fmt: skip
 
 

@@ -115,23 +115,25 @@ def imports_of(tree: ast.Module, module: str, is_package: bool) -> Iterator[Impo
                 yield Import(str(node.args[0].value), node.lineno, at_top)
 
 
-def walk_imports(node: ast.AST, at_top: bool = True) -> Iterator[tuple[Any, bool]]:
+def walk_imports(tree: ast.AST) -> Iterator[tuple[Any, bool]]:
     """Import statements and calls of `import_module`; whether importing the file executes them."""
-    if isinstance(node, ast.Import | ast.ImportFrom):
-        yield node, at_top
-    elif isinstance(node, ast.Call):
-        if dotted_end(node.func).endswith("import_module"):
+    nodes: list[tuple[Any, bool]] = [(tree, True)]
+    while nodes:
+        node, at_top = nodes.pop()
+        if isinstance(node, ast.Import | ast.ImportFrom):
             yield node, at_top
-    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-        at_top = False
-    typing_only = isinstance(node, ast.If) and any(
-        dotted_end(part) == "TYPE_CHECKING" for part in ast.walk(node.test)
-    )
-    executed = node.orelse if typing_only else ast.iter_child_nodes(node)
-    for child in executed:
-        yield from walk_imports(child, at_top)
-    for child in node.body if typing_only else ():
-        yield from walk_imports(child, False)
+            continue
+        if isinstance(node, ast.Call) and dotted_end(node.func).endswith("import_module"):
+            yield node, at_top
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            at_top = False
+        typing_only = isinstance(node, ast.If) and any(
+            dotted_end(part) == "TYPE_CHECKING" for part in ast.walk(node.test)
+        )
+        executed = node.orelse if typing_only else ast.iter_child_nodes(node)
+        children = [(child, at_top) for child in executed]
+        children += [(child, False) for child in (node.body if typing_only else ())]
+        nodes += reversed(children)
 
 
 def dotted_end(node: ast.AST) -> str:

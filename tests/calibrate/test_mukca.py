@@ -43,6 +43,7 @@ def noisy():
     return simulated()
 
 
+@pytest.mark.nightly
 def test_without_noise_unseen_places_are_exact():
     exact = Errors(play=0.0)
     nominal, true, _, sockets = simulated(errors=exact, rows=12)

@@ -141,6 +141,7 @@ def test_physics_shows_the_simulation():
     env.close()
 
 
+@pytest.mark.nightly
 def test_pictures():
     env = dm.load("TrackTrajectory", 1, **SHORT)
     env.reset()

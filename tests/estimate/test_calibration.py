@@ -14,6 +14,7 @@ _KINDS = ("mass", "valve_gain", "valve_deadband", "viscous_friction", "internal_
 _ROUNDS = 2  # of new gains: the first errors are large
 
 
+@pytest.mark.nightly
 def test_numbers_off_everywhere_are_recovered_within_their_intervals():
     """All numbers of some kinds on boom and stick, drawn from their priors; 12 s of data.
 

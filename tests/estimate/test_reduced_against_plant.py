@@ -285,6 +285,7 @@ def test_terms_with_variables_of_another_drive(machine_of, reduced_of, tmp_path)
         assert beyond(differences_of(reduced_of, nominal, run, 40)), "without it it would be seen"
 
 
+@pytest.mark.nightly
 def test_terms_with_a_memory(machine_of, reduced_of, tmp_path):
     """Force, flow and command that see a variable through a play, or that a relay switches."""
     nominal = machine_of("cat215/none")

@@ -114,6 +114,7 @@ def test_step_converges_with_second_order_to_an_independent_integration(user):
     assert errors[0] < 1e-3 * RELIEF  # at the usual 1 ms, in the middle of a violent transient
 
 
+@pytest.mark.nightly
 def test_a_wide_open_valve_shares_a_short_pump_with_others(user):
     """A swing that is dragged along draws all that boom and stick leave, through a drop of 0.1 MPa.
 

@@ -124,6 +124,7 @@ def test_without_pressures_of_one_side_the_others_are_still_told(short):
     assert rows["coulomb.stick_rod"].value == pytest.approx(2000, abs=4 * 60)
 
 
+@pytest.mark.nightly
 def test_a_drive_that_rests_has_no_friction_to_tell(short):
     fit, heldout, setup = short
 

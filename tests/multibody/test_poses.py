@@ -33,6 +33,7 @@ def test_leg_lengths_are_distances_and_lead_back_to_the_pose(chain):
     np.testing.assert_allclose(back[:, [chain.index(p) for p in POSE]], x, atol=1e-9)
 
 
+@pytest.mark.nightly
 def test_a_jump_is_followed_to_the_nearest_assembly(chain):
     """Rows far apart, in no order: leg lengths that Newton's method from before may not reach."""
     x = poses(30, seed=4)[np.random.default_rng(1).permutation(30)]

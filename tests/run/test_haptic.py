@@ -61,6 +61,7 @@ def test_the_device_moves_the_machine_and_latency_is_told(driven):
         assert set(line[name]["percentiles_us"]) == {"p50", "p90", "p99", "p99.9", "largest"}
 
 
+@pytest.mark.nightly
 def test_the_scenario_that_is_written_makes_a_run_like_it(driven):
     again = run_scenario(load_scenario(driven / "scenario.yaml"))
     before, after = load_log(driven / "measured.parquet"), again.measured

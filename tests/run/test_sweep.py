@@ -247,6 +247,7 @@ def test_all_numbers_that_runs_have_are_known_beforehand():
     assert names <= set(possible) and "teleoperation.handle_energy_J" in names
 
 
+@pytest.mark.nightly
 def test_a_killed_process_costs_its_run_alone(tmp_path):
     base = open_base(load_sweep(write_sweep(tmp_path)))
     quick = [scenario_of(base, point) for point in list(points(base.file.sweep))[:2]]
