@@ -2,7 +2,7 @@
 
 Whitened errors of a perfect model are white noise of size 1 in every channel. The limits lie well
 above what integrators and linearisation leave on clean simulated machines, whose worst channels
-reach 1.02, 1.4 and 25 (`docs/results/gap_calibration.md`), and far below what an effect of some
+reach 1.02, 1.4 and 25 (`docs/validation/gap_calibration.md`), and far below what an effect of some
 size leaves (3, 54 and 3100 on open_02).
 
 Does an effect have the same size in every run? Something else that looks alike has not.
@@ -16,7 +16,7 @@ them has is imitated by some of them to a part: by one, which leaves much, or by
 axis, each of which takes a piece. The right effect in another form leaves little.
 
 The numbers here are set by hand, from trials on a machine of other code whose answers were known
-when they were set; series drawn later judge them (`docs/results/independent_trials.md`).
+when they were set; series drawn later judge them (`docs/validation/independent_trials.md`).
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """The workflow on measured logs whose answers are known, and on damaged copies of them.
 
 Half of every fitted run is enough to tell what is asserted here; all ten whole logs are searched by
-`tools/validation/open_cases.py` (docs/results/open_cases.md).
+`tools/validation/open_cases.py` (docs/validation/open_cases.md).
 """
 
 import dataclasses

@@ -1,6 +1,6 @@
 """Measure the speed of environments: native batch, gymnasium's sync and async vector environments.
 
-    python tools/release/env_speed.py --out docs/results/env_speed.md
+    python tools/release/env_speed.py --out docs/validation/env_speed.md
 
 All in one process run and in turns, the best of several, so that ratios hold on a noisy machine.
 """
@@ -27,19 +27,22 @@ def main() -> None:
         __doc__, task="TrackTrajectory", turns=5, seconds=1.0, loop=64, processes=16, batch=1024
     )
     name = f"hydrotele/{asked.task}-v0"
-    text = [f"{asked.task}, valve actions, real sensors, {multiprocessing.cpu_count()} cores.\n"]
+    text = [
+        "Speed and memory of the batched environments, compared with the vector environments of"
+        f" gymnasium. Task {asked.task}, valve actions, real sensors,"
+        f" {multiprocessing.cpu_count()} cores.\n"
+    ]
     text += ["## Physics steps per second, with hydraulics and sensors\n", *_ways(name, asked)]
-    text += ["\n## Cost of a batch by its size\n", *_sizes(name, asked)]
+    text += ["\n## Cost by batch size\n", *_sizes(name, asked)]
     text += ["\n## Memory\n", *_memory(name)]
     publish("\n".join(text) + "\n", "Speed of the environments", asked)
 
 
 def _ways(name: str, asked) -> list[str]:
     lines = [
-        f"Batches have {asked.batch} environments, `Sync` {asked.loop}, `Async` {asked.processes}.",
-        "",
-        "`Physics alone` is `mujoco.batch.Batch` with two threads on the same model and commands:",
-        "no environment on MuJoCo's steps can be faster.",
+        f"A batch has {asked.batch} environments, `Sync` {asked.loop}, `Async` {asked.processes}.",
+        "Larger is better. `Physics alone` is `mujoco.batch.Batch` with two threads on the same",
+        "model and commands, without control, sensors and reward.",
         "",
         "| control rate [Hz] | physics steps per step | batched, 2 threads | 1 thread | Sync "
         "| Async | physics alone | batched / Sync | batched / Async | physics alone / Sync |",
@@ -118,7 +121,7 @@ def _sizes(name: str, asked) -> list[str]:
         for count in COUNTS
     ]
     speeds = _speeds([_stepper(env, asked.seconds) for env in made], asked.turns)
-    lines = ["| environments | us per environment and step of 20 ms | against 64 |"]
+    lines = ["| environments | us per environment and step of 20 ms | relative to 64 |"]
     lines += ["| --- | --- | --- |"]
     lines += [
         f"| {count} | {1e6 / speed:.2f} | {speeds[0] / speed:.3f} |"
@@ -137,8 +140,9 @@ def _memory(name: str) -> list[str]:
     core: TaskCore = gymnasium.make(name, sensors="real").unwrapped.core  # pyright: ignore
     arrays = core.bytes_per_environment
     return [
-        f"{each / 1000:.2f} kB per environment (resident memory of a process with {large} less that"
-        f" of one with {small}, after 20 steps); its arrays take {arrays / 1000:.2f} kB."
+        f"An environment takes {each / 1000:.2f} kB. This is the difference in resident memory"
+        f" between processes with {large} and {small} environments after 20 steps, per environment."
+        f" Its arrays take {arrays / 1000:.2f} kB."
     ]
 
 

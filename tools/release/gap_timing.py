@@ -44,7 +44,7 @@ if __name__ == "__main__":
     machine = load_machine("cat215")
     sets = {case: load_dataset(args.folder / case, machine) for case in ("open_04", "open_05")}
     find_gap(shortened(sets["open_05"], 10.0), effects=["valve_deadband"], jobs=args.jobs)
-    print("| four runs of | verdict | time [s] | per second of run |")
+    print("| four runs of | verdict | time [s] | time per second of run [s] |")
     print("| --- | --- | --- | --- |")
     for data in sets.values():
         for seconds in LENGTHS:

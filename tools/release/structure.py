@@ -4,10 +4,10 @@
     python tools/release/structure.py --arrows   # the same, and each dependency between packages
     python tools/release/structure.py -- run scenarios/dig.yaml --out runs/dig   # modules used
 
-A room is a package below hydrotele. An arrow is a pair of rooms of which one imports the other,
-anywhere in its modules. A module is used by a command when one of its Python functions is called
-while the command runs, other than by an import; compiled functions call each other without Python,
-and are not seen.
+A dependency is a pair of packages below hydrotele of which one imports the other, anywhere in its
+modules. A module is used by a command when one of its Python functions is called
+while the command runs, other than by an import. Compiled functions call each other without Python
+and are not counted.
 """
 
 import argparse
@@ -28,7 +28,7 @@ def room_of(path: Path) -> str:
 
 
 def imported_rooms(path: Path) -> set[str]:
-    """Rooms that a module imports, at its top or within functions."""
+    """Packages that a module imports, at its top or within functions."""
     rooms = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -73,11 +73,11 @@ def passed_by(words: list[str]) -> tuple[Counter[str], int]:
 
 
 def main() -> int:
-    """Print the numbers; the exit status is that of the command."""
+    """Print the counts; the exit status is that of the command."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--arrows", action="store_true", help="list every arrow between rooms")
+    parser.add_argument("--arrows", action="store_true", help="list every dependency")
     parser.add_argument("command", nargs="*", help="command of hydrotele, after --")
     args = parser.parse_args()
     paths = sorted(PACKAGE.rglob("*.py"))
@@ -87,19 +87,21 @@ def main() -> int:
         modules[room] += 1
         lines[room] += len(path.read_text().splitlines())
         arrows |= {(room, other) for other in imported_rooms(path) if other != room}
-    print(f"{'room':12} modules  lines  imports from")
+    print(f"{'package':12} modules  lines  imports from")
     for room in sorted(modules):
         others = sorted(b for a, b in arrows if a == room)
         names = " ".join(others) if args.arrows else len(others)
         print(f"{room:12} {modules[room]:7} {lines[room]:6}  {names}")
     total = sum(modules.values()), sum(lines.values())
-    print(f"{len(modules)} rooms, {total[0]} modules, {total[1]} lines, {len(arrows)} arrows")
+    print(
+        f"{len(modules)} packages, {total[0]} modules, {total[1]} lines, {len(arrows)} dependencies"
+    )
     if not args.command:
         return 0
     calls, status = passed_by(args.command)
     for name, number in sorted(calls.items()):
         print(f"{number:9} calls  {name}")
-    print(f"{len(calls)} modules passed by: hydrotele {' '.join(args.command)}")
+    print(f"{len(calls)} modules used by: hydrotele {' '.join(args.command)}")
     return status
 
 

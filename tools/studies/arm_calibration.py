@@ -54,9 +54,10 @@ def noise(seeds: int) -> str:
     lines = [
         f"{seeds} seeds of uniform sensor noise within 0.1 deg, {sum(len(c.theta) for c in clean)}"
         " poses, a machine that differs from nominal by N(0, 30 mm) and N(0, 1 deg)."
-        " Errors in mm and mdeg; bias +- its standard error.", "",
-        "| parameter | bias, hierarchical | std | 95 % covers | bias, joint | std | 95 % covers |"
-        " RMS joint / hierarchical |",
+        " Bias with its standard error and standard deviation in mm and mdeg; smaller is better.",
+        "",
+        "| parameter | bias, hierarchical | std | coverage 95 % | bias, joint | std |"
+        " coverage 95 % | RMS joint / hierarchical |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]  # fmt: skip
     for k, name in enumerate(names):
@@ -72,14 +73,14 @@ def noise(seeds: int) -> str:
     ratio, told = rms[1] / rms[0], np.mean(spread[:, 1], axis=0) / np.mean(spread[:, 0], axis=0)
     lines += [
         "",
-        f"Largest bias over its standard error: {np.abs(z[0]).max():.2f} hierarchical,"
+        f"Largest ratio of bias to its standard error: {np.abs(z[0]).max():.2f} hierarchical,"
         f" {np.abs(z[1]).max():.2f} joint. Mean coverage {100 * cover[:, 0].mean():.1f} % and"
         f" {100 * cover[:, 1].mean():.1f} %; by parameter"
         f" {100 * cover[:, 0].mean(axis=0).min():.1f} to"
         f" {100 * cover[:, 0].mean(axis=0).max():.1f} % and"
         f" {100 * cover[:, 1].mean(axis=0).min():.1f} to"
         f" {100 * cover[:, 1].mean(axis=0).max():.1f} % (binomial standard error"
-        f" {100 * np.sqrt(0.05 * 0.95 / seeds):.1f} %). RMS error of the joint over the"
+        f" {100 * np.sqrt(0.05 * 0.95 / seeds):.1f} %). Ratio of the RMS errors, joint to"
         f" hierarchical: {ratio.min():.2f} to {ratio.max():.2f}; expected from the covariances"
         f" {told.min():.2f} to {told.max():.2f}.",
     ]
@@ -153,23 +154,22 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
     each = np.sqrt(np.array(before) / np.array(after))
     half = clean_trials // 2
     lines += [
-        f"{trials} measurements of {poses} poses per link, each of another machine, with one"
-        " calibrator joint wrong in 10 to 33 % of one link's poses by 1 to 4"
-        " deg (an offset, scatter"
-        " or a bend and back).", "",
+        f"{trials} measurements of {poses} poses per link, each of a different machine. One joint"
+        " of the calibrator has an error of 1 to 4 deg in 10 to 33 % of the poses of one link (an"
+        " offset, scatter or a temporary bend).", "",
         "| | |", "| --- | --- |",
-        f"| region found (overlap over union at least 0.5, nothing elsewhere) |"
+        f"| region found (overlap over union at least 0.5, no other region) |"
         f" {100 * places / max(trials, 1):.1f} % |",
-        f"| region found and joint named | {100 * joints / max(trials, 1):.1f} % |",
-        "| region found and joint among those not ruled out |"
+        f"| region found and joint identified | {100 * joints / max(trials, 1):.1f} % |",
+        "| region found and joint among the possible ones |"
         f" {100 * possible / max(trials, 1):.1f} % |",
         f"| false alarms, held links fixed | {alarms['fixed']} of {half} |",
         f"| false alarms, held links drifting | {alarms['drifting']} of {half} |",
-        f"| RMS error of all parameters, in expected sizes, with the bad data | {one:.4f} |",
-        f"| the same, re-identified | {two:.4f}, {one / two:.1f} times smaller |",
-        f"| trial by trial: median, 10 % quantile of the ratio | {np.median(each):.1f},"
+        f"| RMS error of all parameters relative to expected sizes, with bad data | {one:.4f} |",
+        f"| the same without bad data | {two:.4f}, {one / two:.1f} times smaller |",
+        f"| ratio by trial: median, 10 % quantile | {np.median(each):.1f},"
         f" {np.quantile(each, 0.1):.1f} |",
-        "", "Not named:", *(f"- {m}" for m in misses),
+        "", "Joint not identified:", *(f"- {m}" for m in misses),
     ]  # fmt: skip
     return "\n".join(lines)
 
@@ -193,7 +193,7 @@ def tip(machines: int) -> str:
         pairs.append(tip_errors(nominal, machine_with_loop(nominal, loop, true), true, stages))
         rows.append(f"| {seed} | {1e3 * pairs[-1][0]:.1f} | {1e3 * pairs[-1][1]:.1f} |")
     one, two = np.sqrt(np.mean(np.square(pairs), axis=0))
-    rows += ["", f"All: {1e3 * one:.1f} mm nominal, {1e3 * two:.1f} mm calibrated,"
+    rows += ["", f"RMS of all machines: {1e3 * one:.1f} mm nominal, {1e3 * two:.1f} mm calibrated,"
              f" {one / two:.1f} times smaller."]  # fmt: skip
     return "\n".join(rows)
 
@@ -203,7 +203,7 @@ def speed() -> str:
     nominal = loop_of(load_machine("calibrator"))
     true = perturb_loop(nominal, np.random.default_rng(TRUTH))
     rows = ["CPU time of one process with one thread.", ""]
-    rows += ["| poses | hierarchical [s] | joint, from there [s] |", "| --- | --- | --- |"]
+    rows += ["| poses | hierarchical [s] | then joint [s] |", "| --- | --- | --- |"]
     for poses in (100, 200, 400, 800):
         rng = np.random.default_rng(5)
         stages = [simulate_readings(true, sweep_poses(true, n, s._replace(poses=poses)), rng)

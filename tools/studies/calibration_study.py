@@ -3,8 +3,8 @@
     python tools/studies/calibration_study.py mukca --trials 200
 
 mukca   robots with random errors, calibrated from simulated postures with their ball in sockets:
-        share of 95 % intervals that cover the truth, bias and standard deviation per parameter,
-        held-out error against the noise.
+        fraction of 95 % intervals that contain the true value, bias and standard deviation per
+        parameter, held-out error compared with the noise.
 """
 
 import argparse
@@ -91,17 +91,17 @@ def mukca(asked: argparse.Namespace) -> str:
         f"{many} robots `{asked.robot}`, 4 places x 2 sockets x {asked.rows} postures, ball play"
         f" {1e3 * asked.play:g} mm, encoders {1e6 * asked.encoder:g} urad,"
         f" {'one set of errors' if asked.same else 'new errors for every seed'}.", "",
-        "| intervals of | number | cover the truth % |", "| --- | ---: | ---: |",
+        "| intervals of | number | contain the true value [%] |", "| --- | ---: | ---: |",
         f"| identifiable parameters | {full.sum()} | {100 * inside[full].mean():.1f} |",
-        f"| parameters told with others only, split by the prior (not reported as intervals) |"
+        f"| parameters identifiable only in combinations, split by the prior (not reported) |"
         f" {(some & ~full).sum()} | {100 * inside[some & ~full].mean():.1f} |",
         f"| identifiable combinations | {len(z)} | {100 * np.mean(np.abs(z) <= 1.959964):.1f} |",
         f"| the ball | {ball.size} | {100 * ball.mean():.1f} |", "",
-        f"Unseen place: RMS distance {heldout.mean():.4f} mm (ball play alone"
+        f"Held-out place: RMS distance {heldout.mean():.4f} mm (ball play alone"
         f" {1e3 * asked.play * 3**0.5:.4f}), without noise {tip.mean():.4f} mm (largest"
         f" {tip.max():.4f}). Median time of a calibration"
         f" {np.median([t.seconds for t in trials]):.2f} s.", "",
-        "| parameter | told in % | bias | standard deviation | stated | covers % |",
+        "| parameter | identifiable in [%] | bias | std | stated std | coverage [%] |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     for k, name in enumerate(trials[0].names):
@@ -113,7 +113,7 @@ def mukca(asked: argparse.Namespace) -> str:
             f" {1e3 * error[:, k].std(ddof=1):.3f} | {1e3 * stated:.3f} |"
             f" {100 * inside[:, k].mean():.1f} |"
         )
-    lines += ["", "Bias and deviations in mm and mrad.", ""]
+    lines += ["", "Bias and standard deviations in mm and mrad.", ""]
     return "\n".join(lines)
 
 

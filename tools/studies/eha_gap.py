@@ -4,7 +4,7 @@
 
 The machine is `models/eha` with every number as its authors publish it; the runs are those of one
 load group. Prints what the search names, calibrates and learns, where it puts each number that
-`docs/results/eha.md` lists, and how far free runs of the held-out run are off before and after.
+`docs/validation/eha.md` lists, and how far free runs of the held-out run are off before and after.
 """
 
 import argparse

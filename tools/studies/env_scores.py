@@ -17,15 +17,25 @@ from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
 from tools.studies.study import options, publish
 
-HEAD = """Mean ± standard error over episodes that all controllers share (same seeds and machines);
-`reference` knows the nominal machine and what the observation says. Randomised machines have the
-effects of `hydrotele.envs.variants.usual_spread`: other dead bands, flows and bandwidths of the
-valves, friction, stiffness of the oil, delay of the commands, payload.
+HEAD = """The reference controller, zero actions and random actions run in every control task, with
+ideal and real sensors. The scores are the baseline for learned controllers. Tasks, rewards and
+terminations: [environments](../environments.md).
+
+All controllers run the same episodes (same seeds and machines). Cells are mean ±
+standard error over the episodes. A larger return, `success` and `contact` are better; a smaller
+error (RMS) is better. `final` is the fraction of episodes in which the condition holds at the end;
+`overload`, `beside` (the tip is no longer over the plate) and `spoiled` are failures.
+
+The `reference` controller uses the nominal machine and the observation. Randomised machines have
+the effects of `hydrotele.envs.variants.typical_variation`: valve overlap, flow and bandwidth,
+Coulomb friction, oil stiffness, command delay, payload.
+
+Limit: all machines are simulated; randomised scores hold for this distribution only.
 """
 
 
 def names(scores: Scores) -> list[str]:
-    """The figures worth a column: the RMS of what varies, the end of what is 0 or 1."""
+    """Return the column names: RMS of continuous measures, final value of flags."""
     found = ["return"]
     for name in scores.figures:
         measure, _, what = name.rpartition(" ")
@@ -44,7 +54,7 @@ def row(cells: list[str]) -> str:
 def table(name: str, asked) -> list[str]:
     """Lines of the table of a task."""
     task = TASKS[name]
-    lines = [f"\n## {name}\n\n{task.sentence} Reward: {task.reward}\n"]
+    lines = [f"\n## {name}\n"]
     spread = typical_variation(load_machine(task.machine, task.tool))
     actions = asked.actions.split(",") if asked.actions else [task.action]
     columns: list[str] = []

@@ -1,7 +1,7 @@
 """Compare the designed excitation with one as Khoshzaban used: determinant and intervals.
 
     python tools/studies/excitation_study.py [--harmonics 10] [--starts 4] [--seed 0] [--trials 5]
-        [--out docs/results/excitation.md]
+        [--out docs/validation/excitation.md]
 
 Both motions repeat after 20 s and are run for 60 s by the simulator, with the CAT 215's sensors.
 The criterion is that of the design, (det of the information)^(1/p) over p base parameters that an
@@ -98,15 +98,19 @@ def main() -> None:
     both = sorted(set(stds[0]) & set(stds[1]))
     ratios = {name: stds[0][name] / stds[1][name] for name in both}
     text = "\n".join([
-        f"{len(base)} base parameters, {asked.harmonics} harmonics, {asked.starts} starts.", "",
+        f"A designed motion is compared with the scenario `{OLD}`, a Fourier motion as in"
+        " Khoshzaban 1992. Both are simulated for 60 s with the sensors of the CAT 215. Design:"
+        f" {len(base)} base parameters, {asked.harmonics} harmonics, {asked.starts} starts. A"
+        " smaller standard deviation is better; a ratio above 1 favours the designed motion.", "",
         "| | |", "| --- | ---: |",
-        f"| determinant criterion per parameter, designed over `{OLD}` | {better:.1f} |",
-        f"| largest use of a limit by the designed motion | {100 * new.worst:.0f} % |",
-        f"| parameters told from either | {len(both)} |",
-        f"| parameters told from `{OLD}` / designed only | {len(stds[0])} / {len(stds[1])} |",
-        f"| interval of `{OLD}` over that of the designed motion, median | "
+        f"| ratio of the determinant criterion per parameter, designed to `{OLD}` | {better:.1f} |",
+        f"| largest utilisation of a limit by the designed motion | {100 * new.worst:.0f} % |",
+        f"| parameters identifiable with both motions | {len(both)} |",
+        f"| parameters identifiable with `{OLD}` / with the designed motion |"
+        f" {len(stds[0])} / {len(stds[1])} |",
+        f"| interval width, `{OLD}` to designed motion, median ratio | "
         f"{np.median(list(ratios.values())):.2f} |", "",
-        "| parameter | std, Khoshzaban's style | std, designed | ratio |",
+        "| parameter | std, `excitation` | std, designed | ratio |",
         "| --- | ---: | ---: | ---: |",
         *(f"| {n} | {stds[0][n]:.3g} | {stds[1][n]:.3g} | {r:.2f} |" for n, r in ratios.items()),
         "",

@@ -1,4 +1,4 @@
-"""Study the calibration of the hybrid robot: tables of docs/results/kinematic_calibration.md.
+"""Study the calibration of the hybrid robot: tables of docs/validation/kinematic_calibration.md.
 
 Usage: python tools/studies/hybrid_calibration_study.py [--trials 200] [--part coverage ...]
 """
@@ -55,12 +55,12 @@ def coverage(trials: int) -> None:
     bias = away.mean(axis=0) * np.sqrt(trials)
     print(f"{trials} trials, 36 parameters, 25 poses")
     print(
-        f"95 % intervals hold {100 * np.mean(inside):.2f} % of the planted errors;"
+        f"95 % intervals contain {100 * np.mean(inside):.2f} % of the true errors;"
         f" per parameter {100 * share.min():.1f} to {100 * share.max():.1f} %"
     )
     print(
-        f"bias over its standard error: largest {np.abs(bias).max():.2f} of 36;"
-        f" standard deviation over the stated one {away.std(axis=0).min():.3f} to"
+        f"largest ratio of bias to its standard error: {np.abs(bias).max():.2f} of 36;"
+        f" ratio of standard deviation to the stated one {away.std(axis=0).min():.3f} to"
         f" {away.std(axis=0).max():.3f}"
     )
     _print_test_errors(before, after)
@@ -70,7 +70,7 @@ def _print_test_errors(before, after) -> None:
     rms = [1e3 * np.sqrt(np.mean(np.square(e), axis=1)) for e in (before, after)]
     largest = 1e3 * np.max(after, axis=1)
     print(
-        f"25 poses not used: RMS {np.median(rms[0]):.2f} mm before (least {rms[0].min():.2f}),"
+        f"25 test poses: RMS {np.median(rms[0]):.2f} mm before (smallest {rms[0].min():.2f}),"
         f" {np.median(rms[1]):.4f} mm after (largest trial {rms[1].max():.4f}); largest single"
         f" pose: median {np.median(largest):.4f}, of all {largest.max():.4f} mm; trials with every"
         f" pose below 0.1 mm: {100 * np.mean(largest < 0.1):.1f} %"
@@ -94,17 +94,15 @@ def all54(trials: int) -> None:
             before.append(pose_errors_at_test_poses(one, IWR)[0])
             after.append(pose_errors_at_test_poses(one, done.robot)[0])
         print(
-            f"{trials} trials, {kind}, 54 planted, rank {ranks}: 95 % intervals of the"
-            f" combinations hold {100 * np.mean(inside):.2f} %; chi {np.mean(chi):.3f}"
+            f"{trials} trials, {kind}, 54 errors, rank {ranks}: 95 % intervals of the"
+            f" combinations contain {100 * np.mean(inside):.2f} %; chi {np.mean(chi):.3f}"
         )
         _print_test_errors(before, after)
 
 
 def noise(trials: int) -> None:
     """Error at poses not used against the noise of all sensors."""
-    print(
-        "| noise of all sensors | RMS at poses not used, mm | largest, mm |\n| --- | ---: | ---: |"
-    )
+    print("| noise of all sensors | RMS at test poses [mm] | largest [mm] |\n| --- | ---: | ---: |")
     for factor in (0.25, 0.5, 1.0, 2.0, 4.0):
         errors = []
         for seed in range(trials):
@@ -119,7 +117,7 @@ def noise(trials: int) -> None:
 
 def poses(trials: int) -> None:
     """Error at poses not used against the number of poses."""
-    print("| poses | 36 parameters, RMS mm | 50 of 54, RMS mm | seconds per calibration |")
+    print("| poses | 36 parameters, RMS [mm] | 50 of 54, RMS [mm] | CPU time per calibration [s] |")
     print("| ---: | ---: | ---: | ---: |")
     for count in (15, 20, 25, 50, 100, 200):
         errors, whole, took = [], [], 0.0
@@ -159,7 +157,7 @@ def choice(trials: int) -> None:
             robot = calibrate(IWR, measured, "dh").robot
             away = forward(robot, *unused).position - forward(built, *unused).position
             found.append(np.linalg.norm(away, axis=1))
-    print("| 20 poses | RMS at 50 poses not used, mm | largest, mm |\n| --- | ---: | ---: |")
+    print("| 20 poses | RMS at 50 test poses [mm] | largest [mm] |\n| --- | ---: | ---: |")
     for name, found in errors.items():
         print(
             f"| {name} | {1e3 * np.sqrt(np.mean(np.square(found))):.4f} |"
@@ -183,15 +181,16 @@ def posterior(trials: int) -> None:
         inside.append((truth > low) & (truth < high))
         agree.append(np.abs(sample.mean - fit.values) / fit.deviations)
     print(
-        f"{trials} trials of MCMC: central 95 % hold {100 * np.mean(inside):.1f} % of the planted"
-        f" errors; means differ from least squares by at most {np.max(agree):.2f} deviations"
+        f"{trials} trials of MCMC: central 95 % contain {100 * np.mean(inside):.1f} % of the true"
+        f" errors; means differ from least squares by at most {np.max(agree):.2f} standard"
+        " deviations"
     )
 
 
 def speed(trials: int) -> None:
     """Time of 1e5 likelihoods of the 54-parameter models on one core."""
     rng = np.random.default_rng(0)
-    print("| model | poses | 1e5 likelihoods, CPU seconds of one core |\n| --- | ---: | ---: |")
+    print("| model | poses | CPU time of 1e5 likelihoods on one core [s] |\n| --- | ---: | ---: |")
     for kind in ("dh", "poe"):
         for count in (25, 50, 100, 200):
             one = simulate_robot(8000, count, kind, document=False)

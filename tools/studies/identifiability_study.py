@@ -1,6 +1,6 @@
 """Determine the identifiable parameters of the CAT 215; compare with Khoshzaban's Table 13.
 
-    python tools/studies/identifiability_study.py [--out docs/results/identifiability.md]
+    python tools/studies/identifiability_study.py [--out docs/validation/identifiability.md]
 
 82 parameters: swing, boom, stick, two tubes and two rods with ten each, Coulomb friction and offset
 of the drives, friction of joints and pins. The motion is 300 independent random states. The
@@ -18,7 +18,10 @@ def report() -> str:
     """The tables."""
     bases = {said: find_base("complete", ball) for said, ball in ENDS}
     lines = [
-        "| ends of the cylinders | rank | unidentifiable | linearly identifiable |"
+        "This study counts the identifiable parameters of the CAT 215 (82 parameters) and compares"
+        " them with Table 13 of Khoshzaban 1992. The motion is 300 independent random states.",
+        "",
+        "| cylinder ends | rank | unidentifiable | linearly identifiable |"
         " fully identifiable | singular values at the rank |",
         "| --- | ---: | ---: | ---: | ---: | --- |",
         "| Khoshzaban, Table 13 | | " + " | ".join(map(str, TABLE_13.values())) + " | |",
@@ -35,24 +38,23 @@ def report() -> str:
 
 
 TEXT = """\
-As in the thesis (p. 100), unidentifiable counts the columns that have no effect and those for
-which others can stand: 82 less the rank. Linearly identifiable are the remaining parameters that
-stand for a combination. Singular values are those on either side of the rank, over the largest,
-of columns of length 1. Nine parameters of the swing have no effect in either case: all but Izz.
-
-Both counts are exact, under different assumptions. The thesis lets cylinders end in spherical
-joints and sets the moment about their axes to zero (Eq. 4.23), while tube and rod turn with the
-links as pins would turn them. `machine_setup(..., ball_joints=True)` is this model; it has the
-thesis' 31, 24 and 27. Pins carry the moment that turns tubes and rods about the cylinders' axes
-when the machine swings. Six combinations, which Eq. 4.23 separates, can then no longer be
-separated from the inertias of the links. The two models differ by the inertia of tubes and rods
-about their axes, 10 kg m^2 each in Table 13: 0.05 % of the swing's torque in his simulated
-motions, and nothing in the cylinders' forces.
-
-The regressor agrees with MuJoCo's inverse dynamics of the closed chain (pins) to 1e-8, and for
-both assumptions with the thesis' recursion of wrenches from stick to swing (Eqs 4.20 to 4.47),
-which `tests/experiments/test_khoshzaban_dynamics.py` derives a second time. The null space does
-not depend on the states that are drawn."""
+- Unidentifiable (thesis, p. 100): 82 minus the rank. These columns are zero or depend linearly on
+  other columns. Linearly identifiable: only a combination is determined.
+- Singular values are those before and after the rank, relative to the largest one, with columns
+  scaled to length 1.
+- All parameters of the swing except Izz (nine parameters) have no effect in both models.
+- The two counts are exact for different assumptions. The thesis assumes spherical joints at the
+  cylinder ends and no moment about the cylinder axes (Eq. 4.23).
+  `machine_setup(..., ball_joints=True)` is this model and has the 31, 24 and 27 of the thesis.
+- Pins transmit the moment that rotates tubes and rods about the cylinder axes during swing motion.
+  Six combinations that Eq. 4.23 separates are then not separable from the inertias of the links.
+- The models differ by the inertia of tubes and rods about their axes, 10 kg m^2 each in Table 13.
+  This is 0.05 % of the swing torque in the simulated motions of the thesis, and zero in the
+  cylinder forces.
+- The regressor with pins agrees with the inverse dynamics of MuJoCo to 1e-8. For both assumptions
+  it agrees with the recursion of the thesis (Eqs 4.20 to 4.47), derived independently in
+  `tests/experiments/test_khoshzaban_dynamics.py`.
+- The null space does not depend on the random states."""
 
 
 if __name__ == "__main__":

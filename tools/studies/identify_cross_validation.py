@@ -1,7 +1,7 @@
 """Cross-validate the complete, reduced and given models on motions that were not fitted.
 
     python tools/studies/identify_cross_validation.py MEASURED [--trials 10] [--seed 1] [--jobs 2]
-        [--out docs/results/identify_cross_validation.md]
+        [--out docs/validation/identify_cross_validation.md]
 
 Each of `excitation` and `excitation_fast` of the CAT 215, recorded with its sensors' noise, is
 fitted and judged on the other one: RMS of measured less predicted force. The given machine's
@@ -85,7 +85,7 @@ def rows(results: Sequence[Errors]) -> list[str]:
     """RMS over results, drive by drive."""
     lines = [
         "| force of | complete | reduced | as given | noise alone | complete over noise |"
-        " given over complete |",
+        " as given over complete |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for drive in results[0]:
@@ -100,11 +100,17 @@ def rows(results: Sequence[Errors]) -> list[str]:
 def report(trials: Sequence[list[Errors]], measured: Sequence[Errors]) -> str:
     """All tables in Markdown."""
     return "\n".join([
-        "N m for the swing, N for the cylinders.", "",
-        f"Simulated here, {len(trials)} trials:", "", *rows([e for found in trials for e in found]),
-        "", f"The independent simulator's clean logs ({CLEAN}), each run held out in turn:", "",
+        "Models of the CAT 215 are identified from one motion and predict the forces of another."
+        " Cells are RMS errors of the predicted force in N m for the swing and N for the cylinders;"
+        " smaller is better. `as given` is the machine before identification, `noise alone` the"
+        " error of a perfect model with these sensors.", "",
+        f"Simulation, {len(trials)} trials, given parameters with errors of up to 15 %:", "",
+        *rows([e for found in trials for e in found]), "",
+        f"Logs of an independent simulator without sensor errors ({CLEAN}), each run held out in"
+        " turn:", "",
         *rows(measured), "",
-        "The thesis' excavator (all frequencies, its own noise and nominal model):", "",
+        "Published for the excavator of Khoshzaban 1992 (all frequencies, with the noise and"
+        " nominal model of that machine):", "",
         "| force of | complete | reduced | nominal |", "| --- | ---: | ---: | ---: |",
         *(f"| {d} | {c:.0f} | {r:.0f} | {n:.0f} |" for d, (c, r, n) in THESIS.items()), "",
     ])  # fmt: skip

@@ -87,14 +87,14 @@ def panda(real: Path) -> None:
         )  # fmt: skip
         print(f"Panda, {'Coulomb, viscous, offset' if friction else 'no friction'}")
         for name, (learned, judged), band in (
-            ("fitted and judged on the whole", (whole, whole), None),
-            ("fitted and judged on the whole", (whole, whole), WIDE),
-            ("judged on the last quarter", (fit, heldout), None),
-            ("judged on the last quarter", (fit, heldout), WIDE),
+            ("fitted and evaluated on the whole record", (whole, whole), None),
+            ("fitted and evaluated on the whole record", (whole, whole), WIDE),
+            ("held out: last quarter", (fit, heldout), None),
+            ("held out: last quarter", (fit, heldout), WIDE),
         ):
             found = identify_with_shapes([learned], judged, setup, Processing(band=band))
             print(f"  {name}: rank {len(found.structure.base)} of {len(found.names)},"
-                  f" {len(found.told.base)} told in spite of noise, relative torque error"
+                  f" {len(found.told.base)} identifiable with noise, relative torque error"
                   f" {100 * relative(found):.2f} % (below {found.band:.3g} Hz),"
                   f" {found.seconds:.1f} s")  # fmt: skip
 
@@ -114,12 +114,16 @@ def emps(real: Path) -> None:
     for asymmetry in (False, True):
         setup = machine_setup(machine, closed_chain(machine), asymmetry=asymmetry)
         found = identify_with_shapes(fit, heldout, setup)
-        print(f"EMPS, viscous friction {'by direction' if asymmetry else 'the same both ways'}")
+        print(
+            f"EMPS, viscous friction {'by direction' if asymmetry else 'equal in both directions'}"
+        )
         for row in parameter_rows(found):
             if row.value is None:
                 continue
             known = PUBLISHED.get(row.name)
-            away = f", {100 * (row.value / known - 1):+.2f} % from {known}" if known else ""
+            away = (
+                f", {100 * (row.value / known - 1):+.2f} % from published {known}" if known else ""
+            )
             print(f"  {row.name:24s} {row.value:9.3f} +- {row.std:.3f} {row.unit}{away}")
         print(f"  relative force error, held out: {100 * found.heldout['slide'].relative:.2f} %"
               f" (below {found.band:.3g} Hz)")  # fmt: skip

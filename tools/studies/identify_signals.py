@@ -1,7 +1,7 @@
 """Compare signal processing methods by the prediction error of the identified parameters.
 
     python tools/studies/identify_signals.py [--trials 10] [--seed 1] [--cycles 5] [--jobs 2]
-        [--out docs/results/identify_signals.md]
+        [--out docs/validation/identify_signals.md]
 
 The CAT 215 repeats a Fourier motion with its sensors' noise. The same records are differentiated
 raw, by the optimal smoother, by the zero-phase filter, and in the frequency domain; everything else
@@ -40,8 +40,8 @@ WAYS = {  # what is said -> method, pairs of noise to find the bias with
     "time domain: optimal smoother": ("optimal", 0),
     "time domain: zero-phase filter": ("zero_phase", 0),
     "frequency domain": ("periodic", 0),
-    "zero-phase filter, bias taken off": ("zero_phase", 4),
-    "frequency domain, bias taken off": ("periodic", 4),
+    "zero-phase filter, bias subtracted": ("zero_phase", 4),
+    "frequency domain, bias subtracted": ("periodic", 4),
 }
 
 
@@ -92,8 +92,12 @@ def one_trial(seed: int, number: int, cycles: int) -> dict[str, list[list[float]
 def report(results: list[dict[str, list[list[float]]]]) -> str:
     """A table in Markdown."""
     lines = [
-        f"Mean over {len(results)} trials.", "",
-        "| lap [s] | processing | swing [N m] | boom [N] | stick [N] | all, over the best |",
+        "Identification differentiates noisy positions. This study compares the signal processing"
+        " methods by the force error of the identified model. Each model predicts the forces along"
+        f" a circle of {RADIUS:g} m radius at rising speed. Cells are RMS errors over one lap, mean"
+        f" of {len(results)} trials; smaller is better. The last column is the geometric mean over"
+        " the drives of the error relative to the smallest error of that lap.", "",
+        "| lap [s] | processing | swing [N m] | boom [N] | stick [N] | all, relative to best |",
         "| ---: | --- | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     table = {way: np.mean([r[way] for r in results], axis=0) for way in WAYS}
@@ -110,4 +114,4 @@ def report(results: list[dict[str, list[list[float]]]]) -> str:
 if __name__ == "__main__":
     asked = options(__doc__, trials=10, seed=1, cycles=5, jobs=2)
     found = side_by_side(one_trial, asked, asked.cycles)
-    publish(report(found), "Signal processing and what it predicts", asked)
+    publish(report(found), "Signal processing for identification", asked)

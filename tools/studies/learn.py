@@ -198,7 +198,7 @@ def judge(name: str, asked: argparse.Namespace) -> list[tuple[str, Scores]]:
     controllers = {
         "learned": Learned(asked.out, make_view(name, core.setup)),
         "reference, tuned on the same machines": recipe.law(core.setup, recipe.gains),
-        "reference as it comes": make_controller("reference", core.setup),
+        "reference with default gains": make_controller("reference", core.setup),
         "zero": make_controller("zero", core.setup),
     }
     return [(k, evaluate(core, c, asked.episodes, FIRST)) for k, c in controllers.items()]
@@ -252,7 +252,7 @@ def main() -> None:
     lines = [
         compare(scores, figures),
         "",
-        "Learned less the tuned reference, episode by episode:\n",
+        "Learned controller minus tuned reference, paired by episode:\n",
     ]
     lines += [f"- {difference(scores, figure)}" for figure in figures]
     text = "\n".join(lines)
@@ -261,24 +261,31 @@ def main() -> None:
 
 
 def head(asked: argparse.Namespace) -> str:
-    """What was done, for the file of scores."""
+    """Return the title, command and description for the file of scores."""
     recipe = RECIPES[asked.task]
     facts = json.loads((asked.out / "training.json").read_text(encoding="utf-8"))
     command = f"python tools/studies/learn.py {asked.task} --minutes {facts['minutes']:g}"
-    does = "acts on its own"
+    does = "acts without the reference controller"
     if recipe.corrects:
         does = f"corrects the tuned reference by at most {recipe.share:g} of a full action"
     options = ", ".join(f"{key} {value}" for key, value in recipe.options.items())
     machines = (
-        "of `typical_variation`, other ones for learning and judging" if recipe.randomised else ""
+        "Machines have the effects of `typical_variation`; training and test machines differ."
+        if recipe.randomised
+        else "The machine is nominal."
     )
     gains = ", ".join(f"{key} {value:g}" for key, value in recipe.gains.items())
     return (
-        f"# Learned against tuned: {asked.task}\n\n`{command} --seed {facts['seed']}`\n\n"
-        f"A network learned by PPO, in {facts['steps']:,} steps, {does}; it sees {recipe.history}"
-        f" steps. Both have {options}; machines {machines or 'nominal'}. The reference was tuned on"
-        f" the machines that were learned on (`--tune`): {gains}. Mean ± standard error of"
-        f" {asked.episodes} episodes that none has met."
+        f"# Learned and tuned controllers: {asked.task}\n\n"
+        "A learned controller is compared with a tuned reference controller on episodes that"
+        " neither of them used before.\n\n"
+        f"`{command} --seed {facts['seed']}`\n\n"
+        f"- The network, trained with PPO in {facts['steps']:,} steps, {does}. Its input is the"
+        f" last {recipe.history} steps.\n"
+        f"- Both controllers have {options}. {machines}\n"
+        f"- The reference was tuned on the training machines (`--tune`): {gains}.\n"
+        f"- Cells are mean ± standard error of {asked.episodes} episodes. A larger return and a"
+        " smaller error are better."
     )
 
 

@@ -58,7 +58,7 @@ def crossover(number: int | None, form: int, records: int, seed: int = 0, **know
 
 
 def recovered(number: int, form: int) -> list[tuple[str, bool, float]]:
-    """(parameter, whether its interval holds the truth, its width) of a laboratory's record."""
+    """(parameter, whether its interval contains the true value, width) of a laboratory's record."""
     him, rng = drawn_operator(FILE, number), np.random.default_rng([number, form, 7])
     length = LEARNING + 1.5 * PERIOD
     target, _ = sum_of_sines(np.arange(0.0, length, 0.01), duration=PERIOD, seed=50 + number)
@@ -88,7 +88,7 @@ def recovered(number: int, form: int) -> list[tuple[str, bool, float]]:
 
 
 def held(changes: dict[str, str]) -> float:
-    """Largest error of the two forces held by feel, as a share."""
+    """Largest relative error of the two forces held by feel."""
     run = run_scenario(load_scenario("press_stiffness", changes))
     time, force = run.truth.time, run.truth["truth.contact_force.z"]
     half = 0.5 * float(time[-1])
@@ -127,14 +127,14 @@ def person(number: int | None, seed: int, **known: float) -> dict[str, str]:
 
 CONFIGURATIONS = {
     "force held by feel: error [%]": (held, {}, 100.0),
-    "tracking, display and stiffness: RMS error [kN]": (tracked, DISPLAYED, 1e-3),
+    "tracking, display and stiffness feedback: RMS error [kN]": (tracked, DISPLAYED, 1e-3),
     "tracking, display alone: RMS error [kN]": (
         tracked, DISPLAYED | {"pilot.reflection": "none"}, 1e-3),
-    "tracking, stiffness alone: RMS error [kN]": (tracked, {}, 1e-3),
+    "tracking, stiffness feedback alone: RMS error [kN]": (tracked, {}, 1e-3),
     "tracking, neither: RMS error [kN]": (tracked, {"pilot.reflection": "none"}, 1e-3),
     "rate control: speed at rest [mm/s]": (restless, {}, 1e3),
     "position control: speed at rest [mm/s]": (restless, {"pilot.mode": "position"}, 1e3),
-    "position control, joystick off the cab: speed at rest [mm/s]": (
+    "position control, joystick on a table: speed at rest [mm/s]": (
         restless, {"pilot.mode": "position", "pilot.mount": "table"}, 1e3),
 }  # fmt: skip
 
@@ -152,7 +152,7 @@ def scenario_results(number: int) -> list[float]:
 def sensitivity(
     name: str, value: float | str, seeds: int, records: int, trials: int
 ) -> list[float]:  # fmt: skip
-    """What one parameter changes, with everything else nominal: bench; machine by `seeds` runs."""
+    """Results with one parameter changed, the others nominal: bench; machine by `seeds` runs."""
     known, hand = {name: value} if name else {}, HAND
     bench: dict[str, float] = {}
     if isinstance(value, str):  # grip or posture
@@ -238,7 +238,7 @@ def discrimination_part(asked, pool) -> str:
         rows.append((words, f"{mean:.1f}", span(share), f"{low:g} to {high:g}",
                      "yes" if low <= mean <= high else "no"))  # fmt: skip
     say("discrimination done")
-    head = ("what is told", "mean JND [%]", "operators", "published, with tolerance", "inside")
+    head = ("quantity", "mean JND [%]", "operators", "published, with tolerance", "inside")
     return table(head, rows)
 
 
@@ -256,7 +256,7 @@ def identification_part(asked, pool) -> str:
             rows.append((name, parameter, "-" if ratio else f"{inside}/{len(values)}",
                          f"{middle:+.0f} %" if ratio else f"+-{middle:.0f} %"))  # fmt: skip
     say("identification done")
-    return table(("element", "parameter", "truth inside 95 %", "median half-width"), rows)
+    return table(("element", "parameter", "true value inside 95 %", "median half-width"), rows)
 
 
 def scenario_part(asked, pool) -> str:
@@ -266,15 +266,15 @@ def scenario_part(asked, pool) -> str:
     def survives(words: str, better: int, worse: int) -> tuple[str, str]:
         wins = int((found[:, better] < found[:, worse]).sum())
         ratio = np.median(found[:, worse] / found[:, better])
-        verdict = "holds" if wins >= 0.95 * len(found) else "does not survive the spread"
+        verdict = "holds" if wins >= 0.95 * len(found) else "does not hold"
         return words, f"{wins}/{len(found)} operators, median ratio {ratio:.2g}: {verdict}"
 
     rows += [
         survives("reflection helps tracking without a display", 3, 4),
         survives("reflection helps tracking with a display", 1, 2),
         survives("a display helps tracking without reflection", 2, 4),
-        survives("rate control rests more quietly than position control", 5, 6),
-        survives("so it does with the joystick off the cab", 5, 7),
+        survives("lower speed at rest under rate control than under position control", 5, 6),
+        survives("the same with the joystick on a table", 5, 7),
     ]
     say("scenarios done")
     return table(("result", f"median (range) over {asked.operators} operators"), rows)
@@ -295,16 +295,17 @@ def sensitivity_part(asked, pool) -> str:
         rows.append((f"{name} ({basis})", at, *(f"{x:.3g}" for x in one)))
     say("sensitivity done")
     return table(
-        ("parameter", "at", "crossover with K/s [rad/s]", "phase margin [deg]",
-         "stiffness JND [%]", "held by feel: error [%]", "rate: speed at rest [mm/s]",
-         "position: speed at rest [mm/s]"), rows)  # fmt: skip
+        ("parameter", "value", "crossover with K/s [rad/s]", "phase margin [deg]",
+         "stiffness JND [%]", "force held by feel: error [%]",
+         "rate control: speed at rest [mm/s]",
+         "position control: speed at rest [mm/s]"), rows)  # fmt: skip
 
 
 PARTS = {
     "Crossover in simulated tracking": crossover_part,
     "Discrimination": discrimination_part,
-    "Identification of drawn operators": identification_part,
-    "Results over the published spread": scenario_part,
+    "Identification of random operators": identification_part,
+    "Results over random operators": scenario_part,
     "Sensitivity": sensitivity_part,
 }
 
@@ -312,7 +313,7 @@ if __name__ == "__main__":
     asked = options(__doc__, operators=20, records=10, trials=60, seeds=2, jobs=1, part="all")
     with ProcessPoolExecutor(asked.jobs) as pool:
         text = "\n\n".join(
-            f"## {title}\n{part(asked, pool)}" for title, part in PARTS.items()
+            f"## {title}\n\n{part(asked, pool)}" for title, part in PARTS.items()
             if asked.part in ("all", part.__name__.removesuffix("_part"))
         )  # fmt: skip
     publish(text + "\n", "Operator model", asked)

@@ -1,7 +1,7 @@
 """Compute workspace, singularities and speed of the hexapod PaLiDA, or design its excitation.
 
-    python tools/studies/palida_study.py [--picture docs/results/palida_workspace.png]
-        [--out docs/results/palida_kinematics.md]
+    python tools/studies/palida_study.py [--picture docs/validation/palida_workspace.png]
+        [--out docs/validation/palida_kinematics.md]
     python tools/studies/palida_study.py --design 1 [--seed 1] [--iterations 12]
 
 The map shows the condition number of the inverse Jacobian (leg rates per pose rates, rotations
@@ -36,6 +36,12 @@ CUTS = (
     ("x [m]", "y [m]", 0, 1, (-0.45, 0.45), (-0.45, 0.45), 1.0),
     ("x [m]", "z [m]", 0, 2, (-0.45, 0.45), (0.25, 0.95), 1.0),
     ("rotation about z [deg]", "z [m]", 5, 2, (-2.1, 2.1), (0.25, 0.95), 180.0 / np.pi),
+)
+
+INTRODUCTION = (
+    "This study computes the condition number, the ambiguity of the forward kinematics and the"
+    " speed of the regressor. A condition number of 1 is best. [The map](palida_workspace.png)"
+    " shows the singularities and the workspace."
 )
 
 
@@ -92,7 +98,7 @@ def draw(target: Path) -> None:
     assert shown is not None
     bar = figure.colorbar(shown, ax=axes)
     bar.set_label("condition of the inverse Jacobian, log10")
-    figure.suptitle("Singularities, and the workspace that strokes and hinges allow (white line)")
+    figure.suptitle("Singularities, and the workspace within stroke and hinge limits (white line)")
     figure.savefig(target, dpi=110)
 
 
@@ -130,18 +136,19 @@ def main() -> None:
         return
     if asked.picture:
         draw(Path(asked.picture))
-    own, rows = load_robot(), ["| quantity | value |", "| --- | --- |"]
+    own, rows = load_robot(), [INTRODUCTION, "", "| quantity | value |", "| --- | --- |"]
     chain = own.setup.chain
     q = joint_positions(chain, own.setup.given, HOME_POSE[None])[0]
     legs = q[[chain.index(name) for name in chain.drives]]
     scale = np.array([1.0, 1.0, 1.0, RADIUS, RADIUS, RADIUS])
     home = np.linalg.cond(jacobian(chain, q, chain.drives, own.setup.given) / scale)
     found = assemblies(chain, chain.drives, legs, body="platform", starts=2000)
-    rows.append(f"| condition of the inverse Jacobian at home | {home:.1f} |")
-    rows.append(f"| poses with the leg lengths of home, found by 2000 starts | {len(found)} |")
+    rows.append(f"| condition number of the inverse Jacobian at the home pose | {home:.1f} |")
+    rows.append(f"| poses with the leg lengths of the home pose, from 2000 starts | {len(found)} |")
     count, seconds = speed()
     rows.append(
-        f"| regressor of {count} rows, 24 joints, 19 bodies | {seconds:.2f} s of one core |"
+        f"| time of the regressor, {count} rows, 24 joints, 19 bodies |"
+        f" {seconds:.2f} s on one core |"
     )
     publish("\n".join(rows) + "\n", "Kinematics of the hexapod PaLiDA", asked)
 

@@ -1,7 +1,7 @@
 """Evaluate better pressure sensors: Khoshzaban's Tables 14 and 15 with the CAT 215.
 
     python tools/studies/sensor_study.py [--trials 10] [--seed 1] [--jobs 2]
-        [--out docs/results/sensor_study.md]
+        [--out docs/validation/sensor_study.md]
 
 The same motions with pressure sensors of +-25 psi, +-5 psi and without error, complete and reduced
 model. As in the thesis every base parameter of the model is estimated, whether the data tell it or
@@ -121,10 +121,15 @@ def report(results: list[dict[tuple[str, str, str], dict[str, float]]]) -> str:
         }
 
     lines = [
-        f"RMS over {len(results)} trials, of the parameters' own sizes; geometric mean over the"
-        " parameters.", "",
-        "| model | positions | 25 psi | 5 psi | no error | 25 over 5 psi: median (range) |"
-        " 25 psi over none: median |",
+        "Tables 14 and 15 of Khoshzaban 1992 ask how much better pressure sensors improve the"
+        " identified parameters. This study repeats them with the CAT 215: errors of +-25 psi, +-5"
+        " psi and none, complete and reduced model. Every base parameter is estimated, identifiable"
+        " or not, as in the thesis.", "",
+        f"Cells are RMS errors over {len(results)} trials relative to the size of the parameter"
+        " (geometric mean over the parameters); smaller is better. `true motion` uses the exact"
+        " motion of the simulator, so that only pressures have errors.", "",
+        "| model | positions | 25 psi | 5 psi | no error | ratio 25 psi to 5 psi: median (range) |"
+        " ratio 25 psi to no error: median |",
         "| --- | --- | ---: | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     for model in ("complete", "reduced"):
@@ -142,7 +147,9 @@ def report(results: list[dict[tuple[str, str, str], dict[str, float]]]) -> str:
     links = [errors(model, "25 psi", MEASURED) for model in ("complete", "reduced")]
     shared = sorted(n for n in set(links[0]) & set(links[1]) if "_rod" not in n)
     lines += [
-        "", "Parameters of the links that stand in both models, 25 psi:", "",
+        "",
+        "Parameters of the links that are in both models, 25 psi, angles with errors of +-0.1 deg:",
+        "",
         "| parameter | complete | reduced |", "| --- | ---: | ---: |",
         *(f"| {n} | {100 * links[0][n]:.3g} % | {100 * links[1][n]:.3g} % |" for n in shared),
     ]  # fmt: skip
@@ -151,4 +158,4 @@ def report(results: list[dict[tuple[str, str, str], dict[str, float]]]) -> str:
 
 if __name__ == "__main__":
     asked = options(__doc__, trials=10, seed=1, jobs=2)
-    publish(report(side_by_side(one_trial, asked)), "What better sensors are worth", asked)
+    publish(report(side_by_side(one_trial, asked)), "Value of better pressure sensors", asked)

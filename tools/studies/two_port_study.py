@@ -12,9 +12,9 @@ from hydrotele.teleop.findings import agreement, sweep
 from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance
 from tools.studies.study import options, publish, side_by_side
 
-SPREAD = 0.5  # decades by which every number of the shipped case is varied, up and down
+SPREAD = 0.5  # decades by which every parameter of the shipped case is varied, up and down
 LONGEST = 0.5  # s each way, the largest delay of a map
-FACTORS = (0.01, 100.0)  # on what comes back
+FACTORS = (0.01, 100.0)  # on the returned signal
 SWEPT = 0.1  # s each way, the largest delay of a sweep
 
 
@@ -55,7 +55,8 @@ def percent(error: float | None) -> str:
 
 
 def shipped_table(points: int) -> list[str]:
-    lines = ["| structure | felt, no delay | felt, 20 ms each way | cells that agree |",
+    lines = ["| structure | impedance error, no delay | impedance error, 20 ms each way |"
+             " cells that agree |",
              "| --- | ---: | ---: | ---: |"]  # fmt: skip
     for name, row in zip(STRUCTURES, compared(load_teleop_case().case(), points), strict=True):
         many, agree, _, errors = row
@@ -64,8 +65,8 @@ def shipped_table(points: int) -> list[str]:
 
 
 def random_table(found: list[list[tuple]]) -> list[str]:
-    lines = ["| structure | cells | of them stable | agree | worst case | sweeps | not measurable |"
-             " over 3 % | median error | largest |",
+    lines = ["| structure | cells | stable cells | agree | worst case | sweeps | not measurable |"
+             " over 3 % | median error | largest error |",
              "| --- |" + " ---: |" * 9]  # fmt: skip
     for name, rows in zip(STRUCTURES, zip(*found, strict=True), strict=True):
         many, agree = sum(r[0] for r in rows), sum(r[1] for r in rows)
@@ -86,17 +87,24 @@ def main() -> None:
     shipped = shipped_table(2 * asked.points + 1)
     drawn = random_table(side_by_side(trial, asked, asked.points))
     text = "\n".join([
-        "Felt: largest error of the felt impedance, simulated with imposed sines of 0.1 to 5 Hz,",
-        "against the formula; asked for are 3 %. Cells: of a map over delay (0 to 500 ms each way)",
-        "and factor on what comes back (0.01 to 100), in which the argument principle and a",
-        "simulated kick of the hand agree on stable or not; asked for are 95 %. `hydrotele analyse",
-        "teleop --confirm` does the first table for any case.",
+        "The two-port formula predicts the impedance that the operator feels and whether the "
+        "loop is stable. Both are compared with simulations of two masses.",
+        "",
+        "Impedance error: largest error of the formula against a simulation with imposed sines "
+        "of 0.1 to 5 Hz; required: at most 3 % (lower is better). Cells: points of a map over "
+        "delay (0 to 500 ms each way) and the factor on the returned signal (0.01 to 100). They "
+        "agree if the argument principle and a simulated kick of the hand give the same "
+        "stability; required: 95 % (higher is better). `hydrotele analyse teleop --confirm` "
+        "computes the first table for any case.",
         "", "## The shipped case", "", *shipped, "",
         f"## {asked.trials} random cases", "",
-        "Every mass, damper, spring and gain of the shipped case times 10^u, u uniform within",
-        f"{SPREAD} either way; sweeps without delay, and with one of up to {1e3 * SWEPT:g} ms.",
-        "Not measurable: the slave is unstable while the handle is held, nothing settles.",
-        "", *drawn, "",
+        "Every mass, damper, spring and gain of the shipped case times 10^u, with u uniform "
+        f"between {-SPREAD} and {SPREAD}. Sweeps without delay, and with one of up to "
+        f"{1e3 * SWEPT:g} ms.",
+        "", *drawn, "", "## Limits", "",
+        "- Not measurable: the slave is unstable while the handle is held, so that nothing "
+        "settles.",
+        "",
     ])  # fmt: skip
     publish(text, "The two-port against simulation", asked)
 

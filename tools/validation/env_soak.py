@@ -1,6 +1,6 @@
 """Run environments with random actions for millions of steps and check every observation.
 
-    python tools/validation/env_soak.py --steps 10000000 --out docs/results/env_soak.md
+    python tools/validation/env_soak.py --steps 10000000 --out docs/validation/env_soak.md
 
 The steps are shared by all tasks, kinds of actions and sensors.
 """
@@ -28,9 +28,11 @@ def main() -> None:
     each = -(-asked.steps // (len(cases) * asked.batch))
     rows = [_soak(*case, each, asked) for case in cases]
     lines = [
-        "Uniform actions, held for a number of steps that is itself drawn; observations are tested"
-        " against their space after every step, and what would have left it is counted before it"
-        " saturates.\n",
+        "Long sequences of random actions test that no environment produces a value that is not"
+        " finite, an observation outside its space, a MuJoCo warning or an unstable simulation."
+        " Required: 0 in these columns.\n\nActions are uniform and are held for a random number of"
+        " steps. Observations are tested after every step. Readings beyond the limits of the space"
+        " are counted before they are saturated.\n",
         "| task | actions | sensors | steps | episodes | not finite | outside the space | MuJoCo's"
         " warnings | unstable | saturated readings | physics steps/s |",
         "| " + " | ".join(["---"] * 11) + " |",

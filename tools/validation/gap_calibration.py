@@ -85,8 +85,9 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
     for test, limit in LIMITS.items():
         rows[f"worst channel, {test}"] = ([n["tests"][test] for n in noted.values()], limit)
     lines = [
-        f"{len(noted)} simulated clean machines, motions and sensors of the blind trials.", "",
-        "| figure | " + " | ".join(f"{s:.0%} below" for s in _SHARES) + " | threshold |",
+        f"{len(noted)} simulated unchanged machines; motions and sensors of the blind validation.",
+        "",
+        "| figure | " + " | ".join(f"{s:.0%} quantile" for s in _SHARES) + " | threshold |",
         "| --- |" + " --- |" * (len(_SHARES) + 1),
     ]  # fmt: skip
     document: dict = {"trials": len(noted), "quantiles": {}}
@@ -96,10 +97,12 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
         lines.append(f"| {name} | " + " | ".join(f"{c:.3g}" for c in cuts) + f" | {limit:g} |")
     over = [n["effect"] for n in noted.values() if n["score"] >= ENTER and n["worth_naming"]]
     document["falsely named"] = over
-    lines += ["", f"Over the threshold and worth naming: {len(over)} {over or ''}".rstrip() + "."]
+    count = f"{len(over)} {over or ''}".rstrip()
+    lines += ["", f"Effects above the threshold and large enough to name: {count}."]
     pulled = [n["pulls"] for n in noted.values() if n["pulls"]]
     if pulled:
-        lines += ["", f"Estimate over stated spread in {len(pulled)} of them (a perfect model: 1):",
+        lines += ["", "Estimate divided by its stated standard deviation,"
+                  f" {len(pulled)} machines (ideal: 1):",
                   "", "| effect | RMS |", "| --- | --- |"]  # fmt: skip
         document["pulls"] = {}
         for key in pulled[0]:
@@ -110,7 +113,7 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
         beyond = float(np.mean(np.abs(every) > 1.96))
         size = float(np.sqrt(np.mean(np.square(every))))
         document |= {"pulls_rms": size, "beyond_1.96": beyond}
-        lines += ["", f"All: RMS {size:.2f}, beyond 1.96: {beyond:.1%}."]
+        lines += ["", f"All effects: RMS {size:.2f}; fraction beyond 1.96: {beyond:.1%}."]
     return document, "\n".join(lines) + "\n"
 
 

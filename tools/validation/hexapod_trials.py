@@ -98,7 +98,7 @@ def score(out: Path) -> str:
 
 
 def _summary(verdicts: list[Verdict], answers) -> list[str]:
-    rows = ["| trials | right | share |", "| --- | --- | --- |"]
+    rows = ["| trials | correct | fraction |", "| --- | --- | --- |"]
     for kind in KINDS:
         own = [v for v in verdicts if v.kind == kind]
         if own:
@@ -109,19 +109,19 @@ def _summary(verdicts: list[Verdict], answers) -> list[str]:
             fine = sum(v.right or not answers[v.trial].get("effects") for v in faint)
             clear, right = len(own) - len(faint), sum(v.right for v in own if v not in faint)
             rows.append(f"| single, not faint | {right} of {clear} | {100 * right / clear:.0f} % |")
-            rows.append(f"| faint: right, or nothing named | {fine} of {len(faint)} | |")
+            rows.append(f"| faint: correct, or nothing named | {fine} of {len(faint)} | |")
     named = [v for v in verdicts if v.kind == "clean" and answers[v.trial].get("effects")]
     false = [v for v in verdicts if v.kind == "outside" and any(p > 0.5 for p, _ in v.beliefs)]
     covered = [low <= truth <= high for v in verdicts for _, _, low, high, truth in v.covered]
     rows += [
         "",
-        f"Clean robots with something named: {len(named)}. Outsiders with something named above"
-        f" 50 %: {len(false)}. 95 % intervals that hold the truth: {sum(covered)} of"
+        f"Clean robots with an effect named: {len(named)}. Unmodelled effects with a known effect"
+        f" above 50 %: {len(false)}. 95 % intervals that contain the truth: {sum(covered)} of"
         f" {len(covered)}.",
     ]
     rows.append(
-        f"Faint: what the effect changes in the measured forces of the fitted runs, in units of"
-        f" their noise and summed in squares, has a root below {DETECTABLE:g}."
+        "Faint: the root of the summed squares of the force changes by the effect in the fitted"
+        f" runs, in units of the noise, is below {DETECTABLE:g}."
     )
     loops = []
     for v in verdicts:
@@ -143,7 +143,7 @@ def _summary(verdicts: list[Verdict], answers) -> list[str]:
 
 def _rows(verdicts: list[Verdict], keys, answers) -> list[str]:
     rows = ["| trial | off | hidden | visibility | verdict | answer | errors / noise, both models |"
-            " right |", "| --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+            " correct |", "| --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
     for v in verdicts:
         hidden = ", ".join(
             f"{e['name']} at {e['location']}: " + ", ".join(

@@ -165,8 +165,11 @@ def main() -> int:
     rng = np.random.default_rng(args.seed)
     total, bad = 0, 0
     print(
-        "| machine | tool | steps | NaN | warnings | pins open [mm] | fastest [rad/s, m/s] |"
-        " pressures [MPa absolute] | beyond relief [MPa] |\n" + "| --- " * 2 + "| ---: " * 7 + "|"
+        "| machine | tool | steps | NaN | warnings | largest pin gap [mm] |"
+        " largest speed [rad/s, m/s] | pressures [MPa absolute] | above relief [MPa] |\n"
+        + "| --- " * 2
+        + "| ---: " * 7
+        + "|"
     )
     for name in args.machines:
         tools = args.tools or load_machine(name).tools
@@ -184,7 +187,7 @@ def main() -> int:
                 f" {result['speed']:.1f} | {_said(pressures)} |",
                 flush=True,
             )
-    print(f"\nIn all {total} steps, {bad} NaN states, warnings and pressures that cannot be.")
+    print(f"\nTotal: {total} steps, {bad} NaN states, warnings and impossible pressures.")
     return 1 if bad else 0
 
 

@@ -520,8 +520,8 @@ def run_method(name: str, folder: Path, facts: Facts, limit: float) -> dict[str,
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: by method and kind how often the right effect is named, and what is closed."""
     lines = [
-        "| method | kind | trials | named rightly | named though nothing is planted |"
-        " median gap closed over 5 s | median s |",
+        "| method | kind | trials | named correctly | named although nothing is hidden |"
+        " median error reduction over 5 s | median s |",
         "| --- | --- | ---: | --- | --- | ---: | ---: |",
     ]
     for method in METHODS:

@@ -11,11 +11,24 @@ _PICTURES = (
     ("closure.png", "Closure"),
 )
 
+_CRITERIA = {
+    "single right, silence on weak ones set aside": "single effects correct, weak ones excluded",
+    "single right, silence on weak ones counted as wrong": "single effects correct, all",
+    "double right, silence on weak ones set aside": "pairs correct, weak ones excluded",
+    "double right, silence on weak ones counted as wrong": "pairs correct, all",
+    "clean falsely named": "unchanged machine, effect named",
+    "outside called unknown": "unmodelled effect, reported as `unknown`",
+    "outside surely named": "unmodelled effect, known effect named with probability above 0.9",
+    "interval coverage": "95 % intervals that contain the truth",
+    "interval coverage, not too wide": "95 % intervals that contain the truth, upper limit",
+    "gap closed, median": "error reduction, median",
+}
+
 _WEAK = (
-    f"Weak: visibility below {DETECTABLE:g} (root of the summed squares of what the effect changes,"
-    " in standard deviations of the noise, over all samples and channels of the fit runs). Not to"
-    " name a weak one is no error; to name something else instead is. Singles by visibility, weak"
-    " ones included:"
+    "Visibility: root of the summed squares of the changes by the effect, in standard deviations of"
+    " the noise, over all samples and channels of the fitted runs. An effect is weak if its"
+    f" visibility is below {DETECTABLE:g}. To miss a weak effect is no error; to name another"
+    " effect instead is an error. Single effects by visibility, including weak ones:"
 )
 
 
@@ -45,32 +58,36 @@ def markdown(
 ) -> str:
     """The page."""
     lines = [
-        "# Blind trials",
+        "# Blind validation on the library's own simulation",
         "",
         f"Seed {series.seed}, machine {series.machine}, {scores['trials']} trials of four runs of"
-        f" {series.duration:g} s. Right means name and location; an ambiguous set that holds the"
-        " truth counts.",
+        f" {series.duration:g} s. Correct means the right name and location; an ambiguous answer"
+        " that contains the truth counts as correct.",
         "",
-        "| what | value | asked | reached |",
+        "| criterion | value | required | reached |",
         "| --- | ---: | --- | --- |",
     ]
     for name, target in scores["targets"].items():
         value = "-" if target["value"] is None else f"{target['value']:.3f}"
-        word = {None: "no trial tells", True: "yes", False: "no"}[target["reached"]]
-        lines.append(f"| {name} | {value} | {target['asked']} | {word} |")
-    lines += ["", "| class | right | without weak ones | verdicts |", "| --- | --- | --- | --- |"]
+        word = {None: "no data", True: "yes", False: "no"}[target["reached"]]
+        lines.append(f"| {_CRITERIA.get(name, name)} | {value} | {target['asked']} | {word} |")
+    lines += [
+        "",
+        "| class | correct | without weak effects | verdicts |",
+        "| --- | --- | --- | --- |",
+    ]
     for kind, part in scores["classes"].items():
         words = "; ".join(f"{count} {word}" for word, count in part["verdicts"].items())
         clear = _share(part.get("right_without_weak"))
         lines.append(f"| {kind} | {_share(part['right'])} | {clear} | {words} |")
-    lines += ["", _WEAK, "", "| visibility | right |", "| --- | --- |"]
+    lines += ["", _WEAK, "", "| visibility | correct |", "| --- | --- |"]
     lines += [f"| {bin_} | {_share(part)} |" for bin_, part in scores["by_visibility"].items()]
     crossed = ", ".join(f"{kind} {_share(part)}" for kind, part in control.items())
-    lines += ["", f"With the keys swapped between trials (must collapse): {crossed}.", ""]
+    lines += ["", f"Control, keys exchanged between trials (must be close to 0): {crossed}.", ""]
     for file, title in _PICTURES:
         lines.append(f"![{title}]({file})")
-    lines += ["", "## Answers that were not right", "",
-              "| trial | class | planted | visibility | answered | verdict |",
+    lines += ["", "## Incorrect answers", "",
+              "| trial | class | hidden | visibility | named | verdict |",
               "| --- | --- | --- | ---: | --- | --- |"]  # fmt: skip
     for v in verdicts:
         if not v.right:

@@ -298,21 +298,27 @@ def world_markdown(head: Sequence[str], scores: dict[str, Any], outcomes: Sequen
     Returns:
         Markdown text.
     """
-    lines = ["# Trials on the independent machine", "", *head, "",
-             "| asked | value | | reached |", "| --- | ---: | --- | --- |"]  # fmt: skip
+    lines = [
+        "# Blind validation on an independent simulator",
+        "",
+        *head,
+        "",
+        "| criterion | value | required | reached |",
+        "| --- | ---: | --- | --- |",
+    ]
     for name, target in scores["targets"].items():
         value = "-" if target["value"] is None else f"{target['value']:.3f}"
-        word = {None: "no trial tells", True: "yes", False: "no"}[target["reached"]]
+        word = {None: "no data", True: "yes", False: "no"}[target["reached"]]
         lines.append(f"| {name} | {value} | {target['asked']} | {word} |")
     columns = ("right", "found", "told", "led", "named", "false names", "surely wrong",
                "coverage", "calibrated")  # fmt: skip
     lines += [
         "",
-        "Rates in % with 95 % intervals (Wilson 1927); gap closed is the median share of"
-        " the mean square above the floor.",
+        "Rates in % with 95 % intervals (Wilson 1927). One step and open loop: median reduction"
+        " of the mean square error above that of a perfect model.",
         "",
-        f"| kind | trials | {' | '.join(columns)} | one step | open loop 5 s | s median, most"
-        " | MB median, most | verdicts |",
+        f"| kind | trials | {' | '.join(columns)} | one step | open loop 5 s | s median, max."
+        " | MB median, max. | verdicts |",
         "| --- | ---: " + "| --- " * len(columns) + "| ---: | ---: | --- | --- | --- |",
     ]
     for name, row in scores["rows"].items():
@@ -323,8 +329,8 @@ def world_markdown(head: Sequence[str], scores: dict[str, Any], outcomes: Sequen
         words = ", ".join(f"{count} {word}" for word, count in row["verdicts"].items())
         lines.append(f"| {name} | {row['trials']} | {' | '.join(cells)} | {' | '.join(numbers)} |"
                      f" {seconds or '-'} | {memory or '-'} | {words} |")  # fmt: skip
-    lines += ["", "## Answers that were not right", "",
-              "| trial | kind | planted | visibility | verdict | answered |",
+    lines += ["", "## Incorrect answers", "",
+              "| trial | kind | hidden | visibility | verdict | named |",
               "| --- | --- | --- | ---: | --- | --- |"]  # fmt: skip
     lines += [
         f"| {o.trial} | {o.kind} | {', '.join(o.planted) or 'nothing'} |"
