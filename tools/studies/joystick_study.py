@@ -310,10 +310,10 @@ def damping() -> list[str]:
     printed = {"excavator": (600.0, 6.0, 6.0, 3.0), "feller": (4000.0, 45.0, 25.0, 4.0)}
     lines = [
         "## Rotational damping", "",
-        "Tables 6.7 and 6.9 print 0.03 and 0.04 in 100 N m/rad/s, that is 3 and 4 N m s/rad, "
-        "with a control rate of 200 Hz (5.3). The table gives the largest eigenvalue of the "
-        "sampled loop: below 1 the handle comes to rest. x and ry are coupled with the springs "
-        "of x (60 N s/m) at the handle, free and held. rz is uncoupled, without a hand.",
+        "Tables 6.7 and 6.9 print 0.03 and 0.04 in 100 N m/rad/s, that is 3 and 4 N m s/rad. The "
+        "control rate is 200 Hz (5.3). The table gives the largest eigenvalue of the sampled "
+        "loop: below 1 the handle comes to rest. x and ry are coupled with the springs of x (60 "
+        "N s/m) at the handle, free and held. rz is uncoupled, without a hand.",
         "",
         "| gains | damping [N m s/rad] | rate [Hz] | free | held | rz |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
@@ -520,10 +520,9 @@ def report(results) -> str:
         "## Limits", "",
         "- Identification includes no error of the coil map and none of the position of the "
         "diodes; a real joystick has both.",
-        "- No inertia of this size makes the printed rotational damping stable at 200 Hz, in "
-        "particular about z, where the height of the handle has no influence. Either the printed "
-        "unit of damping is not that of stiffness, or the coil loop ran faster than the 200 Hz "
-        "of 5.3.",
+        "- No inertia of this size makes the printed rotational damping stable at 200 Hz. About "
+        "z, the height of the handle has no influence. Either the printed unit of damping is not "
+        "that of stiffness, or the coil loop ran faster than the 200 Hz of 5.3.",
         "- Without a hand, x and ry are unstable with every one of these springs at 200 Hz: a "
         "push at the handle tilts a free flotor. A handle without a hand is therefore held by "
         "the law of 5.1.3.",

@@ -86,10 +86,10 @@ def main() -> None:
         "delays of the network.",
         "",
         "Stiffness of the plate, speed of the handle and bandwidth of the force estimate are "
-        f"random. So are the delays (up to {1e3 * DELAY:g} ms each way), the jitter (mean of up "
-        f"to {1e3 * JITTER:g} ms) and the ratio (within {ASIDE} e-folds of the predicted limit). "
-        f"A run is stable in simulation if the contact force swings by less than {100 * SWING:g} "
-        "% of the target.",
+        f"random. So are the delays (up to {1e3 * DELAY:g} ms each way) and the jitter (mean of "
+        f"up to {1e3 * JITTER:g} ms). The ratio is random within {ASIDE} e-folds of the predicted "
+        "limit. A run is stable in simulation if the contact force swings by less than "
+        f"{100 * SWING:g} % of the target.",
         "", *lines, "",
         f"Correct (higher is better): {right} of {len(found)}; {right_far} of the {len(far)} that"
         " are further than 20 to 25 % from the limit.",
