@@ -93,8 +93,9 @@ def main() -> int:
         names = " ".join(others) if args.arrows else len(others)
         print(f"{room:12} {modules[room]:7} {lines[room]:6}  {names}")
     total = sum(modules.values()), sum(lines.values())
-    print(f"{len(modules)} packages, {total[0]} modules, {total[1]} lines, "
-          f"{len(arrows)} dependencies")
+    print(
+        f"{len(modules)} packages, {total[0]} modules, {total[1]} lines, {len(arrows)} dependencies"
+    )
     if not args.command:
         return 0
     calls, status = passed_by(args.command)
