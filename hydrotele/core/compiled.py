@@ -224,8 +224,13 @@ def _imports(module: str) -> frozenset[str]:
 
 @functools.cache
 def digest(module: str) -> str:
-    """Of a module's source and those that it imports: one that changes asks for another cache."""
-    reached, open_ones = {module}, [module]
+    """Digest of a module's source, of what it imports, and of what compiles it and keeps the result.
+
+    A change of any of them asks for another cache. A law is compiled by another module than its
+    own, which need not import this one.
+    """
+    open_ones = [module, __name__]
+    reached = set(open_ones)
     while open_ones:
         more = _imports(open_ones.pop()) - reached
         reached |= more
