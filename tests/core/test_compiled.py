@@ -85,6 +85,21 @@ def test_a_changed_module_drops_the_caches_of_those_that_use_it_and_no_others(tm
     assert _run(elsewhere, cache, code)[0] == ["1.0", "12.0", "1", "1"]
 
 
+def test_another_form_of_the_cache_is_never_read(tmp_path):
+    """Also for a function whose module imports nothing of the package, such as a law."""
+    package = tmp_path / "hydrotele"
+    shutil.copytree(PACKAGE / "core", package / "core")
+    (package / "__init__.py").write_text("")
+    (package / "law.py").write_text("def law(x):\n    return 5.0 * x\n")
+    code = "from hydrotele.core.compiled import compiled; from hydrotele.law import law\n"
+    code += "called = compiled(law); print(called(2.0), len(called.stats.cache_hits))"
+    assert _run(tmp_path, tmp_path, code)[0] == ["10.0", "0"]
+    assert _run(tmp_path, tmp_path, code)[0] == ["10.0", "1"]
+    with (package / "core" / "linking.py").open("a") as file:
+        file.write("# another form\n")
+    assert _run(tmp_path, tmp_path, code)[0] == ["10.0", "0"]
+
+
 def test_two_processes_compile_a_function_once(tmp_path):
     package = tmp_path / "hydrotele"
     shutil.copytree(PACKAGE / "core", package / "core")
