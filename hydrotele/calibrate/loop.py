@@ -286,7 +286,7 @@ def _ancestors(machine: Machine, link: str) -> list[str]:
 def _denavit_hartenberg(
     ways: np.ndarray, points: np.ndarray, tip: np.ndarray, parallel: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters (N, 5) of axes given by points and directions, and frame 0's origin (3,)."""
+    """Return parameters (N, 5) of axes through points, and the origin of frame 0 (3,)."""
     count = len(ways)
     values = np.zeros((count, 5))
     foot, _ = _feet(points[0], ways[0], points[1], ways[1])
