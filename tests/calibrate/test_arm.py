@@ -206,7 +206,7 @@ def test_unusable_data_say_why(clean):
     with pytest.raises(InputError, match="keep one of them"):
         identify_arm(LOOP, [stages[0], stages[0]])
     still = Strokes("boom", np.full(50, 0.3), np.full(50, 0.4), 1e-3, 1e-3)
-    with pytest.raises(InputError, match="l_l, l_c and l_u stay unknown"):
+    with pytest.raises(InputError, match="l_l, l_c and l_u are not identifiable"):
         identify_linkage(MACHINE, still)
     assert strokes_of(log_of(), MACHINE, ["boom"]) == []
 
