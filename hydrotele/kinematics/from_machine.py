@@ -388,4 +388,6 @@ def _expect_feller(machine: Machine, joints: Sequence[str], aside: Sequence[floa
     if machine.arm and machine.arm.tip.link != machine.link_of(joints[-1]):
         raise InputError(where, f"its tip must be on the head, not on {machine.arm.tip.link}")
     if np.abs(aside).max() > _EXACT:
-        raise InputError(where, "each pin must be in the plane y = 0, on the x axis of the link before")
+        raise InputError(
+            where, "each pin must be in the plane y = 0, on the x axis of the link before"
+        )
